@@ -1,0 +1,42 @@
+"""The sequence of events, for the flights that follow it."""
+
+from apt_evap._core.octree cimport Octree
+from apt_evap._core.robin cimport ChargingRule
+from apt_evap._core.surface cimport Neighbourhood
+
+
+cdef class Journal:
+    cdef readonly long n_events
+    cdef long[::1] start                # (most + 1,) where each event's changes begin
+    cdef int[::1] slot                  # changed slots; the first of each event is the one taken out
+    cdef double[::1] charge             # new charges [e]
+    cdef long[::1] fresh_start          # (most + 1,)
+    cdef int[::1] fresh_atom            # atoms put in
+    cdef int[::1] fresh_leaf            # and the leaf each joined
+    cdef double[:, ::1] positions       # (n_atoms, 3) nm
+
+    cdef int room(self, long changes, long fresh) except -1 nogil
+    cdef void replay(self, long event, Octree tree) noexcept nogil
+
+
+cdef class Evaporation:
+    cdef readonly Neighbourhood atoms
+    cdef readonly Octree tree
+    cdef readonly ChargingRule rule
+    cdef readonly double potential, patch_radius, update_radius, bond_length, opening_angle
+    cdef object potential_point
+    cdef readonly long n_removed, since_sweep, n_clipped
+    cdef double[::1] weight             # (n_atoms,) 1/evaporation field, 0 where an atom may not leave
+    cdef int[::1] slot_of               # (n_atoms,) -1 away from the surface
+    cdef double[:, ::1] normals         # (capacity, 3) by slot
+    cdef double[::1] rank               # (capacity,) charge times weight
+    cdef int[::1] winner                # tournament over the slots: node i has the better of 2 i and 2 i + 1
+    cdef long leaves
+    cdef int[::1] near                  # (most,) slots around the hole
+    cdef int[::1] patch                 # (most,)
+    cdef double[::1] work               # (5 most,)
+
+    cdef bint better(self, int a, int b) noexcept nogil
+    cdef void settle(self, int slot) noexcept nogil
+    cdef long strongest_neighbour(self, long atom) noexcept nogil
+    cdef int event(self, long atom, Journal journal) except -1 nogil

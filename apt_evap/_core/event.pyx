@@ -1,0 +1,355 @@
+"""Events: which atom leaves, and what its leaving does to the charges around the hole.
+
+An event takes the atom with the largest field over evaporation field, exposes what lay under it, and solves the charges
+of a patch around the hole while all others are held: the change falls off as the cube of the distance. What is left
+over is smooth, and `relax` (a sweep over the whole surface every so many events) carries it. The cost of an event does
+not depend on the size of the specimen.
+"""
+
+from libc.math cimport sqrt
+
+import numpy as np
+
+from apt_evap._core.octree cimport Octree, Sources, point_atoms, sources_field, sources_free, sources_init
+from apt_evap._core.surface cimport MOST_NEAR
+
+DONE, SWEEP_DUE, EXHAUSTED, TOO_SHALLOW = range(4)
+
+cdef enum:
+    MOST_PATCH = 4096   # slots within the update radius; 10 lattice constants of fcc hold some 800
+
+
+cdef class Journal:
+    """What each event of a batch changed in the tree, to be replayed on a copy of it bit by bit."""
+
+    def __init__(self, const double[:, ::1] positions, long most):
+        self.n_events = 0
+        self.positions = np.asarray(positions)
+        self.start = np.zeros(most + 1, np.int64)
+        self.fresh_start = np.zeros(most + 1, np.int64)
+        self.slot = np.empty(most * 256, np.int32)
+        self.charge = np.empty(most * 256)
+        self.fresh_atom = np.empty(most * 8, np.int32)
+        self.fresh_leaf = np.empty(most * 8, np.int32)
+
+    cdef int room(self, long changes, long fresh) except -1 nogil:
+        # Space for one more event.
+        if self.start[self.n_events] + changes > self.slot.shape[0]:
+            with gil:
+                self.slot = np.resize(np.asarray(self.slot), 2 * self.slot.shape[0] + changes)
+                self.charge = np.resize(np.asarray(self.charge), 2 * self.charge.shape[0] + changes)
+        if self.fresh_start[self.n_events] + fresh > self.fresh_atom.shape[0]:
+            with gil:
+                self.fresh_atom = np.resize(np.asarray(self.fresh_atom), 2 * self.fresh_atom.shape[0] + fresh)
+                self.fresh_leaf = np.resize(np.asarray(self.fresh_leaf), 2 * self.fresh_leaf.shape[0] + fresh)
+        return 0
+
+    cdef void replay(self, long event, Octree tree) noexcept nogil:
+        # The same calls in the same order as the event made them.
+        cdef long k
+        cdef int atom
+        tree.take_out(self.slot[self.start[event]])
+        for k in range(self.fresh_start[event], self.fresh_start[event + 1]):
+            atom = self.fresh_atom[k]
+            tree.put_in(atom, self.positions[atom, 0], self.positions[atom, 1], self.positions[atom, 2],
+                        self.fresh_leaf[k])
+        for k in range(self.start[event] + 1, self.start[event + 1]):
+            tree.set_charge(self.slot[k], self.charge[k])
+        tree.refresh()
+
+    def replay_on(self, Octree tree, long event):
+        """Make event number `event` of this journal happen in a copy of the tree."""
+        if not 0 <= event < self.n_events:
+            raise IndexError(f"event must be from 0 to {self.n_events - 1}, got {event}")
+        self.replay(event, tree)
+
+
+cdef class Evaporation:
+    """A charged surface from which atoms leave one by one.
+
+    Parameters
+    ----------
+    atoms : Neighbourhood
+        The atoms and their surface.
+    rule : ChargingRule
+        How charge settles.
+    weights : ndarray, shape (n,)
+        One over the evaporation field of each atom [nm/V]; 0 for atoms that may not leave.
+    potential : float
+        Potential of the specimen, over the Coulomb constant [e/nm].
+    potential_point : ndarray, shape (3,)
+        Point inside the specimen that has this potential [nm].
+    bond_length : float
+        Atoms closer than this are nearest neighbours [nm].
+    patch_radius, update_radius : float
+        Within the first the charges are solved after an event, within the second the fields are kept up to date [nm].
+    opening_angle : float
+        Of sweeps and of fields on newly exposed atoms [rad].
+    """
+
+    def __init__(self, Neighbourhood atoms, ChargingRule rule, const double[::1] weights, double potential,
+                 potential_point, double bond_length, double patch_radius, double update_radius,
+                 double opening_angle):
+        self.atoms, self.rule = atoms, rule
+        self.weight = np.array(weights)
+        self.potential, self.bond_length = potential, bond_length
+        self.patch_radius, self.update_radius, self.opening_angle = patch_radius, update_radius, opening_angle
+        self.potential_point = np.array(potential_point, dtype=np.float64).reshape(1, 3)
+        self.n_removed = self.since_sweep = self.n_clipped = 0
+        self.slot_of = np.full(atoms.n_atoms, -1, np.int32)
+        self.near = np.empty(MOST_PATCH + MOST_NEAR, np.int32)
+        self.patch = np.empty(MOST_PATCH + MOST_NEAR, np.int32)
+        self.work = np.empty(5 * (MOST_PATCH + MOST_NEAR))
+
+    def relax(self, *, double tolerance=1e-4, int most_sweeps=200, bint double_precision=False, long extra=0,
+              int n_threads=1):
+        """Build the tree anew and iterate over the whole surface; bring the potential to the voltage.
+
+        Parameters
+        ----------
+        tolerance : float
+            Largest change of a charge in a sweep, relative to the mean charge, at which to stop.
+        most_sweeps : int
+            Sweeps after which to stop in any case.
+        double_precision : bool
+            Sweeps in float64; needed for tolerances below 1e-6.
+        extra : int
+            Room for atoms that come to the surface before the next relaxation; by default an eighth of the surface.
+        n_threads : int
+            Threads.
+
+        Returns
+        -------
+        sweeps : int
+            Sweeps done.
+        residual : float
+            Largest change of a charge in the last one, relative to the mean charge.
+        """
+        cdef long slot, n
+        surface = self.atoms.surface
+        if len(surface) == 0:
+            raise ValueError("the specimen has no surface atoms")
+        charges = np.ones(len(surface))
+        slot_of = np.asarray(self.slot_of)
+        slots = slot_of[surface]
+        if self.tree is not None:
+            charges = np.where(slots >= 0, self.tree.charges[slots], 0.0)
+        positions = np.ascontiguousarray(np.asarray(self.atoms.positions)[surface])
+        self.tree = Octree(positions, charges, surface, extra=extra or len(surface) // 8 + MOST_NEAR)
+        slot_of[:] = -1
+        slot_of[self.tree.atoms] = np.arange(len(surface), dtype=np.int32)
+        n, capacity = self.tree.n_slots, self.tree.x.shape[0]
+        self.normals = np.zeros((capacity, 3))
+        np.asarray(self.normals)[:n] = self.atoms.normals[self.tree.atoms]
+        lists = self.tree.lists(self.opening_angle, n_threads)
+        outcome = self.rule.solve(self.tree, self.normals, lists, tolerance=tolerance, most_sweeps=most_sweeps,
+                                  double_precision=double_precision, n_threads=n_threads)
+        self.rule.scale(self.tree, self.potential / self.tree.potentials(self.potential_point, 0.0)[0])
+        self.rank = np.full(capacity, -1.0)
+        np.asarray(self.rank)[:n] = self.tree.charges * np.asarray(self.weight)[self.tree.atoms]
+        self.leaves = 1
+        while self.leaves < capacity:
+            self.leaves *= 2
+        self.winner = np.full(2 * self.leaves, -1, np.int32)
+        np.asarray(self.winner)[self.leaves:self.leaves + n] = np.arange(n)
+        with nogil:
+            for slot in range(self.leaves - 1, 0, -1):
+                self.winner[slot] = self.winner[2 * slot]
+                if self.better(self.winner[2 * slot + 1], self.winner[2 * slot]):
+                    self.winner[slot] = self.winner[2 * slot + 1]
+        self.since_sweep = 0
+        return outcome
+
+    # ---- which atom leaves -----------------------------------------------------------------------------------------
+
+    cdef bint better(self, int a, int b) noexcept nogil:
+        # Extremal: the higher rank; equal ranks go by the number of the atom.
+        if a < 0 or b < 0:
+            return b < 0 <= a
+        if self.rank[a] != self.rank[b]:
+            return self.rank[a] > self.rank[b]
+        return self.tree.atom[a] < self.tree.atom[b]
+
+    cdef void settle(self, int slot) noexcept nogil:
+        # Carry a changed rank up the tournament.
+        cdef long node = (self.leaves + slot) // 2
+        cdef int a, b
+        self.winner[self.leaves + slot] = slot
+        while node:
+            a, b = self.winner[2 * node], self.winner[2 * node + 1]
+            self.winner[node] = b if self.better(b, a) else a
+            node //= 2
+
+    cdef long strongest_neighbour(self, long atom) noexcept nogil:
+        # The surface nearest neighbour with the highest charge; -1: there is none.
+        cdef int[MOST_NEAR] others
+        cdef int n = self.atoms.near(atom, others), i
+        cdef long best = -1, other
+        cdef double dx, dy, dz
+        for i in range(n):
+            other = others[i]
+            dx = self.atoms.positions[other, 0] - self.atoms.positions[atom, 0]
+            dy = self.atoms.positions[other, 1] - self.atoms.positions[atom, 1]
+            dz = self.atoms.positions[other, 2] - self.atoms.positions[atom, 2]
+            if self.slot_of[other] < 0 or dx * dx + dy * dy + dz * dz > self.bond_length * self.bond_length:
+                continue
+            if best < 0 or self.tree.q[self.slot_of[other]] > self.tree.q[self.slot_of[best]] or (
+                    self.tree.q[self.slot_of[other]] == self.tree.q[self.slot_of[best]] and other < best):
+                best = other
+        return best
+
+    # ---- one event -------------------------------------------------------------------------------------------------
+
+    cdef int event(self, long atom, Journal journal) except -1 nogil:
+        cdef Sources sources
+        cdef int[MOST_NEAR] fresh
+        cdef int gone = self.slot_of[atom], n_fresh, slot, best
+        cdef double px = self.atoms.positions[atom, 0], py = self.atoms.positions[atom, 1]
+        cdef double pz = self.atoms.positions[atom, 2], charge = self.tree.q[gone], s, nearest
+        cdef double dx, dy, dz, over, change
+        cdef double* work = &self.work[0]
+        cdef long n_near, n, i, k, at
+        cdef int axis
+        self.n_removed += 1
+        self.since_sweep += 1
+        self.tree.take_out(gone)
+        self.tree.refresh()
+        self.slot_of[atom] = -1
+        self.rank[gone] = -1.0
+        self.settle(gone)
+        n_fresh = self.atoms.remove(atom, fresh)
+
+        # the slots around the hole, without the charge that left
+        n_near = self.tree.within(px, py, pz, self.update_radius, &self.near[0], MOST_PATCH)
+        n = 0
+        for i in range(n_near):
+            slot = self.near[i]
+            dx, dy, dz = self.tree.x[slot] - px, self.tree.y[slot] - py, self.tree.z[slot] - pz
+            s = dx * dx + dy * dy + dz * dz
+            over = charge / (s * sqrt(s))
+            self.rule.field[slot, 0] -= over * dx
+            self.rule.field[slot, 1] -= over * dy
+            self.rule.field[slot, 2] -= over * dz
+            if s <= self.patch_radius * self.patch_radius:
+                self.patch[n] = slot
+                n += 1
+                for axis in range(3):
+                    self.normals[slot, axis] = self.atoms.normal[self.tree.atom[slot], axis]
+
+        # the atoms that came to the surface join the leaf of the slot nearest to them, without charge at first
+        journal.room(n + n_fresh + 1, n_fresh)
+        journal.fresh_start[journal.n_events + 1] = journal.fresh_start[journal.n_events] + n_fresh
+        if n_fresh:
+            sources_init(&sources)
+        for k in range(n_fresh):
+            dx, dy, dz = self.atoms.positions[fresh[k], 0], self.atoms.positions[fresh[k], 1], self.atoms.positions[fresh[k], 2]
+            nearest = 1e30
+            best = gone
+            for i in range(n):
+                slot = self.patch[i]
+                s = (self.tree.x[slot] - dx) ** 2 + (self.tree.y[slot] - dy) ** 2 + (self.tree.z[slot] - dz) ** 2
+                if s < nearest:
+                    nearest = s
+                    best = slot
+            at = journal.fresh_start[journal.n_events] + k
+            journal.fresh_atom[at] = fresh[k]
+            journal.fresh_leaf[at] = self.tree.leaf[best]
+            slot = <int>self.tree.put_in(fresh[k], dx, dy, dz, self.tree.leaf[best])
+            self.slot_of[fresh[k]] = slot
+            self.tree.collect(dx, dy, dz, 0.0, self.opening_angle, &sources)
+            sources_field(&sources, dx, dy, dz, &self.rule.field[slot, 0])
+            for axis in range(3):
+                self.normals[slot, axis] = self.atoms.normal[fresh[k], axis]
+            self.near[n_near] = slot
+            n_near += 1
+            self.patch[n] = slot
+            n += 1
+        if n_fresh:
+            sources_free(&sources)
+
+        # new charges of the patch, and what they change in the fields around it
+        at = journal.start[journal.n_events]
+        journal.slot[at] = gone
+        journal.charge[at] = 0.0
+        journal.start[journal.n_events + 1] = at + 1 + n
+        if n:
+            self.rule.solve_patch(self.tree, self.normals, &self.patch[0], n, work)
+        for i in range(n):
+            slot = self.patch[i]
+            if work[i] < 0.0:   # a cell's moments stand on its centre of charge: none may be negative
+                work[i] = 0.0
+                self.n_clipped += 1
+            journal.slot[at + 1 + i] = slot
+            journal.charge[at + 1 + i] = work[i]
+            change = work[i] - self.tree.q[slot]
+            self.tree.set_charge(slot, work[i])
+            self.rank[slot] = work[i] * self.weight[self.tree.atom[slot]]
+            work[i] = change
+        for i in range(n):
+            self.settle(self.patch[i])
+        for i in range(n_near):
+            slot = self.near[i]
+            point_atoms(n, work + n, work + 2 * n, work + 3 * n, work, self.tree.x[slot], self.tree.y[slot],
+                        self.tree.z[slot], &self.rule.field[slot, 0])
+        self.tree.refresh()
+        journal.n_events += 1
+        return 0
+
+    def evaporate(self, Journal journal, long most, long sweep_interval, long long[::1] atom, double[::1] charge,
+                  double[:, ::1] normal, long long[::1] neighbour):
+        """Let atoms leave until `most` are in the journal, or something has to be done first.
+
+        Parameters
+        ----------
+        journal : Journal
+            Filled; must be new.
+        most : int
+            Events at most.
+        sweep_interval : int
+            Events after which a relaxation is due.
+        atom, charge, normal, neighbour : ndarray, shapes (most,), (most,), (most, 3), (most,)
+            Filled, for each event, with the atom that left, its charge [e], its normal, and its surface nearest
+            neighbour of the highest charge (-1: none).
+
+        Returns
+        -------
+        int
+            DONE; SWEEP_DUE (call `relax`); EXHAUSTED (no atom may leave); TOO_SHALLOW (the next event would reach
+            atoms that are held as support).
+        """
+        cdef long n, leaving
+        cdef int status = 0, best, axis
+        cdef bint shallow = np.asarray(self.atoms.support).any()
+        if journal.start.shape[0] <= most:
+            raise ValueError(f"journal must have room for {most} events")
+        with nogil:
+            while journal.n_events < most:
+                n = journal.n_events
+                best = self.winner[1]
+                if self.since_sweep >= sweep_interval or self.tree.n_slots + MOST_NEAR > self.tree.x.shape[0]:
+                    status = 1
+                    break
+                if best < 0 or self.rank[best] <= 0.0:
+                    status = 2
+                    break
+                leaving = self.tree.atom[best]
+                if shallow and self.atoms.reaches_support(leaving):
+                    status = 3
+                    break
+                atom[n] = leaving
+                charge[n] = self.tree.q[best]
+                for axis in range(3):
+                    normal[n, axis] = self.atoms.normal[leaving, axis]
+                neighbour[n] = self.strongest_neighbour(leaving)
+                self.event(leaving, journal)
+        return status
+
+    @property
+    def slots(self):
+        """Slots that hold an atom now, shape (n,)."""
+        return np.flatnonzero(self.tree.atoms >= 0)
+
+    @property
+    def slot_normals(self):
+        """Outward unit normals by slot, shape (capacity, 3)."""
+        return np.asarray(self.normals)

@@ -1,0 +1,319 @@
+"""Flights of ions from the surface to where the field has died away.
+
+Flights are in reduced units: charge and mass of the ion are 1, so velocities are in sqrt(V) and times in nm/sqrt(V); the
+path of an ion depends on its energy per charge alone. Flights that start together (one ion under many perturbations)
+share their steps, and each step shares one walk through the tree: what acts on a ball around all of them is collected
+once, then summed for every stage and flight.
+
+The scheme is the Runge-Kutta-Nystrom pair of orders 8 and 6 of Dormand, El-Mikkawy and Prince (IMA J. Numer. Anal. 7,
+423, 1987), nine stages a step.
+"""
+
+from libc.math cimport INFINITY, pow, sqrt
+from libc.stdlib cimport free, malloc
+
+import numpy as np
+
+from apt_evap._core.event cimport Journal
+from apt_evap._core.octree cimport Octree, Sources, sources_field, sources_free, sources_init
+
+cdef extern from *:
+    """
+    /* The next piece of work of several threads. */
+    static long take_next(long long *counter) { return (long)__atomic_fetch_add(counter, 1, __ATOMIC_RELAXED); }
+    """
+    long take_next(long long* counter) nogil
+
+LEFT, NEVER_LEFT = range(2)
+
+cdef enum:
+    STAGES = 9
+
+cdef double[9] NODE = [0.0, 1 / 20.0, 1 / 10.0, 3 / 10.0, 1 / 2.0, 7 / 10.0, 9 / 10.0, 1.0, 1.0]
+cdef double[81] STAGE = [
+    0, 0, 0, 0, 0, 0, 0, 0, 0,
+    1 / 800.0, 0, 0, 0, 0, 0, 0, 0, 0,
+    1 / 600.0, 1 / 300.0, 0, 0, 0, 0, 0, 0, 0,
+    9 / 200.0, -9 / 100.0, 9 / 100.0, 0, 0, 0, 0, 0, 0,
+    -66701 / 197352.0, 28325 / 32892.0, -2665 / 5482.0, 2170 / 24669.0, 0, 0, 0, 0, 0,
+    227015747 / 304251000.0, -54897451 / 30425100.0, 12942349 / 10141700.0, -9499 / 304251.0, 539 / 9250.0, 0, 0, 0, 0,
+    -1131891597 / 901789000.0, 41964921 / 12882700.0, -6663147 / 3220675.0, 270954 / 644135.0, -108 / 5875.0,
+    114 / 1645.0, 0, 0, 0,
+    13836959 / 3667458.0, -17731450 / 1833729.0, 1063919505 / 156478208.0, -33213845 / 39119552.0, 13335 / 28544.0,
+    -705 / 14272.0, 1645 / 57088.0, 0, 0,
+    223 / 7938.0, 0, 1175 / 8064.0, 925 / 6048.0, 41 / 448.0, 925 / 14112.0, 1175 / 72576.0, 0, 0,
+]
+cdef double[9] VELOCITY = [
+    223 / 7938.0, 0, 5875 / 36288.0, 4625 / 21168.0, 41 / 224.0, 4625 / 21168.0, 5875 / 36288.0, 223 / 7938.0, 0,
+]
+# Differences to the embedded solution of order 6.
+cdef double[9] POSITION_ERROR = [
+    -0.044557986852984274, 0, 0.10965442077101599, -0.14620589436135464, 0.1315853049252192, -0.06265966901200913,
+    0.012183824530112887, 0, 0,
+]
+cdef double[9] VELOCITY_ERROR = [
+    -0.044557986852984274, 0, 0.12183824530112887, -0.2088655633733638, 0.2631706098504384, -0.2088655633733638,
+    0.12183824530112887, 0.10544201314701572, -0.15,
+]
+
+
+cdef class Flights:
+    """Flies ions over one copy of the charged surface.
+
+    Parameters
+    ----------
+    tree : Octree
+        The surface; this object keeps a copy of its own and replays the events on it.
+    coulomb : float
+        Coulomb constant [V nm/e].
+    length : float
+        A length of the atomic scale, for the first step [nm].
+    centre : ndarray, shape (3,)
+        The apex, from which `reach` is measured [nm].
+    reach : float
+        Distance at which a flight ends; beyond it the ion goes straight on [nm].
+    opening_angle : float
+        Full angle under which a cell is taken as a whole [rad]; 0 sums over all atoms.
+    tolerance : float
+        Of the position relative to the path and of the velocity, in a step.
+    most_steps : int
+        Steps after which an ion counts as one that never left.
+    """
+
+    cdef Octree tree
+    cdef long n_replayed
+    cdef Sources sources
+    cdef double coulomb, length, reach, opening_angle, tolerance
+    cdef double[3] centre
+    cdef long most_steps
+    cdef long room
+    cdef double* work          # (STAGES + 3, room, 3): accelerations, then position, velocity, trial position
+    cdef readonly long n_steps, n_evaluations, n_pairs
+
+    def __cinit__(self, *args, **kwargs):
+        self.work = NULL
+        self.room = 0
+        sources_init(&self.sources)
+
+    def __init__(self, Octree tree, *, double coulomb, double length, centre, double reach, double opening_angle,
+                 double tolerance, long most_steps):
+        self.coulomb, self.length, self.reach = coulomb, length, reach
+        self.opening_angle, self.tolerance, self.most_steps = opening_angle, tolerance, most_steps
+        self.centre[0], self.centre[1], self.centre[2] = centre
+        self.n_steps = self.n_evaluations = self.n_pairs = 0
+        self.begin(tree)
+
+    def __dealloc__(self):
+        sources_free(&self.sources)
+        free(self.work)
+
+    def begin(self, Octree tree):
+        """Take a copy of the surface as it stands before the first event of a journal."""
+        self.tree = tree.copy()
+        self.n_replayed = 0
+
+    def go_on(self):
+        """Begin another journal on the surface as the one before left it."""
+        self.n_replayed = 0
+
+    def fly(self, Journal journal, const long long[::1] event, const long long[::1] start,
+            const double[:, ::1] positions, const double[:, ::1] velocities, double[:, ::1] end,
+            signed char[::1] outcome, long long[::1] counter):
+        """Fly groups of launches, each in the field that its event left behind.
+
+        Several objects may share the work in threads of their own: `counter` hands out the groups.
+
+        Parameters
+        ----------
+        journal : Journal
+            The events since `begin`.
+        event : ndarray, shape (g,)
+            Event of each group, not falling.
+        start : ndarray, shape (g + 1,)
+            Where the launches of each group begin.
+        positions, velocities : ndarray, shape (m, 3)
+            Launches [nm], [sqrt(V)].
+        end : ndarray, shape (m, 7)
+            Filled with the position, velocity and time at the end of each flight [nm], [sqrt(V)], [nm/sqrt(V)].
+        outcome : ndarray, shape (m,)
+            Filled with LEFT or NEVER_LEFT.
+        counter : ndarray, shape (1,)
+            The next group.
+        """
+        cdef long group, n_groups = event.shape[0]
+        with nogil:
+            while True:
+                group = take_next(&counter[0])
+                if group >= n_groups:
+                    break
+                while self.n_replayed <= event[group]:
+                    journal.replay(self.n_replayed, self.tree)
+                    self.n_replayed += 1
+                if start[group + 1] > start[group]:
+                    self.fly_group(start[group + 1] - start[group], &positions[start[group], 0],
+                                   &velocities[start[group], 0], &end[start[group], 0], &outcome[start[group]])
+            while self.n_replayed < journal.n_events:
+                journal.replay(self.n_replayed, self.tree)
+                self.n_replayed += 1
+
+    cdef int fly_group(self, long m, const double* positions, const double* velocities, double* end,
+                       signed char* outcome) except -1 nogil:
+        cdef double* a
+        cdef double* x
+        cdef double* v
+        cdef double* trial
+        cdef double time = 0.0, dt, largest, s, length, away
+        cdef long i, flying = m, steps
+        cdef int stage, k, axis
+        if m > self.room:
+            free(self.work)
+            self.room = m
+            self.work = <double*>malloc((STAGES + 3) * 3 * m * sizeof(double))
+            if self.work == NULL:
+                with gil:
+                    raise MemoryError
+        a, x = self.work, self.work + STAGES * 3 * m
+        v, trial = x + 3 * m, x + 6 * m
+        for i in range(m):
+            outcome[i] = 1
+            for axis in range(3):
+                x[3 * i + axis] = positions[3 * i + axis]
+                v[3 * i + axis] = velocities[3 * i + axis]
+                a[3 * i + axis] = 0.0
+        # a first step of a tenth of an atomic distance, from the acceleration at the start
+        self.gather(m, x, v, a, outcome, 0.0)
+        self.evaluate(m, x, a, outcome)
+        dt = 1e30
+        for i in range(m):
+            s = sqrt(a[3 * i] ** 2 + a[3 * i + 1] ** 2 + a[3 * i + 2] ** 2)
+            length = sqrt(v[3 * i] ** 2 + v[3 * i + 1] ** 2 + v[3 * i + 2] ** 2)
+            dt = min(dt, 0.2 * self.length / (length + sqrt(0.2 * self.length * s) + 1e-30))
+        for steps in range(self.most_steps):
+            dt = min(dt, self.time_to_reach(m, x, v, outcome))
+            self.gather(m, x, v, a, outcome, dt)
+            self.evaluate(m, x, a, outcome)
+            for stage in range(1, STAGES):
+                for i in range(m):
+                    if outcome[i] == 1:
+                        for axis in range(3):
+                            s = 0.0
+                            for k in range(stage):
+                                s += STAGE[9 * stage + k] * a[3 * (k * m + i) + axis]
+                            trial[3 * i + axis] = x[3 * i + axis] + dt * (NODE[stage] * v[3 * i + axis] + dt * s)
+                self.evaluate(m, trial, a + 3 * m * stage, outcome)
+            largest = 0.0
+            for i in range(m):
+                if outcome[i] == 1:
+                    largest = max(largest, self.step_error(i, m, dt, a, v, positions, trial))
+            self.n_steps += 1
+            if largest <= 1.0:
+                time += dt
+                for i in range(m):
+                    if outcome[i] != 1:
+                        continue
+                    away = 0.0
+                    for axis in range(3):
+                        s = 0.0
+                        for k in range(STAGES):
+                            s += VELOCITY[k] * a[3 * (k * m + i) + axis]
+                        x[3 * i + axis] = trial[3 * i + axis]
+                        v[3 * i + axis] += dt * s
+                        away += (x[3 * i + axis] - self.centre[axis]) ** 2
+                        a[3 * i + axis] = a[3 * (8 * m + i) + axis]
+                    if away > self.reach * self.reach:
+                        outcome[i] = 0
+                        flying -= 1
+                    if outcome[i] == 0 or steps == self.most_steps - 1:
+                        for axis in range(3):
+                            end[7 * i + axis] = x[3 * i + axis]
+                            end[7 * i + 3 + axis] = v[3 * i + axis]
+                        end[7 * i + 6] = time
+                if flying == 0:
+                    return 0
+            if not largest < 1e30:   # a stage ran into an atom
+                dt *= 0.1
+            else:
+                dt *= min(4.0, max(0.2, 0.9 * pow(max(largest, 1e-12), -1.0 / 7.0)))
+        for i in range(m):
+            if outcome[i] == 1:
+                for axis in range(3):
+                    end[7 * i + axis] = x[3 * i + axis]
+                    end[7 * i + 3 + axis] = v[3 * i + axis]
+                end[7 * i + 6] = time
+        return 0
+
+    cdef double time_to_reach(self, long m, const double* x, const double* v, const signed char* outcome) noexcept nogil:
+        # Time in which the slowest of those about to cross `reach` has crossed it on a straight line, so that no flight
+        # ends far beyond it; flights that need more than the largest step do not count.
+        cdef double rr, rv, vv, dx, longest = 0.0
+        cdef long i
+        cdef int axis
+        for i in range(m):
+            if outcome[i] == 1:
+                rr = rv = vv = 0.0
+                for axis in range(3):
+                    dx = x[3 * i + axis] - self.centre[axis]
+                    rr += dx * dx
+                    rv += dx * v[3 * i + axis]
+                    vv += v[3 * i + axis] ** 2
+                if vv == 0.0:
+                    return INFINITY
+                longest = max(longest, (sqrt(max(0.0, rv * rv + vv * (self.reach * self.reach - rr))) - rv) / vv)
+        return 1.0001 * longest
+
+    cdef double step_error(self, long i, long m, double dt, const double* a, const double* v, const double* origin,
+                           const double* trial) noexcept nogil:
+        # Largest error of the step over what the tolerance allows.
+        cdef double dx, dv, ex = 0.0, ev = 0.0, path = 0.0, speed = 0.0, new
+        cdef int axis, k
+        for axis in range(3):
+            dx = dv = 0.0
+            new = v[3 * i + axis]
+            for k in range(STAGES):
+                dx += POSITION_ERROR[k] * a[3 * (k * m + i) + axis]
+                dv += VELOCITY_ERROR[k] * a[3 * (k * m + i) + axis]
+                new += dt * VELOCITY[k] * a[3 * (k * m + i) + axis]
+            ex += dx * dx
+            ev += dv * dv
+            path += (trial[3 * i + axis] - origin[3 * i + axis]) ** 2
+            speed += new * new
+        ex = dt * dt * sqrt(ex) / (self.tolerance * (sqrt(path) + 0.1 * self.length))
+        ev = dt * sqrt(ev) / (self.tolerance * sqrt(speed))
+        return max(ex, ev) if ex == ex and ev == ev else INFINITY
+
+    cdef int gather(self, long m, const double* x, const double* v, const double* a, const signed char* outcome,
+                    double dt) except -1 nogil:
+        # Collects what acts on a ball that holds all flights from here to the end of the step.
+        cdef double cx = 0.0, cy = 0.0, cz = 0.0, radius = 0.0, dx, dy, dz
+        cdef long i, n = 0
+        for i in range(m):
+            if outcome[i] == 1:
+                n += 1
+                cx += x[3 * i] + 0.5 * dt * (v[3 * i] + 0.5 * dt * a[3 * i])
+                cy += x[3 * i + 1] + 0.5 * dt * (v[3 * i + 1] + 0.5 * dt * a[3 * i + 1])
+                cz += x[3 * i + 2] + 0.5 * dt * (v[3 * i + 2] + 0.5 * dt * a[3 * i + 2])
+        cx /= n
+        cy /= n
+        cz /= n
+        for i in range(m):
+            if outcome[i] == 1:
+                dx, dy, dz = x[3 * i] - cx, x[3 * i + 1] - cy, x[3 * i + 2] - cz
+                radius = max(radius, dx * dx + dy * dy + dz * dz)
+                dx += dt * (v[3 * i] + 0.5 * dt * a[3 * i])
+                dy += dt * (v[3 * i + 1] + 0.5 * dt * a[3 * i + 1])
+                dz += dt * (v[3 * i + 2] + 0.5 * dt * a[3 * i + 2])
+                radius = max(radius, dx * dx + dy * dy + dz * dz)
+        self.tree.collect(cx, cy, cz, sqrt(radius), self.opening_angle, &self.sources)
+        return 0
+
+    cdef void evaluate(self, long m, const double* x, double* a, const signed char* outcome) noexcept nogil:
+        # Accelerations [V/nm] of the flights still under way.
+        cdef long i
+        cdef int axis
+        for i in range(m):
+            if outcome[i] == 1:
+                sources_field(&self.sources, x[3 * i], x[3 * i + 1], x[3 * i + 2], a + 3 * i)
+                for axis in range(3):
+                    a[3 * i + axis] *= self.coulomb
+                self.n_evaluations += 1
+                self.n_pairs += self.sources.n_atoms + self.sources.n_cells

@@ -1,0 +1,714 @@
+"""Octree over charged atoms: fields by cells with quadrupoles (Barnes and Hut, Nature 324, 446, 1986).
+
+The tree is flat: nodes in preorder with two integers each (`skip`, the next node outside the subtree, and the slots
+[first, last)), so a walk is a loop. A cell carries charge and traceless quadrupole about its centre of charge; whether
+it may stand for its atoms is decided on its fixed ball, so the lists do not depend on the charges. Charges must not be
+negative: a cell has its centre of charge for origin.
+"""
+
+from cython.parallel cimport prange
+from libc.math cimport sqrt
+from libc.stdlib cimport free, malloc, realloc
+
+import numpy as np
+
+
+MORTON_BITS = 21
+
+
+cdef int sources_init(Sources* sources) except -1 nogil:
+    sources.n_atoms = sources.n_cells = 0
+    sources.capacity = 4096
+    sources.atoms = <double*>malloc(4 * sources.capacity * sizeof(double))
+    sources.cells = <double*>malloc(CELL * sources.capacity * sizeof(double))
+    if sources.atoms == NULL or sources.cells == NULL:
+        with gil:
+            raise MemoryError
+    return 0
+
+
+cdef void sources_free(Sources* sources) noexcept nogil:
+    free(sources.atoms)
+    free(sources.cells)
+    sources.atoms = sources.cells = NULL
+
+
+cdef int sources_grow(Sources* sources) except -1 nogil:
+    # Columns keep their stride: the old ones are spread out over the new, wider ones, last column first.
+    cdef long old = sources.capacity, column, k
+    sources.capacity = 2 * old
+    sources.atoms = <double*>realloc(sources.atoms, 8 * old * sizeof(double))
+    sources.cells = <double*>realloc(sources.cells, 2 * CELL * old * sizeof(double))
+    if sources.atoms == NULL or sources.cells == NULL:
+        with gil:
+            raise MemoryError
+    for column in range(3, 0, -1):
+        for k in range(old - 1, -1, -1):
+            sources.atoms[column * 2 * old + k] = sources.atoms[column * old + k]
+    for column in range(CELL - 1, 0, -1):
+        for k in range(old - 1, -1, -1):
+            sources.cells[column * 2 * old + k] = sources.cells[column * old + k]
+    return 0
+
+
+cdef void sources_field(const Sources* sources, double px, double py, double pz, double* field) noexcept nogil:
+    # Field [e/nm^2] of everything collected, at one point.
+    cdef const double* a = sources.atoms
+    cdef long stride = sources.capacity
+    field[0] = field[1] = field[2] = 0.0
+    point_atoms(sources.n_atoms, a, a + stride, a + 2 * stride, a + 3 * stride, px, py, pz, field)
+    point_cells(sources.n_cells, stride, sources.cells, px, py, pz, field)
+
+
+def morton_order(positions):
+    """Order of the positions along the Morton curve of their bounding cube, with the keys in that order."""
+    low = positions.min(axis=0)
+    edge = max(float((positions.max(axis=0) - low).max()), 1e-9)
+    grid = ((positions - low) * ((2**MORTON_BITS - 1) / edge)).astype(np.uint64)
+    key = np.zeros(len(positions), np.uint64)
+    for axis in range(3):
+        spread = grid[:, axis]
+        for shift, mask in (
+            (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F),
+            (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249),
+        ):
+            spread = (spread | (spread << np.uint64(shift))) & np.uint64(mask)
+        key |= spread << np.uint64(2 - axis)
+    order = np.argsort(key, kind="stable")
+    return order, key[order]
+
+
+cdef class Octree:
+    """Octree over n charged atoms.
+
+    Parameters
+    ----------
+    positions : ndarray, shape (n, 3)
+        Positions of the atoms [nm].
+    charges : ndarray, shape (n,)
+        Charges, none negative [e].
+    atoms : ndarray of int64, shape (n,), optional
+        The caller's index of each atom; by default 0 ... n - 1.
+    leaf_size : int
+        Most atoms of a leaf; 16 against 8 halves the error at the same opening angle for 0.95 of the time
+    extra : int
+        How many atoms may be put in before the tree is built anew.
+    """
+
+    def __init__(self, const double[:, ::1] positions, const double[::1] charges, atoms=None, int leaf_size=16,
+                 long extra=0):
+        cdef long n = positions.shape[0], capacity = n + extra, i
+        if n == 0:
+            raise ValueError("an octree needs at least one atom, got none")
+        order, keys = morton_order(np.asarray(positions))
+        self.leaf_size = leaf_size
+        self.n_slots = self.n_sorted = n
+        slots = np.zeros((4, capacity))
+        slots[:3, :n] = np.asarray(positions)[order].T
+        slots[3, :n] = np.asarray(charges)[order]
+        self.x, self.y, self.z, self.q = slots
+        index = np.full(capacity, -1, np.int64)
+        index[:n] = order if atoms is None else np.asarray(atoms)[order]
+        self.atom = index
+        self.leaf = np.full(capacity, -1, np.int32)
+        self.next_extra = np.full(capacity, -1, np.int32)
+        self._split(keys)
+        self._enclose()
+        self.dirty = np.zeros(self.n_nodes, np.int8)
+        self.queue = np.empty(self.n_nodes, np.int32)
+        self.n_dirty = 0
+        self.cells = np.zeros((self.n_nodes, CELL))
+        self.refresh_all()
+
+    def _split(self, const unsigned long long[::1] keys):
+        # Preorder with an explicit stack; a range whose atoms share the octant goes one level down without a node.
+        cdef long n = self.n_slots, most = 4 * n // max(1, self.leaf_size) + 1024, count = 0, depth = 0
+        cdef long begin, end, middle, low, high, octant, i
+        cdef int level, up
+        cdef bint whole
+        cdef int[::1] first = np.empty(most, np.int32), last = np.empty(most, np.int32)
+        cdef int[::1] parent = np.empty(most, np.int32)
+        cdef long[:, ::1] stack = np.empty((8 * (MORTON_BITS + 2), 4), np.int64)
+        cdef long[9] cut
+        stack[0, 0], stack[0, 1], stack[0, 2], stack[0, 3] = 0, n, 3 * (MORTON_BITS - 1), -1
+        depth = 1
+        while depth:
+            depth -= 1
+            begin, end, level, up = stack[depth, 0], stack[depth, 1], <int>stack[depth, 2], <int>stack[depth, 3]
+            if count == most:
+                most *= 2
+                first = np.resize(np.asarray(first), most)
+                last = np.resize(np.asarray(last), most)
+                parent = np.resize(np.asarray(parent), most)
+            first[count], last[count], parent[count] = <int>begin, <int>end, up
+            whole = end - begin > self.leaf_size
+            while whole and level >= 0:
+                cut[0], cut[8] = begin, end
+                for octant in range(1, 8):
+                    low, high = cut[octant - 1], end
+                    while low < high:
+                        middle = (low + high) // 2
+                        if <long>((keys[middle] >> level) & 7) < octant:
+                            low = middle + 1
+                        else:
+                            high = middle
+                    cut[octant] = low
+                level -= 3
+                for octant in range(7, -1, -1):
+                    if 0 < cut[octant + 1] - cut[octant] < end - begin:
+                        whole = False
+                        stack[depth, 0], stack[depth, 1] = cut[octant], cut[octant + 1]
+                        stack[depth, 2], stack[depth, 3] = level, count
+                        depth += 1
+            count += 1
+        self.n_nodes = count
+        self.first = np.asarray(first)[:count].copy()
+        self.last = np.asarray(last)[:count].copy()
+        self.parent = np.asarray(parent)[:count].copy()
+        self.skip = np.zeros(count, np.int32)
+        self.extra = np.full(count, -1, np.int32)
+        for i in range(count - 1, -1, -1):
+            if self.skip[i] == 0:
+                self.skip[i] = <int>i + 1
+                for begin in range(self.first[i], self.last[i]):
+                    self.leaf[begin] = <int>i
+            if i and self.skip[self.parent[i]] < self.skip[i]:
+                self.skip[self.parent[i]] = self.skip[i]
+
+    def _enclose(self):
+        # Ball of a node: the middle of its bounding box, and the distance to its farthest atom.
+        cdef long node, k
+        cdef double cx, cy, cz, far, s
+        cdef double[:, ::1] low, high
+        first = np.asarray(self.first)
+        columns = self.positions[:self.n_sorted]
+        low = np.empty((self.n_nodes, 3))
+        high = np.empty((self.n_nodes, 3))
+        leaves = np.flatnonzero(np.asarray(self.skip) == np.arange(1, self.n_nodes + 1))
+        starts = first[leaves]
+        np.asarray(low)[:] = np.inf
+        np.asarray(high)[:] = -np.inf
+        np.asarray(low)[leaves] = np.minimum.reduceat(columns, starts)
+        np.asarray(high)[leaves] = np.maximum.reduceat(columns, starts)
+        cdef int up
+        cdef int axis
+        for node in range(self.n_nodes - 1, 0, -1):
+            up = self.parent[node]
+            for axis in range(3):
+                low[up, axis] = min(low[up, axis], low[node, axis])
+                high[up, axis] = max(high[up, axis], high[node, axis])
+        self.ball = np.empty((self.n_nodes, 4))
+        for node in prange(self.n_nodes, nogil=True, schedule="dynamic", chunksize=256):
+            cx = 0.5 * (low[node, 0] + high[node, 0])
+            cy = 0.5 * (low[node, 1] + high[node, 1])
+            cz = 0.5 * (low[node, 2] + high[node, 2])
+            far = 0.0
+            for k in range(self.first[node], self.last[node]):
+                s = (self.x[k] - cx) ** 2 + (self.y[k] - cy) ** 2 + (self.z[k] - cz) ** 2
+                far = max(far, s)
+            self.ball[node, 0] = cx
+            self.ball[node, 1] = cy
+            self.ball[node, 2] = cz
+            self.ball[node, 3] = sqrt(far)
+
+    # ---- charges and moments ---------------------------------------------------------------------------------------
+
+    cdef void moments(self, long node) noexcept nogil:
+        # Charge, centre of charge and traceless quadrupole sum q (3 d d - d^2) of one node, from its atoms or children.
+        cdef double charge = 0.0, cx = 0.0, cy = 0.0, cz = 0.0, q, dx, dy, dz, s
+        cdef double xx = 0.0, xy = 0.0, xz = 0.0, yy = 0.0, yz = 0.0, zz = 0.0
+        cdef long k, end = self.skip[node]
+        cdef bint is_leaf = end == node + 1
+        if is_leaf:
+            for k in range(self.first[node], self.last[node]):
+                q = self.q[k]
+                charge += q
+                cx += q * self.x[k]
+                cy += q * self.y[k]
+                cz += q * self.z[k]
+            k = self.extra[node]
+            while k >= 0:
+                q = self.q[k]
+                charge += q
+                cx += q * self.x[k]
+                cy += q * self.y[k]
+                cz += q * self.z[k]
+                k = self.next_extra[k]
+        else:
+            k = node + 1
+            while k < end:
+                q = self.cells[k, 3]
+                charge += q
+                cx += q * self.cells[k, 0]
+                cy += q * self.cells[k, 1]
+                cz += q * self.cells[k, 2]
+                k = self.skip[k]
+        if charge > 0.0:
+            cx /= charge
+            cy /= charge
+            cz /= charge
+        else:
+            cx, cy, cz = self.ball[node, 0], self.ball[node, 1], self.ball[node, 2]
+        if is_leaf:
+            for k in range(self.first[node], self.last[node]):
+                q, dx, dy, dz = self.q[k], self.x[k] - cx, self.y[k] - cy, self.z[k] - cz
+                xx += q * dx * dx
+                xy += q * dx * dy
+                xz += q * dx * dz
+                yy += q * dy * dy
+                yz += q * dy * dz
+                zz += q * dz * dz
+            k = self.extra[node]
+            while k >= 0:
+                q, dx, dy, dz = self.q[k], self.x[k] - cx, self.y[k] - cy, self.z[k] - cz
+                xx += q * dx * dx
+                xy += q * dx * dy
+                xz += q * dx * dz
+                yy += q * dy * dy
+                yz += q * dy * dz
+                zz += q * dz * dz
+                k = self.next_extra[k]
+            s = xx + yy + zz
+            xx = 3.0 * xx - s
+            yy = 3.0 * yy - s
+            zz = 3.0 * zz - s
+            xy *= 3.0
+            xz *= 3.0
+            yz *= 3.0
+        else:
+            k = node + 1
+            while k < end:
+                q = self.cells[k, 3]
+                dx, dy, dz = self.cells[k, 0] - cx, self.cells[k, 1] - cy, self.cells[k, 2] - cz
+                s = dx * dx + dy * dy + dz * dz
+                xx += self.cells[k, 4] + q * (3.0 * dx * dx - s)
+                xy += self.cells[k, 5] + q * 3.0 * dx * dy
+                xz += self.cells[k, 6] + q * 3.0 * dx * dz
+                yy += self.cells[k, 7] + q * (3.0 * dy * dy - s)
+                yz += self.cells[k, 8] + q * 3.0 * dy * dz
+                zz += self.cells[k, 9] + q * (3.0 * dz * dz - s)
+                k = self.skip[k]
+        self.cells[node, 0] = cx
+        self.cells[node, 1] = cy
+        self.cells[node, 2] = cz
+        self.cells[node, 3] = charge
+        self.cells[node, 4] = xx
+        self.cells[node, 5] = xy
+        self.cells[node, 6] = xz
+        self.cells[node, 7] = yy
+        self.cells[node, 8] = yz
+        self.cells[node, 9] = zz
+
+    def refresh_all(self):
+        """Moments of every node from the charges."""
+        cdef long node
+        with nogil:
+            for node in range(self.n_nodes - 1, -1, -1):
+                self.moments(node)
+
+    cdef void mark(self, long node) noexcept nogil:
+        while node >= 0 and not self.dirty[node]:
+            self.dirty[node] = 1
+            self.queue[self.n_dirty] = <int>node
+            self.n_dirty += 1
+            node = self.parent[node]
+
+    cdef void set_charge(self, long slot, double charge) noexcept nogil:
+        # The moments follow at the next refresh().
+        self.q[slot] = charge
+        self.mark(self.leaf[slot])
+
+    cdef void take_out(self, long slot) noexcept nogil:
+        # The slot stays, without charge and without an atom.
+        self.atom[slot] = -1
+        self.set_charge(slot, 0.0)
+
+    cdef long put_in(self, long long atom, double px, double py, double pz, int leaf) noexcept nogil:
+        # A new atom joins a leaf that has an atom beside it; the balls above grow to hold it. -1: no room left.
+        cdef long slot = self.n_slots, node = leaf
+        cdef double far
+        if slot >= self.x.shape[0]:
+            return -1
+        self.n_slots += 1
+        self.atom[slot] = atom
+        self.x[slot] = px
+        self.y[slot] = py
+        self.z[slot] = pz
+        self.q[slot] = 0.0
+        self.leaf[slot] = leaf
+        self.next_extra[slot] = self.extra[leaf]
+        self.extra[leaf] = <int>slot
+        while node >= 0:
+            far = sqrt((px - self.ball[node, 0]) ** 2 + (py - self.ball[node, 1]) ** 2 + (pz - self.ball[node, 2]) ** 2)
+            self.ball[node, 3] = max(self.ball[node, 3], far)
+            node = self.parent[node]
+        return slot
+
+    cdef void refresh(self) noexcept nogil:
+        # Moments of the nodes above changed charges, children before parents: preorder numbers from high to low.
+        cdef long i, j
+        cdef int node
+        for i in range(1, self.n_dirty):
+            node = self.queue[i]
+            j = i - 1
+            while j >= 0 and self.queue[j] < node:
+                self.queue[j + 1] = self.queue[j]
+                j -= 1
+            self.queue[j + 1] = node
+        for i in range(self.n_dirty):
+            self.moments(self.queue[i])
+            self.dirty[self.queue[i]] = 0
+        self.n_dirty = 0
+
+    # ---- walks -----------------------------------------------------------------------------------------------------
+
+    cdef int collect(self, double cx, double cy, double cz, double radius, double opening_angle,
+                     Sources* sources) except -1 nogil:
+        # Everything that acts on the targets in a ball: a cell where its ball is seen under less than the opening
+        # angle from all of the targets' ball, atoms elsewhere.
+        cdef long node = 0, k, stride, m
+        cdef double dx, dy, dz, distance, factor = 2.0 / opening_angle if opening_angle > 0.0 else 1e30
+        sources.n_atoms = sources.n_cells = 0
+        while node < self.n_nodes:
+            dx, dy, dz = cx - self.ball[node, 0], cy - self.ball[node, 1], cz - self.ball[node, 2]
+            distance = sqrt(dx * dx + dy * dy + dz * dz)
+            if self.ball[node, 3] * factor + radius < distance:
+                if sources.n_cells + LANES >= sources.capacity:
+                    sources_grow(sources)
+                stride = sources.capacity
+                for m in range(CELL):
+                    sources.cells[m * stride + sources.n_cells] = self.cells[node, m]
+                sources.n_cells += 1
+                node = self.skip[node]
+            elif self.skip[node] == node + 1:
+                while sources.n_atoms + self.last[node] - self.first[node] >= sources.capacity:
+                    sources_grow(sources)
+                for k in range(self.first[node], self.last[node]):
+                    if self.atom[k] >= 0:
+                        self.add_atom(k, sources)
+                k = self.extra[node]
+                while k >= 0:
+                    if sources.n_atoms >= sources.capacity:
+                        sources_grow(sources)
+                    if self.atom[k] >= 0:
+                        self.add_atom(k, sources)
+                    k = self.next_extra[k]
+                node += 1
+            else:
+                node += 1
+        stride = sources.capacity
+        while sources.n_cells % LANES:
+            for m in range(CELL):
+                sources.cells[m * stride + sources.n_cells] = 0.0
+            sources.cells[sources.n_cells] = cx + 1e6   # an empty cell, away from every target
+            sources.n_cells += 1
+        return 0
+
+    cdef inline void add_atom(self, long k, Sources* sources) noexcept nogil:
+        cdef long stride = sources.capacity, m = sources.n_atoms
+        sources.atoms[m] = self.x[k]
+        sources.atoms[stride + m] = self.y[k]
+        sources.atoms[2 * stride + m] = self.z[k]
+        sources.atoms[3 * stride + m] = self.q[k]
+        sources.n_atoms = m + 1
+
+    cdef long within(self, double px, double py, double pz, double radius, int* slots, long most) noexcept nogil:
+        # Slots of the atoms within a radius, in the order of the tree; returns how many, at most `most`.
+        cdef long node = 0, k, n = 0
+        cdef double dx, dy, dz, reach
+        while node < self.n_nodes:
+            dx, dy, dz = px - self.ball[node, 0], py - self.ball[node, 1], pz - self.ball[node, 2]
+            reach = self.ball[node, 3] + radius
+            if dx * dx + dy * dy + dz * dz > reach * reach:
+                node = self.skip[node]
+                continue
+            if self.skip[node] == node + 1:
+                for k in range(self.first[node], self.last[node]):
+                    dx, dy, dz = px - self.x[k], py - self.y[k], pz - self.z[k]
+                    if self.atom[k] >= 0 and dx * dx + dy * dy + dz * dz <= radius * radius and n < most:
+                        slots[n] = <int>k
+                        n += 1
+                k = self.extra[node]
+                while k >= 0:
+                    dx, dy, dz = px - self.x[k], py - self.y[k], pz - self.z[k]
+                    if self.atom[k] >= 0 and dx * dx + dy * dy + dz * dz <= radius * radius and n < most:
+                        slots[n] = <int>k
+                        n += 1
+                    k = self.next_extra[k]
+            node += 1
+        return n
+
+    # ---- sweeps: the field on all of the tree's own atoms ------------------------------------------------------------
+
+    cdef void group_ball(self, long group, double* ball) noexcept nogil:
+        # Middle and radius of the atoms [GROUP * group, GROUP * (group + 1)) of the Morton order.
+        cdef long begin = GROUP * group, end = min(begin + GROUP, self.n_sorted), k
+        cdef double lx = 1e30, ly = 1e30, lz = 1e30, hx = -1e30, hy = -1e30, hz = -1e30, far = 0.0, s
+        for k in range(begin, end):
+            lx, hx = min(lx, self.x[k]), max(hx, self.x[k])
+            ly, hy = min(ly, self.y[k]), max(hy, self.y[k])
+            lz, hz = min(lz, self.z[k]), max(hz, self.z[k])
+        ball[0], ball[1], ball[2] = 0.5 * (lx + hx), 0.5 * (ly + hy), 0.5 * (lz + hz)
+        for k in range(begin, end):
+            s = (self.x[k] - ball[0]) ** 2 + (self.y[k] - ball[1]) ** 2 + (self.z[k] - ball[2]) ** 2
+            far = max(far, s)
+        ball[3] = sqrt(far) * 1.0001   # no atom on the rim may take itself for a cell of one atom
+
+    cdef long walk_lists(self, long group, double opening_angle, int* cell_list, int* range_list,
+                         long* n_cells, long* n_ranges) noexcept nogil:
+        # Lists of one group: accepted cells, and slots [begin, end) of the leaves that stay atoms, neighbours merged.
+        # With NULL lists it only counts.
+        cdef double[4] ball
+        cdef long node = 0, cells = 0, ranges = 0, open_end = -1, pairs = 0
+        cdef double dx, dy, dz, reach, factor = 2.0 / opening_angle if opening_angle > 0.0 else 1e30
+        self.group_ball(group, ball)
+        while node < self.n_nodes:
+            dx, dy, dz = ball[0] - self.ball[node, 0], ball[1] - self.ball[node, 1], ball[2] - self.ball[node, 2]
+            reach = self.ball[node, 3] * factor + ball[3]
+            if reach * reach < dx * dx + dy * dy + dz * dz:
+                if cell_list != NULL:
+                    cell_list[cells] = <int>node
+                cells += 1
+                node = self.skip[node]
+            elif self.skip[node] == node + 1:
+                if self.first[node] == open_end:
+                    if range_list != NULL:
+                        range_list[2 * ranges - 1] = self.last[node]
+                else:
+                    if range_list != NULL:
+                        range_list[2 * ranges] = self.first[node]
+                        range_list[2 * ranges + 1] = self.last[node]
+                    ranges += 1
+                open_end = self.last[node]
+                pairs += self.last[node] - self.first[node]
+                node += 1
+            else:
+                node += 1
+        n_cells[0] = cells
+        n_ranges[0] = ranges
+        return pairs
+
+    def lists(self, double opening_angle, int n_threads=1):
+        """Interaction lists of all groups of 32 atoms, for any number of sweeps.
+
+        Parameters
+        ----------
+        opening_angle : float
+            A cell stands for its atoms where its ball is seen under less than this full angle [rad].
+        n_threads : int
+            Threads.
+
+        Returns
+        -------
+        InteractionLists
+        """
+        if self.n_slots != self.n_sorted:
+            raise ValueError("lists need a tree with no atoms put in since it was built")
+        cdef long n_groups = (self.n_sorted + GROUP - 1) // GROUP, group
+        cdef InteractionLists lists = InteractionLists()
+        cdef long[:, ::1] starts = np.zeros((n_groups + 1, 3), np.int64)
+        for group in prange(n_groups, nogil=True, schedule="dynamic", chunksize=16, num_threads=n_threads):
+            starts[group + 1, 2] = self.walk_lists(
+                group, opening_angle, NULL, NULL, &starts[group + 1, 0], &starts[group + 1, 1]
+            )
+        total = np.cumsum(np.asarray(starts), axis=0)
+        starts = total
+        lists.starts = starts
+        lists.cells = np.empty(max(1, total[-1, 0]), np.int32)
+        lists.ranges = np.empty(max(1, 2 * total[-1, 1]), np.int32)
+        cdef int[::1] cells = lists.cells, ranges = lists.ranges
+        cdef long n_cells = 0, n_ranges = 0
+        for group in prange(n_groups, nogil=True, schedule="dynamic", chunksize=16, num_threads=n_threads):
+            self.fill_lists(group, opening_angle, &cells[0], &ranges[0], starts)
+        return lists
+
+    cdef void fill_lists(self, long group, double opening_angle, int* cells, int* ranges,
+                         long[:, ::1] starts) noexcept nogil:
+        cdef long n_cells, n_ranges
+        self.walk_lists(group, opening_angle, cells + starts[group, 0], ranges + 2 * starts[group, 1],
+                        &n_cells, &n_ranges)
+
+    def sweep(self, InteractionLists lists, double[:, ::1] field, bint double_precision=False, int n_threads=1):
+        """Field of all the others on each atom of the tree, by its lists.
+
+        Parameters
+        ----------
+        lists : InteractionLists
+            Of this tree; the charges may have changed since.
+        field : ndarray, shape (n, 3)
+            Filled with the field [e/nm^2], in the order of the slots.
+        double_precision : bool
+            Vector lanes of float64; else of float32 (relative error near 1e-6).
+        n_threads : int
+            Threads.
+        """
+        cdef long n_groups = (self.n_sorted + GROUP - 1) // GROUP, group
+        for group in prange(n_groups, nogil=True, schedule="dynamic", chunksize=8, num_threads=n_threads):
+            if double_precision:
+                self.group_field_double(group, lists, field)
+            else:
+                self.group_field_single(group, lists, field)
+
+    cdef void group_field_single(self, long group, InteractionLists lists, double[:, ::1] field) noexcept nogil:
+        cdef long begin = GROUP * group, count = min(<long>GROUP, self.n_sorted - begin), k, l
+        cdef double[4] ball
+        cdef float[96] targets
+        cdef float[96] sums
+        cdef const int* ranges = &lists.ranges[0]
+        self.group_ball(group, ball)
+        for l in range(GROUP):
+            k = begin + min(l, count - 1)
+            targets[l] = <float>(self.x[k] - ball[0])
+            targets[GROUP + l] = <float>(self.y[k] - ball[1])
+            targets[2 * GROUP + l] = <float>(self.z[k] - ball[2])
+            sums[l] = sums[GROUP + l] = sums[2 * GROUP + l] = 0.0
+        group_cells_single(lists.starts[group + 1, 0] - lists.starts[group, 0], &lists.cells[0] + lists.starts[group, 0],
+                           &self.cells[0, 0], ball, targets, sums)
+        for k in range(lists.starts[group, 1], lists.starts[group + 1, 1]):
+            group_atoms_single(ranges[2 * k], ranges[2 * k + 1], &self.x[0], &self.y[0], &self.z[0], &self.q[0],
+                               ball, targets, sums)
+        for l in range(count):
+            field[begin + l, 0] = sums[l]
+            field[begin + l, 1] = sums[GROUP + l]
+            field[begin + l, 2] = sums[2 * GROUP + l]
+
+    cdef void group_field_double(self, long group, InteractionLists lists, double[:, ::1] field) noexcept nogil:
+        cdef long begin = GROUP * group, count = min(<long>GROUP, self.n_sorted - begin), k, l
+        cdef double[4] ball
+        cdef double[96] targets
+        cdef double[96] sums
+        cdef const int* ranges = &lists.ranges[0]
+        self.group_ball(group, ball)
+        for l in range(GROUP):
+            k = begin + min(l, count - 1)
+            targets[l] = self.x[k] - ball[0]
+            targets[GROUP + l] = self.y[k] - ball[1]
+            targets[2 * GROUP + l] = self.z[k] - ball[2]
+            sums[l] = sums[GROUP + l] = sums[2 * GROUP + l] = 0.0
+        group_cells_double(lists.starts[group + 1, 0] - lists.starts[group, 0], &lists.cells[0] + lists.starts[group, 0],
+                           &self.cells[0, 0], ball, targets, sums)
+        for k in range(lists.starts[group, 1], lists.starts[group + 1, 1]):
+            group_atoms_double(ranges[2 * k], ranges[2 * k + 1], &self.x[0], &self.y[0], &self.z[0], &self.q[0],
+                               ball, targets, sums)
+        for l in range(count):
+            field[begin + l, 0] = sums[l]
+            field[begin + l, 1] = sums[GROUP + l]
+            field[begin + l, 2] = sums[2 * GROUP + l]
+
+    # ---- single points ---------------------------------------------------------------------------------------------
+
+    def fields(self, const double[:, ::1] points, double opening_angle, int n_threads=1):
+        """Field at points in space.
+
+        Parameters
+        ----------
+        points : ndarray, shape (m, 3)
+            Points [nm]; an atom of the tree at the very place of a point does not act on it.
+        opening_angle : float
+            Full angle under which a cell is taken as a whole [rad]; 0 sums over all atoms.
+        n_threads : int
+            Threads.
+
+        Returns
+        -------
+        ndarray, shape (m, 3)
+            Field q r/r^3 [e/nm^2]; times COULOMB it is in V/nm.
+        """
+        cdef double[:, ::1] field = np.empty((points.shape[0], 3))
+        cdef long i
+        for i in prange(points.shape[0], nogil=True, schedule="dynamic", chunksize=16, num_threads=n_threads):
+            self.field_at(points[i, 0], points[i, 1], points[i, 2], opening_angle, &field[i, 0])
+        return np.asarray(field)
+
+    cdef int field_at(self, double px, double py, double pz, double opening_angle, double* field) except -1 nogil:
+        cdef Sources sources
+        sources_init(&sources)
+        self.collect(px, py, pz, 0.0, opening_angle, &sources)
+        sources_field(&sources, px, py, pz, field)
+        sources_free(&sources)
+        return 0
+
+    def potentials(self, const double[:, ::1] points, double opening_angle, int n_threads=1):
+        """Potential q/r at points in space [e/nm], shape (m,); times COULOMB it is in V. Parameters as in `fields`."""
+        cdef double[::1] potential = np.empty(points.shape[0])
+        cdef long i
+        for i in prange(points.shape[0], nogil=True, schedule="dynamic", chunksize=16, num_threads=n_threads):
+            potential[i] = self.potential_at(points[i, 0], points[i, 1], points[i, 2], opening_angle)
+        return np.asarray(potential)
+
+    cdef double potential_at(self, double px, double py, double pz, double opening_angle) except? -1 nogil:
+        cdef Sources sources
+        cdef double total = 0.0, dx, dy, dz, s, w2
+        cdef long k, stride
+        cdef double* c
+        sources_init(&sources)
+        self.collect(px, py, pz, 0.0, opening_angle, &sources)
+        stride = sources.capacity
+        for k in range(sources.n_atoms):
+            dx, dy, dz = px - sources.atoms[k], py - sources.atoms[stride + k], pz - sources.atoms[2 * stride + k]
+            s = dx * dx + dy * dy + dz * dz
+            if s > 1e-12:
+                total += sources.atoms[3 * stride + k] / sqrt(s)
+        for k in range(sources.n_cells):
+            c = sources.cells + k
+            dx, dy, dz = px - c[0], py - c[stride], pz - c[2 * stride]
+            w2 = 1.0 / (dx * dx + dy * dy + dz * dz)
+            s = c[4 * stride] * dx * dx + c[7 * stride] * dy * dy + c[9 * stride] * dz * dz + 2.0 * (
+                c[5 * stride] * dx * dy + c[6 * stride] * dx * dz + c[8 * stride] * dy * dz)
+            total += sqrt(w2) * (c[3 * stride] + 0.5 * s * w2 * w2)
+        sources_free(&sources)
+        return total
+
+    # ---- for the callers' eyes -------------------------------------------------------------------------------------
+
+    @property
+    def positions(self):
+        """Positions of the slots [nm], shape (n_slots, 3)."""
+        return np.stack([np.asarray(self.x), np.asarray(self.y), np.asarray(self.z)], axis=1)[:self.n_slots]
+
+    @property
+    def charges(self):
+        """Charges of the slots [e], shape (n_slots,); 0 where an atom was taken out."""
+        return np.asarray(self.q)[:self.n_slots]
+
+    @charges.setter
+    def charges(self, const double[::1] charges):
+        np.asarray(self.q)[:self.n_slots] = charges
+        self.refresh_all()
+
+    @property
+    def atoms(self):
+        """The caller's index of the atom in each slot, shape (n_slots,); -1 where an atom was taken out."""
+        return np.asarray(self.atom)[:self.n_slots]
+
+    @property
+    def nodes(self):
+        """Balls (n_nodes, 4), cells (n_nodes, 10) and parents (n_nodes,) of the tree."""
+        return np.asarray(self.ball), np.asarray(self.cells), np.asarray(self.parent)
+
+    def copy(self):
+        """Return an independent tree with the same bits."""
+        cdef Octree other = Octree.__new__(Octree)
+        other.n_slots, other.n_sorted, other.n_nodes = self.n_slots, self.n_sorted, self.n_nodes
+        other.leaf_size, other.n_dirty = self.leaf_size, self.n_dirty
+        other.x, other.y, other.z, other.q = self.x.copy(), self.y.copy(), self.z.copy(), self.q.copy()
+        other.atom, other.leaf, other.next_extra = self.atom.copy(), self.leaf.copy(), self.next_extra.copy()
+        other.first, other.last, other.skip = self.first, self.last, self.skip
+        other.parent, other.extra = self.parent, self.extra.copy()
+        other.ball, other.cells = self.ball.copy(), self.cells.copy()
+        other.dirty, other.queue = self.dirty.copy(), self.queue.copy()
+        return other
+
+
+cdef class InteractionLists:
+    """Cells and ranges of atoms that act on each group of 32 atoms, made by `Octree.lists`."""
+
+    @property
+    def pairs(self):
+        """Number of (atom, atom) and of (atom, cell) interactions of one sweep."""
+        return int(self.starts[self.starts.shape[0] - 1, 2]) * GROUP, int(self.starts[self.starts.shape[0] - 1, 0]) * GROUP
+
+    @property
+    def nbytes(self):
+        """Memory [bytes]."""
+        return self.cells.nbytes + self.ranges.nbytes + self.starts.nbytes

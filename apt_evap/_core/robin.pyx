@@ -1,0 +1,139 @@
+"""Charges of the surface atoms: Robin's iteration, for the whole surface and for a patch of it.
+
+q_i <- (s/2 pi) sum_{k != i} q_k n_i . (r_i - r_k)/|r_i - r_k|^3, with s, the area per atom, set anew in every sweep so
+that the total charge is kept (Rolland et al., Phil. Mag. 95, 1620, 2015; Robin 1886).
+"""
+
+from libc.math cimport M_PI, fabs
+
+import numpy as np
+
+from apt_evap._core.octree cimport lane_dot, robin_row
+
+
+cdef class ChargingRule:
+    """How charge settles on the surface atoms.
+
+    A rule keeps the field of all the others on each slot of the tree (`field`), and gives two things: `solve`, the
+    charges of the whole surface, and `solve_patch`, those of a few atoms while all others are held.
+    """
+
+    cdef int solve_patch(self, Octree tree, double[:, ::1] normals, const int* patch, long n,
+                         double* charges) noexcept nogil:
+        # New charges of the n slots in `patch`, from their fields and the old charges in the tree.
+        return -1
+
+
+cdef class Robin(ChargingRule):
+    """Robin's iteration.
+
+    Parameters
+    ----------
+    tolerance : float
+        Largest change of a charge in the last iteration of a patch, relative to the mean charge.
+    """
+
+    def __init__(self, double tolerance=1e-6):
+        self.tolerance = tolerance
+        self.area = 1.0
+        self.matrix = np.empty(256 * 256)
+        self.residual = np.empty(256)
+        self.change = np.empty(256)
+
+    def solve(self, Octree tree, const double[:, ::1] normals, InteractionLists lists, *, double tolerance=1e-6,
+              int most_sweeps=200, bint double_precision=False, int n_threads=1):
+        """Iterate over the whole surface from the charges the tree has.
+
+        Parameters
+        ----------
+        tree : Octree
+            Its charges are the start, and are replaced; their sum is kept.
+        normals : ndarray, shape (n, 3)
+            Outward unit normals in the order of the slots.
+        lists : InteractionLists
+            Of this tree.
+        tolerance : float
+            Largest change of a charge in a sweep, relative to the mean charge, at which to stop.
+        most_sweeps : int
+            Sweeps after which to stop in any case.
+        double_precision : bool
+            Needed for tolerances below 1e-6.
+        n_threads : int
+            Threads.
+
+        Returns
+        -------
+        sweeps : int
+            Sweeps done.
+        residual : float
+            Largest change of a charge in the last one, relative to the mean charge.
+        """
+        cdef long n = tree.n_slots
+        cdef int sweeps
+        cdef double residual = np.inf
+        normal = np.asarray(normals)[:n]
+        self.field = np.zeros((tree.x.shape[0], 3))
+        field = np.asarray(self.field)
+        total = tree.charges.sum()
+        sweeps = 0
+        for sweeps in range(1, most_sweeps + 1):
+            old = tree.charges.copy()
+            tree.sweep(lists, self.field, double_precision, n_threads)
+            flux = np.einsum("ij,ij->i", field[:n], normal)
+            self.area = 2.0 * M_PI * total / flux.sum()
+            new = flux * (total / flux.sum())
+            tree.charges = new
+            residual = np.abs(new - old).max() * n / total
+            if residual < tolerance:
+                break
+        return sweeps, residual
+
+    def scale(self, Octree tree, double factor):
+        """Multiply all charges, and the fields they make, by a factor."""
+        tree.charges = np.asarray(tree.charges) * factor
+        np.asarray(self.field)[:] *= factor
+
+    cdef double* grow(self, long n) noexcept nogil:
+        if n > self.residual.shape[0]:
+            with gil:
+                self.matrix = np.empty(n * n)
+                self.residual = np.empty(n)
+                self.change = np.empty(n)
+        return &self.matrix[0]
+
+    cdef int solve_patch(self, Octree tree, double[:, ::1] normals, const int* patch, long n,
+                         double* charges) noexcept nogil:
+        # Gauss-Seidel on the changes: x_i = r_i + (s/2 pi) sum_k K_ik x_k with the residual r_i of the old charges.
+        # `charges` has room for 5 n numbers: the new charges, then the patch's coordinates.
+        cdef double c = self.area / (2.0 * M_PI), new, largest, mean = 0.0
+        cdef double* matrix = self.grow(n)
+        cdef double* x = charges + n
+        cdef double* y = charges + 2 * n
+        cdef double* z = charges + 3 * n
+        cdef double[3] point
+        cdef long i, slot
+        cdef int iteration
+        for i in range(n):
+            slot = patch[i]
+            x[i], y[i], z[i] = tree.x[slot], tree.y[slot], tree.z[slot]
+            mean += tree.q[slot]
+        mean /= n
+        for i in range(n):
+            slot = patch[i]
+            point[0], point[1], point[2] = x[i], y[i], z[i]
+            robin_row(n, x, y, z, point, &normals[slot, 0], matrix + i * n)
+            self.residual[i] = c * (
+                normals[slot, 0] * self.field[slot, 0] + normals[slot, 1] * self.field[slot, 1]
+                + normals[slot, 2] * self.field[slot, 2]) - tree.q[slot]
+            self.change[i] = self.residual[i]
+        for iteration in range(60):
+            largest = 0.0
+            for i in range(n):
+                new = self.residual[i] + c * lane_dot(n, matrix + i * n, &self.change[0])
+                largest = max(largest, fabs(new - self.change[i]))
+                self.change[i] = new
+            if largest < self.tolerance * mean:
+                break
+        for i in range(n):
+            charges[i] = tree.q[patch[i]] + self.change[i]
+        return iteration

@@ -1,0 +1,263 @@
+"""The emitter: the charged surface of a specimen, and the sequence of atoms that leave it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from apt_evap._arrays import check_array, check_count, check_number
+from apt_evap._core.event import DONE, EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, Evaporation, Journal
+from apt_evap._core.octree import Octree
+from apt_evap._core.robin import Robin
+from apt_evap._core.surface import Neighbourhood
+from apt_evap._threads import thread_count
+from apt_evap.law import Extremal
+from apt_evap.units import COULOMB
+
+__all__ = ["DONE", "EXHAUSTED", "SWEEP_DUE", "TOO_SHALLOW", "Batch", "ChargeSettings", "Emitter"]
+
+
+@dataclass(frozen=True)
+class ChargeSettings:
+    """How finely the charges are solved.
+
+    Lengths are in nearest neighbour distances d_nn of the specimen.
+
+    Parameters
+    ----------
+    opening_angle : float
+        Full angle under which a cell of the octree stands for its atoms [rad]. 0.6 gives fields within 1e-4 (RMS).
+    patch_radius : float
+        Charges are solved within this distance of a hole [d_nn]; 7 is 5 lattice constants of fcc.
+    update_radius : float
+        Fields are kept up to date within this distance of a hole [d_nn].
+    sweep_interval : int, optional
+        Events between two relaxations of the whole surface; by default a fortieth of the surface atoms.
+    tolerance : float
+        Change of a charge, relative to the mean charge, at which a relaxation stops.
+    start_tolerance : float
+        The same for the first one, which starts from equal charges.
+    """
+
+    opening_angle: float = 0.6
+    patch_radius: float = 7.07
+    update_radius: float = 11.3
+    sweep_interval: int | None = None
+    tolerance: float = 1e-4
+    start_tolerance: float = 1e-8
+
+    def __post_init__(self):
+        check_number(self.opening_angle, "opening_angle", at_least=0, at_most=1.5, unit="rad")
+        check_number(self.patch_radius, "patch_radius", at_least=1.5, at_most=30, unit="d_nn")
+        check_number(self.update_radius, "update_radius", at_least=self.patch_radius, at_most=30, unit="d_nn")
+        check_number(self.tolerance, "tolerance", above=0)
+        check_number(self.start_tolerance, "start_tolerance", above=0)
+        if self.sweep_interval is not None:
+            check_count(self.sweep_interval, "sweep_interval", at_least=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """Atoms that left one after the other.
+
+    Parameters
+    ----------
+    site : ndarray of int64, shape (n,)
+        Index of each atom in the specimen.
+    charges : ndarray, shape (n,)
+        Charge before it left [e].
+    fields : ndarray, shape (n,)
+        Field just outside before it left [V/nm].
+    normals : ndarray, shape (n, 3)
+        Outward unit normal.
+    neighbour : ndarray of int64, shape (n,)
+        Index of the surface nearest neighbour with the highest charge; -1 if there was none.
+    journal : Journal
+        What each event changed in the tree.
+    tree : Octree or None
+        Copy of the tree before the first event, if it was built anew since the batch before.
+    status : int
+        DONE, SWEEP_DUE, EXHAUSTED or TOO_SHALLOW.
+    """
+
+    site: np.ndarray
+    charges: np.ndarray
+    fields: np.ndarray
+    normals: np.ndarray
+    neighbour: np.ndarray
+    journal: Journal
+    tree: Octree | None
+    status: int
+
+    def __len__(self):
+        return len(self.site)
+
+
+class Emitter:
+    """The charged surface of a specimen.
+
+    Parameters
+    ----------
+    tip : Tip
+        The specimen.
+    voltage : float
+        Applied voltage [V].
+    law : Extremal
+        Which atom leaves next.
+    settings : ChargeSettings
+        How finely the charges are solved.
+    n_threads : int, optional
+        Threads; by default the processors this process may use.
+
+    Raises
+    ------
+    ValueError
+        If the voltage is not above 0, or the specimen has no surface atom that may leave.
+    """
+
+    def __init__(self, tip, voltage=1000.0, law=None, settings=None, n_threads=None):
+        self.tip = tip
+        self.voltage = check_number(voltage, "voltage", above=0, unit="V")
+        self.law = law or Extremal()
+        self.settings = settings or ChargeSettings()
+        self.n_threads = thread_count(n_threads)
+        distance = tip.nearest_neighbour_distance
+        self._neighbourhood = Neighbourhood(
+            tip.positions,
+            tip.neighbour_radius,
+            tip.surface_threshold,
+            tip.support.astype(np.int8),
+            self.n_threads,
+        )
+        weights = check_array(self.law.weights(tip), "weights of the law", (len(tip.positions),))
+        if not weights[self._neighbourhood.surface].any():
+            raise ValueError(f"no surface atom of {tip!r} may leave, expected some evaporable ones")
+        self._core = Evaporation(
+            self._neighbourhood,
+            Robin(),
+            weights,
+            self.voltage / COULOMB,
+            tip.potential_point,
+            1.2 * distance,  # between the first and the second shell of neighbours of every lattice
+            self.settings.patch_radius * distance,
+            self.settings.update_radius * distance,
+            self.settings.opening_angle,
+        )
+        self._fresh = False
+        self.relax(tolerance=self.settings.start_tolerance)
+        surface = len(self._neighbourhood.surface)
+        self._sweep_interval = self.settings.sweep_interval or max(100, surface // 40)
+
+    def __len__(self):
+        return len(self._core.slots)
+
+    def __repr__(self):
+        return f"<Emitter: {len(self):,} surface atoms of {len(self.tip.positions):,} at {self.voltage:g} V>"
+
+    @property
+    def atoms(self):
+        """Index of each surface atom in the specimen, shape (n,)."""
+        return self._core.tree.atoms[self._core.slots]
+
+    @property
+    def positions(self):
+        """Positions of the surface atoms [nm], shape (n, 3)."""
+        return self._core.tree.positions[self._core.slots]
+
+    @property
+    def normals(self):
+        """Outward unit normals of the surface atoms, shape (n, 3)."""
+        return self._core.slot_normals[self._core.slots]
+
+    @property
+    def charges(self):
+        """Charges of the surface atoms [e], shape (n,)."""
+        return self._core.tree.charges[self._core.slots]
+
+    @property
+    def fields(self):
+        """Fields just outside the surface atoms [V/nm], shape (n,).
+
+        F_i = 4 pi k_e q_i / s, with s the area per surface atom: the field at the outer face of a charged surface.
+        """
+        return self._field(self.charges)
+
+    def _field(self, charges):
+        return 4 * np.pi * COULOMB / self._core.rule.area * charges
+
+    def field_at(self, points, opening_angle=0.3):
+        """Electric field of the surface charges.
+
+        Parameters
+        ----------
+        points : array_like, shape (m, 3)
+            Where [nm].
+        opening_angle : float
+            See `ChargeSettings`; 0 sums over all atoms.
+
+        Returns
+        -------
+        ndarray, shape (m, 3)
+            Field [V/nm].
+        """
+        points = check_array(points, "points", ("m", 3))
+        return COULOMB * self._core.tree.fields(points, opening_angle, self.n_threads)
+
+    def potential_at(self, points, opening_angle=0.3):
+        """Electric potential of the surface charges [V], shape (m,); parameters as in `field_at`."""
+        points = check_array(points, "points", ("m", 3))
+        return COULOMB * self._core.tree.potentials(points, opening_angle, self.n_threads)
+
+    def relax(self, tolerance=None):
+        """Bring the whole surface to equilibrium at the applied voltage.
+
+        Parameters
+        ----------
+        tolerance : float, optional
+            Change of a charge in the last sweep, relative to the mean charge; by default that of the settings.
+
+        Returns
+        -------
+        sweeps : int
+            Sweeps done.
+        residual : float
+            The change in the last one.
+        """
+        tolerance = self.settings.tolerance if tolerance is None else tolerance
+        outcome = self._core.relax(
+            tolerance=tolerance,
+            double_precision=tolerance < 1e-6,  # below it the rounding of float32 keeps charges moving
+            n_threads=self.n_threads,
+        )
+        self._fresh = True
+        return outcome
+
+    def evaporate(self, most):
+        """Let atoms leave, `most` of them or as many as leave before something has to be done first.
+
+        Parameters
+        ----------
+        most : int
+            Events at most.
+
+        Returns
+        -------
+        Batch
+            Its status says why it ended: DONE, SWEEP_DUE (call `relax` and go on), EXHAUSTED, TOO_SHALLOW.
+        """
+        journal = Journal(self.tip.positions, most)
+        site, neighbour = np.empty(most, np.int64), np.empty(most, np.int64)
+        charges, normals = np.empty(most), np.empty((most, 3))
+        tree = self._core.tree.copy() if self._fresh else None
+        self._fresh = False
+        status = self._core.evaporate(journal, most, self._sweep_interval, site, charges, normals, neighbour)
+        n = journal.n_events
+        return Batch(
+            site=site[:n],
+            charges=charges[:n],
+            fields=self._field(charges[:n]),
+            normals=normals[:n],
+            neighbour=neighbour[:n],
+            journal=journal,
+            tree=tree,
+            status=status,
+        )

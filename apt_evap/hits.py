@@ -1,0 +1,212 @@
+"""The one type for simulated and measured ions: columns of equal length, one row per ion."""
+
+from dataclasses import dataclass, fields
+from enum import IntEnum
+
+import numpy as np
+
+from apt_evap._arrays import check_array
+
+
+class Outcome(IntEnum):
+    """What became of a simulated ion."""
+
+    HIT = 0
+    """It hit the detector."""
+    MISSED = 1
+    """It flew past the detector."""
+    NEVER_LEFT = 2
+    """It never got away from the specimen."""
+
+
+_FLOAT = ("x", "y", "time_of_flight", "voltage", "pulse_voltage", "mass_to_charge", "positions")
+_WHOLE = {
+    "pulses": np.uint32,
+    "multiplicity": np.uint32,
+    "pulse_id": np.int64,
+    "site": np.int64,
+    "ion": np.int64,
+    "outcome": np.int8,
+}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class Hits:
+    """Ions as NumPy columns of equal length n; a column that is not there is None.
+
+    Floating point columns keep float32 where given so and are float64 otherwise. Arrays are taken over
+    without a copy where their type and memory order allow.
+
+    Parameters
+    ----------
+    x, y : array_like, optional
+        Detector coordinates [mm], shape (n,).
+    time_of_flight : array_like, optional
+        Time of flight [ns], shape (n,).
+    voltage, pulse_voltage : array_like, optional
+        Standing voltage and height of the pulse [V], shape (n,).
+    mass_to_charge : array_like, optional
+        Mass over charge state [Da], shape (n,).
+    positions : array_like, optional
+        Reconstructed positions of measured ions, launch sites of simulated ones [nm], shape (n, 3).
+    pulses : array_like, optional
+        Pulses since the last pulse with an ion, shape (n,).
+    multiplicity : array_like, optional
+        Number of ions in the pulse of this ion, for every ion, shape (n,).
+    pulse_id : array_like, optional
+        Ions of one pulse share it, shape (n,).
+    site : array_like, optional
+        Index of the atom in the specimen, shape (n,).
+    ion : array_like, optional
+        Place in the sequence of evaporation, shape (n,).
+    outcome : array_like, optional
+        An `Outcome` for every ion, shape (n,). None for measured ions.
+    source : str
+        File name, or what made the ions.
+
+    Raises
+    ------
+    ValueError
+        If there is no column at all, a column has the wrong shape or type, lengths differ, or an outcome is
+        unknown.
+    """
+
+    x: np.ndarray = None
+    y: np.ndarray = None
+    time_of_flight: np.ndarray = None
+    voltage: np.ndarray = None
+    pulse_voltage: np.ndarray = None
+    mass_to_charge: np.ndarray = None
+    positions: np.ndarray = None
+    pulses: np.ndarray = None
+    multiplicity: np.ndarray = None
+    pulse_id: np.ndarray = None
+    site: np.ndarray = None
+    ion: np.ndarray = None
+    outcome: np.ndarray = None
+    source: str = ""
+
+    def __post_init__(self):
+        lengths = {}
+        for name in _FLOAT + tuple(_WHOLE):
+            value = getattr(self, name)
+            if value is not None:
+                column = _column(name, value)
+                object.__setattr__(self, name, column)
+                lengths[name] = len(column)
+        if not lengths:
+            raise ValueError("Hits needs at least one column, got none")
+        if len(set(lengths.values())) > 1:
+            listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
+            raise ValueError(f"the columns of Hits must have one length, got {listed}")
+        if self.outcome is not None and len(self):
+            low, high = self.outcome.min(), self.outcome.max()
+            if low < min(Outcome) or high > max(Outcome):
+                raise ValueError(f"outcome must hold Outcomes, {min(Outcome)} to {max(Outcome)}, got {low} to {high}")
+
+    @property
+    def columns(self):
+        """Names of the columns that are there, tuple of str."""
+        return tuple(f.name for f in fields(self) if f.name != "source" and getattr(self, f.name) is not None)
+
+    def require(self, *names):
+        """Return the named columns, or say which one is missing.
+
+        Parameters
+        ----------
+        *names : str
+            Names of columns.
+
+        Returns
+        -------
+        tuple of ndarray
+
+        Raises
+        ------
+        ValueError
+            Naming the missing column and the source.
+        """
+        for name in names:
+            if name not in _FLOAT and name not in _WHOLE:
+                raise ValueError(f"Hits has no column {name!r}; its columns are {', '.join(_FLOAT + tuple(_WHOLE))}")
+            if getattr(self, name) is None:
+                raise ValueError(
+                    f"{self.source or 'these hits'} has no column {name!r}, only {', '.join(self.columns)}"
+                )
+        return tuple(getattr(self, name) for name in names)
+
+    @property
+    def detected(self):
+        """Mask of the ions with an outcome of HIT and finite detector coordinates, bool of shape (n,).
+
+        What is missing is not asked for: measured ions have no outcome, and those of a .pos file no detector
+        coordinates.
+        """
+        good = np.ones(len(self), bool) if self.outcome is None else self.outcome == Outcome.HIT
+        for column in (self.x, self.y):
+            if column is not None:
+                good &= np.isfinite(column)
+        return good
+
+    @property
+    def counts(self):
+        """Number of ions with each `Outcome`, dict; measured ions (no outcome) have all hit."""
+        if self.outcome is None:
+            return {outcome: len(self) if outcome == Outcome.HIT else 0 for outcome in Outcome}
+        return {outcome: int(np.count_nonzero(self.outcome == outcome)) for outcome in Outcome}
+
+    def map(self, bins=256, **options):
+        """Count the detected ions on the detector.
+
+        Parameters
+        ----------
+        bins : int
+            Number of bins along the longer side.
+        **options
+            Passed to `apt_evap.maps.DetectorMap.from_hits`.
+
+        Returns
+        -------
+        apt_evap.maps.DetectorMap
+        """
+        # maps.py stands on a higher floor; this shorthand is the one import that goes up
+        from apt_evap.maps import DetectorMap
+
+        return DetectorMap.from_hits(self, bins=bins, **options)
+
+    def __len__(self):
+        for name in _FLOAT + tuple(_WHOLE):
+            if (column := getattr(self, name)) is not None:
+                return len(column)
+        return 0
+
+    def __getitem__(self, selection):
+        """Return the selected ions as `Hits`; takes a slice, a mask, indices or one index."""
+        if not isinstance(selection, slice):
+            index = np.asarray(selection)
+            if index.size == 0 and index.dtype == float:
+                index = index.astype(np.intp)
+            if index.ndim > 1 or index.dtype.kind not in "biu":
+                raise ValueError(f"Hits are selected by a slice, a mask or indices, got {selection!r:.80}")
+            if index.dtype == bool:
+                if index.shape != (len(self),):
+                    raise ValueError(f"the mask must have shape ({len(self)},), got {index.shape}")
+                index = np.flatnonzero(index)
+            selection = np.atleast_1d(index)
+        chosen = {name: getattr(self, name)[selection] for name in self.columns}
+        return Hits(**chosen, source=self.source)
+
+    def __repr__(self):
+        detected = np.count_nonzero(self.detected)
+        source = f" from {self.source!r}" if self.source else ""
+        return f"<Hits: {len(self):,} ions, {detected:,} detected{source}; {', '.join(self.columns)}>"
+
+
+def _column(name, value):
+    """Check one column and give it its type."""
+    if name in _WHOLE:
+        return check_array(value, name, ("n",), dtype=_WHOLE[name])
+    given = getattr(value, "dtype", None)
+    single = given is not None and given.kind == "f" and given.itemsize == 4
+    shape = ("n", 3) if name == "positions" else ("n",)
+    return check_array(value, name, shape, dtype=np.float32 if single else np.float64, finite=False)

@@ -1,0 +1,28 @@
+"""Evaporation laws: which atom leaves next."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Extremal:
+    """The atom with the largest field over evaporation field leaves; equal ones go by their number.
+
+    The limit of low temperature of the Arrhenius rate nu_0 exp(-C (1 - F/F_evap)/kT) (Vurpillot et al., 2013).
+    """
+
+    def weights(self, tip):
+        """Return what the field of each atom is multiplied by for the choice.
+
+        Parameters
+        ----------
+        tip : Tip
+            The specimen.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            One over the evaporation field [nm/V]; 0 for atoms that may not leave.
+        """
+        return np.where(tip.evaporable, 1.0 / tip.evaporation_fields[tip.species], 0.0)

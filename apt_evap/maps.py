@@ -1,0 +1,366 @@
+"""Maps of the hits on the detector, binned so that the comb of measured coordinates does not show."""
+
+import warnings
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from scipy import ndimage
+
+from apt_evap._arrays import check_array, check_count, check_number
+from apt_evap.binning import bin_edges, count, field_of_view, find_combs
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class DetectorMap:
+    """Hits on the detector in bins of one size; made by `from_hits` or `from_array`.
+
+    Parameters
+    ----------
+    values : ndarray
+        Hits per bin, or a density in any unit, shape (ny, nx), indexed [y, x].
+    x_edges, y_edges : ndarray
+        Edges of the bins [mm], shapes (nx + 1,) and (ny + 1,), evenly spaced.
+    mask : ndarray
+        Whether a bin is inside the detector, bool of shape (ny, nx).
+    is_counts : bool
+        Whether `values` are hits per bin.
+    ions : int or None
+        Number of hits inside the detector, None if not known.
+    quantum : tuple of float or None
+        Spacing of the comb of the coordinates [mm] in x and y, None if they are continuous.
+    smoothing : float
+        Standard deviation of the Gaussian the density was smoothed with [mm].
+    source : str
+        What the map was made from.
+    """
+
+    values: np.ndarray
+    x_edges: np.ndarray
+    y_edges: np.ndarray
+    mask: np.ndarray
+    is_counts: bool = False
+    ions: int | None = None
+    quantum: tuple | None = None
+    smoothing: float = 0.0
+    source: str = ""
+
+    @classmethod
+    def from_hits(cls, hits, bins=256, extent=None, quantum="auto", dither_seed=None, mask=None, like=None):
+        """Count the detected ions in bins that are as good as square.
+
+        Measured coordinates lie on a comb; bins that are no multiple of its spacing, the quantum, hold now
+        one tooth more, now one less, and show stripes. So the bins become multiples of the quantum, with
+        edges half way between teeth: they are then not quite square and not exactly `bins` in number. With
+        `dither_seed` every hit is moved at random within its quantum instead, and bins are square.
+
+        Parameters
+        ----------
+        hits : Hits
+            Ions with x and y.
+        bins : int
+            Number of bins along the longer side.
+        extent : tuple of float, optional
+            x_min, x_max, y_min, y_max [mm]; that of the hits by default. Bins may reach a little over it.
+        quantum : {"auto", None} or tuple of float
+            Spacing of the comb in x and y [mm], "auto" to find it in the data, None for continuous data.
+        dither_seed : int, optional
+            Seed; dithers by one quantum instead of fitting the bins to the comb.
+        mask : array_like, optional
+            Which bins are inside the detector; by default the convex outline of the field of view, where the
+            density exceeds a tenth of its median.
+        like : DetectorMap, optional
+            Take edges and mask from this map, for comparison, instead of `bins` and `extent`.
+
+        Returns
+        -------
+        DetectorMap
+
+        Raises
+        ------
+        ValueError
+            If x or y is missing, no ion was detected, none lies in the extent, or an argument is out of
+            range.
+        """
+        x, y = hits.require("x", "y")
+        detected = hits.detected
+        if not detected.any():
+            raise ValueError(f"a map needs detected ions, {hits.source or 'these hits'} has none of {len(hits)}")
+        if not detected.all():
+            x, y = x[detected], y[detected]
+        combs = find_combs(x, y, quantum)
+        if dither_seed is not None:
+            if combs is None:
+                raise ValueError("dither_seed needs a quantum to dither by, and the coordinates show no comb")
+            random = np.random.default_rng(check_count(dither_seed, "dither_seed"))
+            x, y = (
+                values + comb.spacing * (random.random(len(values)) - 0.5)
+                for values, comb in zip((x, y), combs, strict=True)
+            )
+        if like is not None:
+            x_edges, y_edges, mask = like.x_edges, like.y_edges, like.mask if mask is None else mask
+            if combs is not None and dither_seed is None and not _fits(like, combs):
+                warnings.warn(
+                    "hits on a comb are binned on the edges of another map and may show stripes; dither_seed "
+                    "prevents them",
+                    stacklevel=2,
+                )
+        else:
+            x_edges, y_edges = bin_edges(x, y, bins, extent, combs if dither_seed is None else None)
+        counts = count(x, y, x_edges, y_edges)
+        if not counts.any():
+            raise ValueError(
+                f"none of {len(x):,} hits lies in x {x_edges[0]:g} to {x_edges[-1]:g}, "
+                f"y {y_edges[0]:g} to {y_edges[-1]:g} mm"
+            )
+        mask = field_of_view(counts) if mask is None else _check_mask(mask, counts.shape)
+        found = None if combs is None else tuple(float(comb.spacing) for comb in combs)
+        ions = int(counts[mask].sum())
+        return cls(counts, x_edges, y_edges, mask, True, ions, quantum=found, source=hits.source)
+
+    @classmethod
+    def from_array(cls, values, x_edges, y_edges, mask=None, *, is_counts=False, source=""):
+        """Make a map of a given array, such as a published one.
+
+        Parameters
+        ----------
+        values : array_like
+            Densities in any unit, or hits per bin, shape (ny, nx), indexed [y, x]; NaN is outside the
+            detector.
+        x_edges, y_edges : array_like
+            Edges of the bins [mm], shapes (nx + 1,) and (ny + 1,), evenly spaced and increasing.
+        mask : array_like, optional
+            Which bins are inside the detector; by default those that are not NaN.
+        is_counts : bool
+            Whether `values` are hits per bin; Poisson errors need that.
+        source : str
+            What the map is.
+
+        Returns
+        -------
+        DetectorMap
+
+        Raises
+        ------
+        ValueError
+            If shapes do not fit, edges are not even, values are negative or the mask is empty.
+        """
+        values = check_array(values, "values", ("ny", "nx"), finite=False)
+        x_edges = _check_edges(x_edges, "x_edges", values.shape[1])
+        y_edges = _check_edges(y_edges, "y_edges", values.shape[0])
+        finite = np.isfinite(values)
+        mask = _check_mask(finite if mask is None else mask, values.shape)
+        if not (finite & mask).any() or (values[finite] < 0).any():
+            raise ValueError("values of a map must not be negative, and some must be finite and in the mask")
+        mask = mask & finite
+        values = np.where(finite, values, 0.0)
+        ions = None
+        if is_counts:
+            values = check_array(values, "values", ("ny", "nx"), dtype=np.int64)
+            ions = int(values[mask].sum())
+        return cls(values, x_edges, y_edges, mask, bool(is_counts), ions, source=source)
+
+    @cached_property
+    def density(self):
+        """Hits per area relative to their mean inside the detector, NaN outside of it, shape (ny, nx)."""
+        mean = self.values[self.mask].mean()
+        if not mean > 0:
+            raise ValueError(f"the map {self.source} has no hits inside its mask")
+        return np.where(self.mask, self.values / mean, np.nan)
+
+    @property
+    def counts(self):
+        """Hits per bin, int64 of shape (ny, nx); a ValueError for a map of densities."""
+        if not self.is_counts:
+            raise ValueError(f"{self!r} holds densities, not counts of ions")
+        return self.values
+
+    @property
+    def bin_size(self):
+        """Width and height of a bin [mm]."""
+        return tuple(float((edges[-1] - edges[0]) / (len(edges) - 1)) for edges in (self.x_edges, self.y_edges))
+
+    @property
+    def extent(self):
+        """Where the map reaches: x_min, x_max, y_min, y_max [mm]."""
+        return tuple(float(edges[end]) for edges in (self.x_edges, self.y_edges) for end in (0, -1))
+
+    @property
+    def centres(self):
+        """Centres of the bins in x and in y [mm], shapes (nx,) and (ny,)."""
+        return tuple((edges[:-1] + edges[1:]) / 2 for edges in (self.x_edges, self.y_edges))
+
+    def smoothed(self, sigma):
+        """Smooth the density with a Gaussian that sees only the inside of the detector.
+
+        The smoothed density is divided by the smoothed mask, so that it does not fall off at the rim.
+
+        Parameters
+        ----------
+        sigma : float
+            Standard deviation [mm].
+
+        Returns
+        -------
+        DetectorMap
+            A map of densities; itself for a sigma of 0.
+
+        Raises
+        ------
+        ValueError
+            If sigma is negative.
+        """
+        sigma = check_number(sigma, "sigma", at_least=0, unit="mm")
+        if sigma == 0:
+            return self
+        width, height = self.bin_size
+        blur = {"sigma": (sigma / height, sigma / width), "mode": "constant"}
+        weight = ndimage.gaussian_filter(self.mask.astype(float), **blur)
+        values = ndimage.gaussian_filter(np.where(self.mask, self.values, 0).astype(float), **blur)
+        values = np.divide(values, weight, out=np.zeros_like(values), where=self.mask)
+        total = float(np.hypot(sigma, self.smoothing))
+        return replace(self, values=values, is_counts=False, smoothing=total)
+
+    def __repr__(self):
+        ny, nx = self.values.shape
+        width, height = self.bin_size
+        what = "densities" if self.ions is None else f"{self.ions:,} ions"
+        smoothing = f", smoothed by {self.smoothing:g} mm" if self.smoothing else ""
+        source = f" from {self.source!r}" if self.source else ""
+        return f"<DetectorMap: {what}{source}, {nx} x {ny} bins of {width:.4g} x {height:.4g} mm{smoothing}>"
+
+
+def _check_edges(edges, name, bins):
+    edges = check_array(edges, name, (bins + 1,))
+    widths = np.diff(edges)
+    if not (widths > 0).all() or np.ptp(widths) > 0.01 * widths.mean():
+        raise ValueError(
+            f"{name} must increase in even steps (to 1 %), got steps of {widths.min():g} to {widths.max():g}"
+        )
+    return edges
+
+
+def _check_mask(mask, shape):
+    mask = check_array(mask, "mask", shape, dtype=bool)
+    if not mask.any():
+        raise ValueError("mask must leave some bin inside the detector, got none")
+    return mask
+
+
+def _fits(like, combs):
+    """Whether the bins of a map are whole multiples of the combs' spacings."""
+    multiples = [size / comb.spacing for size, comb in zip(like.bin_size, combs, strict=True)]
+    return all(multiple > 0.99 and abs(multiple - round(multiple)) < 1e-3 for multiple in multiples)
+
+
+class Profile(NamedTuple):
+    """Density of hits against azimuth or radius."""
+
+    position: np.ndarray
+    """Centres of the bins, azimuth [degrees] or radius [mm], shape (bins,)."""
+    density: np.ndarray
+    """Hits per area relative to that of all bins together, NaN where no area is, shape (bins,)."""
+    error: np.ndarray
+    """Poisson error of the density (one standard deviation), NaN for maps of densities, shape (bins,)."""
+
+
+def azimuthal_profile(hits, centre=(0.0, 0.0), *, inner, outer, bins=72):
+    """Density of hits in a ring against the azimuth.
+
+    Parameters
+    ----------
+    hits : Hits or DetectorMap
+        Hits, which should fill the whole ring; of a map, only the inside of the detector counts.
+    centre : tuple of float
+        Centre of the ring [mm].
+    inner, outer : float
+        Radii of the ring [mm].
+    bins : int
+        Number of sectors; the first begins at the x axis, azimuths grow from x to y.
+
+    Returns
+    -------
+    Profile
+        position is the azimuth [degrees], 0 to 360.
+
+    Raises
+    ------
+    ValueError
+        If the ring is not one or holds no hits.
+    """
+    inner, outer, bins = _check_ring(inner, outer, bins)
+    radius, azimuth, *_ = polar = _polar(hits, centre)
+    ring = (radius >= inner) & (radius < outer)
+    sector = np.floor(azimuth[ring] * (bins / 360)).astype(np.intp) % bins
+    exact = np.full(bins, np.pi * (outer**2 - inner**2) / bins)
+    return _profile((np.arange(bins) + 0.5) * (360 / bins), sector, ring, polar, exact)
+
+
+def radial_profile(hits, centre=(0.0, 0.0), *, outer, inner=0.0, bins=50):
+    """Density of hits against the distance from a centre.
+
+    Parameters
+    ----------
+    hits : Hits or DetectorMap
+        Hits, which should fill the whole disc; of a map, only the inside of the detector counts.
+    centre : tuple of float
+        Centre of the rings [mm].
+    outer, inner : float
+        Where the profile ends and begins [mm].
+    bins : int
+        Number of rings, all of one width.
+
+    Returns
+    -------
+    Profile
+        position is the radius [mm].
+
+    Raises
+    ------
+    ValueError
+        If outer is not larger than inner or there are no hits between them.
+    """
+    inner, outer, bins = _check_ring(inner, outer, bins)
+    radius, *_ = polar = _polar(hits, centre)
+    ring = (radius >= inner) & (radius < outer)
+    edges = np.linspace(inner, outer, bins + 1)
+    annulus = np.minimum((radius[ring] - inner) * (bins / (outer - inner)), bins - 1).astype(np.intp)
+    return _profile((edges[:-1] + edges[1:]) / 2, annulus, ring, polar, np.pi * np.diff(edges**2))
+
+
+def _check_ring(inner, outer, bins):
+    inner = check_number(inner, "inner", at_least=0, unit="mm")
+    return inner, check_number(outer, "outer", above=inner, unit="mm"), check_count(bins, "bins", at_least=1)
+
+
+def _polar(hits, centre):
+    """Radius, azimuth [degrees], and for a map the values and area of its bins, each of shape (n,)."""
+    centre = check_array(centre, "centre", (2,))
+    if isinstance(hits, DetectorMap):
+        x, y = (grid[hits.mask] for grid in np.meshgrid(*hits.centres))
+        values, area = hits.values[hits.mask], float(np.prod(hits.bin_size))
+    else:
+        x, y = hits.require("x", "y")
+        detected = hits.detected
+        x, y = x[detected], y[detected]
+        values, area = None, None
+    x, y = x - centre[0], y - centre[1]
+    errors = values is None or hits.is_counts
+    return np.hypot(x, y), np.degrees(np.arctan2(y, x)) % 360, values, area, errors
+
+
+def _profile(position, index, ring, polar, areas):
+    """Add up hits and area over the bins of a profile; hits that are no map fill `areas`."""
+    _, _, values, area, errors = polar
+    if values is None:
+        number = np.bincount(index, minlength=len(position)).astype(float)
+    else:
+        number = np.bincount(index, weights=values[ring], minlength=len(position))
+        areas = area * np.bincount(index, minlength=len(position))
+    if not number.any():
+        raise ValueError("a profile needs hits, there are none between inner and outer")
+    # an empty bin gets the error of one hit
+    spread = np.sqrt(np.maximum(number, 1)) if errors else np.full(len(position), np.nan)
+    scale = np.where(areas > 0, areas, np.nan) * (number.sum() / areas.sum())
+    return Profile(position, number / scale, spread / scale)

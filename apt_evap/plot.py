@@ -1,0 +1,176 @@
+"""Pictures: functions that draw into axes and return them, with or without pyplot."""
+
+import sys
+
+import numpy as np
+from matplotlib.figure import Figure
+
+OUTSIDE = "0.88"
+"""Colour of what is outside the detector."""
+
+
+def detector_map(map, ax=None, *, title=None, limits=None, colormap="inferno", colorbar=True, caption=True):
+    """Draw a detector map.
+
+    Parameters
+    ----------
+    map : DetectorMap
+        The map; its density relative to the mean is shown.
+    ax : matplotlib.axes.Axes, optional
+        Where to draw; a new figure by default.
+    title : str, optional
+        Title above the map.
+    limits : tuple of float, optional
+        Densities at the ends of the colour scale; by default `color_limits`.
+    colormap : str
+        Name of a colour map of matplotlib.
+    colorbar, caption : bool
+        Whether to draw a colour bar, and the number of ions and size of the bins above the map.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        Its ``figure.savefig`` writes the picture.
+    """
+    if ax is None:
+        ax = new_figure((5.6, 5.0)).subplots()
+    low, high = color_limits(map) if limits is None else limits
+    image = ax.imshow(
+        map.density,
+        origin="lower",
+        extent=map.extent,
+        cmap=colormap,
+        vmin=low,
+        vmax=high,
+        interpolation="nearest",
+    )
+    # bins outside the mask are NaN and let the background through
+    ax.set(facecolor=OUTSIDE, aspect="equal", xlabel="x [mm]", ylabel="y [mm]")
+    if title:
+        ax.set_title(title, pad=20 if caption else 8)
+    if caption:
+        ax.annotate(
+            describe(map), (0.5, 1), xytext=(0, 5), xycoords="axes fraction", textcoords="offset points",
+            ha="center", fontsize="small", color="0.35",
+        )  # fmt: skip
+    if colorbar:
+        add_colorbar([image], ax)
+    return ax
+
+
+def detector_maps(maps, titles=None, *, limits=None, colormap="inferno", columns=None):
+    """Draw several detector maps side by side with one colour scale.
+
+    Parameters
+    ----------
+    maps : sequence of DetectorMap
+        The maps.
+    titles : sequence of str, optional
+        A title for each.
+    limits : tuple of float, optional
+        Densities at the ends of the colour scale; by default the widest of `color_limits`.
+    colormap : str
+        Name of a colour map of matplotlib.
+    columns : int, optional
+        Maps in a row; all of them up to four by default.
+
+    Returns
+    -------
+    ndarray of matplotlib.axes.Axes
+        One for each map, shape (n,).
+
+    Raises
+    ------
+    ValueError
+        If there is no map, or not one title for each.
+    """
+    maps = list(maps)
+    titles = [None] * len(maps) if titles is None else list(titles)
+    if not maps or len(titles) != len(maps):
+        raise ValueError(f"detector_maps needs maps and a title for each, got {len(maps)} and {len(titles)}")
+    columns = min(len(maps), columns or 4)
+    rows = -(-len(maps) // columns)
+    if limits is None:
+        each = np.array([color_limits(map) for map in maps])
+        limits = each[:, 0].min(), each[:, 1].max()
+    figure = new_figure((4.1 * columns + 0.9, 4.3 * rows))
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for ax, map, title in zip(axes, maps, titles, strict=False):
+        detector_map(map, ax, title=title, limits=limits, colormap=colormap, colorbar=False)
+    for ax in axes[len(maps) :]:
+        ax.remove()
+    axes = axes[: len(maps)]
+    add_colorbar([ax.images[0] for ax in axes], list(axes))
+    return axes
+
+
+def color_limits(map):
+    """Robust ends of a colour scale: the 0.5 and 99.5 percentiles of the density inside the detector.
+
+    Parameters
+    ----------
+    map : DetectorMap
+        The map.
+
+    Returns
+    -------
+    tuple of float
+        Lowest and highest density; 0 and 2 if all are the same.
+    """
+    low, high = np.percentile(map.density[map.mask], [0.5, 99.5])
+    return (float(low), float(high)) if high > low else (0.0, 2.0)
+
+
+def describe(map):
+    """Number of ions, size of the bins and smoothing of a map, as a caption (str)."""
+    width, height = map.bin_size
+    square = abs(width / height - 1) < 1e-3
+    size = f"{width:.3g} mm bins" if square else f"{width:.3g} × {height:.3g} mm bins"
+    parts = [f"{map.ions:,} ions", size] if map.ions is not None else [size]
+    if map.smoothing:
+        parts.append(f"smoothed by {map.smoothing:.3g} mm")
+    return ", ".join(parts)
+
+
+def add_colorbar(images, ax, label="hits per area / mean"):
+    """Add a colour bar for images of one scale, with arrows where it cuts off values.
+
+    Parameters
+    ----------
+    images : sequence of matplotlib.image.AxesImage
+        What is coloured.
+    ax : matplotlib.axes.Axes or list of them
+        Axes the bar takes its place from.
+    label : str
+        What the colours mean, with its unit.
+
+    Returns
+    -------
+    matplotlib.colorbar.Colorbar
+    """
+    low, high = images[0].get_clim()
+    below = min(np.nanmin(image.get_array()) for image in images) < low
+    above = max(np.nanmax(image.get_array()) for image in images) > high
+    extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[below, above]
+    figure = images[0].axes.figure
+    return figure.colorbar(images[0], ax=ax, label=label, extend=extend, fraction=0.05, pad=0.02)
+
+
+def new_figure(size):
+    """Make a figure of (width, height) `size` [inch].
+
+    With pyplot imported, as in a notebook, pyplot makes it, so that it is shown; without, as in a batch job,
+    it needs no display.
+
+    Parameters
+    ----------
+    size : tuple of float
+        Width and height [inch].
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    pyplot = sys.modules.get("matplotlib.pyplot")
+    make = Figure if pyplot is None else pyplot.figure
+    return make(figsize=size, layout="constrained", dpi=150)

@@ -1,0 +1,345 @@
+"""A run: the sequence of atoms that left, and where their ions land under any perturbation; saved in HDF5."""
+
+import datetime
+import json
+from dataclasses import dataclass, field, replace
+
+import h5py
+import numpy as np
+
+from apt_evap._files import FileError, check_path, open_for_reading, replace_file
+from apt_evap._version import __version__
+from apt_evap.detector import Detector
+from apt_evap.emission import Emissions
+from apt_evap.hits import Hits
+from apt_evap.ion_random import IonRandom
+from apt_evap.perturbation import from_dict, to_dict
+from apt_evap.response import Design, Responses, ResponseSettings, unflattened
+
+FORMAT = "apt_evap run 1"
+
+
+@dataclass(frozen=True, eq=False)
+class Flown:
+    """What one perturbation gave in the run: stereographic directions (n, 2) and times of flight (n,) [ns]."""
+
+    directions: np.ndarray
+    times: np.ndarray
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Run:
+    """Atoms in the order in which they left, with what is needed to say where their ions land.
+
+    Made by `Simulation.run` and `load`.
+
+    Parameters
+    ----------
+    emissions : Emissions
+        Sites, normals, neighbours, charge states, masses and numbers of the n ions.
+    site : ndarray of int64, shape (n,)
+        Index of each atom in the specimen.
+    species : ndarray of int32, shape (n,)
+        Index of each atom into `elements`.
+    charges, fields : ndarray, shape (n,)
+        Charge [e] and field just outside [V/nm] of each atom before it left.
+    perturbations : tuple
+        The perturbations flown in the run, or what is known of them from a file.
+    flown : tuple of Flown
+        What each of these gave.
+    responses : Responses or None
+        Polynomials of every ion.
+    seed : int
+        Seed of the random numbers of the perturbations.
+    voltage : float
+        Applied voltage [V].
+    detector : Detector
+        The detector.
+    response_settings : ResponseSettings
+        What the responses were made with.
+    elements : tuple of str
+        Names of the species.
+    settings : dict
+        Everything the run was made with, in plain types.
+    ended : str
+        Why the run ended before its time; "" if it did not.
+    provenance : dict
+        Version and time.
+    """
+
+    emissions: Emissions
+    site: np.ndarray
+    species: np.ndarray
+    charges: np.ndarray
+    fields: np.ndarray
+    perturbations: tuple
+    flown: tuple
+    responses: Responses | None
+    seed: int
+    voltage: float
+    detector: Detector
+    response_settings: ResponseSettings
+    elements: tuple
+    settings: dict
+    ended: str = ""
+    provenance: dict = field(
+        default_factory=lambda: {
+            "version": __version__,
+            "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        }
+    )
+
+    def __len__(self):
+        return len(self.site)
+
+    def __repr__(self):
+        flown = ", ".join(_describe(perturbation) for perturbation in self.perturbations)
+        responses = "" if self.responses is None else f"responses with {self.marked.sum():,} ions marked"
+        held = "; ".join(part for part in (responses, flown and f"flown: {flown}", self.ended) if part)
+        return f"<Run: {len(self):,} ions of {', '.join(self.elements)} at {self.voltage:g} V; {held}>"
+
+    @property
+    def marked(self):
+        """Ions whose responses miss their own flights by more than the bound, or could not be fitted, bool (n,)."""
+        if self.responses is None:
+            return np.zeros(len(self), bool)
+        rolls = np.isfinite(self.emissions.neighbours).all(axis=1)
+        bad = ~(self.responses.residuals <= self.response_settings.bound)
+        return bad[:, 0] | (bad[:, 1] & rolls)
+
+    def hits(self, perturbation):
+        """Where the ions land under a perturbation.
+
+        One that was flown in the run is taken as flown; any other that launches along the surface (all built-in ones,
+        with any energies) follows from the responses. Every perturbation sees the same random numbers of an ion.
+
+        Parameters
+        ----------
+        perturbation : perturbation
+            How the ions start.
+
+        Returns
+        -------
+        Hits
+            One row per ion, in the order in which the atoms left; `outcome` counts those that miss the detector.
+
+        Raises
+        ------
+        ValueError
+            If the perturbation was not flown and does not follow from responses.
+        """
+        for flown_as, flown in zip(self.perturbations, self.flown, strict=True):
+            if flown_as == perturbation:
+                return self._hits(flown.directions, flown.times, perturbation)
+        if not callable(getattr(perturbation, "tangential", None)):
+            raise ValueError(
+                f"{perturbation!r} was not flown in this run and does not say how it launches along the surface; "
+                "name it when the run starts: simulation.run(n, emissions=[...])"
+            )
+        if self.responses is None:
+            raise ValueError(f"this run has no responses and {perturbation!r} was not flown in it")
+        settings = self.response_settings
+        rolled, first, second = perturbation.tangential(self.emissions, IonRandom(self.seed, self.emissions.ions))
+        velocities = settings.reduced(np.column_stack([first, second]), self.emissions.masses)
+        values = np.empty((len(self), 3))
+        for design, coefficients, chosen in (
+            (settings.site, self.responses.site, ~rolled),
+            (settings.rolled, self.responses.rolled, rolled),
+        ):
+            every = slice(None) if chosen.all() else chosen
+            values[every] = design.evaluate(coefficients[every], velocities[every])
+        return self._hits(*unflattened(values), perturbation)
+
+    def _hits(self, directions, times, perturbation):
+        x, y, outcome = self.detector.impacts(directions)
+        emissions = self.emissions
+        return Hits(
+            x=x,
+            y=y,
+            time_of_flight=times,
+            voltage=np.full(len(self), self.voltage),
+            mass_to_charge=emissions.masses / emissions.charge_states,
+            positions=emissions.positions,
+            site=self.site,
+            ion=emissions.ions,
+            outcome=outcome,
+            source=f"simulation, {_describe(perturbation)}",
+        )
+
+    def summary(self):
+        """Counts of what happened, dict: ions, outcomes of the first perturbation, ions that cannot roll, marked."""
+        first = self.perturbations[0] if self.flown else from_dict({"name": "Unperturbed"})
+        counts = {outcome.name.lower(): count for outcome, count in self.hits(first).counts.items()}
+        return {
+            "ions": len(self),
+            "perturbation": _describe(first),
+            **counts,
+            "without_neighbour": int((~np.isfinite(self.emissions.neighbours).all(axis=1)).sum()),
+            "marked": int(self.marked.sum()),
+            "ended": self.ended,
+        }
+
+    # ---- parts -----------------------------------------------------------------------------------------------------
+
+    @classmethod
+    def join(cls, runs):
+        """Join the parts of one run, in their order, into one."""
+        first = runs[0]
+        emissions = Emissions(
+            **{
+                name: np.concatenate([getattr(run.emissions, name) for run in runs])
+                for name in ("positions", "normals", "neighbours", "charge_states", "masses", "ions")
+            },
+            nearest_neighbour_distance=first.emissions.nearest_neighbour_distance,
+        )
+        columns = {
+            name: np.concatenate([getattr(run, name) for run in runs])
+            for name in ("site", "species", "charges", "fields")
+        }
+        flown = tuple(
+            Flown(
+                np.concatenate([part.directions for part in parts]),
+                np.concatenate([part.times for part in parts]),
+            )
+            for parts in zip(*(run.flown for run in runs), strict=True)
+        )
+        responses = None
+        if first.responses is not None:
+            responses = Responses(
+                *(np.concatenate(parts) for parts in zip(*(run.responses for run in runs), strict=True))
+            )
+        return replace(first, emissions=emissions, flown=flown, responses=responses, **columns)
+
+    def ended_by(self, reason):
+        """Return the same run with the reason why it ended before its time."""
+        return replace(self, ended=reason)
+
+    # ---- files -----------------------------------------------------------------------------------------------------
+
+    def save(self, path):
+        """Write the run to an HDF5 file, whole or not at all.
+
+        Parameters
+        ----------
+        path : str or path-like
+            The file to write or overwrite.
+
+        Raises
+        ------
+        FileError
+            If it cannot be written.
+        """
+        with replace_file(path) as target, h5py.File(target, "w") as file:
+            file.attrs["format"] = FORMAT
+            file.attrs["provenance"] = json.dumps(self.provenance)
+            file.attrs["settings"] = json.dumps(self.settings, default=_plain)
+            file.attrs["elements"] = json.dumps(self.elements)
+            file.attrs["ended"] = self.ended
+            file.attrs["nearest_neighbour_distance"] = self.emissions.nearest_neighbour_distance
+            ions = file.create_group("ions")
+            for name in ("positions", "normals", "neighbours", "charge_states", "masses", "ions"):
+                ions[name] = getattr(self.emissions, name)
+            for name in ("site", "species", "charges", "fields"):
+                ions[name] = getattr(self, name)
+            for name, unit in _UNITS.items():
+                ions[name].attrs["units"] = unit
+            for index, (perturbation, flown) in enumerate(zip(self.perturbations, self.flown, strict=True)):
+                group = file.create_group(f"flown/{index}")
+                group.attrs["perturbation"] = json.dumps(
+                    perturbation if isinstance(perturbation, dict) else to_dict(perturbation)
+                )
+                group["directions"] = flown.directions
+                group["times"] = flown.times
+                group["times"].attrs["units"] = "ns"
+            if self.responses is not None:
+                group = file.create_group("responses")
+                for name, values in self.responses._asdict().items():
+                    group[name] = values
+                group["residuals"].attrs["units"] = "mm"
+
+
+_UNITS = {
+    "positions": "nm",
+    "neighbours": "nm",
+    "charge_states": "e",
+    "masses": "Da",
+    "charges": "e",
+    "fields": "V/nm",
+}
+
+
+def load(path):
+    """Read a run from an HDF5 file that `Run.save` wrote.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file.
+
+    Returns
+    -------
+    Run
+
+    Raises
+    ------
+    FileError
+        If it is missing, unreadable, damaged or not a run.
+    """
+    with open_for_reading(path):
+        pass  # says why it cannot be opened better than HDF5 does
+    try:
+        with h5py.File(check_path(path), "r") as file:
+            kind = file.attrs.get("format")
+            if kind != FORMAT:
+                raise FileError(f"{str(path)!r} is not a run of this version: expected {FORMAT!r}, got {kind!r}")
+            return _read(file)
+    except (OSError, KeyError, RuntimeError, json.JSONDecodeError) as error:
+        raise FileError(f"cannot read {str(path)!r} as a run: {str(error).splitlines()[0]}") from error
+
+
+def _read(file):
+    settings = json.loads(file.attrs["settings"])
+    columns = {name: dataset[()] for name, dataset in file["ions"].items()}
+    kept = {name: columns.pop(name) for name in ("site", "species", "charges", "fields")}
+    perturbations, flown = [], []
+    for index in range(len(file.get("flown", ()))):
+        group = file[f"flown/{index}"]
+        described = json.loads(group.attrs["perturbation"])
+        perturbations.append(described if "repr" in described else from_dict(described))
+        flown.append(Flown(group["directions"][()], group["times"][()]))
+    responses = None
+    if "responses" in file:
+        responses = Responses(**{name: dataset[()] for name, dataset in file["responses"].items()})
+    designs = settings["responses"]
+    return Run(
+        emissions=Emissions(**columns, nearest_neighbour_distance=float(file.attrs["nearest_neighbour_distance"])),
+        **kept,
+        perturbations=tuple(perturbations),
+        flown=tuple(flown),
+        responses=responses,
+        seed=settings["seed"],
+        voltage=settings["voltage"],
+        detector=Detector(**settings["detector"]),
+        response_settings=ResponseSettings(
+            energy_limit=designs["energy_limit"],
+            bound=designs["bound"],
+            site=Design(**designs["site"]),
+            rolled=Design(**designs["rolled"]),
+        ),
+        elements=tuple(json.loads(file.attrs["elements"])),
+        settings=settings,
+        ended=file.attrs["ended"],
+        provenance=json.loads(file.attrs["provenance"]),
+    )
+
+
+def _describe(perturbation):
+    return perturbation["repr"] if isinstance(perturbation, dict) else repr(perturbation)
+
+
+def _plain(value):
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    raise TypeError(f"a setting must be a plain number, text or list, got {value!r}")

@@ -1,0 +1,388 @@
+"""The simulation: atoms leave one by one, their flights follow in parallel, and a run comes out.
+
+Events and flights are a pipeline. While a batch of events happens, the flights of the batch before are flown on copies
+of the surface that replay the events one by one, so each ion flies in exactly the field that its own event left behind,
+whatever the number of threads and the size of a batch.
+"""
+
+import signal
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from tqdm.auto import tqdm
+
+from apt_evap._arrays import check_count, check_number
+from apt_evap._core.flight import LEFT, Flights
+from apt_evap._threads import thread_count
+from apt_evap.detector import Detector
+from apt_evap.emission import Emissions, tangent_frame
+from apt_evap.emitter import EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, Emitter
+from apt_evap.ion_random import IonRandom
+from apt_evap.law import Extremal
+from apt_evap.perturbation import Unperturbed
+from apt_evap.response import Responses, ResponseSettings, flattened
+from apt_evap.run import Flown, Run
+from apt_evap.units import COULOMB, FLIGHT_TIME
+
+BATCH = 256  # events at a time; the results do not depend on it
+
+
+@dataclass(frozen=True)
+class FlightSettings:
+    """How the flights are integrated.
+
+    Parameters
+    ----------
+    opening_angle : float
+        Full angle under which a cell of the octree stands for its atoms [rad]. Measured on Ni[111], R = 20 a: 0.3 puts
+        ions within 2 um (median) and 6 um (largest of 40) of where exact sums put them on a detector at 100 mm.
+    tolerance : float
+        Error of a step relative to path and velocity; at 1e-3 it moves ions by 0.1 um.
+    reach : float
+        Distance from the apex, in nearest neighbour distances, at which a flight ends and the ion goes straight on;
+        11,314 is 8,000 lattice constants of fcc, as in Shaikh et al.
+    most_steps : int
+        Steps after which an ion counts as one that never left.
+    """
+
+    opening_angle: float = 0.3
+    tolerance: float = 1e-3
+    reach: float = 11314.0
+    most_steps: int = 500
+
+    def __post_init__(self):
+        check_number(self.opening_angle, "opening_angle", at_least=0, at_most=1.0, unit="rad")
+        check_number(self.tolerance, "tolerance", above=0, at_most=0.1)
+        check_number(self.reach, "reach", at_least=100, unit="d_nn")
+        check_count(self.most_steps, "most_steps", at_least=1)
+
+
+class Simulation:
+    """Field evaporation of a specimen in front of a detector.
+
+    Parameters
+    ----------
+    tip : Tip
+        The specimen.
+    voltage : float
+        Applied voltage [V].
+    seed : int
+        Seed of the random numbers of the perturbations.
+    detector : Detector, optional
+        By default a square of 300 mm at 100 mm.
+    law : Extremal, optional
+        Which atom leaves next.
+    charge_settings : ChargeSettings, optional
+        How finely charges are solved.
+    flight_settings : FlightSettings, optional
+        How flights are integrated.
+    response_settings : ResponseSettings, optional
+        Flights and polynomials of the responses.
+    n_threads : int, optional
+        Threads; by default the processors this process may use. The results do not depend on it.
+
+    Raises
+    ------
+    ValueError
+        If a setting is out of its range.
+    """
+
+    def __init__(
+        self,
+        tip,
+        voltage=1000.0,
+        seed=0,
+        detector=None,
+        law=None,
+        charge_settings=None,
+        flight_settings=None,
+        response_settings=None,
+        n_threads=None,
+    ):
+        self.tip = tip
+        self.voltage = check_number(voltage, "voltage", above=0, unit="V")
+        self.seed = check_count(seed, "seed")
+        self.detector = detector or Detector()
+        self.law = law or Extremal()
+        self.flight_settings = flight_settings or FlightSettings()
+        self.response_settings = response_settings or ResponseSettings()
+        self.n_threads = thread_count(n_threads)
+        self.emitter = Emitter(tip, self.voltage, self.law, charge_settings, self.n_threads)
+        self.n_evaporated = 0
+        self._workers = []
+
+    def __repr__(self):
+        return f"<Simulation of {self.tip!r}, {self.voltage:g} V, {self.n_evaporated:,} atoms evaporated>"
+
+    def run(self, n_ions, emissions=(), *, responses=True, progress=None, batch_size=BATCH):
+        """Evaporate atoms and fly their ions.
+
+        Ctrl-C ends the run after the batch under way, with everything done so far; a second one ends it at once. A run
+        after a run goes on where the one before ended.
+
+        Parameters
+        ----------
+        n_ions : int
+            Number of atoms to evaporate.
+        emissions : sequence of perturbations
+            Flown as they are, beside the responses: needed for one of your own that launches from elsewhere than the
+            site or the rolled-up position.
+        responses : bool
+            Whether to fly what the responses need, so that `Run.hits` takes any built-in perturbation afterwards.
+            Without, and without `emissions`, the unperturbed ions are flown.
+        progress : bool, optional
+            Whether to show a progress bar; by default if the output is a terminal or a notebook.
+        batch_size : int
+            Events at a time; the results do not depend on it.
+
+        Returns
+        -------
+        Run
+
+        Raises
+        ------
+        ValueError
+            If an argument is out of its range, or a perturbation has no `launch`.
+        """
+        n_ions = check_count(n_ions, "n_ions", at_least=1)
+        batch_size = check_count(batch_size, "batch_size", at_least=1)
+        emissions = tuple(emissions)
+        for perturbation in emissions:
+            if not callable(getattr(perturbation, "launch", None)):
+                raise ValueError(f"emissions must be perturbations with a method launch, got {perturbation!r}")
+        if not emissions and not responses:
+            emissions = (Unperturbed(),)
+        parts, ended = [], ""
+        disable = None if progress is None else not progress
+        with (
+            tqdm(total=n_ions, unit=" ions", smoothing=0.1, disable=disable, mininterval=0.5) as bar,
+            ThreadPoolExecutor(self.n_threads) as pool,
+            _interruptible() as interrupted,
+        ):
+
+            def collect():
+                while waiting:
+                    parts.append(waiting.pop()())
+                    bar.update(len(parts[-1]))
+
+            waiting = []
+            started = 0
+            while started < n_ions and not ended:
+                batch = self.emitter.evaporate(min(batch_size, n_ions - started))
+                started += len(batch)
+                collect()
+                waiting.append(self._start_flights(batch, emissions, responses, pool))
+                if self.n_threads == 1:
+                    collect()
+                if batch.status == SWEEP_DUE:
+                    self.emitter.relax()
+                elif batch.status == EXHAUSTED:
+                    ended = "no atom is left that may evaporate"
+                elif batch.status == TOO_SHALLOW:
+                    ended = "evaporation reached the depth to which the specimen is held"
+                if interrupted.is_set():
+                    ended = "interrupted"
+            collect()
+        run = Run.join(parts)
+        return run.ended_by(ended) if ended else run
+
+    # ---- one batch -------------------------------------------------------------------------------------------------
+
+    def _start_flights(self, batch, emissions, responses, pool):
+        """Begin the flights of a batch; return a function that waits for them and gives the batch as a Run."""
+        ions = np.arange(self.n_evaporated, self.n_evaporated + len(batch))
+        self.n_evaporated += len(batch)
+        emitted = self._emissions(batch, ions)
+        launches = [perturbation.launch(emitted, IonRandom(self.seed, ions)) for perturbation in emissions]
+        for perturbation, launch in zip(emissions, launches, strict=True):
+            if len(launch.positions) != len(batch):
+                raise ValueError(
+                    f"{perturbation!r} must launch {len(batch)} ions, one per emission, got {len(launch.positions)}"
+                )
+        slowness = FLIGHT_TIME * np.sqrt(emitted.masses / emitted.charge_states)  # ns per reduced time
+        groups = [(launch.positions[:, None], (launch.velocities * slowness[:, None])[:, None]) for launch in launches]
+        if responses:
+            groups += self._designs(emitted)
+        flight = self._fly(batch, groups, pool)
+
+        def finish():
+            ends = flight()
+            flown = []
+            for position, velocity, time, left in ends[: len(emissions)]:
+                directions, times = self._landed(position[:, 0], velocity[:, 0], time[:, 0], left[:, 0], slowness)
+                flown.append(Flown(directions, times))
+            fitted = self._fit(ends[len(emissions) :], slowness) if responses else None
+            return Run(
+                emissions=emitted,
+                site=batch.site,
+                species=self.tip.species[batch.site],
+                charges=batch.charges,
+                fields=batch.fields,
+                perturbations=emissions,
+                flown=tuple(flown),
+                responses=fitted,
+                seed=self.seed,
+                voltage=self.voltage,
+                detector=self.detector,
+                response_settings=self.response_settings,
+                elements=tuple(element.name for element in self.tip.elements),
+                settings=self.settings,
+            )
+
+        return finish
+
+    def _emissions(self, batch, ions):
+        species = self.tip.species[batch.site]
+        positions = self.tip.positions
+        neighbours = np.where((batch.neighbour >= 0)[:, None], positions[batch.neighbour], np.nan)
+        return Emissions(
+            positions=positions[batch.site],
+            normals=batch.normals,
+            neighbours=neighbours,
+            charge_states=self.tip.charge_states[species],
+            masses=self.tip.masses[species],
+            ions=ions,
+            nearest_neighbour_distance=self.tip.nearest_neighbour_distance,
+        )
+
+    def _designs(self, emitted):
+        """Launches of the two designs: positions and velocities of shape (n, m, 3)."""
+        settings = self.response_settings
+        first, second = tangent_frame(emitted.normals)
+        lifted = emitted.neighbours + emitted.nearest_neighbour_distance * emitted.normals
+        groups = []
+        for design, start in ((settings.site, emitted.positions), (settings.rolled, lifted)):
+            speeds = settings.launched(design.velocities, emitted.charge_states)
+            velocities = speeds[..., :1] * first[:, None] + speeds[..., 1:] * second[:, None]
+            groups.append((np.broadcast_to(start[:, None], velocities.shape), velocities))
+        return groups
+
+    def _fly(self, batch, groups, pool):
+        """Fly groups of launches (n, m, 3) of every ion of a batch; give their ends once they are there."""
+        flights = self.flight_settings
+        if batch.tree is not None:
+            while len(self._workers) < self.n_threads:
+                self._workers.append(
+                    Flights(
+                        batch.tree,
+                        coulomb=COULOMB,
+                        length=self.tip.nearest_neighbour_distance,
+                        centre=(0.0, 0.0, self.tip.apex),
+                        reach=flights.reach * self.tip.nearest_neighbour_distance,
+                        opening_angle=flights.opening_angle,
+                        tolerance=flights.tolerance,
+                        most_steps=flights.most_steps,
+                    )
+                )
+        n, sizes = len(batch), [group[0].shape[1] for group in groups]
+        positions = np.concatenate([group[0] for group in groups], axis=1).reshape(-1, 3)
+        velocities = np.concatenate([group[1] for group in groups], axis=1).reshape(-1, 3)
+        # an ion without a neighbour has no rolled-up position: its launches are not flown
+        flown = np.isfinite(positions).all(axis=1)
+        counts = np.concatenate(
+            [
+                flown.reshape(n, -1)[:, start : start + size].sum(axis=1)[:, None]
+                for start, size in zip(np.cumsum([0, *sizes[:-1]]), sizes, strict=True)
+            ],
+            axis=1,
+        ).ravel()
+        end = np.empty((int(counts.sum()), 7))
+        outcome = np.empty(len(end), np.int8)
+        job = (
+            batch.journal,
+            np.repeat(np.arange(n), len(groups)),
+            np.concatenate([[0], np.cumsum(counts)]),
+            np.ascontiguousarray(positions[flown]),
+            np.ascontiguousarray(velocities[flown]),
+            end,
+            outcome,
+            np.zeros(1, np.int64),
+        )
+
+        def work(worker):
+            if batch.tree is not None:
+                worker.begin(batch.tree)
+            else:
+                worker.go_on()
+            worker.fly(*job)
+
+        futures = [pool.submit(work, worker) for worker in self._workers]
+
+        def wait():
+            for future in futures:
+                future.result()
+            ends = np.full((len(flown), 7), np.nan)
+            ends[flown] = end
+            left = np.zeros(len(flown), bool)
+            left[flown] = outcome == LEFT
+            ends, left = ends.reshape(n, -1, 7), left.reshape(n, -1)
+            edges = np.cumsum([0, *sizes])
+            return [(ends[:, a:b, :3], ends[:, a:b, 3:6], ends[:, a:b, 6], left[:, a:b]) for a, b in pairwise(edges)]
+
+        return wait
+
+    def _landed(self, position, velocity, time, left, slowness):
+        """Stereographic directions (n, 2) and times of flight (n,) [ns]; NaN where an ion never left."""
+        directions, remaining = self.detector.directions(position, velocity, self.tip.apex)
+        directions[~left] = np.nan
+        return directions, np.where(left, (time + remaining) * slowness, np.nan)
+
+    def _fit(self, ends, slowness):
+        coefficients, residuals = [], []
+        designs = (self.response_settings.site, self.response_settings.rolled)
+        for design, (position, velocity, time, left) in zip(designs, ends, strict=True):
+            n, m = left.shape
+            directions, times = self._landed(
+                position.reshape(-1, 3),
+                velocity.reshape(-1, 3),
+                time.ravel(),
+                left.ravel(),
+                np.repeat(slowness, m),
+            )
+            fitted, residual = design.fit(flattened(directions, times).reshape(n, m, 3))
+            coefficients.append(fitted)
+            # a small change of the stereographic direction is half as large on a plane at unit distance
+            residuals.append(2.0 * self.detector.distance * residual)
+        return Responses(*coefficients, np.stack(residuals, axis=1).astype(np.float32))
+
+    @property
+    def settings(self):
+        """Everything the run was made with, in plain types."""
+        return {
+            "tip": self.tip.settings,
+            "voltage": self.voltage,
+            "seed": self.seed,
+            "detector": vars(self.detector),
+            "law": {"name": type(self.law).__name__},
+            "charges": vars(self.emitter.settings),
+            "flights": vars(self.flight_settings),
+            "responses": {
+                "energy_limit": self.response_settings.energy_limit,
+                "bound": self.response_settings.bound,
+                "site": vars(self.response_settings.site),
+                "rolled": vars(self.response_settings.rolled),
+            },
+        }
+
+
+@contextmanager
+def _interruptible():
+    """Turn the first Ctrl-C into a flag, so that the batch under way is kept; the second one interrupts."""
+    flag = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield flag
+        return
+
+    def note(number, frame):
+        flag.set()
+        signal.signal(signal.SIGINT, before)
+
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield flag
+    finally:
+        signal.signal(signal.SIGINT, before)

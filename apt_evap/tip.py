@@ -1,0 +1,330 @@
+"""The specimen: a crystal (or any arrangement of atoms) in the shape of a tip."""
+
+from dataclasses import asdict
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from apt_evap import lattice
+from apt_evap._arrays import check_array, check_count, check_number
+from apt_evap.material import Material
+from apt_evap.material import material as known_material
+from apt_evap.shape import TaperedCap
+
+_BYTES_PER_ATOM = 100  # at the peak of building a tip, measured 70 to 96
+_SAMPLE = 10_000  # atoms asked for their nearest neighbour
+
+
+class Tip:
+    """A crystal in the shape of a field emitter: a spherical cap on a shank that widens downwards.
+
+    The shape is a `TaperedCap`: the centre of the cap is the origin, the apex is at z = R, and the shank
+    points down to z = -L. Atoms below z = -L/2 never evaporate.
+
+    Parameters
+    ----------
+    material : Material or str
+        The crystal; a str is looked up by `material`.
+    apex_radius : float
+        Radius R of the cap [nm].
+    axis : sequence of int
+        Crystal direction along +z, see `rotation_to_axis`.
+    shank_angle : float
+        Half the opening angle of the shank [degrees], at least 0 and below 45.
+    shank_length : float, optional
+        Length L of the shank [nm]; 2 R if not given.
+    base : str
+        "rounded" or "flat".
+    rotation : float
+        Rotation of the crystal about z [degrees].
+    origin : sequence of float
+        Where the lattice has an atom [nm]; an atom at the centre of the cap makes the tip symmetric.
+    offset_seed : int, optional
+        Moves the lattice by a random part of its cell on top of `origin`: a tip without symmetry.
+    depth : float, optional
+        Hold only atoms at most this far below the surface [nm]; None holds all of them. The innermost layer,
+        one neighbourhood thick, is `support`.
+    solutes : mapping, optional
+        Substitutional solutes of a random alloy: atomic fraction by element (str or Material).
+    seed : int, optional
+        Seed of the random alloy, needed with `solutes`.
+
+    Attributes
+    ----------
+    positions : ndarray
+        Atoms [nm], shape (n, 3).
+    elements : tuple of Material
+        The species.
+    species : ndarray of int32
+        Index into `elements`, shape (n,).
+    evaporable, support : ndarray of bool
+        Whether an atom may leave; whether it only completes the neighbourhoods of others, shape (n,).
+    nearest_neighbour_distance, neighbour_radius, surface_threshold : float
+        d_nn [nm]; the radius of the neighbourhood whose mean position tells surface atoms, and how far from
+        that mean a surface atom is [nm], see `lattice.SURFACE_FACTORS`.
+    evaporation_fields, charge_states, masses : ndarray
+        Of each species [V/nm], [e], [Da].
+    apex : float
+        z of the apex [nm].
+    potential_point : ndarray
+        Where the potential is the applied voltage [nm], shape (3,).
+    settings : dict
+        What the tip was made from, in plain types.
+
+    Raises
+    ------
+    ValueError
+        For a shape that is impossible, or that needs more memory than there is.
+    """
+
+    def __init__(
+        self,
+        material,
+        apex_radius,
+        axis=(0, 0, 1),
+        shank_angle=1.5,
+        shank_length=None,
+        base="rounded",
+        rotation=0.0,
+        origin=(0.0, 0.0, 0.0),
+        offset_seed=None,
+        depth=None,
+        solutes=None,
+        seed=None,
+    ):
+        host = _as_material(material)
+        d = host.nearest_neighbour_distance
+        radius = check_number(apex_radius, "apex_radius", at_least=3 * d, unit="nm")
+        length = 2 * radius if shank_length is None else shank_length
+        self._shape = shape = TaperedCap(radius, length, shank_angle, base)
+        origin = check_array(origin, "origin", (3,))
+        self._set_neighbourhood(host.structure, d)
+        if depth is not None:
+            depth = check_number(depth, "depth", above=self.neighbour_radius, unit="nm")
+        fractions = _check_solutes(solutes, seed)
+        _check_memory(self._shape.volume(depth) * lattice.atom_density(host.structure, host.a, host.c))
+
+        orientation = lattice.rotation_to_axis(host, axis, rotation)
+        shift = origin
+        if offset_seed is not None:
+            part = np.random.default_rng(check_count(offset_seed, "offset_seed")).random(3)
+            shift = origin + orientation @ (part * lattice.cell_lengths(host.structure, host.a, host.c))
+        self.positions = lattice.lattice_points_in(
+            host.structure,
+            host.a,
+            host.c,
+            orientation,
+            shift,
+            self.signed_distance,
+            self._shape.bounds,
+            depth=depth,
+            tolerance=1e-6 * d,  # sites on the surface stay together whatever their rounding
+        )
+        n = len(self.positions)
+        self.support = np.zeros(n, dtype=bool)
+        if depth is not None:
+            self.support = self.signed_distance(self.positions) < self.neighbour_radius - depth
+        self.evaporable = (self.positions[:, 2] >= -shape.shank_length / 2) & ~self.support
+        self._set_elements((host, *fractions), np.zeros(n, dtype=np.int32))
+        if fractions:
+            edges = np.cumsum(list(fractions.values()))
+            drawn = np.searchsorted(edges, np.random.default_rng(seed).random(n), side="right")
+            self.species[:] = (drawn + 1) % (len(fractions) + 1)
+        self.apex = radius
+        self.potential_point = np.zeros(3)
+        self.settings = {
+            "material": asdict(host),
+            "apex_radius": radius,
+            "axis": [int(index) for index in axis],
+            "shank_angle": shape.shank_angle,
+            "shank_length": shape.shank_length,
+            "base": base,
+            "rotation": float(rotation),
+            "origin": origin.tolist(),
+            "offset_seed": None if offset_seed is None else int(offset_seed),
+            "depth": depth,
+            "solutes": [[asdict(solute), fraction] for solute, fraction in fractions.items()],
+            "seed": None if seed is None else int(seed),
+        }
+
+    @classmethod
+    def from_positions(
+        cls,
+        positions,
+        species,
+        elements,
+        evaporable=None,
+        neighbour_radius=None,
+        surface_threshold=None,
+        potential_point=None,
+    ):
+        """Make a tip of any arrangement of atoms, its axis along +z.
+
+        Parameters
+        ----------
+        positions : array_like
+            Atoms [nm], shape (n, 3).
+        species : array_like of int
+            Index of each atom into `elements`, shape (n,).
+        elements : sequence of Material or str
+            The species; the structure of the first one says how surface atoms are told.
+        evaporable : array_like of bool, optional
+            Which atoms may leave, shape (n,); the upper half of the tip's height if not given, because the
+            rim of a cut base carries the largest charges of all.
+        neighbour_radius, surface_threshold : float, optional
+            [nm]; from the measured nearest neighbour distance (a median) if not given.
+        potential_point : array_like, optional
+            Where the potential is the applied voltage [nm], shape (3,): any point well inside the cap. On the
+            mean axis, as far below the apex as the tip is wide to the side, if not given.
+
+        Returns
+        -------
+        Tip
+
+        Raises
+        ------
+        ValueError
+            If shapes disagree, an index names no element, or two atoms are at the same place.
+        """
+        tip = cls.__new__(cls)
+        tip._shape = None
+        tip.positions = check_array(positions, "positions", ("n", 3))
+        n = len(tip.positions)
+        if n < 2:
+            raise ValueError(f"positions must hold at least 2 atoms, got {n}")
+        elements = tuple(_as_material(element) for element in elements)
+        if not elements:
+            raise ValueError("elements must name at least one material, got none")
+        tip._set_elements(elements, check_array(species, "species", (n,), dtype=np.int32))
+        if not 0 <= tip.species.min() <= tip.species.max() < len(elements):
+            raise ValueError(
+                f"species must be indices from 0 to {len(elements) - 1}, got {tip.species.min()} to {tip.species.max()}"
+            )
+        sample = tip.positions[:: max(1, n // _SAMPLE)]
+        distances = cKDTree(tip.positions).query(sample, k=2)[0][:, 1]
+        if not distances.min() > 0:
+            raise ValueError("positions must be distinct, got two atoms at the same place")
+        tip._set_neighbourhood(elements[0].structure, float(np.median(distances)))
+        if neighbour_radius is not None:
+            tip.neighbour_radius = check_number(neighbour_radius, "neighbour_radius", above=0, unit="nm")
+        if surface_threshold is not None:
+            tip.surface_threshold = check_number(surface_threshold, "surface_threshold", above=0, unit="nm")
+        low, high = tip.positions.min(axis=0), tip.positions.max(axis=0)
+        tip.apex = float(high[2])
+        if evaporable is None:
+            evaporable = tip.positions[:, 2] >= (low[2] + high[2]) / 2
+        if np.shape(evaporable) != (n,) or np.asarray(evaporable).dtype != bool:
+            raise ValueError(f"evaporable must be true or false for each of the {n} atoms, shape ({n},)")
+        tip.evaporable = np.array(evaporable)
+        tip.support = np.zeros(n, dtype=bool)
+        if potential_point is None:
+            below = min((high[0] - low[0]) / 2, (high[1] - low[1]) / 2, (high[2] - low[2]) / 2)
+            potential_point = [*tip.positions[:, :2].mean(axis=0), high[2] - below]
+        tip.potential_point = check_array(potential_point, "potential_point", (3,))
+        tip.settings = {
+            "atoms": n,
+            "elements": [asdict(element) for element in elements],
+            "neighbour_radius": tip.neighbour_radius,
+            "surface_threshold": tip.surface_threshold,
+            "potential_point": tip.potential_point.tolist(),
+        }
+        return tip
+
+    @classmethod
+    def from_settings(cls, settings):
+        """Make the tip again that has these `settings`; one made from positions has none to go by.
+
+        Raises
+        ------
+        ValueError
+            If a setting is unknown or the tip was made from positions.
+        """
+        settings = dict(settings)
+        if "apex_radius" not in settings:
+            raise ValueError(
+                f"settings must hold 'apex_radius' (a tip made from positions needs those), got {', '.join(settings)}"
+            )
+        settings["material"] = Material(**settings["material"])
+        settings["solutes"] = {Material(**solute): fraction for solute, fraction in settings.get("solutes") or ()}
+        try:
+            return cls(**settings)
+        except TypeError as error:
+            raise ValueError(f"settings of a tip: {error}") from error
+
+    def __len__(self):
+        return len(self.positions)
+
+    def __repr__(self):
+        names = "-".join(element.name for element in self.elements)
+        if self._shape is None:
+            return f"<Tip: {len(self)} atoms of {names} from positions>"
+        shape = self._shape
+        axis = " ".join(str(index) for index in self.settings["axis"])
+        return (
+            f"<Tip: {len(self)} atoms of {names} [{axis}], apex radius {shape.apex_radius:.4g} nm, "
+            f"shank {shape.shank_length:.4g} nm at {shape.shank_angle:g} degrees, {shape.base} base>"
+        )
+
+    def signed_distance(self, points):
+        """Distance from the surface of the shape [nm], negative inside: see `TaperedCap.signed_distance`.
+
+        Raises
+        ------
+        ValueError
+            If the tip was made from positions.
+        """
+        if self._shape is None:
+            raise ValueError("a tip made from positions has no shape to measure a distance from")
+        return self._shape.signed_distance(points)
+
+    def _set_neighbourhood(self, structure, distance):
+        radius, threshold = lattice.SURFACE_FACTORS[structure]
+        self.nearest_neighbour_distance = distance
+        self.neighbour_radius = radius * distance
+        self.surface_threshold = threshold * distance
+
+    def _set_elements(self, elements, species):
+        self.elements = elements
+        self.species = species
+        self.evaporation_fields = np.array([element.evaporation_field for element in elements])
+        self.charge_states = np.array([element.charge_state for element in elements], dtype=np.int32)
+        self.masses = np.array([element.mass for element in elements])
+
+
+def _as_material(value):
+    if isinstance(value, str):
+        return known_material(value)
+    if not isinstance(value, Material):
+        raise ValueError(f"material must be a Material or the name of one, got {value!r}")
+    return value
+
+
+def _check_solutes(solutes, seed):
+    """Atomic fraction by Material."""
+    fractions = {}
+    for element, fraction in (solutes or {}).items():
+        solute = _as_material(element)
+        fractions[solute] = check_number(fraction, f"fraction of {solute.name}", above=0, at_most=1)
+    if sum(fractions.values()) > 1:
+        raise ValueError(f"solutes must have fractions that sum to at most 1, got {sum(fractions.values()):g}")
+    if fractions or seed is not None:
+        check_count(seed, "seed (the random places of the solutes are drawn from it)")
+    return fractions
+
+
+def _available_memory():
+    """Free memory [bytes], or None where the system does not say (other than Linux)."""
+    try:
+        with open("/proc/meminfo") as lines:
+            return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable"))
+    except (OSError, StopIteration):
+        return None
+
+
+def _check_memory(atoms):
+    needed, free = atoms * _BYTES_PER_ATOM, _available_memory()
+    if free is not None and needed > free:
+        raise ValueError(
+            f"a tip of {atoms:.2g} atoms needs about {needed / 1e9:.2g} GB, {free / 1e9:.2g} GB are free; "
+            "give depth=... to hold only the atoms near the surface, or a smaller apex_radius"
+        )
