@@ -121,6 +121,27 @@ def color_limits(map):
     return (float(low), float(high)) if high > low else (0.0, 2.0)
 
 
+def common_limits(maps):
+    """One colour scale for maps side by side: the 0.5 and 99.5 percentiles of the densities of all of them.
+
+    A low end below a twentieth of the high one becomes 0.
+
+    Parameters
+    ----------
+    maps : sequence of DetectorMap
+        The maps.
+
+    Returns
+    -------
+    tuple of float
+        Lowest and highest density; 0 and 2 if all are the same.
+    """
+    low, high = np.percentile(np.concatenate([map.density[map.mask] for map in maps]), [0.5, 99.5])
+    if not high > low:
+        return 0.0, 2.0
+    return (float(low) if low > high / 20 else 0.0), float(high)
+
+
 def describe(map):
     """Number of ions, size of the bins and smoothing of a map, as a caption (str)."""
     width, height = map.bin_size

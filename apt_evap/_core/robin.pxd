@@ -12,5 +12,6 @@ cdef class ChargingRule:
 
 cdef class Robin(ChargingRule):
     cdef readonly double tolerance
+    cdef readonly int window
     cdef double[::1] matrix, residual, change
     cdef double* grow(self, long n) noexcept nogil

@@ -4,6 +4,7 @@ q_i <- (s/2 pi) sum_{k != i} q_k n_i . (r_i - r_k)/|r_i - r_k|^3, with s, the ar
 that the total charge is kept (Rolland et al., Phil. Mag. 95, 1620, 2015; Robin 1886).
 """
 
+cimport cython
 from libc.math cimport M_PI, fabs
 
 import numpy as np
@@ -31,15 +32,19 @@ cdef class Robin(ChargingRule):
     ----------
     tolerance : float
         Largest change of a charge in the last iteration of a patch, relative to the mean charge.
+    window : int
+        Sweeps before the last that are mixed into the next charges; 0 is Robin's plain iteration.
     """
 
-    def __init__(self, double tolerance=1e-6):
+    def __init__(self, double tolerance=1e-6, int window=8):
         self.tolerance = tolerance
+        self.window = window
         self.area = 1.0
         self.matrix = np.empty(256 * 256)
         self.residual = np.empty(256)
         self.change = np.empty(256)
 
+    @cython.wraparound(True)
     def solve(self, Octree tree, const double[:, ::1] normals, InteractionLists lists, *, double tolerance=1e-6,
               int most_sweeps=200, bint double_precision=False, int n_threads=1):
         """Iterate over the whole surface from the charges the tree has.
@@ -69,24 +74,47 @@ cdef class Robin(ChargingRule):
             Largest change of a charge in the last one, relative to the mean charge.
         """
         cdef long n = tree.n_slots
-        cdef int sweeps
+        cdef int sweeps = 0
         cdef double residual = np.inf
         normal = np.asarray(normals)[:n]
         self.field = np.zeros((tree.x.shape[0], 3))
-        field = np.asarray(self.field)
-        total = tree.charges.sum()
-        sweeps = 0
+        field = np.asarray(self.field)[:n]
+        charges = tree.charges
+        total = charges.sum()
+        maps, steps = [], []   # of the last sweeps: what Robin's iteration made of the charges, and by how much
         for sweeps in range(1, most_sweeps + 1):
-            old = tree.charges.copy()
             tree.sweep(lists, self.field, double_precision, n_threads)
-            flux = np.einsum("ij,ij->i", field[:n], normal)
+            flux = np.einsum("ij,ij->i", field, normal)
             self.area = 2.0 * M_PI * total / flux.sum()
-            new = flux * (total / flux.sum())
-            tree.charges = new
-            residual = np.abs(new - old).max() * n / total
+            flux *= total / flux.sum()
+            maps.append(flux)
+            steps.append(flux - charges)
+            residual = np.abs(steps[-1]).max() * n / total
             if residual < tolerance:
+                tree.charges = flux
                 break
+            tree.charges = np.maximum(self.mixed(maps, steps), 0.0)
         return sweeps, residual
+
+    @cython.wraparound(True)
+    def mixed(self, maps, steps):
+        """Next charges by Anderson's mixing of the last sweeps (J. ACM 12, 547, 1965).
+
+        The combination of the last maps whose combined step is the smallest; a sum of charges that all maps share is
+        kept. einsum, not BLAS, makes the products: their bits do not depend on threads.
+        """
+        del maps[:-self.window - 1], steps[:-self.window - 1]
+        if len(steps) == 1:
+            return maps[-1]
+        step_changes = [steps[-1] - step for step in steps[:-1]]
+        gram = np.array([[np.einsum("i,i", a, b) for b in step_changes] for a in step_changes])
+        right = np.array([np.einsum("i,i", a, steps[-1]) for a in step_changes])
+        gram += 1e-12 * np.trace(gram) * np.eye(len(gram))   # equal steps: any share will do
+        shares = np.linalg.solve(gram, right)
+        charges = maps[-1].copy()
+        for share, other in zip(shares, maps[:-1]):
+            charges -= share * (maps[-1] - other)
+        return charges
 
     def scale(self, Octree tree, double factor):
         """Multiply all charges, and the fields they make, by a factor."""

@@ -1,0 +1,131 @@
+"""What a run or a file of ions holds, in plain types."""
+
+import numpy as np
+
+from apt_evap.binning import find_combs
+from apt_evap.run import Run
+
+UNITS = {
+    "x": "mm",
+    "y": "mm",
+    "time_of_flight": "ns",
+    "voltage": "V",
+    "pulse_voltage": "V",
+    "mass_to_charge": "Da",
+    "position_x": "nm",
+    "position_y": "nm",
+    "position_z": "nm",
+    "detector_extent": "mm",
+    "detector_quantum": "mm",
+    "distance": "mm",
+    "width": "mm",
+    "field_before_leaving": "V/nm",
+    "energy_limit": "eV",
+    "median_residual": "mm",
+    "marked_above": "mm",
+    "apex_radius": "nm",
+    "shank_length": "nm",
+    "shank_angle": "degrees",
+    "rotation": "degrees",
+    "origin": "nm",
+    "depth": "nm",
+    "a": "nm",
+    "c": "nm",
+    "evaporation_field": "V/nm",
+    "charge_state": "e",
+    "mass": "Da",
+    "polarizability": "F m^2",
+}
+"""Units of what `describe` gives, by key."""
+
+
+def describe(held):
+    """Say what a run or ions hold.
+
+    Parameters
+    ----------
+    held : Run or Hits
+        What `apt_evap.read` gives.
+
+    Returns
+    -------
+    dict
+        Plain types, what `apt-evap info` prints; a pair is the least and the greatest value. Units are in `UNITS`.
+    """
+    return _of_run(held) if isinstance(held, Run) else _of_hits(held)
+
+
+def _of_run(run):
+    summary = run.summary()
+    responses = None
+    if run.responses is not None:
+        settings, residuals = run.response_settings, run.responses.residuals[np.isfinite(run.responses.residuals)]
+        responses = {
+            "energy_limit": settings.energy_limit,
+            "median_residual": _plain(np.median(residuals)) if len(residuals) else None,
+            "marked_above": settings.bound,
+            "marked": summary["marked"],
+        }
+    return {
+        "kind": "simulated run",
+        "version": run.provenance.get("version"),
+        "created": run.provenance.get("created"),
+        "config": run.provenance.get("config"),
+        "ended": run.ended or "as planned",
+        "voltage": run.voltage,
+        "seed": run.seed,
+        "tip": _tip(run.settings["tip"]),
+        "detector": {"distance": run.detector.distance, "width": run.detector.width},
+        "ions": len(run),
+        "species": {name: int((run.species == index).sum()) for index, name in enumerate(run.elements)},
+        "field_before_leaving": _extent(run.fields),
+        "outcomes": {key: summary[key] for key in ("perturbation", "hit", "missed", "never_left")},
+        "without_neighbour_to_roll_onto": summary["without_neighbour"],
+        "perturbations_flown": [str(each["repr"] if isinstance(each, dict) else each) for each in run.perturbations],
+        "responses": responses,
+    }
+
+
+def _tip(settings):
+    """Settings of a tip that are given, without the sources of the materials."""
+    told = {key: value for key, value in settings.items() if value not in (None, [], {})}
+    if "material" in told:
+        host = told["material"].items()
+        told["material"] = {key: value for key, value in host if value is not None and key != "sources"}
+    if "solutes" in told:
+        told["solutes"] = {solute["name"]: fraction for solute, fraction in told["solutes"]}
+    if "elements" in told:
+        told["elements"] = [element["name"] for element in told["elements"]]
+    return told
+
+
+def _of_hits(hits):
+    columns = {}
+    for name in hits.columns:
+        values = getattr(hits, name)
+        parts = (
+            {name: values} if values.ndim == 1 else {f"position_{axis}": values[:, k] for k, axis in enumerate("xyz")}
+        )
+        columns |= {key: _extent(part) for key, part in parts.items()}
+    detected = hits.detected
+    told = {"kind": "measured ions", "ions": len(hits), "detected": int(np.count_nonzero(detected)), "columns": columns}
+    if hits.x is not None and hits.y is not None and detected.any():
+        x, y = hits.x[detected], hits.y[detected]
+        told["detector_extent"] = [_plain(np.ptp(x)), _plain(np.ptp(y))]
+        combs = find_combs(x, y)
+        told["detector_quantum"] = None if combs is None else [_plain(comb.spacing) for comb in combs]
+    if hits.multiplicity is not None:
+        told["multi_hit_share"] = _plain(np.mean(hits.multiplicity > 1))
+        told["largest_multi_hit"] = int(hits.multiplicity.max())
+    return told
+
+
+def _extent(values):
+    """Least and greatest of the finite values, None if there are none."""
+    finite = values[np.isfinite(values)]
+    return [_plain(finite.min()), _plain(finite.max())] if len(finite) else None
+
+
+def _plain(value):
+    """A number for people: whole ones as they are, others with six digits."""
+    return int(value) if isinstance(value, np.integer) else float(f"{value:.6g}")

@@ -1,0 +1,121 @@
+"""Slow twins of the compiled core in plain NumPy: the same physics, no tree, no lists, no patches."""
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+
+def potential(points, atoms, charges):
+    """Sum q/r at the points, shape (m,)."""
+    return np.array([(charges / np.linalg.norm(point - atoms, axis=1)).sum() for point in points])
+
+
+def field(points, atoms, charges):
+    """Sum q r/r^3 at the points, shape (m, 3); an atom at the very place of a point does not act on it."""
+    out = np.empty((len(points), 3))
+    for i, point in enumerate(points):
+        d = point - atoms
+        r2 = np.einsum("ij,ij->i", d, d)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            out[i] = np.where(r2 > 1e-12, charges / r2**1.5, 0.0) @ d
+    return out
+
+
+def moments(atoms, charges):
+    """Charge, centre of charge and traceless quadrupole sum q (3 d d - d^2), the ten numbers of a cell."""
+    total = charges.sum()
+    centre = charges @ atoms / total
+    d = atoms - centre
+    q = 3 * np.einsum("i,ij,ik->jk", charges, d, d) - np.eye(3) * (charges @ np.einsum("ij,ij->i", d, d))
+    return np.array([*centre, total, q[0, 0], q[0, 1], q[0, 2], q[1, 1], q[1, 2], q[2, 2]])
+
+
+class Surface:
+    """Surface atoms by the centre of mass of their neighbours, worked out anew by a k-d tree at every question."""
+
+    def __init__(self, positions, radius, threshold, support):
+        self.positions, self.radius, self.threshold, self.support = positions, radius, threshold, support
+        self.alive = np.ones(len(positions), bool)
+
+    def offsets(self):
+        """Mean offset of the neighbours of each atom, (n, 3), and their number, (n,); 0 for atoms taken away."""
+        left = np.flatnonzero(self.alive)
+        pairs = cKDTree(self.positions[left]).query_pairs(self.radius, output_type="ndarray")
+        pairs = left[np.concatenate([pairs, pairs[:, ::-1]])]
+        step = self.positions[pairs[:, 1]] - self.positions[pairs[:, 0]]
+        n = len(self.positions)
+        count = np.bincount(pairs[:, 0], minlength=n)
+        total = np.stack([np.bincount(pairs[:, 0], weights=step[:, axis], minlength=n) for axis in range(3)], axis=1)
+        return total / np.maximum(count, 1)[:, None], count
+
+    def exposed(self):
+        """Who is at the surface now, bool (n,)."""
+        mean, count = self.offsets()
+        far = (np.linalg.norm(mean, axis=1) > self.threshold) | (count == 0)
+        return far & self.alive & ~self.support
+
+
+def robin(positions, normals, tolerance=1e-12, most_sweeps=400):
+    """Charges (sum n) and area per atom of Robin's iteration, with the full matrix in float64."""
+    n = len(positions)
+    matrix = np.empty((n, n))
+    for i in range(n):
+        d = positions[i] - positions
+        r2 = np.einsum("ij,ij->i", d, d)
+        r2[i] = np.inf
+        matrix[i] = (d @ normals[i]) / r2**1.5
+    charges = np.ones(n)
+    for _ in range(most_sweeps):
+        flux = matrix @ charges
+        new = flux * (n / flux.sum())
+        change = np.abs(new - charges).max()
+        charges = new
+        if change < tolerance:
+            break
+    return charges, 2 * np.pi * n / (matrix @ charges).sum()
+
+
+def verlet(acceleration, position, velocity, centre, reach, factor, first_length):
+    """Velocity Verlet with dt = factor |v|/|a|, the first step by a length (Shaikh et al., arXiv 2509.13744).
+
+    Returns position, velocity, time and the number of steps at the first step beyond `reach` from `centre`.
+    """
+    x, v, time, steps = np.array(position), np.array(velocity), 0.0, 0
+    a = acceleration(x)
+    while np.linalg.norm(x - centre) < reach:
+        dt = factor * np.linalg.norm(v) / np.linalg.norm(a)
+        if steps == 0:
+            speed = np.linalg.norm(v)
+            dt = 2 * first_length / (speed + np.sqrt(speed**2 + 2 * first_length * np.linalg.norm(a)))
+        x = x + dt * (v + 0.5 * dt * a)
+        new = acceleration(x)
+        v = v + 0.5 * dt * (a + new)
+        a, time, steps = new, time + dt, steps + 1
+    return x, v, time, steps
+
+
+def hyperbola(strength, position, velocity, radius):
+    """Where and when a repelled particle, a = strength r/r^3, passes `radius` on its way out: (3,), (3,), time.
+
+    Closed form: r = A (e cosh F + 1), t = sqrt(A^3/strength) (e sinh F + F), with A = strength/(2 energy) (Landau and
+    Lifshitz, Mechanics, section 15). A start with an inward velocity has F < 0.
+    """
+    r0 = np.linalg.norm(position)
+    energy = 0.5 * velocity @ velocity + strength / r0
+    momentum = np.linalg.norm(np.cross(position, velocity))
+    a = strength / (2 * energy)
+    e = np.sqrt(1 + 2 * energy * momentum**2 / strength**2)
+    anomaly = [np.arccosh(max(1.0, (r / a - 1) / e)) for r in (r0, radius)]
+    if position @ velocity < 0:
+        anomaly[0] = -anomaly[0]
+    time = np.sqrt(a**3 / strength) * (e * np.sinh(anomaly[1]) + anomaly[1] - e * np.sinh(anomaly[0]) - anomaly[0])
+    outward = position / r0
+    sideways = velocity - (velocity @ outward) * outward
+    sideways = sideways / (np.linalg.norm(sideways) or 1.0)
+    # angle from the axis of the hyperbola
+    polar = [2 * np.arctan(np.sqrt((e - 1) / (e + 1)) * np.tanh(f / 2)) if e > 1 else 0.0 for f in anomaly]
+    polar = [np.arctan2(np.sqrt(e**2 - 1) * np.sinh(f), e + np.cosh(f)) for f in anomaly]
+    turn = polar[1] - polar[0]
+    direction = np.cos(turn) * outward + np.sin(turn) * sideways
+    across = -np.sin(turn) * outward + np.cos(turn) * sideways
+    radial = np.sqrt(max(0.0, 2 * (energy - strength / radius) - (momentum / radius) ** 2))
+    return radius * direction, radial * direction + momentum / radius * across, time
