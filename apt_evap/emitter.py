@@ -27,11 +27,11 @@ class ChargeSettings:
     opening_angle : float
         Full angle under which a cell of the octree stands for its atoms [rad]. 0.6 gives fields within 1e-4 (RMS).
     patch_radius : float
-        Charges are solved within this distance of a hole [d_nn]; 7 is 5 lattice constants of fcc.
+        Charges are solved within this distance of a hole [d_nn]; 8.5 is 6 lattice constants of fcc.
     update_radius : float
         Fields are kept up to date within this distance of a hole [d_nn].
     sweep_interval : int, optional
-        Events between two relaxations of the whole surface; by default a fortieth of the surface atoms.
+        Events between two relaxations of the whole surface; by default a two-hundredth of the surface atoms.
     tolerance : float
         Change of a charge, relative to the mean charge, at which a relaxation stops.
     start_tolerance : float
@@ -39,11 +39,11 @@ class ChargeSettings:
     """
 
     opening_angle: float = 0.6
-    patch_radius: float = 7.07
-    update_radius: float = 11.3
+    patch_radius: float = 8.5
+    update_radius: float = 12.0
     sweep_interval: int | None = None
-    tolerance: float = 1e-4
-    start_tolerance: float = 1e-8
+    tolerance: float = 1e-3
+    start_tolerance: float = 1e-5
 
     def __post_init__(self):
         check_number(self.opening_angle, "opening_angle", at_least=0, at_most=1.5, unit="rad")
@@ -121,18 +121,11 @@ class Emitter:
         self.settings = settings or ChargeSettings()
         self.n_threads = thread_count(n_threads)
         distance = tip.nearest_neighbour_distance
-        self._neighbourhood = Neighbourhood(
-            tip.positions,
-            tip.neighbour_radius,
-            tip.surface_threshold,
-            tip.support.astype(np.int8),
-            self.n_threads,
-        )
-        weights = check_array(self.law.weights(tip), "weights of the law", (len(tip.positions),))
-        if not weights[self._neighbourhood.surface].any():
+        neighbourhood, weights = self._neighbourhood_of(tip), self._weights_of(tip)
+        if not weights[neighbourhood.surface].any():
             raise ValueError(f"no surface atom of {tip!r} may leave, expected some evaporable ones")
         self._core = Evaporation(
-            self._neighbourhood,
+            neighbourhood,
             Robin(),
             weights,
             self.voltage / COULOMB,
@@ -144,8 +137,20 @@ class Emitter:
         )
         self._fresh = False
         self.relax(tolerance=self.settings.start_tolerance)
-        surface = len(self._neighbourhood.surface)
-        self._sweep_interval = self.settings.sweep_interval or max(100, surface // 40)
+        self._sweep_interval = self.settings.sweep_interval or max(100, len(self) // 200)
+
+    def _neighbourhood_of(self, tip, before=None):
+        return Neighbourhood(
+            tip.positions,
+            tip.neighbour_radius,
+            tip.surface_threshold,
+            tip.support.view(np.int8),
+            self.n_threads,
+            before,
+        )
+
+    def _weights_of(self, tip):
+        return check_array(self.law.weights(tip), "weights of the law", (len(tip.positions),))
 
     def __len__(self):
         return len(self._core.slots)
@@ -231,6 +236,21 @@ class Emitter:
         self._fresh = True
         return outcome
 
+    def deepen(self):
+        """Hold more of the specimen, after `evaporate` came upon atoms that are only held as support.
+
+        The atoms held so far keep their numbers.
+
+        Raises
+        ------
+        ValueError
+            If the specimen has nothing below: one made from positions.
+        """
+        self.tip = self.tip.deepened()
+        neighbourhood = self._neighbourhood_of(self.tip, self._core.atoms)
+        self._core.take_over(neighbourhood, self._weights_of(self.tip))
+        self.relax()
+
     def evaporate(self, most):
         """Let atoms leave, `most` of them or as many as leave before something has to be done first.
 
@@ -242,7 +262,8 @@ class Emitter:
         Returns
         -------
         Batch
-            Its status says why it ended: DONE, SWEEP_DUE (call `relax` and go on), EXHAUSTED, TOO_SHALLOW.
+            Its status says why it ended: DONE, SWEEP_DUE (call `relax` and go on), EXHAUSTED, TOO_SHALLOW (call
+            `deepen` and go on).
         """
         journal = Journal(self.tip.positions, most)
         site, neighbour = np.empty(most, np.int64), np.empty(most, np.int64)

@@ -184,8 +184,9 @@ def lattice_points_in(
         distance between the points.
     bounds : array_like
         Lower and upper corner of a box around the shape [nm], shape (2, 3).
-    depth : float, optional
-        Only points at most this far below the surface [nm].
+    depth : callable, optional
+        Takes points (n, 3) [nm], returns (n,) [nm]: only points at most this far below the surface. It must not
+        change faster than the distance between the points either.
     tolerance : float
         Points at most this far outside count as inside [nm]: points that lie on the surface but for rounding.
     block : int
@@ -207,11 +208,13 @@ def lattice_points_in(
     count = np.ceil((corners.max(axis=0) + 1) / block).astype(np.int64) - first
     reach = 0.5 * block * float(np.linalg.norm(lengths)) + tolerance
     cells = np.indices((block,) * 3).reshape(3, -1)
-    deepest = -math.inf if depth is None else -depth
 
     def inside(points, margin):
         distance = signed_distance(points)
-        return (distance <= margin) & (distance >= deepest - margin)
+        kept = distance <= margin
+        if depth is not None:
+            kept &= distance >= -(depth(points) + 2 * margin)
+        return kept
 
     def slab(layer):
         """Points of one layer of blocks, whose first cell indices no other layer has."""

@@ -87,7 +87,9 @@ class Design:
         coefficients = np.einsum("cm,nmk->nkc", np.linalg.pinv(matrix), values)
         misfit = np.einsum("mc,nkc->nmk", matrix, coefficients[:, :2]) - values[:, :, :2]
         freedom = max(1, len(matrix) - matrix.shape[1])
-        return coefficients.astype(np.float32), np.sqrt(np.einsum("nmk,nmk->n", misfit, misfit) / freedom)
+        return np.ascontiguousarray(coefficients, np.float32), np.sqrt(
+            np.einsum("nmk,nmk->n", misfit, misfit) / freedom
+        )
 
     def evaluate(self, coefficients, velocities):
         """Values of the polynomials of n ions, each at a velocity of its own; shape (n, 3)."""

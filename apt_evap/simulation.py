@@ -103,7 +103,6 @@ class Simulation:
         response_settings=None,
         n_threads=None,
     ):
-        self.tip = tip
         self.voltage = check_number(voltage, "voltage", above=0, unit="V")
         self.seed = check_count(seed, "seed")
         self.detector = detector or Detector()
@@ -114,6 +113,11 @@ class Simulation:
         self.emitter = Emitter(tip, self.voltage, self.law, charge_settings, self.n_threads)
         self.n_evaporated = 0
         self._workers = []
+
+    @property
+    def tip(self):
+        """The specimen, as deep as it is held by now."""
+        return self.emitter.tip
 
     def __repr__(self):
         return f"<Simulation of {self.tip!r}, {self.voltage:g} V, {self.n_evaporated:,} atoms evaporated>"
@@ -183,7 +187,7 @@ class Simulation:
                 elif batch.status == EXHAUSTED:
                     ended = "no atom is left that may evaporate"
                 elif batch.status == TOO_SHALLOW:
-                    ended = "evaporation reached the depth to which the specimen is held"
+                    self.emitter.deepen()
                 if interrupted.is_set():
                     ended = "interrupted"
             collect()
@@ -285,7 +289,7 @@ class Simulation:
         flown = np.isfinite(positions).all(axis=1)
         counts = np.concatenate(
             [
-                flown.reshape(n, -1)[:, start : start + size].sum(axis=1)[:, None]
+                flown.reshape(n, sum(sizes))[:, start : start + size].sum(axis=1)[:, None]
                 for start, size in zip(np.cumsum([0, *sizes[:-1]]), sizes, strict=True)
             ],
             axis=1,
@@ -319,7 +323,7 @@ class Simulation:
             ends[flown] = end
             left = np.zeros(len(flown), bool)
             left[flown] = outcome == LEFT
-            ends, left = ends.reshape(n, -1, 7), left.reshape(n, -1)
+            ends, left = ends.reshape(n, sum(sizes), 7), left.reshape(n, sum(sizes))
             edges = np.cumsum([0, *sizes])
             return [(ends[:, a:b, :3], ends[:, a:b, 3:6], ends[:, a:b, 6], left[:, a:b]) for a, b in pairwise(edges)]
 

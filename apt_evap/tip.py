@@ -12,6 +12,8 @@ from apt_evap.material import material as known_material
 from apt_evap.shape import TaperedCap
 
 _BYTES_PER_ATOM = 100  # at the peak of building a tip, measured 70 to 96
+_ROUNDING = 1e-6  # nearest neighbour distances: sites on the surface stay together whatever their rounding
+_SKIN = 3.2  # neighbour radii held below the surface where hardly an atom leaves: two of them are support
 _SAMPLE = 10_000  # atoms asked for their nearest neighbour
 
 
@@ -42,8 +44,8 @@ class Tip:
     offset_seed : int, optional
         Moves the lattice by a random part of its cell on top of `origin`: a tip without symmetry.
     depth : float, optional
-        Hold only atoms at most this far below the surface [nm]; None holds all of them. The innermost layer,
-        one neighbourhood thick, is `support`.
+        Hold only atoms at most this far below the surface of the cap [nm]; None holds all of them. Below z = -R/2,
+        where hardly an atom leaves, only a skin is held. The innermost layer, one neighbourhood thick, is `support`.
     solutes : mapping, optional
         Substitutional solutes of a random alloy: atomic fraction by element (str or Material).
     seed : int, optional
@@ -101,8 +103,9 @@ class Tip:
         self._set_neighbourhood(host.structure, d)
         if depth is not None:
             depth = check_number(depth, "depth", above=self.neighbour_radius, unit="nm")
+        self._depth = depth
         fractions = _check_solutes(solutes, seed)
-        _check_memory(self._shape.volume(depth) * lattice.atom_density(host.structure, host.a, host.c))
+        _check_memory(self._held_volume() * lattice.atom_density(host.structure, host.a, host.c))
 
         orientation = lattice.rotation_to_axis(host, axis, rotation)
         shift = origin
@@ -117,19 +120,11 @@ class Tip:
             shift,
             self.signed_distance,
             self._shape.bounds,
-            depth=depth,
-            tolerance=1e-6 * d,  # sites on the surface stay together whatever their rounding
+            depth=None if depth is None else self._depth_at,
+            tolerance=_ROUNDING * d,
         )
-        n = len(self.positions)
-        self.support = np.zeros(n, dtype=bool)
-        if depth is not None:
-            self.support = self.signed_distance(self.positions) < self.neighbour_radius - depth
-        self.evaporable = (self.positions[:, 2] >= -shape.shank_length / 2) & ~self.support
-        self._set_elements((host, *fractions), np.zeros(n, dtype=np.int32))
-        if fractions:
-            edges = np.cumsum(list(fractions.values()))
-            drawn = np.searchsorted(edges, np.random.default_rng(seed).random(n), side="right")
-            self.species[:] = (drawn + 1) % (len(fractions) + 1)
+        self._mark()
+        self._set_elements((host, *fractions), _draw_species(len(self), fractions, seed))
         self.apex = radius
         self.potential_point = np.zeros(3)
         self.settings = {
@@ -277,6 +272,63 @@ class Tip:
             raise ValueError("a tip made from positions has no shape to measure a distance from")
         return self._shape.signed_distance(points)
 
+    def deepened(self, by=None):
+        """Hold a shell to a greater depth.
+
+        Parameters
+        ----------
+        by : float, optional
+            How much deeper [nm]; by default two neighbourhoods.
+
+        Returns
+        -------
+        Tip
+            Its first atoms are those of this one, in the same order.
+
+        Raises
+        ------
+        ValueError
+            If this tip is not a shell: it was made from positions, or holds every atom.
+        """
+        if self._shape is None or self._depth is None:
+            raise ValueError(f"{self!r} is not a shell that could be deepened, it holds every atom there is")
+        by = 2 * self.neighbour_radius if by is None else check_number(by, "by", above=0, unit="nm")
+        deeper = Tip.from_settings({**self.settings, "depth": self._depth + by})
+        rounding = 2 * _ROUNDING * self.nearest_neighbour_distance
+        below = self.signed_distance(deeper.positions) < -(self._depth_at(deeper.positions) + rounding)
+        deeper.positions = np.concatenate([self.positions, deeper.positions[below]])
+        deeper.species = np.concatenate([self.species, deeper.species[below]])
+        deeper._mark()
+        return deeper
+
+    def _depth_at(self, points):
+        """How far below the surface atoms are held [nm], (n,): `depth` in the cap, falling to a skin below."""
+        skin, ramp = self._ramp
+        return skin + (self._depth - skin) * np.clip(1 + points[:, 2] / ramp, 0, 1)
+
+    @property
+    def _ramp(self):
+        """Depth of the skin, and the height over which `depth` falls to it, at a slope of at most 1 [nm]."""
+        skin = min(_SKIN * self.neighbour_radius, self._depth)
+        return skin, max(self._shape.apex_radius / 2, self._depth - skin)
+
+    def _held_volume(self):
+        if self._depth is None:
+            return self._shape.volume()
+        radius, (skin, ramp) = self._shape.apex_radius, self._ramp
+        cap = 2 / 3 * np.pi * (max(0.0, radius - skin) ** 3 - max(0.0, radius - self._depth) ** 3)
+        flank = np.pi * radius * ramp * (self._depth - skin)
+        return min(self._shape.volume(), self._shape.volume(skin) + cap + flank)
+
+    def _mark(self):
+        """Tell the support from the others, and which atoms may leave."""
+        self.support = np.zeros(len(self), dtype=bool)
+        if self._depth is not None:
+            skin, ramp = self._ramp
+            lost = self.neighbour_radius * (1 + (self._depth - skin) / ramp)  # across one neighbourhood
+            self.support = self.signed_distance(self.positions) < lost - self._depth_at(self.positions)
+        self.evaporable = (self.positions[:, 2] >= -self._shape.shank_length / 2) & ~self.support
+
     def _set_neighbourhood(self, structure, distance):
         radius, threshold = lattice.SURFACE_FACTORS[structure]
         self.nearest_neighbour_distance = distance
@@ -310,6 +362,15 @@ def _check_solutes(solutes, seed):
     if fractions or seed is not None:
         check_count(seed, "seed (the random places of the solutes are drawn from it)")
     return fractions
+
+
+def _draw_species(n, fractions, seed):
+    """Index of the element of each of n atoms: the host is 0."""
+    if not fractions:
+        return np.zeros(n, dtype=np.int32)
+    edges = np.cumsum(list(fractions.values()))
+    drawn = np.searchsorted(edges, np.random.default_rng(seed).random(n), side="right")
+    return ((drawn + 1) % (len(fractions) + 1)).astype(np.int32)
 
 
 def _available_memory():

@@ -4,6 +4,7 @@ import ast
 import re
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
+from statistics import median
 
 import pytest
 
@@ -15,13 +16,14 @@ FLOORS = (
     {"lattice", "shape", "material", "tip", "detector", "hits"},
     {"ion_random", "energy", "emission", "perturbation", "law", "emitter", "response"},
     {"run", "simulation"},
-    {"binning", "maps", "register", "compare", "study", "config", "io"},
+    {"binning", "maps", "register", "compare", "study", "config", "info", "io"},
     {"plot", "cli"},
 )
 FLOOR = {module: number for number, floor in enumerate(FLOORS) for module in floor}
 
 UPWARD = {("hits", "maps")}  # Hits.map, a shorthand: inside the method, never when the module is loaded
 MOST_LINES = 400
+LONGER = {"_core/octree.pyx": 720}  # build, moments, walks and sums, all on the same flat arrays
 
 
 def sources():
@@ -142,6 +144,15 @@ def test_the_core_has_no_cycles():
     assert graph["flight"] >= {"octree", "event"}
 
 
-@pytest.mark.parametrize("path", [str(path.relative_to(PACKAGE)) for path in sorted(PACKAGE.rglob("*.py"))])
+MODULES = sorted(
+    path.relative_to(PACKAGE).as_posix() for end in ("py", "pyx", "pxd", "h") for path in PACKAGE.rglob(f"*.{end}")
+)
+
+
+@pytest.mark.parametrize("path", MODULES)
 def test_modules_are_short(path):
-    assert len((PACKAGE / path).read_text().splitlines()) <= MOST_LINES
+    assert len((PACKAGE / path).read_text().splitlines()) <= LONGER.get(path, MOST_LINES)
+
+
+def test_half_of_the_modules_have_less_than_200_lines():
+    assert median(len((PACKAGE / path).read_text().splitlines()) for path in MODULES if path.endswith(".py")) < 200

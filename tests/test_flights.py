@@ -47,7 +47,7 @@ def landing(end, apex, distance=100.0):
     return (end[:, :2] + end[:, 3:5] * ahead[:, None]) / NM_PER_MM
 
 
-# ---- a single charge: closed form -------------------------------------------------------------------------------------
+# ---- a single charge: closed form ----------------------------------------------------------------------------------
 
 POINT = Octree(np.zeros((1, 3)), np.array([2.0]))
 START, PUSH = np.array([[1.0, 0.3, 0.2]]), np.array([[-0.5, 0.8, 0.1]])  # inwards at first
@@ -125,7 +125,7 @@ def test_a_charge_state_only_rescales_time():
     assert four[6] == pytest.approx(one[6] / 2, rel=1e-9)
 
 
-# ---- outcomes ---------------------------------------------------------------------------------------------------------
+# ---- outcomes ------------------------------------------------------------------------------------------------------
 
 
 def test_an_ion_without_steps_never_leaves():
@@ -146,7 +146,7 @@ def test_no_field_no_acceleration():
     assert outcome[0] == NEVER_LEFT
 
 
-# ---- spheres: radial --------------------------------------------------------------------------------------------------
+# ---- spheres: radial -----------------------------------------------------------------------------------------------
 
 
 def test_radial_by_symmetry():
@@ -161,7 +161,7 @@ def test_radial_by_symmetry():
 
 
 def test_radial_on_a_dense_sphere():
-    """The field of 20,000 even points, a spacing away, is that of a sphere: what ripples is exp(-2 pi height/spacing)."""
+    """The field of 20,000 even points, some spacings away, is a sphere's: ripples fall as exp(-2 pi height/spacing)."""
     n, radius = 20_000, 7.0
     k = np.arange(n) + 0.5
     z, azimuth = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
@@ -179,7 +179,7 @@ def test_radial_on_a_dense_sphere():
     assert energy == pytest.approx(COULOMB * 0.1 * n / (radius + 3 * spacing), rel=1e-5)
 
 
-# ---- a specimen -------------------------------------------------------------------------------------------------------
+# ---- a specimen ----------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -269,7 +269,7 @@ def test_the_verlet_of_the_paper(scene, tip12, reference):
     """It converges to where these flights end as its steps get smaller.
 
     Not with their square: far out, where |v| hardly changes, c |v|/|a| grows with the square of the distance, and from
-    R/(2 c) on a step is longer than the way so far. What is left of the deflection there falls with c, so the error does.
+    R/(2 c) on a step is longer than the way so far. The deflection left there falls with c, and so does the error.
     """
     atoms, charges, starts, push = scene
     d, expected = tip12.nearest_neighbour_distance, landing(reference[:2], tip12.apex)

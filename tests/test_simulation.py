@@ -5,9 +5,11 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
+from apt_evap.emitter import SWEEP_DUE
 from apt_evap.run import Run
 
 ENERGY = ae.TruncatedNormal(0.155, 0.155)
+FLOWN = (ae.RollUp(0.2), ae.LateralVelocity(ENERGY))
 
 
 def columns(run):
@@ -34,11 +36,11 @@ def different(one, other):
     ]
 
 
-def simulate(tip, n, *, batch_size=256, emissions=(ae.RollUp(0.2),), **options):
+def simulate(tip, n, *, batch_size=256, emissions=FLOWN, **options):
     return ae.Simulation(tip, seed=5, **options).run(n, emissions, progress=False, batch_size=batch_size)
 
 
-# ---- bits -------------------------------------------------------------------------------------------------------------
+# ---- bits ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -58,13 +60,13 @@ def test_threads_change_no_bit(small_tip, plain, n_threads):
 
 def test_a_run_goes_on_where_the_one_before_ended(small_tip, plain):
     simulation = ae.Simulation(small_tip, seed=5)
-    parts = [simulation.run(100, [ae.RollUp(0.2)], progress=False) for _ in range(2)]
+    parts = [simulation.run(100, FLOWN, progress=False) for _ in range(2)]
     assert np.array_equal(parts[1].emissions.ions, np.arange(100, 200))
     assert different(plain, Run.join(parts)) == []
 
 
 def test_the_seed_changes_the_perturbations_and_not_the_sequence(small_tip, plain):
-    other = ae.Simulation(small_tip, seed=6).run(200, [ae.RollUp(0.2)], progress=False)
+    other = ae.Simulation(small_tip, seed=6).run(200, FLOWN, progress=False)
     assert np.array_equal(other.site, plain.site)
     assert np.array_equal(other.hits(ae.Unperturbed()).x, plain.hits(ae.Unperturbed()).x, equal_nan=True)
     lateral = ae.LateralVelocity(ENERGY)
@@ -73,13 +75,29 @@ def test_the_seed_changes_the_perturbations_and_not_the_sequence(small_tip, plai
 
 def test_what_is_flown_besides_changes_nothing(small_tip, plain):
     """An ion lands in the same place whatever else is flown of it: within the tolerance of steps that others share."""
-    alone = simulate(small_tip, 100, emissions=[ae.RollUp(0.2), ae.LateralVelocity(1.0)])
+    alone = simulate(small_tip, 100, emissions=[ae.RollUp(0.2), ae.LateralVelocity(1.0)], n_threads=1)
     a, b = alone.hits(ae.RollUp(0.2)), plain.hits(ae.RollUp(0.2))[:100]
     assert a.x == pytest.approx(b.x, abs=1e-9, nan_ok=True)
     assert np.array_equal(alone.site, plain.site[:100])
 
 
-# ---- outcomes ---------------------------------------------------------------------------------------------------------
+def test_the_sequence_is_that_of_the_emitter(small_tip, plain):
+    """The simulation relaxes when the emitter asks for it, and not otherwise: the same atoms at the same charges."""
+    emitter = ae.Emitter(small_tip)
+    sites, charges, sweeps = [], [], 0
+    while sum(map(len, sites)) < 200:
+        batch = emitter.evaporate(200 - sum(map(len, sites)))
+        sites.append(batch.site)
+        charges.append(batch.charges)
+        if batch.status == SWEEP_DUE:
+            emitter.relax()
+            sweeps += 1
+    assert sweeps >= 1
+    assert np.array_equal(np.concatenate(sites), plain.site)
+    assert np.array_equal(np.concatenate(charges), plain.charges)
+
+
+# ---- outcomes ------------------------------------------------------------------------------------------------------
 
 
 def test_ions_that_miss_are_counted(small_tip, plain):
@@ -165,11 +183,17 @@ def test_a_run_after_the_end_is_empty(nickel, small_tip):
     assert again.ended == "no atom is left that may evaporate"
 
 
-def test_a_shell_that_is_used_up_ends_the_run(nickel):
-    tip = ae.Tip(nickel, apex_radius=6 * nickel.a, axis=(1, 1, 1), depth=3.2 * nickel.a)
-    run = ae.Simulation(tip).run(3000, responses=False, progress=False)
-    assert run.ended == "evaporation reached the depth to which the specimen is held"
-    assert 0 < len(run) < 3000
+def test_a_shell_gives_the_ions_of_the_whole_specimen(nickel):
+    """Holding only what is near the surface changes no bit, as far as the run goes."""
+    shape = {"apex_radius": 10 * nickel.a, "axis": (1, 1, 1)}
+    shell, whole = ae.Tip(nickel, **shape, depth=5.2 * nickel.a), ae.Tip(nickel, **shape)
+    assert len(shell) < 0.9 * len(whole)
+    held = ae.Simulation(shell).run(1200, responses=False, progress=False)
+    full = ae.Simulation(whole).run(len(held), responses=False, progress=False)
+    assert len(held) > 300
+    assert np.array_equal(held.emissions.positions, full.emissions.positions)
+    assert np.array_equal(held.charges, full.charges)
+    assert np.array_equal(held.hits(ae.Unperturbed()).x, full.hits(ae.Unperturbed()).x, equal_nan=True)
 
 
 def test_ctrl_c_keeps_what_is_done(small_tip):
@@ -186,7 +210,7 @@ def test_ctrl_c_keeps_what_is_done(small_tip):
     assert signal.getsignal(signal.SIGINT) is before
 
 
-# ---- refusals ---------------------------------------------------------------------------------------------------------
+# ---- refusals ------------------------------------------------------------------------------------------------------
 
 
 class Half:
@@ -220,7 +244,7 @@ def test_bad_input_gets_one_clear_sentence(small_tip, call, message):
     assert "\n" not in str(caught.value)
 
 
-# ---- as a user writes it ----------------------------------------------------------------------------------------------
+# ---- as a user writes it -------------------------------------------------------------------------------------------
 
 
 def test_the_names_users_rely_on(tmp_path):
@@ -255,7 +279,7 @@ def test_charge_states_and_masses_change_times_and_not_paths(nickel, small_tip):
     assert a.time_of_flight == pytest.approx(np.sqrt(2.0) * b.time_of_flight, rel=1e-12, nan_ok=True)
 
 
-# ---- the patterns of Ni[111] ------------------------------------------------------------------------------------------
+# ---- the patterns of Ni[111] ---------------------------------------------------------------------------------------
 
 INNER, OUTER = 10.0, 40.0  # mm, on a detector at 100 mm
 

@@ -1,7 +1,7 @@
 """The sequence of events, for the flights that follow it."""
 
 from apt_evap._core.octree cimport Octree
-from apt_evap._core.robin cimport ChargingRule
+from apt_evap._core.robin cimport ChargingRule, Patch
 from apt_evap._core.surface cimport Neighbourhood
 
 
@@ -33,10 +33,13 @@ cdef class Evaporation:
     cdef int[::1] winner                # tournament over the slots: node i has the better of 2 i and 2 i + 1
     cdef long leaves
     cdef int[::1] near                  # (most,) slots around the hole
-    cdef int[::1] patch                 # (most,)
-    cdef double[::1] work               # (5 most,)
+    cdef Patch patch                    # those whose charges are solved; its memory follows
+    cdef int[::1] patch_slot
+    cdef double[::1] patch_charge
+    cdef float[:, ::1] patch_float
 
     cdef bint better(self, int a, int b) noexcept nogil
     cdef void settle(self, int slot) noexcept nogil
     cdef long strongest_neighbour(self, long atom) noexcept nogil
+    cdef void join(self, int slot, double dx, double dy, double dz) noexcept nogil
     cdef int event(self, long atom, Journal journal) except -1 nogil

@@ -10,7 +10,8 @@ from libc.math cimport sqrt
 
 import numpy as np
 
-from apt_evap._core.octree cimport Octree, Sources, point_atoms, sources_field, sources_free, sources_init
+from apt_evap._core.octree cimport PATCH_LANES, Octree, Sources, patch_field, sources_field, sources_free, sources_init
+from apt_evap._core.robin cimport Patch
 from apt_evap._core.surface cimport MOST_NEAR
 
 DONE, SWEEP_DUE, EXHAUSTED, TOO_SHALLOW = range(4)
@@ -98,8 +99,18 @@ cdef class Evaporation:
         self.n_removed = self.since_sweep = self.n_clipped = 0
         self.slot_of = np.full(atoms.n_atoms, -1, np.int32)
         self.near = np.empty(MOST_PATCH + MOST_NEAR, np.int32)
-        self.patch = np.empty(MOST_PATCH + MOST_NEAR, np.int32)
-        self.work = np.empty(5 * (MOST_PATCH + MOST_NEAR))
+        self.patch_slot = np.empty(MOST_PATCH + MOST_NEAR, np.int32)
+        self.patch_charge = np.empty(MOST_PATCH + MOST_NEAR)
+        self.patch_float = np.empty((4, MOST_PATCH + MOST_NEAR), np.float32)
+        self.patch.slot, self.patch.charge = &self.patch_slot[0], &self.patch_charge[0]
+        self.patch.x, self.patch.y = &self.patch_float[0, 0], &self.patch_float[1, 0]
+        self.patch.z, self.patch.change = &self.patch_float[2, 0], &self.patch_float[3, 0]
+
+    def take_over(self, Neighbourhood atoms, const double[::1] weights):
+        """Go on with more atoms: the first of them are those held so far. Call `relax` next."""
+        cdef int[::1] slot_of = np.full(atoms.n_atoms, -1, np.int32)
+        np.asarray(slot_of)[:self.atoms.n_atoms] = self.slot_of
+        self.atoms, self.weight, self.slot_of = atoms, np.array(weights), slot_of
 
     def relax(self, *, double tolerance=1e-4, int most_sweeps=200, bint double_precision=False, long extra=0,
               int n_threads=1):
@@ -129,18 +140,20 @@ cdef class Evaporation:
         surface = self.atoms.surface
         if len(surface) == 0:
             raise ValueError("the specimen has no surface atoms")
-        charges = np.ones(len(surface))
         slot_of = np.asarray(self.slot_of)
-        slots = slot_of[surface]
+        charges, normals = np.ones(len(surface)), self.atoms.normals_of(surface)
         if self.tree is not None:
+            slots = slot_of[surface]
             charges = np.where(slots >= 0, self.tree.charges[slots], 0.0)
+            pulled = np.asarray(self.atoms.counts)[surface] > 0   # the others keep the normals they had
+            normals = np.where((pulled | (slots < 0))[:, None], normals, np.asarray(self.normals)[slots])
         positions = np.ascontiguousarray(np.asarray(self.atoms.positions)[surface])
         self.tree = Octree(positions, charges, surface, extra=extra or len(surface) // 8 + MOST_NEAR)
         slot_of[:] = -1
         slot_of[self.tree.atoms] = np.arange(len(surface), dtype=np.int32)
         n, capacity = self.tree.n_slots, self.tree.x.shape[0]
         self.normals = np.zeros((capacity, 3))
-        np.asarray(self.normals)[:n] = self.atoms.normals[self.tree.atoms]
+        np.asarray(self.normals)[:n] = normals[np.searchsorted(surface, self.tree.atoms)]
         lists = self.tree.lists(self.opening_angle, n_threads)
         outcome = self.rule.solve(self.tree, self.normals, lists, tolerance=tolerance, most_sweeps=most_sweeps,
                                   double_precision=double_precision, n_threads=n_threads)
@@ -198,6 +211,14 @@ cdef class Evaporation:
                 best = other
         return best
 
+    cdef void join(self, int slot, double dx, double dy, double dz) noexcept nogil:
+        # One more slot in the patch, at (dx, dy, dz) from the hole; its normal may have changed.
+        cdef long n = self.patch.n
+        self.patch.slot[n] = slot
+        self.patch.x[n], self.patch.y[n], self.patch.z[n] = <float>dx, <float>dy, <float>dz
+        self.atoms.normal(self.tree.atom[slot], &self.normals[slot, 0])
+        self.patch.n = n + 1
+
     # ---- one event -------------------------------------------------------------------------------------------------
 
     cdef int event(self, long atom, Journal journal) except -1 nogil:
@@ -206,10 +227,9 @@ cdef class Evaporation:
         cdef int gone = self.slot_of[atom], n_fresh, slot, best
         cdef double px = self.atoms.positions[atom, 0], py = self.atoms.positions[atom, 1]
         cdef double pz = self.atoms.positions[atom, 2], charge = self.tree.q[gone], s, nearest
-        cdef double dx, dy, dz, over, change
-        cdef double* work = &self.work[0]
-        cdef long n_near, n, i, k, at
-        cdef int axis
+        cdef double dx, dy, dz, over
+        cdef Patch* patch = &self.patch
+        cdef long n_near, i, k, at
         self.n_removed += 1
         self.since_sweep += 1
         self.tree.take_out(gone)
@@ -221,7 +241,7 @@ cdef class Evaporation:
 
         # the slots around the hole, without the charge that left
         n_near = self.tree.within(px, py, pz, self.update_radius, &self.near[0], MOST_PATCH)
-        n = 0
+        patch.n = 0
         for i in range(n_near):
             slot = self.near[i]
             dx, dy, dz = self.tree.x[slot] - px, self.tree.y[slot] - py, self.tree.z[slot] - pz
@@ -231,13 +251,10 @@ cdef class Evaporation:
             self.rule.field[slot, 1] -= over * dy
             self.rule.field[slot, 2] -= over * dz
             if s <= self.patch_radius * self.patch_radius:
-                self.patch[n] = slot
-                n += 1
-                for axis in range(3):
-                    self.normals[slot, axis] = self.atoms.normal[self.tree.atom[slot], axis]
+                self.join(slot, dx, dy, dz)
 
         # the atoms that came to the surface join the leaf of the slot nearest to them, without charge at first
-        journal.room(n + n_fresh + 1, n_fresh)
+        journal.room(patch.n + n_fresh + 1, n_fresh)
         journal.fresh_start[journal.n_events + 1] = journal.fresh_start[journal.n_events] + n_fresh
         if n_fresh:
             sources_init(&sources)
@@ -245,8 +262,8 @@ cdef class Evaporation:
             dx, dy, dz = self.atoms.positions[fresh[k], 0], self.atoms.positions[fresh[k], 1], self.atoms.positions[fresh[k], 2]
             nearest = 1e30
             best = gone
-            for i in range(n):
-                slot = self.patch[i]
+            for i in range(patch.n):
+                slot = patch.slot[i]
                 s = (self.tree.x[slot] - dx) ** 2 + (self.tree.y[slot] - dy) ** 2 + (self.tree.z[slot] - dz) ** 2
                 if s < nearest:
                     nearest = s
@@ -258,12 +275,9 @@ cdef class Evaporation:
             self.slot_of[fresh[k]] = slot
             self.tree.collect(dx, dy, dz, 0.0, self.opening_angle, &sources)
             sources_field(&sources, dx, dy, dz, &self.rule.field[slot, 0])
-            for axis in range(3):
-                self.normals[slot, axis] = self.atoms.normal[fresh[k], axis]
             self.near[n_near] = slot
             n_near += 1
-            self.patch[n] = slot
-            n += 1
+            self.join(slot, dx - px, dy - py, dz - pz)
         if n_fresh:
             sources_free(&sources)
 
@@ -271,26 +285,28 @@ cdef class Evaporation:
         at = journal.start[journal.n_events]
         journal.slot[at] = gone
         journal.charge[at] = 0.0
-        journal.start[journal.n_events + 1] = at + 1 + n
-        if n:
-            self.rule.solve_patch(self.tree, self.normals, &self.patch[0], n, work)
-        for i in range(n):
-            slot = self.patch[i]
-            if work[i] < 0.0:   # a cell's moments stand on its centre of charge: none may be negative
-                work[i] = 0.0
+        journal.start[journal.n_events + 1] = at + 1 + patch.n
+        patch.stride = (patch.n + PATCH_LANES - 1) // PATCH_LANES * PATCH_LANES
+        for i in range(patch.n, patch.stride):
+            patch.x[i] = patch.y[i] = patch.z[i] = 1e6
+            patch.change[i] = 0.0
+        if patch.n:
+            self.rule.solve_patch(self.tree, self.normals, patch)
+        for i in range(patch.n):
+            slot = patch.slot[i]
+            if patch.charge[i] < 0.0:   # a cell's moments stand on its centre of charge: none may be negative
+                patch.change[i] = <float>-self.tree.q[slot]
+                patch.charge[i] = 0.0
                 self.n_clipped += 1
             journal.slot[at + 1 + i] = slot
-            journal.charge[at + 1 + i] = work[i]
-            change = work[i] - self.tree.q[slot]
-            self.tree.set_charge(slot, work[i])
-            self.rank[slot] = work[i] * self.weight[self.tree.atom[slot]]
-            work[i] = change
-        for i in range(n):
-            self.settle(self.patch[i])
+            journal.charge[at + 1 + i] = patch.charge[i]
+            self.tree.set_charge(slot, patch.charge[i])
+            self.rank[slot] = patch.charge[i] * self.weight[self.tree.atom[slot]]
+            self.settle(slot)
         for i in range(n_near):
             slot = self.near[i]
-            point_atoms(n, work + n, work + 2 * n, work + 3 * n, work, self.tree.x[slot], self.tree.y[slot],
-                        self.tree.z[slot], &self.rule.field[slot, 0])
+            patch_field(patch.stride, patch.x, patch.y, patch.z, patch.change, <float>(self.tree.x[slot] - px),
+                        <float>(self.tree.y[slot] - py), <float>(self.tree.z[slot] - pz), &self.rule.field[slot, 0])
         self.tree.refresh()
         journal.n_events += 1
         return 0
@@ -339,7 +355,7 @@ cdef class Evaporation:
                 atom[n] = leaving
                 charge[n] = self.tree.q[best]
                 for axis in range(3):
-                    normal[n, axis] = self.atoms.normal[leaving, axis]
+                    normal[n, axis] = self.normals[best, axis]
                 neighbour[n] = self.strongest_neighbour(leaving)
                 self.event(leaving, journal)
         return status

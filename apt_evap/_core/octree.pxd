@@ -13,9 +13,12 @@ cdef extern from "pair.h":
     void point_atoms(long, const double*, const double*, const double*, const double*,
                      double, double, double, double*) noexcept nogil
     void point_cells(long, long, const double*, double, double, double, double*) noexcept nogil
-    void robin_row(long, const double*, const double*, const double*, const double*, const double*,
-                   double*) noexcept nogil
-    double lane_dot(long, const double*, const double*) noexcept nogil
+    const int PATCH_LANES
+    void patch_row(long, const float*, const float*, const float*, float, float, float, const double*,
+                   float*) noexcept nogil
+    float patch_dot(long, const float*, const float*) noexcept nogil
+    void patch_field(long, const float*, const float*, const float*, const float*, float, float, float,
+                     double*) noexcept nogil
 
 
 cdef struct Sources:

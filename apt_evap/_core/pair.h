@@ -102,30 +102,60 @@ APT_CLONES static void point_cells(long n, long stride, const double *restrict c
     }
 }
 
+/* The sums of a patch of some 300 atoms are in single precision, its coordinates relative to the hole. Rows have a
+ * length that is a multiple of PATCH_LANES, filled up with atoms of no charge: four registers wide, or the additions of
+ * a dot product wait for one another. */
+#define PATCH_LANES 64
+
 /* One row of the Robin matrix: row[k] = n . (p - r_k)/|p - r_k|^3 for the atom at p with normal n. */
-APT_CLONES static void robin_row(long n, const double *restrict x, const double *restrict y, const double *restrict z,
-                                 const double *p, const double *normal, double *restrict row)
+APT_CLONES static void patch_row(long n, const float *restrict x, const float *restrict y, const float *restrict z,
+                                 float px, float py, float pz, const double *normal, float *restrict row)
 {
-    const double px = p[0], py = p[1], pz = p[2], nx = normal[0], ny = normal[1], nz = normal[2];
+    const float nx = (float)normal[0], ny = (float)normal[1], nz = (float)normal[2];
 #pragma omp simd
     for (long k = 0; k < n; k++) {
-        const double dx = px - x[k], dy = py - y[k], dz = pz - z[k];
-        const double s = dx * dx + dy * dy + dz * dz;
-        row[k] = s > SAME_PLACE ? (nx * dx + ny * dy + nz * dz) / (s * sqrt(s)) : 0.0;
+        const float dx = px - x[k], dy = py - y[k], dz = pz - z[k];
+        const float s = dx * dx + dy * dy + dz * dz;
+        row[k] = s > (float)SAME_PLACE ? (nx * dx + ny * dy + nz * dz) / (s * sqrtf(s)) : 0.0f;
     }
 }
 
-/* Dot product in LANES fixed partial sums. */
-APT_CLONES static double lane_dot(long n, const double *restrict a, const double *restrict b)
+/* Dot product in PATCH_LANES fixed partial sums. */
+APT_CLONES static float patch_dot(long n, const float *restrict a, const float *restrict b)
 {
-    double sum[LANES] = {0};
-    for (long k = 0; k + LANES <= n; k += LANES) {
+    float sum[PATCH_LANES] = {0}, s[16];
+    for (long k = 0; k < n; k += PATCH_LANES) {
 #pragma omp simd
-        for (int l = 0; l < LANES; l++)
+        for (int l = 0; l < PATCH_LANES; l++)
             sum[l] += a[k + l] * b[k + l];
     }
-    for (long k = n - n % LANES; k < n; k++)
-        sum[k % LANES] += a[k] * b[k];
-    return ((sum[0] + sum[1]) + (sum[2] + sum[3])) + ((sum[4] + sum[5]) + (sum[6] + sum[7]));
+#pragma omp simd
+    for (int l = 0; l < 16; l++)
+        s[l] = (sum[l] + sum[16 + l]) + (sum[32 + l] + sum[48 + l]);
+    return (((s[0] + s[8]) + (s[4] + s[12])) + ((s[2] + s[10]) + (s[6] + s[14])))
+         + (((s[1] + s[9]) + (s[5] + s[13])) + ((s[3] + s[11]) + (s[7] + s[15])));
+}
+
+/* Adds the field of the patch's charges q at (px, py, pz), relative to the hole, to field[3]. */
+APT_CLONES static void patch_field(long n, const float *restrict x, const float *restrict y, const float *restrict z,
+                                   const float *restrict q, float px, float py, float pz, double *restrict field)
+{
+    float ex[16] = {0}, ey[16] = {0}, ez[16] = {0};
+    for (long k = 0; k < n; k += 16) {
+#pragma omp simd
+        for (int l = 0; l < 16; l++) {
+            const float dx = px - x[k + l], dy = py - y[k + l], dz = pz - z[k + l];
+            const float s = dx * dx + dy * dy + dz * dz;
+            const float w = s > (float)SAME_PLACE ? q[k + l] / (s * sqrtf(s)) : 0.0f;
+            ex[l] += w * dx;
+            ey[l] += w * dy;
+            ez[l] += w * dz;
+        }
+    }
+    for (int l = 0; l < 16; l++) {
+        field[0] += ex[l];
+        field[1] += ey[l];
+        field[2] += ez[l];
+    }
 }
 #endif

@@ -1,15 +1,15 @@
 """Charges of the surface atoms: Robin's iteration, for the whole surface and for a patch of it.
 
 q_i <- (s/2 pi) sum_{k != i} q_k n_i . (r_i - r_k)/|r_i - r_k|^3, with s, the area per atom, set anew in every sweep so
-that the total charge is kept (Rolland et al., Phil. Mag. 95, 1620, 2015; Robin 1886).
+that the total charge is kept (Robin, 1886; Rolland et al., Microsc. Microanal. 21, 1649, 2015).
 """
 
 cimport cython
-from libc.math cimport M_PI, fabs
+from libc.math cimport M_PI, fabsf
 
 import numpy as np
 
-from apt_evap._core.octree cimport lane_dot, robin_row
+from apt_evap._core.octree cimport patch_dot, patch_row
 
 
 cdef class ChargingRule:
@@ -19,9 +19,8 @@ cdef class ChargingRule:
     charges of the whole surface, and `solve_patch`, those of a few atoms while all others are held.
     """
 
-    cdef int solve_patch(self, Octree tree, double[:, ::1] normals, const int* patch, long n,
-                         double* charges) noexcept nogil:
-        # New charges of the n slots in `patch`, from their fields and the old charges in the tree.
+    cdef int solve_patch(self, Octree tree, double[:, ::1] normals, Patch* patch) noexcept nogil:
+        # New charges of a patch, from the fields on its slots and the old charges in the tree.
         return -1
 
 
@@ -36,13 +35,11 @@ cdef class Robin(ChargingRule):
         Sweeps before the last that are mixed into the next charges; 0 is Robin's plain iteration.
     """
 
-    def __init__(self, double tolerance=1e-6, int window=8):
+    def __init__(self, double tolerance=1e-5, int window=8):
         self.tolerance = tolerance
         self.window = window
         self.area = 1.0
-        self.matrix = np.empty(256 * 256)
-        self.residual = np.empty(256)
-        self.change = np.empty(256)
+        self.grow(512)
 
     @cython.wraparound(True)
     def solve(self, Octree tree, const double[:, ::1] normals, InteractionLists lists, *, double tolerance=1e-6,
@@ -121,47 +118,37 @@ cdef class Robin(ChargingRule):
         tree.charges = np.asarray(tree.charges) * factor
         np.asarray(self.field)[:] *= factor
 
-    cdef double* grow(self, long n) noexcept nogil:
-        if n > self.residual.shape[0]:
+    cdef void grow(self, long stride) noexcept nogil:
+        if stride > self.residual.shape[0]:
             with gil:
-                self.matrix = np.empty(n * n)
-                self.residual = np.empty(n)
-                self.change = np.empty(n)
-        return &self.matrix[0]
+                self.matrix = np.zeros(stride * stride, np.float32)
+                self.residual = np.zeros(stride, np.float32)
 
-    cdef int solve_patch(self, Octree tree, double[:, ::1] normals, const int* patch, long n,
-                         double* charges) noexcept nogil:
+    cdef int solve_patch(self, Octree tree, double[:, ::1] normals, Patch* patch) noexcept nogil:
         # Gauss-Seidel on the changes: x_i = r_i + (s/2 pi) sum_k K_ik x_k with the residual r_i of the old charges.
-        # `charges` has room for 5 n numbers: the new charges, then the patch's coordinates.
-        cdef double c = self.area / (2.0 * M_PI), new, largest, mean = 0.0
-        cdef double* matrix = self.grow(n)
-        cdef double* x = charges + n
-        cdef double* y = charges + 2 * n
-        cdef double* z = charges + 3 * n
-        cdef double[3] point
+        cdef double c = self.area / (2.0 * M_PI), mean = 0.0
+        cdef float new, largest
         cdef long i, slot
         cdef int iteration
-        for i in range(n):
-            slot = patch[i]
-            x[i], y[i], z[i] = tree.x[slot], tree.y[slot], tree.z[slot]
-            mean += tree.q[slot]
-        mean /= n
-        for i in range(n):
-            slot = patch[i]
-            point[0], point[1], point[2] = x[i], y[i], z[i]
-            robin_row(n, x, y, z, point, &normals[slot, 0], matrix + i * n)
-            self.residual[i] = c * (
+        self.grow(patch.stride)
+        for i in range(patch.n):
+            slot = patch.slot[i]
+            mean += tree.q[slot] / patch.n
+            patch_row(patch.stride, patch.x, patch.y, patch.z, patch.x[i], patch.y[i], patch.z[i], &normals[slot, 0],
+                      &self.matrix[i * patch.stride])
+            self.residual[i] = <float>(c * (
                 normals[slot, 0] * self.field[slot, 0] + normals[slot, 1] * self.field[slot, 1]
-                + normals[slot, 2] * self.field[slot, 2]) - tree.q[slot]
-            self.change[i] = self.residual[i]
+                + normals[slot, 2] * self.field[slot, 2]) - tree.q[slot])
+            patch.change[i] = self.residual[i]
         for iteration in range(60):
             largest = 0.0
-            for i in range(n):
-                new = self.residual[i] + c * lane_dot(n, matrix + i * n, &self.change[0])
-                largest = max(largest, fabs(new - self.change[i]))
-                self.change[i] = new
+            for i in range(patch.n):
+                new = self.residual[i] + <float>c * patch_dot(
+                    patch.stride, &self.matrix[i * patch.stride], patch.change)
+                largest = max(largest, fabsf(new - patch.change[i]))
+                patch.change[i] = new
             if largest < self.tolerance * mean:
                 break
-        for i in range(n):
-            charges[i] = tree.q[patch[i]] + self.change[i]
+        for i in range(patch.n):
+            patch.charge[i] = tree.q[patch.slot[i]] + patch.change[i]
         return iteration

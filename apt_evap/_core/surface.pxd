@@ -7,21 +7,21 @@ cdef enum:
 cdef class Neighbourhood:
     cdef readonly long n_atoms
     cdef readonly double radius, threshold
-    cdef double[:, ::1] positions       # (n, 3) nm, the caller's order
+    cdef const double[:, ::1] positions # (n, 3) nm, the caller's own array
     cdef char[::1] alive                # (n,)
-    cdef char[::1] support              # (n,) atoms that never become surface atoms
+    cdef const char[::1] support              # (n,) atoms that never become surface atoms
     cdef char[::1] exposed              # (n,) surface atoms
     cdef int[::1] count                 # (n,) neighbours within the radius
     cdef double[:, ::1] offset          # (n, 3) sum of (neighbour - atom) over the neighbours [nm]
-    cdef double[:, ::1] normal          # (n, 3) outward unit normal, of surface atoms
     cdef double[::1] low                # (3,) corner of the grid of cells [nm]
     cdef long[::1] shape                # (3,) cells along each axis
     cdef double edge                    # edge of a cell [nm]
-    cdef long[::1] start                # (cells + 1,) where each cell's atoms begin in `order`
+    cdef int[::1] start                 # (cells + 1,) where each cell's atoms begin in `order`
     cdef int[::1] order                 # (n,) atoms cell by cell
 
     cdef int near(self, long atom, int* others) noexcept nogil
     cdef void gather(self, long atom) noexcept nogil
     cdef bint judge(self, long atom) noexcept nogil
+    cdef void normal(self, long atom, double* normal) noexcept nogil
     cdef int remove(self, long atom, int* fresh) noexcept nogil
     cdef bint reaches_support(self, long atom) noexcept nogil

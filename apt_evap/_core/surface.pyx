@@ -1,8 +1,8 @@
 """Which atoms are at the surface, and their normals: from the centre of mass of each atom's neighbourhood.
 
 For atom i at p_i with the mean c_i of all other atoms within a radius, d_i = |p_i - c_i|: a surface atom has d_i above
-a threshold, its outward normal is (p_i - c_i)/d_i (Boll, Philippe, Vurpillot, 2013; Rolland et al., 2015). An atom
-once exposed stays exposed until it leaves.
+a threshold, its outward normal is (p_i - c_i)/d_i (Rolland et al., Microsc. Microanal. 21, 1649, 2015). An atom once
+exposed stays exposed until it leaves.
 """
 
 from cython.parallel cimport prange
@@ -26,34 +26,45 @@ cdef class Neighbourhood:
         1 for atoms that complete the neighbourhoods of others but are never surface atoms themselves.
     n_threads : int
         Threads.
+    before : Neighbourhood, optional
+        Of the first of these atoms: what has left it and what was exposed in it stays so.
     """
 
     def __init__(self, const double[:, ::1] positions, double radius, double threshold, const char[::1] support,
-                 int n_threads=1):
+                 int n_threads=1, Neighbourhood before=None):
         cdef long n = positions.shape[0], i
         if n == 0:
             raise ValueError("a specimen needs at least one atom, got none")
         self.n_atoms = n
         self.radius, self.threshold, self.edge = radius, threshold, radius
-        self.positions = np.array(positions)
-        self.support = np.array(support)
+        if n >= 2**31:
+            raise ValueError(f"a specimen holds fewer than 2**31 atoms, got {n}")
+        self.positions, self.support = positions, support
         self.alive = np.ones(n, np.int8)
         self.exposed = np.zeros(n, np.int8)
         self.count = np.zeros(n, np.int32)
         self.offset = np.zeros((n, 3))
-        self.normal = np.zeros((n, 3))
+        if before is not None:
+            np.asarray(self.alive)[:before.n_atoms] = before.alive
         where = np.asarray(positions)
         low = where.min(axis=0)
         self.low = low
-        cells = np.floor((where - low) / radius).astype(np.int64)
-        shape = cells.max(axis=0) + 1
+        shape = np.floor((where.max(axis=0) - low) / radius).astype(np.int64) + 1
         self.shape = shape
-        flat = (cells[:, 0] * shape[1] + cells[:, 1]) * shape[2] + cells[:, 2]
+        flat = np.zeros(n, np.int64)
+        for axis in range(3):   # one axis at a time: whole arrays of temporaries would be the peak of the memory
+            flat *= shape[axis]
+            flat += np.floor((where[:, axis] - low[axis]) / radius).astype(np.int64)
         self.order = np.argsort(flat, kind="stable").astype(np.int32)
-        self.start = np.concatenate([[0], np.cumsum(np.bincount(flat, minlength=shape.prod()))])
+        start = np.zeros(shape.prod() + 1, np.int32)
+        np.cumsum(np.bincount(flat, minlength=shape.prod()), out=start[1:])
+        self.start = start
+        del flat
         for i in prange(n, nogil=True, schedule="dynamic", chunksize=1024, num_threads=n_threads):
             self.gather(i)
-            self.exposed[i] = self.judge(i)
+            self.exposed[i] = self.alive[i] and self.judge(i)
+        if before is not None:
+            np.asarray(self.exposed)[:before.n_atoms] |= before.exposed
         if np.asarray(self.count).min() < 0:
             raise ValueError(f"radius must hold at most {MOST_NEAR} atoms around each atom, got {radius!r} nm")
 
@@ -90,18 +101,18 @@ cdef class Neighbourhood:
                 self.offset[atom, axis] += self.positions[others[i], axis] - self.positions[atom, axis]
 
     cdef bint judge(self, long atom) noexcept nogil:
-        # Whether the atom is at the surface by its neighbours; sets its normal.
+        # Whether the atom is at the surface by its neighbours; one alone in space is.
         cdef double sx = self.offset[atom, 0], sy = self.offset[atom, 1], sz = self.offset[atom, 2]
-        cdef double length = sqrt(sx * sx + sy * sy + sz * sz)
         if self.support[atom]:
             return False
-        if self.count[atom] == 0:
-            return True   # alone in space: keeps the normal it had
-        if length > 1e-9:
-            self.normal[atom, 0] = -sx / length
-            self.normal[atom, 1] = -sy / length
-            self.normal[atom, 2] = -sz / length
-        return length > self.threshold * self.count[atom]
+        return self.count[atom] == 0 or sqrt(sx * sx + sy * sy + sz * sz) > self.threshold * self.count[atom]
+
+    cdef void normal(self, long atom, double* normal) noexcept nogil:
+        # Outward unit normal; an atom whose neighbours pull nowhere keeps the one it had.
+        cdef double sx = self.offset[atom, 0], sy = self.offset[atom, 1], sz = self.offset[atom, 2]
+        cdef double length = sqrt(sx * sx + sy * sy + sz * sz)
+        if self.count[atom] > 0 and length > 1e-9:
+            normal[0], normal[1], normal[2] = -sx / length, -sy / length, -sz / length
 
     cdef int remove(self, long atom, int* fresh) noexcept nogil:
         # Takes an atom away, renews the normals around it; lists the atoms that came to the surface, returns how many.
@@ -140,10 +151,14 @@ cdef class Neighbourhood:
         """Atoms at the surface, shape (m,), in the caller's numbering."""
         return np.flatnonzero(np.asarray(self.exposed))
 
-    @property
-    def normals(self):
-        """Outward unit normals, shape (n, 3); meaningful for surface atoms."""
-        return np.asarray(self.normal)
+    def normals_of(self, atoms):
+        """Outward unit normals of some atoms, shape (m, 3); (0, 0, 1) where the neighbours pull nowhere."""
+        cdef long long[::1] chosen = np.ascontiguousarray(atoms, np.int64)
+        cdef double[:, ::1] normals = np.tile([0.0, 0.0, 1.0], (len(chosen), 1))
+        cdef long i
+        for i in range(chosen.shape[0]):
+            self.normal(chosen[i], &normals[i, 0])
+        return np.asarray(normals)
 
     @property
     def counts(self):
