@@ -107,7 +107,7 @@ class Run:
         bad = ~(self.responses.residuals <= self.response_settings.bound)
         return bad[:, 0] | (bad[:, 1] & rolls)
 
-    def hits(self, perturbation):
+    def hits(self, perturbation, *, by_response=False):
         """Where the ions land under a perturbation.
 
         One that was flown in the run is taken as flown; any other that launches along the surface (all built-in ones,
@@ -117,6 +117,8 @@ class Run:
         ----------
         perturbation : perturbation
             How the ions start.
+        by_response : bool
+            Whether to take the responses also for one that was flown, to compare them.
 
         Returns
         -------
@@ -129,7 +131,8 @@ class Run:
             If the perturbation was not flown and does not follow from responses.
         """
         for flown_as, flown in zip(self.perturbations, self.flown, strict=True):
-            if flown_as == perturbation:
+            known = flown_as == perturbation or flown_as == to_dict(perturbation)  # by name and repr in a file
+            if known and not by_response:
                 return self._hits(flown.directions, flown.times, perturbation)
         if not callable(getattr(perturbation, "tangential", None)):
             raise ValueError(

@@ -48,9 +48,9 @@ half = SometimesRollUp(ae.TruncatedNormal(0.155, 0.155), share=0.5)
 run = ae.Simulation(tip, seed=1).run(400, emissions=[half])
 
 run.save("own.h5")
-from_file = ae.load("own.h5")
-by_response = from_file.hits(half)  # a file does not know the class `half` is of: this follows from the responses
+run = ae.load("own.h5")
 flown = run.hits(half)
+by_response = run.hits(half, by_response=True)
 error = np.hypot(by_response.x - flown.x, by_response.y - flown.y)[flown.detected & by_response.detected]
 print(f"{flown}\nresponses against flights: median {np.median(error):.4f} mm, largest {error.max():.4f} mm")
 

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import twins
 from apt_evap._core.octree import Octree, morton_order
+from apt_evap._core.sweep import InteractionLists
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -82,10 +83,10 @@ def test_sweep_is_the_field_of_all_others(surface12, double):
     tree = Octree(positions, charges)
     field = np.empty((len(positions), 3))
     expected = twins.field(tree.positions, tree.positions, tree.charges)
-    tree.sweep(tree.lists(0.0), field, double_precision=double)
+    InteractionLists(tree, 0.0).sweep(field, double_precision=double)
     # float32 carries 6e-8 per term, about a group's middle; its sums of 8,000 terms stay at 1e-6
     assert rms(field - expected, expected) < (1e-13 if double else 2e-6)
-    tree.sweep(tree.lists(DEFAULT_ANGLE), field, double_precision=double)
+    InteractionLists(tree, DEFAULT_ANGLE).sweep(field, double_precision=double)
     assert 1e-5 < rms(field - expected, expected) < 1e-3  # the accuracy asked of the default; and cells were in use
 
 
@@ -98,7 +99,7 @@ def test_sweep_over_a_cell_leaves_the_octupole(rng):
         tree = Octree(np.concatenate([clump, clump + away]), charges, leaf_size=32)
         own = np.arange(64) // 32  # slots go by clump; the field of the other clump is what is left without one's own
         field, expected = np.empty((64, 3)), twins.field(tree.positions, tree.positions, tree.charges)
-        tree.sweep(tree.lists(0.8), field, double_precision=True)
+        InteractionLists(tree, 0.8).sweep(field, double_precision=True)
         inner = np.concatenate([twins.field(*[tree.positions[own == k]] * 2, tree.charges[own == k]) for k in (0, 1)])
         errors.append(rms(field - expected, expected - inner))
     assert np.polyfit(np.log(distances), np.log(errors), 1)[0] == pytest.approx(-3.0, abs=0.2)
@@ -111,7 +112,7 @@ def test_sweep_better_with_smaller_angle(surface12):
     errors = []
     for angle in (0.8, 0.6, 0.4, 0.2):
         field = np.empty((len(positions), 3))
-        tree.sweep(tree.lists(angle), field, double_precision=True)
+        InteractionLists(tree, angle).sweep(field, double_precision=True)
         errors.append(rms(field - expected, expected))
     assert errors == sorted(errors, reverse=True)
 
@@ -175,7 +176,7 @@ def test_threads_give_the_same_bits(surface12, tip12, rng):
         fields = []
         for threads in (1, 2):
             fields.append(np.empty((len(positions), 3)))
-            tree.sweep(tree.lists(DEFAULT_ANGLE, threads), fields[-1], double, threads)
+            InteractionLists(tree, DEFAULT_ANGLE, threads).sweep(fields[-1], double, threads)
         assert np.array_equal(*fields)
 
 
@@ -204,7 +205,7 @@ def test_odd_arrangements(name, rng):
     assert rms(tree.potentials(points, 0.0) - potential, potential) < 1e-13
     assert rms(tree.fields(points, 0.3) - field, field) < 1e-3
     swept = np.empty((len(positions), 3))
-    tree.sweep(tree.lists(0.3), swept, double_precision=True)
+    InteractionLists(tree, 0.3).sweep(swept, double_precision=True)
     expected = twins.field(tree.positions, tree.positions, tree.charges)
     if len(positions) == 1 or name == "all in one place":
         assert not swept.any()

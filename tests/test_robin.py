@@ -3,6 +3,7 @@ import pytest
 import twins
 from apt_evap._core.octree import Octree
 from apt_evap._core.robin import Robin
+from apt_evap._core.sweep import InteractionLists
 
 import apt_evap as ae
 from apt_evap.units import COULOMB
@@ -18,7 +19,7 @@ def solved(positions, normals, opening_angle=0.0, tolerance=1e-10, start=None, *
     sweeps, residual = rule.solve(
         tree,
         np.ascontiguousarray(normals[tree.atoms]),
-        tree.lists(opening_angle, 2),
+        InteractionLists(tree, opening_angle, 2),
         tolerance=tolerance,
         double_precision=True,
         n_threads=2,

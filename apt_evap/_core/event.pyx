@@ -10,9 +10,17 @@ from libc.math cimport sqrt
 
 import numpy as np
 
-from apt_evap._core.octree cimport PATCH_LANES, Octree, Sources, patch_field, sources_field, sources_free, sources_init
+from apt_evap._core.octree cimport Octree, Sources, sources_field, sources_free, sources_init
 from apt_evap._core.robin cimport Patch
 from apt_evap._core.surface cimport MOST_NEAR
+from apt_evap._core.sweep cimport InteractionLists
+
+
+cdef extern from "pair.h":
+    const int PATCH_LANES
+    void patch_field(long, const float*, const float*, const float*, const float*, float, float, float,
+                     double*) noexcept nogil
+
 
 DONE, SWEEP_DUE, EXHAUSTED, TOO_SHALLOW = range(4)
 
@@ -154,7 +162,7 @@ cdef class Evaporation:
         n, capacity = self.tree.n_slots, self.tree.x.shape[0]
         self.normals = np.zeros((capacity, 3))
         np.asarray(self.normals)[:n] = normals[np.searchsorted(surface, self.tree.atoms)]
-        lists = self.tree.lists(self.opening_angle, n_threads)
+        lists = InteractionLists(self.tree, self.opening_angle, n_threads)
         outcome = self.rule.solve(self.tree, self.normals, lists, tolerance=tolerance, most_sweeps=most_sweeps,
                                   double_precision=double_precision, n_threads=n_threads)
         self.rule.scale(self.tree, self.potential / self.tree.potentials(self.potential_point, 0.0)[0])

@@ -1,24 +1,11 @@
 """The octree's memory, for the other compiled modules."""
 
 cdef extern from "pair.h":
-    const int GROUP
     const int CELL
     const int LANES
-    void group_atoms_single(long, long, const double*, const double*, const double*, const double*, const double*,
-                            const float*, float*) noexcept nogil
-    void group_cells_single(long, const int*, const double*, const double*, const float*, float*) noexcept nogil
-    void group_atoms_double(long, long, const double*, const double*, const double*, const double*, const double*,
-                            const double*, double*) noexcept nogil
-    void group_cells_double(long, const int*, const double*, const double*, const double*, double*) noexcept nogil
     void point_atoms(long, const double*, const double*, const double*, const double*,
                      double, double, double, double*) noexcept nogil
     void point_cells(long, long, const double*, double, double, double, double*) noexcept nogil
-    const int PATCH_LANES
-    void patch_row(long, const float*, const float*, const float*, float, float, float, const double*,
-                   float*) noexcept nogil
-    float patch_dot(long, const float*, const float*) noexcept nogil
-    void patch_field(long, const float*, const float*, const float*, const float*, float, float, float,
-                     double*) noexcept nogil
 
 
 cdef struct Sources:
@@ -59,20 +46,7 @@ cdef class Octree:
     cdef int collect(self, double cx, double cy, double cz, double radius, double opening_angle,
                      Sources* sources) except -1 nogil
     cdef long within(self, double px, double py, double pz, double radius, int* slots, long most) noexcept nogil
-    cdef long walk_lists(self, long group, double opening_angle, int* cell_list, int* range_list,
-                         long* n_cells, long* n_ranges) noexcept nogil
     cdef void mark(self, long node) noexcept nogil
     cdef void add_atom(self, long k, Sources* sources) noexcept nogil
-    cdef void group_ball(self, long group, double* ball) noexcept nogil
-    cdef void fill_lists(self, long group, double opening_angle, int* cells, int* ranges,
-                         long[:, ::1] starts) noexcept nogil
-    cdef void group_field_single(self, long group, InteractionLists lists, double[:, ::1] field) noexcept nogil
-    cdef void group_field_double(self, long group, InteractionLists lists, double[:, ::1] field) noexcept nogil
     cdef int field_at(self, double px, double py, double pz, double opening_angle, double* field) except -1 nogil
     cdef double potential_at(self, double px, double py, double pz, double opening_angle) except? -1 nogil
-
-
-cdef class InteractionLists:
-    cdef int[::1] cells          # accepted nodes of all groups, one after the other
-    cdef int[::1] ranges         # slots [begin, end) of the leaves that stay atoms
-    cdef long[:, ::1] starts     # (n_groups + 1, 3) where each group's cells and ranges begin, and its atoms so far

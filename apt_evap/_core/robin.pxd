@@ -1,6 +1,6 @@
 """What a charging rule offers to the event loop."""
 
-from apt_evap._core.octree cimport InteractionLists, Octree
+from apt_evap._core.octree cimport Octree
 
 
 cdef struct Patch:

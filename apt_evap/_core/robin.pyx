@@ -9,7 +9,14 @@ from libc.math cimport M_PI, fabsf
 
 import numpy as np
 
-from apt_evap._core.octree cimport patch_dot, patch_row
+from apt_evap._core.octree cimport Octree
+from apt_evap._core.sweep cimport InteractionLists
+
+
+cdef extern from "pair.h":
+    void patch_row(long, const float*, const float*, const float*, float, float, float, const double*,
+                   float*) noexcept nogil
+    float patch_dot(long, const float*, const float*) noexcept nogil
 
 
 cdef class ChargingRule:
@@ -80,8 +87,8 @@ cdef class Robin(ChargingRule):
         total = charges.sum()
         maps, steps = [], []   # of the last sweeps: what Robin's iteration made of the charges, and by how much
         for sweeps in range(1, most_sweeps + 1):
-            tree.sweep(lists, self.field, double_precision, n_threads)
-            flux = np.einsum("ij,ij->i", field, normal)
+            lists.sweep(self.field, double_precision, n_threads)
+            flux = np.maximum(np.einsum("ij,ij->i", field, normal), 0.0)   # a site deep in a notch stays without charge
             self.area = 2.0 * M_PI * total / flux.sum()
             flux *= total / flux.sum()
             maps.append(flux)
@@ -90,7 +97,9 @@ cdef class Robin(ChargingRule):
             if residual < tolerance:
                 tree.charges = flux
                 break
-            tree.charges = np.maximum(self.mixed(maps, steps), 0.0)
+            mixed = np.maximum(self.mixed(maps, steps), 0.0)
+            mixed *= total / mixed.sum()
+            tree.charges = mixed
         return sweeps, residual
 
     @cython.wraparound(True)
