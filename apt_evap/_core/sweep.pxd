@@ -6,12 +6,13 @@ from apt_evap._core.octree cimport Octree
 cdef class InteractionLists:
     cdef readonly Octree tree
     cdef long n_groups
+    cdef int[:, ::1] members     # (n_groups, 32) slots of each group
     cdef double[:, ::1] ball     # (n_groups, 4) middle and radius of each group
     cdef int[::1] cells          # accepted nodes of all groups, one after the other
     cdef int[::1] ranges         # slots [begin, end) of the leaves that stay atoms
     cdef long[:, ::1] starts     # (n_groups + 1, 3) where each group's cells and ranges begin, and its atoms so far
 
-    cdef void enclose(self, Octree tree, long group) noexcept nogil
+    cdef void split(self, Octree tree, int* slots, long n, long group) noexcept nogil
     cdef void walk(self, Octree tree, long group, double opening_angle, int* cells, int* ranges,
                    long* counts) noexcept nogil
     cdef void sweep_single(self, Octree tree, long group, double[:, ::1] field) noexcept nogil

@@ -1,0 +1,443 @@
+"""Speed and accuracy of apt_evap: prints a table and writes JSON. `python benchmarks/measure.py --help`.
+
+Every speed stands beside its accuracy and, where there is something to compare with, as a ratio taken in the same run.
+"""
+
+import argparse
+import json
+import platform
+import resource
+import time
+from pathlib import Path
+
+import numpy as np
+
+import apt_evap as ae
+from apt_evap._core.event import Journal
+from apt_evap._core.flight import Flights
+from apt_evap._core.octree import Octree
+from apt_evap._core.robin import Robin
+from apt_evap._core.sweep import InteractionLists, direct_field
+from apt_evap.emitter import SWEEP_DUE, TOO_SHALLOW, Emitter
+from apt_evap.units import COULOMB
+
+NICKEL = ae.material("Ni")
+A = NICKEL.a
+
+
+def nickel_tip(radius, shank, depth=8.0):
+    """Ni[111] of a radius, with a shank of so many radii; large ones as a shell. Lengths in lattice constants."""
+    depth = depth * A if radius > 40 else None
+    return ae.Tip(NICKEL, radius * A, axis=(1, 1, 1), shank_length=shank * radius * A, depth=depth)
+
+
+def best(function, repeats=3):
+    """Shortest of some times [s], and the last result."""
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        result = function()
+        times.append(time.perf_counter() - start)
+    return min(times), result
+
+
+def peak_memory():
+    """Peak memory of this process so far [GB]."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+
+
+def processor():
+    """Name of the processor."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor()
+
+
+# ---- (a) fields ------------------------------------------------------------------------------------------------------
+
+
+def fields(radius=80, shank=3.0, targets=2000, angles=(0.5, 0.6, 0.7, 0.75, 0.8), threads=(1, 2)):
+    """Field on all surface atoms by lists, as a fraction of the time of a direct float64 sum measured beside it."""
+    emitter = Emitter(nickel_tip(radius, shank, depth=5.0), n_threads=max(threads))
+    positions, n = np.ascontiguousarray(emitter.positions), len(emitter)
+    charges = np.random.default_rng(1).uniform(0.5, 1.5, n)
+    tree = Octree(positions, charges)
+    chosen = np.random.default_rng(2).choice(n, targets, replace=False)
+    points = np.ascontiguousarray(tree.positions[chosen])
+    seconds, exact = best(lambda: direct_field(points, tree.positions, tree.charges.copy()))
+    direct = seconds * n / targets
+    scale = np.sqrt((exact**2).sum(axis=1).mean())
+    rows = []
+    for angle in angles:
+        for n_threads in threads:
+            walk, lists = best(lambda angle=angle, n_threads=n_threads: InteractionLists(tree, angle, n_threads))
+            field = np.empty((n, 3))
+            sweep, _ = best(lambda lists=lists, n_threads=n_threads: lists.sweep(field, False, n_threads))
+            error = np.linalg.norm(field[chosen] - exact, axis=1) / scale
+            rows.append(
+                {
+                    "opening angle": angle,
+                    "threads": n_threads,
+                    "lists [s]": walk,
+                    "sweep [s]": sweep,
+                    "direct / (lists + sweep)": direct / (walk + sweep),
+                    "direct / sweep": direct / sweep,
+                    "RMS error": float(np.sqrt((error**2).mean())),
+                    "largest error": float(error.max()),
+                    "Gpair/s": sum(lists.pairs) / sweep / 1e9,
+                    "lists [MB]": lists.nbytes / 1e6,
+                }
+            )
+    return {
+        "title": f"field on all {n:,} surface atoms, Ni[111], R = {radius} a, shank {shank} R; a direct float64 sum, "
+        f"one thread: {n / direct * n / 1e9:.2f} Gpair/s, {direct:.1f} s (from {targets:,} targets)",
+        "rows": rows,
+    }
+
+
+# ---- (b) solutions from scratch --------------------------------------------------------------------------------------
+
+
+def solutions(radii=(20, 40, 80), shank=2.0, n_threads=2):
+    """Sweeps and seconds from equal charges, plain and mixed."""
+    rows = []
+    for radius in radii:
+        emitter = Emitter(nickel_tip(radius, shank, depth=5.0), n_threads=n_threads)
+        core = emitter._core
+        lists = InteractionLists(core.tree, emitter.settings.opening_angle, n_threads)
+        for window in (0, 8):
+            for tolerance in (1e-3, 1e-6, 1e-10):
+                core.tree.charges = np.ones(core.tree.n_slots)
+                start = time.perf_counter()
+                sweeps, residual = Robin(window=window).solve(
+                    core.tree,
+                    core.slot_normals,
+                    lists,
+                    tolerance=tolerance,
+                    double_precision=tolerance < 1e-5,
+                    n_threads=n_threads,
+                )
+                rows.append(
+                    {
+                        "R [a]": radius,
+                        "surface atoms": len(emitter),
+                        "mixed sweeps": window,
+                        "tolerance": tolerance,
+                        "sweeps": sweeps,
+                        "residual": residual,
+                        "seconds": time.perf_counter() - start,
+                    }
+                )
+    return {"title": f"charges from scratch, {n_threads} threads", "rows": rows}
+
+
+# ---- (c) (e) (f) ions ------------------------------------------------------------------------------------------------
+
+
+def evaporate(emitter, events):
+    """Let atoms leave without flights; return the seconds of events and of relaxations."""
+    seconds = [0.0, 0.0]
+    done = 0
+    while done < events:
+        start = time.perf_counter()
+        batch = emitter.evaporate(min(256, events - done))
+        seconds[0] += time.perf_counter() - start
+        done += len(batch)
+        start = time.perf_counter()
+        if batch.status == SWEEP_DUE:
+            emitter.relax()
+        elif batch.status == TOO_SHALLOW:
+            emitter.deepen()
+        seconds[1] += time.perf_counter() - start
+    return seconds
+
+
+def rates(radii=(20, 40, 80, 120), shank=2.0, ions=5000, threads=(1, 2), depth=8.0):
+    """Microseconds an event, ions per second with one flight and with both responses, peak memory."""
+    rows = []
+    for radius in radii:
+        for n_threads in threads:
+            start = time.perf_counter()
+            simulation = ae.Simulation(nickel_tip(radius, shank, depth), seed=1, n_threads=n_threads)
+            begun = time.perf_counter() - start
+            events, relaxations = evaporate(simulation.emitter, ions)
+            speeds = []
+            for responses in (False, True):
+                start = time.perf_counter()
+                simulation.run(ions, responses=responses, progress=False)
+                speeds.append(ions / (time.perf_counter() - start))
+            rows.append(
+                {
+                    "R [a]": radius,
+                    "surface atoms": len(simulation.emitter),
+                    "threads": n_threads,
+                    "start [s]": begun,
+                    "event [us]": events / ions * 1e6,
+                    "relaxation, per event [us]": relaxations / ions * 1e6,
+                    "ions/s, one flight": speeds[0],
+                    "ions/s, both responses": speeds[1],
+                    "peak memory [GB]": peak_memory(),
+                }
+            )
+    return {"title": f"Ni[111], shank {shank} R, {ions:,} ions each", "rows": rows}
+
+
+# ---- accuracy of events, flights and responses -----------------------------------------------------------------------
+
+
+def charge_errors(radius=40, shank=1.0, events=5000, n_threads=2):
+    """Charges after events against a converged solution of the same surface, just after and just before relaxations."""
+    rows = []
+    emitter = Emitter(nickel_tip(radius, shank), n_threads=n_threads)
+    interval = emitter._sweep_interval
+    for count in (events, interval - 1 - events % interval):
+        evaporate(emitter, count)
+        atoms, charges, since = emitter.atoms, emitter.charges.copy(), emitter._core.since_sweep
+        emitter.relax(1e-10)
+        solved = np.zeros(len(emitter.tip))
+        solved[emitter.atoms] = emitter.charges
+        solved = solved[atoms]
+        error = (charges * (solved.sum() / charges.sum()) - solved) / solved.mean()
+        rows.append(
+            {
+                "events": emitter._core.n_removed,
+                "since the last relaxation": since,
+                "interval": interval,
+                "RMS": float(np.sqrt((error**2).mean())),
+                "largest": float(np.abs(error).max()),
+            }
+        )
+    return {
+        "title": f"error of charges over the mean charge, Ni[111], R = {radius} a, {len(emitter):,} atoms",
+        "rows": rows,
+    }
+
+
+def flights(radii=(20, 40, 80, 120), shank=2.0, ions=256, group=17):
+    """Microseconds and evaluations of a flight, alone and in a group that shares its walks; one thread."""
+    rows = []
+    for radius in radii:
+        emitter = Emitter(nickel_tip(radius, shank))
+        batch = emitter.evaporate(min(ions, emitter._sweep_interval))
+        tip, settings = emitter.tip, ae.FlightSettings()
+        speed = np.sqrt(2 * 0.5)  # 0.5 eV, charge state 1
+        for launches in (1, group):
+            flier = flier_over(batch.tree, tip, settings)
+            angle = np.tile(2 * np.pi * np.arange(launches) / launches, len(batch))
+            first, second = (np.repeat(t, launches, axis=0) for t in ae.tangent_frame(batch.normals))
+            velocities = speed * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second)
+            positions = np.repeat(tip.positions[batch.site], launches, axis=0)
+            start = time.perf_counter()
+            fly(flier, batch.journal, np.arange(len(batch)), launches, positions, velocities)
+            seconds = time.perf_counter() - start
+            flown = len(batch) * launches
+            rows.append(
+                {
+                    "R [a]": radius,
+                    "launches a group": launches,
+                    "us a flight": seconds / flown * 1e6,
+                    "steps": flier.n_steps / len(batch),
+                    "evaluations a flight": flier.n_evaluations / flown,
+                    "atoms and cells an evaluation": flier.n_pairs / flier.n_evaluations,
+                }
+            )
+    return {"title": "flights, one thread, replay of the events included", "rows": rows}
+
+
+def flier_over(tree, tip, settings):
+    """Flights over a tree, as `Simulation` makes them."""
+    return Flights(
+        tree,
+        coulomb=COULOMB,
+        length=tip.nearest_neighbour_distance,
+        centre=(0.0, 0.0, tip.apex),
+        reach=settings.reach * tip.nearest_neighbour_distance,
+        opening_angle=settings.opening_angle,
+        tolerance=settings.tolerance,
+        most_steps=settings.most_steps,
+    )
+
+
+def fly(flier, journal, events, launches, positions, velocities):
+    """Fly groups of so many launches; return ends (m, 7) and outcomes (m,)."""
+    end, outcome = np.empty((len(positions), 7)), np.empty(len(positions), np.int8)
+    start = np.arange(0, len(positions) + 1, launches)
+    counter = np.zeros(1, np.int64)
+    flier.fly(journal, np.asarray(events), start, positions, velocities, end, outcome, counter)
+    return end, outcome
+
+
+def place_errors(radius=40, shank=1.0, events=5000, ions=200, n_threads=2):
+    """Places of ions of a run against exact flights in the exact field: converged charges, sums over all atoms."""
+    simulation = ae.Simulation(nickel_tip(radius, shank), seed=1, n_threads=n_threads)
+    detector, tip, errors = simulation.detector, simulation.tip, []
+    for _ in range(ions):
+        evaporate(simulation.emitter, events // ions - 1)
+        run = simulation.run(1, responses=False, progress=False)
+        emitter = simulation.emitter
+        tree = Octree(np.ascontiguousarray(emitter.positions), emitter.charges.copy())
+        normals = np.ascontiguousarray(emitter.normals[tree.atoms])
+        Robin().solve(
+            tree,
+            normals,
+            InteractionLists(tree, 0.3, n_threads),
+            tolerance=1e-6,
+            double_precision=True,
+            n_threads=n_threads,
+        )
+        potential = COULOMB * tree.potentials(tip.potential_point[None], 0.0)[0]
+        tree.charges = tree.charges * (simulation.voltage / potential)
+        flier = flier_over(tree, tip, ae.FlightSettings(opening_angle=0.0, tolerance=1e-6))
+        end, _ = fly(flier, Journal(tip.positions, 1), [-1], 1, run.emissions.positions, np.zeros((1, 3)))
+        x, y, _ = detector.impacts(detector.directions(end[:, :3], end[:, 3:6], tip.apex)[0])
+        hits = run.hits(ae.Unperturbed())
+        errors.append(np.hypot(hits.x - x, hits.y - y)[0])
+    rows = [
+        {
+            "ions": ions,
+            "of events": events,
+            "median [mm]": float(np.median(errors)),
+            "99 % [mm]": float(np.quantile(errors, 0.99)),
+            "largest [mm]": float(np.max(errors)),
+        }
+    ]
+    return {"title": f"places against exact flights in the exact field, Ni[111], R = {radius} a", "rows": rows}
+
+
+def response_errors(radii=(20, 80), shank=2.0, events=5000, ions=200, n_threads=2):
+    """Places by responses against flights at energies to 1.5 eV that no design used."""
+    rows = []
+    energies = [ae.Fixed(energy) for energy in (0.05, 0.2, 0.5, 0.8, 1.1, 1.5)]
+    for radius in radii:
+        simulation = ae.Simulation(nickel_tip(radius, shank), seed=1, n_threads=n_threads)
+        evaporate(simulation.emitter, events)
+        checks = [kind(energy) for energy in energies for kind in (ae.LateralVelocity, ae.RollUp)]
+        run = simulation.run(ions, emissions=checks, progress=False)
+        for kind in (ae.LateralVelocity, ae.RollUp):
+            errors = []
+            for energy in energies:
+                flown, fitted = run.hits(kind(energy)), run.hits(kind(energy), by_response=True)
+                both = flown.detected & fitted.detected
+                errors.append(np.hypot(flown.x - fitted.x, flown.y - fitted.y)[both])
+            errors = np.concatenate(errors)
+            rows.append(
+                {
+                    "R [a]": radius,
+                    "launches": kind.__name__,
+                    "flights": len(errors),
+                    "median [mm]": float(np.median(errors)),
+                    "95 % [mm]": float(np.quantile(errors, 0.95)),
+                    "largest [mm]": float(errors.max()),
+                    "ions marked [%]": 100 * float(run.marked.mean()),
+                }
+            )
+    return {"title": f"responses against flights, energies to 1.5 eV, {ions} ions", "rows": rows}
+
+
+def hits_of_a_million(ions=1_000_000, n_threads=2):
+    """Seconds of Run.hits for a million ions: a small run, joined with itself."""
+    run = ae.Simulation(nickel_tip(12, 1.0), seed=1, n_threads=n_threads).run(2000, progress=False)
+    run = ae.Run.join([run] * (ions // len(run)))
+    energy = ae.TruncatedNormal(0.155, 0.155)
+    rows = []
+    for perturbation in (ae.Unperturbed(), ae.LateralVelocity(energy), ae.RollUp(energy), ae.Combined(energy, 0.75)):
+        seconds, hits = best(lambda perturbation=perturbation: run.hits(perturbation))
+        rows.append({"perturbation": type(perturbation).__name__, "ions": len(hits), "seconds": seconds})
+    return {"title": "Run.hits by responses", "rows": rows}
+
+
+# ---- the base --------------------------------------------------------------------------------------------------------
+
+
+def bases(radius=20, shanks=(0.5, 1.0, 2.0, 3.0, 5.0, 8.0), ions=200, n_threads=2):
+    """What the foot does to the cap: fields over their mean, and places, against the longest shank."""
+    cases = [(base, shank) for shank in shanks for base in ("rounded", "flat")]
+    results = {}
+    for base, shank in cases:
+        tip = ae.Tip(NICKEL, radius * A, axis=(1, 1, 1), shank_length=shank * radius * A, base=base)
+        simulation = ae.Simulation(tip, seed=1, n_threads=n_threads)
+        emitter = simulation.emitter
+        emitter.relax(1e-8)
+        cap = emitter.positions[:, 2] > 0.5 * radius * A
+        # atoms of both caps in one order, to rounding
+        order = np.lexsort(np.round(emitter.positions[cap], 6).T)
+        fields = emitter.fields[cap][order]
+        sites = (emitter.positions + 0.25 * emitter.normals)[cap][order]
+        rim = emitter.fields[emitter.positions[:, 2] < -0.5 * shank * radius * A].max()
+        # the same launches for all: from the first atoms, one flight each, nobody leaving in between
+        batch = emitter.evaporate(1)
+        chosen = np.ascontiguousarray(sites[:: max(1, len(sites) // ions)])
+        flier = flier_over(batch.tree, tip, ae.FlightSettings())
+        end, _ = fly(flier, batch.journal, np.full(len(chosen), -1), 1, chosen, np.zeros_like(chosen))
+        directions, _ = simulation.detector.directions(end[:, :3], end[:, 3:6], tip.apex)
+        results[base, shank] = fields, rim, np.stack(simulation.detector.impacts(directions)[:2], axis=1)
+    reference = results["rounded", shanks[-1]]
+    rows = []
+    for (base, shank), (fields, rim, places) in results.items():
+        relative = fields / fields.mean() / (reference[0] / reference[0].mean()) - 1
+        radial = np.hypot(*places.T) / np.hypot(*reference[2].T)
+        rows.append(
+            {
+                "base": base,
+                "shank [R]": shank,
+                "V/(R mean cap field)": 1000.0 / (radius * A * fields.mean()),
+                "cap field / mean, RMS change": float(np.sqrt((relative**2).mean())),
+                "largest": float(np.abs(relative).max()),
+                "place, magnification": float(np.nanmedian(radial)),
+                "its spread": float(np.nanstd(radial)),
+                "largest field of the foot / of the cap": rim / fields.max(),
+            }
+        )
+    return {"title": f"the foot, Ni[111], R = {radius} a; against a rounded base at {shanks[-1]:g} R", "rows": rows}
+
+
+# ---- printing --------------------------------------------------------------------------------------------------------
+
+PARTS = {
+    "fields": fields,
+    "solutions": solutions,
+    "rates": rates,
+    "flights": flights,
+    "charges": charge_errors,
+    "places": place_errors,
+    "responses": response_errors,
+    "hits": hits_of_a_million,
+    "bases": bases,
+    "large": lambda: rates(radii=(284,), ions=20_000, threads=(2,), depth=7.0),
+}
+
+
+def table(result):
+    """Text of one table."""
+    rows = [[_text(value) for value in row.values()] for row in result["rows"]]
+    heads = list(result["rows"][0])
+    widths = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
+    lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in [heads, *rows]]
+    return "\n".join([result["title"], *lines, ""])
+
+
+def _text(value):
+    return f"{value:.4g}" if isinstance(value, float) else f"{value:,}" if isinstance(value, int) else str(value)
+
+
+def main():
+    """Measure the parts named, or all but the largest."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("parts", nargs="*", help=f"of {', '.join(PARTS)}; all but large if none is named")
+    parser.add_argument("-o", "--output", default="measure.json", help="JSON file [%(default)s]")
+    arguments = parser.parse_args()
+    for name in arguments.parts:
+        if name not in PARTS:
+            parser.error(f"no part {name!r}; known are {', '.join(PARTS)}")
+    results = {"processor": processor(), "version": ae.__version__, "python": platform.python_version()}
+    print(f"{results['processor']}, apt_evap {ae.__version__}\n")
+    for name in arguments.parts or [name for name in PARTS if name != "large"]:
+        results[name] = PARTS[name]()
+        print(table(results[name]), flush=True)
+        Path(arguments.output).write_text(json.dumps(results, indent=1, default=float))
+
+
+if __name__ == "__main__":
+    main()
