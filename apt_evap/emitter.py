@@ -33,7 +33,7 @@ class ChargeSettings:
     update_radius : float
         Fields are kept up to date within this distance of a hole [d_nn].
     sweep_interval : int, optional
-        Events between two relaxations of the whole surface; by default a two-hundredth of the surface atoms.
+        Events between two relaxations of the whole surface; by default a three-hundredth of the surface atoms.
     tolerance : float
         Change of a charge, relative to the mean charge, at which a relaxation stops.
     start_tolerance : float
@@ -139,7 +139,7 @@ class Emitter:
         )
         self._fresh = False
         self.relax(tolerance=self.settings.start_tolerance)
-        self._sweep_interval = self.settings.sweep_interval or max(100, len(self) // 200)
+        self._sweep_interval = self.settings.sweep_interval or max(100, len(self) // 300)
 
     def _neighbourhood_of(self, tip, before=None):
         return Neighbourhood(
@@ -243,6 +243,10 @@ class Emitter:
                 stacklevel=2,
             )
         return outcome
+
+    def hand_out_tree(self):
+        """Let the next batch come with a copy of the tree, for flights that have not followed the events so far."""
+        self._fresh = True
 
     def deepen(self):
         """Hold more of the specimen, after `evaporate` came upon atoms that are only held as support.

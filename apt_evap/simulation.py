@@ -161,6 +161,7 @@ class Simulation:
         if not emissions and not responses:
             emissions = (Unperturbed(),)
         parts, ended = [], ""
+        self.emitter.hand_out_tree()  # somebody may have let atoms evaporate without flights
         disable = None if progress is None else not progress
         with (
             tqdm(total=n_ions, unit=" ions", smoothing=0.1, disable=disable, mininterval=0.5) as bar,

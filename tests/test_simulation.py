@@ -331,3 +331,12 @@ def test_every_ion_of_the_large_run_is_accounted_for(run20):
     assert summary["hit"] + summary["missed"] + summary["never_left"] == 15_000
     assert summary["never_left"] == 0
     assert summary["ended"] == ""
+
+
+def test_flights_follow_an_emitter_that_was_driven_by_hand(nickel):
+    tip = ae.Tip(nickel, apex_radius=6 * nickel.a, axis=(1, 1, 1), shank_length=6 * nickel.a)
+    by_hand, whole = ae.Simulation(tip, seed=1), ae.Simulation(tip, seed=1)
+    by_hand.emitter.evaporate(60)
+    later = by_hand.run(20, responses=False, progress=False).hits(ae.Unperturbed())
+    run = whole.run(80, responses=False, progress=False).hits(ae.Unperturbed())
+    assert np.array_equal(later.x, run.x[60:]) and np.array_equal(later.site, run.site[60:])
