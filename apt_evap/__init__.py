@@ -8,12 +8,13 @@ from apt_evap.emission import Emissions, Launches, tangent_frame
 from apt_evap.emitter import ChargeSettings, Emitter
 from apt_evap.energy import Fixed, Thermal, TruncatedNormal
 from apt_evap.hits import Hits, Outcome
-from apt_evap.io import FileError, TruncatedFile, read, write
+from apt_evap.io import FileError, TruncatedFile, chunks, read, read_ranges, write
 from apt_evap.ion_random import IonRandom
 from apt_evap.law import Extremal
 from apt_evap.maps import DetectorMap, azimuthal_profile, radial_profile
 from apt_evap.material import Material, material, polarization_energy
 from apt_evap.perturbation import Combined, LateralVelocity, RollUp, Unperturbed
+from apt_evap.ranges import Ranges
 from apt_evap.response import Design, ResponseSettings
 from apt_evap.run import Run, load
 from apt_evap.simulation import FlightSettings, Simulation
@@ -37,6 +38,7 @@ __all__ = [
     "Launches",
     "Material",
     "Outcome",
+    "Ranges",
     "ResponseSettings",
     "RollUp",
     "Run",
@@ -48,6 +50,7 @@ __all__ = [
     "Unperturbed",
     "__version__",
     "azimuthal_profile",
+    "chunks",
     "half_ceiling",
     "load",
     "material",
@@ -55,6 +58,7 @@ __all__ = [
     "polarization_energy",
     "radial_profile",
     "read",
+    "read_ranges",
     "ssim",
     "tangent_frame",
     "write",

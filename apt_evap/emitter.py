@@ -33,7 +33,7 @@ class ChargeSettings:
     update_radius : float
         Fields are kept up to date within this distance of a hole [d_nn].
     sweep_interval : int, optional
-        Events between two relaxations of the whole surface; by default a three-hundredth of the surface atoms.
+        Events between two relaxations of the whole surface; by default a 200th of the surface atoms.
     tolerance : float
         Change of a charge, relative to the mean charge, at which a relaxation stops.
     start_tolerance : float
@@ -42,15 +42,15 @@ class ChargeSettings:
 
     opening_angle: float = 0.5
     patch_radius: float = 8.5
-    update_radius: float = 12.0
+    update_radius: float = 18.0
     sweep_interval: int | None = None
-    tolerance: float = 1e-3
+    tolerance: float = 3e-3
     start_tolerance: float = 1e-5
 
     def __post_init__(self):
         check_number(self.opening_angle, "opening_angle", at_least=0, at_most=1.5, unit="rad")
         check_number(self.patch_radius, "patch_radius", at_least=1.5, at_most=30, unit="d_nn")
-        check_number(self.update_radius, "update_radius", at_least=self.patch_radius, at_most=30, unit="d_nn")
+        check_number(self.update_radius, "update_radius", at_least=self.patch_radius, at_most=40, unit="d_nn")
         check_number(self.tolerance, "tolerance", above=0)
         check_number(self.start_tolerance, "start_tolerance", above=0)
         if self.sweep_interval is not None:
@@ -139,7 +139,7 @@ class Emitter:
         )
         self._fresh = False
         self.relax(tolerance=self.settings.start_tolerance)
-        self._sweep_interval = self.settings.sweep_interval or max(100, len(self) // 300)
+        self._sweep_interval = self.settings.sweep_interval or max(100, len(self) // 200)
 
     def _neighbourhood_of(self, tip, before=None):
         return Neighbourhood(

@@ -1,11 +1,12 @@
 """The one type for simulated and measured ions: columns of equal length, one row per ion."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field
 from enum import IntEnum
+from numbers import Real
 
 import numpy as np
 
-from apt_evap._arrays import check_array
+from apt_evap._arrays import check_array, check_number
 
 
 class Outcome(IntEnum):
@@ -28,6 +29,7 @@ _WHOLE = {
     "ion": np.int64,
     "outcome": np.int8,
 }
+_COLUMNS = (*_FLOAT, *_WHOLE)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -61,6 +63,10 @@ class Hits:
         Place in the sequence of evaporation, shape (n,).
     outcome : array_like, optional
         An `Outcome` for every ion, shape (n,). None for measured ions.
+    extra : dict, optional
+        Further columns by name, as a file has them: arrays of any type, shape (n,) or (n, k). A selection carries them.
+    units : dict, optional
+        Units of the further columns by name, where they have one.
     source : str
         File name, or what made the ions.
 
@@ -84,16 +90,21 @@ class Hits:
     site: np.ndarray = None
     ion: np.ndarray = None
     outcome: np.ndarray = None
+    extra: dict = field(default_factory=dict)
+    units: dict = field(default_factory=dict)
     source: str = ""
 
     def __post_init__(self):
         lengths = {}
-        for name in _FLOAT + tuple(_WHOLE):
+        for name in _COLUMNS:
             value = getattr(self, name)
             if value is not None:
                 column = _column(name, value)
                 object.__setattr__(self, name, column)
                 lengths[name] = len(column)
+        object.__setattr__(self, "extra", {name: _extra(name, value) for name, value in dict(self.extra or {}).items()})
+        object.__setattr__(self, "units", dict(self.units or {}))
+        lengths.update((name, len(values)) for name, values in self.extra.items())
         if not lengths:
             raise ValueError("Hits needs at least one column, got none")
         if len(set(lengths.values())) > 1:
@@ -106,8 +117,8 @@ class Hits:
 
     @property
     def columns(self):
-        """Names of the columns that are there, tuple of str."""
-        return tuple(f.name for f in fields(self) if f.name != "source" and getattr(self, f.name) is not None)
+        """Names of the columns that are there, without those in `extra`, tuple of str."""
+        return tuple(name for name in _COLUMNS if getattr(self, name) is not None)
 
     def require(self, *names):
         """Return the named columns, or say which one is missing.
@@ -128,7 +139,7 @@ class Hits:
         """
         for name in names:
             if name not in _FLOAT and name not in _WHOLE:
-                raise ValueError(f"Hits has no column {name!r}; its columns are {', '.join(_FLOAT + tuple(_WHOLE))}")
+                raise ValueError(f"Hits has no column {name!r}; its columns are {', '.join(_COLUMNS)}")
             if getattr(self, name) is None:
                 raise ValueError(
                     f"{self.source or 'these hits'} has no column {name!r}, only {', '.join(self.columns)}"
@@ -174,11 +185,72 @@ class Hits:
 
         return DetectorMap.from_hits(self, bins=bins, **options)
 
+    def within_circle(self, radius, centre=(0.0, 0.0)):
+        """Select the detected ions within a circle on the detector.
+
+        Parameters
+        ----------
+        radius : float
+            Radius of the circle [mm]; its rim is inside.
+        centre : array_like
+            Its centre [mm], shape (2,).
+
+        Returns
+        -------
+        Hits
+            With pulse_id and multiplicity as they were.
+
+        Raises
+        ------
+        ValueError
+            If there are no detector coordinates, or the circle is none.
+        """
+        x, y = self.require("x", "y")
+        radius = check_number(radius, "radius", above=0, unit="mm")
+        centre = check_array(centre, "centre", (2,))
+        with np.errstate(over="ignore", invalid="ignore"):
+            distance = np.hypot(x - centre[0], y - centre[1])
+        return self[self.detected & (distance <= radius)]
+
+    def window(self, **bounds):
+        """Select the ions whose columns are within bounds: ``hits.window(voltage=(4e3, 5e3), multiplicity=(2, None))``.
+
+        Parameters
+        ----------
+        **bounds
+            For any column of one value per ion, or of `extra`: (low, high), in its unit, low <= value < high; None
+            is no bound. ``ion`` counts the rows where there is no such column (measured ions). Windows that
+            adjoin share no ion; values that are NaN are in none.
+
+        Returns
+        -------
+        Hits
+            With pulse_id and multiplicity as they were.
+
+        Raises
+        ------
+        ValueError
+            If a column is missing or has several values per ion, or its bounds are not two numbers in order.
+        """
+        chosen = np.ones(len(self), bool)
+        for name, limits in bounds.items():
+            if name in self.extra:
+                values = self.extra[name]
+            elif name == "ion" and self.ion is None:
+                values = np.arange(len(self))
+            else:
+                (values,) = self.require(name)
+            if values.ndim > 1 or values.dtype.kind not in "biuf":
+                raise ValueError(f"{name} must have one number per ion to select by, got shape {values.shape}")
+            low, high = _bounds(limits, name)
+            chosen &= (values >= low) & (values < high)
+        return self[chosen]
+
     def __len__(self):
-        for name in _FLOAT + tuple(_WHOLE):
+        for name in _COLUMNS:
             if (column := getattr(self, name)) is not None:
                 return len(column)
-        return 0
+        return len(next(iter(self.extra.values())))
 
     def __getitem__(self, selection):
         """Return the selected ions as `Hits`; takes a slice, a mask, indices or one index."""
@@ -194,19 +266,40 @@ class Hits:
                 index = np.flatnonzero(index)
             selection = np.atleast_1d(index)
         chosen = {name: getattr(self, name)[selection] for name in self.columns}
-        return Hits(**chosen, source=self.source)
+        extra = {name: values[selection] for name, values in self.extra.items()}
+        return Hits(**chosen, extra=extra, units=self.units, source=self.source)
 
     def __repr__(self):
         detected = np.count_nonzero(self.detected)
         source = f" from {self.source!r}" if self.source else ""
-        return f"<Hits: {len(self):,} ions, {detected:,} detected{source}; {', '.join(self.columns)}>"
+        return f"<Hits: {len(self):,} ions, {detected:,} detected{source}; {', '.join([*self.columns, *self.extra])}>"
 
 
 def _column(name, value):
     """Check one column and give it its type."""
     if name in _WHOLE:
+        if isinstance(value, np.ndarray) and value.ndim == 1 and value.dtype == _WHOLE[name]:
+            return np.ascontiguousarray(value)  # nothing to lose in a cast
         return check_array(value, name, ("n",), dtype=_WHOLE[name])
     given = getattr(value, "dtype", None)
     single = given is not None and given.kind == "f" and given.itemsize == 4
     shape = ("n", 3) if name == "positions" else ("n",)
     return check_array(value, name, shape, dtype=np.float32 if single else np.float64, finite=False)
+
+
+def _extra(name, value):
+    """Check one of the further columns."""
+    column = np.asarray(value)
+    if column.ndim not in (1, 2) or column.dtype == object:
+        raise ValueError(f"extra[{name!r}] must be an array of shape (n,) or (n, k), got {value!r:.80}")
+    return column
+
+
+def _bounds(limits, name):
+    """Return two bounds, infinite where None."""
+    if not isinstance(limits, str) and np.iterable(limits) and len(pair := tuple(limits)) == 2:
+        low = -np.inf if pair[0] is None else pair[0]
+        high = np.inf if pair[1] is None else pair[1]
+        if isinstance(low, Real) and isinstance(high, Real) and low <= high:
+            return low, high
+    raise ValueError(f"{name} must have two bounds (low, high) with low <= high, None for no bound, got {limits!r:.80}")

@@ -296,7 +296,9 @@ def load(path):
             if kind != FORMAT:
                 raise FileError(f"{str(path)!r} is not a run of this version: expected {FORMAT!r}, got {kind!r}")
             return _read(file)
-    except (OSError, KeyError, RuntimeError, json.JSONDecodeError) as error:
+    except FileError:
+        raise
+    except (OSError, KeyError, RuntimeError, TypeError, ValueError, AttributeError) as error:
         raise FileError(f"cannot read {str(path)!r} as a run: {str(error).splitlines()[0]}") from error
 
 

@@ -11,13 +11,13 @@ import time
 from pathlib import Path
 
 import numpy as np
-
-import apt_evap as ae
 from apt_evap._core.event import Journal
 from apt_evap._core.flight import Flights
 from apt_evap._core.octree import Octree
 from apt_evap._core.robin import Robin
 from apt_evap._core.sweep import InteractionLists, direct_field
+
+import apt_evap as ae
 from apt_evap.emitter import SWEEP_DUE, TOO_SHALLOW, Emitter
 from apt_evap.units import COULOMB
 
@@ -74,7 +74,7 @@ def fields(radius=80, shank=3.0, targets=2000, angles=(0.5, 0.6, 0.7, 0.75, 0.8)
         for n_threads in threads:
             walk, lists = best(lambda angle=angle, n_threads=n_threads: InteractionLists(tree, angle, n_threads))
             field = np.empty((n, 3))
-            sweep, _ = best(lambda lists=lists, n_threads=n_threads: lists.sweep(field, False, n_threads))
+            sweep, _ = best(lambda lists=lists, field=field, n=n_threads: lists.sweep(field, False, n))
             error = np.linalg.norm(field[chosen] - exact, axis=1) / scale
             rows.append(
                 {

@@ -13,7 +13,7 @@ PACKAGE = Path(__file__).parents[1] / "apt_evap"
 FLOORS = (
     {"units", "_arrays", "_threads", "_files", "_version"},
     {"_core"},
-    {"lattice", "shape", "material", "tip", "detector", "hits"},
+    {"lattice", "ranges", "shape", "material", "tip", "detector", "hits"},
     {"ion_random", "energy", "emission", "perturbation", "law", "emitter", "response"},
     {"run", "simulation"},
     {"binning", "maps", "register", "compare", "study", "config", "info", "io"},

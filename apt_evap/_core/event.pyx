@@ -25,7 +25,7 @@ cdef extern from "pair.h":
 DONE, SWEEP_DUE, EXHAUSTED, TOO_SHALLOW = range(4)
 
 cdef enum:
-    MOST_PATCH = 4096   # slots within the update radius; 10 lattice constants of fcc hold some 800
+    MOST_PATCH = 16384   # slots within the update radius; 20 lattice constants of fcc hold some 2,500
 
 
 cdef class Journal:
@@ -149,23 +149,27 @@ cdef class Evaporation:
         if len(surface) == 0:
             raise ValueError("the specimen has no surface atoms")
         slot_of = np.asarray(self.slot_of)
-        charges, normals = np.ones(len(surface)), self.atoms.normals_of(surface)
+        charges, kept = np.ones(len(surface)), None
         if self.tree is not None:
             slots = slot_of[surface]
             charges = np.where(slots >= 0, self.tree.charges[slots], 0.0)
-            pulled = np.asarray(self.atoms.counts)[surface] > 0   # the others keep the normals they had
-            normals = np.where((pulled | (slots < 0))[:, None], normals, np.asarray(self.normals)[slots])
-        positions = np.ascontiguousarray(np.asarray(self.atoms.positions)[surface])
-        self.tree = Octree(positions, charges, surface, extra=extra or len(surface) // 8 + MOST_NEAR)
-        slot_of[:] = -1
-        slot_of[self.tree.atoms] = np.arange(len(surface), dtype=np.int32)
+            kept = np.asarray(self.normals)
+        self.tree = Octree(np.asarray(self.atoms.positions)[surface], charges, surface,
+                           extra=extra or len(surface) // 8 + MOST_NEAR)
+        surface = self.tree.atoms   # in the order of the slots from here on
         n, capacity = self.tree.n_slots, self.tree.x.shape[0]
         self.normals = np.zeros((capacity, 3))
-        np.asarray(self.normals)[:n] = normals[np.searchsorted(surface, self.tree.atoms)]
+        np.asarray(self.normals)[:n] = self.atoms.normals_of(surface)
+        if kept is not None:   # where no neighbour pulls, an atom keeps the normal it had
+            alone = np.flatnonzero((np.asarray(self.atoms.counts)[surface] == 0) & (slot_of[surface] >= 0))
+            np.asarray(self.normals)[alone] = kept[slot_of[surface[alone]]]
+        slot_of[:] = -1
+        slot_of[surface] = np.arange(n, dtype=np.int32)
         lists = InteractionLists(self.tree, self.opening_angle, n_threads)
         outcome = self.rule.solve(self.tree, self.normals, lists, tolerance=tolerance, most_sweeps=most_sweeps,
                                   double_precision=double_precision, n_threads=n_threads)
-        self.rule.scale(self.tree, self.potential / self.tree.potentials(self.potential_point, 0.0)[0])
+        away = np.linalg.norm(self.tree.positions - self.potential_point, axis=1)
+        self.rule.scale(self.tree, self.potential / (self.tree.charges / away).sum())
         self.rank = np.full(capacity, -1.0)
         np.asarray(self.rank)[:n] = self.tree.charges * np.asarray(self.weight)[self.tree.atoms]
         self.leaves = 1

@@ -1,7 +1,8 @@
-"""Headerless files of 4-byte big-endian words in rows of one length: what .pos and .epos share."""
+"""Headerless files of 4-byte words in rows of one length: what .pos, .epos and .raw share."""
 
 import os
 import warnings
+from contextlib import contextmanager
 
 import numpy as np
 
@@ -9,35 +10,79 @@ from apt_evap._files import FileError, TruncatedFile, open_for_reading, replace_
 from apt_evap.hits import Outcome
 
 _CHUNK = 1 << 14
-_BYTE_ORDERS = {None: ">", "big": ">", "little": "<"}
+_ORDERS = {"big": ">", "little": "<"}
 
 
-def read_words(path, groups, row_size, kind, *, partial=False, byte_order=None, rival=None):
-    """Read the columns of a headerless file, chunk by chunk, into native arrays.
+class Words:
+    """The rows of an open file: `n` whole ones, `cut` if the file ends in the middle of one more."""
+
+    def __init__(self, file, path, words, order, n, cut):
+        self.n = n
+        self.cut = cut
+        self._file, self._path, self._words, self._order = file, path, words, order
+
+    def read(self, fields, start=0, stop=None):
+        """Read columns, through a small buffer, into native arrays.
+
+        Parameters
+        ----------
+        fields : dict
+            First word, number of words and type ("f4" or "u4") of each column, by name.
+        start, stop : int
+            Rows to read; all by default.
+
+        Returns
+        -------
+        dict of ndarray
+            Shape (rows,), or (rows, words) where a column has several words.
+
+        Raises
+        ------
+        TruncatedFile
+            If the file became shorter since it was opened.
+        """
+        stop = self.n if stop is None else stop
+        n = stop - start
+        columns = {name: np.empty((n, count) if count > 1 else n, dtype) for name, (_, count, dtype) in fields.items()}
+        buffer = np.empty((min(n, _CHUNK), self._words), self._order + "u4")
+        self._file.seek(start * 4 * self._words)
+        for at in range(0, n, _CHUNK):
+            rows = buffer[: min(_CHUNK, n - at)]
+            if fill(self._file, rows) < rows.nbytes:
+                raise TruncatedFile(f"{str(self._path)!r} became shorter while it was read, expected {stop} ions")
+            for name, (first, count, dtype) in fields.items():
+                column = columns[name][at : at + len(rows)].reshape(len(rows), count)
+                for word in range(count):  # a word at a time is faster than rows of three
+                    column[:, word] = rows.view(self._order + dtype)[:, first + word]
+        return columns
+
+
+@contextmanager
+def open_words(path, row_size, kind, *, order="big", floats=4, partial=False, byte_order=None, rival=None):
+    """Open a headerless file and check its size and byte order.
 
     Parameters
     ----------
     path : str or path-like
         The file.
-    groups : sequence of (int, int, str)
-        First word, number of words and type ("f4" or "u4") of each result.
     row_size : int
         Bytes per ion.
     kind : str
         Name of the format, for messages.
+    order : {"big", "little"}
+        Byte order of the format.
+    floats : int
+        Number of words at the start of a row that are float32, by which the byte order is checked.
     partial : bool
         Read the whole ions of a file that ends in the middle of one.
     byte_order : {None, "big", "little"}
-        None reads big-endian after a check that the file is.
+        None reads in the order of the format after a check that the file is in it.
     rival : (str, int), optional
         Name and row size of the format the file may be instead.
 
-    Returns
-    -------
-    columns : list of ndarray
-        Shape (n,), or (n, words) where a group has several words.
-    cut : bool
-        Whether the end of the file is missing.
+    Yields
+    ------
+    Words
 
     Raises
     ------
@@ -46,9 +91,8 @@ def read_words(path, groups, row_size, kind, *, partial=False, byte_order=None, 
     TruncatedFile
         If the size is no multiple of `row_size` and `partial` is False.
     """
-    if byte_order not in _BYTE_ORDERS:
+    if byte_order not in (None, *_ORDERS):
         raise ValueError(f"byte_order must be None, 'big' or 'little', got {byte_order!r}")
-    order = _BYTE_ORDERS[byte_order]
     words = row_size // 4
     with open_for_reading(path) as file:
         size = os.fstat(file.fileno()).st_size
@@ -59,18 +103,60 @@ def read_words(path, groups, row_size, kind, *, partial=False, byte_order=None, 
             raise _wrong_size(path, size, row_size, kind, rival)
         if n == 0:
             raise TruncatedFile(f"{str(path)!r} has {size} bytes, less than one ion of {kind} ({row_size} bytes)")
-        columns = [np.empty((n, count) if count > 1 else n, dtype) for _, count, dtype in groups]
-        buffer = np.empty((min(n, _CHUNK), words), order + "u4")
-        for start in range(0, n, _CHUNK):
-            rows = buffer[: min(_CHUNK, n - start)]
-            if _fill(file, rows) < rows.nbytes:
+        if byte_order is None:
+            rows = np.empty((min(n, _CHUNK), words), "u4")
+            if fill(file, rows) < rows.nbytes:
                 raise TruncatedFile(f"{str(path)!r} became shorter while it was read, expected {size} bytes")
-            if start == 0 and byte_order is None:
-                _check_byte_order(path, rows[:, :4])
-            for column, (first, count, dtype) in zip(columns, groups, strict=True):
-                part = rows.view(order + dtype)[:, first : first + count]
-                column[start : start + len(rows)] = part if count > 1 else part[:, 0]
-    return columns, bool(tail)
+            _check_byte_order(path, rows[:, :floats], order)
+        yield Words(file, path, words, _ORDERS[byte_order or order], n, bool(tail))
+
+
+def fill(file, array):
+    """Read until `array` is full or the file ends; return the number of bytes."""
+    target = memoryview(array).cast("B") if array.size else b""
+    done = 0
+    while done < len(target) and (got := file.readinto(target[done:])):
+        done += got
+    return done
+
+
+def check_columns(columns, available, path):
+    """Return the names of the columns to read, or say which one the format does not have.
+
+    Parameters
+    ----------
+    columns : str or sequence of str, optional
+        What the user asked for; None is all.
+    available : sequence of str
+        What there is.
+    path : str or path-like
+        For the message.
+
+    Returns
+    -------
+    tuple of str
+
+    Raises
+    ------
+    FileError
+        Naming the column and what there is.
+    """
+    if columns is None:
+        return tuple(available)
+    try:
+        chosen = (columns,) if isinstance(columns, str) else tuple(columns)
+    except TypeError:
+        chosen = ()
+    for name in chosen or (columns,):
+        if name not in available:
+            raise FileError(f"{str(path)!r} has no column {name!r}, expected some of {', '.join(available)}")
+    return chosen
+
+
+def check_any(chosen, path):
+    """Complain if there is none of the columns asked for, a dict of name and array or None."""
+    if all(values is None for values in chosen.values()):
+        raise FileError(f"{str(path)!r} has nothing in {', '.join(chosen)}: absent or zero throughout")
 
 
 def choose(path, hits, columns):
@@ -142,15 +228,6 @@ def write_words(path, columns, row_size, chosen):
             file.write(rows.data)
 
 
-def _fill(file, rows):
-    """Read until `rows` is full or the file ends; return the number of bytes."""
-    target = memoryview(rows).cast("B") if rows.size else b""
-    done = 0
-    while done < len(target) and (got := file.readinto(target[done:])):
-        done += got
-    return done
-
-
 def _wrong_size(path, size, row_size, kind, rival):
     n, tail = divmod(size, row_size)
     advice = "partial=True reads the whole ones"
@@ -164,18 +241,19 @@ def _wrong_size(path, size, row_size, kind, rival):
     )
 
 
-def _check_byte_order(path, words):
-    """Complain if x, y, z and m/n of the first rows look saner as little-endian."""
-    if _absurd(words.view(">f4")) > _absurd(words.view("<f4")):
+def _check_byte_order(path, words, order):
+    """Complain if the first rows look saner in the other byte order."""
+    other = "little" if order == "big" else "big"
+    if _absurd(words.view(_ORDERS[order] + "f4")) > _absurd(words.view(_ORDERS[other] + "f4")):
         raise FileError(
-            f"{str(path)!r} looks little-endian (as big-endian its first row is "
-            f"{words.view('>f4')[0].tolist()}), expected big-endian; byte_order='little' reads it, "
-            f"byte_order='big' reads it as it stands"
+            f"{str(path)!r} looks {other}-endian (as {order}-endian its first row is "
+            f"{words.view(_ORDERS[order] + 'f4')[0].tolist()}), expected {order}-endian; "
+            f"byte_order={other!r} reads it, byte_order={order!r} reads it as it stands"
         )
 
 
 def _absurd(values):
-    """Count values that no position [nm] or mass [Da] has: huge, denormal or not finite."""
+    """Count values that no position [nm], mass [Da], time [ns] or voltage [V] has: huge, denormal or not finite."""
     with np.errstate(invalid="ignore"):
         size = np.abs(values.astype(np.float32))
         return np.count_nonzero(~(size <= 1e6) | ((size > 0) & (size < np.finfo(np.float32).tiny)))

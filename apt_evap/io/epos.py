@@ -9,13 +9,28 @@ import warnings
 import numpy as np
 
 from apt_evap.hits import Hits
-from apt_evap.io._records import choose, read_words, write_words
+from apt_evap.io._pulses import PulseCheck, first_from_equal, pulses_from_first, whole_pulses
+from apt_evap.io._records import check_any, check_columns, choose, open_words, write_words
 
 _ROW = 44
-_GROUPS = [(0, 3, "f4"), *((word, 1, "f4") for word in range(3, 9)), (9, 1, "u4"), (10, 1, "u4")]
+_FIELDS = {
+    "positions": (0, 3, "f4"),
+    "mass_to_charge": (3, 1, "f4"),
+    "time_of_flight": (4, 1, "f4"),
+    "voltage": (5, 1, "f4"),
+    "pulse_voltage": (6, 1, "f4"),
+    "x": (7, 1, "f4"),
+    "y": (8, 1, "f4"),
+    "pulses": (9, 1, "u4"),
+    "ions": (10, 1, "u4"),
+}
+_COLUMNS = (*tuple(_FIELDS)[:-1], "pulse_id", "multiplicity")
+# what else has to be read to know whether a column is there, and its unit
+_WITH = {"x": ("y",), "y": ("x",), "pulse_voltage": ("voltage",), "pulse_id": ("ions",), "multiplicity": ("ions",)}
+_SURVEY = 1 << 16
 
 
-def read_epos(path, *, partial=False, byte_order=None):
+def read_epos(path, *, columns=None, partial=False, byte_order=None):
     """Read an .epos file.
 
     A column of zeros counts as absent (None): positions, mass, time of flight, standing voltage, and detector
@@ -26,6 +41,8 @@ def read_epos(path, *, partial=False, byte_order=None):
     ----------
     path : str or path-like
         The file.
+    columns : sequence of str, optional
+        Names of the columns of `Hits` to read, so that only these take up memory; all by default.
     partial : bool
         Read the whole ions of a file that ends in the middle of one.
     byte_order : {None, "big", "little"}
@@ -40,30 +57,124 @@ def read_epos(path, *, partial=False, byte_order=None):
     Raises
     ------
     FileError
-        If the file is missing, unreadable, empty or in the wrong byte order.
+        If the file is missing, unreadable, empty or in the wrong byte order, or has no such column.
     TruncatedFile
         If the size is no multiple of 44 bytes and `partial` is False.
     """
-    columns, cut = read_words(
-        path, _GROUPS, _ROW, "an .epos", partial=partial, byte_order=byte_order, rival=("a .pos", 16)
-    )
-    positions, mass, time, voltage, pulse_voltage, x, y, pulses, ions = columns
-    pulse_id, multiplicity = _group(ions, cut, path)
-    voltage, pulse_voltage = _volts(voltage, pulse_voltage)
-    detector = x.any() or y.any()
-    return Hits(
-        positions=positions if positions.any() else None,
-        mass_to_charge=mass if mass.any() else None,
-        time_of_flight=time if time.any() else None,
-        voltage=voltage,
-        pulse_voltage=pulse_voltage,
-        x=x if detector else None,
-        y=y if detector else None,
-        pulses=pulses,
-        pulse_id=pulse_id,
-        multiplicity=multiplicity,
-        source=str(path),
-    )
+    chosen, fields = _chosen(columns, path)
+    with _open(path, partial, byte_order) as words:
+        block = words.read(fields)
+        survey = _Survey()
+        survey.add(block)
+        survey.end(words.cut, path)
+        return _hits(block, survey, chosen, path)
+
+
+def chunk_epos(path, rows, *, columns=None, partial=False, byte_order=None):
+    """Read an .epos file in `Hits` of at most `rows` ions, one after the other, in whole pulses.
+
+    The file is read twice: what is absent, the unit of the voltages and whether the pulses are consistent is
+    known only at its end. If they are not, chunks are of `rows` ions whatever the pulses. Otherwise as `read_epos`.
+
+    Yields
+    ------
+    Hits
+
+    Raises
+    ------
+    ValueError
+        If `rows` is less than the ions of one pulse.
+    """
+    chosen, fields = _chosen(columns, path)
+    fields = {**fields, "ions": _FIELDS["ions"]}
+    with _open(path, partial, byte_order) as words:
+        survey = _Survey()
+        for start in range(0, words.n, _SURVEY):
+            survey.add(words.read(fields, start, min(start + _SURVEY, words.n)))
+        survey.end(words.cut, path)
+        if survey.grouped and rows < survey.pulses.largest:
+            raise ValueError(
+                f"rows must be at least {survey.pulses.largest}, the ions of the largest pulse of {str(path)!r}, "
+                f"got {rows}"
+            )
+        start = first_pulse = 0
+        while start < words.n:
+            stop = min(start + rows, words.n)
+            block = words.read(fields, start, stop)
+            if survey.grouped and stop < words.n:
+                stop = start + whole_pulses(block["ions"])
+                block = {name: values[: stop - start] for name, values in block.items()}
+            pulses = np.count_nonzero(block["ions"])
+            yield _hits(block, survey, chosen, path, first_pulse)
+            first_pulse += pulses
+            start = stop
+
+
+class _Survey:
+    """What only the whole file tells: columns of zeros, kilovolts, and whether the pulses are consistent."""
+
+    def __init__(self):
+        self.present = set()
+        self.highest = {}
+        self.pulses = PulseCheck()
+        self.grouped = False
+
+    @np.errstate(invalid="ignore")
+    def add(self, block):
+        """Go on with the next rows."""
+        for name, values in block.items():
+            # mostly the first rows tell
+            if name not in self.present and (values[:64].any() or values.any()):
+                self.present.add(name)
+            if name in ("voltage", "pulse_voltage"):
+                # fmax passes over NaN
+                self.highest[name] = np.fmax(self.highest.get(name, np.nan), np.fmax.reduce(values))
+        if "ions" in block:
+            self.pulses.add(block["ions"])
+
+    def end(self, cut, path):
+        """Conclude, and warn of pulses that contradict themselves."""
+        if self.present & {"x", "y"}:
+            self.present |= {"x", "y"}
+        decisive = "voltage" if "voltage" in self.present else "pulse_voltage"
+        self.kilovolts = self.highest.get(decisive, 100) < 100
+        if "voltage" in self.present:
+            self.present.add("pulse_voltage")
+        self.present.add("pulses")
+        if self.pulses.rows:
+            problem = self.pulses.problem(cut)
+            self.grouped = not problem
+            if problem:
+                warnings.warn(
+                    f"{str(path)!r} does not tell which ions share a pulse, so pulse_id and multiplicity are None: "
+                    f"the ions-per-pulse column is not consistent, {problem}",
+                    stacklevel=5,
+                )
+
+
+def _hits(block, survey, chosen, path, first_pulse=0):
+    """Make Hits of a block of whole pulses."""
+    columns = {name: values for name, values in block.items() if name in survey.present}
+    if survey.kilovolts:
+        with np.errstate(over="ignore"):
+            for name in {"voltage", "pulse_voltage"} & set(columns):
+                columns[name] = columns[name] * np.float32(1000)
+    if survey.grouped and {"pulse_id", "multiplicity"} & set(chosen):
+        columns["pulse_id"], columns["multiplicity"] = pulses_from_first(block["ions"], first_pulse)
+    wanted = {name: columns.get(name) for name in chosen}
+    check_any(wanted, path)
+    return Hits(**wanted, source=str(path))
+
+
+def _chosen(columns, path):
+    """Names of the columns wanted, and the fields to read for them."""
+    chosen = check_columns(columns, _COLUMNS, path)
+    needed = {*chosen, *(other for name in chosen for other in _WITH.get(name, ()))}
+    return chosen, {name: field for name, field in _FIELDS.items() if name in needed}
+
+
+def _open(path, partial, byte_order):
+    return open_words(path, _ROW, "an .epos", partial=partial, byte_order=byte_order, rival=("a .pos", 16))
 
 
 def write_epos(path, hits):
@@ -100,58 +211,7 @@ def write_epos(path, hits):
     chosen = choose(path, hits, columns)
     ions = np.zeros(len(hits), np.uint32)
     if hits.pulse_id is not None:
-        ions[chosen] = _ions_per_pulse(hits.pulse_id[chosen])
+        ions[chosen] = first_from_equal(hits.pulse_id[chosen])
     elif hits.outcome is not None or hits.ion is not None:
         ions[:] = 1
     write_words(path, [*columns, (10, ions, "u4")], _ROW, chosen)
-
-
-def _group(ions, cut, path):
-    """Pulse and multiplicity of every ion from the last column: n on the first ion, 0 on the other n - 1."""
-    first = np.flatnonzero(ions)
-    sizes = np.diff(first, append=len(ions))
-    wrong = np.flatnonzero(sizes != ions[first])
-    if cut and len(wrong) == 1 and wrong[0] == len(first) - 1 and ions[first[-1]] > sizes[-1]:
-        # the file was cut inside its last pulse, whose size is still known
-        wrong = wrong[:0]
-    if len(first) == 0:
-        problem = "it is zero throughout"
-    elif first[0] > 0:
-        problem = f"its first {first[0]} rows belong to a pulse whose first ion is missing"
-    elif len(wrong):
-        row, size = first[wrong[0]], sizes[wrong[0]]
-        problem = f"row {row} announces {ions[row]} ions in its pulse but the next pulse begins {size} rows later"
-        if len(wrong) > 1:
-            problem += f" ({len(wrong)} such pulses)"
-    else:
-        pulse_id = np.cumsum(ions != 0, dtype=np.int64)
-        pulse_id -= 1
-        multiplicity = ions.copy()
-        followers = np.flatnonzero(ions == 0)
-        multiplicity[followers] = ions[first[pulse_id[followers]]]
-        return pulse_id, multiplicity
-    warnings.warn(
-        f"{str(path)!r} does not tell which ions share a pulse, so pulse_id and multiplicity are None: the "
-        f"ions-per-pulse column is not consistent, {problem}",
-        stacklevel=4,
-    )
-    return None, None
-
-
-def _ions_per_pulse(pulse_id):
-    """Write n on the first ion of each run of equal pulse_id and 0 on the others."""
-    first = np.flatnonzero(np.diff(pulse_id, prepend=pulse_id[0] - 1))
-    ions = np.zeros(len(pulse_id), np.uint32)
-    ions[first] = np.diff(first, append=len(pulse_id))
-    return ions
-
-
-def _volts(voltage, pulse_voltage):
-    """Return both voltages in V; None for what is zero throughout and not a laser's missing pulse."""
-    present = [column.any() for column in (voltage, pulse_voltage)]
-    if not any(present):
-        return None, None
-    # fmax passes over NaN
-    if np.fmax.reduce(voltage if present[0] else pulse_voltage) < 100:
-        voltage, pulse_voltage = voltage * np.float32(1000), pulse_voltage * np.float32(1000)
-    return (voltage if present[0] else None), pulse_voltage

@@ -4,18 +4,21 @@ Larson et al., Local Electrode Atom Probe Tomography (Springer, 2013), appendix 
 """
 
 from apt_evap.hits import Hits
-from apt_evap.io._records import choose, read_words, write_words
+from apt_evap.io._records import check_columns, choose, open_words, write_words
 
 _ROW = 16
+_FIELDS = {"positions": (0, 3, "f4"), "mass_to_charge": (3, 1, "f4")}
 
 
-def read_pos(path, *, partial=False, byte_order=None):
+def read_pos(path, *, columns=None, partial=False, byte_order=None):
     """Read a .pos file.
 
     Parameters
     ----------
     path : str or path-like
         The file.
+    columns : sequence of str, optional
+        Names of the columns to read, "positions" and "mass_to_charge"; all by default.
     partial : bool
         Read the whole ions of a file that ends in the middle of one.
     byte_order : {None, "big", "little"}
@@ -29,20 +32,26 @@ def read_pos(path, *, partial=False, byte_order=None):
     Raises
     ------
     FileError
-        If the file is missing, unreadable, empty or in the wrong byte order.
+        If the file is missing, unreadable, empty or in the wrong byte order, or has no such column.
     TruncatedFile
         If the size is no multiple of 16 bytes and `partial` is False.
     """
-    (positions, mass), _ = read_words(
-        path,
-        [(0, 3, "f4"), (3, 1, "f4")],
-        _ROW,
-        "a .pos",
-        partial=partial,
-        byte_order=byte_order,
-        rival=("an .epos", 44),
-    )
-    return Hits(positions=positions, mass_to_charge=mass, source=str(path))
+    fields = _chosen(columns, path)
+    with _open(path, partial, byte_order) as words:
+        return Hits(**words.read(fields), source=str(path))
+
+
+def chunk_pos(path, rows, *, columns=None, partial=False, byte_order=None):
+    """Read a .pos file in `Hits` of at most `rows` ions, one after the other; otherwise as `read_pos`.
+
+    Yields
+    ------
+    Hits
+    """
+    fields = _chosen(columns, path)
+    with _open(path, partial, byte_order) as words:
+        for start in range(0, words.n, rows):
+            yield Hits(**words.read(fields, start, min(start + rows, words.n)), source=str(path))
 
 
 def write_pos(path, hits):
@@ -67,3 +76,11 @@ def write_pos(path, hits):
     (positions,) = hits.require("positions")
     columns = [(0, positions, "f4"), (3, hits.mass_to_charge, "f4")]
     write_words(path, columns, _ROW, choose(path, hits, columns))
+
+
+def _open(path, partial, byte_order):
+    return open_words(path, _ROW, "a .pos", partial=partial, byte_order=byte_order, rival=("an .epos", 44))
+
+
+def _chosen(columns, path):
+    return {name: _FIELDS[name] for name in check_columns(columns, tuple(_FIELDS), path)}

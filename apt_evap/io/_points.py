@@ -1,0 +1,61 @@
+"""Ions as points with data: what the formats for drawing share."""
+
+import re
+import warnings
+
+import numpy as np
+
+_NAMES = {"x": "detector_x", "y": "detector_y"}
+
+
+def points_and_data(path, hits):
+    """Positions, and the columns that go with them, of the ions to write.
+
+    Parameters
+    ----------
+    path : str or path-like
+        For messages.
+    hits : Hits
+        Ions with positions; those whose positions are not finite are left out, with a warning that counts them.
+
+    Returns
+    -------
+    chosen : ndarray or slice
+        What selects the ions to write.
+    positions : ndarray, shape (n, 3)
+        Positions [nm].
+    data : dict of ndarray
+        The other columns by name, with the numbers of `extra`; detector coordinates are detector_x and detector_y.
+
+    Raises
+    ------
+    ValueError
+        If there are no positions, or none is finite.
+    """
+    (positions,) = hits.require("positions")
+    finite = np.isfinite(positions).all(axis=1)
+    left = len(hits) - np.count_nonzero(finite)
+    reason = f"{left:,} of {len(hits):,} ions have positions that are not finite"
+    if left == len(hits):
+        raise ValueError(f"nothing to write to {str(path)!r}: {reason}")
+    if left:
+        warnings.warn(f"{str(path)!r} leaves out what has no place: {reason}", stacklevel=4)
+    chosen = finite if left else slice(None)
+    data = {_NAMES.get(name, name): getattr(hits, name) for name in hits.columns if name != "positions"}
+    for name, values in hits.extra.items():
+        if values.dtype.kind in "iuf":
+            data[_distinct(name, data)] = values
+    return chosen, positions[chosen], {name: values[chosen] for name, values in data.items()}
+
+
+def _distinct(name, others):
+    """Make a word of letters, digits and underscores that is none of the others."""
+    word = re.sub(r"[^0-9A-Za-z]+", "_", name).strip("_") or "column"
+    word = "_" + word if word[0].isdigit() else word
+    taken = {*others, "species", "pos"}
+    number = 2
+    distinct = word
+    while distinct in taken:
+        distinct = f"{word}_{number}"
+        number += 1
+    return distinct

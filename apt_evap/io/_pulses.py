@@ -1,0 +1,135 @@
+"""Which ions share a pulse: the conventions of the formats, checked, and turned into pulse_id and multiplicity."""
+
+import numpy as np
+
+_BLOCK = 1 << 15  # rows that stay in the cache
+
+
+class PulseCheck:
+    """Whether a column holds n on the first ion of each pulse and 0 on the other n - 1, block by block."""
+
+    def __init__(self):
+        self.rows = 0
+        self.largest = 0
+        self._first = self._last = None
+        self._announced = 0
+        self._wrong = 0
+        self._example = ""
+
+    def add(self, ions):
+        """Go on with the next rows of the column."""
+        for start in range(0, len(ions), _BLOCK):
+            self._add_block(ions[start : start + _BLOCK])
+
+    def _add_block(self, ions):
+        complete = self._last is None or self.rows - self._last == self._announced
+        if complete and ions[0] and _consistent(ions):
+            last = len(ions) - 1 - int((ions[::-1] != 0).argmax())
+            self._first = self.rows if self._last is None else self._first
+            self._last, self._announced = self.rows + last, int(ions[last])
+            self.largest = max(self.largest, int(ions.max()))
+        else:
+            self._add_pulses(ions)
+        self.rows += len(ions)
+
+    def _add_pulses(self, ions):
+        """Compare every pulse; ten times slower than `_consistent`, and knows which one is wrong."""
+        first = np.flatnonzero(ions)
+        if len(first) == 0:
+            return
+        announced = ions[first]
+        self.largest = max(self.largest, int(announced.max()))
+        if self._last is None:
+            self._first = self.rows + int(first[0])
+        else:
+            self._compare(self.rows + int(first[0]) - self._last)
+        sizes = np.diff(first)
+        wrong = np.flatnonzero(sizes != announced[:-1])
+        if len(wrong):
+            at = wrong[0]
+            self._note(self.rows + int(first[at]), int(announced[at]), int(sizes[at]), len(wrong))
+        self._last, self._announced = self.rows + int(first[-1]), int(announced[-1])
+
+    def problem(self, cut):
+        """Return what is wrong with the whole column, or ""; `cut` says that the end of the file is missing."""
+        if self._last is None:
+            return "it is zero throughout"
+        # a file cut inside its last pulse still tells the size of it
+        if not (cut and self._announced > self.rows - self._last):
+            self._compare(self.rows - self._last)
+        if self._first:
+            return f"its first {self._first} rows belong to a pulse whose first ion is missing"
+        return self._example + (f" ({self._wrong} such pulses)" if self._wrong > 1 else "")
+
+    def _compare(self, size):
+        if size != self._announced:
+            self._note(self._last, self._announced, size, 1)
+
+    def _note(self, row, announced, size, count):
+        if not self._wrong:
+            self._example = (
+                f"row {row} announces {announced} ions in its pulse but the next pulse begins {size} rows later"
+            )
+        self._wrong += count
+
+
+def _consistent(ions):
+    """Whether rows that begin with a pulse hold n on its first ion and 0 on the others; the last pulse may go on."""
+    several = np.flatnonzero(ions > 1)
+    zeros = np.flatnonzero(ions == 0)
+    followers = ions[several].astype(np.int64) - 1
+    if len(several) and followers[-1] >= len(ions) - several[-1]:
+        followers[-1] = len(ions) - 1 - several[-1]
+    if len(several) and (followers.min() < 0 or followers.max() >= len(ions)):
+        return False
+    if (ions.dtype.kind == "i" and ions.min() < 0) or followers.sum() != len(zeros):
+        return False
+    # few pulses hold several ions, so that where the zeros must be is told by these alone
+    before = np.cumsum(followers) - followers
+    return np.array_equal(np.repeat(several + 1 - before, followers) + np.arange(len(zeros)), zeros)
+
+
+def pulses_from_first(ions, first_pulse=0):
+    """Pulse and multiplicity of every ion from n on the first ion of each pulse and 0 on the other n - 1.
+
+    The column begins with a pulse and was found consistent; the end of its last pulse may be missing. It becomes the
+    multiplicity in place.
+    """
+    begins = ions != 0
+    begins[0] = False
+    pulse_id = np.cumsum(begins, dtype=np.int64)
+    if first_pulse:
+        pulse_id += first_pulse
+    several = ions[ions > 1]
+    followers = np.flatnonzero(ions == 0)
+    counts = several.astype(np.int64) - 1
+    counts[-1:] -= counts.sum() - len(followers)  # those of the last pulse that are missing
+    ions[followers] = np.repeat(several, counts)
+    return pulse_id, ions
+
+
+def first_from_equal(numbers):
+    """Write n on the first ion of each run of equal numbers and 0 on the others."""
+    ions = np.zeros(len(numbers), np.uint32)
+    if len(numbers):
+        first = np.flatnonzero(np.concatenate([[True], numbers[1:] != numbers[:-1]]))
+        ions[first] = np.diff(first, append=len(numbers))
+    return ions
+
+
+def first_from_every(multiplicity):
+    """Turn n on every ion of a pulse into n on the first and 0 on the others; None where that cannot be."""
+    multiplicity = multiplicity.astype(np.int64)
+    runs = first_from_equal(multiplicity)
+    first = np.flatnonzero(runs)
+    sizes = multiplicity[first]
+    if not (sizes > 0).all() or (runs[first] % sizes).any():
+        return None
+    within = np.arange(len(runs)) - np.repeat(first, runs[first])
+    return np.where(within % multiplicity == 0, multiplicity, 0).astype(np.uint32)
+
+
+def whole_pulses(ions):
+    """Count the rows in whole pulses, given rows that begin with a pulse (n on its first ion, 0 on the others)."""
+    last = int(np.flatnonzero(ions)[-1])
+    return len(ions) if len(ions) - last >= ions[last] else last

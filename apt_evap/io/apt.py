@@ -1,0 +1,240 @@
+"""The .apt exchange format of CAMECA: a header, then sections of one column each, little-endian.
+
+Larson et al., Local Electrode Atom Probe Tomography (Springer, 2013), and the layout of files as IVAS and AP Suite
+write them. Any section of fixed records, one to an ion, is read; the others are named in a warning.
+"""
+
+import math
+import os
+import warnings
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+
+from apt_evap._files import TruncatedFile, open_for_reading
+from apt_evap.hits import Hits
+from apt_evap.io._apt_sections import read_sections
+from apt_evap.io._pulses import PulseCheck, first_from_every, pulses_from_first, whole_pulses
+from apt_evap.io._records import check_columns, fill
+
+# sections, in small letters, that are columns of Hits: name, number of values per ion, unit
+_KNOWN = {
+    "tofc": ("time_of_flight", 1, "ns"),
+    "mass": ("mass_to_charge", 1, "Da"),
+    "xdet_mm": ("x", 1, "mm"),
+    "ydet_mm": ("y", 1, "mm"),
+    "position": ("positions", 3, "nm"),
+    "multiplicity": ("multiplicity", 1, None),
+}
+_DETECTOR = "detector coordinates"
+
+# dimension and power of ten
+_UNITS = {
+    **{name: ("length", power) for name, power in {"m": 0, "cm": -2, "mm": -3, "um": -6, "µm": -6, "μm": -6}.items()},
+    **{name: ("length", power) for name, power in {"nm": -9, "Å": -10, "pm": -12}.items()},
+    **{name: ("time", power) for name, power in {"s": 0, "ms": -3, "us": -6, "µs": -6, "μs": -6}.items()},
+    **{name: ("time", power) for name, power in {"ns": -9, "ps": -12}.items()},
+    **{name: ("mass", power) for name, power in {"Da": 0, "u": 0, "amu": 0, "kDa": 3}.items()},
+}
+
+
+@dataclass
+class _Column:
+    """A section and where it goes: a name of Hits, or None for `extra`; factor to its unit; which of the values."""
+
+    section: object
+    target: str | None
+    factor: float = 1.0
+    part: int | None = None
+
+
+def read_apt(path, *, columns=None, partial=False):
+    """Read an .apt file.
+
+    The sections tofc, Mass, XDet_mm and YDet_mm (or Detector Coordinates), Position and Multiplicity become columns
+    of `Hits`, in its units. All others, and one of these whose unit is not known, are in ``extra`` under their own
+    names, as they are in the file, and their units in ``units``. A second section of a name is called "name (2)".
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file.
+    columns : sequence of str, optional
+        Columns of `Hits` and names of sections to read, so that only these take up memory; all by default.
+    partial : bool
+        Read the whole sections of a file that ends in the middle of one.
+
+    Returns
+    -------
+    Hits
+        pulse_id and multiplicity come from Multiplicity, which may hold the ions of the pulse on every ion or on
+        the first one, with 0 on the others. If it fits neither it is in ``extra``, with a warning.
+
+    Raises
+    ------
+    FileError
+        If the file is missing, unreadable, damaged or holds no ion, or has no such column.
+    TruncatedFile
+        If it ends in the middle of a section and `partial` is False.
+    """
+    with _open(path, columns, partial) as (file, n, chosen, grouping):
+        ions = _ions(file, path, grouping, n) if grouping else None
+        return _hits(file, path, chosen, grouping, ions, 0, n)
+
+
+def chunk_apt(path, rows, *, columns=None, partial=False):
+    """Read an .apt file in `Hits` of at most `rows` ions, one after the other, in whole pulses; else as `read_apt`.
+
+    The multiplicity of all ions is held in memory, 4 bytes per ion. Without one, chunks are of `rows` ions.
+
+    Yields
+    ------
+    Hits
+
+    Raises
+    ------
+    ValueError
+        If `rows` is less than the ions of one pulse.
+    """
+    with _open(path, columns, partial, chunks=True) as (file, n, chosen, grouping):
+        ions = _ions(file, path, grouping, n) if grouping else None
+        if ions is not None and rows < ions.max():
+            raise ValueError(
+                f"rows must be at least {ions.max()}, the ions of the largest pulse of {str(path)!r}, got {rows}"
+            )
+        start = first_pulse = 0
+        while start < n:
+            stop = min(start + rows, n)
+            part = None
+            if ions is not None:
+                stop = start + whole_pulses(ions[start:stop])
+                part = ions[start:stop].copy()
+            pulses = 0 if part is None else np.count_nonzero(part)
+            yield _hits(file, path, chosen, grouping, part, start, stop, first_pulse)
+            first_pulse += pulses
+            start = stop
+
+
+@contextmanager
+def _open(path, columns, partial, chunks=False):
+    """Open a file; yield it with the number of ions, the columns to read, and the section of multiplicities."""
+    with open_for_reading(path) as file:
+        n, sections = read_sections(file, path, partial)
+        found = _assign(sections, path)
+        names = dict.fromkeys(column.target or column.section.name for column in found)
+        if "multiplicity" in names:
+            names["pulse_id"] = None
+        wanted = check_columns(columns, tuple(names), path)
+        grouping = None
+        chosen = []
+        for column in found:
+            grouped = column.target == "multiplicity"
+            if grouped and (chunks or {"multiplicity", "pulse_id"} & set(wanted)):
+                grouping = _Grouping(column.section, [name for name in ("multiplicity", "pulse_id") if name in wanted])
+            elif not grouped and (column.target or column.section.name) in wanted:
+                chosen.append(column)
+        yield file, n, chosen, grouping
+
+
+@dataclass
+class _Grouping:
+    """The section of multiplicities, and which of the columns made of it are wanted."""
+
+    section: object
+    wanted: list
+
+
+def _assign(sections, path):
+    """Say for every section where it goes."""
+    found = []
+    taken = set()
+    names = {section.name.casefold() for section in sections}
+    for section in sections:
+        name = section.name.casefold()
+        columns = [_KNOWN[name]] if name in _KNOWN else []
+        if name == _DETECTOR and not {"xdet_mm", "ydet_mm"} & names:
+            columns = [("x", 2, "mm"), ("y", 2, "mm")]
+        problem = ""
+        factors = [_factor(section.unit, unit) for _, _, unit in columns]
+        if any(section.values != values for _, values, _ in columns):
+            problem = f"{section.values} values per ion"
+        elif None in factors:
+            problem = f"the unknown unit {section.unit!r}"
+        elif columns and section.dtype.kind not in ("iu" if columns[0][0] == "multiplicity" else "iuf"):
+            problem = f"values of type {section.dtype}"
+        if problem:
+            warnings.warn(
+                f"{str(path)!r}: section {section.name!r} has {problem}, so it is in extra and not {columns[0][0]}",
+                stacklevel=5,
+            )
+        if problem or not columns or taken & {target for target, _, _ in columns}:
+            found.append(_Column(section, None))
+            continue
+        for index, ((target, values, _), factor) in enumerate(zip(columns, factors, strict=True)):
+            taken.add(target)
+            found.append(_Column(section, target, factor, index if values == 2 else None))
+    return found
+
+
+def _factor(unit, wanted):
+    """What turns one unit into another; None if that cannot be said."""
+    if wanted is None:
+        return 1.0
+    dimension, power = _UNITS.get(unit, (None, 0))
+    wanted_dimension, wanted_power = _UNITS[wanted]
+    return 10.0 ** (power - wanted_power) if dimension == wanted_dimension else None
+
+
+def _ions(file, path, grouping, n):
+    """Ions per pulse on the first ion of each and 0 on the others; None, with a warning, if unclear."""
+    numbers = _values(file, path, grouping.section, 0, n)
+    check = PulseCheck()
+    check.add(numbers)
+    problem = check.problem(False)
+    if not problem and numbers.min() >= 0:
+        return numbers.astype(np.uint32)
+    ions = first_from_every(numbers)
+    if ions is None:
+        warnings.warn(
+            f"{str(path)!r} does not tell which ions share a pulse, so its Multiplicity is in extra: "
+            f"neither every ion nor the first one of each pulse holds the number of ions in it ({problem})",
+            stacklevel=4,
+        )
+    return ions
+
+
+def _hits(file, path, chosen, grouping, ions, start, stop, first_pulse=0):
+    """Make Hits of the ions from start to stop."""
+    columns, extra, units = {}, {}, {}
+    section = values = None
+    for column in chosen:
+        if column.section is not section:
+            section, values = column.section, _values(file, path, column.section, start, stop)
+        if column.target is None:
+            extra[section.name], units[section.name] = values, section.unit
+            continue
+        part = values if column.part is None else values[:, column.part]
+        if column.factor != 1:
+            with np.errstate(over="ignore"):
+                part = part * (part.dtype.type(column.factor) if part.dtype.kind == "f" else column.factor)
+        columns[column.target] = part
+    if grouping and ions is not None:
+        pulse_id, multiplicity = pulses_from_first(ions, first_pulse)
+        made = {"pulse_id": pulse_id, "multiplicity": multiplicity}
+        columns.update({name: made[name] for name in grouping.wanted})
+    elif grouping and grouping.wanted:
+        section = grouping.section
+        extra[section.name], units[section.name] = _values(file, path, section, start, stop), section.unit
+    return Hits(**columns, extra=extra, units=units, source=str(path))
+
+
+def _values(file, path, section, start, stop):
+    """Read the records of a section from start to stop."""
+    shape = (stop - start, section.values) if section.values > 1 else (stop - start,)
+    values = np.empty(shape, section.dtype)
+    file.seek(section.data + start * section.record_size)
+    if fill(file, values.view(np.uint8)) < math.prod(shape) * section.dtype.itemsize:
+        size = os.fstat(file.fileno()).st_size
+        raise TruncatedFile(f"{str(path)!r} became shorter while it was read, it has {size} bytes now")
+    return values.astype(section.dtype.newbyteorder("="), copy=False)

@@ -1,0 +1,150 @@
+"""The .raw format of Stuttgart's atom probes: voltages, detector, time of flight and pulse, 32 bytes per ion.
+
+Little-endian, no header: base, pulse and reflectron voltage [V], detector x, y [mm], time of flight [ns], all
+float32, then an epoch (int32) and the number of the pulse (uint32).
+"""
+
+import warnings
+
+import numpy as np
+
+from apt_evap.hits import Hits
+from apt_evap.io._pulses import first_from_equal, pulses_from_first
+from apt_evap.io._records import check_any, check_columns, open_words
+
+_ROW = 32
+_FIELDS = {
+    "voltage": (0, 1, "f4"),
+    "pulse_voltage": (1, 1, "f4"),
+    "reflectron_voltage": (2, 1, "f4"),
+    "x": (3, 1, "f4"),
+    "y": (4, 1, "f4"),
+    "time_of_flight": (5, 1, "f4"),
+    "epoch": (6, 1, "i4"),
+    "pulse_number": (7, 1, "u4"),
+}
+_EXTRA = ("reflectron_voltage", "epoch", "pulse_number")
+_COLUMNS = (*_FIELDS, "pulse_id", "multiplicity")
+_SURVEY = 1 << 16
+
+
+def read_raw(path, *, columns=None, partial=False, byte_order=None):
+    """Read a Stuttgart .raw file.
+
+    Neighbouring ions of equal pulse number share a pulse; the number may wrap around. A pulse number that is zero
+    throughout groups nothing.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file.
+    columns : sequence of str, optional
+        Names of the columns to read, so that only these take up memory; all by default.
+    partial : bool
+        Read the whole ions of a file that ends in the middle of one.
+    byte_order : {None, "big", "little"}
+        None reads little-endian after a check that the file is.
+
+    Returns
+    -------
+    Hits
+        With voltage, pulse_voltage [V], x, y [mm], time_of_flight [ns], pulse_id and multiplicity;
+        ``extra`` holds "reflectron_voltage" [V], "epoch" and "pulse_number".
+
+    Raises
+    ------
+    FileError
+        If the file is missing, unreadable, empty or in the wrong byte order, or has no such column.
+    TruncatedFile
+        If the size is no multiple of 32 bytes and `partial` is False.
+    """
+    chosen, fields = _chosen(columns, path)
+    with _open(path, partial, byte_order) as words:
+        block = words.read(fields)
+        grouped = "pulse_number" in block and _grouped([block["pulse_number"]], path)
+        return _hits(block, grouped, chosen, path)
+
+
+def chunk_raw(path, rows, *, columns=None, partial=False, byte_order=None):
+    """Read a .raw file in `Hits` of at most `rows` ions, one after the other, in whole pulses; else as `read_raw`.
+
+    Yields
+    ------
+    Hits
+
+    Raises
+    ------
+    ValueError
+        If `rows` is less than the ions of one pulse.
+    """
+    chosen, fields = _chosen(columns, path)
+    fields = {**fields, "pulse_number": _FIELDS["pulse_number"]}
+    number = {"pulse_number": _FIELDS["pulse_number"]}
+    with _open(path, partial, byte_order) as words:
+        starts = range(0, words.n, _SURVEY)
+        grouped = _grouped(
+            (words.read(number, start, min(start + _SURVEY, words.n))["pulse_number"] for start in starts), path
+        )
+        start = first_pulse = 0
+        while start < words.n:
+            stop = min(start + rows, words.n)
+            # one row more tells whether the last pulse ends here
+            block = words.read(fields, start, min(stop + 1, words.n))
+            if stop < words.n:
+                numbers = block["pulse_number"]
+                if grouped:
+                    borders = np.flatnonzero(numbers[1:] != numbers[:-1])
+                    if len(borders) == 0:
+                        raise ValueError(
+                            f"rows must be at least the ions of the largest pulse of {str(path)!r}, more than {rows} "
+                            f"in pulse {numbers[0]}, got {rows}"
+                        )
+                    stop = start + int(borders[-1]) + 1
+                block = {name: values[: stop - start] for name, values in block.items()}
+            yield _hits(block, grouped, chosen, path, first_pulse)
+            first_pulse += np.count_nonzero(first_from_equal(block["pulse_number"]))
+            start = stop
+
+
+def _grouped(blocks, path):
+    """Whether the pulse numbers tell anything; warn if they do not, or are out of order."""
+    found = False
+    falls = 0
+    last = None
+    for numbers in blocks:
+        found = found or numbers.any()
+        steps = numbers[1:].astype(np.int64) - numbers[:-1]
+        falls += np.count_nonzero((steps < 0) & (steps > -(1 << 31)))
+        if last is not None:
+            falls += -(1 << 31) < int(numbers[0]) - last < 0
+        last = int(numbers[-1])
+    if not found:
+        problem = "pulse_id and multiplicity are None: the pulse number is zero throughout"
+    elif falls:
+        problem = f"only neighbours of equal pulse number are grouped: the number falls at {falls} rows"
+    else:
+        return True
+    warnings.warn(f"{str(path)!r} does not tell for certain which ions share a pulse, so {problem}", stacklevel=4)
+    return bool(found)
+
+
+def _hits(block, grouped, chosen, path, first_pulse=0):
+    columns = dict(block)
+    if grouped and {"pulse_id", "multiplicity"} & set(chosen):
+        ions = first_from_equal(block["pulse_number"])
+        columns["pulse_id"], columns["multiplicity"] = pulses_from_first(ions, first_pulse)
+    wanted = {name: columns.get(name) for name in chosen}
+    check_any(wanted, path)
+    extra = {name: wanted.pop(name) for name in _EXTRA if name in wanted}
+    units = {"reflectron_voltage": "V"} if "reflectron_voltage" in extra else {}
+    return Hits(**wanted, extra=extra, units=units, source=str(path))
+
+
+def _chosen(columns, path):
+    chosen = check_columns(columns, _COLUMNS, path)
+    needed = set(chosen) | ({"pulse_number"} if {"pulse_id", "multiplicity"} & set(chosen) else set())
+    return chosen, {name: field for name, field in _FIELDS.items() if name in needed}
+
+
+def _open(path, partial, byte_order):
+    return open_words(path, _ROW, "a .raw", order="little", floats=6, partial=partial, byte_order=byte_order)

@@ -1,0 +1,120 @@
+"""The .rrng format: ranges of mass over charge state as INI text.
+
+Larson et al., Local Electrode Atom Probe Tomography (Springer, 2013), appendix A. Sections, lines and the parts of a
+line may come in any order, case and spacing; volume and colour may be missing; commas may stand for decimal points.
+"""
+
+import re
+import warnings
+
+import numpy as np
+
+from apt_evap._files import FileError, open_for_reading
+from apt_evap.ranges import Ranges
+
+_MOST = 1 << 22
+
+
+def read_ranges(path):
+    """Read the mass ranges of an .rrng file.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file.
+
+    Returns
+    -------
+    Ranges
+        In the order of the file. A range is called by its ``Name``, or else by its elements, such as "CrO2".
+
+    Raises
+    ------
+    FileError
+        If the file is missing or unreadable, has no ranges, or a line cannot be understood.
+    """
+    with open_for_reading(path) as file:
+        data = b""
+        while len(data) <= _MOST and (more := file.read(1 << 20)):
+            data += more
+    if not data:
+        raise FileError(f"{str(path)!r} is empty (0 bytes), expected the text of an .rrng file")
+    if len(data) > _MOST:
+        raise FileError(f"{str(path)!r} has more than {_MOST} bytes, expected the text of an .rrng file")
+    lines = _lines(data)
+    elements = {}
+    for section, _, key, value in lines:
+        if section == "ions" and re.fullmatch(r"ion\s*[0-9]+", key) and value:
+            element = value.split()[0]
+            elements.setdefault(element.casefold(), element)
+    parts = [
+        _range(value, elements, f"{str(path)!r}, line {number}")
+        for section, number, key, value in lines
+        if section == "ranges" and re.fullmatch(r"range\s*[0-9]+", key)
+    ]
+    if not parts:
+        raise FileError(f"{str(path)!r} has no lines Range1=... in a section [Ranges], expected at least one")
+    announced = [value for section, _, key, value in lines if section == "ranges" and key == "number"]
+    if announced and announced[0] != str(len(parts)):
+        warnings.warn(f"{str(path)!r} announces {announced[0]:.20} ranges and holds {len(parts)}", stacklevel=2)
+    names, low, high, volume, colour, composition = zip(*parts, strict=True)
+    return Ranges(names, low, high, volume, colour, composition, source=str(path))
+
+
+def _lines(data):
+    """(section, line number, key, value) of every assignment, section and key in small letters."""
+    try:
+        text = data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
+    except UnicodeDecodeError:
+        text = data.decode("latin-1")
+    section = ""
+    found = []
+    for number, line in enumerate(text.splitlines(), 1):
+        line = line.strip()
+        if match := re.match(r"\[\s*(.*?)\s*\]", line):
+            section = match[1].casefold()
+        elif "=" in line and not line.startswith((";", "#")):
+            key, _, value = line.partition("=")
+            found.append((section, number, key.strip().casefold(), value.strip()))
+    return found
+
+
+def _range(text, elements, where):
+    """Read "13.8745 14.2410 Vol:0.02003 Si:1 Color:CCCCCC"."""
+    bounds = []
+    name, volume, colour, composition = "", np.nan, "", {}
+    # "Vol : 0.02" is "Vol:0.02", but the value may also be missing
+    for part in re.sub(r":\s+(?=[^\s:]+(\s|$))", ":", re.sub(r"\s+:", ":", text)).split():
+        key, colon, value = part.partition(":")
+        word = key.casefold()
+        if not colon:
+            bounds.append(_number(part, "a bound [Da]", where))
+        elif word == "vol":
+            volume = _number(value, "a volume [nm^3]", where) if value else np.nan
+        elif word in ("color", "colour"):
+            colour = "#" + value.upper() if re.fullmatch(r"#?[0-9A-Fa-f]{6}", value) else ""
+            colour = colour.replace("##", "#")
+        elif word == "name":
+            name = value
+        elif re.fullmatch(r"[0-9]{1,4}", value):
+            element = elements.get(word, key.capitalize())
+            composition[element] = composition.get(element, 0) + int(value)
+        else:
+            raise FileError(f"{where}: expected a number of atoms such as {key}:1, got {part!r:.60}")
+    if len(bounds) != 2 or not bounds[0] < bounds[1]:
+        raise FileError(f"{where}: expected two bounds [Da], the lower one first, got {bounds} in {text!r:.60}")
+    composition = {element: count for element, count in composition.items() if count}
+    formula = "".join(element + (str(count) if count > 1 else "") for element, count in composition.items())
+    if not (name or formula):
+        raise FileError(f"{where}: expected an element such as Si:1, or Name:..., got {text!r:.60}")
+    return name or formula, *bounds, volume, colour, composition
+
+
+def _number(text, what, where):
+    try:
+        number = float(text.replace(",", ".")) if re.fullmatch(r"[-+0-9.,eE]+", text) else np.nan
+    except ValueError:
+        number = np.nan
+    if not np.isfinite(number):
+        raise FileError(f"{where}: expected {what}, got {text!r:.60}")
+    return number

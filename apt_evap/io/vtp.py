@@ -1,0 +1,67 @@
+"""The .vtp format of VTK and ParaView: points [nm] with data, as binary appended to XML."""
+
+import numpy as np
+
+from apt_evap._files import replace_file
+from apt_evap.io._points import points_and_data
+
+_CHUNK = 1 << 20
+_TYPES = {"f": "Float", "i": "Int", "u": "UInt"}
+
+
+def write_vtp(path, hits):
+    """Write ions as points of VTK, one vertex each, with all other columns as data of the points.
+
+    Positions are in nm, all other columns in the units of `Hits`. Left out are ions whose positions are not finite;
+    ions that missed the detector are written, with NaN where they have no value.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file; an existing one is replaced once the new one is complete.
+    hits : Hits
+        Ions with positions.
+
+    Raises
+    ------
+    ValueError
+        If there are no positions, or none is finite.
+    FileError
+        If the file cannot be written.
+    """
+    _, positions, data = points_and_data(path, hits)
+    n = len(positions)
+    index = np.arange(n + 1, dtype=np.int32 if n < 2**31 - 1 else np.int64)
+    blocks = []
+    written = 0
+
+    def array(name, values):
+        nonlocal written
+        if values.dtype.kind == "f" and values.dtype.itemsize not in (4, 8):
+            values = values.astype(np.float64)
+        blocks.append(values)
+        kind = f"{_TYPES[values.dtype.kind]}{8 * values.dtype.itemsize}"
+        width = 1 if values.ndim == 1 else values.shape[1]
+        offset, written = written, written + 8 + values.nbytes
+        return (
+            f'<DataArray type="{kind}" Name="{name}" NumberOfComponents="{width}" '
+            f'format="appended" offset="{offset}"/>\n'
+        )
+
+    head = (
+        '<?xml version="1.0"?>\n<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" '
+        'header_type="UInt64">\n<PolyData>\n'
+        f'<Piece NumberOfPoints="{n}" NumberOfVerts="{n}" NumberOfLines="0" NumberOfStrips="0" NumberOfPolys="0">\n'
+        f"<PointData>\n{''.join(array(name, values) for name, values in data.items())}</PointData>\n"
+        f"<Points>\n{array('positions', positions)}</Points>\n"
+        f"<Verts>\n{array('connectivity', index[:-1])}{array('offsets', index[1:])}</Verts>\n"
+        '</Piece>\n</PolyData>\n<AppendedData encoding="raw">\n_'
+    )
+    with replace_file(path) as file:
+        file.write(head.encode())
+        for values in blocks:
+            file.write(np.array(values.nbytes, "<u8").tobytes())
+            for start in range(0, len(values), _CHUNK):
+                part = values[start : start + _CHUNK]
+                file.write(np.ascontiguousarray(part, part.dtype.newbyteorder("<")).data)
+        file.write(b"\n</AppendedData>\n</VTKFile>\n")

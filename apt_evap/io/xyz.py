@@ -1,0 +1,68 @@
+"""Extended XYZ, text that OVITO and ASE read: species and position [Angstrom] of every ion, and its other columns."""
+
+import numpy as np
+
+from apt_evap._files import replace_file
+from apt_evap.io._points import points_and_data
+
+_CHUNK = 1 << 14
+_ANGSTROM_PER_NM = 10
+
+
+def write_xyz(path, hits, *, species="X"):
+    """Write ions as extended XYZ.
+
+    Positions are in Angstrom, with five decimals; all other columns are in the units of `Hits`, float32 with nine and
+    float64 with seventeen digits at most, which is what brings them back. Whole numbers beyond 32 bits are declared
+    as real ones, for ASE has no others. Left out are ions whose positions are not
+    finite; ions that missed the detector are written.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file; an existing one is replaced once the new one is complete.
+    hits : Hits
+        Ions with positions.
+    species : str or sequence of str
+        Species of all ions, or of each one, such as ``ranges.labels(hits)``. ASE wants chemical elements; "X" is none.
+
+    Raises
+    ------
+    ValueError
+        If there are no positions, none is finite, or a species is not one word.
+    FileError
+        If the file cannot be written.
+    """
+    labels = _labels(species, len(hits))
+    chosen, positions, data = points_and_data(path, hits)
+    properties = ["species:S:1", "pos:R:3"]
+    formats = ["%s", "%.5f", "%.5f", "%.5f"]
+    for name, values in data.items():
+        width = 1 if values.ndim == 1 else values.shape[1]
+        # the whole numbers of ASE have 32 bits
+        whole = values.dtype.kind in "iu" and -(2**31) <= values.min() and values.max() < 2**31
+        properties.append(f"{name}:{'I' if whole else 'R'}:{width}")
+        formats += ["%d" if values.dtype.kind in "iu" else "%.17g" if values.dtype.itemsize > 4 else "%.9g"] * width
+    row = " ".join(formats) + "\n"
+    labels = labels[chosen] if labels.ndim else labels
+    n = len(positions)
+    with replace_file(path) as file:
+        file.write(f'{n}\nProperties={":".join(properties)} pbc="F F F"\n'.encode())
+        for start in range(0, n, _CHUNK):
+            part = slice(start, min(start + _CHUNK, n))
+            rows = part.stop - part.start
+            columns = [(labels[part] if labels.ndim else np.full(rows, labels)).tolist()]
+            columns += (positions[part].astype(np.float64) * _ANGSTROM_PER_NM).T.tolist()
+            for values in data.values():
+                columns += values[part].reshape(rows, -1).T.tolist()
+            file.write("".join([row % values for values in zip(*columns, strict=True)]).encode())
+
+
+def _labels(species, n):
+    labels = np.asarray(species)
+    if labels.dtype.kind != "U" or labels.shape not in ((), (n,)):
+        raise ValueError(f"species must be a str or one str for each of the {n} ions, got {species!r:.80}")
+    for label in np.unique(labels):
+        if len(str(label).split()) != 1 or '"' in label:
+            raise ValueError(f"species must be single words, got {str(label)!r:.80}")
+    return labels
