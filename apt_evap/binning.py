@@ -11,6 +11,9 @@ from apt_evap._arrays import check_array, check_count, check_number
 _CHUNK = 1 << 16
 
 
+MOST_BY_CHANCE = 32  # so few different values may lie on a comb by chance: eight of a normal distribution did
+
+
 class Comb(NamedTuple):
     """Teeth at ``origin + k * spacing`` [mm] for whole k."""
 
@@ -41,12 +44,12 @@ def find_comb(values, sample=100_000):
     teeth = np.unique(values)
     rounding = float(np.spacing(np.abs(teeth).max())) if len(teeth) else 0.0
     teeth = teeth.astype(np.float64)
-    if len(teeth) < 8 or len(teeth) > 0.9 * len(values):
+    if len(teeth) < MOST_BY_CHANCE or len(teeth) > 0.9 * len(values):
         return None
     # values of one tooth may differ in their last bits
     teeth = teeth[np.diff(teeth, prepend=-np.inf) > 8 * rounding]
     gaps = np.diff(teeth)
-    if len(gaps) < 7:
+    if len(gaps) < MOST_BY_CHANCE - 1:
         return None
     low = np.percentile(gaps, 2)
     number = np.concatenate([[0], np.cumsum(np.rint(gaps / np.median(gaps[gaps < 1.5 * low])))])

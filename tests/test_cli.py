@@ -232,7 +232,7 @@ def test_ctrl_c_keeps_what_is_done(folder):
     termios.tcsetwinsize(end, (24, 100))
     (folder / "small.toml").write_text(SMALL.replace("6 a", "10 a"))
     process = subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, "run", "small.toml", "--ions", "5000", "--threads", "1"],
+        [sys.executable, "-P", "-c", PROGRAM, "run", "small.toml", "--ions", "5000", "--threads", "1"],
         cwd=folder,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         stdout=subprocess.PIPE,
@@ -434,7 +434,7 @@ def test_a_reader_of_the_output_may_leave(made):
     read, write_end = os.pipe()
     os.close(read)
     done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, "info", str(made)],
+        [sys.executable, "-P", "-c", PROGRAM, "info", str(made)],
         stdout=write_end,
         stderr=subprocess.PIPE,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
