@@ -20,7 +20,7 @@ from apt_evap.io import write
 from apt_evap.perturbation import Combined, LateralVelocity, RollUp, Unperturbed
 from apt_evap.run import load
 
-ROOT = Path(__file__).parents[1]
+HERE = str(Path(cli.__file__).parents[1])  # the package under test, installed or not
 PROGRAM = "import sys; from apt_evap.cli import main; sys.exit(main())"
 SMALL = """
 [tip]
@@ -232,9 +232,9 @@ def test_ctrl_c_keeps_what_is_done(folder):
     termios.tcsetwinsize(end, (24, 100))
     (folder / "small.toml").write_text(SMALL.replace("6 a", "10 a"))
     process = subprocess.Popen(
-        [sys.executable, "-P", "-c", PROGRAM, "run", "small.toml", "--ions", "5000", "--threads", "1"],
+        [sys.executable, "-c", PROGRAM, "run", "small.toml", "--ions", "5000", "--threads", "1"],
         cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        env=os.environ | {"PYTHONPATH": HERE},
         stdout=subprocess.PIPE,
         stderr=end,
         text=True,
@@ -434,10 +434,10 @@ def test_a_reader_of_the_output_may_leave(made):
     read, write_end = os.pipe()
     os.close(read)
     done = subprocess.run(
-        [sys.executable, "-P", "-c", PROGRAM, "info", str(made)],
+        [sys.executable, "-c", PROGRAM, "info", str(made)],
         stdout=write_end,
         stderr=subprocess.PIPE,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        env=os.environ | {"PYTHONPATH": HERE},
     )
     os.close(write_end)
     assert done.returncode == 1 and done.stderr == b""
