@@ -435,6 +435,7 @@ def test_a_reader_of_the_output_may_leave(made):
     os.close(read)
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM, "info", str(made)],
+        cwd=made.parent,
         stdout=write_end,
         stderr=subprocess.PIPE,
         env=os.environ | {"PYTHONPATH": HERE},
