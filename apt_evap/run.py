@@ -2,6 +2,7 @@
 
 import datetime
 import json
+import warnings
 from dataclasses import dataclass, field, replace
 
 import h5py
@@ -144,6 +145,13 @@ class Run:
         settings = self.response_settings
         rolled, first, second = perturbation.tangential(self.emissions, IonRandom(self.seed, self.emissions.ions))
         velocities = settings.reduced(np.column_stack([first, second]), self.emissions.masses)
+        faster = int(np.count_nonzero(np.einsum("ij,ij->i", velocities, velocities) > 1.0001))
+        if faster:
+            warnings.warn(
+                f"{faster:,} of {len(self):,} ions launch above the {settings.energy_limit:g} eV of the responses: "
+                "their places are extrapolated; set ResponseSettings(energy_limit=...) for the run",
+                stacklevel=2,
+            )
         values = np.empty((len(self), 3))
         for design, coefficients, chosen in (
             (settings.site, self.responses.site, ~rolled),
