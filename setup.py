@@ -12,7 +12,7 @@ from Cython.Build import cythonize
 from setuptools import Extension, setup
 from setuptools.command.build_ext import build_ext
 
-MODULES = ["octree", "sweep", "surface", "robin", "event", "flight"]
+MODULES = ["octree", "sweep", "surface", "robin", "journal", "event", "flight"]
 DIRECTIVES = {
     "language_level": 3,
     "boundscheck": False,

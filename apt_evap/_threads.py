@@ -4,6 +4,8 @@ import os
 
 from apt_evap._arrays import check_count
 
+MOST_THREADS = 1024  # each has a copy of the surface; more is a slip of the keyboard
+
 
 def thread_count(n_threads=None):
     """Return the number of threads to use.
@@ -23,5 +25,8 @@ def thread_count(n_threads=None):
         If it is not a whole number of at least 1.
     """
     if n_threads is not None:
-        return check_count(n_threads, "n_threads", at_least=1)
+        n_threads = check_count(n_threads, "n_threads", at_least=1)
+        if n_threads > MOST_THREADS:
+            raise ValueError(f"n_threads must be at most {MOST_THREADS}, got {n_threads}")
+        return n_threads
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

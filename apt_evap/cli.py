@@ -188,14 +188,21 @@ def _run(options):
     simulation = config.simulation(seed=options.seed, n_threads=options.threads)
     tell(f"{str(simulation.tip).strip('<>')}; {len(simulation.emitter):,} atoms on the surface")
     began = time.perf_counter()
-    run = simulation.run(
-        options.ions or config.n_ions,
-        config.emissions,
-        responses=config.responses,
-        progress=False if options.quiet else None,
-    )
+    provenance = {"config": config.path.name, "maps": config.maps.to_dict()}
+    try:
+        run = simulation.run(
+            options.ions or config.n_ions,
+            config.emissions,
+            responses=config.responses,
+            progress=False if options.quiet else None,
+        )
+    except Exception as error:
+        if run := getattr(error, "run", None):
+            replace(run, provenance=run.provenance | provenance).save(output)
+            _say("note", f"the {len(run):,} ions done so far are in {str(output)!r}")
+        raise
     seconds = time.perf_counter() - began
-    run = replace(run, provenance=run.provenance | {"config": config.path.name, "maps": config.maps.to_dict()})
+    run = replace(run, provenance=run.provenance | provenance)
     run.save(output)
     tell(f"{len(run):,} ions in {seconds:.1f} s, {len(run) / seconds:,.0f} ions/s")
     for panel in config.maps.panels:

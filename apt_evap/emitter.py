@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from apt_evap._arrays import check_array, check_count, check_number
-from apt_evap._core.event import DONE, EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, Evaporation, Journal
+from apt_evap._core.event import DONE, EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, Evaporation
+from apt_evap._core.journal import Journal
 from apt_evap._core.octree import Octree
 from apt_evap._core.robin import Robin
 from apt_evap._core.surface import Neighbourhood
@@ -33,7 +34,8 @@ class ChargeSettings:
     update_radius : float
         Fields are kept up to date within this distance of a hole [d_nn].
     sweep_interval : int, optional
-        Events between two relaxations of the whole surface; by default a 200th of the surface atoms.
+        Events between two relaxations of the whole surface; by default a 200th of the surface
+        atoms there are at the start, but at least 100.
     tolerance : float
         Change of a charge, relative to the mean charge, at which a relaxation stops.
     start_tolerance : float
@@ -109,6 +111,8 @@ class Emitter:
         How finely the charges are solved.
     n_threads : int, optional
         Threads; by default the processors this process may use.
+    rule : ChargingRule, optional
+        How charge settles; by default `Robin`.
 
     Raises
     ------
@@ -116,11 +120,12 @@ class Emitter:
         If the voltage is not above 0, or the specimen has no surface atom that may leave.
     """
 
-    def __init__(self, tip, voltage=1000.0, law=None, settings=None, n_threads=None):
+    def __init__(self, tip, voltage=1000.0, law=None, settings=None, n_threads=None, rule=None):
         self.tip = tip
         self.voltage = check_number(voltage, "voltage", above=0, unit="V")
         self.law = law or Extremal()
         self.settings = settings or ChargeSettings()
+        self.rule = rule or Robin()
         self.n_threads = thread_count(n_threads)
         distance = tip.nearest_neighbour_distance
         neighbourhood, weights = self._neighbourhood_of(tip), self._weights_of(tip)
@@ -128,11 +133,11 @@ class Emitter:
             raise ValueError(f"no surface atom of {tip!r} may leave, expected some evaporable ones")
         self._core = Evaporation(
             neighbourhood,
-            Robin(),
+            self.rule,
             weights,
             self.voltage / COULOMB,
             tip.potential_point,
-            1.2 * distance,  # between the first and the second shell of neighbours of every lattice
+            tip.bond_length,
             self.settings.patch_radius * distance,
             self.settings.update_radius * distance,
             self.settings.opening_angle,
@@ -229,14 +234,14 @@ class Emitter:
         residual : float
             The change in the last one.
         """
-        tolerance = self.settings.tolerance if tolerance is None else tolerance
+        tolerance = check_number(self.settings.tolerance if tolerance is None else tolerance, "tolerance", above=0)
         outcome = self._core.relax(
             tolerance=tolerance,
             double_precision=tolerance < 1e-6,  # below it the rounding of float32 keeps charges moving
             n_threads=self.n_threads,
         )
         self._fresh = True
-        if outcome[1] >= tolerance:
+        if not outcome[1] < tolerance:
             warnings.warn(
                 f"the charges had not settled after {outcome[0]} sweeps: the last one changed one by {outcome[1]:.1g} "
                 f"of the mean charge, expected {tolerance:.1g}",
@@ -258,9 +263,10 @@ class Emitter:
         ValueError
             If the specimen has nothing below: one made from positions.
         """
-        self.tip = self.tip.deepened()
-        neighbourhood = self._neighbourhood_of(self.tip, self._core.atoms)
-        self._core.take_over(neighbourhood, self._weights_of(self.tip))
+        tip = self.tip.deepened()
+        neighbourhood = self._neighbourhood_of(tip, self._core.atoms)
+        self._core.take_over(neighbourhood, self._weights_of(tip))
+        self.tip = tip
         self.relax()
 
     def evaporate(self, most):
@@ -277,6 +283,7 @@ class Emitter:
             Its status says why it ended: DONE, SWEEP_DUE (call `relax` and go on), EXHAUSTED, TOO_SHALLOW (call
             `deepen` and go on).
         """
+        most = check_count(most, "most", at_least=1)
         journal = Journal(self.tip.positions, most)
         site, neighbour = np.empty(most, np.int64), np.empty(most, np.int64)
         charges, normals = np.empty(most), np.empty((most, 3))

@@ -22,6 +22,9 @@ COORDINATION = {"fcc": 12, "bcc": 8, "sc": 6, "diamond": 4, "hcp": 12}
 
 # Caps of 14 d_nn along 4 or 5 axes: of the atoms with fewer nearest neighbours than in the bulk, and of the
 # others down to 4 d_nn, so many are taken for surface atoms
+BOND_FACTORS = {"fcc": 1.2, "bcc": 1.077, "sc": 1.2, "diamond": 1.3, "hcp": 1.2}
+"""Nearest neighbours are closer than this many nearest neighbour distances: half way to the second shell."""
+
 SURFACE_FACTORS = {
     "fcc": (2.19, 0.42),  # 88 %, none (12 % have lost one neighbour only)
     "bcc": (2.41, 0.49),  # 92 %, none; (2.19, 0.42): 94 %, 0.9 %, which is 2.6 % of the surface

@@ -81,15 +81,20 @@ class Design:
         coefficients : ndarray of float32, shape (n, 3, coefficients)
             Of the three quantities.
         residual : ndarray, shape (n,)
-            Root mean square over the launches of the misfit of the first two, per degree of freedom.
+            Root mean square over the launches of the misfit of the first two, per degree of freedom. Infinite where
+            some launches are NaN: the polynomial is the smallest through the others; NaN where all are.
         """
         matrix = self.monomials(self.velocities)
         coefficients = np.einsum("cm,nmk->nkc", np.linalg.pinv(matrix), values)
         misfit = np.einsum("mc,nkc->nmk", matrix, coefficients[:, :2]) - values[:, :, :2]
         freedom = max(1, len(matrix) - matrix.shape[1])
-        return np.ascontiguousarray(coefficients, np.float32), np.sqrt(
-            np.einsum("nmk,nmk->n", misfit, misfit) / freedom
-        )
+        residual = np.sqrt(np.einsum("nmk,nmk->n", misfit, misfit) / freedom)
+        for ion in np.flatnonzero(~np.isfinite(residual)):
+            good = np.isfinite(values[ion]).all(axis=1)
+            if good.any():
+                coefficients[ion] = np.linalg.lstsq(matrix[good], values[ion, good], rcond=None)[0].T
+                residual[ion] = np.inf
+        return np.ascontiguousarray(coefficients, np.float32), residual
 
     def evaluate(self, coefficients, velocities):
         """Values of the polynomials of n ions, each at a velocity of its own; shape (n, 3)."""

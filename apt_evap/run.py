@@ -318,7 +318,7 @@ def _read(file):
     for index in range(len(file.get("flown", ()))):
         group = file[f"flown/{index}"]
         described = json.loads(group.attrs["perturbation"])
-        perturbations.append(described if "repr" in described else from_dict(described))
+        perturbations.append(_known(described))
         flown.append(Flown(group["directions"][()], group["times"][()]))
     responses = None
     if "responses" in file:
@@ -346,8 +346,16 @@ def _read(file):
     )
 
 
+def _known(described):
+    """The perturbation that `to_dict` described, or the description if it was one of a user's own."""
+    try:
+        return from_dict(described)
+    except ValueError:
+        return described
+
+
 def _describe(perturbation):
-    return perturbation["repr"] if isinstance(perturbation, dict) else repr(perturbation)
+    return perturbation.get("repr", json.dumps(perturbation)) if isinstance(perturbation, dict) else repr(perturbation)
 
 
 def _plain(value):

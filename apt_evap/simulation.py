@@ -9,56 +9,24 @@ import signal
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from tqdm.auto import tqdm
 
 from apt_evap._arrays import check_count, check_number
-from apt_evap._core.flight import LEFT, Flights
 from apt_evap._threads import thread_count
 from apt_evap.detector import Detector
-from apt_evap.emission import Emissions, tangent_frame
+from apt_evap.emission import Emissions, Launches, tangent_frame
 from apt_evap.emitter import EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, Emitter
+from apt_evap.flights import FlightCrew, FlightSettings
 from apt_evap.ion_random import IonRandom
 from apt_evap.law import Extremal
 from apt_evap.perturbation import Unperturbed
 from apt_evap.response import Responses, ResponseSettings, flattened
 from apt_evap.run import Flown, Run
-from apt_evap.units import COULOMB, FLIGHT_TIME
+from apt_evap.units import FLIGHT_TIME
 
 BATCH = 256  # events at a time; the results do not depend on it
-
-
-@dataclass(frozen=True)
-class FlightSettings:
-    """How the flights are integrated.
-
-    Parameters
-    ----------
-    opening_angle : float
-        Full angle under which a cell of the octree stands for its atoms [rad]. Measured on Ni[111], R = 20 a: 0.3 puts
-        ions within 2 um (median) and 6 um (largest of 40) of where exact sums put them on a detector at 100 mm.
-    tolerance : float
-        Error of a step relative to path and velocity; at 1e-3 it moves ions by 0.1 um.
-    reach : float
-        Distance from the apex, in nearest neighbour distances, at which a flight ends and the ion goes straight on;
-        11,314 is 8,000 lattice constants of fcc, as in Shaikh et al.
-    most_steps : int
-        Steps after which an ion counts as one that never left.
-    """
-
-    opening_angle: float = 0.3
-    tolerance: float = 1e-3
-    reach: float = 11314.0
-    most_steps: int = 500
-
-    def __post_init__(self):
-        check_number(self.opening_angle, "opening_angle", at_least=0, at_most=1.0, unit="rad")
-        check_number(self.tolerance, "tolerance", above=0, at_most=0.1)
-        check_number(self.reach, "reach", at_least=100, unit="d_nn")
-        check_count(self.most_steps, "most_steps", at_least=1)
 
 
 class Simulation:
@@ -84,6 +52,8 @@ class Simulation:
         Flights and polynomials of the responses.
     n_threads : int, optional
         Threads; by default the processors this process may use. The results do not depend on it.
+    rule : ChargingRule, optional
+        How charge settles; by default Robin's iteration.
 
     Raises
     ------
@@ -102,6 +72,7 @@ class Simulation:
         flight_settings=None,
         response_settings=None,
         n_threads=None,
+        rule=None,
     ):
         self.voltage = check_number(voltage, "voltage", above=0, unit="V")
         self.seed = check_count(seed, "seed")
@@ -110,9 +81,11 @@ class Simulation:
         self.flight_settings = flight_settings or FlightSettings()
         self.response_settings = response_settings or ResponseSettings()
         self.n_threads = thread_count(n_threads)
-        self.emitter = Emitter(tip, self.voltage, self.law, charge_settings, self.n_threads)
+        self._check_reach(tip)
+        self.emitter = Emitter(tip, self.voltage, self.law, charge_settings, self.n_threads, rule)
+        self.settings = self._settings_of(tip)
         self.n_evaporated = 0
-        self._workers = []
+        self._crew = FlightCrew(tip, self.flight_settings, self.n_threads)
 
     @property
     def tip(self):
@@ -150,7 +123,8 @@ class Simulation:
         Raises
         ------
         ValueError
-            If an argument is out of its range, or a perturbation has no `launch`.
+            If an argument is out of its range, or a perturbation has no `launch`. Whatever is raised once ions are done
+            has them in its attribute `run`.
         """
         n_ions = check_count(n_ions, "n_ions", at_least=1)
         batch_size = check_count(batch_size, "batch_size", at_least=1)
@@ -176,22 +150,31 @@ class Simulation:
 
             waiting = []
             started = 0
-            while started < n_ions and not ended:
-                batch = self.emitter.evaporate(min(batch_size, n_ions - started))
-                started += len(batch)
-                collect()
-                waiting.append(self._start_flights(batch, emissions, responses, pool))
-                if self.n_threads == 1:
+            try:
+                while started < n_ions and not ended:
+                    batch = self.emitter.evaporate(min(batch_size, n_ions - started))
+                    started += len(batch)
                     collect()
-                if batch.status == SWEEP_DUE:
-                    self.emitter.relax()
-                elif batch.status == EXHAUSTED:
-                    ended = "no atom is left that may evaporate"
-                elif batch.status == TOO_SHALLOW:
-                    self.emitter.deepen()
-                if interrupted.is_set():
-                    ended = "interrupted"
-            collect()
+                    waiting.append(self._start_flights(batch, emissions, responses, pool))
+                    if self.n_threads == 1:
+                        collect()
+                    if batch.status == SWEEP_DUE:
+                        self.emitter.relax()
+                    elif batch.status == EXHAUSTED:
+                        ended = "no atom is left that may evaporate"
+                    elif batch.status == TOO_SHALLOW:
+                        self.emitter.deepen()
+                    if interrupted.is_set() and not ended and started < n_ions:
+                        ended = "interrupted"
+                collect()
+            except Exception as error:  # nothing done is lost: a caller may save it
+                collect()
+                if parts:
+                    error.run = Run.join(parts).ended_by(f"{type(error).__name__}: {error}")
+                    error.add_note(
+                        f"the {len(error.run):,} ions done so far are in the attribute `run` of this exception"
+                    )
+                raise
         run = Run.join(parts)
         return run.ended_by(ended) if ended else run
 
@@ -202,7 +185,11 @@ class Simulation:
         ions = np.arange(self.n_evaporated, self.n_evaporated + len(batch))
         self.n_evaporated += len(batch)
         emitted = self._emissions(batch, ions)
-        launches = [perturbation.launch(emitted, IonRandom(self.seed, ions)) for perturbation in emissions]
+        nobody = Launches(emitted.positions, emitted.positions, np.zeros(len(batch), bool))
+        launches = [
+            perturbation.launch(emitted, IonRandom(self.seed, ions)) if len(batch) else nobody
+            for perturbation in emissions
+        ]
         for perturbation, launch in zip(emissions, launches, strict=True):
             if len(launch.positions) != len(batch):
                 raise ValueError(
@@ -212,7 +199,7 @@ class Simulation:
         groups = [(launch.positions[:, None], (launch.velocities * slowness[:, None])[:, None]) for launch in launches]
         if responses:
             groups += self._designs(emitted)
-        flight = self._fly(batch, groups, pool)
+        flight = self._crew.start(batch, groups, pool)
 
         def finish():
             ends = flight()
@@ -266,70 +253,6 @@ class Simulation:
             groups.append((np.broadcast_to(start[:, None], velocities.shape), velocities))
         return groups
 
-    def _fly(self, batch, groups, pool):
-        """Fly groups of launches (n, m, 3) of every ion of a batch; give their ends once they are there."""
-        flights = self.flight_settings
-        if batch.tree is not None:
-            while len(self._workers) < self.n_threads:
-                self._workers.append(
-                    Flights(
-                        batch.tree,
-                        coulomb=COULOMB,
-                        length=self.tip.nearest_neighbour_distance,
-                        centre=(0.0, 0.0, self.tip.apex),
-                        reach=flights.reach * self.tip.nearest_neighbour_distance,
-                        opening_angle=flights.opening_angle,
-                        tolerance=flights.tolerance,
-                        most_steps=flights.most_steps,
-                    )
-                )
-        n, sizes = len(batch), [group[0].shape[1] for group in groups]
-        positions = np.concatenate([group[0] for group in groups], axis=1).reshape(-1, 3)
-        velocities = np.concatenate([group[1] for group in groups], axis=1).reshape(-1, 3)
-        # an ion without a neighbour has no rolled-up position: its launches are not flown
-        flown = np.isfinite(positions).all(axis=1)
-        counts = np.concatenate(
-            [
-                flown.reshape(n, sum(sizes))[:, start : start + size].sum(axis=1)[:, None]
-                for start, size in zip(np.cumsum([0, *sizes[:-1]]), sizes, strict=True)
-            ],
-            axis=1,
-        ).ravel()
-        end = np.empty((int(counts.sum()), 7))
-        outcome = np.empty(len(end), np.int8)
-        job = (
-            batch.journal,
-            np.repeat(np.arange(n), len(groups)),
-            np.concatenate([[0], np.cumsum(counts)]),
-            np.ascontiguousarray(positions[flown]),
-            np.ascontiguousarray(velocities[flown]),
-            end,
-            outcome,
-            np.zeros(1, np.int64),
-        )
-
-        def work(worker):
-            if batch.tree is not None:
-                worker.begin(batch.tree)
-            else:
-                worker.go_on()
-            worker.fly(*job)
-
-        futures = [pool.submit(work, worker) for worker in self._workers]
-
-        def wait():
-            for future in futures:
-                future.result()
-            ends = np.full((len(flown), 7), np.nan)
-            ends[flown] = end
-            left = np.zeros(len(flown), bool)
-            left[flown] = outcome == LEFT
-            ends, left = ends.reshape(n, sum(sizes), 7), left.reshape(n, sum(sizes))
-            edges = np.cumsum([0, *sizes])
-            return [(ends[:, a:b, :3], ends[:, a:b, 3:6], ends[:, a:b, 6], left[:, a:b]) for a, b in pairwise(edges)]
-
-        return wait
-
     def _landed(self, position, velocity, time, left, slowness):
         """Stereographic directions (n, 2) and times of flight (n,) [ns]; NaN where an ion never left."""
         directions, remaining = self.detector.directions(position, velocity, self.tip.apex)
@@ -354,15 +277,25 @@ class Simulation:
             residuals.append(2.0 * self.detector.distance * residual)
         return Responses(*coefficients, np.stack(residuals, axis=1).astype(np.float32))
 
-    @property
-    def settings(self):
-        """Everything the run was made with, in plain types."""
+    def _check_reach(self, tip):
+        """Refuse flights that would end beside the specimen."""
+        height = tip.apex - float(tip.positions[tip.evaporable, 2].min(initial=tip.apex))
+        reach = self.flight_settings.reach * tip.nearest_neighbour_distance
+        if reach < 3 * height:
+            raise ValueError(
+                f"reach must be at least three times the {height:.4g} nm between the apex and the lowest atom that may "
+                f"leave, got {self.flight_settings.reach:g} d_nn, which is {reach:.4g} nm"
+            )
+
+    def _settings_of(self, tip):
+        """Everything a run is made with, in plain types."""
         return {
-            "tip": self.tip.settings,
+            "tip": tip.settings,
             "voltage": self.voltage,
             "seed": self.seed,
             "detector": vars(self.detector),
-            "law": {"name": type(self.law).__name__},
+            "law": {"name": type(self.law).__name__, "repr": repr(self.law)},
+            "rule": type(self.emitter.rule).__name__,
             "charges": vars(self.emitter.settings),
             "flights": vars(self.flight_settings),
             "responses": {

@@ -1,5 +1,6 @@
 """The specimen: a crystal (or any arrangement of atoms) in the shape of a tip."""
 
+import hashlib
 from dataclasses import asdict
 
 import numpy as np
@@ -7,11 +8,11 @@ from scipy.spatial import cKDTree
 
 from apt_evap import lattice
 from apt_evap._arrays import check_array, check_count, check_number
+from apt_evap._memory import check_memory
 from apt_evap.material import Material
 from apt_evap.material import material as known_material
 from apt_evap.shape import TaperedCap
 
-_BYTES_PER_ATOM = 100  # at the peak of building a tip, measured 70 to 96
 _ROUNDING = 1e-6  # nearest neighbour distances: sites on the surface stay together whatever their rounding
 _SKIN = 3.2  # neighbour radii held below the surface where hardly an atom leaves: two of them are support
 _SAMPLE = 10_000  # atoms asked for their nearest neighbour
@@ -64,6 +65,8 @@ class Tip:
     nearest_neighbour_distance, neighbour_radius, surface_threshold : float
         d_nn [nm]; the radius of the neighbourhood whose mean position tells surface atoms, and how far from
         that mean a surface atom is [nm], see `lattice.SURFACE_FACTORS`.
+    bond_length : float
+        Atoms closer than this are nearest neighbours [nm], see `lattice.BOND_FACTORS`.
     evaporation_fields, charge_states, masses : ndarray
         Of each species [V/nm], [e], [Da].
     apex : float
@@ -105,7 +108,7 @@ class Tip:
             depth = check_number(depth, "depth", above=self.neighbour_radius, unit="nm")
         self._depth = depth
         fractions = _check_solutes(solutes, seed)
-        _check_memory(self._held_volume() * lattice.atom_density(host.structure, host.a, host.c))
+        check_memory(self._held_volume() * lattice.atom_density(host.structure, host.a, host.c))
 
         orientation = lattice.rotation_to_axis(host, axis, rotation)
         shift = origin
@@ -196,8 +199,9 @@ class Tip:
                 f"species must be indices from 0 to {len(elements) - 1}, got {tip.species.min()} to {tip.species.max()}"
             )
         sample = tip.positions[:: max(1, n // _SAMPLE)]
-        distances = cKDTree(tip.positions).query(sample, k=2)[0][:, 1]
-        if not distances.min() > 0:
+        neighbours = cKDTree(tip.positions)
+        distances = neighbours.query(sample, k=2)[0][:, 1]
+        if not distances.min() > 0 or neighbours.query_pairs(1e-3 * float(np.median(distances))):
             raise ValueError("positions must be distinct, got two atoms at the same place")
         tip._set_neighbourhood(elements[0].structure, float(np.median(distances)))
         if neighbour_radius is not None:
@@ -218,6 +222,7 @@ class Tip:
         tip.potential_point = check_array(potential_point, "potential_point", (3,))
         tip.settings = {
             "atoms": n,
+            "sha256": _digest(tip.positions, tip.species, tip.evaporable),
             "elements": [asdict(element) for element in elements],
             "neighbour_radius": tip.neighbour_radius,
             "surface_threshold": tip.surface_threshold,
@@ -332,6 +337,7 @@ class Tip:
     def _set_neighbourhood(self, structure, distance):
         radius, threshold = lattice.SURFACE_FACTORS[structure]
         self.nearest_neighbour_distance = distance
+        self.bond_length = lattice.BOND_FACTORS[structure] * distance
         self.neighbour_radius = radius * distance
         self.surface_threshold = threshold * distance
 
@@ -373,19 +379,9 @@ def _draw_species(n, fractions, seed):
     return ((drawn + 1) % (len(fractions) + 1)).astype(np.int32)
 
 
-def _available_memory():
-    """Free memory [bytes], or None where the system does not say (other than Linux)."""
-    try:
-        with open("/proc/meminfo") as lines:
-            return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable"))
-    except (OSError, StopIteration):
-        return None
-
-
-def _check_memory(atoms):
-    needed, free = atoms * _BYTES_PER_ATOM, _available_memory()
-    if free is not None and needed > free:
-        raise ValueError(
-            f"a tip of {atoms:.2g} atoms needs about {needed / 1e9:.2g} GB, {free / 1e9:.2g} GB are free; "
-            "give depth=... to hold only the atoms near the surface, or a smaller apex_radius"
-        )
+def _digest(*arrays):
+    """Hash of some arrays, by which atoms given as positions are known again."""
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(np.ascontiguousarray(array))
+    return digest.hexdigest()

@@ -11,8 +11,8 @@ import time
 from pathlib import Path
 
 import numpy as np
-from apt_evap._core.event import Journal
 from apt_evap._core.flight import Flights
+from apt_evap._core.journal import Journal
 from apt_evap._core.octree import Octree
 from apt_evap._core.robin import Robin
 from apt_evap._core.sweep import InteractionLists, direct_field

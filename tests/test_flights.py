@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 import twins
-from apt_evap._core.event import Journal
 from apt_evap._core.flight import LEFT, NEVER_LEFT, Flights
+from apt_evap._core.journal import Journal
 from apt_evap._core.octree import Octree
 from scipy.integrate import solve_ivp
 

@@ -340,3 +340,61 @@ def test_flights_follow_an_emitter_that_was_driven_by_hand(nickel):
     later = by_hand.run(20, responses=False, progress=False).hits(ae.Unperturbed())
     run = whole.run(80, responses=False, progress=False).hits(ae.Unperturbed())
     assert np.array_equal(later.x, run.x[60:]) and np.array_equal(later.site, run.site[60:])
+
+
+@pytest.mark.parametrize("element", ["Ni", "W", "Si"])
+def test_ions_roll_onto_nearest_neighbours(element):
+    material = ae.material(element)
+    tip = ae.Tip(material, apex_radius=8 * material.nearest_neighbour_distance, axis=(0, 1, 1))
+    emissions = ae.Simulation(tip, seed=1).run(60, responses=False, progress=False).emissions
+    distances = np.linalg.norm(emissions.neighbours - emissions.positions, axis=1)
+    assert np.isfinite(distances).sum() > 40
+    assert np.nanmax(np.abs(distances / material.nearest_neighbour_distance - 1)) < 1e-9
+
+
+def test_evaporation_past_the_point_of_the_potential(nickel):
+    # the cap's centre, where the voltage is defined, is an atom of this tip: all of the cap goes
+    tip = ae.Tip(nickel, apex_radius=1.0, axis=(1, 1, 1), shank_length=6.0)
+    simulation = ae.Simulation(tip, seed=1)
+    run = simulation.run(400, responses=False, progress=False)
+    assert len(run) == 400 and run.emissions.positions[:, 2].min() < -0.5
+    assert np.isfinite(run.fields).all() and run.fields.min() > 0
+    # deep inside the shank the potential is the voltage within the few percent that it varies along it
+    deep = simulation.emitter.potential_at([[0.0, 0.0, -4.0]])[0]
+    assert deep == pytest.approx(1000.0, rel=0.1)
+
+
+def test_settings_do_not_depend_on_threads_when_a_shell_deepens(nickel):
+    tip = ae.Tip(nickel, apex_radius=6 * nickel.a, axis=(1, 1, 1), depth=3.5 * nickel.a)
+    settings, sites = [], []
+    for n_threads in (1, 2):
+        simulation = ae.Simulation(tip, seed=1, n_threads=n_threads)
+        run = simulation.run(900, responses=False, progress=False)
+        assert len(simulation.tip) > len(tip)  # it has deepened
+        assert np.array_equal(simulation.tip.positions[run.site], run.emissions.positions)
+        settings.append(run.settings)
+        sites.append(run.site)
+    assert settings[0] == settings[1] and settings[0]["tip"] == tip.settings
+    assert np.array_equal(*sites)
+
+
+class Breaking:
+    """Raises once it has launched a hundred ions."""
+
+    def launch(self, emissions, random):
+        if emissions.ions[-1] >= 100:
+            raise RuntimeError("broken on purpose")
+        return ae.Unperturbed().launch(emissions, random)
+
+
+def test_an_exception_keeps_what_is_done(small_tip):
+    with pytest.raises(RuntimeError, match="broken on purpose") as caught:
+        ae.Simulation(small_tip, seed=1).run(200, [Breaking()], responses=False, progress=False, batch_size=50)
+    assert len(caught.value.run) == 100
+    assert caught.value.run.ended == "RuntimeError: broken on purpose"
+
+
+def test_reach_must_be_beyond_the_specimen(small_tip):
+    with pytest.raises(ValueError, match="reach must be at least three times the"):
+        tip = ae.Tip("Ni", apex_radius=10.0, shank_length=60.0, depth=1.5)
+        ae.Simulation(tip, flight_settings=ae.FlightSettings(reach=120.0))

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from apt_evap import tip as tip_module
+from apt_evap import _memory
 from apt_evap.lattice import COORDINATION, atom_density
 from apt_evap.material import Material, material
 from apt_evap.shape import TaperedCap
@@ -258,8 +258,8 @@ def test_impossible_tips_are_refused_in_one_sentence(changes, message):
 
 
 def test_tip_that_does_not_fit_in_memory_is_refused_before_it_is_built(monkeypatch):
-    monkeypatch.setattr(tip_module, "_available_memory", lambda: 8e9)
+    monkeypatch.setattr(_memory, "_available_memory", lambda: 8e9)
     with pytest.raises(ValueError, match=r"needs about \d+ GB, 8 GB are free; give depth="):
         Tip(NICKEL, 250 * NICKEL.a)
-    monkeypatch.setattr(tip_module, "_available_memory", lambda: None)
+    monkeypatch.setattr(_memory, "_available_memory", lambda: None)
     assert len(small()) > 0

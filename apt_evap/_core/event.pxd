@@ -1,22 +1,9 @@
-"""The sequence of events, for the flights that follow it."""
+"""The sequence of events."""
 
+from apt_evap._core.journal cimport Journal
 from apt_evap._core.octree cimport Octree
 from apt_evap._core.robin cimport ChargingRule, Patch
 from apt_evap._core.surface cimport Neighbourhood
-
-
-cdef class Journal:
-    cdef readonly long n_events
-    cdef long[::1] start                # (most + 1,) where each event's changes begin
-    cdef int[::1] slot                  # changed slots; the first of each event is the one taken out
-    cdef double[::1] charge             # new charges [e]
-    cdef long[::1] fresh_start          # (most + 1,)
-    cdef int[::1] fresh_atom            # atoms put in
-    cdef int[::1] fresh_leaf            # and the leaf each joined
-    cdef double[:, ::1] positions       # (n_atoms, 3) nm
-
-    cdef int room(self, long changes, long fresh) except -1 nogil
-    cdef void replay(self, long event, Octree tree) noexcept nogil
 
 
 cdef class Evaporation:
@@ -25,7 +12,11 @@ cdef class Evaporation:
     cdef readonly ChargingRule rule
     cdef readonly double potential, patch_radius, update_radius, bond_length, opening_angle
     cdef object potential_point
-    cdef readonly long n_removed, since_sweep, n_clipped
+    cdef readonly long n_removed, since_sweep
+    cdef readonly long n_clipped        # charges that came out negative and were set to 0
+    cdef readonly long n_unsettled      # patches whose charges were still moving after the last iteration
+    cdef double clearance               # of the point of the potential from the surface at first [nm]
+    cdef bint has_support
     cdef double[::1] weight             # (n_atoms,) 1/evaporation field, 0 where an atom may not leave
     cdef int[::1] slot_of               # (n_atoms,) -1 away from the surface
     cdef double[:, ::1] normals         # (capacity, 3) by slot
@@ -38,6 +29,7 @@ cdef class Evaporation:
     cdef double[::1] patch_charge
     cdef float[:, ::1] patch_float
 
+    cdef void make_room(self, long most)
     cdef bint better(self, int a, int b) noexcept nogil
     cdef void settle(self, int slot) noexcept nogil
     cdef long strongest_neighbour(self, long atom) noexcept nogil

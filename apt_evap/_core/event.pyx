@@ -10,6 +10,7 @@ from libc.math cimport sqrt
 
 import numpy as np
 
+from apt_evap._core.journal cimport Journal
 from apt_evap._core.octree cimport Octree, Sources, sources_field, sources_free, sources_init
 from apt_evap._core.robin cimport Patch
 from apt_evap._core.surface cimport MOST_NEAR
@@ -22,55 +23,16 @@ cdef extern from "pair.h":
                      double*) noexcept nogil
 
 
-DONE, SWEEP_DUE, EXHAUSTED, TOO_SHALLOW = range(4)
 
 cdef enum:
-    MOST_PATCH = 16384   # slots within the update radius; 20 lattice constants of fcc hold some 2,500
+    NOT_SETTLED = 1 << 30   # events since the last relaxation, while there is none
+    MOST_PATCH = 4096       # slots at first within the update radius; 18 d_nn of fcc hold some 1,000
+    STATUS_DONE = 0
+    STATUS_SWEEP_DUE = 1
+    STATUS_EXHAUSTED = 2
+    STATUS_TOO_SHALLOW = 3
 
-
-cdef class Journal:
-    """What each event of a batch changed in the tree, to be replayed on a copy of it bit by bit."""
-
-    def __init__(self, const double[:, ::1] positions, long most):
-        self.n_events = 0
-        self.positions = np.asarray(positions)
-        self.start = np.zeros(most + 1, np.int64)
-        self.fresh_start = np.zeros(most + 1, np.int64)
-        self.slot = np.empty(most * 256, np.int32)
-        self.charge = np.empty(most * 256)
-        self.fresh_atom = np.empty(most * 8, np.int32)
-        self.fresh_leaf = np.empty(most * 8, np.int32)
-
-    cdef int room(self, long changes, long fresh) except -1 nogil:
-        # Space for one more event.
-        if self.start[self.n_events] + changes > self.slot.shape[0]:
-            with gil:
-                self.slot = np.resize(np.asarray(self.slot), 2 * self.slot.shape[0] + changes)
-                self.charge = np.resize(np.asarray(self.charge), 2 * self.charge.shape[0] + changes)
-        if self.fresh_start[self.n_events] + fresh > self.fresh_atom.shape[0]:
-            with gil:
-                self.fresh_atom = np.resize(np.asarray(self.fresh_atom), 2 * self.fresh_atom.shape[0] + fresh)
-                self.fresh_leaf = np.resize(np.asarray(self.fresh_leaf), 2 * self.fresh_leaf.shape[0] + fresh)
-        return 0
-
-    cdef void replay(self, long event, Octree tree) noexcept nogil:
-        # The same calls in the same order as the event made them.
-        cdef long k
-        cdef int atom
-        tree.take_out(self.slot[self.start[event]])
-        for k in range(self.fresh_start[event], self.fresh_start[event + 1]):
-            atom = self.fresh_atom[k]
-            tree.put_in(atom, self.positions[atom, 0], self.positions[atom, 1], self.positions[atom, 2],
-                        self.fresh_leaf[k])
-        for k in range(self.start[event] + 1, self.start[event + 1]):
-            tree.set_charge(self.slot[k], self.charge[k])
-        tree.refresh()
-
-    def replay_on(self, Octree tree, long event):
-        """Make event number `event` of this journal happen in a copy of the tree."""
-        if not 0 <= event < self.n_events:
-            raise IndexError(f"event must be from 0 to {self.n_events - 1}, got {event}")
-        self.replay(event, tree)
+DONE, SWEEP_DUE, EXHAUSTED, TOO_SHALLOW = STATUS_DONE, STATUS_SWEEP_DUE, STATUS_EXHAUSTED, STATUS_TOO_SHALLOW
 
 
 cdef class Evaporation:
@@ -87,7 +49,7 @@ cdef class Evaporation:
     potential : float
         Potential of the specimen, over the Coulomb constant [e/nm].
     potential_point : ndarray, shape (3,)
-        Point inside the specimen that has this potential [nm].
+        Point inside the specimen that has this potential [nm]; it moves down the axis as the surface comes close.
     bond_length : float
         Atoms closer than this are nearest neighbours [nm].
     patch_radius, update_radius : float
@@ -104,12 +66,19 @@ cdef class Evaporation:
         self.potential, self.bond_length = potential, bond_length
         self.patch_radius, self.update_radius, self.opening_angle = patch_radius, update_radius, opening_angle
         self.potential_point = np.array(potential_point, dtype=np.float64).reshape(1, 3)
-        self.n_removed = self.since_sweep = self.n_clipped = 0
+        self.n_removed = self.n_clipped = self.n_unsettled = 0
+        self.since_sweep = NOT_SETTLED
+        self.clearance = 0.0
+        self.has_support = bool(np.asarray(atoms.support).any())
         self.slot_of = np.full(atoms.n_atoms, -1, np.int32)
-        self.near = np.empty(MOST_PATCH + MOST_NEAR, np.int32)
-        self.patch_slot = np.empty(MOST_PATCH + MOST_NEAR, np.int32)
-        self.patch_charge = np.empty(MOST_PATCH + MOST_NEAR)
-        self.patch_float = np.empty((4, MOST_PATCH + MOST_NEAR), np.float32)
+        self.make_room(MOST_PATCH)
+
+    cdef void make_room(self, long most):
+        # Buffers for so many slots around a hole, and the atoms that come to the surface.
+        self.near = np.empty(most + MOST_NEAR, np.int32)
+        self.patch_slot = np.empty(most + MOST_NEAR, np.int32)
+        self.patch_charge = np.empty(most + MOST_NEAR)
+        self.patch_float = np.empty((4, most + MOST_NEAR), np.float32)
         self.patch.slot, self.patch.charge = &self.patch_slot[0], &self.patch_charge[0]
         self.patch.x, self.patch.y = &self.patch_float[0, 0], &self.patch_float[1, 0]
         self.patch.z, self.patch.change = &self.patch_float[2, 0], &self.patch_float[3, 0]
@@ -118,6 +87,8 @@ cdef class Evaporation:
         """Go on with more atoms: the first of them are those held so far. Call `relax` next."""
         cdef int[::1] slot_of = np.full(atoms.n_atoms, -1, np.int32)
         np.asarray(slot_of)[:self.atoms.n_atoms] = self.slot_of
+        self.since_sweep = NOT_SETTLED
+        self.has_support = bool(np.asarray(atoms.support).any())
         self.atoms, self.weight, self.slot_of = atoms, np.array(weights), slot_of
 
     def relax(self, *, double tolerance=1e-4, int most_sweeps=200, bint double_precision=False, long extra=0,
@@ -148,30 +119,32 @@ cdef class Evaporation:
         surface = self.atoms.surface
         if len(surface) == 0:
             raise ValueError("the specimen has no surface atoms")
-        slot_of = np.asarray(self.slot_of)
+        self.since_sweep = NOT_SETTLED   # an interruption below leaves a surface that no atom may leave
+        before = np.asarray(self.slot_of)
         charges, kept = np.ones(len(surface)), None
         if self.tree is not None:
-            slots = slot_of[surface]
+            slots = before[surface]
             charges = np.where(slots >= 0, self.tree.charges[slots], 0.0)
             kept = np.asarray(self.normals)
-        self.tree = Octree(np.asarray(self.atoms.positions)[surface], charges, surface,
-                           extra=extra or len(surface) // 8 + MOST_NEAR)
-        surface = self.tree.atoms   # in the order of the slots from here on
-        n, capacity = self.tree.n_slots, self.tree.x.shape[0]
-        self.normals = np.zeros((capacity, 3))
-        np.asarray(self.normals)[:n] = self.atoms.normals_of(surface)
+        tree = Octree(np.asarray(self.atoms.positions)[surface], charges, surface,
+                      extra=extra or len(surface) // 8 + MOST_NEAR, n_threads=n_threads)
+        surface = tree.atoms   # in the order of the slots from here on
+        n, capacity = tree.n_slots, tree.capacity
+        normals = np.zeros((capacity, 3))
+        normals[:n] = self.atoms.normals_of(surface)
         if kept is not None:   # where no neighbour pulls, an atom keeps the normal it had
-            alone = np.flatnonzero((np.asarray(self.atoms.counts)[surface] == 0) & (slot_of[surface] >= 0))
-            np.asarray(self.normals)[alone] = kept[slot_of[surface[alone]]]
-        slot_of[:] = -1
-        slot_of[surface] = np.arange(n, dtype=np.int32)
-        lists = InteractionLists(self.tree, self.opening_angle, n_threads)
-        outcome = self.rule.solve(self.tree, self.normals, lists, tolerance=tolerance, most_sweeps=most_sweeps,
+            alone = np.flatnonzero((np.asarray(self.atoms.counts)[surface] == 0) & (before[surface] >= 0))
+            normals[alone] = kept[before[surface[alone]]]
+        lists = InteractionLists(tree, self.opening_angle, n_threads)
+        outcome = self.rule.solve(tree, normals, lists, tolerance=tolerance, most_sweeps=most_sweeps,
                                   double_precision=double_precision, n_threads=n_threads)
-        away = np.linalg.norm(self.tree.positions - self.potential_point, axis=1)
-        self.rule.scale(self.tree, self.potential / (self.tree.charges / away).sum())
-        self.rank = np.full(capacity, -1.0)
-        np.asarray(self.rank)[:n] = self.tree.charges * np.asarray(self.weight)[self.tree.atoms]
+        away = self.keep_inside(tree.positions)
+        self.rule.scale(tree, self.potential / (tree.charges / away).sum())
+        slot_of = np.full(self.atoms.n_atoms, -1, np.int32)
+        slot_of[surface] = np.arange(n, dtype=np.int32)
+        rank = np.full(capacity, -1.0)
+        rank[:n] = tree.charges * np.asarray(self.weight)[surface]
+        self.tree, self.normals, self.slot_of, self.rank = tree, normals, slot_of, rank
         self.leaves = 1
         while self.leaves < capacity:
             self.leaves *= 2
@@ -184,6 +157,18 @@ cdef class Evaporation:
                     self.winner[slot] = self.winner[2 * slot + 1]
         self.since_sweep = 0
         return outcome
+
+    def keep_inside(self, positions):
+        """Distances of the surface from the point of the potential; it goes down as evaporation comes close to it."""
+        away = np.linalg.norm(positions - self.potential_point, axis=1)
+        if self.clearance == 0.0:
+            self.clearance = away.min()
+        for _ in range(100):
+            if away.min() >= 0.5 * self.clearance:
+                break
+            self.potential_point = self.potential_point - (0.0, 0.0, 0.25 * self.clearance)
+            away = np.linalg.norm(positions - self.potential_point, axis=1)
+        return np.maximum(away, 1e-3 * self.clearance)
 
     # ---- which atom leaves -----------------------------------------------------------------------------------------
 
@@ -241,7 +226,7 @@ cdef class Evaporation:
         cdef double pz = self.atoms.positions[atom, 2], charge = self.tree.q[gone], s, nearest
         cdef double dx, dy, dz, over
         cdef Patch* patch = &self.patch
-        cdef long n_near, i, k, at
+        cdef long n_near, most, i, k, at
         self.n_removed += 1
         self.since_sweep += 1
         self.tree.take_out(gone)
@@ -252,13 +237,18 @@ cdef class Evaporation:
         n_fresh = self.atoms.remove(atom, fresh)
 
         # the slots around the hole, without the charge that left
-        n_near = self.tree.within(px, py, pz, self.update_radius, &self.near[0], MOST_PATCH)
+        most = self.near.shape[0] - MOST_NEAR - PATCH_LANES
+        n_near = self.tree.within(px, py, pz, self.update_radius, &self.near[0], most)
+        if n_near > most:
+            with gil:
+                self.make_room(2 * n_near + PATCH_LANES)
+            n_near = self.tree.within(px, py, pz, self.update_radius, &self.near[0], n_near)
         patch.n = 0
         for i in range(n_near):
             slot = self.near[i]
             dx, dy, dz = self.tree.x[slot] - px, self.tree.y[slot] - py, self.tree.z[slot] - pz
             s = dx * dx + dy * dy + dz * dz
-            over = charge / (s * sqrt(s))
+            over = charge / (s * sqrt(s)) if s > 1e-12 else 0.0
             self.rule.field[slot, 0] -= over * dx
             self.rule.field[slot, 1] -= over * dy
             self.rule.field[slot, 2] -= over * dz
@@ -302,8 +292,8 @@ cdef class Evaporation:
         for i in range(patch.n, patch.stride):
             patch.x[i] = patch.y[i] = patch.z[i] = 1e6
             patch.change[i] = 0.0
-        if patch.n:
-            self.rule.solve_patch(self.tree, self.normals, patch)
+        if patch.n and self.rule.solve_patch(self.tree, self.normals, patch) > 0:
+            self.n_unsettled += 1
         for i in range(patch.n):
             slot = patch.slot[i]
             if patch.charge[i] < 0.0:   # a cell's moments stand on its centre of charge: none may be negative
@@ -346,23 +336,22 @@ cdef class Evaporation:
             atoms that are held as support).
         """
         cdef long n, leaving
-        cdef int status = 0, best, axis
-        cdef bint shallow = np.asarray(self.atoms.support).any()
+        cdef int status = STATUS_DONE, best, axis
         if journal.start.shape[0] <= most:
             raise ValueError(f"journal must have room for {most} events")
         with nogil:
             while journal.n_events < most:
                 n = journal.n_events
                 best = self.winner[1]
-                if self.since_sweep >= sweep_interval or self.tree.n_slots + MOST_NEAR > self.tree.x.shape[0]:
-                    status = 1
+                if self.since_sweep < NOT_SETTLED and (best < 0 or not self.rank[best] > 0.0):
+                    status = STATUS_EXHAUSTED
                     break
-                if best < 0 or self.rank[best] <= 0.0:
-                    status = 2
+                if self.since_sweep >= sweep_interval or self.tree.n_slots + MOST_NEAR > self.tree.x.shape[0]:
+                    status = STATUS_SWEEP_DUE
                     break
                 leaving = self.tree.atom[best]
-                if shallow and self.atoms.reaches_support(leaving):
-                    status = 3
+                if self.has_support and self.atoms.reaches_support(leaving):
+                    status = STATUS_TOO_SHALLOW
                     break
                 atom[n] = leaving
                 charge[n] = self.tree.q[best]

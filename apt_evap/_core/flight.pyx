@@ -14,7 +14,7 @@ from libc.stdlib cimport free, malloc
 
 import numpy as np
 
-from apt_evap._core.event cimport Journal
+from apt_evap._core.journal cimport Journal
 from apt_evap._core.octree cimport Octree, Sources, sources_field, sources_free, sources_init
 
 cdef extern from *:
@@ -140,7 +140,7 @@ cdef class Flights:
         counter : ndarray, shape (1,)
             The next group.
         """
-        cdef long group, n_groups = event.shape[0]
+        cdef long group, k, n_groups = event.shape[0]
         with nogil:
             while True:
                 group = take_next(&counter[0])
@@ -152,6 +152,10 @@ cdef class Flights:
                 if start[group + 1] > start[group]:
                     self.fly_group(start[group + 1] - start[group], &positions[start[group], 0],
                                    &velocities[start[group], 0], &end[start[group], 0], &outcome[start[group]])
+                if start[group + 1] > start[group] + 1:   # one that runs into an atom stops its whole group
+                    for k in range(start[group], start[group + 1]):
+                        if outcome[k] == 1:
+                            self.fly_group(1, &positions[k, 0], &velocities[k, 0], &end[k, 0], &outcome[k])
             while self.n_replayed < journal.n_events:
                 journal.replay(self.n_replayed, self.tree)
                 self.n_replayed += 1

@@ -93,10 +93,12 @@ cdef class Octree:
         Most atoms of a leaf; 16 against 8 halves the error at the same opening angle for 0.95 of the time
     extra : int
         How many atoms may be put in before the tree is built anew.
+    n_threads : int
+        Threads.
     """
 
     def __init__(self, const double[:, ::1] positions, const double[::1] charges, atoms=None, int leaf_size=16,
-                 long extra=0):
+                 long extra=0, int n_threads=1):
         cdef long n = positions.shape[0], capacity = n + extra, i
         if n == 0:
             raise ValueError("an octree needs at least one atom, got none")
@@ -113,7 +115,7 @@ cdef class Octree:
         self.leaf = np.full(capacity, -1, np.int32)
         self.next_extra = np.full(capacity, -1, np.int32)
         self._split(keys)
-        self._enclose()
+        self._enclose(n_threads)
         self.dirty = np.zeros(self.n_nodes, np.int8)
         self.queue = np.empty(self.n_nodes, np.int32)
         self.n_dirty = 0
@@ -175,7 +177,7 @@ cdef class Octree:
             if i and self.skip[self.parent[i]] < self.skip[i]:
                 self.skip[self.parent[i]] = self.skip[i]
 
-    def _enclose(self):
+    def _enclose(self, int n_threads):
         # Ball of a node: the middle of its bounding box, and the distance to its farthest atom.
         cdef long node, k
         cdef double cx, cy, cz, far, s
@@ -198,7 +200,7 @@ cdef class Octree:
                 low[up, axis] = min(low[up, axis], low[node, axis])
                 high[up, axis] = max(high[up, axis], high[node, axis])
         self.ball = np.empty((self.n_nodes, 4))
-        for node in prange(self.n_nodes, nogil=True, schedule="dynamic", chunksize=256):
+        for node in prange(self.n_nodes, nogil=True, schedule="dynamic", chunksize=256, num_threads=n_threads):
             cx = 0.5 * (low[node, 0] + high[node, 0])
             cy = 0.5 * (low[node, 1] + high[node, 1])
             cz = 0.5 * (low[node, 2] + high[node, 2])
@@ -413,7 +415,7 @@ cdef class Octree:
         sources.n_atoms = m + 1
 
     cdef long within(self, double px, double py, double pz, double radius, int* slots, long most) noexcept nogil:
-        # Slots of the atoms within a radius, in the order of the tree; returns how many, at most `most`.
+        # Slots of the atoms within a radius, in the order of the tree; lists at most `most`, returns how many there are.
         cdef long node = 0, k, n = 0
         cdef double dx, dy, dz, reach
         while node < self.n_nodes:
@@ -425,14 +427,16 @@ cdef class Octree:
             if self.skip[node] == node + 1:
                 for k in range(self.first[node], self.last[node]):
                     dx, dy, dz = px - self.x[k], py - self.y[k], pz - self.z[k]
-                    if self.atom[k] >= 0 and dx * dx + dy * dy + dz * dz <= radius * radius and n < most:
-                        slots[n] = <int>k
+                    if self.atom[k] >= 0 and dx * dx + dy * dy + dz * dz <= radius * radius:
+                        if n < most:
+                            slots[n] = <int>k
                         n += 1
                 k = self.extra[node]
                 while k >= 0:
                     dx, dy, dz = px - self.x[k], py - self.y[k], pz - self.z[k]
-                    if self.atom[k] >= 0 and dx * dx + dy * dy + dz * dz <= radius * radius and n < most:
-                        slots[n] = <int>k
+                    if self.atom[k] >= 0 and dx * dx + dy * dy + dz * dz <= radius * radius:
+                        if n < most:
+                            slots[n] = <int>k
                         n += 1
                     k = self.next_extra[k]
             node += 1
@@ -523,6 +527,11 @@ cdef class Octree:
     def atoms(self):
         """The caller's index of the atom in each slot, shape (n_slots,); -1 where an atom was taken out."""
         return np.asarray(self.atom)[:self.n_slots]
+
+    @property
+    def capacity(self):
+        """Slots there is room for."""
+        return self.x.shape[0]
 
     @property
     def nodes(self):

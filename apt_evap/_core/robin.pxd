@@ -19,11 +19,11 @@ cdef struct Patch:
 cdef class ChargingRule:
     cdef double[:, ::1] field           # (capacity, 3) e/nm^2, field of all the others on each slot
     cdef readonly double area           # s, surface per atom [nm^2]; field just outside = 4 pi COULOMB q / area
-    cdef int solve_patch(self, Octree tree, double[:, ::1] normals, Patch* patch) noexcept nogil
+    cdef int solve_patch(self, Octree tree, double[:, ::1] normals, Patch* patch) except -1 nogil
 
 
 cdef class Robin(ChargingRule):
     cdef readonly double tolerance
     cdef readonly int window
     cdef float[::1] matrix, residual
-    cdef void grow(self, long stride) noexcept nogil
+    cdef int grow(self, long stride) except -1 nogil

@@ -22,13 +22,19 @@ cdef extern from "pair.h":
 cdef class ChargingRule:
     """How charge settles on the surface atoms.
 
-    A rule keeps the field of all the others on each slot of the tree (`field`), and gives two things: `solve`, the
-    charges of the whole surface, and `solve_patch`, those of a few atoms while all others are held.
+    A rule keeps the field of all the others on each slot of the tree (`field`) and the area per atom, and gives two
+    things: `solve`, the charges of the whole surface, and `solve_patch`, those of a few atoms while all others are held.
     """
 
-    cdef int solve_patch(self, Octree tree, double[:, ::1] normals, Patch* patch) noexcept nogil:
-        # New charges of a patch, from the fields on its slots and the old charges in the tree.
-        return -1
+    def scale(self, Octree tree, double factor):
+        """Multiply all charges, and the fields they make, by a factor."""
+        tree.charges = np.asarray(tree.charges) * factor
+        np.asarray(self.field)[:] *= factor
+
+    cdef int solve_patch(self, Octree tree, double[:, ::1] normals, Patch* patch) except -1 nogil:
+        # New charges of a patch, from the fields on its slots and the old charges in the tree; 1: not settled.
+        with gil:
+            raise NotImplementedError(f"{type(self).__name__} has no solve_patch")
 
 
 cdef class Robin(ChargingRule):
@@ -89,6 +95,8 @@ cdef class Robin(ChargingRule):
         for sweeps in range(1, most_sweeps + 1):
             lists.sweep(self.field, double_precision, n_threads)
             flux = np.maximum(np.einsum("ij,ij->i", field, normal), 0.0)   # a site deep in a notch stays without charge
+            if not flux.sum() > 0.0:
+                raise ValueError(f"{n} surface atoms hold no charge together: expected normals that point outwards")
             self.area = 2.0 * M_PI * total / flux.sum()
             flux *= total / flux.sum()
             maps.append(flux)
@@ -122,18 +130,14 @@ cdef class Robin(ChargingRule):
             charges -= share * (maps[-1] - other)
         return charges
 
-    def scale(self, Octree tree, double factor):
-        """Multiply all charges, and the fields they make, by a factor."""
-        tree.charges = np.asarray(tree.charges) * factor
-        np.asarray(self.field)[:] *= factor
-
-    cdef void grow(self, long stride) noexcept nogil:
+    cdef int grow(self, long stride) except -1 nogil:
         if stride > self.residual.shape[0]:
             with gil:
                 self.matrix = np.zeros(stride * stride, np.float32)
                 self.residual = np.zeros(stride, np.float32)
+        return 0
 
-    cdef int solve_patch(self, Octree tree, double[:, ::1] normals, Patch* patch) noexcept nogil:
+    cdef int solve_patch(self, Octree tree, double[:, ::1] normals, Patch* patch) except -1 nogil:
         # Gauss-Seidel on the changes: x_i = r_i + (s/2 pi) sum_k K_ik x_k with the residual r_i of the old charges.
         cdef double c = self.area / (2.0 * M_PI), mean = 0.0
         cdef float new, largest
@@ -156,8 +160,8 @@ cdef class Robin(ChargingRule):
                     patch.stride, &self.matrix[i * patch.stride], patch.change)
                 largest = max(largest, fabsf(new - patch.change[i]))
                 patch.change[i] = new
-            if largest < self.tolerance * mean:
+            if largest <= self.tolerance * mean:
                 break
         for i in range(patch.n):
             patch.charge[i] = tree.q[patch.slot[i]] + patch.change[i]
-        return iteration
+        return largest > self.tolerance * mean

@@ -1,0 +1,17 @@
+"""The journal, for the events that write it and the flights that read it."""
+
+from apt_evap._core.octree cimport Octree
+
+
+cdef class Journal:
+    cdef readonly long n_events
+    cdef long[::1] start                # (most + 1,) where each event's changes begin
+    cdef int[::1] slot                  # changed slots; the first of each event is the one taken out
+    cdef double[::1] charge             # new charges [e]
+    cdef long[::1] fresh_start          # (most + 1,)
+    cdef int[::1] fresh_atom            # atoms put in
+    cdef int[::1] fresh_leaf            # and the leaf each joined
+    cdef const double[:, ::1] positions # (n_atoms, 3) nm
+
+    cdef int room(self, long changes, long fresh) except -1 nogil
+    cdef void replay(self, long event, Octree tree) noexcept nogil

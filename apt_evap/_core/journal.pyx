@@ -1,0 +1,54 @@
+"""The journal of events: what each changed in the tree, to make it happen again in a copy.
+
+Flights follow the events on copies of the tree; since a replay makes the same calls in the same order, and moments are
+always made anew from charges, a copy has the same bits as the tree had then.
+"""
+
+import numpy as np
+
+from apt_evap._core.octree cimport Octree
+
+
+cdef class Journal:
+    """What each event of a batch changed in the tree, to be replayed on a copy of it bit by bit."""
+
+    def __init__(self, const double[:, ::1] positions, long most):
+        self.n_events = 0
+        self.positions = positions
+        self.start = np.zeros(most + 1, np.int64)
+        self.fresh_start = np.zeros(most + 1, np.int64)
+        self.slot = np.empty(most * 256, np.int32)
+        self.charge = np.empty(most * 256)
+        self.fresh_atom = np.empty(most * 8, np.int32)
+        self.fresh_leaf = np.empty(most * 8, np.int32)
+
+    cdef int room(self, long changes, long fresh) except -1 nogil:
+        # Space for one more event.
+        if self.start[self.n_events] + changes > self.slot.shape[0]:
+            with gil:
+                self.slot = np.resize(np.asarray(self.slot), 2 * self.slot.shape[0] + changes)
+                self.charge = np.resize(np.asarray(self.charge), 2 * self.charge.shape[0] + changes)
+        if self.fresh_start[self.n_events] + fresh > self.fresh_atom.shape[0]:
+            with gil:
+                self.fresh_atom = np.resize(np.asarray(self.fresh_atom), 2 * self.fresh_atom.shape[0] + fresh)
+                self.fresh_leaf = np.resize(np.asarray(self.fresh_leaf), 2 * self.fresh_leaf.shape[0] + fresh)
+        return 0
+
+    cdef void replay(self, long event, Octree tree) noexcept nogil:
+        # The same calls in the same order as the event made them.
+        cdef long k
+        cdef int atom
+        tree.take_out(self.slot[self.start[event]])
+        for k in range(self.fresh_start[event], self.fresh_start[event + 1]):
+            atom = self.fresh_atom[k]
+            tree.put_in(atom, self.positions[atom, 0], self.positions[atom, 1], self.positions[atom, 2],
+                        self.fresh_leaf[k])
+        for k in range(self.start[event] + 1, self.start[event + 1]):
+            tree.set_charge(self.slot[k], self.charge[k])
+        tree.refresh()
+
+    def replay_on(self, Octree tree, long event):
+        """Make event number `event` of this journal happen in a copy of the tree."""
+        if not 0 <= event < self.n_events:
+            raise IndexError(f"event must be from 0 to {self.n_events - 1}, got {event}")
+        self.replay(event, tree)
