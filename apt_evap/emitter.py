@@ -27,7 +27,7 @@ class ChargeSettings:
     Parameters
     ----------
     opening_angle : float
-        Full angle under which a cell of the octree stands for its atoms [rad]. 0.5 keeps charges within 1e-3 of what
+        Full angle under which a cell of the octree stands for its atoms [rad]. 0.4 keeps charges within 3e-4 of what
         direct sums give (largest difference on a tip of R = 12 a).
     patch_radius : float
         Charges are solved within this distance of a hole [d_nn]; 8.5 is 6 lattice constants of fcc.
@@ -42,7 +42,7 @@ class ChargeSettings:
         The same for the first one, which starts from equal charges.
     """
 
-    opening_angle: float = 0.5
+    opening_angle: float = 0.4
     patch_radius: float = 8.5
     update_radius: float = 18.0
     sweep_interval: int | None = None
