@@ -92,7 +92,7 @@ cdef class Evaporation:
         self.atoms, self.weight, self.slot_of = atoms, np.array(weights), slot_of
 
     def relax(self, *, double tolerance=1e-4, int most_sweeps=200, bint double_precision=False, long extra=0,
-              int n_threads=1):
+              double opening_angle=0.0, int n_threads=1):
         """Build the tree anew and iterate over the whole surface; bring the potential to the voltage.
 
         Parameters
@@ -105,6 +105,8 @@ cdef class Evaporation:
             Sweeps in float64; needed for tolerances below 1e-6.
         extra : int
             Room for atoms that come to the surface before the next relaxation; by default an eighth of the surface.
+        opening_angle : float
+            Of the sweeps [rad]; by default that of the events.
         n_threads : int
             Threads.
 
@@ -135,7 +137,7 @@ cdef class Evaporation:
         if kept is not None:   # where no neighbour pulls, an atom keeps the normal it had
             alone = np.flatnonzero((np.asarray(self.atoms.counts)[surface] == 0) & (before[surface] >= 0))
             normals[alone] = kept[before[surface[alone]]]
-        lists = InteractionLists(tree, self.opening_angle, n_threads)
+        lists = InteractionLists(tree, opening_angle or self.opening_angle, n_threads)
         outcome = self.rule.solve(tree, normals, lists, tolerance=tolerance, most_sweeps=most_sweeps,
                                   double_precision=double_precision, n_threads=n_threads)
         away = self.keep_inside(tree.positions)
