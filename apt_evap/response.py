@@ -5,8 +5,7 @@ polynomial for launches from the site, and another for launches from the rolled-
 of any perturbation that launches along the surface, without another flight.
 
 What is fitted is the stereographic direction (see `Detector.directions`) and the time of flight times the cosine of the
-polar angle: smoother than the place itself, which grows without bound for ions that fly along the detector. A cubic in
-these is as good as a quintic in x and y.
+polar angle: smoother than the place itself, which grows without bound for ions that fly along the detector.
 """
 
 from dataclasses import dataclass

@@ -298,3 +298,10 @@ def test_refuses_a_specimen_from_which_nothing_may_leave(nickel, small_tip):
     )
     with pytest.raises(ValueError, match="may leave"):
         ae.Emitter(tip)
+
+
+def test_counts_of_events(tip12):
+    emitter = ae.Emitter(tip12)
+    evaporate(emitter, 200)
+    # a smooth metal tip: every patch settles, no charge comes out negative
+    assert emitter.counts == {"events": 200, "clipped": 0, "unsettled": 0}

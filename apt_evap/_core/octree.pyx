@@ -90,7 +90,7 @@ cdef class Octree:
     atoms : ndarray of int64, shape (n,), optional
         The caller's index of each atom; by default 0 ... n - 1.
     leaf_size : int
-        Most atoms of a leaf; 16 against 8 halves the error at the same opening angle for 0.95 of the time
+        Most atoms of a leaf. 8, 16 and 24 are within a tenth in the time and the error of lists and sweep (R = 80 a).
     extra : int
         How many atoms may be put in before the tree is built anew.
     n_threads : int

@@ -6,7 +6,8 @@ cdef enum:
 
 cdef class Neighbourhood:
     cdef readonly long n_atoms
-    cdef readonly double radius, threshold
+    cdef readonly double radius         # of the neighbourhood, and edge of a cell of the grid [nm]
+    cdef readonly double threshold
     cdef const double[:, ::1] positions # (n, 3) nm, the caller's own array
     cdef char[::1] alive                # (n,)
     cdef const char[::1] support              # (n,) atoms that never become surface atoms
@@ -15,7 +16,6 @@ cdef class Neighbourhood:
     cdef double[:, ::1] offset          # (n, 3) sum of (neighbour - atom) over the neighbours [nm]
     cdef double[::1] low                # (3,) corner of the grid of cells [nm]
     cdef long[::1] shape                # (3,) cells along each axis
-    cdef double edge                    # edge of a cell [nm]
     cdef int[::1] start                 # (cells + 1,) where each cell's atoms begin in `order`
     cdef int[::1] order                 # (n,) atoms cell by cell
 

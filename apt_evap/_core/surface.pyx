@@ -36,7 +36,7 @@ cdef class Neighbourhood:
         if n == 0:
             raise ValueError("a specimen needs at least one atom, got none")
         self.n_atoms = n
-        self.radius, self.threshold, self.edge = radius, threshold, radius
+        self.radius, self.threshold = radius, threshold
         if n >= 2**31:
             raise ValueError(f"a specimen holds fewer than 2**31 atoms, got {n}")
         self.positions, self.support = positions, support
@@ -72,8 +72,8 @@ cdef class Neighbourhood:
         # The atoms still there within the radius of one atom, in the order of the cells; -1: more than MOST_NEAR.
         cdef double px = self.positions[atom, 0], py = self.positions[atom, 1], pz = self.positions[atom, 2]
         cdef double dx, dy, dz, reach = self.radius * self.radius
-        cdef long ci = <long>floor((px - self.low[0]) / self.edge), cj = <long>floor((py - self.low[1]) / self.edge)
-        cdef long ck = <long>floor((pz - self.low[2]) / self.edge), i, j, m, row
+        cdef long ci = <long>floor((px - self.low[0]) / self.radius), cj = <long>floor((py - self.low[1]) / self.radius)
+        cdef long ck = <long>floor((pz - self.low[2]) / self.radius), i, j, m, row
         cdef int other, n = 0
         for i in range(max(ci - 1, 0), min(ci + 2, self.shape[0])):
             for j in range(max(cj - 1, 0), min(cj + 2, self.shape[1])):
