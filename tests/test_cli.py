@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from apt_evap import __version__, cli
+from apt_evap import __version__, cli, plot
 from apt_evap.cli import main
 from apt_evap.hits import Hits
 from apt_evap.io import write
 from apt_evap.perturbation import Combined, LateralVelocity, RollUp, Unperturbed
 from apt_evap.run import load
 
-HERE = str(Path(cli.__file__).parents[1])  # the package under test, installed or not
+HERE = str(Path(cli.__file__).parents[2])  # the package under test, installed or not
 PROGRAM = "import sys; from apt_evap.cli import main; sys.exit(main())"
 SMALL = """
 [tip]
@@ -142,7 +142,7 @@ def test_a_second_run_overwrites_the_first_but_nobody_elses_files(folder, capsys
 
 
 def test_what_cannot_be_written_is_said_before_computing(folder, capsys, monkeypatch):
-    monkeypatch.setattr(cli, "read_config", checked := Counting(cli.read_config))
+    monkeypatch.setattr(cli.run, "read_config", checked := Counting(cli.run.read_config))
     assert "cannot write 'none/a.h5': No such file or directory" in failed(
         capsys, "run", "small.toml", "-o", "none/a.h5"
     )
@@ -276,10 +276,10 @@ def drawn_by(monkeypatch, *arguments):
         drawn.update(maps=maps, titles=titles)
         return original(maps, titles, **options)
 
-    original = cli.plot.detector_maps
-    monkeypatch.setattr(cli.plot, "detector_maps", note)
+    original = plot.detector_maps
+    monkeypatch.setattr(plot, "detector_maps", note)
     assert main([str(argument) for argument in arguments]) == 0
-    monkeypatch.setattr(cli.plot, "detector_maps", original)
+    monkeypatch.setattr(plot, "detector_maps", original)
     return drawn["maps"], drawn["titles"]
 
 

@@ -1,0 +1,66 @@
+"""Files of the commands: read by their options, and written only where nobody else's is lost."""
+
+import contextlib
+import os
+import tempfile
+from pathlib import Path
+
+import h5py
+
+from apt_evap import plot
+from apt_evap._files import FileError, check_path, replace_file
+from apt_evap._version import __version__
+from apt_evap.io import read as read_file
+
+_MARK = f"apt_evap {__version__}"
+_MARK_KEYS = {".png": "Software", ".pdf": "Creator", ".svg": "Creator"}
+
+
+def read(options):
+    wanted = {"partial": options.partial, "byte_order": options.byte_order}
+    try:
+        return read_file(
+            options.file, format=options.format, **{key: value for key, value in wanted.items() if value is not None}
+        )
+    except FileError as error:
+        # the readers speak of arguments of Python
+        message = str(error).replace("partial=True", "--partial").replace("byte_order=", "--byte-order ")
+        raise FileError(message.replace("format=", "--format ")) from error
+
+
+def picture_path(path):
+    path = check_path(path)
+    if path.suffix.lower() not in _MARK_KEYS:
+        raise FileError(f"a picture is a {', '.join(_MARK_KEYS)} file, got {str(path)!r}")
+    return path
+
+
+def save_picture(path, maps, titles):
+    figure = plot.detector_maps(maps, titles, limits=plot.common_limits(maps))[0].figure
+    suffix = path.suffix.lower()
+    with replace_file(path) as file:
+        figure.savefig(file, format=suffix[1:], dpi=200, metadata={_MARK_KEYS[suffix]: _MARK})
+
+
+def check_output(path, is_ours, force):
+    """Make sure that a file can be written, and that nobody else's is overwritten."""
+    target = Path(os.path.realpath(path))
+    try:
+        if target.is_dir():
+            raise IsADirectoryError(None, "Is a directory")
+        with tempfile.TemporaryFile(dir=target.parent):
+            pass
+        if target.exists() and not force and not is_ours(target):
+            raise FileError(f"{str(path)!r} exists and was not made by apt-evap: --force overwrites it")
+    except OSError as error:
+        raise FileError(f"cannot write {str(path)!r}: {error.strerror or error}") from error
+
+
+def is_run(path):
+    with contextlib.suppress(OSError, RuntimeError), h5py.File(path, "r") as file:
+        return str(file.attrs.get("format", "")).startswith("apt_evap run")
+    return False
+
+
+def is_picture(path):
+    return b"apt_evap" in path.read_bytes()

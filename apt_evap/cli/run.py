@@ -1,0 +1,81 @@
+"""`apt-evap run`: simulate what a TOML file describes."""
+
+import time
+from dataclasses import replace
+
+from apt_evap._files import FileError, check_path
+from apt_evap.cli._files import check_output, is_picture, is_run, picture_path, save_picture
+from apt_evap.cli._options import INTERRUPTED, SHAPE, say, whole
+from apt_evap.cli.map import run_maps
+from apt_evap.config import read_config
+
+
+def add_parser(commands):
+    """Describe the command."""
+    command = commands.add_parser(
+        "run",
+        help="simulate what a TOML file describes",
+        description="Simulate what a TOML file describes, save the run and draw its detector maps.\n"
+        "Ctrl-C ends the simulation and saves what is done.",
+        epilog="example: apt-evap run examples/ni111.toml -o ni.h5 --ions 5000",
+        **SHAPE,
+    )
+    command.add_argument("config", metavar="CONFIG.toml")
+    command.add_argument("-o", "--output", metavar="RUN.h5", help="default: output of the file, or its name with .h5")
+    command.add_argument("--ions", type=whole(1), metavar="N", help="atoms to evaporate, instead of those of the file")
+    command.add_argument("--threads", type=whole(1), metavar="N", help="default: all processors")
+    command.add_argument("--seed", type=whole(0), metavar="N", help="instead of that of the file")
+    command.add_argument("--map", metavar="MAP.png", help="picture of the maps; default: beside the run")
+    command.add_argument("--quiet", action="store_true", help="no progress bar, no summary")
+    command.add_argument("--force", action="store_true", help="overwrite files that apt-evap did not make")
+    command.set_defaults(command=_run)
+
+
+def _run(options):
+    config = read_config(options.config)
+    output = check_path(options.output or config.output or f"{config.path.stem}.h5")
+    if output.suffix.lower() != ".h5":
+        raise FileError(f"a run is saved in an HDF5 file whose name ends in .h5, got {str(output)!r}")
+    picture = picture_path(options.map or output.with_suffix(".png"))
+    # before the hours of computing, not after
+    check_output(output, is_run, options.force)
+    check_output(picture, is_picture, options.force)
+
+    def tell(line):
+        if not options.quiet:
+            print(line, flush=True)
+
+    simulation = config.simulation(seed=options.seed, n_threads=options.threads)
+    tell(f"{str(simulation.tip).strip('<>')}; {len(simulation.emitter):,} atoms on the surface")
+    began = time.perf_counter()
+    provenance = {"config": config.path.name, "maps": config.maps.to_dict()}
+    try:
+        run = simulation.run(
+            options.ions or config.n_ions,
+            config.emissions,
+            responses=config.responses,
+            progress=False if options.quiet else None,
+        )
+    except Exception as error:
+        if run := getattr(error, "run", None):
+            replace(run, provenance=run.provenance | provenance).save(output)
+            say("note", f"the {len(run):,} ions done so far are in {str(output)!r}")
+        raise
+    seconds = time.perf_counter() - began
+    run = replace(run, provenance=run.provenance | provenance)
+    run.save(output)
+    tell(f"{len(run):,} ions in {seconds:.1f} s, {len(run) / seconds:,.0f} ions/s")
+    for panel in config.maps.panels:
+        hit, missed, never_left = run.hits(panel.perturbation).counts.values()
+        tell(f"{panel.title}: {hit:,} hit the detector, {missed:,} missed it, {never_left:,} never left the tip")
+    if run.responses is not None:
+        tell(f"responses: {run.marked.sum():,} ions marked as inexact")
+    if run.ended:
+        say("note", f"the run ended before its time: {run.ended}; the {len(run):,} ions so far are kept")
+    tell(f"wrote {output}")
+    try:
+        save_picture(picture, *run_maps(run, config.maps))
+    except ValueError as error:
+        raise ValueError(f"no maps are drawn, the run is in {str(output)!r}: {error}") from error
+    tell(f"wrote {picture}")
+    return INTERRUPTED if run.ended == "interrupted" else 0

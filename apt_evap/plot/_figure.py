@@ -1,0 +1,53 @@
+"""Figures and colour bars, the same for every picture."""
+
+import sys
+
+import numpy as np
+from matplotlib.figure import Figure
+
+OUTSIDE = "0.88"
+"""Colour of what is outside the detector."""
+
+
+def add_colorbar(images, ax, label="hits per area / mean"):
+    """Add a colour bar for images of one scale, with arrows where it cuts off values.
+
+    Parameters
+    ----------
+    images : sequence of matplotlib.image.AxesImage
+        What is coloured.
+    ax : matplotlib.axes.Axes or list of them
+        Axes the bar takes its place from.
+    label : str
+        What the colours mean, with its unit.
+
+    Returns
+    -------
+    matplotlib.colorbar.Colorbar
+    """
+    low, high = images[0].get_clim()
+    below = min(np.nanmin(image.get_array()) for image in images) < low
+    above = max(np.nanmax(image.get_array()) for image in images) > high
+    extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[below, above]
+    figure = images[0].axes.figure
+    return figure.colorbar(images[0], ax=ax, label=label, extend=extend, fraction=0.05, pad=0.02)
+
+
+def new_figure(size):
+    """Make a figure of (width, height) `size` [inch].
+
+    With pyplot imported, as in a notebook, pyplot makes it, so that it is shown; without, as in a batch job,
+    it needs no display.
+
+    Parameters
+    ----------
+    size : tuple of float
+        Width and height [inch].
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    pyplot = sys.modules.get("matplotlib.pyplot")
+    make = Figure if pyplot is None else pyplot.figure
+    return make(figsize=size, layout="constrained", dpi=150)
