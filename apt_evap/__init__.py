@@ -15,6 +15,7 @@ from apt_evap.maps import DetectorMap, azimuthal_profile, radial_profile
 from apt_evap.material import Material, material, polarization_energy
 from apt_evap.perturbation import Combined, LateralVelocity, RollUp, Unperturbed
 from apt_evap.ranges import Ranges
+from apt_evap.register import Registration, register, register_points
 from apt_evap.response import Design, ResponseSettings
 from apt_evap.run import Run, load
 from apt_evap.simulation import FlightSettings, Simulation
@@ -39,6 +40,7 @@ __all__ = [
     "Material",
     "Outcome",
     "Ranges",
+    "Registration",
     "ResponseSettings",
     "RollUp",
     "Run",
@@ -59,6 +61,8 @@ __all__ = [
     "radial_profile",
     "read",
     "read_ranges",
+    "register",
+    "register_points",
     "ssim",
     "tangent_frame",
     "write",
