@@ -11,7 +11,7 @@ from scipy.stats import truncnorm
 import apt_evap as ae
 from apt_evap.energy_grid import EnergyGrid, maxima, spline_maxima
 from apt_evap.perturbation import Combined
-from apt_evap.resample import GROUPS, Comparison, Sampler
+from apt_evap.resample import NOISE, Comparison, Sampler
 
 EDGES = np.linspace(-60, 60, 49)
 ROLLUP = ae.RollUp(ae.TruncatedNormal(0.155, 0.155))
@@ -140,21 +140,39 @@ def test_flattening_takes_gradients_away():
     assert a.flattened(0) is a
 
 
-def test_errors_are_those_of_ions_drawn_one_by_one(run, other):
-    """Groups of ions against ions, over 300 resamples each."""
+def test_errors_of_measured_maps_are_those_of_new_measurements(run, other):
+    """The error told from one measured map, against the scatter of 200 that are truly independent."""
+    random = np.random.default_rng(4)
+    truth = seen(other, ROLLUP).smoothed(2.5)
+    simulated = run.hits(ROLLUP)
+    frame = ae.DetectorMap.from_array(np.ones((48, 48), int), EDGES, EDGES, is_counts=True)
+    counts = ae.DetectorMap.from_hits(simulated, like=frame).counts.astype(float)
+    values, errors = [], []
+    for seed in range(200):
+        measured = replace(frame, values=random.poisson(3 * truth.values))
+        resamples = 300 if seed < 3 else 0
+        comparison = Comparison(measured, 2.5, 0.0, 2.0, resamples, seed)
+        found = comparison.similarities(np.repeat(counts[None], resamples + 1, axis=0))
+        values.append(found[0])
+        if resamples:
+            errors.append(found[1:].std(ddof=1))
+    # a standard deviation from 200 has an error of 5 %, from 300 one of 4 %: three times both
+    assert errors == pytest.approx(np.full(3, np.std(values, ddof=1)), rel=0.2)
+
+
+def test_noise_of_simulated_maps_is_that_of_their_ions(run, other):
+    """In every bin as many ions as Poisson's distribution says, and bins independent of each other."""
     measured = seen(other, ROLLUP)
-    comparison = Comparison(measured, 3.0, 0.0, 2.0, 0, 0)
-    sampler = Sampler(run, HERE, measured, comparison.box, 300, 7)
-    by_group = comparison.similarities(sampler.maps(ROLLUP, 1))[1:]
-    random, hits, one_by_one = np.random.default_rng(8), run.hits(ROLLUP), []
-    for _ in range(300):
-        drawn = hits[random.integers(0, len(hits), len(hits))]
-        map = ae.DetectorMap.from_hits(drawn, like=measured)
-        one_by_one.append(comparison.similarities(map.counts[None][:, *comparison.box])[0])
-    one_by_one = np.array(one_by_one)
-    # errors of an error: 1/sqrt(2 300) each and 1/sqrt(2 GROUPS), 7 % together; three of them
-    assert by_group.std() == pytest.approx(one_by_one.std(), rel=3 * np.sqrt(1 / 300 + 0.5 / GROUPS))
-    assert by_group.mean() == pytest.approx(one_by_one.mean(), abs=4 * one_by_one.std() / np.sqrt(150))
+    sampler = Sampler(run, HERE, measured, (slice(None), slice(None)), 400, 7)
+    maps = sampler.maps(ROLLUP, 1)
+    noise = (maps[1:] - maps[0]) / NOISE
+    assert np.array_equal(maps[0], seen(run, ROLLUP).counts)
+    # mean over 2,304 bins of a variance from 400 resamples: 7 % / sqrt(2304), and of 4-th moments as much
+    assert noise.var(axis=0).sum() == pytest.approx(maps[0].sum(), rel=0.01)
+    assert noise.sum(axis=(1, 2)).var() == pytest.approx(maps[0].sum(), rel=3 * np.sqrt(2 / 400))
+    # replicas of an ion are one ion: nothing is gained for the errors of the run by drawing often
+    together = (sampler.maps(ROLLUP, 2).sum(axis=(1, 2))[1:] - sampler.maps(ROLLUP, 2)[0].sum()) / NOISE / 2
+    assert together.std() == pytest.approx(noise.sum(axis=(1, 2)).std(), rel=0.05)
 
 
 def test_replicas_have_less_noise(run, other):
@@ -186,11 +204,13 @@ TWINS = {"roll-up": (ROLLUP, (1.0, 1.0, 0.155)), "lateral": (LATERAL, (0.0, 0.31
 
 @pytest.fixture(scope="module", params=TWINS)
 def twin(request, run, other):
-    """A study of a map with hidden energies, of other ions than those of the run."""
+    """A study of a map with hidden energies: eight draws of the ions of another tip, in bins of 1.25 mm."""
     hidden, truth = TWINS[request.param]
-    study = ae.fit_energies(
-        run, seen(other, hidden), request.param, registration=HERE, replicas=2, resamples=40, progress=False
-    )
+    edges = np.linspace(-60, 60, 97)
+    frame = ae.DetectorMap.from_array(np.ones((96, 96), int), edges, edges, is_counts=True)
+    draws = [ae.DetectorMap.from_hits(replace(other, seed=seed).hits(hidden), like=frame) for seed in range(10, 18)]
+    measured = replace(frame, values=sum(draw.counts for draw in draws))
+    study = ae.fit_energies(run, measured, request.param, registration=HERE, replicas=4, resamples=40, progress=False)
     return study, hidden, truth
 
 
