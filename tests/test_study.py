@@ -163,7 +163,7 @@ def test_errors_of_measured_maps_are_those_of_new_measurements(run, other):
 def test_noise_of_simulated_maps_is_that_of_their_ions(run, other):
     """In every bin as many ions as Poisson's distribution says, and bins independent of each other."""
     measured = seen(other, ROLLUP)
-    sampler = Sampler(run, HERE, measured, (slice(None), slice(None)), 400, 7)
+    sampler = Sampler(run, HERE, measured, (slice(0, 48), slice(0, 48)), 400, 7)
     maps = sampler.maps(ROLLUP, 1)
     noise = (maps[1:] - maps[0]) / NOISE
     assert np.array_equal(maps[0], seen(run, ROLLUP).counts)
@@ -178,8 +178,8 @@ def test_noise_of_simulated_maps_is_that_of_their_ions(run, other):
 def test_replicas_have_less_noise(run, other):
     """Maps of two disjoint sets of draws are the more alike the more draws there are."""
     measured = seen(other, ROLLUP)
-    sampler = Sampler(run, HERE, measured, (slice(None), slice(None)), 0, 0)
-    again = Sampler(replace(run, seed=99), HERE, measured, (slice(None), slice(None)), 0, 0)
+    sampler = Sampler(run, HERE, measured, (slice(0, 48), slice(0, 48)), 0, 0)
+    again = Sampler(replace(run, seed=99), HERE, measured, (slice(0, 48), slice(0, 48)), 0, 0)
     alike = []
     for replicas in (1, 4):
         maps = [each.maps(LATERAL, replicas)[0].astype(int) for each in (sampler, again)]
@@ -202,24 +202,39 @@ def steps_off(study, truth):
 TWINS = {"roll-up": (ROLLUP, (1.0, 1.0, 0.155)), "lateral": (LATERAL, (0.0, 0.316, 0.3))}
 
 
-@pytest.fixture(scope="module", params=TWINS)
-def twin(request, run, other):
-    """A study of a map with hidden energies: eight draws of the ions of another tip, in bins of 1.25 mm."""
-    hidden, truth = TWINS[request.param]
+def measured_map(other, perturbation):
+    """Eight draws of the ions of another tip, in bins of 1.25 mm."""
     edges = np.linspace(-60, 60, 97)
     frame = ae.DetectorMap.from_array(np.ones((96, 96), int), edges, edges, is_counts=True)
-    draws = [ae.DetectorMap.from_hits(replace(other, seed=seed).hits(hidden), like=frame) for seed in range(10, 18)]
-    measured = replace(frame, values=sum(draw.counts for draw in draws))
+    runs = [replace(other, seed=seed) for seed in range(10, 18)]
+    draws = [ae.DetectorMap.from_hits(run.hits(perturbation), like=frame).counts for run in runs]
+    return replace(frame, values=sum(draws))
+
+
+@pytest.fixture(scope="module", params=TWINS)
+def twin(request, run, other):
+    """A study of a map with hidden energies."""
+    hidden, truth = TWINS[request.param]
+    measured = measured_map(other, hidden)
     study = ae.fit_energies(run, measured, request.param, registration=HERE, replicas=4, resamples=40, progress=False)
     return study, hidden, truth
 
 
 def test_hidden_energies_are_found(twin):
     study, hidden, truth = twin
-    assert max(steps_off(study, truth)) <= 1
+    _, rsd_off, mean_off = steps_off(study, truth)
+    assert mean_off <= 1
+    # widths of the lateral velocity below a third of the mean look alike: the study says so
+    assert rsd_off <= (1 if study.grid.mechanism == "roll-up" else 3)
+    best, hidden_cell = (tuple(axis.index(value) for axis, value in zip(
+        (study.grid.rollup_fractions, study.grid.rsds, study.grid.means), values, strict=True
+    )) for values in ((study.optimum.rollup_fraction, study.optimum.rsd, study.optimum.mean), truth))  # fmt: skip
+    missed = study.ssim[best] - study.ssim[hidden_cell]
+    error = np.std(study.resampled[(..., *best)] - study.resampled[(..., *hidden_cell)], ddof=1)
+    assert missed <= 3 * error
     assert study.optimum.score.value == study.ssim.max()
-    # energies after the cut, which the map sees; half a step of the grid
-    assert abs(study.refined.true_mean - hidden.energy.true_mean) < 0.036
+    # energies after the cut, which the map sees: within half a step of the grid
+    assert abs(study.refined.true_mean - hidden.energy.true_mean) < 0.04
     low, high = study.refined.intervals["true_mean"]
     assert low <= study.refined.true_mean <= high and high - low < 0.2
 
@@ -292,7 +307,7 @@ def test_the_axis_of_the_rollup_fraction(run, other):
     assert max(steps_off(study, (0.9, 0.5, 0.2))) <= 1
     assert np.isnan(study.errors).all() and study.refined.intervals == {} and np.isnan(study.gain.error)
     assert "±" not in repr(study).split(";")[0]
-    assert "nan" not in json.dumps(study.to_dict()).lower()
+    json.dumps(study.to_dict(), allow_nan=False)
 
 
 def test_bins_of_a_map_are_merged(run, other):
@@ -305,12 +320,12 @@ def test_bins_of_a_map_are_merged(run, other):
 
 
 def test_gradients_of_the_instrument_do_not_move_the_energies(run, other):
-    """A measured map that is twice as bright on one side as on the other."""
-    measured = seen(other, ROLLUP)
-    x = (EDGES[1:] + EDGES[:-1]) / 2
-    kept = np.random.default_rng(3).binomial(measured.counts, np.broadcast_to(0.75 + x / 240, (48, 48)))
-    tilted = ae.DetectorMap.from_array(kept, EDGES, EDGES, measured.mask, is_counts=True)
-    options = {"registration": HERE, "replicas": 1, "resamples": 0, "progress": False, "smoothing": 2.5}
+    """A measured map that is three times as bright on one side as on the other."""
+    measured = measured_map(other, ROLLUP)
+    x, _ = measured.centres
+    kept = np.random.default_rng(3).binomial(measured.counts, np.broadcast_to(0.66 + 0.33 * x / 60, (96, 96)))
+    tilted = replace(measured, values=kept)
+    options = {"registration": HERE, "replicas": 2, "resamples": 0, "progress": False}
     flat = ae.fit_energies(run, tilted, **options)
     assert max(steps_off(flat, (1.0, 1.0, 0.155))) <= 1
     assert flat.ssim.max() > ae.fit_energies(run, tilted, flattening=0, **options).ssim.max()
