@@ -162,7 +162,7 @@ class Run:
         return self._hits(*unflattened(values), perturbation)
 
     def _hits(self, directions, times, perturbation):
-        x, y, outcome = self.detector.impacts(directions)
+        x, y, times, outcome = self.detector.impacts(directions, times)
         emissions = self.emissions
         return Hits(
             x=x,
@@ -176,6 +176,20 @@ class Run:
             outcome=outcome,
             source=f"simulation, {_describe(perturbation)}",
         )
+
+    def seen_by(self, detector):
+        """Let another detector see the ions of this run: only where they are recorded changes.
+
+        Parameters
+        ----------
+        detector : Detector
+            Another distance, width or projection.
+
+        Returns
+        -------
+        Run
+        """
+        return replace(self, detector=detector, settings=self.settings | {"detector": vars(detector)})
 
     def summary(self):
         """Counts of what happened, dict: ions, outcomes of the first perturbation, ions that cannot roll, marked."""
