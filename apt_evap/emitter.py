@@ -6,12 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from apt_evap._arrays import check_array, check_count, check_number
-from apt_evap._core.event import DONE, EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, Evaporation
+from apt_evap._core.event import DONE, EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, Evaporation, Start
 from apt_evap._core.journal import Journal
 from apt_evap._core.octree import Octree
 from apt_evap._core.robin import Robin
 from apt_evap._core.surface import Neighbourhood
 from apt_evap._threads import thread_count
+from apt_evap.emitter_state import EmitterState
 from apt_evap.law import Extremal
 from apt_evap.units import COULOMB
 
@@ -148,6 +149,7 @@ class Emitter:
             self.settings.opening_angle,
         )
         self._fresh = False
+        self._left, self._deepened = [], []  # sites batch by batch; events at which more of the specimen was held
         self.relax(tolerance=self.settings.start_tolerance)
         self._sweep_interval = self.settings.sweep_interval or max(100, len(self) // 300)
 
@@ -248,20 +250,77 @@ class Emitter:
         """
         angle = self.settings.relaxation_angle if tolerance is None else self.settings.opening_angle
         tolerance = check_number(self.settings.tolerance if tolerance is None else tolerance, "tolerance", above=0)
+        return self._relax(tolerance, angle)
+
+    def _relax(self, tolerance, angle, start=None):
+        counts = self.counts
+        self._relaxed = (tolerance, angle, counts["clipped"], counts["unsettled"])
         outcome = self._core.relax(
             tolerance=tolerance,
             opening_angle=angle,
             double_precision=tolerance < 1e-6,  # below it the rounding of float32 keeps charges moving
             n_threads=self.n_threads,
+            start=start,
         )
         self._fresh = True
         if not outcome[1] < tolerance:
             warnings.warn(
                 f"the charges had not settled after {outcome[0]} sweeps: the last one changed one by {outcome[1]:.1g} "
                 f"of the mean charge, expected {tolerance:.1g}",
-                stacklevel=2,
+                stacklevel=3,
             )
         return outcome
+
+    def state(self):
+        """What makes the surface again as its last relaxation left it.
+
+        Returns
+        -------
+        EmitterState
+        """
+        start = self._core.start
+        sites = np.concatenate([np.empty(0, np.int64), *self._left])
+        self._left = [sites]
+        tolerance, angle, clipped, unsettled = self._relaxed
+        return EmitterState(
+            sites=sites[: start.n_removed],
+            charges=start.charges,
+            lonely=start.lonely,
+            lonely_normals=start.lonely_normals,
+            potential_point=tuple(start.potential_point.ravel().tolist()),
+            deepened=tuple(self._deepened),
+            tolerance=tolerance,
+            opening_angle=angle,
+            clipped=clipped,
+            unsettled=unsettled,
+        )
+
+    def restore(self, state):
+        """Make the surface again that another emitter of the same settings had.
+
+        Parameters
+        ----------
+        state : EmitterState
+            Of the other; the surface becomes what its last relaxation left, and events go on from there.
+
+        Raises
+        ------
+        ValueError
+            If atoms have left already, or the state is of another specimen.
+        """
+        if self.counts["events"]:
+            raise ValueError(f"restore needs a new emitter, got one that {self.counts['events']:,} atoms have left")
+        done = 0
+        for event in state.deepened:
+            self._core.atoms.remove_atoms(state.sites[done:event])
+            self._hold_more()
+            done = event
+        self._core.atoms.remove_atoms(state.sites[done:])
+        self._left, self._deepened = [state.sites], list(state.deepened)
+        self._core.n_clipped, self._core.n_unsettled = state.clipped, state.unsettled
+        point = np.reshape(state.potential_point, (1, 3))
+        start = Start(len(state.sites), state.charges, state.lonely, state.lonely_normals, point)
+        self._relax(state.tolerance, state.opening_angle, start)
 
     def hand_out_tree(self):
         """Let the next batch come with a copy of the tree, for flights that have not followed the events so far."""
@@ -277,11 +336,15 @@ class Emitter:
         ValueError
             If the specimen has nothing below: one made from positions.
         """
+        self._hold_more()
+        self._deepened.append(self._core.n_removed)
+        self.relax()
+
+    def _hold_more(self):
         tip = self.tip.deepened()
         neighbourhood = self._neighbourhood_of(tip, self._core.atoms)
         self._core.take_over(neighbourhood, self._weights_of(tip))
         self.tip = tip
-        self.relax()
 
     def evaporate(self, most):
         """Let atoms leave, `most` of them or as many as leave before something has to be done first.
@@ -305,6 +368,7 @@ class Emitter:
         self._fresh = False
         status = self._core.evaporate(journal, most, self._sweep_interval, site, charges, normals, neighbour)
         n = journal.n_events
+        self._left.append(site[:n].copy())
         return Batch(
             site=site[:n],
             charges=charges[:n],
