@@ -2,6 +2,7 @@
 
 from apt_evap import plot
 from apt_evap._version import __version__
+from apt_evap.checkpoint import Checkpoint
 from apt_evap.compare import half_ceiling, ssim
 from apt_evap.detector import Detector
 from apt_evap.emission import Emissions, Launches, tangent_frame
@@ -19,9 +20,11 @@ from apt_evap.response import Design, ResponseSettings
 from apt_evap.run import Run, load
 from apt_evap.simulation import FlightSettings, Simulation
 from apt_evap.tip import Tip
+from apt_evap.watch import History, WatchSettings
 
 __all__ = [
     "ChargeSettings",
+    "Checkpoint",
     "Combined",
     "Design",
     "Detector",
@@ -32,6 +35,7 @@ __all__ = [
     "FileError",
     "Fixed",
     "FlightSettings",
+    "History",
     "Hits",
     "IonRandom",
     "LateralVelocity",
@@ -48,6 +52,7 @@ __all__ = [
     "TruncatedFile",
     "TruncatedNormal",
     "Unperturbed",
+    "WatchSettings",
     "__version__",
     "azimuthal_profile",
     "chunks",

@@ -151,7 +151,7 @@ class Emitter:
         self._fresh = False
         self._left, self._deepened = [], []  # sites batch by batch; events at which more of the specimen was held
         self.relax(tolerance=self.settings.start_tolerance)
-        self._sweep_interval = self.settings.sweep_interval or max(100, len(self) // 300)
+        self.sweep_interval = self.settings.sweep_interval or max(100, len(self) // 300)
 
     def _neighbourhood_of(self, tip, before=None):
         return Neighbourhood(
@@ -201,13 +201,18 @@ class Emitter:
         return self._field(self.charges)
 
     @property
+    def area_per_atom(self):
+        """Area s of the surface per atom, as of the last relaxation [nm^2]."""
+        return self._core.rule.area
+
+    @property
     def counts(self):
         """Events so far, charges that came out negative and were set to 0, patches that did not settle; dict of int."""
         core = self._core
         return {"events": core.n_removed, "clipped": core.n_clipped, "unsettled": core.n_unsettled}
 
     def _field(self, charges):
-        return 4 * np.pi * COULOMB / self._core.rule.area * charges
+        return 4 * np.pi * COULOMB / self.area_per_atom * charges
 
     def field_at(self, points, opening_angle=0.3):
         """Electric field of the surface charges.
@@ -366,7 +371,7 @@ class Emitter:
         charges, normals = np.empty(most), np.empty((most, 3))
         tree = self._core.tree.copy() if self._fresh else None
         self._fresh = False
-        status = self._core.evaporate(journal, most, self._sweep_interval, site, charges, normals, neighbour)
+        status = self._core.evaporate(journal, most, self.sweep_interval, site, charges, normals, neighbour)
         n = journal.n_events
         self._left.append(site[:n].copy())
         return Batch(

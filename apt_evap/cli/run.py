@@ -4,10 +4,11 @@ import time
 from dataclasses import replace
 
 from apt_evap._files import FileError, check_path
-from apt_evap.cli._files import check_output, is_picture, is_run, picture_path, save_picture
+from apt_evap.cli._files import check_output, is_picture, picture_path, save_picture
 from apt_evap.cli._options import INTERRUPTED, SHAPE, say, whole
 from apt_evap.cli.map import run_maps
 from apt_evap.config import read_config
+from apt_evap.run_file import is_run
 
 
 def add_parser(commands):
