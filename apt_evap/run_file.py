@@ -3,8 +3,8 @@
 Groups and fields have the names of NeXus NXapm where it has one; see docs/formats.rst.
 """
 
+import io
 import json
-import re
 import warnings
 from contextlib import contextmanager, suppress
 
@@ -68,19 +68,53 @@ def write_run(path, run):
         _write(file, run)
 
 
+class _Sink(io.RawIOBase):
+    """A file for HDF5, which crashes where writing fails: the first error is kept, to be raised when it is done."""
+
+    def __init__(self, file):
+        self._file, self._place, self._end, self.error = file, 0, 0, None
+
+    def _do(self, method, *arguments):
+        if self.error is None:
+            try:
+                getattr(self._file, method)(*arguments)
+            except OSError as error:
+                self.error = error
+
+    def seek(self, offset, whence=0):
+        self._place = offset + (0, self._place, self._end)[whence]
+        self._do("seek", self._place)
+        return self._place
+
+    def tell(self):
+        return self._place
+
+    def write(self, data):
+        self._do("write", data)
+        self._place += len(data)
+        self._end = max(self._end, self._place)
+        return len(data)
+
+    def truncate(self, size):
+        self._do("truncate", size)
+        self._end = size
+        return size
+
+    def flush(self):
+        self._do("flush")
+
+
 @contextmanager
 def _writing(path):
-    try:
-        with replace_file(path) as target, h5py.File(target, "w") as file:
-            file.attrs["format"] = FORMAT
-            yield file
-    except RuntimeError as error:  # HDF5 speaks of what it could not do, and the reason is inside
-        raise FileError(f"cannot write {str(path)!r}: {_reason(error)}") from error
-
-
-def _reason(error):
-    found = re.search(r"error message = '([^']+)'", str(error))
-    return found[1] if found else str(error).splitlines()[0]
+    with replace_file(path) as target:
+        sink = _Sink(target)
+        try:
+            with h5py.File(sink, "w") as file:
+                file.attrs["format"] = FORMAT
+                yield file
+        finally:
+            if sink.error is not None:
+                raise sink.error
 
 
 def _put(group, name, values, units=None):
@@ -252,6 +286,7 @@ def _columns(file, paths, partial):
 
 def _read_state(group):
     values = {name: group[name][()] for name in group} | dict(group.attrs)
+    values.pop("format", None)  # of a file of its own
     first_event = int(values.pop("first_event"))
     for name in ("potential_point", "deepened"):
         values[name] = tuple(values[name].tolist())
