@@ -13,6 +13,7 @@ from apt_evap._core.robin import Robin
 from apt_evap._core.surface import Neighbourhood
 from apt_evap._threads import thread_count
 from apt_evap.emitter_state import EmitterState
+from apt_evap.interchange import to_atoms
 from apt_evap.law import Extremal
 from apt_evap.units import COULOMB
 
@@ -199,6 +200,17 @@ class Emitter:
         F_i = 4 pi k_e q_i / s, with s the area per surface atom: the field at the outer face of a charged surface.
         """
         return self._field(self.charges)
+
+    def to_atoms(self):
+        """Return the surface as ase.Atoms [Angstrom]; needs ASE.
+
+        Returns
+        -------
+        ase.Atoms
+            With arrays "charge" [e], "field" [V/nm], "normal" and "atom", the index in the specimen.
+        """
+        arrays = {"charge": self.charges, "field": self.fields, "normal": self.normals, "atom": self.atoms}
+        return to_atoms(self.positions, self.tip.elements, self.tip.species[self.atoms], **arrays)
 
     @property
     def area_per_atom(self):

@@ -188,6 +188,8 @@ class Run:
             site=self.site,
             ion=emissions.ions,
             outcome=outcome,
+            extra={"charge": self.charges, "field": self.fields},
+            units={"charge": "e", "field": "V/nm"},
             source=f"simulation, {_describe(perturbation)}",
         )
 
