@@ -16,7 +16,7 @@ FLOORS = (
     {"lattice", "ranges", "shape", "material", "tip", "detector", "hits"},
     {"ion_random", "energy", "emission", "perturbation", "law", "emitter", "flights", "response"},
     {"run", "simulation"},
-    {"binning", "maps", "register", "compare", "study", "config", "info", "io"},
+    {"binning", "maps", "profiles", "zone_line", "tracks", "register", "compare", "study", "config", "info", "io"},
     {"plot", "cli"},
 )
 FLOOR = {module: number for number, floor in enumerate(FLOORS) for module in floor}

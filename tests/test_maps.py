@@ -10,7 +10,8 @@ from apt_evap import plot
 from apt_evap.binning import bin_edges, count, field_of_view, find_comb
 from apt_evap.hits import Hits
 from apt_evap.io import read
-from apt_evap.maps import DetectorMap, azimuthal_profile, radial_profile
+from apt_evap.maps import DetectorMap
+from apt_evap.profiles import azimuthal_profile, radial_profile
 
 SILICON = Path(__file__).parents[2] / "shared" / "data" / "Si.epos"
 
