@@ -4,18 +4,19 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import curve_fit
-from scipy.special import ndtr
+from scipy.optimize import approx_fprime, curve_fit
 from scipy.stats import chi2
 
+from apt_evap._arrays import check_number
 from apt_evap.profiles import Profile
 
-FULL_WIDTH = 2 * np.sqrt(2 * np.log(2))  # full width at half height of a Gaussian, in standard deviations
+EXPONENTS = 1.0, 12.0  # of a fitted line: from one that comes to a point to one that is all but a box
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 
 
 @dataclass(frozen=True)
 class ZoneLine:
-    """A Gaussian line on a linear background, fitted to a profile by `fit_zone_line`.
+    """A line on a linear background, fitted to a profile by `fit_zone_line`.
 
     Parameters
     ----------
@@ -28,12 +29,14 @@ class ZoneLine:
         Density of the background at the centre.
     slope : float
         Slope of the background [1/mm].
-    centre_error, width_error, height_error, background_error : float
-        Standard deviations, from the counting errors of the profile.
+    exponent : float
+        2 for a Gaussian, more for a line that is flat in its middle.
+    centre_error, width_error, height_error, background_error, exponent_error : float
+        Standard deviations; 0 for an exponent that was given.
     chi_square : float
         Sum of the squared misfits in units of their errors; NaN for a profile without errors.
     degrees_of_freedom : int
-        Bins less the five numbers fitted.
+        Bins less the numbers fitted.
     """
 
     centre: float
@@ -41,10 +44,12 @@ class ZoneLine:
     height: float
     background: float
     slope: float
+    exponent: float
     centre_error: float
     width_error: float
     height_error: float
     background_error: float
+    exponent_error: float
     chi_square: float
     degrees_of_freedom: int
 
@@ -56,20 +61,22 @@ class ZoneLine:
     def density(self, position):
         """Density of the line and its background at some positions [mm], in units of the profile, any shape."""
         away = np.asarray(position, float) - self.centre
-        peak = np.exp(-0.5 * (away * (FULL_WIDTH / self.width)) ** 2)
-        return self.background + self.slope * away + self.height * peak
+        return self.background + self.slope * away + self.height * _shape(away, self.width, self.exponent)
 
     def __str__(self):
         return f"{self.kind}, {self.width:.2f} ± {self.width_error:.2f} mm wide at {self.centre:+.2f} mm"
 
 
-def fit_zone_line(profile):
-    """Fit a Gaussian dip or peak on a linear background to a profile across a zone line.
+def fit_zone_line(profile, *, exponent=2.0):
+    r"""Fit a dip or a peak on a linear background to a profile across a zone line.
 
     Parameters
     ----------
     profile : Profile
         Profile of at least 8 bins.
+    exponent : float, optional
+        Shape of the line, 1 to 12: 2 is a Gaussian. None fits it too, for lines that are flat in their middle, such as
+        dark ones without any hits there; it takes some hundred hits in a bin.
 
     Returns
     -------
@@ -79,84 +86,82 @@ def fit_zone_line(profile):
     ------
     ValueError
         If there are too few bins, or no line between the edges of the profile that is wider than half a bin and
-        narrower than half the profile.
+        narrower than the profile.
 
     Notes
     -----
-    The Gaussian is averaged over each bin. The fit is least squares weighted with the counting errors, which are taken
-    from the fitted densities in a second round: those of the counts themselves would favour bins that happen to be
-    low. A profile without errors is fitted with equal weights. A `chi_square` well above `degrees_of_freedom` says
-    that the line is no Gaussian, as an unperturbed one with a bright core; the errors do not know of that.
+    The density at the distance u from the centre is
+
+    .. math:: b + c u + h \, 2^{-|2 u / w|^p}
+
+    with the width w, the height h and the exponent p; it is averaged over each bin. All bins weigh the same: weights by
+    the errors of counting would make the few hits at the bottom of a dark line decide its width. The errors of the
+    parameters are those that the errors sigma of the bins propagate to, with the covariance P diag(sigma^2) P^T and P
+    the pseudoinverse of the derivatives of the model; without errors of the bins, they follow from the scatter around
+    the fit. A `chi_square` well above `degrees_of_freedom` says that the line is not of this shape; the width then
+    depends on how wide the profile is.
     """
     good = np.isfinite(profile.density)
     position, density, error = (np.asarray(column)[good] for column in profile)
     if len(position) < 8:
         raise ValueError(f"a profile must have at least 8 bins to fit a line, got {len(position)}")
+    if exponent is not None:
+        exponent = check_number(exponent, "exponent", at_least=EXPONENTS[0], at_most=EXPONENTS[1])
     bin_width = float(np.median(np.diff(position)))
-    span = position[-1] - position[0] + bin_width
-    weighted = bool(np.isfinite(error).all())
+    span = float(position[-1] - position[0]) + bin_width
 
-    def model(position, centre, sigma, height, background, slope):
-        peak = _mean_gaussian(position - centre, sigma, bin_width)
-        return background + slope * (position - centre) + height * peak
+    def model(position, centre, width, height, background, slope, exponent=exponent):
+        line = _mean_shape(position - centre, width, exponent, bin_width)
+        return background + slope * (position - centre) + height * line
 
-    start = _best_of_grid(position, density, error if weighted else np.ones_like(density), bin_width, span)
-    lowest = [position[0], bin_width / (2 * FULL_WIDTH), -np.inf, -np.inf, -np.inf]
-    highest = [position[-1], span / (2 * FULL_WIDTH), np.inf, np.inf, np.inf]
+    start = [*_best_of_grid(position, density, exponent or 2.0, bin_width, span), *([3.0] if exponent is None else [])]
+    lowest = [position[0], bin_width / 2, -np.inf, -np.inf, -np.inf, EXPONENTS[0]][: len(start)]
+    highest = [position[-1], span, np.inf, np.inf, np.inf, EXPONENTS[1]][: len(start)]
     missing = f"the profile of {len(position)} bins over {span:g} mm shows no line"
     try:
-        for _ in range(2 if weighted else 1):
-            found, covariance = curve_fit(
-                model,
-                position,
-                density,
-                start,
-                sigma=error if weighted else None,
-                absolute_sigma=weighted,
-                bounds=(lowest, highest),
-            )
-            start = found
-            last_error = error
-            error = _errors_of(model(position, *found), profile.density[good], profile.error[good])
+        found, covariance = curve_fit(model, position, density, start, bounds=(lowest, highest))
     except RuntimeError as failure:
         raise ValueError(f"{missing}: {failure}") from failure
-    at_edge = np.isclose(found[:2], lowest[:2], atol=1e-6 * span) | np.isclose(found[:2], highest[:2], atol=1e-6 * span)
-    if at_edge.any() or not np.isfinite(covariance).all():
-        raise ValueError(f"{missing}: the fit ran to {FULL_WIDTH * found[1]:.3g} mm wide at {found[0]:.3g} mm")
-    centre, sigma, height, background, slope = (float(value) for value in found)
-    errors = np.sqrt(np.diag(covariance))
-    misfit = (density - model(position, *found)) / last_error
+    at_edge = [np.isclose(found[:2], edge[:2], atol=1e-6 * span) for edge in (lowest, highest)]
+    if np.any(at_edge) or not np.isfinite(covariance).all():
+        raise ValueError(f"{missing}: the fit ran to {found[1]:.3g} mm wide at {found[0]:.3g} mm")
+    if np.isfinite(error).all():
+        change = np.linalg.pinv(approx_fprime(found, lambda values: model(position, *values)))
+        covariance = (change * error**2) @ change.T
+    names = ("centre", "width", "height", "background", "slope", "exponent")
+    values = {"exponent": exponent} | dict(zip(names, found.tolist(), strict=False))
+    errors = {"exponent": 0.0} | dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=False))
+    fitted = model(position, *found)
+    misfit = (density - fitted) / _errors_of(fitted, density, error)
     return ZoneLine(
-        centre=centre,
-        width=FULL_WIDTH * sigma,
-        height=height,
-        background=background,
-        slope=slope,
-        centre_error=float(errors[0]),
-        width_error=float(FULL_WIDTH * errors[1]),
-        height_error=float(errors[2]),
-        background_error=float(errors[3]),
+        **values,
+        **{f"{name}_error": errors[name] for name in names if name != "slope"},
         chi_square=float(misfit @ misfit),
-        degrees_of_freedom=len(position) - 5,
+        degrees_of_freedom=len(position) - len(found),
     )
 
 
-def _mean_gaussian(away, sigma, bin_width):
-    """Gaussian of height 1 averaged over bins that lie `away` from its centre."""
-    upper, lower = (away + bin_width / 2) / sigma, (away - bin_width / 2) / sigma
-    return np.sqrt(2 * np.pi) * sigma / bin_width * (ndtr(upper) - ndtr(lower))
+def _shape(away, width, exponent):
+    """1 at the centre, 1/2 at half the width from it."""
+    return 0.5 ** (np.abs(2 * away / width) ** exponent)
 
 
-def _best_of_grid(position, density, error, bin_width, span):
-    """Centre, sigma, height, background and slope to start from: for each centre and sigma the rest is linear."""
+def _mean_shape(away, width, exponent, bin_width):
+    """The shape averaged over bins that lie `away` from its centre, by Gauss's quadrature."""
+    return _shape(away[:, None] + bin_width / 2 * _NODES, width, exponent) @ _WEIGHTS / 2
+
+
+def _best_of_grid(position, density, exponent, bin_width, span):
+    """Centre, width, height, background and slope to start from: for each centre and width the rest is linear."""
     best = (np.inf,)
-    for sigma in np.geomspace(bin_width / 2, span / (2.2 * FULL_WIDTH), 6):
+    for width in np.geomspace(bin_width, 0.9 * span, 8):
         for centre in position[1:-1]:
             away = position - centre
-            columns = np.stack([_mean_gaussian(away, sigma, bin_width), np.ones_like(away), away], axis=1)
-            values, *_ = np.linalg.lstsq(columns / error[:, None], density / error, rcond=None)
-            misfit = (density - columns @ values) / error
-            best = min(best, (misfit @ misfit, centre, sigma, *values))
+            line = _mean_shape(away, width, exponent, bin_width)
+            columns = np.stack([line, np.ones_like(away), away], axis=1)
+            values, *_ = np.linalg.lstsq(columns, density, rcond=None)
+            misfit = density - columns @ values
+            best = min(best, (misfit @ misfit, centre, width, *values))
     return best[1:]
 
 

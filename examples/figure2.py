@@ -1,4 +1,8 @@
-"""Where chosen surface atoms land as the energy of the perturbation grows from 0 to 1 eV.
+"""
+The response of chosen atoms
+============================
+
+Where surface atoms land as the energy of the perturbation grows from 0 to 1 eV.
 
 Redraws figure 2 of Shaikh et al., arXiv 2509.13744: lateral velocities of Al[012], roll-up of Ni[111]. Writes
 figure2.png and figure2.json. Tips have R = 20 a; `--full` makes them as large as the paper's, R = 80 a.

@@ -56,8 +56,7 @@ def profile(profiles, labels=None, ax=None, *, lines=None, xlabel="distance from
     ax.set(xlabel=xlabel, ylabel="hits per area / mean", ylim=(0, None))
     ax.grid(alpha=0.3)
     if any(label or line for label, line in zip(labels, lines, strict=True)):
-        ax.margins(y=0.2)  # room for the legend
-        ax.set_ylim(0, None)
+        ax.set_ylim(0, 1.25 * ax.get_ylim()[1])  # room for the legend
         ax.legend(loc="upper center", frameon=False, fontsize="small")
     return ax
 
@@ -92,6 +91,7 @@ def profile_comparison(first, second, labels=None, axes=None, *, lines=None):
     upper, lower = axes
     profile([first, second], labels, upper, lines=lines)
     upper.set_xlabel("")
+    upper.tick_params(labelbottom=False)
     bin_width = compared.position[1] - compared.position[0] if len(compared.position) > 1 else 1.0
     lower.axhspan(-1, 1, color="0.9", linewidth=0)
     lower.axhline(0, color="0.4", linewidth=0.8)

@@ -55,7 +55,7 @@ def specimen(
     else:
         values = check_array(color, "color", (len(emitter),), finite=False)
     right, up, towards = _viewed_from(elevation, azimuth)
-    shown = np.flatnonzero(emitter.normals @ towards > 0)  # the others face away
+    shown = np.flatnonzero(emitter.normals @ towards > 1e-9)  # the others face away; symmetric ones lie across
     positions = emitter.positions[shown]
     shown = shown[np.argsort(positions @ towards, kind="stable")]  # what is drawn last is in front
     positions, values = emitter.positions[shown], values[shown]
