@@ -12,15 +12,18 @@ from apt_evap.hits import Hits, Outcome
 from apt_evap.io import FileError, TruncatedFile, chunks, read, read_ranges, write
 from apt_evap.ion_random import IonRandom
 from apt_evap.law import Extremal
-from apt_evap.maps import DetectorMap, azimuthal_profile, radial_profile
+from apt_evap.maps import DetectorMap
 from apt_evap.material import Material, material, polarization_energy
 from apt_evap.perturbation import Combined, LateralVelocity, RollUp, Unperturbed
+from apt_evap.profiles import Rectangle, azimuthal_profile, radial_profile, zone_line_profile
 from apt_evap.ranges import Ranges
 from apt_evap.response import Design, ResponseSettings
 from apt_evap.run import Run, load
 from apt_evap.simulation import FlightSettings, Simulation
 from apt_evap.tip import Tip
 from apt_evap.watch import History, WatchSettings
+from apt_evap.tracks import lateral_tracks, rollup_tracks
+from apt_evap.zone_line import ZoneLine, compare_profiles, fit_zone_line
 
 __all__ = [
     "ChargeSettings",
@@ -43,6 +46,7 @@ __all__ = [
     "Material",
     "Outcome",
     "Ranges",
+    "Rectangle",
     "ResponseSettings",
     "RollUp",
     "Run",
@@ -53,10 +57,14 @@ __all__ = [
     "TruncatedNormal",
     "Unperturbed",
     "WatchSettings",
+    "ZoneLine",
     "__version__",
     "azimuthal_profile",
     "chunks",
+    "compare_profiles",
+    "fit_zone_line",
     "half_ceiling",
+    "lateral_tracks",
     "load",
     "material",
     "plot",
@@ -64,7 +72,9 @@ __all__ = [
     "radial_profile",
     "read",
     "read_ranges",
+    "rollup_tracks",
     "ssim",
     "tangent_frame",
     "write",
+    "zone_line_profile",
 ]
