@@ -2,6 +2,7 @@
 
 from apt_evap import plot
 from apt_evap._version import __version__
+from apt_evap.cap import field_factor, fit_caps, image_compression, run_field_factor
 from apt_evap.compare import half_ceiling, ssim
 from apt_evap.detector import Detector
 from apt_evap.emission import Emissions, Launches, tangent_frame
@@ -13,7 +14,9 @@ from apt_evap.ion_random import IonRandom
 from apt_evap.law import Extremal
 from apt_evap.maps import DetectorMap, azimuthal_profile, radial_profile
 from apt_evap.material import Material, material, polarization_energy
+from apt_evap.orientation import Orientation, fit_orientation
 from apt_evap.perturbation import Combined, LateralVelocity, RollUp, Unperturbed
+from apt_evap.projection import Projection
 from apt_evap.ranges import Ranges
 from apt_evap.response import Design, ResponseSettings
 from apt_evap.run import Run, load
@@ -37,7 +40,9 @@ __all__ = [
     "LateralVelocity",
     "Launches",
     "Material",
+    "Orientation",
     "Outcome",
+    "Projection",
     "Ranges",
     "ResponseSettings",
     "RollUp",
@@ -51,7 +56,11 @@ __all__ = [
     "__version__",
     "azimuthal_profile",
     "chunks",
+    "field_factor",
+    "fit_caps",
+    "fit_orientation",
     "half_ceiling",
+    "image_compression",
     "load",
     "material",
     "plot",
@@ -59,6 +68,7 @@ __all__ = [
     "radial_profile",
     "read",
     "read_ranges",
+    "run_field_factor",
     "ssim",
     "tangent_frame",
     "write",

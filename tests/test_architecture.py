@@ -13,10 +13,10 @@ PACKAGE = Path(__file__).parents[1] / "apt_evap"
 FLOORS = (
     {"units", "_arrays", "_threads", "_memory", "_files", "_version"},
     {"_core"},
-    {"lattice", "ranges", "shape", "material", "tip", "detector", "hits"},
+    {"lattice", "ranges", "shape", "material", "projection", "poles", "orientation", "tip", "detector", "hits"},
     {"ion_random", "energy", "emission", "perturbation", "law", "emitter", "flights", "response"},
     {"run", "simulation"},
-    {"binning", "maps", "register", "compare", "study", "config", "info", "io"},
+    {"binning", "maps", "cap", "register", "compare", "study", "config", "info", "io"},
     {"plot", "cli"},
 )
 FLOOR = {module: number for number, floor in enumerate(FLOORS) for module in floor}

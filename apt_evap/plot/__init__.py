@@ -2,6 +2,7 @@
 
 from apt_evap.plot._figure import add_colorbar, new_figure
 from apt_evap.plot.maps import color_limits, common_limits, describe, detector_map, detector_maps
+from apt_evap.plot.poles import poles
 
 __all__ = [
     "add_colorbar",
@@ -11,4 +12,5 @@ __all__ = [
     "detector_map",
     "detector_maps",
     "new_figure",
+    "poles",
 ]
