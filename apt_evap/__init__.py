@@ -3,6 +3,7 @@
 from apt_evap import plot
 from apt_evap._version import __version__
 from apt_evap.checkpoint import Checkpoint
+from apt_evap.cap import field_factor, fit_caps, image_compression, run_field_factor
 from apt_evap.compare import half_ceiling, ssim
 from apt_evap.detector import Detector
 from apt_evap.emission import Emissions, Launches, tangent_frame
@@ -14,8 +15,10 @@ from apt_evap.ion_random import IonRandom
 from apt_evap.law import Extremal
 from apt_evap.maps import DetectorMap
 from apt_evap.material import Material, material, polarization_energy
+from apt_evap.orientation import Orientation, fit_orientation
 from apt_evap.perturbation import Combined, LateralVelocity, RollUp, Unperturbed
 from apt_evap.profiles import Rectangle, azimuthal_profile, radial_profile, zone_line_profile
+from apt_evap.projection import Projection
 from apt_evap.ranges import Ranges
 from apt_evap.response import Design, ResponseSettings
 from apt_evap.run import Run, load
@@ -44,7 +47,9 @@ __all__ = [
     "LateralVelocity",
     "Launches",
     "Material",
+    "Orientation",
     "Outcome",
+    "Projection",
     "Ranges",
     "Rectangle",
     "ResponseSettings",
@@ -65,6 +70,10 @@ __all__ = [
     "fit_zone_line",
     "half_ceiling",
     "lateral_tracks",
+    "field_factor",
+    "fit_caps",
+    "fit_orientation",
+    "image_compression",
     "load",
     "material",
     "plot",
@@ -73,6 +82,7 @@ __all__ = [
     "read",
     "read_ranges",
     "rollup_tracks",
+    "run_field_factor",
     "ssim",
     "tangent_frame",
     "write",

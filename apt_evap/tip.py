@@ -30,8 +30,8 @@ class Tip:
         The crystal; a str is looked up by `material`.
     apex_radius : float
         Radius R of the cap [nm].
-    axis : sequence of int
-        Crystal direction along +z, see `rotation_to_axis`.
+    axis : sequence of float
+        Crystal direction along +z, of whole numbers or any others, see `lattice.rotation_to_axis`.
     shank_angle : float
         Half the opening angle of the shank [degrees], at least 0 and below 45.
     shank_length : float, optional
@@ -130,10 +130,11 @@ class Tip:
         self._set_elements((host, *fractions), draw_species(len(self), fractions, seed))
         self.apex = radius
         self.potential_point = np.zeros(3)
+        whole = all(float(index).is_integer() for index in axis)
         self.settings = {
             "material": asdict(host),
             "apex_radius": radius,
-            "axis": [int(index) for index in axis],
+            "axis": [int(index) if whole else float(index) for index in axis],
             "shank_angle": shape.shank_angle,
             "shank_length": shape.shank_length,
             "base": base,
@@ -289,7 +290,7 @@ class Tip:
         if self._shape is None:
             return f"<Tip: {len(self)} atoms of {names} from positions>"
         shape = self._shape
-        axis = " ".join(str(index) for index in self.settings["axis"])
+        axis = " ".join(f"{index:.4g}" for index in self.settings["axis"])
         return (
             f"<Tip: {len(self)} atoms of {names} [{axis}], apex radius {shape.apex_radius:.4g} nm, "
             f"shank {shape.shank_length:.4g} nm at {shape.shank_angle:g} degrees, {shape.base} base>"

@@ -6,6 +6,7 @@ from apt_evap.plot.maps import color_limits, common_limits, describe, detector_m
 from apt_evap.plot.profiles import profile, profile_comparison, rectangles
 from apt_evap.plot.responses import ion_colors, response
 from apt_evap.plot.specimens import mark_atoms, specimen
+from apt_evap.plot.poles import poles
 
 __all__ = [
     "add_colorbar",
@@ -23,4 +24,5 @@ __all__ = [
     "rectangles",
     "response",
     "specimen",
+    "poles",
 ]
