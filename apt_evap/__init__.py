@@ -7,8 +7,10 @@ from apt_evap.detector import Detector
 from apt_evap.emission import Emissions, Launches, tangent_frame
 from apt_evap.emitter import ChargeSettings, Emitter
 from apt_evap.energy import Fixed, Thermal, TruncatedNormal
+from apt_evap.fit import fit_energies
 from apt_evap.hits import Hits, Outcome
 from apt_evap.io import FileError, TruncatedFile, chunks, read, read_ranges, write
+from apt_evap.io.npz import read_map
 from apt_evap.ion_random import IonRandom
 from apt_evap.law import Extremal
 from apt_evap.maps import DetectorMap, azimuthal_profile, radial_profile
@@ -19,6 +21,7 @@ from apt_evap.register import Registration, register, register_points
 from apt_evap.response import Design, ResponseSettings
 from apt_evap.run import Run, load
 from apt_evap.simulation import FlightSettings, Simulation
+from apt_evap.study import Study
 from apt_evap.tip import Tip
 
 __all__ = [
@@ -45,6 +48,7 @@ __all__ = [
     "RollUp",
     "Run",
     "Simulation",
+    "Study",
     "Thermal",
     "Tip",
     "TruncatedFile",
@@ -53,6 +57,7 @@ __all__ = [
     "__version__",
     "azimuthal_profile",
     "chunks",
+    "fit_energies",
     "half_ceiling",
     "load",
     "material",
@@ -60,6 +65,7 @@ __all__ = [
     "polarization_energy",
     "radial_profile",
     "read",
+    "read_map",
     "read_ranges",
     "register",
     "register_points",

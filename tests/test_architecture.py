@@ -16,7 +16,20 @@ FLOORS = (
     {"lattice", "ranges", "shape", "material", "tip", "detector", "hits"},
     {"ion_random", "energy", "emission", "perturbation", "law", "emitter", "flights", "response"},
     {"run", "simulation"},
-    {"binning", "maps", "alignment", "register", "compare", "study", "config", "info", "io"},
+    {
+        "binning",
+        "maps",
+        "alignment",
+        "register",
+        "compare",
+        "energy_grid",
+        "resample",
+        "study",
+        "fit",
+        "config",
+        "info",
+        "io",
+    },
     {"plot", "cli"},
 )
 FLOOR = {module: number for number, floor in enumerate(FLOORS) for module in floor}
