@@ -9,8 +9,10 @@ from apt_evap.detector import Detector
 from apt_evap.emission import Emissions, Launches, tangent_frame
 from apt_evap.emitter import ChargeSettings, Emitter
 from apt_evap.energy import Fixed, Thermal, TruncatedNormal
+from apt_evap.fit import fit_energies
 from apt_evap.hits import Hits, Outcome
 from apt_evap.io import FileError, TruncatedFile, chunks, read, read_ranges, write
+from apt_evap.io.npz import read_map
 from apt_evap.ion_random import IonRandom
 from apt_evap.law import Extremal
 from apt_evap.maps import DetectorMap
@@ -20,9 +22,11 @@ from apt_evap.perturbation import Combined, LateralVelocity, RollUp, Unperturbed
 from apt_evap.profiles import Rectangle, azimuthal_profile, radial_profile, zone_line_profile
 from apt_evap.projection import Projection
 from apt_evap.ranges import Ranges
+from apt_evap.register import Registration, register, register_points
 from apt_evap.response import Design, ResponseSettings
 from apt_evap.run import Run, load
 from apt_evap.simulation import FlightSettings, Simulation
+from apt_evap.study import Study
 from apt_evap.tip import Tip
 from apt_evap.watch import History, WatchSettings
 from apt_evap.tracks import lateral_tracks, rollup_tracks
@@ -52,10 +56,12 @@ __all__ = [
     "Projection",
     "Ranges",
     "Rectangle",
+    "Registration",
     "ResponseSettings",
     "RollUp",
     "Run",
     "Simulation",
+    "Study",
     "Thermal",
     "Tip",
     "TruncatedFile",
@@ -68,6 +74,7 @@ __all__ = [
     "chunks",
     "compare_profiles",
     "fit_zone_line",
+    "fit_energies",
     "half_ceiling",
     "lateral_tracks",
     "field_factor",
@@ -80,9 +87,12 @@ __all__ = [
     "polarization_energy",
     "radial_profile",
     "read",
+    "read_map",
     "read_ranges",
     "rollup_tracks",
     "run_field_factor",
+    "register",
+    "register_points",
     "ssim",
     "tangent_frame",
     "write",

@@ -213,13 +213,40 @@ class DetectorMap:
         sigma = check_number(sigma, "sigma", at_least=0, unit="mm")
         if sigma == 0:
             return self
+        total = float(np.hypot(sigma, self.smoothing))
+        return replace(self, values=self._blurred(sigma), is_counts=False, smoothing=total)
+
+    def flattened(self, sigma):
+        """Divide the density by itself, smoothed broadly: what varies slowly over the detector goes.
+
+        Parameters
+        ----------
+        sigma : float
+            Standard deviation of the Gaussian of `smoothed` [mm]; variations broader than that go.
+
+        Returns
+        -------
+        DetectorMap
+            A map of densities; itself for a sigma of 0.
+
+        Raises
+        ------
+        ValueError
+            If sigma is negative.
+        """
+        sigma = check_number(sigma, "sigma", at_least=0, unit="mm")
+        if sigma == 0:
+            return self
+        broad = self._blurred(sigma)
+        flat = np.divide(self.values, broad, out=np.zeros_like(broad), where=self.mask & (broad > 0))
+        return replace(self, values=flat, is_counts=False)
+
+    def _blurred(self, sigma):
         width, height = self.bin_size
         blur = {"sigma": (sigma / height, sigma / width), "mode": "constant"}
         weight = ndimage.gaussian_filter(self.mask.astype(float), **blur)
         values = ndimage.gaussian_filter(np.where(self.mask, self.values, 0).astype(float), **blur)
-        values = np.divide(values, weight, out=np.zeros_like(values), where=self.mask)
-        total = float(np.hypot(sigma, self.smoothing))
-        return replace(self, values=values, is_counts=False, smoothing=total)
+        return np.divide(values, weight, out=np.zeros_like(values), where=self.mask)
 
     def __repr__(self):
         ny, nx = self.values.shape

@@ -7,6 +7,7 @@ from apt_evap.plot.profiles import profile, profile_comparison, rectangles
 from apt_evap.plot.responses import ion_colors, response
 from apt_evap.plot.specimens import mark_atoms, specimen
 from apt_evap.plot.poles import poles
+from apt_evap.plot.study import side_by_side, ssim_matrix
 
 __all__ = [
     "add_colorbar",
@@ -25,4 +26,6 @@ __all__ = [
     "response",
     "specimen",
     "poles",
+    "side_by_side",
+    "ssim_matrix",
 ]
