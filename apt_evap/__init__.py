@@ -2,8 +2,8 @@
 
 from apt_evap import plot
 from apt_evap._version import __version__
-from apt_evap.checkpoint import Checkpoint
 from apt_evap.cap import field_factor, fit_caps, image_compression, run_field_factor
+from apt_evap.checkpoint import Checkpoint
 from apt_evap.compare import half_ceiling, ssim
 from apt_evap.detector import Detector
 from apt_evap.emission import Emissions, Launches, tangent_frame
@@ -28,8 +28,8 @@ from apt_evap.run import Run, load
 from apt_evap.simulation import FlightSettings, Simulation
 from apt_evap.study import Study
 from apt_evap.tip import Tip
-from apt_evap.watch import History, WatchSettings
 from apt_evap.tracks import lateral_tracks, rollup_tracks
+from apt_evap.watch import History, WatchSettings
 from apt_evap.zone_line import ZoneLine, compare_profiles, fit_zone_line
 
 __all__ = [
@@ -73,14 +73,14 @@ __all__ = [
     "azimuthal_profile",
     "chunks",
     "compare_profiles",
-    "fit_zone_line",
-    "fit_energies",
-    "half_ceiling",
-    "lateral_tracks",
     "field_factor",
     "fit_caps",
+    "fit_energies",
     "fit_orientation",
+    "fit_zone_line",
+    "half_ceiling",
     "image_compression",
+    "lateral_tracks",
     "load",
     "material",
     "plot",
@@ -89,10 +89,10 @@ __all__ = [
     "read",
     "read_map",
     "read_ranges",
-    "rollup_tracks",
-    "run_field_factor",
     "register",
     "register_points",
+    "rollup_tracks",
+    "run_field_factor",
     "ssim",
     "tangent_frame",
     "write",

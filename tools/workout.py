@@ -6,10 +6,10 @@ python tools/workout.py [ions] [threads]
 import sys
 
 import numpy as np
-from apt_evap._core.octree import Octree
-from apt_evap._core.sweep import InteractionLists
 
 import apt_evap as ae
+from apt_evap._core.octree import Octree
+from apt_evap._core.sweep import InteractionLists
 
 ions = int(sys.argv[1]) if len(sys.argv) > 1 else 40
 n_threads = int(sys.argv[2]) if len(sys.argv) > 2 else 3
