@@ -1,4 +1,4 @@
-"""The detector: a plane in front of the specimen, and where a flight that has left the field meets it."""
+"""The detector in front of the specimen, and where a flight that has left the field meets it."""
 
 from dataclasses import dataclass
 
@@ -8,28 +8,37 @@ from apt_evap._arrays import check_number
 from apt_evap.hits import Outcome
 from apt_evap.units import NM_PER_MM
 
+PROJECTIONS = ("plane", "equidistant")
+
 
 @dataclass(frozen=True)
 class Detector:
-    """A square plane detector, centred on the axis of the specimen.
+    """A square detector, centred on the axis of the specimen.
 
     Parameters
     ----------
     distance : float
-        From the apex to the plane [mm].
+        From the apex to the detector [mm].
     width : float
         Edge of the square [mm].
+    projection : str
+        "plane": a flat detector, on which an ion at the polar angle theta lands at D tan(theta) from the centre, with D
+        the distance. "equidistant": at D theta, the azimuthal equidistant projection that measured maps come close to,
+        whose ions have passed a reflectron or a curved field; the time of flight is that to the sphere of radius D.
 
     Raises
     ------
     ValueError
-        If a length is not above 0.
+        If a length is not above 0, or the projection is unknown.
     """
 
     distance: float = 100.0
     width: float = 300.0
+    projection: str = "plane"
 
     def __post_init__(self):
+        if self.projection not in PROJECTIONS:
+            raise ValueError(f"projection must be one of {', '.join(PROJECTIONS)}, got {self.projection!r}")
         for name in ("distance", "width"):
             object.__setattr__(self, name, check_number(getattr(self, name), name, above=0, unit="mm"))
 
@@ -65,26 +74,37 @@ class Detector:
             directions = place[:, :2] / (np.linalg.norm(place, axis=1) + place[:, 2])[:, None]
         return directions, remaining
 
-    def impacts(self, directions):
-        """Where ions meet the plane.
+    def impacts(self, directions, times):
+        """Where and when ions meet the detector.
 
         Parameters
         ----------
         directions : ndarray, shape (n, 2)
             Stereographic directions, see `directions`; NaN for an ion that never left.
+        times : ndarray, shape (n,)
+            Times of flight to the plane [ns].
 
         Returns
         -------
         x, y : ndarray, shape (n,)
             Detector coordinates [mm]; NaN for ions that do not fly towards the plane.
+        times : ndarray, shape (n,)
+            Times of flight to the detector [ns].
         outcome : ndarray of int8, shape (n,)
             An `Outcome` each.
         """
         s2 = np.einsum("ij,ij->i", directions, directions)
+        ahead = s2 < 1.0
         with np.errstate(divide="ignore", invalid="ignore"):
-            scale = np.where(s2 < 1.0, 2.0 * self.distance / (1.0 - s2), np.nan)
+            if self.projection == "plane":
+                scale = 2.0 / (1.0 - s2)  # tan(theta) / tan(theta / 2)
+            else:
+                s = np.sqrt(s2)
+                scale = np.where(s > 0, 2.0 * np.arctan(s) / s, 2.0)
+                times = np.where(ahead, times * (1.0 - s2) / (1.0 + s2), times)  # cos(theta) of the way to the plane
+            scale = np.where(ahead, self.distance * scale, np.nan)
         x, y = directions[:, 0] * scale, directions[:, 1] * scale
         outcome = np.full(len(x), Outcome.MISSED, np.int8)
         outcome[(np.abs(x) <= self.width / 2) & (np.abs(y) <= self.width / 2)] = Outcome.HIT
         outcome[np.isnan(s2)] = Outcome.NEVER_LEFT
-        return x, y, outcome
+        return x, y, times, outcome

@@ -142,6 +142,30 @@ def material(name, **changes):
     return replace(found, **changes, sources=found.sources | dict.fromkeys(changes, "given by the user"))
 
 
+def as_material(value):
+    """Return a Material as it is, and the known one of a name.
+
+    Parameters
+    ----------
+    value : Material or str
+        What the user gave.
+
+    Returns
+    -------
+    Material
+
+    Raises
+    ------
+    ValueError
+        If it is neither, or no material has this name.
+    """
+    if isinstance(value, str):
+        return material(value)
+    if not isinstance(value, Material):
+        raise ValueError(f"material must be a Material or the name of one, got {value!r}")
+    return value
+
+
 def _nearest(name, known):
     lower = {word.lower(): word for word in known}
     close = get_close_matches(str(name).lower(), lower, n=1, cutoff=0.5)

@@ -6,11 +6,11 @@ from dataclasses import asdict
 import numpy as np
 from scipy.spatial import cKDTree
 
-from apt_evap import lattice
+from apt_evap import interchange, lattice
 from apt_evap._arrays import check_array, check_count, check_number
 from apt_evap._memory import check_memory
-from apt_evap.material import Material
-from apt_evap.material import material as known_material
+from apt_evap.alloy import check_solutes, draw_species
+from apt_evap.material import Material, as_material
 from apt_evap.shape import TaperedCap
 
 _ROUNDING = 1e-6  # nearest neighbour distances: sites on the surface stay together whatever their rounding
@@ -30,8 +30,8 @@ class Tip:
         The crystal; a str is looked up by `material`.
     apex_radius : float
         Radius R of the cap [nm].
-    axis : sequence of int
-        Crystal direction along +z, see `rotation_to_axis`.
+    axis : sequence of float
+        Crystal direction along +z, of whole numbers or any others, see `lattice.rotation_to_axis`.
     shank_angle : float
         Half the opening angle of the shank [degrees], at least 0 and below 45.
     shank_length : float, optional
@@ -97,7 +97,7 @@ class Tip:
         solutes=None,
         seed=None,
     ):
-        host = _as_material(material)
+        host = as_material(material)
         d = host.nearest_neighbour_distance
         radius = check_number(apex_radius, "apex_radius", at_least=3 * d, unit="nm")
         length = 2 * radius if shank_length is None else shank_length
@@ -107,7 +107,7 @@ class Tip:
         if depth is not None:
             depth = check_number(depth, "depth", above=self.neighbour_radius, unit="nm")
         self._depth = depth
-        fractions = _check_solutes(solutes, seed)
+        fractions = check_solutes(solutes, seed)
         check_memory(self._held_volume() * lattice.atom_density(host.structure, host.a, host.c))
 
         orientation = lattice.rotation_to_axis(host, axis, rotation)
@@ -127,13 +127,14 @@ class Tip:
             tolerance=_ROUNDING * d,
         )
         self._mark()
-        self._set_elements((host, *fractions), _draw_species(len(self), fractions, seed))
+        self._set_elements((host, *fractions), draw_species(len(self), fractions, seed))
         self.apex = radius
         self.potential_point = np.zeros(3)
+        whole = all(float(index).is_integer() for index in axis)
         self.settings = {
             "material": asdict(host),
             "apex_radius": radius,
-            "axis": [int(index) for index in axis],
+            "axis": [int(index) if whole else float(index) for index in axis],
             "shank_angle": shape.shank_angle,
             "shank_length": shape.shank_length,
             "base": base,
@@ -190,7 +191,7 @@ class Tip:
         n = len(tip.positions)
         if n < 2:
             raise ValueError(f"positions must hold at least 2 atoms, got {n}")
-        elements = tuple(_as_material(element) for element in elements)
+        elements = tuple(as_material(element) for element in elements)
         if not elements:
             raise ValueError("elements must name at least one material, got none")
         tip._set_elements(elements, check_array(species, "species", (n,), dtype=np.int32))
@@ -231,6 +232,36 @@ class Tip:
         return tip
 
     @classmethod
+    def from_atoms(cls, atoms, materials=None, **options):
+        """Make a tip of an ASE Atoms object, its axis along +z.
+
+        Parameters
+        ----------
+        atoms : ase.Atoms
+            Positions in Angstrom; the cell is not looked at. An array "evaporable" says which atoms may leave.
+        materials : mapping of str to Material, optional
+            Materials by chemical symbol, in place of those that `material` knows.
+        **options
+            Passed to `from_positions`.
+
+        Returns
+        -------
+        Tip
+            Its `elements` begin with the most frequent one.
+
+        Raises
+        ------
+        ValueError
+            If a symbol has no material, or as `from_positions` does.
+        """
+        return cls.from_positions(**(interchange.from_atoms(atoms, materials) | options))
+
+    def to_atoms(self):
+        """Return the specimen as ase.Atoms [Angstrom], with arrays "evaporable" and "support"; needs ASE."""
+        arrays = {"evaporable": self.evaporable, "support": self.support}
+        return interchange.to_atoms(self.positions, self.elements, self.species, **arrays)
+
+    @classmethod
     def from_settings(cls, settings):
         """Make the tip again that has these `settings`; one made from positions has none to go by.
 
@@ -259,7 +290,7 @@ class Tip:
         if self._shape is None:
             return f"<Tip: {len(self)} atoms of {names} from positions>"
         shape = self._shape
-        axis = " ".join(str(index) for index in self.settings["axis"])
+        axis = " ".join(f"{index:.4g}" for index in self.settings["axis"])
         return (
             f"<Tip: {len(self)} atoms of {names} [{axis}], apex radius {shape.apex_radius:.4g} nm, "
             f"shank {shape.shank_length:.4g} nm at {shape.shank_angle:g} degrees, {shape.base} base>"
@@ -347,36 +378,6 @@ class Tip:
         self.evaporation_fields = np.array([element.evaporation_field for element in elements])
         self.charge_states = np.array([element.charge_state for element in elements], dtype=np.int32)
         self.masses = np.array([element.mass for element in elements])
-
-
-def _as_material(value):
-    if isinstance(value, str):
-        return known_material(value)
-    if not isinstance(value, Material):
-        raise ValueError(f"material must be a Material or the name of one, got {value!r}")
-    return value
-
-
-def _check_solutes(solutes, seed):
-    """Atomic fraction by Material."""
-    fractions = {}
-    for element, fraction in (solutes or {}).items():
-        solute = _as_material(element)
-        fractions[solute] = check_number(fraction, f"fraction of {solute.name}", above=0, at_most=1)
-    if sum(fractions.values()) > 1:
-        raise ValueError(f"solutes must have fractions that sum to at most 1, got {sum(fractions.values()):g}")
-    if fractions or seed is not None:
-        check_count(seed, "seed (the random places of the solutes are drawn from it)")
-    return fractions
-
-
-def _draw_species(n, fractions, seed):
-    """Index of the element of each of n atoms: the host is 0."""
-    if not fractions:
-        return np.zeros(n, dtype=np.int32)
-    edges = np.cumsum(list(fractions.values()))
-    drawn = np.searchsorted(edges, np.random.default_rng(seed).random(n), side="right")
-    return ((drawn + 1) % (len(fractions) + 1)).astype(np.int32)
 
 
 def _digest(*arrays):

@@ -11,13 +11,13 @@ import time
 from pathlib import Path
 
 import numpy as np
+
+import apt_evap as ae
 from apt_evap._core.flight import Flights
 from apt_evap._core.journal import Journal
 from apt_evap._core.octree import Octree
 from apt_evap._core.robin import Robin
 from apt_evap._core.sweep import InteractionLists, direct_field
-
-import apt_evap as ae
 from apt_evap.emitter import SWEEP_DUE, TOO_SHALLOW, Emitter
 from apt_evap.units import COULOMB
 
@@ -291,7 +291,7 @@ def place_errors(radius=40, shank=1.0, events=5000, ions=200, n_threads=2):
         tree.charges = tree.charges * (simulation.voltage / potential)
         flier = flier_over(tree, tip, ae.FlightSettings(opening_angle=0.0, tolerance=1e-6))
         end, _ = fly(flier, Journal(tip.positions, 1), [-1], 1, run.emissions.positions, np.zeros((1, 3)))
-        x, y, _ = detector.impacts(detector.directions(end[:, :3], end[:, 3:6], tip.apex)[0])
+        x, y, *_ = detector.impacts(*detector.directions(end[:, :3], end[:, 3:6], tip.apex))
         hits = run.hits(ae.Unperturbed())
         errors.append(np.hypot(hits.x - x, hits.y - y)[0])
     rows = [
@@ -371,8 +371,8 @@ def bases(radius=20, shanks=(0.5, 1.0, 2.0, 3.0, 5.0, 8.0), ions=200, n_threads=
         chosen = np.ascontiguousarray(sites[:: max(1, len(sites) // ions)])
         flier = flier_over(batch.tree, tip, ae.FlightSettings())
         end, _ = fly(flier, batch.journal, np.full(len(chosen), -1), 1, chosen, np.zeros_like(chosen))
-        directions, _ = simulation.detector.directions(end[:, :3], end[:, 3:6], tip.apex)
-        results[base, shank] = fields, rim, np.stack(simulation.detector.impacts(directions)[:2], axis=1)
+        directions, remaining = simulation.detector.directions(end[:, :3], end[:, 3:6], tip.apex)
+        results[base, shank] = fields, rim, np.stack(simulation.detector.impacts(directions, remaining)[:2], axis=1)
     reference = results["rounded", shanks[-1]]
     rows = []
     for (base, shank), (fields, rim, places) in results.items():

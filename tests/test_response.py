@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 import apt_evap as ae
+from apt_evap.hits import Outcome
 from apt_evap.response import Responses, flattened, unflattened
 
 ENERGY = ae.TruncatedNormal(0.155, 0.155)
@@ -106,9 +107,32 @@ def test_a_straight_flight_of_one_speed_is_flat():
     directions, times = detector.directions(np.zeros((3, 3)), velocities, 0.0)
     assert directions[:, 0] == pytest.approx(np.tan(angle / 2), abs=1e-15)
     assert flattened(directions, times)[:, 2] == pytest.approx(times[0], rel=1e-14)
-    x, y, _ = detector.impacts(directions)
+    x, y, at, _ = detector.impacts(directions, times)
     assert x == pytest.approx(100 * np.tan(angle), rel=1e-13)
+    assert np.array_equal(at, times)
     assert not y.any()
+
+
+def test_an_equidistant_detector_keeps_angles_and_times():
+    """Places at D theta, all reached after the same time by ions of one speed: a sphere around the apex."""
+    angle, azimuth = np.radians([0.0, 30.0, 60.0, 89.0, 91.0]), np.radians([0.0, 0.0, 90.0, 200.0, 0.0])
+    velocities = np.stack([np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth), np.cos(angle)], axis=1)
+    plane = ae.Detector(100.0, 300.0)
+    sphere = replace(plane, projection="equidistant")
+    directions, times = plane.directions(np.zeros((5, 3)), velocities, 0.0)
+    x, y, at, outcome = sphere.impacts(directions, times)
+    ahead = slice(0, 4)
+    assert np.hypot(x, y)[ahead] == pytest.approx(100 * angle[ahead], rel=1e-12)
+    assert y[2] == pytest.approx(100 * angle[2], rel=1e-12)
+    assert at[ahead] == pytest.approx(times[0], rel=1e-12)
+    assert [Outcome(each).name for each in outcome] == ["HIT"] * 4 + ["MISSED"]
+    # near the axis the two are one
+    small = [[1e-4, 0.0]]
+    assert sphere.impacts(np.array(small), np.ones(1))[0] == pytest.approx(
+        plane.impacts(np.array(small), np.ones(1))[0]
+    )
+    with pytest.raises(ValueError, match="projection must be one of plane, equidistant, got 'conical'"):
+        ae.Detector(projection="conical")
 
 
 # ---- against flights -----------------------------------------------------------------------------------------------

@@ -198,6 +198,19 @@ def test_files_that_are_no_runs(tmp_path, run):
     with pytest.raises(ae.FileError, match=r"cut\.h5"):
         ae.load(tmp_path / "cut.h5")
     with h5py.File(tmp_path / "run.h5", "a") as file:
-        del file["ions/site"]
+        del file["entry1/simulation/site"]
     with pytest.raises(ae.FileError, match=r"run\.h5"):
         ae.load(tmp_path / "run.h5")
+
+
+def test_another_detector_sees_the_same_ions(run, tmp_path):
+    plane = run.hits(ae.Unperturbed())
+    curved = run.seen_by(ae.Detector(100.0, 300.0, projection="equidistant"))
+    seen = curved.hits(ae.Unperturbed())
+    both = plane.detected & seen.detected
+    assert both.sum() > 50
+    radius = np.hypot(plane.x, plane.y)[both]
+    assert np.hypot(seen.x, seen.y)[both] == pytest.approx(100 * np.arctan(radius / 100), rel=1e-10)
+    assert (seen.time_of_flight[both] < plane.time_of_flight[both]).mean() > 0.9
+    curved.save(tmp_path / "curved.h5")
+    assert ae.load(tmp_path / "curved.h5").detector == curved.detector

@@ -45,8 +45,15 @@ def whole(least, most=None):
     return whole
 
 
-def smoothing(text):
-    try:
-        return check_number(float(text), "it", at_least=0, unit="mm")
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"must be a number [mm] of at least 0, got {text!r}") from None
+def _number(unit):
+    def number(text):
+        try:
+            return check_number(float(text), "it", at_least=0, unit=unit)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"must be a number [{unit}] of at least 0, got {text!r}") from None
+
+    return number
+
+
+smoothing = _number("mm")
+minutes = _number("min")

@@ -1,0 +1,59 @@
+"""Random substitutional alloys: which atom is of which species."""
+
+import numpy as np
+
+from apt_evap._arrays import check_count, check_number
+from apt_evap.material import as_material
+
+
+def check_solutes(solutes, seed):
+    """Return atomic fractions by Material.
+
+    Parameters
+    ----------
+    solutes : mapping or None
+        Atomic fraction by element (str or Material).
+    seed : int or None
+        Needed if there are solutes.
+
+    Returns
+    -------
+    dict
+
+    Raises
+    ------
+    ValueError
+        If a fraction is not above 0, they sum to more than 1, or there is no seed.
+    """
+    fractions = {}
+    for element, fraction in (solutes or {}).items():
+        solute = as_material(element)
+        fractions[solute] = check_number(fraction, f"fraction of {solute.name}", above=0, at_most=1)
+    if sum(fractions.values()) > 1:
+        raise ValueError(f"solutes must have fractions that sum to at most 1, got {sum(fractions.values()):g}")
+    if fractions or seed is not None:
+        check_count(seed, "seed (the random places of the solutes are drawn from it)")
+    return fractions
+
+
+def draw_species(n, fractions, seed):
+    """Draw the species of each of n atoms: 0 is the host, the solutes follow in the order of `fractions`.
+
+    Parameters
+    ----------
+    n : int
+        Number of atoms.
+    fractions : dict
+        Atomic fractions of the solutes.
+    seed : int
+        Seed of the draw.
+
+    Returns
+    -------
+    ndarray of int32, shape (n,)
+    """
+    if not fractions:
+        return np.zeros(n, dtype=np.int32)
+    edges = np.cumsum(list(fractions.values()))
+    drawn = np.searchsorted(edges, np.random.default_rng(seed).random(n), side="right")
+    return ((drawn + 1) % (len(fractions) + 1)).astype(np.int32)
