@@ -1,6 +1,7 @@
 """What the ions of a run say about the shape of the cap and the way to the detector."""
 
 import math
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -76,7 +77,7 @@ def fit_caps(run, windows=None):
     windows = min(10, max(1, n // 500)) if windows is None else check_count(windows, "windows", at_least=1)
     edges = np.linspace(0, n, windows + 1).astype(int)
     caps = []
-    for first, last in zip(edges[:-1], edges[1:], strict=True):
+    for first, last in pairwise(edges):
         sites = run.emissions.positions[first:last]
         centre, radius = np.zeros(3), None
         for _ in range(3):  # the sites on the cap change with its centre
@@ -124,7 +125,8 @@ def image_compression(run, caps=None):
     seen = hits.detected
     # to the corners the square detector shows only some azimuths
     seen &= radius <= run.detector.width / 2
-    detector = np.degrees(np.arctan2(radius, run.detector.distance))
+    plane = run.detector.projection == "plane"
+    detector = np.degrees(np.arctan(radius / run.detector.distance) if plane else radius / run.detector.distance)
     number = np.floor(crystal / _BIN).astype(int)
     # at the rim of the detector only the ions that come in below the average are left
     whole = [np.mean(seen[number == index]) > 0.99 for index in range(int(90 / _BIN)) if (number == index).any()]
@@ -146,7 +148,7 @@ def image_compression(run, caps=None):
         ratio = crystal[chosen] / detector[chosen]
         compression = float(np.median(ratio))
     scatter = float(np.diff(np.percentile(ratio, [16, 84]))[0] / 2)
-    projection = Projection(run.detector.distance / compression, compression=compression)
+    projection = Projection(run.detector.distance / compression, compression=compression if plane else None)
     return ImageCompression(compression, scatter, low, high, angles, medians, projection)
 
 

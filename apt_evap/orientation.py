@@ -169,8 +169,8 @@ def fit_orientation(material, planes, places, *, lines=(), scale=None, centre=(0
     Notes
     -----
     The projection is the azimuthal equidistant one. The start is the rotation that aligns the directions best
-    (Kabsch's method). All lattices here have mirror planes: for every indexing of a map there is one of its mirror image
-    that fits as well, with other members of the same families. Only given indices tell the handedness.
+    (Kabsch's method). All lattices here have mirror planes: for every indexing of a map there is one of its mirror
+    image that fits as well, with other members of the same families. Only given indices tell the handedness.
     """
     host = Orientation(material).material
     normals = plane_normals(host, planes)
@@ -255,7 +255,7 @@ def _offsets(seen, expected):
 
 
 def _scales(normals, places, projection):
-    """Scales to start from [mm/rad]: of all pairs of poles the median of their distance over their angle, and around."""
+    """Scales to start from [mm/rad]: the median over all pairs of poles of distance over angle, and some around."""
     first, second = np.triu_indices(len(normals), 1)
     angles = np.linalg.norm(_offsets(normals[first], normals[second]), axis=1)
     apart = angles > _SAME

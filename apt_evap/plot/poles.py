@@ -71,11 +71,15 @@ def poles(ax, orientation, projection, *, families=6, zone_families=None, labels
         ax.scatter(*places[chosen].T, s=areas, facecolors="none", edgecolors="white", linewidths=1.2, zorder=3,
                    path_effects=outline)  # fmt: skip
         written = []
+        if labels:
+            ax.figure.draw_without_rendering()  # settles the layout, and with it how far apart names are
         for index in chosen if labels else ():
             point = ax.transData.transform(places[index]) * 72 / ax.figure.dpi
             if all(np.hypot(*(point - other)) > _APART * size / 9 for other in written):
                 written.append(point)
-                ax.annotate(found.labels[index], places[index], xytext=(4, 4), textcoords="offset points", size=size,
-                            color="white", path_effects=outline, annotation_clip=True, clip_on=True)  # fmt: skip
+                at_edge = places[index, 0] > x_limits[1] - 0.07 * (x_limits[1] - x_limits[0])
+                ax.annotate(found.labels[index], places[index], xytext=(-4 if at_edge else 4, 4), size=size,
+                            textcoords="offset points", ha="right" if at_edge else "left", color="white",
+                            path_effects=outline, clip_on=True)  # fmt: skip
     ax.set(xlim=x_limits, ylim=y_limits)
     return ax
