@@ -25,7 +25,7 @@ FLOOR = {module: number for number, floor in enumerate(FLOORS) for module in flo
 
 UPWARD = {("hits", "maps")}  # Hits.map, a shorthand: inside the method, never when the module is loaded
 MOST_LINES = 400
-LONGER = {"_core/octree.pyx": 560}  # build, moments, walks and sums, all on the same flat arrays
+LONGER = {}
 
 
 def sources():
