@@ -5,17 +5,29 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from apt_evap._arrays import check_array, check_count, check_number
+from apt_evap._arrays import check_array, check_count, check_kind, check_number
 from apt_evap._core.event import DONE, EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, Evaporation
 from apt_evap._core.journal import Journal
 from apt_evap._core.octree import Octree
-from apt_evap._core.robin import Robin
+from apt_evap._core.robin import ChargingRule, Robin
 from apt_evap._core.surface import Neighbourhood
 from apt_evap._threads import thread_count
 from apt_evap.law import Extremal
+from apt_evap.tip import Tip
 from apt_evap.units import COULOMB
 
 __all__ = ["DONE", "EXHAUSTED", "SWEEP_DUE", "TOO_SHALLOW", "Batch", "ChargeSettings", "Emitter"]
+
+_MOST_EVENTS = 10_000_000  # at a time: 640 MB of results
+
+
+def check_voltage(voltage):
+    """Return the applied voltage [V], above 0 and up to 1 MV, or say what is wrong (ValueError)."""
+    return check_number(voltage, "voltage", above=0, at_most=1e6, unit="V")
+
+
+def _check_angle(angle):
+    return check_number(angle, "opening_angle", at_least=0, at_most=1.5, unit="rad")
 
 
 @dataclass(frozen=True)
@@ -54,12 +66,12 @@ class ChargeSettings:
     relaxation_angle: float = 0.6
 
     def __post_init__(self):
-        check_number(self.opening_angle, "opening_angle", at_least=0, at_most=1.5, unit="rad")
+        _check_angle(self.opening_angle)
         check_number(self.patch_radius, "patch_radius", at_least=1.5, at_most=30, unit="d_nn")
         check_number(self.update_radius, "update_radius", at_least=self.patch_radius, at_most=40, unit="d_nn")
         check_number(self.relaxation_angle, "relaxation_angle", at_least=self.opening_angle, at_most=1.5, unit="rad")
-        check_number(self.tolerance, "tolerance", above=0)
-        check_number(self.start_tolerance, "start_tolerance", above=0)
+        check_number(self.tolerance, "tolerance", above=0, at_most=1)
+        check_number(self.start_tolerance, "start_tolerance", above=0, at_most=1)
         if self.sweep_interval is not None:
             check_count(self.sweep_interval, "sweep_interval", at_least=1)
 
@@ -126,11 +138,12 @@ class Emitter:
     """
 
     def __init__(self, tip, voltage=1000.0, law=None, settings=None, n_threads=None, rule=None):
-        self.tip = tip
-        self.voltage = check_number(voltage, "voltage", above=0, unit="V")
-        self.law = law or Extremal()
-        self.settings = settings or ChargeSettings()
-        self.rule = rule or Robin()
+        self.tip = check_kind(tip, "tip", Tip, "a Tip")
+        self.voltage = check_voltage(voltage)
+        self.law = Extremal() if law is None else check_kind(law, "law", "weights", "a law with a method weights")
+        self.settings = ChargeSettings() if settings is None else settings
+        check_kind(self.settings, "settings", ChargeSettings, "ChargeSettings")
+        self.rule = Robin() if rule is None else check_kind(rule, "rule", ChargingRule, "a ChargingRule such as Robin()")
         self.n_threads = thread_count(n_threads)
         distance = tip.nearest_neighbour_distance
         neighbourhood, weights = self._neighbourhood_of(tip), self._weights_of(tip)
@@ -222,12 +235,12 @@ class Emitter:
         ndarray, shape (m, 3)
             Field [V/nm].
         """
-        points = check_array(points, "points", ("m", 3))
+        points, opening_angle = check_array(points, "points", ("m", 3)), _check_angle(opening_angle)
         return COULOMB * self._core.tree.fields(points, opening_angle, self.n_threads)
 
     def potential_at(self, points, opening_angle=0.3):
         """Electric potential of the surface charges [V], shape (m,); parameters as in `field_at`."""
-        points = check_array(points, "points", ("m", 3))
+        points, opening_angle = check_array(points, "points", ("m", 3)), _check_angle(opening_angle)
         return COULOMB * self._core.tree.potentials(points, opening_angle, self.n_threads)
 
     def relax(self, tolerance=None):
@@ -247,7 +260,8 @@ class Emitter:
             The change in the last one.
         """
         angle = self.settings.relaxation_angle if tolerance is None else self.settings.opening_angle
-        tolerance = check_number(self.settings.tolerance if tolerance is None else tolerance, "tolerance", above=0)
+        tolerance = self.settings.tolerance if tolerance is None else tolerance
+        tolerance = check_number(tolerance, "tolerance", above=0, at_most=1)
         outcome = self._core.relax(
             tolerance=tolerance,
             opening_angle=angle,
@@ -297,7 +311,7 @@ class Emitter:
             Its status says why it ended: DONE, SWEEP_DUE (call `relax` and go on), EXHAUSTED, TOO_SHALLOW (call
             `deepen` and go on).
         """
-        most = check_count(most, "most", at_least=1)
+        most = check_count(most, "most", at_least=1, at_most=_MOST_EVENTS)
         journal = Journal(self.tip.positions, most)
         site, neighbour = np.empty(most, np.int64), np.empty(most, np.int64)
         charges, normals = np.empty(most), np.empty((most, 3))

@@ -9,6 +9,8 @@ from apt_evap._arrays import check_count, check_number
 from apt_evap._core.flight import LEFT, Flights
 from apt_evap.units import COULOMB
 
+_MOST_STEPS = 1_000_000  # flights take some tens
+
 
 @dataclass(frozen=True)
 class FlightSettings:
@@ -37,7 +39,7 @@ class FlightSettings:
         check_number(self.opening_angle, "opening_angle", at_least=0, at_most=1.0, unit="rad")
         check_number(self.tolerance, "tolerance", above=0, at_most=0.1)
         check_number(self.reach, "reach", at_least=100, unit="d_nn")
-        check_count(self.most_steps, "most_steps", at_least=1)
+        check_count(self.most_steps, "most_steps", at_least=1, at_most=_MOST_STEPS)
 
 
 class FlightCrew:

@@ -5,7 +5,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from apt_evap._arrays import check_number
+from apt_evap._arrays import check_choice, check_number
+
+_LONGEST = 1e7  # [nm]: a centimetre is no tip, and volumes keep their digits
 
 
 @dataclass(frozen=True)
@@ -39,13 +41,10 @@ class TaperedCap:
     base: str = "rounded"
 
     def __post_init__(self):
-        radius = check_number(self.apex_radius, "apex_radius", above=0, unit="nm")
-        length = check_number(self.shank_length, "shank_length", above=0, unit="nm")
-        angle = check_number(self.shank_angle, "shank_angle", at_least=0, unit="degrees")
-        if angle >= 45:
-            raise ValueError(f"shank_angle must be below 45 [degrees], got {self.shank_angle!r}")
-        if self.base not in ("rounded", "flat"):
-            raise ValueError(f"base must be 'rounded' or 'flat', got {self.base!r}")
+        radius = check_number(self.apex_radius, "apex_radius", above=0, at_most=_LONGEST, unit="nm")
+        length = check_number(self.shank_length, "shank_length", above=0, at_most=_LONGEST, unit="nm")
+        angle = check_number(self.shank_angle, "shank_angle", at_least=0, below=45, unit="degrees")
+        check_choice(self.base, "base", ("rounded", "flat"))
         for name, value in (("apex_radius", radius), ("shank_length", length), ("shank_angle", angle)):
             object.__setattr__(self, name, value)
 

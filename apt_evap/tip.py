@@ -1,13 +1,14 @@
 """The specimen: a crystal (or any arrangement of atoms) in the shape of a tip."""
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import asdict
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from apt_evap import lattice
-from apt_evap._arrays import check_array, check_count, check_number
+from apt_evap._arrays import check_array, check_kind, check_number, check_seed, check_sequence, shown
 from apt_evap._memory import check_memory
 from apt_evap.material import Material
 from apt_evap.material import material as known_material
@@ -15,6 +16,7 @@ from apt_evap.shape import TaperedCap
 
 _ROUNDING = 1e-6  # nearest neighbour distances: sites on the surface stay together whatever their rounding
 _SKIN = 3.2  # neighbour radii held below the surface where hardly an atom leaves: two of them are support
+_LAYER = 0.74  # thickness of the layer of surface atoms [d_nn]: 0.48 a^2 of the surface for each one of fcc
 _SAMPLE = 10_000  # atoms asked for their nearest neighbour
 
 
@@ -108,12 +110,13 @@ class Tip:
             depth = check_number(depth, "depth", above=self.neighbour_radius, unit="nm")
         self._depth = depth
         fractions = _check_solutes(solutes, seed)
-        check_memory(self._held_volume() * lattice.atom_density(host.structure, host.a, host.c))
-
         orientation = lattice.rotation_to_axis(host, axis, rotation)
+        density = lattice.atom_density(host.structure, host.a, host.c)
+        check_memory(self._held_volume() * density, shape.volume(_LAYER * d) * density)
+
         shift = origin
         if offset_seed is not None:
-            part = np.random.default_rng(check_count(offset_seed, "offset_seed")).random(3)
+            part = np.random.default_rng(check_seed(offset_seed, "offset_seed")).random(3)
             shift = origin + orientation @ (part * lattice.cell_lengths(host.structure, host.a, host.c))
         self.positions = lattice.lattice_points_in(
             host.structure,
@@ -121,8 +124,8 @@ class Tip:
             host.c,
             orientation,
             shift,
-            self.signed_distance,
-            self._shape.bounds,
+            shape.signed_distance,
+            shape.bounds,
             depth=None if depth is None else self._depth_at,
             tolerance=_ROUNDING * d,
         )
@@ -190,9 +193,10 @@ class Tip:
         n = len(tip.positions)
         if n < 2:
             raise ValueError(f"positions must hold at least 2 atoms, got {n}")
-        elements = tuple(_as_material(element) for element in elements)
+        elements = check_sequence(elements, "elements", "materials, such as ('Ni',)")
         if not elements:
             raise ValueError("elements must name at least one material, got none")
+        elements = tuple(_as_material(element, "elements") for element in elements)
         tip._set_elements(elements, check_array(species, "species", (n,), dtype=np.int32))
         if not 0 <= tip.species.min() <= tip.species.max() < len(elements):
             raise ValueError(
@@ -212,9 +216,7 @@ class Tip:
         tip.apex = float(high[2])
         if evaporable is None:
             evaporable = tip.positions[:, 2] >= (low[2] + high[2]) / 2
-        if np.shape(evaporable) != (n,) or np.asarray(evaporable).dtype != bool:
-            raise ValueError(f"evaporable must be true or false for each of the {n} atoms, shape ({n},)")
-        tip.evaporable = np.array(evaporable)
+        tip.evaporable = check_array(evaporable, "evaporable", (n,), dtype=bool).copy()
         tip.support = np.zeros(n, dtype=bool)
         if potential_point is None:
             below = min((high[0] - low[0]) / 2, (high[1] - low[1]) / 2, (high[2] - low[2]) / 2)
@@ -239,14 +241,14 @@ class Tip:
         ValueError
             If a setting is unknown or the tip was made from positions.
         """
-        settings = dict(settings)
+        settings = dict(check_kind(settings, "settings", Mapping, "the settings of a tip"))
         if "apex_radius" not in settings:
             raise ValueError(
                 f"settings must hold 'apex_radius' (a tip made from positions needs those), got {', '.join(settings)}"
             )
-        settings["material"] = Material(**settings["material"])
-        settings["solutes"] = {Material(**solute): fraction for solute, fraction in settings.get("solutes") or ()}
         try:
+            settings["material"] = Material(**settings["material"])
+            settings["solutes"] = {Material(**solute): fraction for solute, fraction in settings.get("solutes") or ()}
             return cls(**settings)
         except TypeError as error:
             raise ValueError(f"settings of a tip: {error}") from error
@@ -275,7 +277,7 @@ class Tip:
         """
         if self._shape is None:
             raise ValueError("a tip made from positions has no shape to measure a distance from")
-        return self._shape.signed_distance(points)
+        return self._shape.signed_distance(check_array(points, "points", ("n", 3)))
 
     def deepened(self, by=None):
         """Hold a shell to a greater depth.
@@ -300,7 +302,7 @@ class Tip:
         by = 2 * self.neighbour_radius if by is None else check_number(by, "by", above=0, unit="nm")
         deeper = Tip.from_settings({**self.settings, "depth": self._depth + by})
         rounding = 2 * _ROUNDING * self.nearest_neighbour_distance
-        below = self.signed_distance(deeper.positions) < -(self._depth_at(deeper.positions) + rounding)
+        below = self._shape.signed_distance(deeper.positions) < -(self._depth_at(deeper.positions) + rounding)
         deeper.positions = np.concatenate([self.positions, deeper.positions[below]])
         deeper.species = np.concatenate([self.species, deeper.species[below]])
         deeper._mark()
@@ -331,7 +333,7 @@ class Tip:
         if self._depth is not None:
             skin, ramp = self._ramp
             lost = self.neighbour_radius * (1 + (self._depth - skin) / ramp)  # across one neighbourhood
-            self.support = self.signed_distance(self.positions) < lost - self._depth_at(self.positions)
+            self.support = self._shape.signed_distance(self.positions) < lost - self._depth_at(self.positions)
         self.evaporable = (self.positions[:, 2] >= -self._shape.shank_length / 2) & ~self.support
 
     def _set_neighbourhood(self, structure, distance):
@@ -349,24 +351,24 @@ class Tip:
         self.masses = np.array([element.mass for element in elements])
 
 
-def _as_material(value):
+def _as_material(value, name="material"):
     if isinstance(value, str):
         return known_material(value)
-    if not isinstance(value, Material):
-        raise ValueError(f"material must be a Material or the name of one, got {value!r}")
-    return value
+    return check_kind(value, name, Material, "a Material or the name of one")
 
 
 def _check_solutes(solutes, seed):
     """Atomic fraction by Material."""
     fractions = {}
+    if solutes is not None:
+        check_kind(solutes, "solutes", Mapping, "a mapping of an element to its atomic fraction")
     for element, fraction in (solutes or {}).items():
-        solute = _as_material(element)
+        solute = _as_material(element, "solutes")
         fractions[solute] = check_number(fraction, f"fraction of {solute.name}", above=0, at_most=1)
     if sum(fractions.values()) > 1:
         raise ValueError(f"solutes must have fractions that sum to at most 1, got {sum(fractions.values()):g}")
     if fractions or seed is not None:
-        check_count(seed, "seed (the random places of the solutes are drawn from it)")
+        check_seed(seed, "seed (the random places of the solutes are drawn from it)")
     return fractions
 
 
