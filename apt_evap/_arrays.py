@@ -12,7 +12,7 @@ LARGEST_SEED = 2**64 - 1
 _LARGEST_COUNT = 2**63 - 1  # what the compiled core counts with
 _LARGEST = 1e100  # the cube of a number is still a number
 _SHORT = reprlib.Repr()
-_SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 60
+_SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 100
 
 
 def check_array(value, name, shape, *, dtype=np.float64, finite=True):

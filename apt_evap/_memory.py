@@ -1,9 +1,10 @@
 """Whether a specimen fits into the memory."""
 
-# Peaks of building a specimen, charging it and flying 300 ions, of 18 specimens of five lattices with 1 to 28 million
-# atoms, whole or a shell: within 15 % of these two numbers. Building alone takes 52 to 63 per atom.
+# Peaks of building a specimen, charging it and flying 300 ions, of 18 specimens of five lattices with 0.4 to 28 million
+# atoms, whole or a shell: within 15 % of what the first two say. The third is 150 to 215, by 1 to 8 threads.
 _BYTES_PER_ATOM = 81
 _BYTES_PER_SURFACE_ATOM = 577
+_BYTES_PER_COPIED_ATOM = 180
 
 
 def _available_memory():
@@ -13,6 +14,11 @@ def _available_memory():
             return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable"))
     except (OSError, StopIteration):
         return None
+
+
+def needed_memory(atoms, surface_atoms):
+    """Most memory [bytes] that a specimen and its charges take, from how many atoms it has and has on the surface."""
+    return _BYTES_PER_ATOM * atoms + _BYTES_PER_SURFACE_ATOM * surface_atoms
 
 
 def check_memory(atoms, surface_atoms):
@@ -28,15 +34,23 @@ def check_memory(atoms, surface_atoms):
     ValueError
         Naming what is needed and what is free.
     """
-    needed, free = needed_memory(atoms, surface_atoms), _available_memory()
+    _check(
+        needed_memory(atoms, surface_atoms),
+        f"a tip of {atoms:.2g} atoms",
+        "give depth=... to hold only the atoms near the surface, a smaller apex_radius or a shorter shank_length",
+    )
+
+
+def check_copies(surface_atoms, n_threads):
+    """Refuse more threads than there is memory for, each with a copy of the surface (ValueError)."""
+    _check(
+        _BYTES_PER_COPIED_ATOM * surface_atoms * n_threads,
+        f"n_threads={n_threads}, each with a copy of {surface_atoms:.2g} surface atoms,",
+        "give fewer",
+    )
+
+
+def _check(needed, what, advice):
+    free = _available_memory()
     if free is not None and not needed <= free:
-        raise ValueError(
-            f"a tip of {atoms:.2g} atoms, {surface_atoms:.2g} of them on the surface, needs about {needed / 1e9:.2g} GB, "
-            f"{free / 1e9:.2g} GB are free; give depth=... to hold only the atoms near the surface, a smaller "
-            "apex_radius or a shorter shank_length"
-        )
-
-
-def needed_memory(atoms, surface_atoms):
-    """Memory [bytes] that a specimen and its charges take at most; parameters as for `check_memory`."""
-    return _BYTES_PER_ATOM * atoms + _BYTES_PER_SURFACE_ATOM * surface_atoms
+        raise ValueError(f"{what} needs about {needed / 1e9:.2g} GB, {free / 1e9:.2g} GB are free; {advice}")

@@ -8,6 +8,7 @@ from skimage.metrics import structural_similarity
 from skimage.morphology import disk
 
 from apt_evap._arrays import check_kind, check_number, check_seed
+from apt_evap.hits import Hits
 from apt_evap.maps import DetectorMap
 
 _WINDOW = 5
@@ -151,6 +152,7 @@ def half_ceiling(hits, *, smoothing=0.0, data_range=2.0, seed=0, **options):
             raise ValueError(f"a map is already binned and takes no {', '.join(options)}")
         whole = hits
     else:
+        check_kind(hits, "hits", Hits, "Hits or a DetectorMap")
         whole = DetectorMap.from_hits(hits, **options)
     # dividing every bin binomially is the same as dividing the ions one by one
     half = np.random.default_rng(seed).binomial(whole.counts, 0.5)

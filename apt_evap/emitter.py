@@ -143,7 +143,9 @@ class Emitter:
         self.law = Extremal() if law is None else check_kind(law, "law", "weights", "a law with a method weights")
         self.settings = ChargeSettings() if settings is None else settings
         check_kind(self.settings, "settings", ChargeSettings, "ChargeSettings")
-        self.rule = Robin() if rule is None else check_kind(rule, "rule", ChargingRule, "a ChargingRule such as Robin()")
+        self.rule = (
+            Robin() if rule is None else check_kind(rule, "rule", ChargingRule, "a ChargingRule such as Robin()")
+        )
         self.n_threads = thread_count(n_threads)
         distance = tip.nearest_neighbour_distance
         neighbourhood, weights = self._neighbourhood_of(tip), self._weights_of(tip)

@@ -308,4 +308,6 @@ def _bounds(limits, name):
         high = np.inf if pair[1] is None else pair[1]
         if isinstance(low, Real) and isinstance(high, Real) and low <= high:
             return low, high
-    raise ValueError(f"{name} must have two bounds (low, high) with low <= high, None for no bound, got {shown(limits)}")
+    raise ValueError(
+        f"{name} must have two bounds (low, high) with low <= high, None for no bound, got {shown(limits)}"
+    )

@@ -98,14 +98,18 @@ class TaperedCap:
             hollow = min(inner) > 0
             core = replace(self, apex_radius=inner[0], shank_length=inner[1]).volume() if hollow else 0.0
             return self.volume() - core
-        sin, cos, foot = self._flank
-        top, upper = self.apex_radius * sin, self.apex_radius * cos
-        bottom, lower, below = -self.shank_length, foot / cos, 0.0
-        if self.base == "rounded":
-            bottom, lower = foot * sin - self.shank_length, foot * cos
-            below = 4 / 3 * math.pi * foot**3 - _cap_volume(foot, foot * sin)
-        frustum = math.pi / 3 * (top - bottom) * (upper**2 + upper * lower + lower**2)
-        return _cap_volume(self.apex_radius, top) + frustum + below
+        if self.base == "flat":
+            return self.volume_above(-self.shank_length)
+        sin, _, foot = self._flank
+        below = 4 / 3 * math.pi * foot**3 - _cap_volume(foot, foot * sin)
+        return self.volume_above(foot * sin - self.shank_length) + below
+
+    def volume_above(self, z):
+        """Volume of the part of the shape above a height `z` on its flank [nm^3]."""
+        sin, cos, _ = self._flank
+        top, upper, lower = self.apex_radius * sin, self.apex_radius * cos, (self.apex_radius - z * sin) / cos
+        frustum = math.pi / 3 * (top - z) * (upper**2 + upper * lower + lower**2)
+        return _cap_volume(self.apex_radius, top) + frustum
 
 
 def _cap_volume(radius, height):

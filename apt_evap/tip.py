@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from apt_evap import lattice
-from apt_evap._arrays import check_array, check_kind, check_number, check_seed, check_sequence, shown
+from apt_evap._arrays import check_array, check_kind, check_number, check_seed, check_sequence
 from apt_evap._memory import check_memory
 from apt_evap.material import Material
 from apt_evap.material import material as known_material
@@ -188,7 +188,7 @@ class Tip:
             If shapes disagree, an index names no element, or two atoms are at the same place.
         """
         tip = cls.__new__(cls)
-        tip._shape = None
+        tip._shape = tip._depth = None
         tip.positions = check_array(positions, "positions", ("n", 3))
         n = len(tip.positions)
         if n < 2:
@@ -266,6 +266,16 @@ class Tip:
             f"<Tip: {len(self)} atoms of {names} [{axis}], apex radius {shape.apex_radius:.4g} nm, "
             f"shank {shape.shank_length:.4g} nm at {shape.shank_angle:g} degrees, {shape.base} base>"
         )
+
+    @property
+    def most_ions(self):
+        """How many atoms may leave, those that a shell does not hold yet included: exact only without `depth`."""
+        held = int(np.count_nonzero(self.evaporable))
+        if self._depth is None:
+            return held
+        host = self.elements[0]
+        volume = self._shape.volume_above(-self._shape.shank_length / 2)
+        return max(held, round(volume * lattice.atom_density(host.structure, host.a, host.c)))
 
     def signed_distance(self, points):
         """Distance from the surface of the shape [nm], negative inside: see `TaperedCap.signed_distance`.

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
+from apt_evap._arrays import check_choice, check_switch, shown
 from apt_evap._files import FileError, TruncatedFile, open_for_reading, replace_file
 from apt_evap.hits import Outcome
 
@@ -91,8 +92,9 @@ def open_words(path, row_size, kind, *, order="big", floats=4, partial=False, by
     TruncatedFile
         If the size is no multiple of `row_size` and `partial` is False.
     """
-    if byte_order not in (None, *_ORDERS):
-        raise ValueError(f"byte_order must be None, 'big' or 'little', got {byte_order!r}")
+    check_switch(partial, "partial")
+    if byte_order is not None:
+        check_choice(byte_order, "byte_order", _ORDERS)
     words = row_size // 4
     with open_for_reading(path) as file:
         size = os.fstat(file.fileno()).st_size
@@ -149,7 +151,7 @@ def check_columns(columns, available, path):
         chosen = ()
     for name in chosen or (columns,):
         if name not in available:
-            raise FileError(f"{str(path)!r} has no column {name!r}, expected some of {', '.join(available)}")
+            raise FileError(f"{str(path)!r} has no column {shown(name)}, expected some of {', '.join(available)}")
     return chosen
 
 
