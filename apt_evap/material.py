@@ -12,7 +12,7 @@ _TSONG = "Tsong, Surf. Sci. 70, 211 (1978), image-hump model, charge state of lo
 _MULLER = "measured; Mueller and Tsong, Field Ion Microscopy (1969)"
 _IUPAC = "IUPAC standard atomic weights, abridged (Prohaska et al., Pure Appl. Chem. 94, 573, 2022)"
 _SHAIKH = "Shaikh et al., arXiv 2509.13744, appendix on polarization"
-# slips of the unit: 3.52 Angstrom for a, 35e9 V/m; no element has more
+# more is a slip of the unit, 3.52 (Angstrom) for a or 35e9 (V/m): no element has it
 _LONGEST = 2.0
 _HIGHEST_FIELD = 1000.0
 
@@ -68,7 +68,7 @@ class Material:
                 self.evaporation_field, "evaporation_field", above=0, at_most=_HIGHEST_FIELD, unit="V/nm"
             ),
             "charge_state": check_count(self.charge_state, "charge_state", at_least=1, at_most=118),
-            "mass": check_number(self.mass, "mass", at_least=1, unit="Da"),
+            "mass": check_number(self.mass, "mass", at_least=1, at_most=1e4, unit="Da"),
             "sources": dict(check_kind(self.sources, "sources", Mapping, "a mapping of a field to its source")),
         }
         if (self.structure == "hcp") != (self.c is not None):
@@ -77,7 +77,9 @@ class Material:
         if self.c is not None:
             checked["c"] = check_number(self.c, "c", above=0, at_most=_LONGEST, unit="nm")
         if self.polarizability is not None:
-            checked["polarizability"] = check_number(self.polarizability, "polarizability", above=0, unit="F m^2")
+            checked["polarizability"] = check_number(
+                self.polarizability, "polarizability", above=0, at_most=1e-30, unit="F m^2"
+            )
         for name, value in checked.items():
             object.__setattr__(self, name, value)
 
@@ -140,7 +142,7 @@ def material(name, **changes):
     for change in changes:
         if change not in known:
             raise ValueError(f"a material has no {change!r}{did_you_mean(change, known)}; it has {', '.join(known)}")
-    if name not in list(MATERIALS):
+    if not isinstance(name, str) or name not in MATERIALS:
         known = f"known are {', '.join(MATERIALS)}, any other is a Material(...) of your own"
         raise ValueError(f"no material is named {shown(name)}{did_you_mean(name, MATERIALS)}; {known}")
     found = MATERIALS[name]

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from apt_evap._arrays import check_count, check_kind, check_number, check_sequence, shown
+from apt_evap.energy import HIGHEST_ENERGY
 from apt_evap.units import FLIGHT_TIME
 
 _HIGHEST_DEGREE = 12  # 91 coefficients: no response needs more
@@ -139,7 +140,7 @@ class ResponseSettings:
     bound: float = 0.2
 
     def __post_init__(self):
-        check_number(self.energy_limit, "energy_limit", above=0, unit="eV")
+        check_number(self.energy_limit, "energy_limit", above=0, at_most=HIGHEST_ENERGY, unit="eV")
         check_number(self.bound, "bound", above=0, unit="mm")
         for name in ("site", "rolled"):
             check_kind(getattr(self, name), name, Design, "a Design")

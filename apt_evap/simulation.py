@@ -293,7 +293,7 @@ class Simulation:
         left = self.tip.most_ions - self.emitter.counts["events"]
         if n_ions > left:
             warnings.warn(
-                f"n_ions is {n_ions:,} and only about {max(left, 0):,} atoms may leave: the run ends with the last of them",
+                f"n_ions is {n_ions:,} but only about {max(left, 0):,} atoms may leave: the run ends with the last",
                 stacklevel=3,
             )
 

@@ -17,6 +17,7 @@ from apt_evap.shape import TaperedCap
 _ROUNDING = 1e-6  # nearest neighbour distances: sites on the surface stay together whatever their rounding
 _SKIN = 3.2  # neighbour radii held below the surface where hardly an atom leaves: two of them are support
 _LAYER = 0.74  # thickness of the layer of surface atoms [d_nn]: 0.48 a^2 of the surface for each one of fcc
+_WIDEST = 10  # neighbourhood [d_nn]: 6,000 atoms each, more do not fit into the memory
 _SAMPLE = 10_000  # atoms asked for their nearest neighbour
 
 
@@ -209,9 +210,13 @@ class Tip:
             raise ValueError("positions must be distinct, got two atoms at the same place")
         tip._set_neighbourhood(elements[0].structure, float(np.median(distances)))
         if neighbour_radius is not None:
-            tip.neighbour_radius = check_number(neighbour_radius, "neighbour_radius", above=0, unit="nm")
+            tip.neighbour_radius = check_number(
+                neighbour_radius, "neighbour_radius", above=0, at_most=_WIDEST * float(np.median(distances)), unit="nm"
+            )
         if surface_threshold is not None:
-            tip.surface_threshold = check_number(surface_threshold, "surface_threshold", above=0, unit="nm")
+            tip.surface_threshold = check_number(
+                surface_threshold, "surface_threshold", above=0, at_most=tip.neighbour_radius, unit="nm"
+            )
         low, high = tip.positions.min(axis=0), tip.positions.max(axis=0)
         tip.apex = float(high[2])
         if evaporable is None:
