@@ -43,8 +43,8 @@ def check_array(value, name, shape, *, dtype=np.float64, finite=True):
     wanted = "(" + ", ".join(str(length) for length in shape) + ("," if len(shape) == 1 else "") + ")"
     try:
         given = np.asarray(value)
-        if given.dtype.kind not in "biufO":
-            raise TypeError(f"{given.dtype} is no number")
+        if given.dtype.kind not in "biufO" or (given.ndim == 0 and shape):
+            raise TypeError(f"{given.dtype} is no array of numbers")
         with np.errstate(invalid="ignore", over="ignore"):
             array = np.ascontiguousarray(given, dtype=dtype)
     except (TypeError, ValueError, OverflowError) as error:

@@ -53,4 +53,5 @@ def check_copies(surface_atoms, n_threads):
 def _check(needed, what, advice):
     free = _available_memory()
     if free is not None and not needed <= free:
-        raise ValueError(f"{what} needs about {needed / 1e9:.2g} GB, {free / 1e9:.2g} GB are free; {advice}")
+        needed, free = (f"{size / 1e9:.2g}" if size < 1e11 else f"{size / 1e9:,.0f}" for size in (needed, free))
+        raise ValueError(f"{what} needs about {needed} GB, {free} GB are free; {advice}")

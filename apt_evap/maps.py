@@ -158,8 +158,10 @@ class DetectorMap:
         y_edges = _check_edges(y_edges, "y_edges", values.shape[0])
         finite = np.isfinite(values)
         mask = _check_mask(finite if mask is None else mask, values.shape)
-        if not (finite & mask).any() or (values[finite] < 0).any():
-            raise ValueError("values of a map must not be negative, and some must be finite and in the mask")
+        if not (finite & mask).any():
+            raise ValueError("values must be finite somewhere in the mask, got none there")
+        if values[finite].min() < 0:
+            raise ValueError(f"values of a map must be at least 0, got {values[finite].min():g}")
         mask = mask & finite
         values = np.where(finite, values, 0.0)
         ions = None

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import h5py
 import numpy as np
 
-from apt_evap._arrays import check_switch, shown
+from apt_evap._arrays import check_kind, check_switch, shown
 from apt_evap._files import FileError, check_path, open_for_reading, replace_file
 from apt_evap._version import __version__
 from apt_evap.detector import Detector
@@ -138,6 +138,7 @@ class Run:
             if known and not by_response:
                 return self._hits(flown.directions, flown.times, perturbation)
         if not callable(getattr(perturbation, "tangential", None)):
+            check_kind(perturbation, "perturbation", "launch", "a perturbation such as Unperturbed() or RollUp(0.2)")
             raise ValueError(
                 f"perturbation {shown(perturbation)} was not flown in this run and does not say how it launches along "
                 "the surface; name it when the run starts: simulation.run(n, emissions=[...])"

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from apt_evap import lattice
-from apt_evap._arrays import check_array, check_kind, check_number, check_seed, check_sequence
+from apt_evap._arrays import check_array, check_kind, check_number, check_seed, check_sequence, shown
 from apt_evap._memory import check_memory
 from apt_evap.material import Material
 from apt_evap.material import material as known_material
@@ -255,8 +255,8 @@ class Tip:
             settings["material"] = Material(**settings["material"])
             settings["solutes"] = {Material(**solute): fraction for solute, fraction in settings.get("solutes") or ()}
             return cls(**settings)
-        except TypeError as error:
-            raise ValueError(f"settings of a tip: {error}") from error
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"settings must be those of a tip, got {shown(settings)}: {error}") from error
 
     def __len__(self):
         return len(self.positions)
