@@ -350,13 +350,13 @@ def check(function, good, argument, values, folder):
     assert not os.listdir(folder)
 
 
-@pytest.mark.parametrize(("function", "good", "argument", "values"), calls(CASES))
+@pytest.mark.parametrize(("function", "good", "argument", "values"), list(calls(CASES)))
 def test_bad_arguments_are_refused_by_name(tmp_path, monkeypatch, function, good, argument, values):
     monkeypatch.chdir(tmp_path)
     check(function, good, argument, values, tmp_path)
 
 
-@pytest.mark.parametrize(("function", "good", "argument", "values"), calls(NEEDS_A_RUN))
+@pytest.mark.parametrize(("function", "good", "argument", "values"), list(calls(NEEDS_A_RUN)))
 def test_bad_arguments_of_a_simulation_are_refused_by_name(
     tmp_path, monkeypatch, ready, function, good, argument, values
 ):

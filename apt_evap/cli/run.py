@@ -5,8 +5,8 @@ from dataclasses import replace
 
 from apt_evap._files import FileError, check_path
 from apt_evap.cli._files import check_output, is_picture, is_run, picture_path, save_picture
-from apt_evap.cli._options import INTERRUPTED, SHAPE, say, whole
-from apt_evap.cli.map import run_maps
+from apt_evap.cli._options import INTERRUPTED, SHAPE, add_speech, say, tell, tell_json, whole
+from apt_evap.cli.map import described, run_maps
 from apt_evap.config import read_config
 
 
@@ -26,7 +26,7 @@ def add_parser(commands):
     command.add_argument("--threads", type=whole(1), metavar="N", help="default: all processors")
     command.add_argument("--seed", type=whole(0), metavar="N", help="instead of that of the file")
     command.add_argument("--map", metavar="MAP.png", help="picture of the maps; default: beside the run")
-    command.add_argument("--quiet", action="store_true", help="no progress bar, no summary")
+    add_speech(command)
     command.add_argument("--force", action="store_true", help="overwrite files that apt-evap did not make")
     command.set_defaults(command=_run)
 
@@ -41,12 +41,8 @@ def _run(options):
     check_output(output, is_run, options.force)
     check_output(picture, is_picture, options.force)
 
-    def tell(line):
-        if not options.quiet:
-            print(line, flush=True)
-
     simulation = config.simulation(seed=options.seed, n_threads=options.threads)
-    tell(f"{str(simulation.tip).strip('<>')}; {len(simulation.emitter):,} atoms on the surface")
+    tell(options, f"{str(simulation.tip).strip('<>')}; {len(simulation.emitter):,} atoms on the surface")
     began = time.perf_counter()
     provenance = {"config": config.path.name, "maps": config.maps.to_dict()}
     try:
@@ -64,18 +60,24 @@ def _run(options):
     seconds = time.perf_counter() - began
     run = replace(run, provenance=run.provenance | provenance)
     run.save(output)
-    tell(f"{len(run):,} ions in {seconds:.1f} s, {len(run) / seconds:,.0f} ions/s")
+    tell(options, f"{len(run):,} ions in {seconds:.1f} s, {len(run) / seconds:,.0f} ions/s")
     for panel in config.maps.panels:
         hit, missed, never_left = run.hits(panel.perturbation).counts.values()
-        tell(f"{panel.title}: {hit:,} hit the detector, {missed:,} missed it, {never_left:,} never left the tip")
+        tell(
+            options, f"{panel.title}: {hit:,} hit the detector, {missed:,} missed it, {never_left:,} never left the tip"
+        )
     if run.responses is not None:
-        tell(f"responses: {run.marked.sum():,} ions marked as inexact")
+        tell(options, f"responses: {run.marked.sum():,} ions marked as inexact")
     if run.ended:
         say("note", f"the run ended before its time: {run.ended}; the {len(run):,} ions so far are kept")
-    tell(f"wrote {output}")
+    tell(options, f"wrote {output}")
     try:
-        save_picture(picture, *run_maps(run, config.maps))
+        maps = run_maps(run, config.maps)
+        save_picture(picture, *maps)
     except ValueError as error:
         raise ValueError(f"no maps are drawn, the run is in {str(output)!r}: {error}") from error
-    tell(f"wrote {picture}")
+    tell(options, f"wrote {picture}")
+    counts = {key: value for key, value in run.summary().items() if key != "ended"}
+    written = {"wrote": str(output), "picture": str(picture), "maps": described(*maps)}
+    tell_json(options, {**written, **counts, "seconds": round(seconds, 3), "ended": run.ended or "as planned"})
     return INTERRUPTED if run.ended == "interrupted" else 0

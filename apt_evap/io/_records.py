@@ -11,6 +11,7 @@ from apt_evap._files import FileError, TruncatedFile, open_for_reading, replace_
 from apt_evap.hits import Outcome
 
 _CHUNK = 1 << 14
+_SURVEY = 1 << 16
 _ORDERS = {"big": ">", "little": "<"}
 
 
@@ -56,6 +57,39 @@ class Words:
                 for word in range(count):  # a word at a time is faster than rows of three
                     column[:, word] = rows.view(self._order + dtype)[:, first + word]
         return columns
+
+    def survey(self, fields):
+        """Read the whole file in blocks of a size that stays in the cache."""
+        for start in range(0, self.n, _SURVEY):
+            yield self.read(fields, start, min(start + _SURVEY, self.n))
+
+    def blocks(self, fields, rows, keep, ahead=0):
+        """Read blocks of at most `rows` ions that end with a pulse.
+
+        Parameters
+        ----------
+        fields : dict
+            As for `read`.
+        rows : int
+            Most ions of a block.
+        keep : callable
+            Takes the columns of a block, returns how many of its rows are in whole pulses.
+        ahead : int
+            Rows after a block that `keep` is shown too.
+
+        Yields
+        ------
+        dict of ndarray
+        """
+        start = 0
+        while start < self.n:
+            stop = min(start + rows, self.n)
+            block = self.read(fields, start, min(stop + ahead, self.n))
+            kept = keep(block) if stop < self.n else stop - start
+            block = {name: values[:kept] for name, values in block.items()}
+            yield block
+            del block  # before the next one takes up memory, here and where it was taken
+            start += kept
 
 
 @contextmanager
@@ -153,6 +187,28 @@ def check_columns(columns, available, path):
         if name not in available:
             raise FileError(f"{str(path)!r} has no column {shown(name)}, expected some of {', '.join(available)}")
     return chosen
+
+
+def choose_fields(columns, available, fields, path, also):
+    """Return the names of the columns to read, and the fields that takes.
+
+    Parameters
+    ----------
+    columns, available, path
+        As for `check_columns`.
+    fields : dict
+        All fields of the format by name, as for `Words.read`.
+    also : dict
+        What else has to be read for a column, names by name.
+
+    Returns
+    -------
+    chosen : tuple of str
+    fields : dict
+    """
+    chosen = check_columns(columns, available, path)
+    needed = {*chosen, *(other for name in chosen for other in also.get(name, ()))}
+    return chosen, {name: field for name, field in fields.items() if name in needed}
 
 
 def check_any(chosen, path):
