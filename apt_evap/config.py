@@ -55,7 +55,7 @@ class MapSettings:
         return {"panels": panels, "bins": self.bins, "smoothing": self.smoothing}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Config:
     """What a TOML file says about a simulation; made by `read_config`.
 
@@ -95,6 +95,13 @@ class Config:
     response_settings: ResponseSettings
     maps: MapSettings
     output: str | None
+
+    def __repr__(self):
+        host, radius = self.tip["material"].name, self.tip["apex_radius"]
+        panels = ", ".join(panel.title for panel in self.maps.panels)
+        return (
+            f"<Config {str(self.path)!r}: {self.n_ions:,} ions of {host}, apex radius {radius:.4g} nm; maps: {panels}>"
+        )
 
     @property
     def emissions(self):

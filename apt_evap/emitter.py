@@ -76,7 +76,7 @@ class ChargeSettings:
             check_count(self.sweep_interval, "sweep_interval", at_least=1)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Batch:
     """Atoms that left one after the other.
 
@@ -111,6 +111,10 @@ class Batch:
 
     def __len__(self):
         return len(self.site)
+
+    def __repr__(self):
+        status = {DONE: "done", SWEEP_DUE: "sweep due", EXHAUSTED: "exhausted", TOO_SHALLOW: "too shallow"}[self.status]
+        return f"<Batch: {len(self):,} atoms left one after the other; {status}>"
 
 
 class Emitter:

@@ -149,6 +149,13 @@ def material(name, **changes):
     return replace(found, **changes, sources=found.sources | dict.fromkeys(changes, "given by the user"))
 
 
+def as_material(value, name="material"):
+    """Return a material as it is, the known one of a name, or say what was expected (ValueError)."""
+    if isinstance(value, str):
+        return material(value)
+    return check_kind(value, name, Material, "a Material or the name of one")
+
+
 def polarization_energy(polarizability, voltage, field_factor, radius, step):
     """Energy that polarization gives an atom moving one step up the field gradient: a lower bound of E_perp.
 

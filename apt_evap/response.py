@@ -164,6 +164,10 @@ class Responses(NamedTuple):
     rolled: np.ndarray
     residuals: np.ndarray
 
+    def __repr__(self):
+        n, _, coefficients = self.site.shape
+        return f"<Responses: {n:,} ions, {coefficients} coefficients from the site, {self.rolled.shape[2]} rolled up>"
+
 
 def flattened(directions, times):
     """The three quantities that are fitted, shape (n, 3), from directions (n, 2) and times of flight (n,)."""

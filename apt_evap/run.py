@@ -21,12 +21,15 @@ from apt_evap.response import Design, Responses, ResponseSettings, unflattened
 FORMAT = "apt_evap run 1"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Flown:
     """What one perturbation gave in the run: stereographic directions (n, 2) and times of flight (n,) [ns]."""
 
     directions: np.ndarray
     times: np.ndarray
+
+    def __repr__(self):
+        return f"<Flown: directions and times of {len(self.times):,} ions>"
 
 
 @dataclass(frozen=True, eq=False, repr=False)

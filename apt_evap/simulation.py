@@ -101,7 +101,11 @@ class Simulation:
         return self.emitter.tip
 
     def __repr__(self):
-        return f"<Simulation of {self.tip!r}, {self.voltage:g} V, {self.n_evaporated:,} atoms evaporated>"
+        tip, detector = repr(self.tip).removeprefix("<Tip: ").removesuffix(">"), self.detector
+        return (
+            f"<Simulation: {self.n_evaporated:,} evaporated of {tip}; {self.voltage:g} V, seed {self.seed}, detector "
+            f"of {detector.width:g} mm at {detector.distance:g} mm>"
+        )
 
     def run(self, n_ions, emissions=(), *, responses=True, progress=None, batch_size=BATCH):
         """Evaporate atoms and fly their ions.

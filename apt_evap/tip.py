@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 from apt_evap import lattice
 from apt_evap._arrays import check_array, check_kind, check_number, check_seed, check_sequence, shown
 from apt_evap._memory import check_memory
-from apt_evap.material import Material
-from apt_evap.material import material as known_material
+from apt_evap.alloy import check_solutes, draw_species
+from apt_evap.material import Material, as_material
 from apt_evap.shape import TaperedCap
 
 _ROUNDING = 1e-6  # nearest neighbour distances: sites on the surface stay together whatever their rounding
@@ -100,7 +100,7 @@ class Tip:
         solutes=None,
         seed=None,
     ):
-        host = _as_material(material)
+        host = as_material(material)
         d = host.nearest_neighbour_distance
         radius = check_number(apex_radius, "apex_radius", at_least=3 * d, unit="nm")
         length = 2 * radius if shank_length is None else shank_length
@@ -110,7 +110,7 @@ class Tip:
         if depth is not None:
             depth = check_number(depth, "depth", above=self.neighbour_radius, unit="nm")
         self._depth = depth
-        fractions = _check_solutes(solutes, seed)
+        fractions = check_solutes(solutes, seed)
         orientation = lattice.rotation_to_axis(host, axis, rotation)
         density = lattice.atom_density(host.structure, host.a, host.c)
         check_memory(self._held_volume() * density, shape.volume(_LAYER * d) * density)
@@ -131,7 +131,7 @@ class Tip:
             tolerance=_ROUNDING * d,
         )
         self._mark()
-        self._set_elements((host, *fractions), _draw_species(len(self), fractions, seed))
+        self._set_elements((host, *fractions), draw_species(len(self), fractions, seed))
         self.apex = radius
         self.potential_point = np.zeros(3)
         self.settings = {
@@ -197,7 +197,7 @@ class Tip:
         elements = check_sequence(elements, "elements", "materials, such as ('Ni',)")
         if not elements:
             raise ValueError("elements must name at least one material, got none")
-        elements = tuple(_as_material(element, "elements") for element in elements)
+        elements = tuple(as_material(element, "elements") for element in elements)
         tip._set_elements(elements, check_array(species, "species", (n,), dtype=np.int32))
         if not 0 <= tip.species.min() <= tip.species.max() < len(elements):
             raise ValueError(
@@ -264,12 +264,13 @@ class Tip:
     def __repr__(self):
         names = "-".join(element.name for element in self.elements)
         if self._shape is None:
-            return f"<Tip: {len(self)} atoms of {names} from positions>"
+            return f"<Tip: {len(self):,} atoms of {names} from positions>"
         shape = self._shape
         axis = " ".join(str(index) for index in self.settings["axis"])
+        held = "" if self._depth is None else f", held to a depth of {self._depth:.4g} nm"
         return (
-            f"<Tip: {len(self)} atoms of {names} [{axis}], apex radius {shape.apex_radius:.4g} nm, "
-            f"shank {shape.shank_length:.4g} nm at {shape.shank_angle:g} degrees, {shape.base} base>"
+            f"<Tip: {len(self):,} atoms of {names} [{axis}], apex radius {shape.apex_radius:.4g} nm, "
+            f"shank {shape.shank_length:.4g} nm at {shape.shank_angle:g} degrees, {shape.base} base{held}>"
         )
 
     @property
@@ -364,36 +365,6 @@ class Tip:
         self.evaporation_fields = np.array([element.evaporation_field for element in elements])
         self.charge_states = np.array([element.charge_state for element in elements], dtype=np.int32)
         self.masses = np.array([element.mass for element in elements])
-
-
-def _as_material(value, name="material"):
-    if isinstance(value, str):
-        return known_material(value)
-    return check_kind(value, name, Material, "a Material or the name of one")
-
-
-def _check_solutes(solutes, seed):
-    """Atomic fraction by Material."""
-    fractions = {}
-    if solutes is not None:
-        check_kind(solutes, "solutes", Mapping, "a mapping of an element to its atomic fraction")
-    for element, fraction in (solutes or {}).items():
-        solute = _as_material(element, "solutes")
-        fractions[solute] = check_number(fraction, f"fraction of {solute.name}", above=0, at_most=1)
-    if sum(fractions.values()) > 1:
-        raise ValueError(f"solutes must have fractions that sum to at most 1, got {sum(fractions.values()):g}")
-    if fractions or seed is not None:
-        check_seed(seed, "seed (the random places of the solutes are drawn from it)")
-    return fractions
-
-
-def _draw_species(n, fractions, seed):
-    """Index of the element of each of n atoms: the host is 0."""
-    if not fractions:
-        return np.zeros(n, dtype=np.int32)
-    edges = np.cumsum(list(fractions.values()))
-    drawn = np.searchsorted(edges, np.random.default_rng(seed).random(n), side="right")
-    return ((drawn + 1) % (len(fractions) + 1)).astype(np.int32)
 
 
 def _digest(*arrays):

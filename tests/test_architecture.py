@@ -13,7 +13,7 @@ PACKAGE = Path(__file__).parents[1] / "apt_evap"
 FLOORS = (
     {"units", "_arrays", "_threads", "_memory", "_files", "_version"},
     {"_core"},
-    {"lattice", "ranges", "shape", "material", "tip", "detector", "hits"},
+    {"lattice", "ranges", "shape", "material", "alloy", "tip", "detector", "hits"},
     {"ion_random", "energy", "emission", "perturbation", "law", "emitter", "flights", "response"},
     {"run", "simulation"},
     {"binning", "maps", "register", "compare", "study", "config", "info", "io"},

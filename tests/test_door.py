@@ -15,6 +15,7 @@ import pytest
 import apt_evap as ae
 from apt_evap import _memory
 from apt_evap._arrays import shown
+from apt_evap.config import read_config
 from apt_evap.perturbation import from_dict
 from apt_evap.shape import TaperedCap
 
@@ -462,3 +463,36 @@ def test_what_does_not_fit_is_refused_before_it_is_built(monkeypatch):
         ValueError, match=r"n_threads=64, each with a copy of .* needs about 0.0\d+ GB, 0.001 GB are free"
     ):
         ae.Simulation(shell, n_threads=64)
+
+
+# ---- what things say of themselves -----------------------------------------------------------------------------------
+
+
+def test_everything_says_in_one_line_what_it_holds(ready, tmp_path):
+    simulation, run, emitter = (ready[name] for name in ("simulation", "run", "emitter"))
+    (tmp_path / "a.toml").write_text('[tip]\nmaterial = "Ni"\napex_radius = "6 a"\n[simulation]\nions = 60\n')
+    launches = ae.Unperturbed().launch(run.emissions, ae.IonRandom(1, run.emissions.ions))
+    told = [
+        (simulation, ["Simulation", "1000 V", "seed 0", "atoms of Ni [0 0 1]", "300 mm at 100 mm"]),
+        (shell, ["Tip", f"{len(shell):,} atoms of Ni [0 0 1]", "1.5 nm", "to a depth of 1.2 nm"]),
+        (emitter, ["Emitter", f"{len(emitter):,} surface atoms", "1000 V"]),
+        (run, ["Run", "12 ions of Ni", "1000 V", "marked"]),
+        (run.hits(ae.Unperturbed()), ["Hits", "12 ions", "detected", "Unperturbed()", "time_of_flight"]),
+        (run.emissions, ["Emissions", "12 atoms", "neighbour"]),
+        (launches, ["Launches", "12 ions", "0 of them rolled up"]),
+        (grid, ["DetectorMap", "densities", "20 x 20 bins of 1 x 1 mm"]),
+        (ranges, ["Ranges", "1 of Ni"]),
+        (nickel, ["Material", "Ni", "fcc", "0.352", "35.0"]),
+        (ae.Detector(), ["Detector", "distance=100.0", "width=300.0"]),
+        (read_config(tmp_path / "a.toml"), ["Config", "a.toml", "60 ions of Ni", "2.112 nm", "roll-up"]),
+        (ae.RollUp(ae.TruncatedNormal(0.3, 0.1)), ["RollUp(energy=TruncatedNormal(mean=0.3, standard_deviation=0.1))"]),
+        (ae.IonRandom(1, [0, 1]), ["IonRandom", "seed=1", "2 ions"]),
+        (ae.ChargeSettings(), ["ChargeSettings", "tolerance=", "opening_angle=0.4"]),
+        (ae.FlightSettings(), ["FlightSettings", "tolerance=", "most_steps=500"]),
+        (ae.ResponseSettings(), ["energy_limit=1.5", "bound=0.2", "degree=4"]),
+    ]
+    for thing, words in told:
+        assert all(word in repr(thing) for word in words), repr(thing)
+        assert "\n" not in repr(thing) and len(repr(thing)) < 260 and "0x" not in repr(thing)
+    assert repr(run.responses) == "<Responses: 12 ions, 15 coefficients from the site, 10 rolled up>"
+    assert "atoms left one after the other" in repr(emitter.evaporate(1))

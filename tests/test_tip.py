@@ -161,7 +161,7 @@ def test_attributes_are_what_the_solver_takes():
     assert (tip.evaporation_fields[0], tip.charge_states[0], tip.masses[0]) == (35.0, 1, NICKEL.mass)
     assert tip.apex == 8 * NICKEL.a and tip.potential_point.tolist() == [0, 0, 0]
     assert tip.positions[:, 2].max() <= tip.apex + 1e-9
-    assert "Ni [1 1 1]" in repr(tip) and str(n) in repr(tip)
+    assert "Ni [1 1 1]" in repr(tip) and f"{n:,}" in repr(tip)
 
 
 def test_settings_make_the_same_tip_after_json():
