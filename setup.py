@@ -13,9 +13,10 @@ from setuptools import Extension, setup
 from setuptools.command.build_ext import build_ext
 
 MODULES = ["octree", "sweep", "surface", "robin", "journal", "event", "flight"]
+BOUNDS = bool(os.environ.get("APT_EVAP_BOUNDS"))  # check every index: slow, for tools/sanitize.sh
 DIRECTIVES = {
     "language_level": 3,
-    "boundscheck": False,
+    "boundscheck": BOUNDS,
     "wraparound": False,
     "cdivision": True,
     "initializedcheck": False,
@@ -65,6 +66,11 @@ extensions = [
     if Path(f"apt_evap/_core/{name}.pyx").exists()
 ]
 setup(
-    ext_modules=cythonize(extensions, build_dir="build/cython", compiler_directives=DIRECTIVES, quiet="-q" in sys.argv),
+    ext_modules=cythonize(
+        extensions,
+        build_dir="build/cython-bounds" if BOUNDS else "build/cython",
+        compiler_directives=DIRECTIVES,
+        quiet="-q" in sys.argv,
+    ),
     cmdclass={"build_ext": BuildCore},
 )

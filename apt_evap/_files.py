@@ -1,7 +1,7 @@
 """What every reader and writer shares: errors in one sentence, whole files or none."""
 
 import os
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 
@@ -80,11 +80,24 @@ def replace_file(path):
             raise IsADirectoryError(None, "Is a directory")
         with open(aside, "wb") as file:
             yield file
+            file.flush()
+            os.fsync(file.fileno())  # a name must not come before the bytes, should the power fail
         os.replace(aside, target)
+        flush_folder(target.parent)
     except OSError as error:
         raise FileError(f"cannot write {str(path)!r}: {_reason(error)}") from error
     finally:
         aside.unlink(missing_ok=True)
+
+
+def flush_folder(folder):
+    """Make sure that the names of new files are on the disk too, where the system can do that."""
+    with suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def _reason(error):

@@ -1,4 +1,4 @@
-"""Random alloys: which solutes there are, and which site has which."""
+"""Random substitutional alloys: which atom is of which species."""
 
 from collections.abc import Mapping
 
@@ -9,7 +9,24 @@ from apt_evap.material import as_material
 
 
 def check_solutes(solutes, seed):
-    """Atomic fraction by Material."""
+    """Return atomic fractions by Material.
+
+    Parameters
+    ----------
+    solutes : mapping or None
+        Atomic fraction by element (str or Material).
+    seed : int or None
+        Needed if there are solutes.
+
+    Returns
+    -------
+    dict
+
+    Raises
+    ------
+    ValueError
+        If a fraction is not above 0, they sum to more than 1, or there is no seed.
+    """
     fractions = {}
     if solutes is not None:
         check_kind(solutes, "solutes", Mapping, "a mapping of an element to its atomic fraction")
@@ -24,7 +41,21 @@ def check_solutes(solutes, seed):
 
 
 def draw_species(n, fractions, seed):
-    """Index of the element of each of n atoms: the host is 0."""
+    """Draw the species of each of n atoms: 0 is the host, the solutes follow in the order of `fractions`.
+
+    Parameters
+    ----------
+    n : int
+        Number of atoms.
+    fractions : dict
+        Atomic fractions of the solutes.
+    seed : int
+        Seed of the draw.
+
+    Returns
+    -------
+    ndarray of int32, shape (n,)
+    """
     if not fractions:
         return np.zeros(n, dtype=np.int32)
     edges = np.cumsum(list(fractions.values()))

@@ -19,6 +19,7 @@ from apt_evap.perturbation import RollUp, Unperturbed, from_dict, to_dict
 from apt_evap.response import ResponseSettings
 from apt_evap.simulation import FlightSettings, Simulation
 from apt_evap.tip import Tip
+from apt_evap.watch import WatchSettings
 
 _LENGTH = re.compile(r"\s*(\S+?)\s*(a|nm)\s*")
 
@@ -77,6 +78,8 @@ class Config:
         The detector.
     charge_settings, flight_settings, response_settings : ChargeSettings, FlightSettings, ResponseSettings
         How finely everything is computed.
+    watch_settings : WatchSettings
+        How the run is watched.
     maps : MapSettings
         Maps to draw of the run.
     output : str or None
@@ -93,6 +96,7 @@ class Config:
     charge_settings: ChargeSettings
     flight_settings: FlightSettings
     response_settings: ResponseSettings
+    watch_settings: WatchSettings
     maps: MapSettings
     output: str | None
 
@@ -138,6 +142,7 @@ class Config:
                 charge_settings=self.charge_settings,
                 flight_settings=self.flight_settings,
                 response_settings=self.response_settings,
+                watch_settings=self.watch_settings,
                 n_threads=n_threads,
             )
 
@@ -146,10 +151,11 @@ def read_config(path):
     """Read a simulation from a TOML file.
 
     The tables are ``[tip]`` (the arguments of `Tip`; lengths in nm or, as text, in lattice constants: "20 a"),
-    ``[simulation]`` (ions, voltage, seed, responses), ``[detector]``, ``[charges]``, ``[flights]``, ``[responses]``
-    (fields of `Detector`, `ChargeSettings`, `FlightSettings`, `ResponseSettings`) and ``[maps]`` (bins, smoothing and
-    panels, each with a title and a perturbation as in `apt_evap.perturbation.from_dict`). Only ``[tip]`` with a
-    material and an apex_radius, and the ions of ``[simulation]``, have to be there.
+    ``[simulation]`` (ions, voltage, seed, responses), ``[detector]``, ``[charges]``, ``[flights]``, ``[responses]``,
+    ``[watch]`` (fields of `Detector`, `ChargeSettings`, `FlightSettings`, `ResponseSettings`, `WatchSettings`) and
+    ``[maps]`` (bins, smoothing and panels, each with a title and a perturbation as in
+    `apt_evap.perturbation.from_dict`). Only ``[tip]`` with a material and an apex_radius, and the ions of
+    ``[simulation]``, have to be there.
 
     Parameters
     ----------
@@ -175,7 +181,7 @@ def read_config(path):
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise FileError(f"{str(path)!r} is not a TOML file: {error}") from error
     with _place(path):
-        tables = ("tip", "simulation", "detector", "charges", "flights", "responses", "maps")
+        tables = ("tip", "simulation", "detector", "charges", "flights", "responses", "watch", "maps")
         _check_keys(document, ("output", *tables), ("tip", "simulation"))
         for name in tables:
             _check_table(document.get(name, {}), f"[{name}]")
@@ -199,6 +205,7 @@ def read_config(path):
         ("charges", ChargeSettings, _field_names(ChargeSettings)),
         ("flights", FlightSettings, _field_names(FlightSettings)),
         ("responses", ResponseSettings, ("energy_limit", "bound")),
+        ("watch", WatchSettings, _field_names(WatchSettings)),
     ):
         with _place(path, name):
             _check_keys(document.get(name, {}), known)

@@ -6,12 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from apt_evap._arrays import check_array, check_count, check_kind, check_number
-from apt_evap._core.event import DONE, EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, Evaporation
+from apt_evap._core.event import DONE, EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, Evaporation, Start
 from apt_evap._core.journal import Journal
 from apt_evap._core.octree import Octree
 from apt_evap._core.robin import ChargingRule, Robin
 from apt_evap._core.surface import Neighbourhood
 from apt_evap._threads import thread_count
+from apt_evap.emitter_state import EmitterState
+from apt_evap.interchange import to_atoms
 from apt_evap.law import Extremal
 from apt_evap.tip import Tip
 from apt_evap.units import COULOMB
@@ -167,8 +169,9 @@ class Emitter:
             self.settings.opening_angle,
         )
         self._fresh = False
+        self._left, self._deepened = [], []  # sites batch by batch; events at which more of the specimen was held
         self.relax(tolerance=self.settings.start_tolerance)
-        self._sweep_interval = self.settings.sweep_interval or max(100, len(self) // 300)
+        self.sweep_interval = self.settings.sweep_interval or max(100, len(self) // 300)
 
     def _neighbourhood_of(self, tip, before=None):
         return Neighbourhood(
@@ -217,6 +220,22 @@ class Emitter:
         """
         return self._field(self.charges)
 
+    def to_atoms(self):
+        """Return the surface as ase.Atoms [Angstrom]; needs ASE.
+
+        Returns
+        -------
+        ase.Atoms
+            With arrays "charge" [e], "field" [V/nm], "normal" and "atom", the index in the specimen.
+        """
+        arrays = {"charge": self.charges, "field": self.fields, "normal": self.normals, "atom": self.atoms}
+        return to_atoms(self.positions, self.tip.elements, self.tip.species[self.atoms], **arrays)
+
+    @property
+    def area_per_atom(self):
+        """Area s of the surface per atom, as of the last relaxation [nm^2]."""
+        return self._core.rule.area
+
     @property
     def counts(self):
         """Events so far, charges that came out negative and were set to 0, patches that did not settle; dict of int."""
@@ -224,7 +243,7 @@ class Emitter:
         return {"events": core.n_removed, "clipped": core.n_clipped, "unsettled": core.n_unsettled}
 
     def _field(self, charges):
-        return 4 * np.pi * COULOMB / self._core.rule.area * charges
+        return 4 * np.pi * COULOMB / self.area_per_atom * charges
 
     def field_at(self, points, opening_angle=0.3):
         """Electric field of the surface charges.
@@ -268,20 +287,77 @@ class Emitter:
         angle = self.settings.relaxation_angle if tolerance is None else self.settings.opening_angle
         tolerance = self.settings.tolerance if tolerance is None else tolerance
         tolerance = check_number(tolerance, "tolerance", above=0, at_most=1)
+        return self._relax(tolerance, angle)
+
+    def _relax(self, tolerance, angle, start=None):
+        counts = self.counts
+        self._relaxed = (tolerance, angle, counts["clipped"], counts["unsettled"])
         outcome = self._core.relax(
             tolerance=tolerance,
             opening_angle=angle,
             double_precision=tolerance < 1e-6,  # below it the rounding of float32 keeps charges moving
             n_threads=self.n_threads,
+            start=start,
         )
         self._fresh = True
         if not outcome[1] < tolerance:
             warnings.warn(
                 f"the charges had not settled after {outcome[0]} sweeps: the last one changed one by {outcome[1]:.1g} "
                 f"of the mean charge, expected {tolerance:.1g}",
-                stacklevel=2,
+                stacklevel=3,
             )
         return outcome
+
+    def state(self):
+        """What makes the surface again as its last relaxation left it.
+
+        Returns
+        -------
+        EmitterState
+        """
+        start = self._core.start
+        sites = np.concatenate([np.empty(0, np.int64), *self._left])
+        self._left = [sites]
+        tolerance, angle, clipped, unsettled = self._relaxed
+        return EmitterState(
+            sites=sites[: start.n_removed],
+            charges=start.charges,
+            lonely=start.lonely,
+            lonely_normals=start.lonely_normals,
+            potential_point=tuple(start.potential_point.ravel().tolist()),
+            deepened=tuple(self._deepened),
+            tolerance=tolerance,
+            opening_angle=angle,
+            clipped=clipped,
+            unsettled=unsettled,
+        )
+
+    def restore(self, state):
+        """Make the surface again that another emitter of the same settings had.
+
+        Parameters
+        ----------
+        state : EmitterState
+            Of the other; the surface becomes what its last relaxation left, and events go on from there.
+
+        Raises
+        ------
+        ValueError
+            If atoms have left already, or the state is of another specimen.
+        """
+        if self.counts["events"]:
+            raise ValueError(f"restore needs a new emitter, got one that {self.counts['events']:,} atoms have left")
+        done = 0
+        for event in state.deepened:
+            self._core.atoms.remove_atoms(state.sites[done:event])
+            self._hold_more()
+            done = event
+        self._core.atoms.remove_atoms(state.sites[done:])
+        self._left, self._deepened = [state.sites], list(state.deepened)
+        self._core.n_clipped, self._core.n_unsettled = state.clipped, state.unsettled
+        point = np.reshape(state.potential_point, (1, 3))
+        start = Start(len(state.sites), state.charges, state.lonely, state.lonely_normals, point)
+        self._relax(state.tolerance, state.opening_angle, start)
 
     def hand_out_tree(self):
         """Let the next batch come with a copy of the tree, for flights that have not followed the events so far."""
@@ -297,11 +373,15 @@ class Emitter:
         ValueError
             If the specimen has nothing below: one made from positions.
         """
+        self._hold_more()
+        self._deepened.append(self._core.n_removed)
+        self.relax()
+
+    def _hold_more(self):
         tip = self.tip.deepened()
         neighbourhood = self._neighbourhood_of(tip, self._core.atoms)
         self._core.take_over(neighbourhood, self._weights_of(tip))
         self.tip = tip
-        self.relax()
 
     def evaporate(self, most):
         """Let atoms leave, `most` of them or as many as leave before something has to be done first.
@@ -323,8 +403,9 @@ class Emitter:
         charges, normals = np.empty(most), np.empty((most, 3))
         tree = self._core.tree.copy() if self._fresh else None
         self._fresh = False
-        status = self._core.evaporate(journal, most, self._sweep_interval, site, charges, normals, neighbour)
+        status = self._core.evaporate(journal, most, self.sweep_interval, site, charges, normals, neighbour)
         n = journal.n_events
+        self._left.append(site[:n].copy())
         return Batch(
             site=site[:n],
             charges=charges[:n],

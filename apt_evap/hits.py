@@ -8,6 +8,7 @@ from numbers import Real
 import numpy as np
 
 from apt_evap._arrays import check_array, check_kind, check_number, did_you_mean, shown
+from apt_evap.interchange import to_dataframe
 
 
 class Outcome(IntEnum):
@@ -190,6 +191,21 @@ class Hits:
         from apt_evap.maps import DetectorMap
 
         return DetectorMap.from_hits(self, bins=bins, **options)
+
+    def to_dataframe(self):
+        """Return the ions as a pandas DataFrame; needs pandas.
+
+        Returns
+        -------
+        pandas.DataFrame
+            One row per ion; positions are position_x, position_y, position_z, and the columns of `extra` follow.
+            ``attrs`` has `source` and `units`.
+        """
+        names = [name for name in self.columns if name != "positions"]
+        columns = {name: getattr(self, name) for name in names}
+        if self.positions is not None:
+            columns |= dict(zip(("position_x", "position_y", "position_z"), self.positions.T, strict=True))
+        return to_dataframe(columns | self.extra, source=self.source, units=self.units)
 
     def within_circle(self, radius, centre=(0.0, 0.0)):
         """Select the detected ions within a circle on the detector.

@@ -77,26 +77,55 @@ def nearest_neighbour_distance(structure, a, c=None):
     return a * {"fcc": math.sqrt(1 / 2), "bcc": math.sqrt(3) / 2, "sc": 1.0, "diamond": math.sqrt(3) / 4}[structure]
 
 
-def _direction_vectors(structure, a, c):
-    """Rows: the Cartesian vectors that the indices of a direction multiply."""
-    if structure != "hcp":
+def direction_vectors(structure, a, c=None):
+    """Vectors that the indices of a direction multiply, in units of a, one a row, shape (3, 3).
+
+    The cubic axes, or for hcp a1, a2 (120 degrees apart) and c; parameters as for `cell_lengths`.
+    """
+    if check_structure(structure) != "hcp":
         return np.eye(3)
     height = cell_lengths(structure, a, c)[2] / a
     return np.array([[1.0, 0.0, 0.0], [-0.5, math.sqrt(3) / 2, 0.0], [0.0, 0.0, height]])
 
 
-def _three_indices(structure, axis):
-    """Return `axis` as three whole numbers without a common factor."""
+def check_axis(structure, axis, name="axis"):
+    """Return a crystal direction as three plain numbers in a tuple, or say what is wrong.
+
+    Parameters
+    ----------
+    structure : str
+        One of fcc, bcc, sc, diamond, hcp.
+    axis : sequence of float
+        Direction [u v w], or for hcp [u v t w] with u + v + t = 0.
+    name : str
+        Name of the argument, for the message.
+
+    Returns
+    -------
+    tuple
+        Ints without a common factor if all are whole numbers, else floats as they are given.
+
+    Raises
+    ------
+    ValueError
+        If it is not a direction.
+    """
     four = structure == "hcp" and np.shape(axis) == (4,)
-    indices = check_array(axis, "axis", (4 if four else 3,), dtype=np.int64)
+    indices = check_array(axis, name, (4 if four else 3,))
     if four:
         u, v, t, w = indices
-        if u + v + t != 0:
-            raise ValueError(f"axis must have u + v + t = 0 for a direction [u v t w], got {axis!r}")
+        # of whole numbers exactly; else to the rounding of a few decimals
+        if abs(u + v + t) > (0 if (indices == np.rint(indices)).all() else 1e-6 * np.abs(indices).max()):
+            raise ValueError(f"{name} must have u + v + t = 0 for a direction [u v t w], got {axis!r}")
         indices = np.array([u - t, v - t, w])
     if not indices.any():
-        raise ValueError(f"axis must be a direction, got {axis!r}")
-    return indices // np.gcd.reduce(indices)
+        raise ValueError(f"{name} must be a direction, got {axis!r}")
+    if np.abs(indices).max() > 1e6 or np.abs(indices).max() < 1e-6:
+        raise ValueError(f"{name} must have its largest number between 1e-6 and 1e6, got {axis!r}")
+    if (indices == np.rint(indices)).all():
+        whole = indices.astype(np.int64)
+        return tuple((whole // np.gcd.reduce(whole)).tolist())
+    return tuple(indices.tolist())
 
 
 def _perpendicular(structure, indices, vectors):
@@ -117,17 +146,19 @@ def _perpendicular(structure, indices, vectors):
 def rotation_to_axis(material, axis, rotation=0.0):
     """Rotation that brings a crystal direction onto +z.
 
-    Of the lattice directions perpendicular to `axis` the shortest is put along +x: [1 0 0] for [0 1 2]; of
-    several equally short ones the one with the largest indices, compared in turn: [1 0 -1] for [1 1 1]. Then
+    For whole numbers, of the lattice directions perpendicular to `axis` the shortest is put along +x: [1 0 0] for
+    [0 1 2]; of several equally short ones the one with the largest indices, compared in turn: [1 0 -1] for [1 1 1].
+    A direction of other numbers seldom has one: then +x is the part perpendicular to it of the edge of the
+    right-angled cell (hcp: a, sqrt(3) a, c) that is most nearly perpendicular to it, of equals the first. Then
     everything is turned about z by `rotation`.
 
     Parameters
     ----------
     material : Material or str
         A material, or the name of a structure (hcp then has the ideal c/a).
-    axis : sequence of int
-        Direction [u v w]. For hcp either [u v t w] with u + v + t = 0 (Miller-Bravais), or [u v w] in the
-        vectors a1, a2 (120 degrees apart) and c.
+    axis : sequence of float
+        Direction [u v w] of any length. For hcp either [u v t w] with u + v + t = 0 (Miller-Bravais), or [u v w] in
+        the vectors a1, a2 (120 degrees apart) and c.
     rotation : float
         Angle about +z, counter-clockwise seen from above [degrees].
 
@@ -139,16 +170,23 @@ def rotation_to_axis(material, axis, rotation=0.0):
     Raises
     ------
     ValueError
-        For an unknown structure, indices that are not whole numbers, or all zeros.
+        For an unknown structure, an axis that is not finite or all zeros.
     """
     structure = check_structure(material if isinstance(material, str) else material.structure)
     a, c = (1.0, None) if isinstance(material, str) else (material.a, material.c)
     angle = math.radians(check_number(rotation, "rotation", unit="degrees"))
-    vectors = _direction_vectors(structure, a, c)
-    indices = _three_indices(structure, axis)
+    vectors = direction_vectors(structure, a, c)
+    indices = np.array(check_axis(structure, axis))
     z = indices @ vectors
-    x = np.array(_perpendicular(structure, indices, vectors)) @ vectors
-    z, x = z / np.linalg.norm(z), x / np.linalg.norm(x)
+    if np.issubdtype(indices.dtype, np.integer):
+        x = np.array(_perpendicular(structure, indices, vectors)) @ vectors
+        z = z / np.linalg.norm(z)
+    else:
+        z = z / np.linalg.norm(z)
+        # rounded: directions that differ by their length only have the same x
+        edge = int(np.argmin(np.round(np.abs(z), 9)))
+        x = np.eye(3)[edge] - z[edge] * z
+    x = x / np.linalg.norm(x)
     y = np.cross(z, x)
     cos, sin = math.cos(angle), math.sin(angle)
     return np.array([cos * x - sin * y, sin * x + cos * y, z])

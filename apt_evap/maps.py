@@ -3,13 +3,12 @@
 import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
 
-from apt_evap._arrays import check_array, check_count, check_kind, check_number, check_seed, check_switch
-from apt_evap.binning import MOST_BINS, bin_edges, count, field_of_view, find_combs
+from apt_evap._arrays import check_array, check_kind, check_number, check_seed, check_switch
+from apt_evap.binning import bin_edges, count, field_of_view, find_combs
 from apt_evap.hits import Hits
 
 
@@ -224,13 +223,40 @@ class DetectorMap:
         sigma = check_number(sigma, "sigma", at_least=0, at_most=longer, unit="mm")
         if sigma == 0:
             return self
+        total = float(np.hypot(sigma, self.smoothing))
+        return replace(self, values=self._blurred(sigma), is_counts=False, smoothing=total)
+
+    def flattened(self, sigma):
+        """Divide the density by itself, smoothed broadly: what varies slowly over the detector goes.
+
+        Parameters
+        ----------
+        sigma : float
+            Standard deviation of the Gaussian of `smoothed` [mm]; variations broader than that go.
+
+        Returns
+        -------
+        DetectorMap
+            A map of densities; itself for a sigma of 0.
+
+        Raises
+        ------
+        ValueError
+            If sigma is negative.
+        """
+        sigma = check_number(sigma, "sigma", at_least=0, unit="mm")
+        if sigma == 0:
+            return self
+        broad = self._blurred(sigma)
+        flat = np.divide(self.values, broad, out=np.zeros_like(broad), where=self.mask & (broad > 0))
+        return replace(self, values=flat, is_counts=False)
+
+    def _blurred(self, sigma):
         width, height = self.bin_size
         blur = {"sigma": (sigma / height, sigma / width), "mode": "constant"}
         weight = ndimage.gaussian_filter(self.mask.astype(float), **blur)
         values = ndimage.gaussian_filter(np.where(self.mask, self.values, 0).astype(float), **blur)
-        values = np.divide(values, weight, out=np.zeros_like(values), where=self.mask)
-        total = float(np.hypot(sigma, self.smoothing))
-        return replace(self, values=values, is_counts=False, smoothing=total)
+        return np.divide(values, weight, out=np.zeros_like(values), where=self.mask)
 
     def __repr__(self):
         ny, nx = self.values.shape
@@ -262,116 +288,3 @@ def _fits(like, combs):
     """Whether the bins of a map are whole multiples of the combs' spacings."""
     multiples = [size / comb.spacing for size, comb in zip(like.bin_size, combs, strict=True)]
     return all(multiple > 0.99 and abs(multiple - round(multiple)) < 1e-3 for multiple in multiples)
-
-
-class Profile(NamedTuple):
-    """Density of hits against azimuth or radius."""
-
-    position: np.ndarray
-    """Centres of the bins, azimuth [degrees] or radius [mm], shape (bins,)."""
-    density: np.ndarray
-    """Hits per area relative to that of all bins together, NaN where no area is, shape (bins,)."""
-    error: np.ndarray
-    """Poisson error of the density (one standard deviation), NaN for maps of densities, shape (bins,)."""
-
-
-def azimuthal_profile(hits, centre=(0.0, 0.0), *, inner, outer, bins=72):
-    """Density of hits in a ring against the azimuth.
-
-    Parameters
-    ----------
-    hits : Hits or DetectorMap
-        Hits, which should fill the whole ring; of a map, only the inside of the detector counts.
-    centre : tuple of float
-        Centre of the ring [mm].
-    inner, outer : float
-        Radii of the ring [mm].
-    bins : int
-        Number of sectors; the first begins at the x axis, azimuths grow from x to y.
-
-    Returns
-    -------
-    Profile
-        position is the azimuth [degrees], 0 to 360.
-
-    Raises
-    ------
-    ValueError
-        If the ring is not one or holds no hits.
-    """
-    inner, outer, bins = _check_ring(inner, outer, bins)
-    radius, azimuth, *_ = polar = _polar(hits, centre)
-    ring = (radius >= inner) & (radius < outer)
-    sector = np.floor(azimuth[ring] * (bins / 360)).astype(np.intp) % bins
-    exact = np.full(bins, np.pi * (outer**2 - inner**2) / bins)
-    return _profile((np.arange(bins) + 0.5) * (360 / bins), sector, ring, polar, exact)
-
-
-def radial_profile(hits, centre=(0.0, 0.0), *, outer, inner=0.0, bins=50):
-    """Density of hits against the distance from a centre.
-
-    Parameters
-    ----------
-    hits : Hits or DetectorMap
-        Hits, which should fill the whole disc; of a map, only the inside of the detector counts.
-    centre : tuple of float
-        Centre of the rings [mm].
-    outer, inner : float
-        Where the profile ends and begins [mm].
-    bins : int
-        Number of rings, all of one width.
-
-    Returns
-    -------
-    Profile
-        position is the radius [mm].
-
-    Raises
-    ------
-    ValueError
-        If outer is not larger than inner or there are no hits between them.
-    """
-    inner, outer, bins = _check_ring(inner, outer, bins)
-    radius, *_ = polar = _polar(hits, centre)
-    ring = (radius >= inner) & (radius < outer)
-    edges = np.linspace(inner, outer, bins + 1)
-    annulus = np.minimum((radius[ring] - inner) * (bins / (outer - inner)), bins - 1).astype(np.intp)
-    return _profile((edges[:-1] + edges[1:]) / 2, annulus, ring, polar, np.pi * np.diff(edges**2))
-
-
-def _check_ring(inner, outer, bins):
-    inner = check_number(inner, "inner", at_least=0, unit="mm")
-    bins = check_count(bins, "bins", at_least=1, at_most=MOST_BINS)
-    return inner, check_number(outer, "outer", above=inner, unit="mm"), bins
-
-
-def _polar(hits, centre):
-    """Radius, azimuth [degrees], and for a map the values and area of its bins, each of shape (n,)."""
-    centre = check_array(centre, "centre", (2,))
-    if isinstance(hits, DetectorMap):
-        x, y = (grid[hits.mask] for grid in np.meshgrid(*hits.centres))
-        values, area = hits.values[hits.mask], float(np.prod(hits.bin_size))
-    else:
-        x, y = check_kind(hits, "hits", Hits, "Hits or a DetectorMap").require("x", "y")
-        detected = hits.detected
-        x, y = x[detected], y[detected]
-        values, area = None, None
-    x, y = x - centre[0], y - centre[1]
-    errors = values is None or hits.is_counts
-    return np.hypot(x, y), np.degrees(np.arctan2(y, x)) % 360, values, area, errors
-
-
-def _profile(position, index, ring, polar, areas):
-    """Add up hits and area over the bins of a profile; hits that are no map fill `areas`."""
-    _, _, values, area, errors = polar
-    if values is None:
-        number = np.bincount(index, minlength=len(position)).astype(float)
-    else:
-        number = np.bincount(index, weights=values[ring], minlength=len(position))
-        areas = area * np.bincount(index, minlength=len(position))
-    if not number.any():
-        raise ValueError("a profile needs hits, there are none between inner and outer")
-    # an empty bin gets the error of one hit
-    spread = np.sqrt(np.maximum(number, 1)) if errors else np.full(len(position), np.nan)
-    scale = np.where(areas > 0, areas, np.nan) * (number.sum() / areas.sum())
-    return Profile(position, number / scale, spread / scale)

@@ -150,7 +150,24 @@ def material(name, **changes):
 
 
 def as_material(value, name="material"):
-    """Return a material as it is, the known one of a name, or say what was expected (ValueError)."""
+    """Return a Material as it is, and the known one of a name.
+
+    Parameters
+    ----------
+    value : Material or str
+        What the user gave.
+    name : str
+        Name of the argument, for the message.
+
+    Returns
+    -------
+    Material
+
+    Raises
+    ------
+    ValueError
+        If it is neither, or no material has this name.
+    """
     if isinstance(value, str):
         return material(value)
     return check_kind(value, name, Material, "a Material or the name of one")

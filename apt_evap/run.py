@@ -4,25 +4,25 @@ import datetime
 import json
 import warnings
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
-import h5py
 import numpy as np
 
 from apt_evap._arrays import check_kind, check_switch, shown
-from apt_evap._files import FileError, check_path, open_for_reading, replace_file
+from apt_evap._files import FileError, check_path
 from apt_evap._version import __version__
 from apt_evap.detector import Detector
 from apt_evap.emission import Emissions
+from apt_evap.emitter_state import EmitterState
 from apt_evap.hits import Hits
 from apt_evap.ion_random import IonRandom
-from apt_evap.perturbation import from_dict, to_dict
-from apt_evap.response import Design, Responses, ResponseSettings, unflattened
+from apt_evap.perturbation import Unperturbed
+from apt_evap.response import Responses, ResponseSettings, unflattened
+from apt_evap.run_file import described, read_run, write_run
+from apt_evap.watch import History
 
-FORMAT = "apt_evap run 1"
 
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Flown:
+class Flown(NamedTuple):
     """What one perturbation gave in the run: stereographic directions (n, 2) and times of flight (n,) [ns]."""
 
     directions: np.ndarray
@@ -66,6 +66,12 @@ class Run:
         Names of the species.
     settings : dict
         Everything the run was made with, in plain types.
+    history : History
+        What was seen of the charges and the ions as the run went on.
+    state : EmitterState or None
+        What makes the surface again at the last relaxation of the run, from which it can be resumed.
+    first_event : int
+        Atoms that had left the specimen before the first ion of the run.
     ended : str
         Why the run ended before its time; "" if it did not.
     provenance : dict
@@ -86,6 +92,9 @@ class Run:
     response_settings: ResponseSettings
     elements: tuple
     settings: dict
+    history: History = field(default_factory=History.empty)
+    state: EmitterState | None = None
+    first_event: int = 0
     ended: str = ""
     provenance: dict = field(
         default_factory=lambda: {
@@ -112,6 +121,11 @@ class Run:
         bad = ~(self.responses.residuals <= self.response_settings.bound)
         return bad[:, 0] | (bad[:, 1] & rolls)
 
+    @property
+    def first_perturbation(self):
+        """The first one flown in the run; `Unperturbed` where there are only responses."""
+        return self.perturbations[0] if self.flown else Unperturbed()
+
     def hits(self, perturbation, *, by_response=False):
         """Where the ions land under a perturbation.
 
@@ -137,7 +151,7 @@ class Run:
         """
         check_switch(by_response, "by_response")
         for flown_as, flown in zip(self.perturbations, self.flown, strict=True):
-            known = flown_as == perturbation or flown_as == to_dict(perturbation)  # by name and repr in a file
+            known = flown_as == perturbation or flown_as == described(perturbation)  # by name and repr in a file
             if known and not by_response:
                 return self._hits(flown.directions, flown.times, perturbation)
         if not callable(getattr(perturbation, "tangential", None)):
@@ -180,6 +194,8 @@ class Run:
             site=self.site,
             ion=emissions.ions,
             outcome=outcome,
+            extra={"charge": self.charges, "field": self.fields},
+            units={"charge": "e", "field": "V/nm"},
             source=f"simulation, {_describe(perturbation)}",
         )
 
@@ -199,7 +215,7 @@ class Run:
 
     def summary(self):
         """Counts of what happened, dict: ions, outcomes of the first perturbation, ions that cannot roll, marked."""
-        first = self.perturbations[0] if self.flown else from_dict({"name": "Unperturbed"})
+        first = self.first_perturbation
         counts = {outcome.name.lower(): count for outcome, count in self.hits(first).counts.items()}
         return {
             "ions": len(self),
@@ -239,7 +255,8 @@ class Run:
             responses = Responses(
                 *(np.concatenate(parts) for parts in zip(*(run.responses for run in runs), strict=True))
             )
-        return replace(first, emissions=emissions, flown=flown, responses=responses, **columns)
+        history = History.join([run.history for run in runs])
+        return replace(first, emissions=emissions, flown=flown, responses=responses, history=history, **columns)
 
     def ended_by(self, reason):
         """Return the same run with the reason why it ended before its time."""
@@ -260,52 +277,18 @@ class Run:
         FileError
             If it cannot be written.
         """
-        with replace_file(path) as target, h5py.File(target, "w") as file:
-            file.attrs["format"] = FORMAT
-            file.attrs["provenance"] = json.dumps(self.provenance)
-            file.attrs["settings"] = json.dumps(self.settings, default=_plain)
-            file.attrs["elements"] = json.dumps(self.elements)
-            file.attrs["ended"] = self.ended
-            file.attrs["nearest_neighbour_distance"] = self.emissions.nearest_neighbour_distance
-            ions = file.create_group("ions")
-            for name in ("positions", "normals", "neighbours", "charge_states", "masses", "ions"):
-                ions[name] = getattr(self.emissions, name)
-            for name in ("site", "species", "charges", "fields"):
-                ions[name] = getattr(self, name)
-            for name, unit in _UNITS.items():
-                ions[name].attrs["units"] = unit
-            for index, (perturbation, flown) in enumerate(zip(self.perturbations, self.flown, strict=True)):
-                group = file.create_group(f"flown/{index}")
-                group.attrs["perturbation"] = json.dumps(
-                    perturbation if isinstance(perturbation, dict) else to_dict(perturbation)
-                )
-                group["directions"] = flown.directions
-                group["times"] = flown.times
-                group["times"].attrs["units"] = "ns"
-            if self.responses is not None:
-                group = file.create_group("responses")
-                for name, values in self.responses._asdict().items():
-                    group[name] = values
-                group["residuals"].attrs["units"] = "mm"
+        write_run(path, self)
 
 
-_UNITS = {
-    "positions": "nm",
-    "neighbours": "nm",
-    "charge_states": "e",
-    "masses": "Da",
-    "charges": "e",
-    "fields": "V/nm",
-}
-
-
-def load(path):
-    """Read a run from an HDF5 file that `Run.save` wrote.
+def load(path, *, partial=False):
+    """Read a run from an HDF5 file that `Run.save` wrote, or from the folder of one that is unfinished.
 
     Parameters
     ----------
     path : str or path-like
-        The file.
+        The file; or the folder beside it, whose name ends in ".unfinished" (see `Checkpoint`).
+    partial : bool
+        Whether to read, of a damaged file or folder, the ions that are whole; a warning says how many are lost.
 
     Returns
     -------
@@ -316,71 +299,40 @@ def load(path):
     FileError
         If it is missing, unreadable, damaged or not a run.
     """
-    with open_for_reading(path):
-        pass  # says why it cannot be opened better than HDF5 does
-    try:
-        with h5py.File(check_path(path), "r") as file:
-            kind = file.attrs.get("format")
-            if kind != FORMAT:
-                raise FileError(f"{str(path)!r} is not a run of this version: expected {FORMAT!r}, got {kind!r}")
-            return _read(file)
-    except FileError:
-        raise
-    except (OSError, KeyError, RuntimeError, TypeError, ValueError, AttributeError) as error:
-        raise FileError(f"cannot read {str(path)!r} as a run: {str(error).splitlines()[0]}") from error
+    path = check_path(path)
+    if path.is_dir():
+        return _load_parts(path, partial)
+    return _load_file(path, partial)
 
 
-def _read(file):
-    settings = json.loads(file.attrs["settings"])
-    columns = {name: dataset[()] for name, dataset in file["ions"].items()}
-    kept = {name: columns.pop(name) for name in ("site", "species", "charges", "fields")}
-    perturbations, flown = [], []
-    for index in range(len(file.get("flown", ()))):
-        group = file[f"flown/{index}"]
-        described = json.loads(group.attrs["perturbation"])
-        perturbations.append(_known(described))
-        flown.append(Flown(group["directions"][()], group["times"][()]))
-    responses = None
-    if "responses" in file:
-        responses = Responses(**{name: dataset[()] for name, dataset in file["responses"].items()})
-    designs = settings["responses"]
-    return Run(
-        emissions=Emissions(**columns, nearest_neighbour_distance=float(file.attrs["nearest_neighbour_distance"])),
-        **kept,
-        perturbations=tuple(perturbations),
-        flown=tuple(flown),
-        responses=responses,
-        seed=settings["seed"],
-        voltage=settings["voltage"],
-        detector=Detector(**settings["detector"]),
-        response_settings=ResponseSettings(
-            energy_limit=designs["energy_limit"],
-            bound=designs["bound"],
-            site=Design(**designs["site"]),
-            rolled=Design(**designs["rolled"]),
-        ),
-        elements=tuple(json.loads(file.attrs["elements"])),
-        settings=settings,
-        ended=file.attrs["ended"],
-        provenance=json.loads(file.attrs["provenance"]),
-    )
+def _load_file(path, partial=False):
+    arguments = read_run(path, partial)
+    return Run(**arguments | {"flown": tuple(Flown(*flown) for flown in arguments["flown"])})
 
 
-def _known(described):
-    """The perturbation that `to_dict` described, or the description if it was one of a user's own."""
-    try:
-        return from_dict(described)
-    except ValueError:
-        return described
+def _load_parts(folder, partial):
+    parts = []
+    for path in part_paths(folder):
+        try:
+            part = _load_file(path, partial)
+        except FileError as error:
+            if not partial:
+                raise
+            warnings.warn(f"{error}: its ions are lost", stacklevel=3)
+            continue
+        parts.append(part)
+    if not parts:
+        raise FileError(f"{str(folder)!r} holds no run: expected files {PART_NAME.format(0)!r} and so on")
+    return Run.join(parts).ended_by("unfinished")
+
+
+PART_NAME = "ions-{:012d}.h5"
+
+
+def part_paths(folder):
+    """Files of an unfinished run in the order of their ions."""
+    return sorted(folder.glob("ions-*.h5"))
 
 
 def _describe(perturbation):
     return perturbation.get("repr", json.dumps(perturbation)) if isinstance(perturbation, dict) else repr(perturbation)
-
-
-def _plain(value):
-    if isinstance(value, np.generic):
-        return value.item()
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    raise TypeError(f"a setting must be a plain number, text or list, got {value!r}")

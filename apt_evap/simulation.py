@@ -15,8 +15,10 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from apt_evap._arrays import check_count, check_kind, check_seed, check_sequence, check_switch
+from apt_evap._files import FileError
 from apt_evap._memory import check_copies
 from apt_evap._threads import thread_count
+from apt_evap.checkpoint import Checkpoint, Keeper, Parts, catch_up
 from apt_evap.detector import Detector
 from apt_evap.emission import Emissions, Launches, tangent_frame
 from apt_evap.emitter import EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, ChargeSettings, Emitter, check_voltage
@@ -28,6 +30,7 @@ from apt_evap.response import Responses, ResponseSettings, flattened
 from apt_evap.run import Flown, Run
 from apt_evap.tip import Tip
 from apt_evap.units import FLIGHT_TIME, NM_PER_MM
+from apt_evap.watch import Watch, WatchSettings
 
 BATCH = 256  # events at a time; the results do not depend on it
 
@@ -57,6 +60,8 @@ class Simulation:
         Threads; by default the processors this process may use. The results do not depend on it.
     rule : ChargingRule, optional
         How charge settles; by default Robin's iteration.
+    watch_settings : WatchSettings, optional
+        How the run is watched as it goes on.
 
     Raises
     ------
@@ -76,6 +81,7 @@ class Simulation:
         response_settings=None,
         n_threads=None,
         rule=None,
+        watch_settings=None,
     ):
         self.voltage = check_voltage(voltage)
         self.seed = check_seed(seed)
@@ -87,6 +93,8 @@ class Simulation:
         check_kind(self.response_settings, "response_settings", ResponseSettings, "ResponseSettings")
         if charge_settings is not None:
             check_kind(charge_settings, "charge_settings", ChargeSettings, "ChargeSettings")
+        self.watch_settings = WatchSettings() if watch_settings is None else watch_settings
+        check_kind(self.watch_settings, "watch_settings", WatchSettings, "WatchSettings")
         self.n_threads = thread_count(n_threads)
         self._check_reach(check_kind(tip, "tip", Tip, "a Tip"))
         self.emitter = Emitter(tip, self.voltage, self.law, charge_settings, self.n_threads, rule)
@@ -107,7 +115,7 @@ class Simulation:
             f"of {detector.width:g} mm at {detector.distance:g} mm>"
         )
 
-    def run(self, n_ions, emissions=(), *, responses=True, progress=None, batch_size=BATCH):
+    def run(self, n_ions, emissions=(), *, responses=True, progress=None, batch_size=BATCH, checkpoint=None):
         """Evaporate atoms and fly their ions.
 
         Ctrl-C ends the run after the batch under way, with everything done so far; a second one ends it at once. A run
@@ -116,7 +124,7 @@ class Simulation:
         Parameters
         ----------
         n_ions : int
-            Number of atoms to evaporate.
+            Number of atoms to evaporate; of a run that is resumed, those done before included.
         emissions : sequence of perturbations
             Flown as they are, beside the responses: needed for one of your own that launches from elsewhere than the
             site or the rolled-up position.
@@ -127,6 +135,9 @@ class Simulation:
             Whether to show a progress bar; by default if the output is a terminal or a notebook.
         batch_size : int
             Events at a time; the results do not depend on it.
+        checkpoint : Checkpoint or str or path-like, optional
+            Where the run is kept while it goes on, and saved once it has ended; a file name for the usual settings. A
+            run that is killed and resumed has the bits of one that was not.
 
         Returns
         -------
@@ -134,6 +145,8 @@ class Simulation:
 
         Raises
         ------
+        FileError
+            If the file of the checkpoints cannot be written, belongs to somebody else or does not fit.
         ValueError
             If an argument is out of its range, or a perturbation has no `launch`. Whatever is raised once ions are done
             has them in its attribute `run`.
@@ -149,22 +162,43 @@ class Simulation:
         self._check_atoms(n_ions)
         if not emissions and not responses:
             emissions = (Unperturbed(),)
-        parts, ended = [], ""
+        if checkpoint is None:
+            return self._run(n_ions, emissions, responses, progress, batch_size, None)
+        if not isinstance(checkpoint, Checkpoint):
+            checkpoint = Checkpoint(checkpoint)
+        with Keeper(checkpoint, self.settings, emissions, responses) as keeper:
+            return self._run(n_ions, emissions, responses, progress, batch_size, keeper)
+
+    def _run(self, n_ions, emissions, responses, progress, batch_size, keeper):
+        parts = Parts(keeper, self.emitter)
+        if len(parts) > n_ions:
+            raise ValueError(f"n_ions must be at least the {len(parts):,} that are done already, got {n_ions:,}")
+        if parts.done:
+            catch_up(self.emitter, parts.done[0], BATCH)
+            self.n_evaporated = int(parts.done[0].emissions.ions[-1]) + 1
+        interval = self.watch_settings.interval or 10 * self.emitter.sweep_interval
+        watch = parts.watch = Watch(self.watch_settings, interval, self.n_evaporated - len(parts), parts.done)
+        ended = ""
         self.emitter.hand_out_tree()  # somebody may have let atoms evaporate without flights
         disable = None if progress is None else not progress
         with (
-            tqdm(total=n_ions, unit=" ions", smoothing=0.1, disable=disable, mininterval=0.5) as bar,
+            tqdm(
+                total=n_ions, initial=len(parts), unit=" ions", smoothing=0.1, disable=disable, mininterval=0.5
+            ) as bar,
             ThreadPoolExecutor(self.n_threads) as pool,
             _interruptible() as interrupted,
         ):
 
             def collect():
                 while waiting:
-                    parts.append(waiting.pop()())
-                    bar.update(len(parts[-1]))
+                    part = waiting.pop()()
+                    parts.append(part)
+                    watch.count(part)
+                    bar.set_postfix(watch.shown, refresh=False)
+                    bar.update(len(part))
 
             waiting = []
-            started = 0
+            started = len(parts)
             try:
                 while started < n_ions and not ended:
                     batch = self.emitter.evaporate(min(batch_size, n_ions - started))
@@ -174,6 +208,8 @@ class Simulation:
                     if self.n_threads == 1:
                         collect()
                     if batch.status == SWEEP_DUE:
+                        if watch.due(self.n_evaporated):
+                            watch.look(self.emitter, self.n_evaporated)
                         self.emitter.relax()
                     elif batch.status == EXHAUSTED:
                         ended = "no atom is left that may evaporate"
@@ -181,17 +217,30 @@ class Simulation:
                         self.emitter.deepen()
                     if interrupted.is_set() and not ended and started < n_ions:
                         ended = "interrupted"
+                    if keeper and keeper.due(started):
+                        collect()
+                        parts.keep()
                 collect()
+            except KeyboardInterrupt:  # the second Ctrl-C: what is in a checkpoint's run stays
+                parts.keep()
+                raise
             except Exception as error:  # nothing done is lost: a caller may save it
                 collect()
-                if parts:
-                    error.run = Run.join(parts).ended_by(f"{type(error).__name__}: {error}")
+                if len(parts):
+                    error.run = parts.run(f"{type(error).__name__}: {error}")
                     error.add_note(
                         f"the {len(error.run):,} ions done so far are in the attribute `run` of this exception"
                     )
+                parts.keep()
                 raise
-        run = Run.join(parts)
-        return run.ended_by(ended) if ended else run
+        run = parts.run(ended)
+        if keeper:
+            try:
+                keeper.finish(run)
+            except FileError as error:
+                error.run = run
+                raise
+        return run
 
     # ---- one batch -------------------------------------------------------------------------------------------------
 
@@ -333,6 +382,7 @@ class Simulation:
                 "site": vars(self.response_settings.site),
                 "rolled": vars(self.response_settings.rolled),
             },
+            "watch": vars(self.watch_settings),
         }
 
 

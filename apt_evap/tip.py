@@ -7,7 +7,7 @@ from dataclasses import asdict
 import numpy as np
 from scipy.spatial import cKDTree
 
-from apt_evap import lattice
+from apt_evap import interchange, lattice
 from apt_evap._arrays import check_array, check_kind, check_number, check_seed, check_sequence, shown
 from apt_evap._memory import check_memory
 from apt_evap.alloy import check_solutes, draw_species
@@ -33,8 +33,8 @@ class Tip:
         The crystal; a str is looked up by `material`.
     apex_radius : float
         Radius R of the cap [nm].
-    axis : sequence of int
-        Crystal direction along +z, see `rotation_to_axis`.
+    axis : sequence of float
+        Crystal direction along +z, of whole numbers or any others, see `lattice.rotation_to_axis`.
     shank_angle : float
         Half the opening angle of the shank [degrees], at least 0 and below 45.
     shank_length : float, optional
@@ -134,10 +134,11 @@ class Tip:
         self._set_elements((host, *fractions), draw_species(len(self), fractions, seed))
         self.apex = radius
         self.potential_point = np.zeros(3)
+        whole = all(float(index).is_integer() for index in axis)
         self.settings = {
             "material": asdict(host),
             "apex_radius": radius,
-            "axis": [int(index) for index in axis],
+            "axis": [int(index) if whole else float(index) for index in axis],
             "shank_angle": shape.shank_angle,
             "shank_length": shape.shank_length,
             "base": base,
@@ -238,6 +239,36 @@ class Tip:
         return tip
 
     @classmethod
+    def from_atoms(cls, atoms, materials=None, **options):
+        """Make a tip of an ASE Atoms object, its axis along +z.
+
+        Parameters
+        ----------
+        atoms : ase.Atoms
+            Positions in Angstrom; the cell is not looked at. An array "evaporable" says which atoms may leave.
+        materials : mapping of str to Material, optional
+            Materials by chemical symbol, in place of those that `material` knows.
+        **options
+            Passed to `from_positions`.
+
+        Returns
+        -------
+        Tip
+            Its `elements` begin with the most frequent one.
+
+        Raises
+        ------
+        ValueError
+            If a symbol has no material, or as `from_positions` does.
+        """
+        return cls.from_positions(**(interchange.from_atoms(atoms, materials) | options))
+
+    def to_atoms(self):
+        """Return the specimen as ase.Atoms [Angstrom], with arrays "evaporable" and "support"; needs ASE."""
+        arrays = {"evaporable": self.evaporable, "support": self.support}
+        return interchange.to_atoms(self.positions, self.elements, self.species, **arrays)
+
+    @classmethod
     def from_settings(cls, settings):
         """Make the tip again that has these `settings`; one made from positions has none to go by.
 
@@ -266,7 +297,7 @@ class Tip:
         if self._shape is None:
             return f"<Tip: {len(self):,} atoms of {names} from positions>"
         shape = self._shape
-        axis = " ".join(str(index) for index in self.settings["axis"])
+        axis = " ".join(f"{index:.4g}" for index in self.settings["axis"])
         held = "" if self._depth is None else f", held to a depth of {self._depth:.4g} nm"
         return (
             f"<Tip: {len(self):,} atoms of {names} [{axis}], apex radius {shape.apex_radius:.4g} nm, "

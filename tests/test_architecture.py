@@ -13,9 +13,9 @@ PACKAGE = Path(__file__).parents[1] / "apt_evap"
 FLOORS = (
     {"units", "_arrays", "_threads", "_memory", "_files", "_version"},
     {"_core"},
-    {"lattice", "ranges", "shape", "material", "alloy", "tip", "detector", "hits"},
-    {"ion_random", "energy", "emission", "perturbation", "law", "emitter", "flights", "response"},
-    {"run", "simulation"},
+    {"lattice", "ranges", "shape", "material", "tip", "detector", "hits"},
+    {"ion_random", "energy", "emission", "perturbation", "law", "emitter_state", "emitter", "flights", "response"},
+    {"watch", "run_file", "run", "checkpoint", "simulation"},
     {"binning", "maps", "register", "compare", "study", "config", "info", "io"},
     {"plot", "cli"},
 )

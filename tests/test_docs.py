@@ -3,10 +3,12 @@
 import enum
 import importlib
 import inspect
+import json
 import re
 import runpy
 import sys
 import textwrap
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -99,6 +101,49 @@ def test_examples_run(name, folder, monkeypatch, capsys):
     if name == "tutorial_4_own_perturbation.py":
         largest = float(re.search(r"largest ([\d.]+) mm", out)[1])
         assert 0 < largest < ae.ResponseSettings().bound  # above it an ion would have been marked
+
+
+def run_figure(name, monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", [name, *arguments])
+    runpy.run_path(str(ROOT / "examples" / name), run_name="__main__")
+
+
+def test_figure_2_of_a_small_tip(folder, monkeypatch, capsys):
+    run_figure("figure2.py", monkeypatch, "--radius", "12", "-o", "out")
+    assert (folder / "out" / "figure2.png").stat().st_size > 100_000
+    results = json.loads((folder / "out" / "figure2.json").read_text())["results"]
+    assert set(results) == {"Al[012]", "Ni[111]"}
+    for result in results.values():
+        assert result["settings"]["tip"]["material"]["name"] in ("Al", "Ni")
+        fields = np.array(result["field [V/nm]"])
+        assert fields[result["neighbours"].index(6)] > fields[result["neighbours"].index(9)]  # kinks stick out
+        # mm: half an electronvolt moves an ion by millimetres, and the roll alone by about as much
+        for column in ("lateral 0.5 eV [mm]", "roll [mm]", "then 0.5 eV [mm]"):
+            assert 1 < min(result[column]) < max(result[column]) < 40
+    assert "Ni[111]: how far" in capsys.readouterr().out
+
+
+def test_figure_7_of_runs_that_are_there(folder, monkeypatch, capsys, run20):
+    """The script turns the crystal by 90 degrees; so is the run here, and taken for both radii."""
+    first, rolled = run20.flown
+    turned = replace(rolled, directions=rolled.directions @ [[0, 1], [-1, 0]])
+    run = replace(run20, flown=(first, turned))
+    for name in ("figure7_R20a.h5", "figure7_R30a.h5"):
+        run.save(folder / name)
+    run_figure("figure7.py", monkeypatch, "--redraw", "--bins", "20")
+    assert (folder / "figure7.png").stat().st_size > 100_000
+    printed = capsys.readouterr().out
+    for kind in ("depleted", "enhanced"):
+        assert f"{kind} line, R = 20 a: {kind}, " in printed  # the rectangles are where the lines are
+    results = json.loads((folder / "figure7.json").read_text())
+    assert results["ions"] == {"R = 30 a": 15_000, "R = 20 a": 15_000}
+    assert results["results"]["enhanced"]["chi_square"] == 0  # of one run with itself
+
+
+def test_figure_7_evaporates_to_one_depth(folder, monkeypatch):
+    with pytest.raises(ValueError, match="profile"):  # that few ions show no line
+        run_figure("figure7.py", monkeypatch, "--radii", "6", "4", "--ions", "54")
+    assert [len(ae.load(folder / f"figure7_R{radius}a.h5")) for radius in (6, 4)] == [54, 16]
 
 
 def test_commands_of_the_readme():

@@ -13,6 +13,7 @@ from ion_files import epos, ions_of, pos, raw, usual_apt
 from apt_evap.hits import Hits
 from apt_evap.io import FORMATS, FileError, chunks, read, read_ranges
 from apt_evap.ranges import Ranges
+from apt_evap.run_file import FORMAT
 
 SILICON = Path(__file__).parents[2] / "shared" / "data" / "Si.epos"
 READ = tuple(entry.suffix for entry in FORMATS if entry.read)
@@ -155,7 +156,7 @@ def test_hdf5_that_is_no_run(tmp_path, member):
     path = tmp_path / "some.h5"
     with h5py.File(path, "w") as file:
         if member == "format only":
-            file.attrs["format"] = "apt_evap run 1"
+            file.attrs["format"] = FORMAT
     assert check(path) is None
 
 

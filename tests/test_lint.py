@@ -8,7 +8,9 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = [
-    folder for folder in ("apt_evap", "tests", "docs", "examples", "benchmarks", "setup.py") if (ROOT / folder).exists()
+    folder
+    for folder in ("apt_evap", "tests", "docs", "examples", "benchmarks", "tools", "setup.py")
+    if (ROOT / folder).exists()
 ]
 
 

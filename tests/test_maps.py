@@ -10,7 +10,7 @@ from apt_evap import plot
 from apt_evap.binning import bin_edges, count, field_of_view, find_comb
 from apt_evap.hits import Hits
 from apt_evap.io import read
-from apt_evap.maps import DetectorMap, azimuthal_profile, radial_profile
+from apt_evap.maps import DetectorMap
 
 SILICON = Path(__file__).parents[2] / "shared" / "data" / "Si.epos"
 
@@ -204,45 +204,6 @@ def test_smoothing_is_a_gaussian_of_the_width_asked_for():
     assert map.smoothed(2.0).smoothing == pytest.approx(2.5)
 
 
-@pytest.mark.parametrize("of_map", [False, True])
-def test_azimuthal_profile_finds_six_lines(of_map):
-    random = np.random.default_rng(8)
-    x, y = disc(200_000, 12.0)
-    angle = np.radians(10 + 60 * random.integers(0, 6, 20_000))
-    r, across = random.uniform(0, 12, 20_000), random.normal(0, 0.2, 20_000)
-    x = np.concatenate([x, r * np.cos(angle) - across * np.sin(angle)]) + 2
-    y = np.concatenate([y, r * np.sin(angle) + across * np.cos(angle)]) - 1
-    hits = Hits(x=x, y=y)
-    profile = azimuthal_profile(hits.map() if of_map else hits, (2, -1), inner=3, outer=10, bins=90)
-    assert profile.position[:2].tolist() == [2, 6]
-    bright = profile.position[profile.density > 1 + 8 * profile.error]
-    assert {round((azimuth - 10) / 60) for azimuth in bright} == set(range(6))
-    assert np.abs((bright - 10 + 30) % 60 - 30).max() <= 6
-
-
-def test_profiles_of_a_uniform_disc_scatter_as_poisson():
-    x, y = disc(300_000)
-    hits = Hits(x=x, y=y)
-    for source in (hits, hits.map()):
-        for profile in (
-            azimuthal_profile(source, inner=2, outer=9, bins=60),
-            radial_profile(source, outer=9, bins=60),
-        ):
-            pull = (profile.density - 1) / profile.error
-            # chi-square of 60 bins: 60 +- 11; 5 standard deviations
-            assert 5 < (pull**2).sum() < 115
-    # all hits inside 9 mm: the total density does not depend on how it is cut
-    areas = np.pi * np.diff(np.linspace(0, 9, 61) ** 2)
-    assert (radial_profile(hits, outer=9, bins=60).density * areas).sum() == pytest.approx(areas.sum())
-
-
-def test_profiles_of_densities_have_no_error():
-    map = DetectorMap.from_array(np.ones((40, 40)), np.linspace(-5, 5, 41), np.linspace(-5, 5, 41))
-    profile = radial_profile(map, outer=4, bins=4)
-    np.testing.assert_allclose(profile.density, 1)
-    assert np.isnan(profile.error).all()
-
-
 def test_bad_arguments_are_named():
     x, y = disc(1000)
     hits = Hits(x=x, y=y)
@@ -255,8 +216,6 @@ def test_bad_arguments_are_named():
         (lambda: Hits(x=[1.0], y=[1.0]).map(), "not a point"),
         (lambda: Hits(x=[np.nan], y=[1.0], source="f").map(), "f has none of 1"),
         (lambda: hits.map().smoothed(-1), "sigma must be"),
-        (lambda: azimuthal_profile(hits, inner=3, outer=2), "outer must be"),
-        (lambda: radial_profile(hits, (99, 99), outer=1), "there are none"),
         (
             lambda: DetectorMap.from_array(np.ones((3, 3)), even, uneven),
             "y_edges must increase in even steps",

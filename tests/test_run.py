@@ -198,7 +198,7 @@ def test_files_that_are_no_runs(tmp_path, run):
     with pytest.raises(ae.FileError, match=r"cut\.h5"):
         ae.load(tmp_path / "cut.h5")
     with h5py.File(tmp_path / "run.h5", "a") as file:
-        del file["ions/site"]
+        del file["entry1/simulation/site"]
     with pytest.raises(ae.FileError, match=r"run\.h5"):
         ae.load(tmp_path / "run.h5")
 

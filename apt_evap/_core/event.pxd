@@ -11,10 +11,11 @@ cdef class Evaporation:
     cdef readonly Octree tree
     cdef readonly ChargingRule rule
     cdef readonly double potential, patch_radius, update_radius, bond_length, opening_angle
-    cdef object potential_point
+    cdef readonly object potential_point
+    cdef readonly object start          # what the last relaxation started from
     cdef readonly long n_removed, since_sweep
-    cdef readonly long n_clipped        # charges that came out negative and were set to 0
-    cdef readonly long n_unsettled      # patches whose charges were still moving after the last iteration
+    cdef public long n_clipped          # charges that came out negative and were set to 0
+    cdef public long n_unsettled        # patches whose charges were still moving after the last iteration
     cdef double clearance               # of the point of the potential from the surface at first [nm]
     cdef bint has_support
     cdef double[::1] weight             # (n_atoms,) 1/evaporation field, 0 where an atom may not leave

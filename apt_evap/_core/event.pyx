@@ -6,6 +6,8 @@ over is smooth, and `relax` (a sweep over the whole surface every so many events
 not depend on the size of the specimen.
 """
 
+from collections import namedtuple
+
 from libc.math cimport sqrt
 
 import numpy as np
@@ -33,6 +35,12 @@ cdef enum:
     STATUS_TOO_SHALLOW = 3
 
 DONE, SWEEP_DUE, EXHAUSTED, TOO_SHALLOW = STATUS_DONE, STATUS_SWEEP_DUE, STATUS_EXHAUSTED, STATUS_TOO_SHALLOW
+
+
+Start = namedtuple("Start", "n_removed charges lonely lonely_normals potential_point")
+"""What a relaxation starts from: events so far, charges of the surface atoms in the order of their numbers (n,) [e],
+atoms that keep the normal they had since no neighbour pulls (m,), these normals (m, 3), and the point that has the
+potential (1, 3) [nm]. With the atoms that are left it makes the same charges again, bit by bit."""
 
 
 cdef class Evaporation:
@@ -92,7 +100,7 @@ cdef class Evaporation:
         self.atoms, self.weight, self.slot_of = atoms, np.array(weights), slot_of
 
     def relax(self, *, double tolerance=1e-4, int most_sweeps=200, bint double_precision=False, long extra=0,
-              double opening_angle=0.0, int n_threads=1):
+              double opening_angle=0.0, int n_threads=1, start=None):
         """Build the tree anew and iterate over the whole surface; bring the potential to the voltage.
 
         Parameters
@@ -109,6 +117,8 @@ cdef class Evaporation:
             Of the sweeps [rad]; by default that of the events.
         n_threads : int
             Threads.
+        start : Start, optional
+            What to start from; by default the surface as it is, or equal charges.
 
         Returns
         -------
@@ -122,28 +132,26 @@ cdef class Evaporation:
         if len(surface) == 0:
             raise ValueError("the specimen has no surface atoms")
         self.since_sweep = NOT_SETTLED   # an interruption below leaves a surface that no atom may leave
-        before = np.asarray(self.slot_of)
-        charges, kept = np.ones(len(surface)), None
-        if self.tree is not None:
-            slots = before[surface]
-            charges = np.where(slots >= 0, self.tree.charges[slots], 0.0)
-            kept = np.asarray(self.normals)
+        if start is None:
+            start = self.start_here(surface)
+        elif len(start.charges) != len(surface):
+            raise ValueError(f"start must have the charges of {len(surface)} surface atoms, got {len(start.charges)}")
+        self.start, self.n_removed, self.potential_point = start, start.n_removed, start.potential_point
+        charges = start.charges
         tree = Octree(np.asarray(self.atoms.positions)[surface], charges, surface,
                       extra=extra or len(surface) // 8 + MOST_NEAR, n_threads=n_threads)
         surface = tree.atoms   # in the order of the slots from here on
         n, capacity = tree.n_slots, tree.capacity
         normals = np.zeros((capacity, 3))
         normals[:n] = self.atoms.normals_of(surface)
-        if kept is not None:   # where no neighbour pulls, an atom keeps the normal it had
-            alone = np.flatnonzero((np.asarray(self.atoms.counts)[surface] == 0) & (before[surface] >= 0))
-            normals[alone] = kept[before[surface[alone]]]
+        slot_of = np.full(self.atoms.n_atoms, -1, np.int32)
+        slot_of[surface] = np.arange(n, dtype=np.int32)
+        normals[slot_of[start.lonely]] = start.lonely_normals
         lists = InteractionLists(tree, opening_angle or self.opening_angle, n_threads)
         outcome = self.rule.solve(tree, normals, lists, tolerance=tolerance, most_sweeps=most_sweeps,
                                   double_precision=double_precision, n_threads=n_threads)
         away = self.keep_inside(tree.positions)
         self.rule.scale(tree, self.potential / (tree.charges / away).sum())
-        slot_of = np.full(self.atoms.n_atoms, -1, np.int32)
-        slot_of[surface] = np.arange(n, dtype=np.int32)
         rank = np.full(capacity, -1.0)
         rank[:n] = tree.charges * np.asarray(self.weight)[surface]
         self.tree, self.normals, self.slot_of, self.rank = tree, normals, slot_of, rank
@@ -159,6 +167,16 @@ cdef class Evaporation:
                     self.winner[slot] = self.winner[2 * slot + 1]
         self.since_sweep = 0
         return outcome
+
+    def start_here(self, surface):
+        """What a relaxation of the surface as it is starts from; equal charges if it has none yet."""
+        charges, lonely, normals = np.ones(len(surface)), np.empty(0, np.int64), np.empty((0, 3))
+        if self.tree is not None:
+            slots = np.asarray(self.slot_of)[surface]
+            charges = np.where(slots >= 0, self.tree.charges[slots], 0.0)
+            lonely = surface[(np.asarray(self.atoms.counts)[surface] == 0) & (slots >= 0)]
+            normals = np.asarray(self.normals)[np.asarray(self.slot_of)[lonely]]
+        return Start(self.n_removed, charges, lonely, normals, self.potential_point)
 
     def keep_inside(self, positions):
         """Distances of the surface from the point of the potential; it goes down as evaporation comes close to it."""

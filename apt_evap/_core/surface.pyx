@@ -146,6 +146,17 @@ cdef class Neighbourhood:
         cdef int[::1] fresh = np.empty(MOST_NEAR, np.int32)
         return np.asarray(fresh)[:self.remove(atom, &fresh[0])].copy()
 
+    def remove_atoms(self, const long long[::1] atoms):
+        """Take atoms away one after the other, as events do; ValueError for one that is not there."""
+        cdef int[::1] fresh = np.empty(MOST_NEAR, np.int32)
+        cdef long i
+        for i in range(atoms.shape[0]):
+            if not (0 <= atoms[i] < self.n_atoms and self.alive[atoms[i]]):
+                raise ValueError(f"atoms to take away must be there, got {atoms[i]} of {self.n_atoms}")
+        with nogil:
+            for i in range(atoms.shape[0]):
+                self.remove(atoms[i], &fresh[0])
+
     @property
     def surface(self):
         """Atoms at the surface, shape (m,), in the caller's numbering."""

@@ -6,10 +6,10 @@ import sys
 import warnings
 
 from apt_evap._version import __version__
-from apt_evap.cli import info, map, run
+from apt_evap.cli import compare, info, map, run
 from apt_evap.cli._options import INTERRUPTED, SHAPE, say
 
-COMMANDS = (run, map, info)
+COMMANDS = (run, map, info, compare)
 
 EXIT_CODES = """\
 exit codes:

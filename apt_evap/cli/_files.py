@@ -1,11 +1,8 @@
 """Files of the commands: read by their options, and written only where nobody else's is lost."""
 
-import contextlib
 import os
 import tempfile
 from pathlib import Path
-
-import h5py
 
 from apt_evap import plot
 from apt_evap._files import FileError, check_path, replace_file
@@ -54,12 +51,6 @@ def check_output(path, is_ours, force):
             raise FileError(f"{str(path)!r} exists and was not made by apt-evap: --force overwrites it")
     except OSError as error:
         raise FileError(f"cannot write {str(path)!r}: {error.strerror or error}") from error
-
-
-def is_run(path):
-    with contextlib.suppress(OSError, RuntimeError), h5py.File(path, "r") as file:
-        return str(file.attrs.get("format", "")).startswith("apt_evap run")
-    return False
 
 
 def is_picture(path):

@@ -19,11 +19,17 @@ def reading_options():
     """Options of a command that reads a FILE."""
     reading = argparse.ArgumentParser(add_help=False)
     reading.add_argument("file", metavar="FILE", help="a run (.h5) or measured ions (.epos, ...)")
-    group = reading.add_argument_group("reading of files")
-    group.add_argument("--format", metavar="SUFFIX", help="read FILE as this format, such as .pos")
+    add_reading_options(reading)
+    return reading
+
+
+def add_reading_options(parser):
+    """Options that say how the file of ions is read, as a group of their own."""
+    group = parser.add_argument_group("reading of files")
+    group.add_argument("--format", metavar="SUFFIX", help="read ions as this format, such as .pos")
     group.add_argument("--partial", action="store_true", default=None, help="read the whole ions of a truncated file")
     group.add_argument("--byte-order", choices=("big", "little"), help="of .pos and .epos files")
-    return reading
+    return group
 
 
 def add_speech(command):
@@ -61,9 +67,17 @@ def whole(least, most=None):
     return whole
 
 
-def smoothing(text):
-    """A kind of argument: a length [mm] of at least 0."""
-    try:
-        return check_number(float(text), "it", at_least=0, unit="mm")
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"must be a number [mm] of at least 0, got {text!r}") from None
+def _number(unit):
+    """A kind of argument: a number of at least 0."""
+
+    def number(text):
+        try:
+            return check_number(float(text), "it", at_least=0, unit=unit)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"must be a number [{unit}] of at least 0, got {text!r}") from None
+
+    return number
+
+
+smoothing = _number("mm")
+minutes = _number("min")

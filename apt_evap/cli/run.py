@@ -4,10 +4,12 @@ import time
 from dataclasses import replace
 
 from apt_evap._files import FileError, check_path
-from apt_evap.cli._files import check_output, is_picture, is_run, picture_path, save_picture
-from apt_evap.cli._options import INTERRUPTED, SHAPE, add_speech, say, tell, tell_json, whole
+from apt_evap.checkpoint import Checkpoint
+from apt_evap.cli._files import check_output, is_picture, picture_path, save_picture
+from apt_evap.cli._options import INTERRUPTED, SHAPE, add_speech, minutes, say, tell, tell_json, whole
 from apt_evap.cli.map import described, run_maps
 from apt_evap.config import read_config
+from apt_evap.run_file import is_run
 
 
 def add_parser(commands):
@@ -16,7 +18,8 @@ def add_parser(commands):
         "run",
         help="simulate what a TOML file describes",
         description="Simulate what a TOML file describes, save the run and draw its detector maps.\n"
-        "Ctrl-C ends the simulation and saves what is done.",
+        "Ctrl-C ends the simulation and saves what is done. While it goes on it is kept in RUN.h5.unfinished;\n"
+        "killed, it goes on from there with --resume, and gives the same bits as if it had not been.",
         epilog="example: apt-evap run examples/ni111.toml -o ni.h5 --ions 5000",
         **SHAPE,
     )
@@ -26,8 +29,14 @@ def add_parser(commands):
     command.add_argument("--threads", type=whole(1), metavar="N", help="default: all processors")
     command.add_argument("--seed", type=whole(0), metavar="N", help="instead of that of the file")
     command.add_argument("--map", metavar="MAP.png", help="picture of the maps; default: beside the run")
+    command.add_argument("--resume", action="store_true", help="go on with an unfinished run, or make one longer")
+    command.add_argument(
+        "--checkpoint", type=minutes, default=10.0, metavar="MINUTES", help="time between two checkpoints; default: 10"
+    )
     add_speech(command)
-    command.add_argument("--force", action="store_true", help="overwrite files that apt-evap did not make")
+    command.add_argument(
+        "--force", action="store_true", help="overwrite files that apt-evap did not make, and unfinished runs"
+    )
     command.set_defaults(command=_run)
 
 
@@ -44,6 +53,7 @@ def _run(options):
     simulation = config.simulation(seed=options.seed, n_threads=options.threads)
     tell(options, f"{str(simulation.tip).strip('<>')}; {len(simulation.emitter):,} atoms on the surface")
     began = time.perf_counter()
+    checkpoint = Checkpoint(output, options.checkpoint, resume=options.resume, overwrite=options.force)
     provenance = {"config": config.path.name, "maps": config.maps.to_dict()}
     try:
         run = simulation.run(
@@ -51,7 +61,12 @@ def _run(options):
             config.emissions,
             responses=config.responses,
             progress=False if options.quiet else None,
+            checkpoint=checkpoint,
         )
+    except FileError as error:
+        # the checkpoints speak of arguments of Python
+        message = str(error).replace("resume=True", "--resume").replace("overwrite=True", "--force")
+        raise FileError(message) from error
     except Exception as error:
         if run := getattr(error, "run", None):
             replace(run, provenance=run.provenance | provenance).save(output)
@@ -60,7 +75,8 @@ def _run(options):
     seconds = time.perf_counter() - began
     run = replace(run, provenance=run.provenance | provenance)
     run.save(output)
-    tell(options, f"{len(run):,} ions in {seconds:.1f} s, {len(run) / seconds:,.0f} ions/s")
+    rate = "" if options.resume else f", {len(run) / seconds:,.0f} ions/s"  # it is not known how many are new
+    tell(options, f"{len(run):,} ions in {seconds:.1f} s{rate}")
     for panel in config.maps.panels:
         hit, missed, never_left = run.hits(panel.perturbation).counts.values()
         tell(

@@ -1,0 +1,29 @@
+import numpy as np
+from numpy.typing import NDArray
+
+from apt_evap._core.octree import Octree
+from apt_evap._core.sweep import InteractionLists
+
+class ChargingRule:
+    @property
+    def area(self) -> float: ...
+    def scale(self, tree: Octree, factor: float) -> None: ...
+
+class Robin(ChargingRule):
+    def __init__(self, tolerance: float = 1e-5, window: int = 8) -> None: ...
+    @property
+    def tolerance(self) -> float: ...
+    @property
+    def window(self) -> int: ...
+    def solve(
+        self,
+        tree: Octree,
+        normals: NDArray[np.float64],
+        lists: InteractionLists,
+        *,
+        tolerance: float = 1e-6,
+        most_sweeps: int = 200,
+        double_precision: bool = False,
+        n_threads: int = 1,
+    ) -> tuple[int, float]: ...
+    def mixed(self, maps: list[NDArray[np.float64]], steps: list[NDArray[np.float64]]) -> NDArray[np.float64]: ...

@@ -1,0 +1,385 @@
+"""Checkpoints: a run is kept in a folder beside its file while it goes on, so that nothing done is lost.
+
+The folder NAME.h5.unfinished holds the ions in parts, each a run file of its own, and the state of the emitter. Every
+file is written aside, flushed to the disk and renamed: it is there whole or not at all, whenever the process is killed.
+A part comes before the state that goes with it. Once the run has ended, NAME.h5 is written in the same way, and then
+the folder goes: renamed first, so that no half of it is taken for an unfinished run.
+"""
+
+import contextlib
+import errno
+import os
+import shutil
+import socket
+import time
+import warnings
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from apt_evap._arrays import check_count, check_number
+from apt_evap._files import FileError, check_path, flush_folder
+from apt_evap.emitter import EXHAUSTED, SWEEP_DUE, TOO_SHALLOW
+from apt_evap.run import PART_NAME, Run, load, part_paths
+from apt_evap.run_file import described, is_run, plain, read_state, write_state
+from apt_evap.watch import History
+
+try:
+    import fcntl
+except ImportError:  # not on this system: two processes on one file are not noticed
+    fcntl = None
+
+
+STATE_NAME, WHOLE_NAME = "state.h5", "whole.h5"
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """Where a run is kept while it goes on, and how often.
+
+    Parameters
+    ----------
+    path : str or path-like
+        File of the run, .h5, written once it has ended; until then the run is in the folder of this name with
+        ".unfinished" after it.
+    minutes : float
+        Time between two checkpoints [min]; 0 for one after every batch of events.
+    ions : int, optional
+        Ions after which there is a checkpoint in any case.
+    resume : bool
+        Whether to go on with what is there: an unfinished run, or the file of one that ended. If nothing is there, the
+        run begins.
+    overwrite : bool
+        Whether to begin anew over an unfinished run, and over a file that is no run.
+    """
+
+    path: str | os.PathLike
+    minutes: float = 10.0
+    ions: int | None = None
+    resume: bool = False
+    overwrite: bool = False
+
+    def __post_init__(self):
+        object.__setattr__(self, "path", check_path(self.path))
+        if self.path.suffix.lower() != ".h5":
+            raise FileError(f"a run is saved in an HDF5 file whose name ends in .h5, got {str(self.path)!r}")
+        check_number(self.minutes, "minutes", at_least=0, unit="min")
+        if self.ions is not None:
+            check_count(self.ions, "ions", at_least=1)
+
+    @property
+    def folder(self):
+        """Folder of the unfinished run."""
+        target = Path(os.path.realpath(self.path))
+        return target.with_name(target.name + ".unfinished")
+
+
+class Keeper:
+    """Keeps one run on the disk; locked against other processes from `open` to `close`.
+
+    Parameters
+    ----------
+    checkpoint : Checkpoint
+        Where and how often.
+    settings : dict
+        Settings of the run that is about to go on or begin.
+    perturbations : tuple
+        Flown in it.
+    responses : bool
+        Whether it has responses.
+    """
+
+    def __init__(self, checkpoint, settings, perturbations, responses):
+        self._checkpoint, self._folder = checkpoint, checkpoint.folder
+        self._target = Path(os.path.realpath(checkpoint.path))
+        self._lock = None
+        self._written_at, self._written_to = time.monotonic(), 0
+        self.done = None  # what is there already
+        self._open()
+        try:
+            self._prepare(settings, perturbations, responses)
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        self.close()
+
+    # ---- the lock --------------------------------------------------------------------------------------------------
+
+    def _open(self):
+        # The lock may be on a folder that its last owner has just taken away: then once more.
+        while self._lock is None:
+            try:
+                self._folder.mkdir(exist_ok=True)
+                lock = open(self._folder / "lock", "a+", encoding="utf-8")
+            except FileNotFoundError as error:
+                if self._folder.parent.is_dir():
+                    continue
+                raise self._error(error) from error
+            except OSError as error:
+                raise self._error(error) from error
+            try:
+                self._take(lock)
+                if os.path.samestat(os.fstat(lock.fileno()), os.stat(self._folder / "lock")):
+                    self._lock = lock
+            except FileNotFoundError:
+                pass
+            finally:
+                if self._lock is None:
+                    lock.close()
+        self._lock.truncate(0)
+        self._lock.write(f"process {os.getpid()} on {socket.gethostname()}")
+        self._lock.flush()
+
+    def _take(self, lock):
+        if fcntl is None:
+            return
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
+                lock.seek(0)
+                owner = lock.read(100) or "another process"
+                raise FileError(
+                    f"{str(self._checkpoint.path)!r} is being written by {owner}; wait for it or choose another file"
+                ) from None
+            warnings.warn(
+                f"no lock on {str(self._folder)!r} ({error.strerror}): see to it that no other process writes there",
+                stacklevel=6,
+            )
+
+    def close(self):
+        """Let go of the files; a folder without ions goes."""
+        if self._lock is None:
+            return
+        with contextlib.suppress(OSError):
+            if self._folder.is_dir() and not part_paths(self._folder):
+                self._remove_folder()
+        self._lock.close()
+        self._lock = None
+
+    def _remove_folder(self):
+        # renamed first: a folder with some of its files gone is no unfinished run
+        gone = self._folder.with_name(f".{self._folder.name}.{os.getpid()}.gone")
+        os.replace(self._folder, gone)
+        shutil.rmtree(gone, ignore_errors=True)
+
+    def _error(self, error):
+        return FileError(f"cannot write {str(self._folder)!r}: {error.strerror or error}")
+
+    # ---- what is there ---------------------------------------------------------------------------------------------
+
+    def _prepare(self, settings, perturbations, responses):
+        checkpoint, folder = self._checkpoint, self._folder
+        try:
+            for rest in (
+                *folder.glob(".*.part"),
+                *folder.glob(WHOLE_NAME),
+                *self._target.parent.glob(f".{folder.name}.*.gone"),
+            ):
+                shutil.rmtree(rest) if rest.is_dir() else rest.unlink()
+        except OSError as error:
+            raise self._error(error) from error
+        parts = part_paths(folder)
+        if checkpoint.resume:
+            if not parts and not self._target.exists():
+                return
+            self.done = load(folder) if parts else load(self._target)
+            self._compare(settings, perturbations, responses)
+            if parts:
+                self.done = self._with_state(self.done)
+            elif self.done.state is None:
+                raise FileError(f"the run in {str(checkpoint.path)!r} cannot be resumed: the file holds no state")
+            else:
+                self._write_part(self.done)
+                write_state(folder / STATE_NAME, self.done.state, self.done.first_event)
+            self._written_to = len(self.done)
+        elif parts and not checkpoint.overwrite:
+            ions = sum(len(load(path)) for path in parts)
+            raise FileError(
+                f"{str(checkpoint.path)!r} has an unfinished run of {ions:,} ions beside it, in {folder.name!r}: "
+                "resume=True goes on with it, overwrite=True begins anew"
+            )
+        else:
+            if self._target.exists() and not checkpoint.overwrite and not is_run(self._target):
+                raise FileError(f"{str(checkpoint.path)!r} exists and is no run: overwrite=True replaces it")
+            for path in (folder / STATE_NAME, *parts[::-1]):
+                path.unlink(missing_ok=True)
+
+    def _with_state(self, run):
+        """The unfinished run with the state beside its parts; without one its events begin at the first."""
+        path = self._folder / STATE_NAME
+        try:
+            if path.exists():
+                state, first_event = read_state(path)
+            else:  # killed after a part and before its state; a part that was a whole run has one of its own
+                last = load(part_paths(self._folder)[-1])
+                state, first_event = last.state, last.first_event
+        except FileError as error:
+            warnings.warn(f"{error}: all events are computed again", stacklevel=7)
+            state, first_event = None, 0
+        return replace(run, state=state, first_event=first_event)
+
+    def _compare(self, settings, perturbations, responses):
+        """Refuse to go on with other settings than those of the beginning."""
+        name, done = str(self._checkpoint.path), self.done
+        here = dict(_flat(plain(settings)), responses=responses, flown=[described(each) for each in perturbations])
+        there = dict(
+            _flat(done.settings),
+            responses=done.responses is not None,
+            flown=[described(each) for each in done.perturbations],
+        )
+        differing = [
+            f"{key} is {there.get(key)!r:.60} there and {here.get(key)!r:.60} here"
+            for key in dict.fromkeys((*there, *here))
+            if there.get(key) != here.get(key)
+        ]
+        if differing:
+            more = f", and {len(differing) - 3} more" if len(differing) > 3 else ""
+            raise FileError(
+                f"the run in {name!r} cannot be resumed with other settings: {'; '.join(differing[:3])}{more}"
+            )
+        if not np.array_equal(done.emissions.ions, done.emissions.ions[0] + np.arange(len(done))):
+            raise FileError(f"the run in {name!r} cannot be resumed: some of its ions are missing")
+
+    # ---- writing ---------------------------------------------------------------------------------------------------
+
+    def due(self, ions):
+        """Whether it is time for a checkpoint once the run has so many ions."""
+        new = ions - self._written_to
+        often = self._checkpoint.ions is not None and new >= self._checkpoint.ions
+        return new > 0 and (often or time.monotonic() - self._written_at >= 60 * self._checkpoint.minutes)
+
+    def write(self, part, state, first_event):
+        """Write the next part of the run, then the state it ends in; if that fails, a warning says so.
+
+        Returns
+        -------
+        bool
+            Whether the part is on the disk; if not, it has to come again with the next one.
+        """
+        self._written_at = time.monotonic()  # not at once again if it fails
+        written = False
+        try:
+            self._write_part(part)
+            self._written_to += len(part)
+            written = True
+            if len(state.sites) <= first_event + self._written_to:  # else its ions are not on the disk yet
+                write_state(self._folder / STATE_NAME, state, first_event)
+        except FileError as error:
+            warnings.warn(f"no checkpoint: {error}; the run goes on and tries again", stacklevel=4)
+        return written
+
+    def _write_part(self, part):
+        part.save(self._folder / PART_NAME.format(int(part.emissions.ions[0])))
+
+    def finish(self, run):
+        """Write the file of the run and take the folder away."""
+        whole = self._folder / WHOLE_NAME
+        run.save(whole)
+        try:
+            os.replace(whole, self._target)
+            flush_folder(self._target.parent)
+            self._remove_folder()
+        except OSError as error:
+            raise FileError(f"cannot write {str(self._checkpoint.path)!r}: {error.strerror or error}") from error
+
+
+class Parts:
+    """The parts of a run in memory, and on the disk where a `Keeper` keeps them.
+
+    Parameters
+    ----------
+    keeper : Keeper or None
+        Where they are kept.
+    emitter : Emitter
+        The surface, whose state goes with them.
+    """
+
+    def __init__(self, keeper, emitter):
+        self.watch = None
+        self.done = [keeper.done] if keeper and keeper.done else []
+        self._keeper, self._emitter = keeper, emitter
+        self._new = []
+        self._first_event = self.done[0].first_event if self.done else emitter.counts["events"]
+
+    def __len__(self):
+        return sum(map(len, self.done)) + sum(map(len, self._new))
+
+    def append(self, part):
+        """Add the next part."""
+        self._new.append(part)
+
+    def _joined(self):
+        # the history goes with the last part, as it is taken but once
+        if self._new:
+            joined = Run.join(self._new)
+            self._new = [replace(joined, history=History.join([joined.history, self.watch.take()]))]
+        return self._new
+
+    def keep(self):
+        """Write what is new to the disk."""
+        if self._keeper and len(self) > sum(map(len, self.done)):
+            if self._keeper.write(self._joined()[0], self._emitter.state(), self._first_event):
+                self.done += self._new
+                self._new = []
+
+    def run(self, ended=""):
+        """Join all parts into one run."""
+        run = Run.join([*self.done, *self._joined()])
+        return replace(run, state=self._emitter.state(), first_event=self._first_event, ended=ended)
+
+
+def catch_up(emitter, run, batch_size):
+    """Bring a new surface to where a run ends, by its state and the events since.
+
+    Parameters
+    ----------
+    emitter : Emitter
+        Of the settings of the run.
+    run : Run
+        What has been done; without a state all its events happen again.
+    batch_size : int
+        Events at a time.
+
+    Raises
+    ------
+    ValueError
+        If atoms have left the emitter, or its events are not those of the run.
+    """
+    if emitter.counts["events"]:
+        raise ValueError(f"a run is resumed by a new Simulation, got one that {emitter.counts['events']:,} atoms left")
+    if run.state is not None:
+        emitter.restore(run.state)
+    ions = emitter.counts["events"] - run.first_event  # ions of the run that have left; those before it count down
+    same = ions <= len(run)
+    while same and ions < len(run):
+        batch = emitter.evaporate(min(batch_size, len(run) - ions))
+        known = slice(max(ions, 0), max(ions + len(batch), 0))
+        kept = slice(len(batch) - (known.stop - known.start), None)
+        same = np.array_equal(batch.site[kept], run.site[known])
+        same = same and np.array_equal(batch.charges[kept], run.charges[known])
+        ions += len(batch)
+        if batch.status == SWEEP_DUE:
+            emitter.relax()
+        elif batch.status == TOO_SHALLOW:
+            emitter.deepen()
+        same = same and batch.status != EXHAUSTED
+    if not same:
+        raise ValueError(
+            "the run cannot be resumed: its events do not come out the same again, as with another version of the "
+            "program, or a surface that was changed by hand"
+        )
+
+
+def _flat(settings, before=""):
+    """Settings in one dict, the names of the tables before those of the keys."""
+    flat = {}
+    for key, value in settings.items():
+        flat |= _flat(value, f"{before}{key}.") if isinstance(value, dict) else {f"{before}{key}": value}
+    return flat

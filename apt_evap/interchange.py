@@ -1,0 +1,117 @@
+"""To and from the types of other packages, which need not be installed: Atoms of ASE, DataFrame of pandas."""
+
+from collections import Counter
+from importlib import import_module
+
+import numpy as np
+
+from apt_evap.material import as_material
+
+_ANGSTROM_PER_NM = 10.0
+
+
+def _needed(name, what):
+    """Import a package that need not be installed."""
+    try:
+        return import_module(name)
+    except ImportError as error:
+        package = name.split(".")[0]
+        raise ImportError(f"{what} needs {package}, which is not installed: pip install {package}") from error
+
+
+def from_atoms(atoms, materials=None):
+    """What `Tip.from_positions` needs of an ASE Atoms object.
+
+    Parameters
+    ----------
+    atoms : ase.Atoms
+        Positions in Angstrom. Its cell and periodicity are not looked at.
+    materials : mapping of str to Material, optional
+        Materials by chemical symbol, for those that `material` does not know.
+
+    Returns
+    -------
+    dict
+        ``positions`` [nm], ``species``, ``elements``, the most frequent one first, and ``evaporable`` if the atoms have
+        an array of this name.
+
+    Raises
+    ------
+    ValueError
+        If it is no Atoms object, a symbol has no material, or the atoms are a shell.
+    """
+    if not all(hasattr(atoms, name) for name in ("get_chemical_symbols", "get_positions", "arrays")):
+        raise ValueError(f"atoms must be an ase.Atoms object, got {atoms!r:.80}")
+    if np.any(atoms.arrays.get("support", False)):
+        raise ValueError("atoms must be all of a specimen, got a shell, whose inner side would count as a surface")
+    symbols = atoms.get_chemical_symbols()
+    names = [name for name, _ in Counter(symbols).most_common()]
+    known = dict(materials or {})
+    numbers = {name: number for number, name in enumerate(names)}
+    found = {
+        "positions": atoms.get_positions() / _ANGSTROM_PER_NM,
+        "species": np.array([numbers[symbol] for symbol in symbols], dtype=np.int32),
+        "elements": [as_material(known.get(name, name)) for name in names],
+    }
+    if "evaporable" in atoms.arrays:
+        found["evaporable"] = atoms.arrays["evaporable"]
+    return found
+
+
+def to_atoms(positions, elements, species, **arrays):
+    """Make an ASE Atoms object.
+
+    Parameters
+    ----------
+    positions : ndarray
+        Atoms [nm], shape (n, 3).
+    elements : sequence of Material
+        The species; one whose name is no chemical symbol becomes "X".
+    species : ndarray of int
+        Index of each atom into `elements`, shape (n,).
+    **arrays
+        Further arrays of the atoms by name, shape (n,) or (n, k).
+
+    Returns
+    -------
+    ase.Atoms
+        Positions in Angstrom, no cell.
+
+    Raises
+    ------
+    ImportError
+        If ASE is not installed.
+    """
+    numbers = _needed("ase.data", "to_atoms").atomic_numbers
+    of_species = np.array([numbers.get(element.name, 0) for element in elements])
+    atoms = _needed("ase", "to_atoms").Atoms(numbers=of_species[species], positions=positions * _ANGSTROM_PER_NM)
+    for name, values in arrays.items():
+        atoms.new_array(name, values)
+    return atoms
+
+
+def to_dataframe(columns, **attributes):
+    """Make a pandas DataFrame.
+
+    Parameters
+    ----------
+    columns : mapping of str to ndarray
+        Columns, shape (n,) or (n, k); one of several values per row becomes name_0, name_1, ...
+    **attributes
+        Kept in ``attrs`` of the DataFrame.
+
+    Returns
+    -------
+    pandas.DataFrame
+
+    Raises
+    ------
+    ImportError
+        If pandas is not installed.
+    """
+    single = {}
+    for name, values in columns.items():
+        single |= {name: values} if values.ndim == 1 else {f"{name}_{k}": part for k, part in enumerate(values.T)}
+    frame = _needed("pandas", "to_dataframe").DataFrame(single)
+    frame.attrs.update(attributes)
+    return frame

@@ -1,0 +1,76 @@
+"""Field and voltage in the course of a run."""
+
+import numpy as np
+
+from apt_evap._arrays import check_count
+from apt_evap.plot._figure import new_figure
+
+
+def history(run, axes=None, *, points=200):
+    """Draw the field at which atoms left and the voltage it takes, or the voltage of a measurement, against the ions.
+
+    The line is the median of successive ions, the band holds 90 % of them.
+
+    Parameters
+    ----------
+    run : Run or Hits
+        A run; or measured ions with a voltage.
+    axes : sequence of matplotlib.axes.Axes, optional
+        Where to draw: two for a run, one for measured ions; a new figure by default.
+    points : int
+        Number of points along each line.
+
+    Returns
+    -------
+    ndarray of matplotlib.axes.Axes
+        Shape (2,) for a run, (1,) for measured ions.
+
+    Raises
+    ------
+    ValueError
+        If measured ions have no voltage, or the number of axes is not the one needed.
+
+    Notes
+    -----
+    Charges and fields are proportional to the voltage. An atom that left at the field F of the run's voltage V would
+    reach its evaporation field at V F_evap / F: the voltage that a measurement at a constant rate would apply.
+    """
+    points = check_count(points, "points", at_least=1)
+    panels = _panels(run)
+    if axes is None:
+        axes = new_figure((6.4, 0.6 + 2.3 * len(panels))).subplots(len(panels), 1, sharex=True, squeeze=False)
+    axes = np.atleast_1d(np.asarray(axes, dtype=object)).ravel()
+    if len(axes) != len(panels):
+        raise ValueError(f"axes must be {len(panels)} for {run!r}, got {len(axes)}")
+    for ax, (label, values) in zip(axes, panels, strict=True):
+        ions, low, middle, high = _course(values, points)
+        ax.fill_between(ions, low, high, color="C0", alpha=0.25, linewidth=0, label="90 % of the ions")
+        ax.plot(ions, middle, color="C0", linewidth=1.3, label="median")
+        ax.set(ylabel=label, xlim=(0, len(values)))
+        ax.grid(alpha=0.3)
+    axes[0].legend(loc="best", frameon=False, ncols=2)
+    axes[-1].set_xlabel("ions")
+    axes[-1].xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
+    return axes
+
+
+def _panels(run):
+    """Label and values of each panel."""
+    if not hasattr(run, "fields"):
+        (voltage,) = run.require("voltage")
+        return [("voltage [V]", voltage)]
+    tip = run.settings["tip"]
+    described = [tip["material"], *(solute for solute, _ in tip["solutes"])] if "material" in tip else tip["elements"]
+    evaporation_fields = {element["name"]: element["evaporation_field"] for element in described}
+    needed = np.array([evaporation_fields[name] for name in run.elements])[run.species]
+    return [
+        (f"field at {run.voltage:g} V [V/nm]", run.fields),
+        ("voltage of evaporation [V]", run.voltage * needed / run.fields),
+    ]
+
+
+def _course(values, points):
+    """Middle, and the 5, 50 and 95 percentiles, of successive stretches of nearly equal length."""
+    edges = np.linspace(0, len(values), min(points, len(values)) + 1).astype(int)
+    stretches = np.split(values, edges[1:-1])
+    return (edges[:-1] + edges[1:]) / 2, *np.array([np.percentile(part, [5, 50, 95]) for part in stretches]).T

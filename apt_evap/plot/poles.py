@@ -1,0 +1,81 @@
+"""Poles and zone lines over a detector map."""
+
+import numpy as np
+from matplotlib.patheffects import withStroke
+
+from apt_evap.poles import poles as poles_of
+from apt_evap.poles import zones
+
+_COLORS = ("#35b6ff", "#ff9d3b", "#7be07b", "#e58cff")
+_AZIMUTHS = np.radians(np.arange(0.0, 360.5, 0.5))
+_APART = 26  # points between a label and one drawn before, at font size 9
+
+
+def poles(ax, orientation, projection, *, families=6, zone_families=None, labels=True, region=None, size=9):
+    """Draw the poles and zone lines of a specimen over a map.
+
+    Parameters
+    ----------
+    ax : matplotlib.axes.Axes
+        Axes of a map in mm, such as `detector_map` returns; only what is within their limits is drawn.
+    orientation : Orientation
+        How the crystal is oriented: of a fit, or ``Orientation.from_settings(run.settings["tip"])``.
+    projection : Projection
+        How directions appear on the map: of a fit, or ``image_compression(run).projection``.
+    families : int
+        How many families of poles, see `poles.poles`; 0 for none.
+    zone_families : sequence, optional
+        Families of zone axes whose lines are drawn, by default those of `poles.ZONES`; () for none.
+    labels : bool
+        Whether poles have their names beside them. Of names that would overlap only that of the wider spacing is
+        written.
+    region : DetectorMap, optional
+        The map, to draw only what is inside its detector.
+    size : float
+        Size of the names [points].
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+    """
+    x_limits, y_limits = sorted(ax.get_xlim()), sorted(ax.get_ylim())
+    material = orientation.material
+
+    def shown(places):
+        with np.errstate(invalid="ignore"):
+            inside = (places[:, 0] > x_limits[0]) & (places[:, 0] < x_limits[1])
+            inside &= (places[:, 1] > y_limits[0]) & (places[:, 1] < y_limits[1])
+        if region is not None:
+            columns = np.searchsorted(region.x_edges, places[inside, 0]) - 1
+            rows = np.searchsorted(region.y_edges, places[inside, 1]) - 1
+            ny, nx = region.mask.shape
+            there = (columns >= 0) & (columns < nx) & (rows >= 0) & (rows < ny)
+            there[there] = region.mask[rows[there], columns[there]]
+            inside[inside] = there
+        return inside
+
+    if zone_families is None or len(zone_families):
+        found = zones(material, zone_families)
+        for axis, family in zip(orientation.directions(found.directions), found.families, strict=True):
+            first, second = np.linalg.svd(axis[None])[2][1:]
+            circle = np.cos(_AZIMUTHS)[:, None] * first + np.sin(_AZIMUTHS)[:, None] * second
+            places = projection.places(circle)
+            places[~shown(places)] = np.nan
+            ax.plot(*places.T, color=_COLORS[family % len(_COLORS)], linewidth=0.8, alpha=0.9, zorder=2.5)
+    if families:
+        found = poles_of(material, families)
+        places = projection.places(orientation.directions(found.normals))
+        chosen = np.flatnonzero(shown(places))
+        areas = 60 * (found.spacings[chosen] / found.spacings.max()) ** 2
+        outline = [withStroke(linewidth=2, foreground="black")]
+        ax.scatter(*places[chosen].T, s=areas, facecolors="none", edgecolors="white", linewidths=1.2, zorder=3,
+                   path_effects=outline)  # fmt: skip
+        written = []
+        for index in chosen if labels else ():
+            point = ax.transData.transform(places[index]) * 72 / ax.figure.dpi
+            if all(np.hypot(*(point - other)) > _APART * size / 9 for other in written):
+                written.append(point)
+                ax.annotate(found.labels[index], places[index], xytext=(4, 4), textcoords="offset points", size=size,
+                            color="white", path_effects=outline, annotation_clip=True, clip_on=True)  # fmt: skip
+    ax.set(xlim=x_limits, ylim=y_limits)
+    return ax

@@ -1,0 +1,136 @@
+"""Profiles, the lines fitted to them, two of them compared; rectangles on a map."""
+
+import numpy as np
+from matplotlib.patches import Polygon
+
+from apt_evap.plot._figure import new_figure
+from apt_evap.zone_line import compare_profiles
+
+
+def profile(profiles, labels=None, ax=None, *, lines=None, xlabel="distance from the line [mm]"):
+    """Draw profiles with their errors, and the lines fitted to them.
+
+    Parameters
+    ----------
+    profiles : Profile or sequence of Profile
+        The profiles.
+    labels : sequence of str, optional
+        A label for each.
+    ax : matplotlib.axes.Axes, optional
+        Where to draw; a new figure by default.
+    lines : sequence of ZoneLine, optional
+        What `fit_zone_line` gave for each; None for one without.
+    xlabel : str
+        What the positions are, with their unit.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+
+    Raises
+    ------
+    ValueError
+        If there is no profile, or not one label or line for each.
+    """
+    profiles = [profiles] if hasattr(profiles, "density") else list(profiles)
+    n = len(profiles)
+    labels = [None] * n if labels is None else list(labels)
+    lines = [None] * n if lines is None else list(lines)
+    if not n or len(labels) != n or len(lines) != n:
+        raise ValueError(
+            f"a picture needs profiles, and a label and a line for each, got {n}, {len(labels)} and {len(lines)}"
+        )
+    if ax is None:
+        ax = new_figure((5.6, 4.0)).subplots()
+    for index, (one, label, line) in enumerate(zip(profiles, labels, lines, strict=True)):
+        color = f"C{index}"
+        errors = one.error if np.isfinite(one.error).any() else None
+        if line is not None:
+            label = f"{label or line.kind}: {line.width:.1f} ± {line.width_error:.1f} mm"
+            fine = np.linspace(one.position[0], one.position[-1], 400)
+            ax.plot(fine, line.density(fine), color=color, linewidth=1.5, alpha=0.85)
+        ax.errorbar(
+            one.position, one.density, errors, color=color, fmt="os"[index % 2], markersize=3.5, elinewidth=0.9,
+            linestyle="none" if line is not None else "-", linewidth=1.0, label=label,
+        )  # fmt: skip
+    ax.set(xlabel=xlabel, ylabel="hits per area / mean", ylim=(0, None))
+    ax.grid(alpha=0.3)
+    if any(label or line for label, line in zip(labels, lines, strict=True)):
+        ax.set_ylim(0, 1.25 * ax.get_ylim()[1])  # room for the legend
+        ax.legend(loc="upper center", frameon=False, fontsize="small")
+    return ax
+
+
+def profile_comparison(first, second, labels=None, axes=None, *, lines=None):
+    """Draw two profiles of one rectangle, and below them their difference in units of its error.
+
+    Parameters
+    ----------
+    first, second : Profile
+        Profiles with the same bins and with errors.
+    labels : sequence of str, optional
+        A label for each.
+    axes : sequence of matplotlib.axes.Axes, optional
+        Two, for the profiles and for the difference; a new figure by default.
+    lines : sequence of ZoneLine, optional
+        The line fitted to each.
+
+    Returns
+    -------
+    ndarray of matplotlib.axes.Axes
+        Shape (2,).
+
+    Raises
+    ------
+    ValueError
+        If bins differ, or a profile has no errors.
+    """
+    compared = compare_profiles(first, second)
+    if axes is None:
+        axes = new_figure((5.6, 5.2)).subplots(2, 1, sharex=True, height_ratios=(3, 1))
+    upper, lower = axes
+    profile([first, second], labels, upper, lines=lines)
+    upper.set_xlabel("")
+    upper.tick_params(labelbottom=False)
+    bin_width = compared.position[1] - compared.position[0] if len(compared.position) > 1 else 1.0
+    lower.axhspan(-1, 1, color="0.9", linewidth=0)
+    lower.axhline(0, color="0.4", linewidth=0.8)
+    lower.bar(compared.position, compared.difference, 0.8 * bin_width, color="0.35")
+    reach = max(4.0, 1.1 * np.nanmax(np.abs(compared.difference)))
+    lower.set(ylim=(-reach, reach), xlabel="distance from the line [mm]", ylabel="difference\n/ error")
+    lower.annotate(
+        f"$\\chi^2$ = {compared.chi_square:.0f} for {compared.degrees_of_freedom}", (0.02, 0.95),
+        xycoords="axes fraction", va="top", fontsize="small",
+    )  # fmt: skip
+    return np.array([upper, lower])
+
+
+def rectangles(chosen, ax, *, colors="cyan", labels=None):
+    """Draw rectangles on a detector map, with a thin line where the profile is zero.
+
+    Parameters
+    ----------
+    chosen : Rectangle or sequence of Rectangle
+        The rectangles.
+    ax : matplotlib.axes.Axes
+        The picture of the map.
+    colors : color or sequence of them
+        Of the rectangles.
+    labels : sequence of str, optional
+        A label for each.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+    """
+    chosen = [chosen] if hasattr(chosen, "corners") else list(chosen)
+    colors = [colors] * len(chosen) if isinstance(colors, str) else list(colors)
+    for index, (rectangle, color) in enumerate(zip(chosen, colors, strict=True)):
+        corners = rectangle.corners
+        ax.add_patch(Polygon(corners, fill=False, edgecolor=color, linewidth=1.6))
+        ends = (corners[[0, 1]] + corners[[3, 2]]) / 2
+        ax.plot(*ends.T, color=color, linewidth=0.7, linestyle=(0, (4, 4)))
+        if labels is not None:
+            place = max(corners, key=lambda corner: corner.sum())
+            ax.annotate(labels[index], place, xytext=(3, 3), textcoords="offset points", color=color, fontweight="bold")
+    return ax

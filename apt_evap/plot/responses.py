@@ -1,0 +1,133 @@
+"""Where chosen ions land as the energy of the perturbation grows."""
+
+import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
+
+from apt_evap.plot._figure import new_figure
+from apt_evap.tracks import lateral_tracks, rollup_tracks
+
+MECHANISMS = ("lateral velocity", "roll-up")
+
+
+def ion_colors(n):
+    """Colours that tell n chosen ions apart, the same in every picture (list of str)."""
+    return [f"C{index % 10}" for index in range(n)]
+
+
+def response(
+    run, ions, mechanism="lateral velocity", ax=None, *, energies=None, colors=None, colormap="viridis",
+    colorbar=True, zoom=None, title=None,
+):  # fmt: skip
+    """Draw where chosen ions land under launch energies from none to the highest.
+
+    For a lateral velocity, every direction along the surface is shown; for roll-up, the track that leads from the
+    place without perturbation (dot), by the roll alone (dashed), through the places of growing energy.
+
+    Parameters
+    ----------
+    run : Run
+        A run with responses.
+    ions : array_like of int
+        Which ions of the run, shape (n,).
+    mechanism : {"lateral velocity", "roll-up"}
+        How they are perturbed.
+    ax : matplotlib.axes.Axes, optional
+        Where to draw; a new figure by default.
+    energies : array_like, optional
+        Launch energies [eV], increasing, shape (m,); 0 to 1 eV by default.
+    colors : sequence of colors, optional
+        Of the dots, one for each ion; `ion_colors` by default.
+    colormap : str
+        Colour map of the energies.
+    colorbar : bool
+        Whether to draw a colour bar.
+    zoom : int, optional
+        Which of the n ions is shown larger in an inset, from 0.
+    title : str, optional
+        Title above the picture.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+
+    Raises
+    ------
+    ValueError
+        If the run has no responses, or an argument is none of those allowed.
+    """
+    if mechanism not in MECHANISMS:
+        raise ValueError(f"mechanism must be one of {', '.join(MECHANISMS)}, got {mechanism!r}")
+    energies = np.linspace(0, 1, 51) if energies is None else np.asarray(energies, float)
+    still = lateral_tracks(run, ions, [0.0], [0.0])
+    dots = np.column_stack([still.x[:, 0, 0], still.y[:, 0, 0]])
+    if zoom is not None and not 0 <= zoom < len(dots):
+        raise ValueError(f"zoom must be one of the {len(dots)} ions, 0 to {len(dots) - 1}, got {zoom!r}")
+    colors = ion_colors(len(dots)) if colors is None else list(colors)
+    if mechanism == MECHANISMS[0]:
+        draw, tracks = _directions, lateral_tracks(run, ions, energies, np.arange(0, 360, 2))
+    else:
+        draw, tracks = _lines, rollup_tracks(run, ions, energies)
+    scale = {"norm": Normalize(energies.min(), energies.max()), "cmap": colormap}
+    if ax is None:
+        ax = new_figure((5.6, 5.0)).subplots()
+    draw(ax, tracks, dots, scale, 1.0)
+    _dots(ax, dots, colors, 26)
+    ax.set(aspect="equal", xlabel="x [mm]", ylabel="y [mm]", title=title)
+    ax.autoscale_view()
+    ax.set_box_aspect(1)
+    ax.set_adjustable("datalim")
+    if zoom is not None:
+        inset = ax.inset_axes(_emptiest_corner(ax, tracks))
+        draw(inset, tracks, dots, scale, 2.2)
+        _dots(inset, dots, colors, 60)
+        places = np.column_stack([tracks.x[zoom].ravel(), tracks.y[zoom].ravel()])
+        low, high = (end([*places, dots[zoom]], axis=0) for end in (np.nanmin, np.nanmax))
+        half = 0.58 * max(high - low)
+        middle = (low + high) / 2
+        inset.set(xlim=middle[0] + [-half, half], ylim=middle[1] + [-half, half], aspect="equal")
+        inset.tick_params(labelsize="x-small")
+        ax.indicate_inset_zoom(inset, edgecolor="0.3")
+    if colorbar:
+        mapped = ScalarMappable(**scale)
+        mapped.set_array(energies)
+        ax.figure.colorbar(mapped, ax=ax, label="launch energy [eV]", fraction=0.05, pad=0.02)
+    return ax
+
+
+def _directions(ax, tracks, dots, scale, size):
+    """All directions at every energy, the highest first so that the lowest are seen."""
+    n, _, k = tracks.x.shape
+    order = np.argsort(-tracks.energies, kind="stable")
+    x, y = (np.moveaxis(values[:, order], 1, 0) for values in (tracks.x, tracks.y))
+    energies = np.repeat(tracks.energies[order], n * k)
+    ax.scatter(x.ravel(), y.ravel(), c=energies, s=3 * size**2, linewidths=0, rasterized=True, **scale)
+
+
+def _lines(ax, tracks, dots, scale, size):
+    for x, y, dot in zip(tracks.x, tracks.y, dots, strict=True):
+        ax.plot([dot[0], x[0]], [dot[1], y[0]], color="0.35", linewidth=1.0, linestyle=(0, (3, 2)), zorder=1)
+        points = np.column_stack([x, y])
+        parts = np.stack([points[:-1], points[1:]], axis=1)
+        middle = (tracks.energies[:-1] + tracks.energies[1:]) / 2
+        ax.add_collection(LineCollection(parts, array=middle, linewidths=2.4 * size**0.5, capstyle="round", **scale))
+
+
+def _dots(ax, dots, colors, size):
+    ax.scatter(*dots.T, s=size, c=colors, edgecolors="white", linewidths=0.8, zorder=5)
+
+
+def _emptiest_corner(ax, tracks):
+    """Bounds of an inset, in fractions of the axes, where the fewest places are."""
+    places = np.column_stack([tracks.x.ravel(), tracks.y.ravel()])
+    ax.figure.draw_without_rendering()  # the limits of the axes settle
+    places = ax.transAxes.inverted().transform(ax.transData.transform(places[np.isfinite(places).all(axis=1)]))
+    side, gap = 0.34, 0.1
+    corners = [(x, y) for y in (gap, 1 - side - 0.02) for x in (gap, 1 - side - 0.02)]
+    labels = 0.1  # room for the numbers along the inset's axes
+    crowd = [
+        np.sum(np.all((places > np.subtract(corner, labels)) & (places < np.add(corner, side)), axis=1))
+        for corner in corners
+    ]
+    return (*corners[int(np.argmin(crowd))], side, side)

@@ -1,0 +1,157 @@
+"""The surface of a specimen, atom by atom, seen from any side."""
+
+import numpy as np
+from matplotlib.collections import EllipseCollection
+
+from apt_evap._arrays import check_array, check_number
+from apt_evap.plot._figure import add_colorbar, new_figure
+
+COLORED_BY = {"fields": "field [V/nm]", "charges": "charge [e]"}
+
+
+def specimen(
+    emitter, color="fields", ax=None, *, elevation=90.0, azimuth=-90.0, label=None, limits=None,
+    colormap="viridis", colorbar=True, title=None,
+):  # fmt: skip
+    """Draw the surface atoms of a specimen as discs of their size, those in front over those behind.
+
+    Parameters
+    ----------
+    emitter : Emitter
+        The charged surface.
+    color : str or array_like
+        "fields", "charges", or a number for each surface atom, shape (n,).
+    ax : matplotlib.axes.Axes, optional
+        Where to draw; a new figure by default.
+    elevation, azimuth : float
+        Where the viewer is [degrees]: above the x-y plane, and around z from x towards y. By default above the
+        apex, with x to the right and y upwards; 25 and -60 show the specimen from the side.
+    label : str, optional
+        What the colours mean, with its unit, for numbers of one's own.
+    limits : tuple of float, optional
+        Values at the ends of the colour scale; by default the 1 and 99.5 percentiles of the atoms shown that may
+        leave: the rim of the foot does not count.
+    colormap : str
+        Name of a colour map of matplotlib.
+    colorbar : bool
+        Whether to draw a colour bar.
+    title : str, optional
+        Title above the picture.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        Its ``figure.savefig`` writes the picture.
+
+    Raises
+    ------
+    ValueError
+        If `color` is no such name, or not one number for each surface atom.
+    """
+    if isinstance(color, str):
+        if color not in COLORED_BY:
+            raise ValueError(f"color must be one of {', '.join(COLORED_BY)}, or numbers, got {color!r}")
+        values, label = getattr(emitter, color), label or COLORED_BY[color]
+    else:
+        values = check_array(color, "color", (len(emitter),), finite=False)
+    right, up, towards = _viewed_from(elevation, azimuth)
+    shown = np.flatnonzero(emitter.normals @ towards > 1e-9)  # the others face away; symmetric ones lie across
+    positions = emitter.positions[shown]
+    shown = shown[np.argsort(positions @ towards, kind="stable")]  # what is drawn last is in front
+    positions, values = emitter.positions[shown], values[shown]
+    if limits is None:
+        counted = values[emitter.tip.evaporable[emitter.atoms[shown]]]
+        limits = np.nanpercentile(counted if len(counted) else values, [1, 99.5])
+    diameter = emitter.tip.nearest_neighbour_distance
+    places = np.column_stack([positions @ right, positions @ up])
+    low, high = places.min(axis=0) - diameter, places.max(axis=0) + diameter
+    if ax is None:
+        width, height = (high - low) * (4.5 / max(high - low))
+        figure = new_figure((width + 1.2, height + 0.5))
+        figure.set_layout_engine("compressed")  # made for axes of a fixed shape
+        ax = figure.subplots()
+    _discs(ax, places, 2 * diameter, color="0.2")  # what lies below the gaps of the surface, and its outline
+    atoms = _discs(ax, places, diameter, array=values, cmap=colormap, clim=tuple(limits))
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", title=title)
+    if abs(elevation) == 90 and azimuth == -90:
+        ax.set(xlabel="x [nm]", ylabel="y [nm]" if elevation > 0 else "-y [nm]")
+    else:
+        _scale_instead_of_axes(ax, right, up, low, high)
+    if colorbar:
+        add_colorbar([atoms], ax, label or "")
+    return ax
+
+
+def _discs(ax, places, diameter, **colors):
+    """Discs of a diameter [nm], which keep their size relative to the axes."""
+    sizes = np.full(len(places), diameter)
+    discs = EllipseCollection(
+        sizes, sizes, np.zeros(len(places)), units="xy", offsets=places, offset_transform=ax.transData,
+        linewidths=0, rasterized=True, **colors,
+    )  # fmt: skip
+    ax.add_collection(discs, autolim=False)
+    return discs
+
+
+def mark_atoms(positions, ax, *, colors="black", elevation=90.0, azimuth=-90.0, size=14.0):
+    """Draw a dashed circle around each of some atoms in a picture of the specimen.
+
+    Parameters
+    ----------
+    positions : array_like
+        The atoms [nm], shape (n, 3), such as ``run.emissions.positions[ions]``.
+    ax : matplotlib.axes.Axes
+        The picture.
+    colors : color or sequence of them
+        Of the circles.
+    elevation, azimuth : float
+        Those of the picture [degrees].
+    size : float
+        Diameter of the circles [points].
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+    """
+    positions = check_array(positions, "positions", ("n", 3))
+    right, up, _ = _viewed_from(elevation, azimuth)
+    ax.scatter(
+        positions @ right, positions @ up, s=size**2, facecolors="none", edgecolors="white", linewidths=3.2, zorder=3
+    )
+    ax.scatter(
+        positions @ right, positions @ up, s=size**2, facecolors="none", edgecolors=colors, linewidths=1.8,
+        linestyles=(0, (2.5, 1)), zorder=4,
+    )  # fmt: skip
+    return ax
+
+
+def _viewed_from(elevation, azimuth):
+    """Unit vectors to the right, upwards and towards the viewer."""
+    elevation = np.radians(check_number(elevation, "elevation", at_least=-90, at_most=90, unit="degrees"))
+    azimuth = np.radians(check_number(azimuth, "azimuth", unit="degrees"))
+    along = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    upwards = np.array([0.0, 0.0, 1.0])
+    towards = np.cos(elevation) * along + np.sin(elevation) * upwards
+    return np.cross(upwards, along), np.cos(elevation) * upwards - np.sin(elevation) * along, towards
+
+
+def _scale_instead_of_axes(ax, right, up, low, high):
+    """Where picture and crystal axes differ: a bar of a round length, and arrows along x, y and z."""
+    ax.axis("off")
+    width = high[0] - low[0]
+    length = max(length for power in range(-1, 5) for length in (10**power * np.array([1, 2, 5])) if length < width / 3)
+    margin = 0.1 * (high[1] - low[1])
+    ax.set_ylim(low[1] - 1.6 * margin, high[1])
+    base = low[1] - margin
+    ax.plot([low[0], low[0] + length], [base, base], color="black", linewidth=2.5, solid_capstyle="butt")
+    ax.annotate(
+        f"{length:g} nm", (low[0] + length / 2, base), xytext=(0, -4), textcoords="offset points", ha="center", va="top"
+    )
+    reach = 0.8 * margin
+    origin = np.array([high[0] - 1.5 * reach, base])
+    for name, along in zip("xyz", np.stack([right, up], axis=1), strict=True):
+        if np.hypot(*along) > 0.1:
+            ax.annotate(
+                name, origin, xytext=origin + reach * along, ha="center", va="center",
+                arrowprops={"arrowstyle": "<-", "shrinkA": 1, "shrinkB": 0, "linewidth": 1.1},
+            )  # fmt: skip

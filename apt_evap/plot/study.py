@@ -1,0 +1,166 @@
+"""Pictures of a study: similarity against energies, and the maps side by side."""
+
+import numpy as np
+from matplotlib.patches import Circle, Rectangle
+
+from apt_evap._arrays import check_array, check_number
+from apt_evap.plot._figure import OUTSIDE, add_colorbar, new_figure
+from apt_evap.plot.maps import common_limits, detector_map
+
+_MARK = "#00d0ff"  # seen on every colour of both maps
+
+
+def ssim_matrix(study, *, colormap="viridis"):
+    """Draw the similarity with the measured map against mean and relative standard deviation of the energy.
+
+    The best point is framed; a circle is the best place between points, with the interval of 95 % of the resamples.
+
+    Parameters
+    ----------
+    study : Study
+        What `fit_energies` gives.
+    colormap : str
+        Name of a colour map of matplotlib.
+
+    Returns
+    -------
+    ndarray of matplotlib.axes.Axes
+        One for each roll-up fraction, shape (n,).
+    """
+    grid = study.grid
+    layers, rows, columns = grid.shape
+    across = min(layers, 3)
+    down = -(-layers // across)
+    figure = new_figure((0.75 * columns * across + 1.8, (0.62 * rows + 1.0) * down))
+    axes = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True).ravel()
+    limits = {"vmin": study.ssim.min(), "vmax": study.ssim.max()}
+    for ax, values, fraction in zip(axes, study.ssim, grid.rollup_fractions, strict=False):
+        image = ax.imshow(values, origin="lower", cmap=colormap, aspect="auto", **limits)
+        for (row, column), value in np.ndenumerate(values):
+            shade = image.cmap(image.norm(value))
+            light = np.dot(shade[:3], (0.299, 0.587, 0.114)) > 0.5
+            ax.text(
+                column, row, f"{value:.3f}", ha="center", va="center", fontsize=8, color="k" if light else "w", zorder=5
+            )
+        ax.set_xticks(range(columns), [f"{mean:.4g}" for mean in grid.means])
+        ax.set_yticks(range(rows), [f"{rsd:.3g}" for rsd in grid.rsds])
+        if grid.mechanism == "combined":
+            ax.set_title(f"roll-up fraction {fraction:g}", fontsize="medium")
+    for ax in axes[layers:]:
+        ax.remove()
+    axes = axes[:layers]
+    for number, ax in enumerate(axes):
+        if number + across >= layers:
+            ax.set_xlabel("mean energy [eV]")
+            ax.tick_params(labelbottom=True)
+        if number % across == 0:
+            ax.set_ylabel("standard deviation / mean")
+    _mark_optima(study, axes)
+    figure.suptitle(f"{grid.mechanism}: structural similarity with the measured map", fontsize="medium")
+    add_colorbar([ax.images[0] for ax in axes], list(axes), label="SSIM")
+    return axes
+
+
+def _mark_optima(study, axes):
+    """Frame the best point, and put a circle with its interval on the best place between points."""
+    grid, best, refined = study.grid, study.optimum, study.refined
+    column, row = grid.means.index(best.mean), grid.rsds.index(best.rsd)
+    ax = axes[grid.rollup_fractions.index(best.rollup_fraction)]
+    ax.add_patch(Rectangle((column - 0.48, row - 0.48), 0.96, 0.96, fill=False, edgecolor="r", linewidth=2))
+
+    def places(values, points):
+        return np.interp(values, points, np.arange(len(points)))
+
+    x, y = places(refined.mean, grid.means), places(np.log(refined.rsd), np.log(grid.rsds))
+    errors = {}
+    if refined.intervals:
+        across = places(refined.intervals["mean"], grid.means)
+        along = places(np.log(refined.intervals["rsd"]), np.log(grid.rsds))
+        errors = {"xerr": np.abs(across - x)[:, None], "yerr": np.abs(along - y)[:, None]}
+    ax.errorbar(x, y, **errors, fmt="o", color="r", capsize=3, markersize=9, markerfacecolor="none")
+
+
+def side_by_side(study, *, circle=None, titles=None, colormap="inferno"):
+    """Draw the measured map beside the simulated ones, unperturbed and at the optimum, and a part of them magnified.
+
+    Maps are drawn as they are compared: flattened and smoothed, inside the region that all show.
+
+    Parameters
+    ----------
+    study : Study
+        What `fit_energies` gives.
+    circle : tuple of float, optional
+        x, y and radius [mm] of the part to magnify; by default about the axis of the simulated specimen if that lies
+        inside, about the middle if not.
+    titles : sequence of str, optional
+        Titles of the three maps.
+    colormap : str
+        Name of a colour map of matplotlib.
+
+    Returns
+    -------
+    ndarray of matplotlib.axes.Axes
+        Measured, unperturbed, optimum, and magnified measured and optimum, shape (5,).
+    """
+    maps = [study.compared(study.measured), *(study.compared(study.maps[name]) for name in ("unperturbed", "optimum"))]
+    x, y, radius = _default_circle(study) if circle is None else check_array(circle, "circle", (3,))
+    check_number(float(radius), "the radius of circle", above=0, unit="mm")
+    best = study.optimum
+    if titles is None:
+        mechanism = study.grid.mechanism
+        if mechanism == "combined":
+            mechanism += f", roll-up fraction {best.rollup_fraction:g}"
+        energies = f"{best.mean:g} eV, σ/mean {best.rsd:g}"
+        titles = "measured", "simulated, unperturbed", f"simulated, {mechanism}\n{energies}"
+    limits = common_limits(maps)
+    figure = new_figure((13.0, 9.0))
+    axes = figure.subplots(2, 3)
+    for ax, map, title in zip(axes[0], maps, titles, strict=True):
+        detector_map(map, ax, title=title, limits=limits, colormap=colormap, colorbar=False, caption=False)
+        _show_inside(ax, map)
+    for ax, map, title in ((axes[1, 0], maps[0], titles[0]), (axes[1, 2], maps[2], "simulated")):
+        detector_map(
+            map, ax, title=f"{title}, magnified", limits=limits, colormap=colormap, colorbar=False, caption=False
+        )
+        ax.images[0].set_clip_path(Circle((x, y), radius, transform=ax.transData))
+        ax.set(xlim=(x - radius, x + radius), ylim=(y - radius, y + radius), facecolor="w")
+        ax.add_patch(Circle((x, y), radius, fill=False, edgecolor=_MARK, linewidth=3))
+    for ax in (axes[0, 0], axes[0, 2]):
+        ax.add_patch(Circle((x, y), radius, fill=False, edgecolor=_MARK, linewidth=2))
+    axes[1, 1].axis("off")
+    axes[1, 1].text(0.5, 0.5, _scores(study), ha="center", va="center", transform=axes[1, 1].transAxes, linespacing=1.7)
+    drawn = [*axes[0], axes[1, 0], axes[1, 2]]
+    add_colorbar([ax.images[0] for ax in drawn], list(axes.ravel()), label="hits per area / mean, flattened")
+    return np.array(drawn)
+
+
+def _show_inside(ax, map):
+    """Show only where the mask is, with a margin of two bins."""
+    rows, columns = (np.flatnonzero(map.mask.any(axis=axis)) for axis in (1, 0))
+    ends = []
+    for edges, index in ((map.x_edges, columns), (map.y_edges, rows)):
+        ends.append((edges[max(index[0] - 2, 0)], edges[min(index[-1] + 3, len(edges) - 1)]))
+    ax.set(xlim=ends[0], ylim=ends[1], facecolor=OUTSIDE)
+
+
+def _default_circle(study):
+    map = study.measured
+    x, y = (grid[map.mask] for grid in np.meshgrid(*map.centres))
+    reach = np.sqrt(map.mask.sum() * np.prod(map.bin_size) / np.pi)
+    axis = [float(value[0]) for value in study.registration.points(np.zeros(1), np.zeros(1))]
+    inside = np.hypot(x - axis[0], y - axis[1]).min() < max(map.bin_size)
+    middle = axis if inside else (x.mean(), y.mean())
+    return *middle, 0.4 * reach
+
+
+def _scores(study):
+    """The similarities as text."""
+    lines = [f"SSIM with the measured map, {study.settings['bins_compared']:,} bins"]
+    lines += [f"{name}: {score}" for name, score in study.baselines.items()]
+    lines.append(f"{study.grid.mechanism}: {study.optimum.score}")
+    if study.ceiling is not None:
+        lines.append(f"two halves of the measured ions: {study.ceiling}")
+    lines.append(f"gain over unperturbed: {study.gain}")
+    width, height = study.measured.bin_size
+    lines.append(f"bins {width:.3g} × {height:.3g} mm, smoothed by {study.settings['smoothing']:.3g} mm")
+    return "\n".join(lines)

@@ -1,0 +1,342 @@
+"""Registration: the rotation, scale, shift and mirror that bring a simulated map into the frame of a measured one."""
+
+import warnings
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+
+from apt_evap._arrays import check_array, check_number
+from apt_evap.alignment import (
+    FINE,
+    MEDIUM,
+    NARROW,
+    ROTATION_STEP,
+    SCALE_STEP,
+    View,
+    distinct,
+    refine,
+    search,
+)
+from apt_evap.maps import DetectorMap
+
+DOUBTFUL = 0.5
+"""Maps that have nothing to do with each other reach this score."""
+_KEPT = 12  # places that are refined: as many as there are symmetric ones of a threefold axis with mirrors, twice
+_BINS = 384  # of a map of simulated hits
+
+
+@dataclass(frozen=True)
+class Registration:
+    """A similarity transform from the simulated into the measured frame, made by `register` or `register_points`.
+
+    Parameters
+    ----------
+    rotation : float
+        Rotation, anticlockwise [degrees].
+    scale : float
+        Measured mm per simulated mm.
+    shift : tuple of float
+        Shift in x and y, applied last [mm].
+    mirror : bool
+        Whether y changes its sign, before the rotation.
+    score : float
+        Correlation coefficient of the flattened maps where both show something; NaN if points were registered.
+    overlap : float
+        Share of the measured field of view that the simulated map covers; NaN if points were registered.
+    residual : float
+        Root mean square distance of registered points [mm]; NaN if maps were registered.
+    method : str
+        How it was found: "search", "start", "points", or "" if given.
+    ties : tuple of Registration
+        Other transforms that fit as well within the noise: the symmetry of the crystal, as a rule.
+
+    Notes
+    -----
+    With z = x + iy, a point goes to z' = scale exp(i rotation) z + shift, or with the conjugate of z if mirrored.
+    """
+
+    rotation: float
+    scale: float
+    shift: tuple
+    mirror: bool = False
+    score: float = float("nan")
+    overlap: float = float("nan")
+    residual: float = float("nan")
+    method: str = ""
+    ties: tuple = ()
+
+    def __post_init__(self):
+        rotation = check_number(self.rotation, "rotation", unit="degrees")
+        object.__setattr__(self, "rotation", (rotation + 180) % 360 - 180)
+        object.__setattr__(self, "scale", check_number(self.scale, "scale", above=0))
+        shift = check_array(self.shift, "shift", (2,))
+        object.__setattr__(self, "shift", tuple(float(value) for value in shift))
+        object.__setattr__(self, "mirror", bool(self.mirror))
+        object.__setattr__(self, "ties", tuple(self.ties))
+
+    def points(self, x, y):
+        """Move points into the measured frame.
+
+        Parameters
+        ----------
+        x, y : array_like
+            Simulated detector coordinates [mm], of equal shape.
+
+        Returns
+        -------
+        x, y : ndarray
+            Measured detector coordinates [mm].
+        """
+        z = np.asarray(x, float) + 1j * np.asarray(y, float)
+        moved = self._turn * (z.conj() if self.mirror else z) + complex(*self.shift)
+        return moved.real, moved.imag
+
+    def hits(self, hits):
+        """Move hits into the measured frame.
+
+        Parameters
+        ----------
+        hits : Hits
+            Simulated ions with x and y.
+
+        Returns
+        -------
+        Hits
+            With all their other columns as they were.
+        """
+        x, y = self.points(*hits.require("x", "y"))
+        return replace(hits, x=x, y=y)
+
+    @property
+    def inverse(self):
+        """The transform from the measured into the simulated frame, a Registration without ties."""
+        rotation = self.rotation if self.mirror else -self.rotation
+        back = Registration(rotation, 1 / self.scale, (0.0, 0.0), self.mirror)
+        x, y = back.points(*self.shift)
+        return replace(self, rotation=rotation, scale=back.scale, shift=(-float(x), -float(y)), ties=())
+
+    @property
+    def _turn(self):
+        return self.scale * np.exp(1j * np.radians(self.rotation))
+
+    def to_dict(self):
+        """Return it as plain types that JSON can hold (dict); NaN becomes None."""
+        plain = asdict(self)
+        plain.update(shift=list(self.shift), ties=[tie.to_dict() for tie in self.ties])
+        return {name: None if value != value else value for name, value in plain.items()}
+
+    @classmethod
+    def from_dict(cls, settings):
+        """Make it from what `to_dict` returned.
+
+        Parameters
+        ----------
+        settings : dict
+            Plain types.
+
+        Returns
+        -------
+        Registration
+        """
+        settings = {name: float("nan") if value is None else value for name, value in settings.items()}
+        ties = tuple(cls.from_dict(tie) for tie in settings.pop("ties", ()))
+        return cls(**settings, ties=ties)
+
+    def __str__(self):
+        parts = [f"rotated by {self.rotation:.2f}°", f"scaled by {self.scale:.4g}"]
+        parts.append(f"shifted by ({self.shift[0]:.2f}, {self.shift[1]:.2f}) mm")
+        if self.mirror:
+            parts.insert(0, "mirrored")
+        return ", ".join(parts)
+
+
+def register(
+    simulated,
+    measured,
+    *,
+    start=None,
+    rotations=None,
+    scales=None,
+    mirrors=None,
+    overlap=0.5,
+):
+    """Find the rotation, scale, shift and mirror that bring a simulated map onto a measured one.
+
+    Both maps are smoothed a little and divided by themselves, smoothed a lot: what is left are poles and zone lines,
+    not the broad gradients of density, which would draw the scale to a wrong value. Rotations, scales and mirrors
+    are tried one by one with all shifts at once; the best places are then refined.
+
+    Parameters
+    ----------
+    simulated, measured : DetectorMap or Hits
+        The maps; a measured one may show any part of the simulated one.
+    start : Registration, optional
+        Roughly the answer: within 15 degrees, 20 % of the scale and a fifth of the measured diameter, of the same
+        mirror, unless the following say otherwise.
+    rotations : float or tuple of float, optional
+        Rotation, or its lowest and highest value [degrees]; all by default.
+    scales : float or tuple of float, optional
+        Scale, or its lowest and highest value [measured mm per simulated mm], where known from angles between
+        poles, say. By default from where the simulated map covers half of the measured one to where the
+        measured one shows a 25th of the simulated one (areas).
+    mirrors : sequence of bool, optional
+        Whether to try the simulated map as it is, mirrored, or both: (False, True), the default.
+    overlap : float
+        Least share of the measured field of view that the simulated map must cover.
+
+    Returns
+    -------
+    Registration
+        The best one, or among those that fit as well within the noise the best that is not mirrored; the others are
+        its ``ties``. A pole with mirror symmetry, such as fcc [111], always has ties.
+
+    Raises
+    ------
+    ValueError
+        If an argument is out of range, or there is no place with that overlap.
+
+    Warns
+    -----
+    UserWarning
+        If the score is one that maps reach which have nothing to do with each other.
+
+    Notes
+    -----
+    Shifts by masked correlation in Fourier space (Padfield, IEEE Trans. Image Process. 21, 2706 (2012)), refinement
+    by the simplex method of Nelder and Mead. Two scores r are alike within the noise if they differ by less than
+    (1 - r^2) / sqrt(n), the standard error of a correlation coefficient of n independent patches (here, areas
+    4 pi sigma^2 of the smoothing).
+    """
+    simulated, measured = (_view(value, name) for value, name in ((simulated, "simulated"), (measured, "measured")))
+    if start is not None and not isinstance(start, Registration):
+        raise ValueError(f"start must be a Registration, got {start!r:.80}")
+    least = check_number(overlap, "overlap", above=0, at_most=1)
+    near = None
+    if start is not None:
+        rotations = (start.rotation - 15, start.rotation + 15) if rotations is None else rotations
+        scales = (start.scale / 1.2, start.scale * 1.2) if scales is None else scales
+        mirrors = (start.mirror,) if mirrors is None else mirrors
+        x, y = start.inverse.points(measured.centre.real, measured.centre.imag)
+        near = complex(x, y), measured.diameter / 5
+    if rotations is not None:
+        rotations = _range(rotations, "rotations", unit="degrees")
+        rotations = None if rotations[1] - rotations[0] >= 360 else rotations
+    if scales is None:
+        ratio = measured.diameter / simulated.diameter
+        tried, scales = (np.sqrt(0.5) * ratio, 5 * ratio), None
+    else:
+        tried = scales = _range(scales, "scales", above=0)
+    mirrors = tuple(dict.fromkeys(bool(mirror) for mirror in ((False, True) if mirrors is None else mirrors)))
+    if not mirrors:
+        raise ValueError("mirrors must hold False, True or both, got none")
+    angles = np.arange(0, 360, ROTATION_STEP) if rotations is None else _steps(*rotations, ROTATION_STEP)
+    fits = search(simulated, measured, angles, np.exp(_steps(*np.log(tried), SCALE_STEP)), mirrors, least, near)
+    if not fits:
+        raise ValueError(
+            f"the maps must share {least:.0%} of the measured field of view (overlap), and do not for scales of "
+            f"{tried[0]:.3g} to {tried[1]:.3g}"
+        )
+    bounds = rotations, scales
+    fits = [refine(simulated, measured, fit.placement, MEDIUM, least, *bounds) for fit in distinct(fits, _KEPT)]
+    fits = distinct(sorted(fits, key=lambda fit: -fit.rank), _KEPT)
+    # the difference of two resolutions is less than three standard errors
+    fits = [fit for fit in fits if fit.rank > fits[0].rank - 3 * _error(fits[0], MEDIUM)]
+    for _ in range(2):  # once more, flattened at the new scale
+        fits = [refine(simulated, measured, fit.placement, FINE, least, *bounds) for fit in fits]
+    fits = sorted(fits, key=lambda fit: -fit.rank)
+    fits = distinct([fit for fit in fits if fit.rank > fits[0].rank - _error(fits[0], FINE)], _KEPT)
+    fits.sort(key=lambda fit: fit.placement.mirror)  # stable: the best stays first among either kind
+    found = [_registration(fit, "search" if start is None else "start") for fit in fits]
+    best = replace(found[0], ties=tuple(found[1:]))
+    if best.score < DOUBTFUL:
+        warnings.warn(
+            f"the maps correlate by only {best.score:.2f}, as maps may that have nothing to do with each other; look "
+            "at plot.overlay, and give scales or a start",
+            stacklevel=2,
+        )
+    return best
+
+
+def register_points(simulated_points, measured_points, mirror=None):
+    """Find the transform that brings simulated points, such as poles, onto measured ones (least squares).
+
+    Parameters
+    ----------
+    simulated_points, measured_points : array_like
+        The same n >= 2 points in both frames [mm], shape (n, 2).
+    mirror : bool, optional
+        Whether the frames are mirror images. By default what fits better, for n >= 3; two points do not tell, and
+        are taken as not mirrored.
+
+    Returns
+    -------
+    Registration
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than two points, numbers differ, or all points of one frame coincide.
+    """
+    simulated = check_array(simulated_points, "simulated_points", ("n", 2))
+    measured = check_array(measured_points, "measured_points", (len(simulated), 2))
+    if len(simulated) < 2:
+        raise ValueError(f"simulated_points must be two or more points, got {len(simulated)}")
+    for points, name in ((simulated, "simulated_points"), (measured, "measured_points")):
+        if not np.ptp(points, axis=0).any():
+            raise ValueError(f"{name} must be different points, got {points[0].tolist()} {len(points)} times")
+    choices = (False, True) if mirror is None else (bool(mirror),)
+    source, target = (points[:, 0] + 1j * points[:, 1] for points in (simulated, measured))
+    found = [_least_squares(source, target, choice) for choice in choices]
+    # rounding must not decide where both fit exactly
+    best = min(found, key=lambda one: (round(one.residual / np.ptp(target.real + target.imag), 9), one.mirror))
+    if not best.scale > 0:
+        raise ValueError("simulated_points and measured_points must be alike but for rotation, scale and shift")
+    return best
+
+
+def _least_squares(source, target, mirror):
+    moved = source.conj() if mirror else source
+    matrix = np.column_stack([moved, np.ones(len(source))])
+    (turn, shift), *_ = np.linalg.lstsq(matrix, target, rcond=None)
+    residual = np.sqrt(np.mean(np.abs(matrix @ (turn, shift) - target) ** 2))
+    shift = (float(shift.real), float(shift.imag))
+    angle = float(np.degrees(np.angle(turn)))
+    return Registration(angle, float(abs(turn)), shift, mirror, residual=float(residual), method="points")
+
+
+def _view(value, name):
+    if not isinstance(value, DetectorMap):
+        if not hasattr(value, "detected"):
+            raise ValueError(f"{name} must be a DetectorMap or Hits, got {value!r:.80}")
+        value = DetectorMap.from_hits(value, bins=_BINS if name == "simulated" else 256)
+    return View(value)
+
+
+def _range(value, name, **limits):
+    low, high = (value, value) if np.ndim(value) == 0 else check_array(value, name, (2,)).tolist()
+    low = check_number(low, name, **limits)
+    return low, check_number(high, name, at_least=low)
+
+
+def _steps(low, high, step):
+    return np.linspace(low, high, int(np.ceil((high - low) / step)) + 1)
+
+
+def _error(fit, pixels):
+    """Standard error of the score of a fit."""
+    patches = fit.overlap * pixels**2 / 4 / (4 * NARROW**2)  # disc of the field of view over 4 pi sigma^2
+    return (1 - fit.score**2) / np.sqrt(patches)
+
+
+def _registration(fit, method):
+    placement = fit.placement
+    shift = complex(placement.forth(0j))
+    return Registration(
+        rotation=float(placement.rotation),
+        scale=float(placement.scale),
+        shift=(shift.real, shift.imag),
+        mirror=placement.mirror,
+        score=fit.score,
+        overlap=fit.overlap,
+        method=method,
+    )

@@ -1,0 +1,112 @@
+"""A long run under watch: does its memory grow by more than its results?
+
+    python benchmarks/soak.py                       # 100,000 ions of Ni[111], R = 30 a, one flight each
+    python benchmarks/soak.py --ions 20000 --radius 20 --output soak.png
+
+Records the resident memory while the run goes on, with checkpoints, draws it over the ions, and fails (exit code 1) if
+it grows, after the first fifth of the run, by more than the results take and the bound below.
+"""
+
+import argparse
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+import apt_evap as ae
+
+# what the sizes of the surface and of the trees' copies vary by, and what allocators keep: a leak of 1 kB an ion, a
+# sixth of the journal of an event, is 100 MB in a run of 100,000 ions
+SLACK = 30e6
+
+
+def resident():
+    """Resident memory of this process [bytes] (Linux)."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("VmRSS:"):
+            return 1024 * int(line.split()[1])
+    raise OSError("/proc/self/status holds no VmRSS")
+
+
+def bytes_of(run):
+    """Memory of the results of a run [bytes]."""
+    arrays = [value for value in vars(run.emissions).values() if isinstance(value, np.ndarray)]
+    arrays += [run.site, run.species, run.charges, run.fields]
+    arrays += [array for flown in run.flown for array in flown]
+    arrays += list(run.responses or ())
+    return sum(array.nbytes for array in arrays)
+
+
+def soak(radius, n_ions, responses, n_threads):
+    """Run, and sample the memory twice a second; returns the run, the ions and the memory [bytes] of each sample."""
+    nickel = ae.material("Ni")
+    tip = ae.Tip(nickel, apex_radius=radius * nickel.a, axis=(1, 1, 1), shank_length=2 * radius * nickel.a)
+    simulation = ae.Simulation(tip, seed=1, n_threads=n_threads)
+    print(f"{simulation!r}; {len(simulation.emitter):,} surface atoms; {resident() / 1e6:.0f} MB", flush=True)
+    samples, done = [], threading.Event()
+
+    def sample():
+        while not done.wait(0.5):
+            samples.append((simulation.n_evaporated, resident()))
+
+    sampler = threading.Thread(target=sample)
+    with tempfile.TemporaryDirectory() as folder:
+        sampler.start()
+        began = time.perf_counter()
+        try:
+            checkpoint = ae.Checkpoint(Path(folder, "soak.h5"), minutes=1.0)
+            run = simulation.run(n_ions, responses=responses, checkpoint=checkpoint)
+        finally:
+            done.set()
+            sampler.join()
+    print(f"{len(run):,} ions, {len(run) / (time.perf_counter() - began):.0f} ions/s; {run.ended or 'not ended early'}")
+    ions, memory = np.array(samples).T
+    under_way = ions < len(run)  # at the end the parts are joined: for a moment they are there twice
+    return run, ions[under_way], memory[under_way]
+
+
+def draw(path, ions, memory, expected):
+    """Draw the memory over the ions."""
+    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(ions / 1e3, memory / 1e6, label="resident memory")
+    axes.plot(ions / 1e3, expected / 1e6, "--", label="at a fifth of the run, and the results since")
+    axes.set(xlabel="ions evaporated / 1000", ylabel="memory / MB", ylim=(0, None), xlim=(0, None))
+    axes.legend(loc="lower right")
+    figure.savefig(path, dpi=150)
+
+
+def main():
+    """Run the soak and judge it."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--radius", type=float, default=30.0, help="apex radius in lattice constants")
+    parser.add_argument("--ions", type=int, default=100_000)
+    parser.add_argument("--responses", action="store_true", help="fly the responses instead of one flight an ion")
+    parser.add_argument("--threads", type=int, help="default: all processors")
+    parser.add_argument("--output", default="soak.png", help="picture; the samples go beside it as .csv")
+    options = parser.parse_args()
+    run, ions, memory = soak(options.radius, options.ions, options.responses, options.threads)
+    path = Path(options.output)
+    np.savetxt(path.with_suffix(".csv"), np.column_stack([ions, memory]), "%d", ",", header="ions,bytes", comments="")
+    per_ion = bytes_of(run) / len(run)
+    fifth = int(np.searchsorted(ions, len(run) / 5))
+    expected = memory[fifth] + per_ion * (ions - ions[fifth])
+    draw(path, ions, memory, np.where(ions >= ions[fifth], expected, np.nan))
+    over = float((memory - expected)[fifth:].max())
+    print(
+        f"memory {memory[fifth] / 1e6:.0f} MB at {ions[fifth]:,} ions, {memory[-1] / 1e6:.0f} MB at {ions[-1]:,}; "
+        f"results {per_ion:.0f} B an ion, {per_ion * (ions[-1] - ions[fifth]) / 1e6:.0f} MB since; "
+        f"at most {over / 1e6:.0f} MB beyond them"
+    )
+    if over > SLACK:
+        print(f"memory grows: expected at most {SLACK / 1e6:.0f} MB beyond the results", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,327 @@
+"""Searches for emission energies: what is compared is what `ssim` compares, and hidden energies are found again."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from scipy.stats import truncnorm
+
+import apt_evap as ae
+from apt_evap.energy_grid import EnergyGrid, maxima, spline_maxima
+from apt_evap.perturbation import Combined
+from apt_evap.resample import GROUPS, Comparison, Sampler
+
+EDGES = np.linspace(-60, 60, 49)
+ROLLUP = ae.RollUp(ae.TruncatedNormal(0.155, 0.155))
+LATERAL = ae.LateralVelocity(ae.TruncatedNormal(0.3, 0.316 * 0.3))
+
+
+@pytest.fixture(scope="module")
+def run(tip20):
+    """15,000 ions of Ni[111], R = 20 a, with responses."""
+    return ae.Simulation(tip20, voltage=1000.0, seed=1).run(15_000, progress=False)
+
+
+@pytest.fixture(scope="module")
+def other(nickel):
+    """Of a tip with another origin of the lattice, and with other random numbers: no ion is one of `run`."""
+    tip = ae.Tip(nickel, apex_radius=20 * nickel.a, axis=(1, 1, 1), shank_length=20 * nickel.a, offset_seed=5)
+    return ae.Simulation(tip, voltage=1000.0, seed=2).run(15_000, progress=False)
+
+
+HERE = ae.Registration(0.0, 1.0, (0.0, 0.0))
+
+
+def seen(run, perturbation):
+    """Map of the middle of the detector."""
+    counts = np.zeros((48, 48), int)
+    frame = ae.DetectorMap.from_array(counts + 1, EDGES, EDGES, is_counts=True)
+    return ae.DetectorMap.from_hits(run.hits(perturbation), like=frame)
+
+
+# ---- the grid ------------------------------------------------------------------------------------------------------
+
+
+def test_the_grid_of_the_paper():
+    grid = EnergyGrid("combined")
+    assert grid.shape == (5, 6, 6) and len(grid.cells) == 180
+    assert EnergyGrid("roll-up").shape == EnergyGrid("lateral").shape == (1, 6, 6)
+    # evenly spaced means, relative standard deviations of two per decade as the paper rounds them
+    assert np.allclose(np.diff(grid.means), 0.0725) and np.allclose(np.diff(np.log10(grid.rsds)), 0.5, atol=2e-3)
+    assert grid.perturbation(*grid.values_at((3, 3, 4))) == Combined(ae.TruncatedNormal(0.3, 0.316 * 0.3), 0.75)
+    assert EnergyGrid("roll-up").perturbation(*EnergyGrid("roll-up").values_at((0, 4, 2))) == ROLLUP
+    assert EnergyGrid("lateral").perturbation(*EnergyGrid("lateral").values_at((0, 3, 4))) == LATERAL
+
+
+def test_places_between_points():
+    grid = EnergyGrid("combined")
+    fraction, rsd, mean = grid.values_at((0.5, 4.5, 1.5))
+    assert fraction == 0.125
+    assert rsd == pytest.approx(np.sqrt(3.16), rel=1e-14)
+    assert mean == pytest.approx((0.0825 + 0.155) / 2, rel=1e-14)
+
+
+def test_share_above_an_energy():
+    grid = EnergyGrid("lateral")
+    share = grid.share_above(1.5)
+    for cell in ((0, 5, 5), (0, 4, 3), (0, 0, 0)):
+        _, rsd, mean = grid.values_at(cell)
+        assert share[cell] == pytest.approx(truncnorm.sf(1.5, -1 / rsd, np.inf, mean, rsd * mean), rel=1e-9)
+    assert 0.1 < share[0, 5, 5] < 0.3
+
+
+@pytest.mark.parametrize("free", [(1, 5, 5), (5, 5, 5), (1, 1, 5)])
+def test_maxima_between_points(free):
+    """Of functions with a maximum anywhere in the box, as wide as those of similarities."""
+    places = [np.arange(-1, 1.5, 0.5) + 3 if number == 5 else np.array([2.0]) for number in free]
+    peaks = np.random.default_rng(1).uniform(2.1, 3.9, (30, 3))
+    peaks[:, [number == 1 for number in free]] = 2.0
+    z, y, x = np.meshgrid(*places, indexing="ij")
+    values = np.array([np.exp(-((x - c) ** 2 + (y - b) ** 2 + (z - a) ** 2) / 4) for a, b, c in peaks])
+    found = spline_maxima(places, values)
+    # a 20th of a step from point to point, so half of that; as much again for what a cubic misses
+    assert np.abs(found - peaks).max() < 0.05
+    assert (
+        np.abs(np.array(places, dtype=object)[2][maxima(values)[:, 2]] - peaks[:, 2]).max() > 0.2
+    )  # the points do not
+
+
+def test_the_box_around_a_point_stays_on_the_grid():
+    grid = EnergyGrid("roll-up")
+    fraction, rsd, mean = grid.around((0, 5, 0))
+    assert fraction.tolist() == [0.0]
+    assert rsd.tolist() == [3.0, 3.5, 4.0, 4.5, 5.0]
+    assert mean.tolist() == [0.0, 0.5, 1.0, 1.5, 2.0]
+
+
+@pytest.mark.parametrize(
+    "wrong, words",
+    [
+        ({"mechanism": "rollup"}, "mechanism must be one of 'roll-up', 'lateral', 'combined', got 'rollup'"),
+        ({"means": (0.1, 0.1)}, "means must be increasing numbers above 0"),
+        ({"means": (0.0, 0.1)}, "means must be increasing numbers above 0"),
+        ({"rsds": ()}, "rsds must be increasing numbers above 0"),
+        ({"rollup_fractions": (0.5,)}, "rollup_fractions are for the mechanism 'combined'"),
+        ({"mechanism": "combined", "rollup_fractions": (0.5, 1.5)}, "rollup_fractions must be .* from 0 to 1"),
+    ],
+)
+def test_grids_that_are_none(wrong, words):
+    with pytest.raises(ValueError, match=words):
+        EnergyGrid(**{"mechanism": "roll-up"} | wrong)
+
+
+# ---- many maps at a time -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("smoothing, flattening", [(0.0, 0.0), (2.5, 0.0), (0.0, 15.0), (3.0, 20.0)])
+def test_what_is_compared_is_what_ssim_compares(run, other, smoothing, flattening):
+    x, y = np.meshgrid(EDGES[1:], EDGES[1:])
+    measured = replace(seen(other, ROLLUP), mask=(x**2 + y**2 < 50**2) & (x < 30))
+    comparison = Comparison(measured, smoothing, flattening, 2.0, 0, 0)
+    sampler = Sampler(run, HERE, measured, comparison.box, 0, 0)
+    simulated = replace(seen(run, LATERAL), mask=measured.mask)
+    maps = sampler.maps(LATERAL, 1)
+    assert np.array_equal(maps[0], simulated.counts[comparison.box])
+    flat = [each.flattened(flattening) for each in (measured, simulated)]
+    # the same sums in another order
+    assert comparison.similarities(maps)[0] == pytest.approx(float(ae.ssim(*flat, smoothing=smoothing)), abs=1e-12)
+
+
+def test_flattening_takes_gradients_away():
+    x, y = np.meshgrid(EDGES[1:], EDGES[1:])
+    pattern = 1 + 0.4 * np.cos(x / 3) * np.cos(y / 3)
+    a = ae.DetectorMap.from_array(pattern, EDGES, EDGES)
+    b = ae.DetectorMap.from_array(pattern * (1 + 0.5 * x / 60), EDGES, EDGES)
+    assert float(ae.ssim(a, b)) < 0.97
+    # what is left is what the Gaussian cannot follow at the rim
+    assert float(ae.ssim(a.flattened(12.0), b.flattened(12.0))) > 0.995
+    assert a.flattened(0) is a
+
+
+def test_errors_are_those_of_ions_drawn_one_by_one(run, other):
+    """Groups of ions against ions, over 300 resamples each."""
+    measured = seen(other, ROLLUP)
+    comparison = Comparison(measured, 3.0, 0.0, 2.0, 0, 0)
+    sampler = Sampler(run, HERE, measured, comparison.box, 300, 7)
+    by_group = comparison.similarities(sampler.maps(ROLLUP, 1))[1:]
+    random, hits, one_by_one = np.random.default_rng(8), run.hits(ROLLUP), []
+    for _ in range(300):
+        drawn = hits[random.integers(0, len(hits), len(hits))]
+        map = ae.DetectorMap.from_hits(drawn, like=measured)
+        one_by_one.append(comparison.similarities(map.counts[None][:, *comparison.box])[0])
+    one_by_one = np.array(one_by_one)
+    # errors of an error: 1/sqrt(2 300) each and 1/sqrt(2 GROUPS), 7 % together; three of them
+    assert by_group.std() == pytest.approx(one_by_one.std(), rel=3 * np.sqrt(1 / 300 + 0.5 / GROUPS))
+    assert by_group.mean() == pytest.approx(one_by_one.mean(), abs=4 * one_by_one.std() / np.sqrt(150))
+
+
+def test_replicas_have_less_noise(run, other):
+    """Maps of two disjoint sets of draws are the more alike the more draws there are."""
+    measured = seen(other, ROLLUP)
+    sampler = Sampler(run, HERE, measured, (slice(None), slice(None)), 0, 0)
+    again = Sampler(replace(run, seed=99), HERE, measured, (slice(None), slice(None)), 0, 0)
+    alike = []
+    for replicas in (1, 4):
+        maps = [each.maps(LATERAL, replicas)[0].astype(int) for each in (sampler, again)]
+        assert maps[0].sum() == pytest.approx(replicas * 9500, rel=0.1)
+        alike.append(float(ae.ssim(*(ae.DetectorMap.from_array(map, EDGES, EDGES, is_counts=True) for map in maps))))
+    assert alike[1] > alike[0] + 0.1
+
+
+# ---- the study -----------------------------------------------------------------------------------------------------
+
+
+def steps_off(study, truth):
+    """Steps of the grid between the optimum and (fraction, rsd, mean)."""
+    best = study.optimum
+    axes = (study.grid.rollup_fractions, study.grid.rsds, study.grid.means)
+    found = (best.rollup_fraction, best.rsd, best.mean)
+    return [abs(axis.index(a) - axis.index(b)) for axis, a, b in zip(axes, found, truth, strict=True)]
+
+
+TWINS = {"roll-up": (ROLLUP, (1.0, 1.0, 0.155)), "lateral": (LATERAL, (0.0, 0.316, 0.3))}
+
+
+@pytest.fixture(scope="module", params=TWINS)
+def twin(request, run, other):
+    """A study of a map with hidden energies, of other ions than those of the run."""
+    hidden, truth = TWINS[request.param]
+    study = ae.fit_energies(
+        run, seen(other, hidden), request.param, registration=HERE, replicas=2, resamples=40, progress=False
+    )
+    return study, hidden, truth
+
+
+def test_hidden_energies_are_found(twin):
+    study, hidden, truth = twin
+    assert max(steps_off(study, truth)) <= 1
+    assert study.optimum.score.value == study.ssim.max()
+    # energies after the cut, which the map sees; half a step of the grid
+    assert abs(study.refined.true_mean - hidden.energy.true_mean) < 0.036
+    low, high = study.refined.intervals["true_mean"]
+    assert low <= study.refined.true_mean <= high and high - low < 0.2
+
+
+def test_unperturbed_is_clearly_less_alike(twin):
+    study, _, _ = twin
+    unperturbed, best = study.baselines["unperturbed"], study.optimum.score
+    assert unperturbed.error > 0 and best.error > 0
+    assert unperturbed.value + 5 * unperturbed.error < best.value - 5 * best.error
+    assert study.gain.value > 5 * study.gain.error > 0
+    assert study.gain_share == 1
+    assert study.baselines["thermal"].value < best.value - 5 * best.error
+
+
+def test_what_a_study_holds(twin):
+    study, _, _ = twin
+    assert study.ssim.shape == study.errors.shape == study.shares.shape == (1, 6, 6)
+    assert study.resampled.shape == (40, 1, 6, 6)
+    assert study.shares.sum() == pytest.approx(1)
+    assert study.errors == pytest.approx(study.resampled.std(axis=0, ddof=1))
+    # a matrix says what the public functions say
+    draws = study.maps["optimum"]
+    assert float(ae.ssim(study.compared(draws), study.compared(study.measured))) == pytest.approx(
+        study.optimum.score.value, abs=1e-9
+    )
+    assert 0 < study.ceiling.value < 1
+    text = repr(study)
+    for part in (study.grid.mechanism, f"{study.optimum.score.value:.3f}", "unperturbed", "thermal", "halves"):
+        assert part in text
+
+
+def test_settings_are_recorded(twin, tmp_path):
+    study, _, _ = twin
+    study.save(tmp_path / "study.json")
+    held = json.loads((tmp_path / "study.json").read_text())
+    assert np.array(held["ssim"]) == pytest.approx(study.ssim)
+    assert held["grid"]["means"] == list(study.grid.means)
+    assert held["optimum"]["perturbation"]["energy"]["mean"] == study.optimum.mean
+    assert held["registration"]["scale"] == 1
+    wanted = {"smoothing", "flattening", "data_range", "temperature", "replicas", "resamples", "seed", "bins", "run"}
+    assert wanted <= set(held["settings"])
+    assert held["settings"]["temperature"] == 50
+
+
+def test_results_do_not_depend_on_threads(run, other):
+    measured = seen(other, ROLLUP)
+    options = {"means": (0.1, 0.2, 0.3), "rsds": (0.3, 1.0), "registration": HERE, "replicas": 1, "resamples": 5}
+    one, two = (ae.fit_energies(run, measured, n_threads=n, progress=False, **options) for n in (1, 2))
+    assert np.array_equal(one.ssim, two.ssim) and np.array_equal(one.resampled, two.resampled)
+    assert one.to_dict() == two.to_dict()
+
+
+def test_densities_have_no_noise_of_their_own(run, other):
+    counts = seen(other, ROLLUP)
+    densities = ae.DetectorMap.from_array(counts.values / 3.7, EDGES, EDGES, counts.mask)
+    options = {"means": (0.1, 0.2, 0.3), "rsds": (1.0,), "registration": HERE, "replicas": 1, "resamples": 30}
+    a, b = (ae.fit_energies(run, each, progress=False, **options) for each in (counts, densities))
+    assert b.ceiling is None and a.ceiling is not None
+    assert a.ssim == pytest.approx(b.ssim, abs=1e-12)
+    assert (b.errors < a.errors).all() and (b.errors > 0).all()
+
+
+def test_the_axis_of_the_rollup_fraction(run, other):
+    measured = seen(other, ae.Combined(ae.TruncatedNormal(0.2, 0.1), 0.9))
+    study = ae.fit_energies(
+        run, measured, "combined", means=(0.1, 0.2, 0.3), rsds=(0.5,), rollup_fractions=(0.0, 0.5, 0.9),
+        registration=HERE, replicas=1, resamples=0, progress=False,
+    )  # fmt: skip
+    assert study.ssim.shape == (3, 1, 3)
+    assert max(steps_off(study, (0.9, 0.5, 0.2))) <= 1
+    assert np.isnan(study.errors).all() and study.refined.intervals == {} and np.isnan(study.gain.error)
+    assert "±" not in repr(study).split(";")[0]
+    assert "nan" not in json.dumps(study.to_dict()).lower()
+
+
+def test_bins_of_a_map_are_merged(run, other):
+    measured = seen(other, ROLLUP)
+    options = {"means": (0.2,), "rsds": (1.0,), "registration": HERE, "replicas": 1, "resamples": 0}
+    study = ae.fit_energies(run, measured, bins=24, progress=False, **options)
+    assert study.measured.values.shape == (24, 24)
+    assert study.measured.counts[5, 7] == measured.counts[10:12, 14:16].sum()
+    assert study.measured.bin_size == (5.0, 5.0)
+
+
+def test_gradients_of_the_instrument_do_not_move_the_energies(run, other):
+    """A measured map that is twice as bright on one side as on the other."""
+    measured = seen(other, ROLLUP)
+    x = (EDGES[1:] + EDGES[:-1]) / 2
+    kept = np.random.default_rng(3).binomial(measured.counts, np.broadcast_to(0.75 + x / 240, (48, 48)))
+    tilted = ae.DetectorMap.from_array(kept, EDGES, EDGES, measured.mask, is_counts=True)
+    options = {"registration": HERE, "replicas": 1, "resamples": 0, "progress": False, "smoothing": 2.5}
+    flat = ae.fit_energies(run, tilted, **options)
+    assert max(steps_off(flat, (1.0, 1.0, 0.155))) <= 1
+    assert flat.ssim.max() > ae.fit_energies(run, tilted, flattening=0, **options).ssim.max()
+
+
+def test_studies_that_cannot_be(run, other, run20):
+    measured = seen(other, ROLLUP)
+    with pytest.raises(ValueError, match="needs a run with responses"):
+        ae.fit_energies(run20, measured, registration=HERE)
+    with pytest.raises(ValueError, match="measured must be Hits or a DetectorMap, got 3"):
+        ae.fit_energies(run, 3, registration=HERE)
+    with pytest.raises(ValueError, match="replicas"):
+        ae.fit_energies(run, measured, registration=HERE, replicas=0)
+    with pytest.raises(ValueError, match="smoothing"):
+        ae.fit_energies(run, measured, registration=HERE, smoothing=-1)
+    with pytest.raises(ValueError, match=r"none of [\d,]+ hits lies in"):
+        ae.fit_energies(run, measured, registration=ae.Registration(0.0, 1.0, (1e6, 0.0)))
+    with pytest.raises(ValueError, match="must hold a window of 11 bins"):
+        small = replace(measured, mask=np.add.outer(np.arange(48), np.arange(48)) < 9)
+        ae.fit_energies(run, small, registration=HERE)
+
+
+def test_pictures(twin, tmp_path):
+    study, _, _ = twin
+    axes = ae.plot.ssim_matrix(study)
+    assert len(axes) == 1
+    assert len(axes[0].texts) == 36
+    parts = ae.plot.side_by_side(study, circle=(5, -5, 20))
+    assert parts[3].get_xlim() == (-15, 25)
+    for name, ax in (("matrix.png", axes[0]), ("maps.png", parts[0])):
+        ax.figure.savefig(tmp_path / name)
+        assert imread(tmp_path / name)[..., :3].std() > 0.1
+    with pytest.raises(ValueError, match="circle"):
+        ae.plot.side_by_side(study, circle=(0, 0, -1))

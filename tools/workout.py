@@ -1,0 +1,40 @@
+"""A little of everything that the compiled core does, on several threads: for checkers that slow it a hundred times.
+
+python tools/workout.py [ions] [threads]
+"""
+
+import sys
+
+import numpy as np
+
+import apt_evap as ae
+from apt_evap._core.octree import Octree
+from apt_evap._core.sweep import InteractionLists
+
+ions = int(sys.argv[1]) if len(sys.argv) > 1 else 40
+n_threads = int(sys.argv[2]) if len(sys.argv) > 2 else 3
+tip = ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1), shank_length=2.5, offset_seed=1, depth=1.2)
+
+# events and flights side by side; the shell deepens when the emitter comes upon its inner side
+settings = ae.ChargeSettings(sweep_interval=max(2, ions // 4))
+simulation = ae.Simulation(tip, seed=1, n_threads=n_threads, charge_settings=settings)
+run = simulation.run(ions, (ae.RollUp(ae.TruncatedNormal(0.155, 0.155)),), progress=False, batch_size=max(2, ions // 3))
+emitter = simulation.emitter
+emitter.deepen()
+emitter.relax(tolerance=1e-7)  # in double precision
+batch = emitter.evaporate(3)
+
+# sums by the tree and over all atoms, on threads
+points = emitter.positions + 0.5 * emitter.normals
+field, potential = emitter.field_at(points), emitter.potential_at(points)
+exact = emitter.field_at(points[:50], opening_angle=0)
+tree = Octree(emitter.positions, emitter.charges, n_threads=n_threads)
+copy = tree.copy()
+lists = InteractionLists(copy, 0.6, n_threads)
+sums = np.zeros((copy.capacity, 3))
+for double_precision in (False, True):
+    lists.sweep(sums, double_precision, n_threads)
+assert np.isfinite(sums).all() and np.isfinite(potential).all() and np.isfinite(batch.charges).all()
+worst = np.linalg.norm(field[:50] - exact, axis=1).max() / np.linalg.norm(exact, axis=1).max()
+assert worst < 0.01, worst  # the tree at its usual angle against the sum over all atoms
+print(f"{run}\nthe tree differs from the direct sum by {worst:.1e} of the largest field")
