@@ -13,10 +13,12 @@ PACKAGE = Path(__file__).parents[1] / "apt_evap"
 FLOORS = (
     {"units", "_arrays", "_threads", "_memory", "_files", "_version"},
     {"_core"},
-    {"lattice", "ranges", "shape", "material", "tip", "detector", "hits"},
+    {"lattice", "ranges", "shape", "material", "alloy", "interchange", "projection", "poles", "orientation", "tip"}
+    | {"detector", "hits"},
     {"ion_random", "energy", "emission", "perturbation", "law", "emitter_state", "emitter", "flights", "response"},
     {"watch", "run_file", "run", "checkpoint", "simulation"},
-    {"binning", "maps", "register", "compare", "study", "config", "info", "io"},
+    {"binning", "maps", "cap", "profiles", "zone_line", "tracks", "alignment", "register", "compare"}
+    | {"energy_grid", "resample", "study", "fit", "config", "info", "io"},
     {"plot", "cli"},
 )
 FLOOR = {module: number for number, floor in enumerate(FLOORS) for module in floor}

@@ -11,7 +11,7 @@ import numpy as np
 
 from apt_evap import plot
 from apt_evap._files import FileError, check_path, open_for_reading
-from apt_evap.cli._files import check_output, is_run, read
+from apt_evap.cli._files import check_output, read
 from apt_evap.cli._options import SHAPE, add_reading_options, smoothing, whole
 from apt_evap.config import MOST_BINS, read_perturbation
 from apt_evap.energy_grid import MEANS, MECHANISMS, ROLLUP_FRACTIONS, RSDS
@@ -19,6 +19,7 @@ from apt_evap.fit import fit_energies
 from apt_evap.io.npz import read_map
 from apt_evap.register import Registration
 from apt_evap.run import Run, load
+from apt_evap.run_file import is_run
 
 _STUDY = "study.json"
 
