@@ -111,5 +111,5 @@ def _places(run, ions, velocities, design, coefficients, shape):
     repeats = int(np.prod(shape[1:]))
     reduced = run.response_settings.reduced(velocities.reshape(-1, 2), np.repeat(run.emissions.masses[ions], repeats))
     values = design.evaluate(np.repeat(coefficients[ions], repeats, axis=0), reduced)
-    x, y, _ = run.detector.impacts(unflattened(values)[0])
+    x, y, *_ = run.detector.impacts(*unflattened(values))
     return x.reshape(shape), y.reshape(shape)
