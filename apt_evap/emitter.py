@@ -12,6 +12,7 @@ from apt_evap._core.octree import Octree
 from apt_evap._core.robin import ChargingRule, Robin
 from apt_evap._core.surface import Neighbourhood
 from apt_evap._threads import thread_count
+from apt_evap.charge_settings import ChargeSettings, check_angle, check_voltage
 from apt_evap.emitter_state import EmitterState
 from apt_evap.interchange import to_atoms
 from apt_evap.law import Extremal
@@ -21,61 +22,6 @@ from apt_evap.units import COULOMB
 __all__ = ["DONE", "EXHAUSTED", "SWEEP_DUE", "TOO_SHALLOW", "Batch", "ChargeSettings", "Emitter"]
 
 _MOST_EVENTS = 10_000_000  # at a time: 640 MB of results
-
-
-def check_voltage(voltage):
-    """Return the applied voltage [V], above 0 and up to 1 MV, or say what is wrong (ValueError)."""
-    return check_number(voltage, "voltage", above=0, at_most=1e6, unit="V")
-
-
-def _check_angle(angle):
-    return check_number(angle, "opening_angle", at_least=0, at_most=1.5, unit="rad")
-
-
-@dataclass(frozen=True)
-class ChargeSettings:
-    """How finely the charges are solved.
-
-    Lengths are in nearest neighbour distances d_nn of the specimen.
-
-    Parameters
-    ----------
-    opening_angle : float
-        Full angle under which a cell of the octree stands for its atoms [rad]. 0.4 keeps charges within 3e-4 of what
-        direct sums give (largest difference on a tip of R = 12 a).
-    patch_radius : float
-        Charges are solved within this distance of a hole [d_nn]; 8.5 is 6 lattice constants of fcc.
-    update_radius : float
-        Fields are kept up to date within this distance of a hole [d_nn].
-    sweep_interval : int, optional
-        Events between two relaxations of the whole surface; by default a 300th of the surface
-        atoms there are at the start, but at least 100.
-    tolerance : float
-        Change of a charge, relative to the mean charge, at which a relaxation between events stops.
-    start_tolerance : float
-        The same for the first one, which starts from equal charges.
-    relaxation_angle : float
-        Opening angle of the relaxations between events [rad]: 0.6 keeps charges within 2.2e-4 of direct sums (RMS, on a
-        tip of R = 12 a), less than what builds up between two of them.
-    """
-
-    opening_angle: float = 0.4
-    patch_radius: float = 8.5
-    update_radius: float = 18.0
-    sweep_interval: int | None = None
-    tolerance: float = 3e-3
-    start_tolerance: float = 1e-5
-    relaxation_angle: float = 0.6
-
-    def __post_init__(self):
-        _check_angle(self.opening_angle)
-        check_number(self.patch_radius, "patch_radius", at_least=1.5, at_most=30, unit="d_nn")
-        check_number(self.update_radius, "update_radius", at_least=self.patch_radius, at_most=40, unit="d_nn")
-        check_number(self.relaxation_angle, "relaxation_angle", at_least=self.opening_angle, at_most=1.5, unit="rad")
-        check_number(self.tolerance, "tolerance", above=0, at_most=1)
-        check_number(self.start_tolerance, "start_tolerance", above=0, at_most=1)
-        if self.sweep_interval is not None:
-            check_count(self.sweep_interval, "sweep_interval", at_least=1)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -260,12 +206,12 @@ class Emitter:
         ndarray, shape (m, 3)
             Field [V/nm].
         """
-        points, opening_angle = check_array(points, "points", ("m", 3)), _check_angle(opening_angle)
+        points, opening_angle = check_array(points, "points", ("m", 3)), check_angle(opening_angle)
         return COULOMB * self._core.tree.fields(points, opening_angle, self.n_threads)
 
     def potential_at(self, points, opening_angle=0.3):
         """Electric potential of the surface charges [V], shape (m,); parameters as in `field_at`."""
-        points, opening_angle = check_array(points, "points", ("m", 3)), _check_angle(opening_angle)
+        points, opening_angle = check_array(points, "points", ("m", 3)), check_angle(opening_angle)
         return COULOMB * self._core.tree.potentials(points, opening_angle, self.n_threads)
 
     def relax(self, tolerance=None):

@@ -22,14 +22,14 @@ from apt_evap.checkpoint import Checkpoint, Keeper, Parts, catch_up
 from apt_evap.detector import Detector
 from apt_evap.emission import Emissions, Launches, tangent_frame
 from apt_evap.emitter import EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, ChargeSettings, Emitter, check_voltage
-from apt_evap.flights import FlightCrew, FlightSettings
+from apt_evap.flights import FlightCrew, FlightSettings, check_reach
 from apt_evap.ion_random import IonRandom
 from apt_evap.law import Extremal
 from apt_evap.perturbation import Unperturbed
 from apt_evap.response import Responses, ResponseSettings, flattened
 from apt_evap.run import Flown, Run
 from apt_evap.tip import Tip
-from apt_evap.units import FLIGHT_TIME, NM_PER_MM
+from apt_evap.units import FLIGHT_TIME
 from apt_evap.watch import Watch, WatchSettings
 
 BATCH = 256  # events at a time; the results do not depend on it
@@ -96,7 +96,7 @@ class Simulation:
         self.watch_settings = WatchSettings() if watch_settings is None else watch_settings
         check_kind(self.watch_settings, "watch_settings", WatchSettings, "WatchSettings")
         self.n_threads = thread_count(n_threads)
-        self._check_reach(check_kind(tip, "tip", Tip, "a Tip"))
+        check_reach(self.flight_settings, check_kind(tip, "tip", Tip, "a Tip"), self.detector)
         self.emitter = Emitter(tip, self.voltage, self.law, charge_settings, self.n_threads, rule)
         check_copies(len(self.emitter), self.n_threads)
         self.settings = self._settings_of(tip)
@@ -348,21 +348,6 @@ class Simulation:
             warnings.warn(
                 f"n_ions is {n_ions:,} but only about {max(left, 0):,} atoms may leave: the run ends with the last",
                 stacklevel=3,
-            )
-
-    def _check_reach(self, tip):
-        """Refuse flights that would end beside the specimen, or behind the detector."""
-        height = tip.apex - float(tip.positions[tip.evaporable, 2].min(initial=tip.apex))
-        reach = self.flight_settings.reach * tip.nearest_neighbour_distance
-        if reach < 3 * height:
-            raise ValueError(
-                f"reach must be at least three times the {height:.4g} nm between the apex and the lowest atom that may "
-                f"leave, got {self.flight_settings.reach:g} d_nn, which is {reach:.4g} nm"
-            )
-        if self.detector.distance * NM_PER_MM < reach:
-            raise ValueError(
-                f"distance of the detector must be at least the {reach / NM_PER_MM:.4g} mm that ions fly through the "
-                f"field (reach), got {self.detector.distance:g} mm: it would be behind the end of the flights"
             )
 
     def _settings_of(self, tip):

@@ -1,6 +1,5 @@
 """The specimen: a crystal (or any arrangement of atoms) in the shape of a tip."""
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import asdict
 
@@ -8,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from apt_evap import interchange, lattice
-from apt_evap._arrays import check_array, check_kind, check_number, check_seed, check_sequence, shown
+from apt_evap._arrays import check_array, check_kind, check_number, check_seed, check_sequence, digest, shown
 from apt_evap._memory import check_memory
 from apt_evap.alloy import check_solutes, draw_species
 from apt_evap.material import Material, as_material
@@ -230,7 +229,7 @@ class Tip:
         tip.potential_point = check_array(potential_point, "potential_point", (3,))
         tip.settings = {
             "atoms": n,
-            "sha256": _digest(tip.positions, tip.species, tip.evaporable),
+            "sha256": digest(tip.positions, tip.species, tip.evaporable),
             "elements": [asdict(element) for element in elements],
             "neighbour_radius": tip.neighbour_radius,
             "surface_threshold": tip.surface_threshold,
@@ -396,11 +395,3 @@ class Tip:
         self.evaporation_fields = np.array([element.evaporation_field for element in elements])
         self.charge_states = np.array([element.charge_state for element in elements], dtype=np.int32)
         self.masses = np.array([element.mass for element in elements])
-
-
-def _digest(*arrays):
-    """Hash of some arrays, by which atoms given as positions are known again."""
-    digest = hashlib.sha256()
-    for array in arrays:
-        digest.update(np.ascontiguousarray(array))
-    return digest.hexdigest()
