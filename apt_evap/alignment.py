@@ -68,6 +68,17 @@ class Fit(NamedTuple):
         return self.score * np.sqrt(self.overlap)
 
 
+class Near(NamedTuple):
+    """Where a simulated point must come to lie."""
+
+    anchor: complex
+    """The simulated point [mm]."""
+    place: complex
+    """The measured point [mm]."""
+    tolerance: float
+    """How far off it may lie, in x and in y [mm]."""
+
+
 @dataclass(frozen=True, eq=False)
 class Image:
     """A flattened map, sampled anywhere; coordinates are complex numbers x + iy [mm]."""
@@ -176,8 +187,8 @@ def search(simulated, measured, rotations, scales, mirrors, least, near=None):
         What to try: degrees, numbers, bools.
     least : float
         Least share of the measured field of view that both must show.
-    near : tuple of complex and float, optional
-        A simulated point and how far from the measured centre it may come to lie [mm].
+    near : Near, optional
+        Bounds of the shift.
 
     Returns
     -------
@@ -201,10 +212,11 @@ def search(simulated, measured, rotations, scales, mirrors, least, near=None):
         for mirror in mirrors:
             moving = spectra(*image.sample(simulated.centre + (points.conj() if mirror else points) / scale), size)
             allowed = True
-            if near is not None:
-                away = (near[0] - simulated.centre) * scale
-                allowed = np.abs((away.conjugate() if mirror else away) + shifts) <= near[1]
             for turn, values, (_, inside) in zip(rotations, fixed, turned, strict=True):
+                if near is not None:
+                    unmoved = Placement(0.0, scale, mirror, simulated.centre, 0j).forth(near.anchor)
+                    target = (near.place - measured.centre) * np.exp(-1j * np.radians(turn))
+                    allowed = np.abs(unmoved + shifts - target) <= max(near.tolerance, pixel)
                 score, shared = correlate(moving, values, size)
                 share = np.minimum(shared / np.count_nonzero(inside), 1)
                 best = np.argmax(np.where(allowed & (share >= least), score * np.sqrt(share), -1))
@@ -224,7 +236,7 @@ def distinct(fits, most):
     return kept
 
 
-def refine(simulated, measured, placement, pixels, least, rotations=None, scales=None):
+def refine(simulated, measured, placement, pixels, least, rotations=None, scales=None, near=None):
     """Maximise the correlation near a placement.
 
     Parameters
@@ -239,6 +251,8 @@ def refine(simulated, measured, placement, pixels, least, rotations=None, scales
         Least share of the measured field of view that both must show.
     rotations, scales : tuple of float, optional
         Bounds; equal ones fix the value.
+    near : Near, optional
+        Bounds of the shift.
 
     Returns
     -------
@@ -250,6 +264,10 @@ def refine(simulated, measured, placement, pixels, least, rotations=None, scales
     points, values = points[inside], values[inside]
     image = simulated.flatten(NARROW * pixel / placement.scale, broad / placement.scale)
     start = placement.anchored(measured.centre)
+    if near is not None:
+        away = placement.forth(near.anchor) - near.place
+        away = complex(*np.clip((away.real, away.imag), -near.tolerance, near.tolerance))
+        start = placement._replace(anchor=near.anchor, place=near.place + away)
     free = [rotations is None or rotations[0] < rotations[1], scales is None or scales[0] < scales[1], True, True]
     units = np.array([ROTATION_STEP / 2, SCALE_STEP / 2, pixel, pixel])
     low, high = np.full(4, -np.inf), np.full(4, np.inf)
@@ -257,6 +275,9 @@ def refine(simulated, measured, placement, pixels, least, rotations=None, scales
         low[0], high[0] = (np.asarray(rotations) - start.rotation) / units[0]
     if scales is not None:
         low[1], high[1] = np.log(np.asarray(scales) / start.scale) / units[1]
+    if near is not None:
+        offset = np.array([away.real, away.imag])
+        low[2:], high[2:] = (-near.tolerance - offset) / pixel, (near.tolerance - offset) / pixel
 
     def placed(steps):
         turn, stretch, x, y = _spread(steps, free) * units

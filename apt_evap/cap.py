@@ -126,7 +126,8 @@ def image_compression(run, caps=None):
     seen = hits.detected
     # to the corners the square detector shows only some azimuths
     seen &= radius <= run.detector.width / 2
-    detector = np.degrees(np.arctan2(radius, run.detector.distance))
+    plane = run.detector.projection == "plane"
+    detector = np.degrees(np.arctan(radius / run.detector.distance) if plane else radius / run.detector.distance)
     number = np.floor(crystal / _BIN).astype(int)
     # at the rim of the detector only the ions that come in below the average are left
     whole = [np.mean(seen[number == index]) > 0.99 for index in range(int(90 / _BIN)) if (number == index).any()]
@@ -148,7 +149,7 @@ def image_compression(run, caps=None):
         ratio = crystal[chosen] / detector[chosen]
         compression = float(np.median(ratio))
     scatter = float(np.diff(np.percentile(ratio, [16, 84]))[0] / 2)
-    projection = Projection(run.detector.distance / compression, compression=compression)
+    projection = Projection(run.detector.distance / compression, compression=compression if plane else None)
     return ImageCompression(compression, scatter, low, high, angles, medians, projection)
 
 

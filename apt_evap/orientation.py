@@ -254,7 +254,7 @@ def _offsets(seen, expected):
 
 
 def _scales(normals, places, projection):
-    """Scales to start from [mm/rad]: of all pairs of poles the median distance over angle, and around."""
+    """Scales to start from [mm/rad]: the median over all pairs of poles of distance over angle, and some around."""
     first, second = np.triu_indices(len(normals), 1)
     angles = np.linalg.norm(_offsets(normals[first], normals[second]), axis=1)
     apart = angles > _SAME

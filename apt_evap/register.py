@@ -12,6 +12,7 @@ from apt_evap.alignment import (
     NARROW,
     ROTATION_STEP,
     SCALE_STEP,
+    Near,
     View,
     distinct,
     refine,
@@ -20,7 +21,7 @@ from apt_evap.alignment import (
 from apt_evap.maps import DetectorMap
 
 DOUBTFUL = 0.5
-"""Maps that have nothing to do with each other reach this score."""
+"""A score times the root of the overlap that maps reach which have nothing to do with each other."""
 _KEPT = 12  # places that are refined: as many as there are symmetric ones of a threefold axis with mirrors, twice
 _BINS = 384  # of a map of simulated hits
 
@@ -46,7 +47,7 @@ class Registration:
     residual : float
         Root mean square distance of registered points [mm]; NaN if maps were registered.
     method : str
-        How it was found: "search", "start", "points", or "" if given.
+        How it was found: "search", "start", "pole", "points", or "" if given.
     ties : tuple of Registration
         Other transforms that fit as well within the noise: the symmetry of the crystal, as a rule.
 
@@ -109,11 +110,11 @@ class Registration:
 
     @property
     def inverse(self):
-        """The transform from the measured into the simulated frame, a Registration without ties."""
+        """The transform from the measured into the simulated frame, a Registration without score."""
         rotation = self.rotation if self.mirror else -self.rotation
         back = Registration(rotation, 1 / self.scale, (0.0, 0.0), self.mirror)
         x, y = back.points(*self.shift)
-        return replace(self, rotation=rotation, scale=back.scale, shift=(-float(x), -float(y)), ties=())
+        return replace(back, shift=(-float(x), -float(y)))
 
     @property
     def _turn(self):
@@ -155,6 +156,8 @@ def register(
     measured,
     *,
     start=None,
+    pole=None,
+    tolerance=None,
     rotations=None,
     scales=None,
     mirrors=None,
@@ -173,6 +176,11 @@ def register(
     start : Registration, optional
         Roughly the answer: within 15 degrees, 20 % of the scale and a fifth of the measured diameter, of the same
         mirror, unless the following say otherwise.
+    pole : tuple, optional
+        A pole that is known in both frames: its simulated and its measured place, ((x, y), (x, y)) [mm].
+    tolerance : float, optional
+        How far the simulated pole may come to lie from the measured one, in x and in y [mm]; by default a 50th of
+        the measured diameter. With `start` and no pole, that of the middle of the measured map.
     rotations : float or tuple of float, optional
         Rotation, or its lowest and highest value [degrees]; all by default.
     scales : float or tuple of float, optional
@@ -211,13 +219,11 @@ def register(
     if start is not None and not isinstance(start, Registration):
         raise ValueError(f"start must be a Registration, got {start!r:.80}")
     least = check_number(overlap, "overlap", above=0, at_most=1)
-    near = None
+    near = _near(start, pole, tolerance, measured)
     if start is not None:
         rotations = (start.rotation - 15, start.rotation + 15) if rotations is None else rotations
         scales = (start.scale / 1.2, start.scale * 1.2) if scales is None else scales
         mirrors = (start.mirror,) if mirrors is None else mirrors
-        x, y = start.inverse.points(measured.centre.real, measured.centre.imag)
-        near = complex(x, y), measured.diameter / 5
     if rotations is not None:
         rotations = _range(rotations, "rotations", unit="degrees")
         rotations = None if rotations[1] - rotations[0] >= 360 else rotations
@@ -237,7 +243,7 @@ def register(
             f"the maps must share {least:.0%} of the measured field of view (overlap), and do not for scales of "
             f"{tried[0]:.3g} to {tried[1]:.3g}"
         )
-    bounds = rotations, scales
+    bounds = rotations, scales, near
     fits = [refine(simulated, measured, fit.placement, MEDIUM, least, *bounds) for fit in distinct(fits, _KEPT)]
     fits = distinct(sorted(fits, key=lambda fit: -fit.rank), _KEPT)
     # the difference of two resolutions is less than three standard errors
@@ -247,12 +253,13 @@ def register(
     fits = sorted(fits, key=lambda fit: -fit.rank)
     fits = distinct([fit for fit in fits if fit.rank > fits[0].rank - _error(fits[0], FINE)], _KEPT)
     fits.sort(key=lambda fit: fit.placement.mirror)  # stable: the best stays first among either kind
-    found = [_registration(fit, "search" if start is None else "start") for fit in fits]
+    found = [_registration(fit, "search" if near is None else "start" if pole is None else "pole") for fit in fits]
     best = replace(found[0], ties=tuple(found[1:]))
-    if best.score < DOUBTFUL:
+    if best.score * np.sqrt(best.overlap) < DOUBTFUL:
         warnings.warn(
-            f"the maps correlate by only {best.score:.2f}, as maps may that have nothing to do with each other; look "
-            "at plot.overlay, and give scales or a start",
+            f"the maps correlate by only {best.score:.2f} where both show something ({best.overlap:.0%} of the "
+            "measured one), as maps may that have nothing to do with each other; look at plot.overlay, and give a "
+            "pole, scales or a start where known",
             stacklevel=2,
         )
     return best
@@ -303,6 +310,23 @@ def _least_squares(source, target, mirror):
     shift = (float(shift.real), float(shift.imag))
     angle = float(np.degrees(np.angle(turn)))
     return Registration(angle, float(abs(turn)), shift, mirror, residual=float(residual), method="points")
+
+
+def _near(start, pole, tolerance, measured):
+    """Bounds of the shift from what is known of it, or None."""
+    if pole is not None:
+        (x, y), (at_x, at_y) = check_array(pole, "pole", (2, 2)).tolist()
+        anchor, place, share = complex(x, y), complex(at_x, at_y), 1 / 50
+    elif start is not None:
+        x, y = start.inverse.points(measured.centre.real, measured.centre.imag)
+        anchor, place, share = complex(x, y), measured.centre, 1 / 5
+    elif tolerance is not None:
+        raise ValueError(f"tolerance needs a pole or a start that it is the tolerance of, got {tolerance!r} alone")
+    else:
+        return None
+    if tolerance is None:
+        tolerance = share * measured.diameter
+    return Near(anchor, place, check_number(tolerance, "tolerance", at_least=0, unit="mm"))
 
 
 def _view(value, name):

@@ -121,6 +121,41 @@ def test_without_responses_the_perturbations_of_the_maps_are_flown(folder, capsy
     assert main(["map", "small.h5"]) == 0 and main(["info", "small.h5"]) == 0
 
 
+def datasets(path):
+    found = {}
+    with h5py.File(path) as file:
+        file.visititems(lambda name, item: found.update({name: item[()]}) if isinstance(item, h5py.Dataset) else None)
+    return found
+
+
+def test_a_run_is_made_longer_by_resume(folder, made, capsys):
+    assert main(["run", "small.toml", "--ions", "25", "--quiet"]) == 0
+    assert main(["run", "small.toml", "--resume", "--checkpoint", "0"]) == 0
+    assert "60 ions in" in capsys.readouterr().out
+    one, two = datasets(made), datasets("small.h5")
+    assert one.keys() == two.keys() and "entry1/atom_probe/hit_finding/hit_positions" in one
+    assert [name for name in one if one[name].tobytes() != two[name].tobytes()] == []
+    assert load("small.h5").provenance["config"] == "small.toml"
+    assert sorted(os.listdir()) == ["small.h5", "small.png", "small.toml"]
+    assert "seed is 1 there and 2 here" in failed(capsys, "run", "small.toml", "--resume", "--seed", "2", "--quiet")
+
+
+def test_an_unfinished_run_is_resumed_or_begun_anew_as_asked(folder, made, capsys):
+    assert main(["run", "small.toml", "--ions", "25", "--quiet"]) == 0
+    (folder / "small.h5.unfinished").mkdir()
+    os.rename("small.h5", "small.h5.unfinished/ions-000000000000.h5")
+    message = failed(capsys, "run", "small.toml", "--quiet")
+    assert "unfinished run of 25 ions" in message and "--resume goes on with it, --force begins anew" in message
+    assert main(["info", "small.h5.unfinished"]) == 2  # no file: it has to be finished first
+    assert main(["run", "small.toml", "--quiet", "--resume", "--ions", "30"]) == 0
+    assert len(load("small.h5")) == 30
+    os.mkdir("small.h5.unfinished")
+    os.rename("small.h5", "small.h5.unfinished/ions-000000000000.h5")
+    assert main(["run", "small.toml", "--quiet", "--force", "--ions", "5"]) == 0
+    assert len(load("small.h5")) == 5
+    assert sorted(os.listdir()) == ["small.h5", "small.png", "small.toml"]
+
+
 def test_a_second_run_overwrites_the_first_but_nobody_elses_files(folder, capsys):
     quick = ["run", "small.toml", "--ions", "5", "--quiet"]
     assert main(quick) == 0

@@ -2,6 +2,7 @@ import copy
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -151,6 +152,16 @@ def test_lengths_are_in_lattice_constants_or_nm(tmp_path, text, length):
     config = read_config(written(tmp_path, MINIMAL | {"tip": {"material": "Ni", "apex_radius": text}}))
     # one rounding of the product
     assert math.isclose(config.tip["apex_radius"], length, rel_tol=1e-15)
+
+
+def test_an_axis_of_any_numbers(tmp_path):
+    axis = [0.3015441344842630, 0.5403229287126988, 0.7855713001793464]
+    table = {"material": "Ni", "apex_radius": "6 a", "axis": axis, "rotation": 157.2870473268672}
+    tip = read_config(written(tmp_path, MINIMAL | {"tip": table})).simulation(n_threads=1).tip
+    assert tip.settings["axis"] == axis
+    np.testing.assert_array_equal(
+        tip.positions, Tip("Ni", 6 * material("Ni").a, axis, rotation=157.2870473268672).positions
+    )
 
 
 def test_a_material_of_ones_own(tmp_path):

@@ -263,3 +263,20 @@ def test_tip_that_does_not_fit_in_memory_is_refused_before_it_is_built(monkeypat
         Tip(NICKEL, 250 * NICKEL.a)
     monkeypatch.setattr(_memory, "_available_memory", lambda: None)
     assert len(small()) > 0
+
+
+@pytest.mark.parametrize("axis", [(0.31, 0.54, 0.7842), (1, 2, 2.5)])
+def test_a_tip_along_any_axis_is_made_again_from_its_settings(axis):
+    tip = small(axis=axis, rotation=17.5, offset_seed=2)
+    assert tip.settings["axis"] == list(axis) and "[" + " ".join(f"{number:g}" for number in axis) + "]" in repr(tip)
+    again = Tip.from_settings(json.loads(json.dumps(tip.settings)))
+    np.testing.assert_array_equal(again.positions, tip.positions)
+    assert again.settings == tip.settings
+
+
+def test_an_axis_of_floats_near_a_lattice_direction_gives_nearly_the_same_tip():
+    # [0 1 2] has [1 0 0] along x by both rules
+    whole, near = small(axis=(0, 1, 2)), small(axis=(0.0, 0.5, 1.0 + 1e-9))
+    distances = cKDTree(near.positions).query(whole.positions)[0]
+    assert len(whole) == len(near)
+    assert distances.max() < 1e-9 * 3 * 8 * NICKEL.a  # the angle times the height of the tip

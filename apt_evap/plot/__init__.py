@@ -3,6 +3,7 @@
 from apt_evap.plot._figure import add_colorbar, new_figure
 from apt_evap.plot.histories import history
 from apt_evap.plot.maps import color_limits, common_limits, describe, detector_map, detector_maps
+from apt_evap.plot.overlay import overlay
 from apt_evap.plot.poles import poles
 from apt_evap.plot.profiles import profile, profile_comparison, rectangles
 from apt_evap.plot.responses import ion_colors, response
@@ -20,6 +21,7 @@ __all__ = [
     "ion_colors",
     "mark_atoms",
     "new_figure",
+    "overlay",
     "poles",
     "profile",
     "profile_comparison",
