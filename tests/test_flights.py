@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 import twins
-from apt_evap._core.flight import LEFT, NEVER_LEFT, Flights
-from apt_evap._core.journal import Journal
-from apt_evap._core.octree import Octree
 from scipy.integrate import solve_ivp
 
 import apt_evap as ae
+from apt_evap._core.flight import LEFT, NEVER_LEFT, Flights
+from apt_evap._core.journal import Journal
+from apt_evap._core.octree import Octree
 from apt_evap.units import COULOMB, NM_PER_MM
 
 DEFAULT = ae.FlightSettings()

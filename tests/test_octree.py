@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 import twins
-from apt_evap._core.octree import Octree, morton_order
-from apt_evap._core.sweep import InteractionLists
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import apt_evap as ae
+from apt_evap._core.octree import Octree, morton_order
+from apt_evap._core.sweep import InteractionLists
 
 DEFAULT_ANGLE = ae.ChargeSettings().opening_angle
 
