@@ -11,7 +11,9 @@ import numpy as np
 from apt_evap._arrays import check_count, check_number
 from apt_evap._core.flight import LEFT, Flights
 from apt_evap._core.octree import Octree
-from apt_evap.units import COULOMB
+from apt_evap.units import COULOMB, NM_PER_MM
+
+_MOST_STEPS = 1_000_000  # flights take some tens
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,23 @@ class FlightSettings:
         check_number(self.opening_angle, "opening_angle", at_least=0, at_most=1.0, unit="rad")
         check_number(self.tolerance, "tolerance", above=0, at_most=0.1)
         check_number(self.reach, "reach", at_least=100, unit="d_nn")
-        check_count(self.most_steps, "most_steps", at_least=1)
+        check_count(self.most_steps, "most_steps", at_least=1, at_most=_MOST_STEPS)
+
+
+def check_reach(settings, tip, detector):
+    """Refuse flights that would end beside the specimen, or behind the detector."""
+    height = tip.apex - float(tip.positions[tip.evaporable, 2].min(initial=tip.apex))
+    reach = settings.reach * tip.nearest_neighbour_distance
+    if reach < 3 * height:
+        raise ValueError(
+            f"reach must be at least three times the {height:.4g} nm between the apex and the lowest atom that may "
+            f"leave, got {settings.reach:g} d_nn, which is {reach:.4g} nm"
+        )
+    if detector.distance * NM_PER_MM < reach:
+        raise ValueError(
+            f"distance of the detector must be at least the {reach / NM_PER_MM:.4g} mm that ions fly through the "
+            f"field (reach), got {detector.distance:g} mm: it would be behind the end of the flights"
+        )
 
 
 @dataclass(frozen=True, eq=False)

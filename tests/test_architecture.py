@@ -15,7 +15,18 @@ FLOORS = (
     {"_core"},
     {"lattice", "ranges", "shape", "material", "alloy", "interchange", "projection", "poles", "orientation", "tip"}
     | {"detector", "hits"},
-    {"ion_random", "energy", "emission", "perturbation", "law", "emitter_state", "emitter", "flights", "response"},
+    {
+        "ion_random",
+        "energy",
+        "emission",
+        "perturbation",
+        "law",
+        "charge_settings",
+        "emitter_state",
+        "emitter",
+        "flights",
+        "response",
+    },
     {"watch", "run_file", "run", "checkpoint", "simulation"},
     {"binning", "maps", "cap", "profiles", "zone_line", "tracks", "alignment", "register", "compare"}
     | {"energy_grid", "resample", "study", "fit", "config", "info", "io"},

@@ -14,7 +14,7 @@ import pytest
 from matplotlib.image import imread
 
 from apt_evap import __version__, cli, plot
-from apt_evap.cli import main
+from apt_evap.cli import EXIT_CODES, main
 from apt_evap.hits import Hits
 from apt_evap.io import write
 from apt_evap.perturbation import Combined, LateralVelocity, RollUp, Unperturbed
@@ -360,6 +360,25 @@ def test_map_of_measured_ions_keeps_to_their_comb(measured, monkeypatch):
     assert only.bin_size == pytest.approx((0.5, 0.5)) and only.smoothing == pytest.approx(0.5)
 
 
+def test_what_was_written_is_told_as_json_or_not_at_all(folder, capsys):
+    assert main(["run", "small.toml", "--json", "--map", "small.svg"]) == 0
+    out, err = capsys.readouterr()
+    told = json.loads(out)
+    run = load("small.h5")
+    assert out.count("\n") == 1 and err == ""
+    assert (told["wrote"], told["picture"], told["ions"], told["ended"]) == ("small.h5", "small.svg", 60, "as planned")
+    assert [told[key] for key in ("hit", "missed", "never_left")] == list(run.hits(Unperturbed()).counts.values())
+    assert main(["map", "small.h5", "--json", "--perturbation", "RollUp:0.2", "--bins", "16"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    on_it = int(np.count_nonzero(run.hits(RollUp(0.2)).detected))
+    assert told["wrote"] == "small_map.png" and Path(told["wrote"]).exists()
+    (only,) = told["maps"]
+    assert (only["title"], only["ions"], only["bins"]) == ("roll-up, 0.2 eV", on_it, [16, 16])
+    assert main(["map", "small.h5", "--quiet"]) == 0
+    assert capsys.readouterr() == ("", "")
+    assert "not allowed with argument" in failed(capsys, "map", "small.h5", "--quiet", "--json")
+
+
 def test_map_errors(measured, made, capsys):
     write("ions.pos", Hits(positions=np.zeros((3, 3)), mass_to_charge=np.ones(3)))
     assert (
@@ -462,7 +481,13 @@ def test_version_and_help(capsys):
     assert capsys.readouterr().out == f"apt-evap {__version__}\n"
     for command in ([], ["run"], ["map"], ["info"]):
         assert main([*command, "--help"]) == 0
-        assert "example: apt-evap " in capsys.readouterr().out
+        helped = capsys.readouterr().out
+        assert re.search(r"^ *(example: )?apt-evap (run|map|info) \S+\.\w+", helped, re.M)
+        assert max(map(len, helped.splitlines())) <= 120
+    assert main(["--help"]) == 0
+    helped = capsys.readouterr().out
+    for line in EXIT_CODES.splitlines():
+        assert line in helped
 
 
 def test_a_reader_of_the_output_may_leave(made):
