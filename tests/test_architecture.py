@@ -11,7 +11,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "apt_evap"
 
 FLOORS = (
-    {"units", "_arrays", "_threads", "_memory", "_files", "_version"},
+    {"units", "_arrays", "_threads", "_memory", "_files", "_types", "_version"},
     {"_core"},
     {"lattice", "ranges", "shape", "material", "alloy", "interchange", "projection", "poles", "orientation", "tip"}
     | {"detector", "hits"},
