@@ -1,8 +1,10 @@
 """Random substitutional alloys: which atom is of which species."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
-from apt_evap._arrays import check_count, check_number
+from apt_evap._arrays import check_kind, check_number, check_seed
 from apt_evap.material import as_material
 
 
@@ -26,13 +28,15 @@ def check_solutes(solutes, seed):
         If a fraction is not above 0, they sum to more than 1, or there is no seed.
     """
     fractions = {}
+    if solutes is not None:
+        check_kind(solutes, "solutes", Mapping, "a mapping of an element to its atomic fraction")
     for element, fraction in (solutes or {}).items():
-        solute = as_material(element)
+        solute = as_material(element, "solutes")
         fractions[solute] = check_number(fraction, f"fraction of {solute.name}", above=0, at_most=1)
     if sum(fractions.values()) > 1:
         raise ValueError(f"solutes must have fractions that sum to at most 1, got {sum(fractions.values()):g}")
     if fractions or seed is not None:
-        check_count(seed, "seed (the random places of the solutes are drawn from it)")
+        check_seed(seed, "seed (the random places of the solutes are drawn from it)")
     return fractions
 
 

@@ -6,11 +6,12 @@ import numpy as np
 from scipy import ndimage
 from skimage.morphology import convex_hull_image
 
-from apt_evap._arrays import check_array, check_count, check_number
+from apt_evap._arrays import check_array, check_count, check_number, shown
 
 _CHUNK = 1 << 16
 
 
+MOST_BINS = 16384  # along a side: 2 GB of counts
 MOST_BY_CHANCE = 32  # so few different values may lie on a comb by chance: eight of a normal distribution did
 
 
@@ -84,7 +85,7 @@ def find_combs(x, y, quantum="auto"):
         return None
     if isinstance(quantum, str):
         if quantum != "auto":
-            raise ValueError(f"quantum must be 'auto', None or two spacings [mm], got {quantum!r}")
+            raise ValueError(f"quantum must be 'auto', None or two spacings [mm], got {shown(quantum)}")
         combs = find_comb(x), find_comb(y)
         return None if None in combs else combs
     spacings = check_array(quantum, "quantum", (2,))
@@ -120,9 +121,7 @@ def bin_edges(x, y, bins, extent=None, combs=None):
     ValueError
         If `bins` or `extent` make no sense.
     """
-    bins = check_count(bins, "bins", at_least=1)
-    if bins > 16384:
-        raise ValueError(f"bins must be at most 16384, got {bins}")
+    bins = check_count(bins, "bins", at_least=1, at_most=MOST_BINS)
     if extent is None:
         extent = (x.min(), x.max(), y.min(), y.max())
     low_x, high_x, low_y, high_y = (float(value) for value in check_array(extent, "extent", (4,)))

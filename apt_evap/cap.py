@@ -1,14 +1,16 @@
 """What the ions of a run say about the shape of the cap and the way to the detector."""
 
 import math
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
 
-from apt_evap._arrays import check_count
+from apt_evap._arrays import check_array, check_count, check_kind, check_number, check_sequence
 from apt_evap.perturbation import Unperturbed
 from apt_evap.projection import Projection
+from apt_evap.run import Run
 
 _CAP = math.radians(45)  # launch sites nearer to the axis than this make the sphere: the shank is far
 _NEAR = math.radians(20)  # about the apex, for its field
@@ -72,11 +74,11 @@ def fit_caps(run, windows=None):
     ValueError
         If a window has too few ions near the axis (50).
     """
-    n = len(run)
+    n = len(check_kind(run, "run", Run, "a Run"))
     windows = min(10, max(1, n // 500)) if windows is None else check_count(windows, "windows", at_least=1)
     edges = np.linspace(0, n, windows + 1).astype(int)
     caps = []
-    for first, last in zip(edges[:-1], edges[1:], strict=True):
+    for first, last in pairwise(edges):
         sites = run.emissions.positions[first:last]
         centre, radius = np.zeros(3), None
         for _ in range(3):  # the sites on the cap change with its centre
@@ -114,9 +116,9 @@ def image_compression(run, caps=None):
     azimuths stands against what poles and zone lines do to their surroundings; within some 15 degrees of a pole on the
     axis all ions are pushed outwards, so that these do not count.
     """
-    hits = run.hits(Unperturbed())
+    hits = check_kind(run, "run", Run, "a Run").hits(Unperturbed())
     crystal = np.empty(len(run))
-    for cap in fit_caps(run) if caps is None else caps:
+    for cap in _caps_of(run, caps):
         from_centre = run.emissions.positions[cap.first : cap.last] - cap.centre
         across = np.hypot(from_centre[:, 0], from_centre[:, 1])
         crystal[cap.first : cap.last] = np.degrees(np.arctan2(across, from_centre[:, 2]))
@@ -124,7 +126,8 @@ def image_compression(run, caps=None):
     seen = hits.detected
     # to the corners the square detector shows only some azimuths
     seen &= radius <= run.detector.width / 2
-    detector = np.degrees(np.arctan2(radius, run.detector.distance))
+    plane = run.detector.projection == "plane"
+    detector = np.degrees(np.arctan(radius / run.detector.distance) if plane else radius / run.detector.distance)
     number = np.floor(crystal / _BIN).astype(int)
     # at the rim of the detector only the ions that come in below the average are left
     whole = [np.mean(seen[number == index]) > 0.99 for index in range(int(90 / _BIN)) if (number == index).any()]
@@ -146,7 +149,7 @@ def image_compression(run, caps=None):
         ratio = crystal[chosen] / detector[chosen]
         compression = float(np.median(ratio))
     scatter = float(np.diff(np.percentile(ratio, [16, 84]))[0] / 2)
-    projection = Projection(run.detector.distance / compression, compression=compression)
+    projection = Projection(run.detector.distance / compression, compression=compression if plane else None)
     return ImageCompression(compression, scatter, low, high, angles, medians, projection)
 
 
@@ -176,10 +179,12 @@ def field_factor(voltage, field, radius):
     -----
     Gomer, Field Emission and Field Ionization (1961).
     """
-    values = [np.asarray(value, dtype=np.float64) for value in (voltage, field, radius)]
-    for name, value in zip(("voltage", "field", "radius"), values, strict=True):
-        if not (np.isfinite(value).all() and (value > 0).all()):
-            raise ValueError(f"{name} must be finite and above 0, got {value.min():g}")
+    values = []
+    for name, value in (("voltage", voltage), ("field", field), ("radius", radius)):
+        shape = tuple(f"n{axis}" for axis in range(np.ndim(value)))
+        values.append(check_array(value, name, shape) if shape else np.float64(check_number(value, name, above=0)))
+        if np.size(value) and values[-1].min() <= 0:
+            raise ValueError(f"{name} must be above 0, got {values[-1].min():g}")
     factor = values[0] / (values[1] * values[2])
     return float(factor) if factor.ndim == 0 else factor
 
@@ -207,13 +212,22 @@ def run_field_factor(run, caps=None):
         If no ion of a cap left near the axis.
     """
     factors = []
-    for cap in fit_caps(run) if caps is None else caps:
+    for cap in _caps_of(run, caps):
         from_centre = run.emissions.positions[cap.first : cap.last] - cap.centre
         near = np.arctan2(np.hypot(from_centre[:, 0], from_centre[:, 1]), from_centre[:, 2]) < _NEAR
         if not near.any():
             raise ValueError(f"no ion from {cap.first} to {cap.last} left within 20 degrees of the axis")
         factors.append(field_factor(run.voltage, np.median(run.fields[cap.first : cap.last][near]), cap.radius))
     return np.array(factors)
+
+
+def _caps_of(run, caps):
+    """The caps given, or those of `fit_caps`."""
+    if caps is None:
+        return fit_caps(run)
+    check_kind(run, "run", Run, "a Run")
+    caps = check_sequence(caps, "caps", "Cap, as fit_caps gives them")
+    return [check_kind(cap, "caps", Cap, "a sequence of Cap, as fit_caps gives them") for cap in caps]
 
 
 def _sphere(points, centre, radius):

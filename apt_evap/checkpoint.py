@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from apt_evap._arrays import check_count, check_number
+from apt_evap._arrays import check_count, check_number, check_switch
 from apt_evap._files import FileError, check_path, flush_folder
 from apt_evap.emitter import EXHAUSTED, SWEEP_DUE, TOO_SHALLOW
 from apt_evap.run import PART_NAME, Run, load, part_paths
@@ -67,6 +67,8 @@ class Checkpoint:
         check_number(self.minutes, "minutes", at_least=0, unit="min")
         if self.ions is not None:
             check_count(self.ions, "ions", at_least=1)
+        for name in ("resume", "overwrite"):
+            check_switch(getattr(self, name), name)
 
     @property
     def folder(self):

@@ -7,7 +7,8 @@ from scipy import ndimage
 from skimage.metrics import structural_similarity
 from skimage.morphology import disk
 
-from apt_evap._arrays import check_count, check_number
+from apt_evap._arrays import check_kind, check_number, check_seed
+from apt_evap.hits import Hits
 from apt_evap.maps import DetectorMap
 
 _WINDOW = 5
@@ -89,6 +90,8 @@ def ssim(map_a, map_b, *, smoothing=0.0, data_range=2.0):
     """
     smoothing = check_number(smoothing, "smoothing", at_least=0, unit="mm")
     data_range = check_number(data_range, "data_range", above=0)
+    for name, each in (("map_a", map_a), ("map_b", map_b)):
+        check_kind(each, name, DetectorMap, "a DetectorMap")
     _check_bins(map_a, map_b)
     common = map_a.mask & map_b.mask
     inside = ndimage.binary_erosion(common, disk(_WINDOW))
@@ -143,12 +146,13 @@ def half_ceiling(hits, *, smoothing=0.0, data_range=2.0, seed=0, **options):
     ValueError
         If the map is one of densities, or what `ssim` and `DetectorMap.from_hits` raise.
     """
-    seed = check_count(seed, "seed")
+    seed = check_seed(seed)
     if isinstance(hits, DetectorMap):
         if options:
             raise ValueError(f"a map is already binned and takes no {', '.join(options)}")
         whole = hits
     else:
+        check_kind(hits, "hits", Hits, "Hits or a DetectorMap")
         whole = DetectorMap.from_hits(hits, **options)
     # dividing every bin binomially is the same as dividing the ions one by one
     half = np.random.default_rng(seed).binomial(whole.counts, 0.5)

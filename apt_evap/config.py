@@ -6,13 +6,13 @@ import tomllib
 from collections.abc import Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
-from difflib import get_close_matches
 from pathlib import Path
 
-from apt_evap._arrays import check_count, check_number
+from apt_evap._arrays import check_count, check_number, check_seed, did_you_mean, shown
 from apt_evap._files import FileError, open_for_reading
+from apt_evap.binning import MOST_BINS
 from apt_evap.detector import Detector
-from apt_evap.emitter import ChargeSettings
+from apt_evap.emitter import ChargeSettings, check_voltage
 from apt_evap.energy import Fixed, Thermal, TruncatedNormal
 from apt_evap.material import MATERIALS, Material, material
 from apt_evap.perturbation import RollUp, Unperturbed, from_dict, to_dict
@@ -21,7 +21,6 @@ from apt_evap.simulation import FlightSettings, Simulation
 from apt_evap.tip import Tip
 from apt_evap.watch import WatchSettings
 
-MOST_BINS = 16384  # as for any map
 _LENGTH = re.compile(r"\s*(\S+?)\s*(a|nm)\s*")
 
 
@@ -57,7 +56,7 @@ class MapSettings:
         return {"panels": panels, "bins": self.bins, "smoothing": self.smoothing}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Config:
     """What a TOML file says about a simulation; made by `read_config`.
 
@@ -101,6 +100,13 @@ class Config:
     maps: MapSettings
     output: str | None
 
+    def __repr__(self):
+        host, radius = self.tip["material"].name, self.tip["apex_radius"]
+        panels = ", ".join(panel.title for panel in self.maps.panels)
+        return (
+            f"<Config {str(self.path)!r}: {self.n_ions:,} ions of {host}, apex radius {radius:.4g} nm; maps: {panels}>"
+        )
+
     @property
     def emissions(self):
         """Perturbations to fly beside the responses: none, or without responses those of the maps."""
@@ -123,11 +129,11 @@ class Config:
         Raises
         ------
         FileError
-            If the specimen is impossible; the message names the file and the table.
+            If the specimen is impossible, or the flights do not fit it; the message names the file.
         """
         with _place(self.path, "tip"):
             tip = Tip(**self.tip)
-        with _place(self.path, "simulation"):
+        with _place(self.path):  # flights against tip or detector: no single table
             return Simulation(
                 tip,
                 voltage=self.voltage,
@@ -181,18 +187,18 @@ def read_config(path):
             _check_table(document.get(name, {}), f"[{name}]")
         output = document.get("output")
         if output is not None and not (isinstance(output, str) and output):
-            raise ValueError(f"output must be a file name such as 'run.h5', got {output!r}")
+            raise ValueError(f"output must be a file name such as 'run.h5', got {shown(output)}")
     with _place(path, "tip"):
         tip = _tip(document["tip"])
     with _place(path, "simulation"):
         simulation = document["simulation"]
         _check_keys(simulation, ("ions", "voltage", "seed", "responses"), ("ions",))
         n_ions = check_count(simulation["ions"], "ions", at_least=1)
-        voltage = check_number(simulation.get("voltage", 1000.0), "voltage", above=0, unit="V")
-        seed = check_count(simulation.get("seed", 0), "seed")
+        voltage = check_voltage(simulation.get("voltage", 1000.0))
+        seed = check_seed(simulation.get("seed", 0))
         responses = simulation.get("responses", True)
         if not isinstance(responses, bool):
-            raise ValueError(f"responses must be true or false, got {responses!r}")
+            raise ValueError(f"responses must be true or false, got {shown(responses)}")
     made = []
     for name, kind, known in (
         ("detector", Detector, _field_names(Detector)),
@@ -231,8 +237,7 @@ def read_maps(table):
     _check_keys(table, ("panels", "bins", "smoothing"))
     bins, smoothing = table.get("bins"), table.get("smoothing")
     if bins is not None:
-        bins = check_count(bins, "bins", at_least=1)
-        check_number(bins, "bins", at_most=MOST_BINS)
+        bins = check_count(bins, "bins", at_least=1, at_most=MOST_BINS)
     if smoothing is not None:
         smoothing = check_number(smoothing, "smoothing", at_least=0, unit="mm")
     if table.get("panels") is None:
@@ -241,7 +246,7 @@ def read_maps(table):
             tuple(Panel(title_of(perturbation), perturbation) for perturbation in usual), bins, smoothing
         )
     if not isinstance(table["panels"], list) or not table["panels"]:
-        raise ValueError(f"panels must be a list of tables such as [[maps.panels]], got {table['panels']!r:.80}")
+        raise ValueError(f"panels must be a list of tables such as [[maps.panels]], got {shown(table['panels'])}")
     panels = []
     for number, entry in enumerate(table["panels"], start=1):
         try:
@@ -250,7 +255,7 @@ def read_maps(table):
             perturbation = read_perturbation(entry["perturbation"])
             title = entry.get("title", title_of(perturbation))
             if not isinstance(title, str):
-                raise ValueError(f"title must be text, got {title!r:.80}")
+                raise ValueError(f"title must be text, got {shown(title)}")
         except ValueError as error:
             raise ValueError(f"panel {number}: {error}") from error
         panels.append(Panel(title, perturbation))
@@ -285,10 +290,10 @@ def read_perturbation(settings):
     _check_table(settings, "perturbation")
     for table in (settings, *settings.values()):
         if isinstance(table, Mapping) and not isinstance(table.get("name"), str):
-            raise ValueError(f"a perturbation or distribution must have a name, got {dict(table)!r:.80}")
+            raise ValueError(f"a perturbation or distribution must have a name, got {shown(dict(table))}")
     perturbation = from_dict(settings)
     if not callable(getattr(perturbation, "launch", None)):
-        raise ValueError(f"perturbation must be one, such as Unperturbed or RollUp, got {settings!r:.80}")
+        raise ValueError(f"perturbation must be one, such as Unperturbed or RollUp, got {shown(dict(settings))}")
     return perturbation
 
 
@@ -344,7 +349,7 @@ def _tip(table):
     elif isinstance(host, str):
         host = material(host)
     else:
-        raise ValueError(f"material must be a name such as 'Ni' or a table, got {host!r:.80}")
+        raise ValueError(f"material must be a name such as 'Ni' or a table, got {shown(host)}")
     settings = dict(table, material=host)
     for name in ("apex_radius", "shank_length", "depth"):
         if name in settings:
@@ -364,7 +369,7 @@ def _length(value, name, a):
     try:
         return float(found[1]) * (a if found[2] == "a" else 1.0)
     except (TypeError, ValueError):
-        raise ValueError(f"{name} must be a number [nm] or text such as '20 a' or '7 nm', got {value!r}") from None
+        raise ValueError(f"{name} must be a number [nm] or text such as '20 a' or '7 nm', got {shown(value)}") from None
 
 
 def _field_names(kind):
@@ -373,15 +378,13 @@ def _field_names(kind):
 
 def _check_table(value, name):
     if not isinstance(value, Mapping):
-        raise ValueError(f"{name} must be a table, got {value!r:.80}")
+        raise ValueError(f"{name} must be a table, got {shown(value)}")
 
 
 def _check_keys(table, known, needed=()):
     for key in table:
         if key not in known:
-            close = get_close_matches(key, known, n=1, cutoff=0.5)
-            hint = f" (did you mean {close[0]!r}?)" if close else ""
-            raise ValueError(f"no key is named {key!r}{hint}; known are {', '.join(known)}")
+            raise ValueError(f"no key is named {shown(key)}{did_you_mean(key, known)}; known are {', '.join(known)}")
     for key in needed:
         if key not in table:
             raise ValueError(f"{key} is missing; needed are {', '.join(needed)}")

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from apt_evap._arrays import check_number
+from apt_evap._arrays import check_choice, check_number
 from apt_evap.hits import Outcome
 from apt_evap.units import NM_PER_MM
 
@@ -29,7 +29,7 @@ class Detector:
     Raises
     ------
     ValueError
-        If a length is not above 0, or the projection is unknown.
+        If a length is not above 0 or is above 1 km, or the projection is unknown.
     """
 
     distance: float = 100.0
@@ -37,10 +37,11 @@ class Detector:
     projection: str = "plane"
 
     def __post_init__(self):
-        if self.projection not in PROJECTIONS:
-            raise ValueError(f"projection must be one of {', '.join(PROJECTIONS)}, got {self.projection!r}")
+        check_choice(self.projection, "projection", PROJECTIONS)
         for name in ("distance", "width"):
-            object.__setattr__(self, name, check_number(getattr(self, name), name, above=0, unit="mm"))
+            # a kilometre is a slip of the unit
+            checked = check_number(getattr(self, name), name, above=0, at_most=1e6, unit="mm")
+            object.__setattr__(self, name, checked)
 
     def directions(self, positions, velocities, apex):
         """Directions in which ions meet the plane, as seen from the apex.

@@ -7,7 +7,7 @@ import numpy as np
 from apt_evap._arrays import check_array, check_number
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Emissions:
     """A batch of atoms about to leave.
 
@@ -65,8 +65,12 @@ class Emissions:
     def __len__(self):
         return len(self.positions)
 
+    def __repr__(self):
+        lonely = np.count_nonzero(np.isnan(self.neighbours).any(axis=1))
+        return f"<Emissions: {len(self):,} atoms about to leave, {lonely:,} of them without a neighbour to roll onto>"
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Launches:
     """How a batch of ions starts.
 
@@ -98,6 +102,9 @@ class Launches:
 
     def __len__(self):
         return len(self.positions)
+
+    def __repr__(self):
+        return f"<Launches: {len(self):,} ions, {np.count_nonzero(self.rolled):,} of them rolled up>"
 
 
 def tangent_frame(normals):

@@ -5,68 +5,28 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from apt_evap._arrays import check_array, check_count, check_number
+from apt_evap._arrays import check_array, check_count, check_kind, check_number
 from apt_evap._core.event import DONE, EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, Evaporation, Start
 from apt_evap._core.journal import Journal
 from apt_evap._core.octree import Octree
-from apt_evap._core.robin import Robin
+from apt_evap._core.robin import ChargingRule, Robin
 from apt_evap._core.surface import Neighbourhood
 from apt_evap._threads import thread_count
+from apt_evap.charge_settings import ChargeSettings, check_angle, check_voltage
 from apt_evap.emitter_state import EmitterState
 from apt_evap.interchange import to_atoms
 from apt_evap.law import Extremal
+from apt_evap.tip import Tip
 from apt_evap.units import COULOMB
+
+RECORD = 16_384  # events after which a batch comes with a tree in any case, so that nobody has to keep the journals
 
 __all__ = ["DONE", "EXHAUSTED", "SWEEP_DUE", "TOO_SHALLOW", "Batch", "ChargeSettings", "Emitter"]
 
-
-@dataclass(frozen=True)
-class ChargeSettings:
-    """How finely the charges are solved.
-
-    Lengths are in nearest neighbour distances d_nn of the specimen.
-
-    Parameters
-    ----------
-    opening_angle : float
-        Full angle under which a cell of the octree stands for its atoms [rad]. 0.4 keeps charges within 3e-4 of what
-        direct sums give (largest difference on a tip of R = 12 a).
-    patch_radius : float
-        Charges are solved within this distance of a hole [d_nn]; 8.5 is 6 lattice constants of fcc.
-    update_radius : float
-        Fields are kept up to date within this distance of a hole [d_nn].
-    sweep_interval : int, optional
-        Events between two relaxations of the whole surface; by default a 300th of the surface
-        atoms there are at the start, but at least 100.
-    tolerance : float
-        Change of a charge, relative to the mean charge, at which a relaxation between events stops.
-    start_tolerance : float
-        The same for the first one, which starts from equal charges.
-    relaxation_angle : float
-        Opening angle of the relaxations between events [rad]: 0.6 keeps charges within 2.2e-4 of direct sums (RMS, on a
-        tip of R = 12 a), less than what builds up between two of them.
-    """
-
-    opening_angle: float = 0.4
-    patch_radius: float = 8.5
-    update_radius: float = 18.0
-    sweep_interval: int | None = None
-    tolerance: float = 3e-3
-    start_tolerance: float = 1e-5
-    relaxation_angle: float = 0.6
-
-    def __post_init__(self):
-        check_number(self.opening_angle, "opening_angle", at_least=0, at_most=1.5, unit="rad")
-        check_number(self.patch_radius, "patch_radius", at_least=1.5, at_most=30, unit="d_nn")
-        check_number(self.update_radius, "update_radius", at_least=self.patch_radius, at_most=40, unit="d_nn")
-        check_number(self.relaxation_angle, "relaxation_angle", at_least=self.opening_angle, at_most=1.5, unit="rad")
-        check_number(self.tolerance, "tolerance", above=0)
-        check_number(self.start_tolerance, "start_tolerance", above=0)
-        if self.sweep_interval is not None:
-            check_count(self.sweep_interval, "sweep_interval", at_least=1)
+_MOST_EVENTS = 10_000_000  # at a time: 640 MB of results
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Batch:
     """Atoms that left one after the other.
 
@@ -85,7 +45,7 @@ class Batch:
     journal : Journal
         What each event changed in the tree.
     tree : Octree or None
-        Copy of the tree before the first event, if it was built anew since the batch before.
+        Copy of the tree before the first event, if it was built anew since the batch before, or that was long ago.
     status : int
         DONE, SWEEP_DUE, EXHAUSTED or TOO_SHALLOW.
     """
@@ -101,6 +61,10 @@ class Batch:
 
     def __len__(self):
         return len(self.site)
+
+    def __repr__(self):
+        status = {DONE: "done", SWEEP_DUE: "sweep due", EXHAUSTED: "exhausted", TOO_SHALLOW: "too shallow"}[self.status]
+        return f"<Batch: {len(self):,} atoms left one after the other; {status}>"
 
 
 class Emitter:
@@ -128,11 +92,14 @@ class Emitter:
     """
 
     def __init__(self, tip, voltage=1000.0, law=None, settings=None, n_threads=None, rule=None):
-        self.tip = tip
-        self.voltage = check_number(voltage, "voltage", above=0, unit="V")
-        self.law = law or Extremal()
-        self.settings = settings or ChargeSettings()
-        self.rule = rule or Robin()
+        self.tip = check_kind(tip, "tip", Tip, "a Tip")
+        self.voltage = check_voltage(voltage)
+        self.law = Extremal() if law is None else check_kind(law, "law", "weights", "a law with a method weights")
+        self.settings = ChargeSettings() if settings is None else settings
+        check_kind(self.settings, "settings", ChargeSettings, "ChargeSettings")
+        self.rule = (
+            Robin() if rule is None else check_kind(rule, "rule", ChargingRule, "a ChargingRule such as Robin()")
+        )
         self.n_threads = thread_count(n_threads)
         distance = tip.nearest_neighbour_distance
         neighbourhood, weights = self._neighbourhood_of(tip), self._weights_of(tip)
@@ -149,7 +116,6 @@ class Emitter:
             self.settings.update_radius * distance,
             self.settings.opening_angle,
         )
-        self._fresh = False
         self._left, self._deepened = [], []  # sites batch by batch; events at which more of the specimen was held
         self.relax(tolerance=self.settings.start_tolerance)
         self.sweep_interval = self.settings.sweep_interval or max(100, len(self) // 300)
@@ -241,12 +207,12 @@ class Emitter:
         ndarray, shape (m, 3)
             Field [V/nm].
         """
-        points = check_array(points, "points", ("m", 3))
+        points, opening_angle = check_array(points, "points", ("m", 3)), check_angle(opening_angle)
         return COULOMB * self._core.tree.fields(points, opening_angle, self.n_threads)
 
     def potential_at(self, points, opening_angle=0.3):
         """Electric potential of the surface charges [V], shape (m,); parameters as in `field_at`."""
-        points = check_array(points, "points", ("m", 3))
+        points, opening_angle = check_array(points, "points", ("m", 3)), check_angle(opening_angle)
         return COULOMB * self._core.tree.potentials(points, opening_angle, self.n_threads)
 
     def relax(self, tolerance=None):
@@ -266,7 +232,8 @@ class Emitter:
             The change in the last one.
         """
         angle = self.settings.relaxation_angle if tolerance is None else self.settings.opening_angle
-        tolerance = check_number(self.settings.tolerance if tolerance is None else tolerance, "tolerance", above=0)
+        tolerance = self.settings.tolerance if tolerance is None else tolerance
+        tolerance = check_number(tolerance, "tolerance", above=0, at_most=1)
         return self._relax(tolerance, angle)
 
     def _relax(self, tolerance, angle, start=None):
@@ -279,7 +246,7 @@ class Emitter:
             n_threads=self.n_threads,
             start=start,
         )
-        self._fresh = True
+        self._recorded = RECORD
         if not outcome[1] < tolerance:
             warnings.warn(
                 f"the charges had not settled after {outcome[0]} sweeps: the last one changed one by {outcome[1]:.1g} "
@@ -341,7 +308,7 @@ class Emitter:
 
     def hand_out_tree(self):
         """Let the next batch come with a copy of the tree, for flights that have not followed the events so far."""
-        self._fresh = True
+        self._recorded = RECORD
 
     def deepen(self):
         """Hold more of the specimen, after `evaporate` came upon atoms that are only held as support.
@@ -377,14 +344,14 @@ class Emitter:
             Its status says why it ended: DONE, SWEEP_DUE (call `relax` and go on), EXHAUSTED, TOO_SHALLOW (call
             `deepen` and go on).
         """
-        most = check_count(most, "most", at_least=1)
+        most = check_count(most, "most", at_least=1, at_most=_MOST_EVENTS)
         journal = Journal(self.tip.positions, most)
         site, neighbour = np.empty(most, np.int64), np.empty(most, np.int64)
         charges, normals = np.empty(most), np.empty((most, 3))
-        tree = self._core.tree.copy() if self._fresh else None
-        self._fresh = False
+        tree = self._core.tree.copy() if self._recorded >= RECORD else None
         status = self._core.evaporate(journal, most, self.sweep_interval, site, charges, normals, neighbour)
         n = journal.n_events
+        self._recorded = n if tree is not None else self._recorded + n
         self._left.append(site[:n].copy())
         return Batch(
             site=site[:n],

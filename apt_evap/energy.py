@@ -7,8 +7,10 @@ from numbers import Real
 import numpy as np
 from scipy.special import log_ndtr, ndtr, ndtri
 
-from apt_evap._arrays import check_array, check_number
+from apt_evap._arrays import check_array, check_number, shown
 from apt_evap.units import BOLTZMANN
+
+HIGHEST_ENERGY = 100.0  # [eV]: more is a slip of the unit, 155 (meV), or ten times any bond
 
 
 @dataclass(frozen=True)
@@ -20,7 +22,7 @@ class TruncatedNormal:
     mean : float
         Mean of the normal before the cut [eV], at least 0.
     standard_deviation : float
-        Standard deviation before the cut [eV], above 0.
+        Standard deviation before the cut [eV], above 0; both are at most 100.
 
     Raises
     ------
@@ -32,8 +34,9 @@ class TruncatedNormal:
     standard_deviation: float
 
     def __post_init__(self):
-        sigma = check_number(self.standard_deviation, "standard_deviation", above=0, unit="eV")
-        object.__setattr__(self, "mean", check_number(self.mean, "mean", at_least=0, unit="eV"))
+        sigma = check_number(self.standard_deviation, "standard_deviation", above=0, at_most=HIGHEST_ENERGY, unit="eV")
+        mean = check_number(self.mean, "mean", at_least=0, at_most=HIGHEST_ENERGY, unit="eV")
+        object.__setattr__(self, "mean", mean)
         object.__setattr__(self, "standard_deviation", sigma)
 
     def quantile(self, u):
@@ -69,18 +72,19 @@ class Fixed:
     Parameters
     ----------
     energy : float
-        Energy [eV], at least 0.
+        Energy [eV], at least 0 and at most 100.
 
     Raises
     ------
     ValueError
-        If the energy is negative or no number.
+        If the energy is out of this range or no number.
     """
 
     energy: float
 
     def __post_init__(self):
-        object.__setattr__(self, "energy", check_number(self.energy, "energy", at_least=0, unit="eV"))
+        energy = check_number(self.energy, "energy", at_least=0, at_most=HIGHEST_ENERGY, unit="eV")
+        object.__setattr__(self, "energy", energy)
 
     def quantile(self, u):
         """Return the energy [eV] in the shape of `u`."""
@@ -94,12 +98,12 @@ class Thermal:
     Parameters
     ----------
     temperature : float
-        Temperature [K], above 0.
+        Temperature [K], above 0 and at most 1e5.
 
     Raises
     ------
     ValueError
-        If the temperature is not above 0.
+        If the temperature is out of this range.
 
     Notes
     -----
@@ -110,7 +114,7 @@ class Thermal:
     temperature: float
 
     def __post_init__(self):
-        kelvin = check_number(self.temperature, "temperature", above=0, unit="K")
+        kelvin = check_number(self.temperature, "temperature", above=0, at_most=1e5, unit="K")
         object.__setattr__(self, "temperature", kelvin)
 
     def quantile(self, u):
@@ -127,7 +131,7 @@ def as_distribution(energy):
     if isinstance(energy, Real) and not isinstance(energy, bool):
         return Fixed(energy)
     if not callable(getattr(energy, "quantile", None)):
-        raise ValueError(f"energy must be a number [eV] or have a method quantile(u), got {energy!r}")
+        raise ValueError(f"energy must be a number [eV] or have a method quantile(u), got {shown(energy)}")
     return energy
 
 

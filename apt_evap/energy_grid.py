@@ -7,7 +7,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.special import ndtr
 
-from apt_evap._arrays import check_array
+from apt_evap._arrays import check_array, check_choice
 from apt_evap.energy import TruncatedNormal
 from apt_evap.perturbation import Combined, LateralVelocity, RollUp
 
@@ -50,8 +50,7 @@ class EnergyGrid:
     rollup_fractions: tuple | None = None
 
     def __post_init__(self):
-        if self.mechanism not in MECHANISMS:
-            raise ValueError(f"mechanism must be one of {', '.join(map(repr, MECHANISMS))}, got {self.mechanism!r}")
+        check_choice(self.mechanism, "mechanism", MECHANISMS)
         fractions = self.rollup_fractions
         if self.mechanism == "combined":
             fractions = ROLLUP_FRACTIONS if fractions is None else fractions

@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 from tqdm.auto import tqdm
 
-from apt_evap._arrays import check_count, check_number
+from apt_evap._arrays import check_count, check_kind, check_number, check_seed
 from apt_evap._threads import thread_count
 from apt_evap.binning import field_of_view
 from apt_evap.energy import Thermal, TruncatedNormal
@@ -18,6 +18,7 @@ from apt_evap.maps import DetectorMap
 from apt_evap.perturbation import LateralVelocity, Unperturbed, to_dict
 from apt_evap.register import register
 from apt_evap.resample import WINDOW, Comparison, Sampler
+from apt_evap.run import Run
 from apt_evap.study import Optimum, Score, Study, plain
 
 BINS = 128
@@ -111,8 +112,8 @@ def fit_energies(
     somewhat more contrast than the truth: more ions, or `smoothing`, help.
     """
     grid = EnergyGrid(mechanism, means, rsds, rollup_fractions)
-    if run.responses is None:
-        raise ValueError("fit_energies needs a run with responses, this one has none")
+    if check_kind(run, "run", Run, "a Run").responses is None:
+        raise ValueError(f"run must have responses for fit_energies, got {run!r}")
     thermal = LateralVelocity(Thermal(temperature))
     measured = _measured_map(measured, bins)
     settings = {
@@ -121,7 +122,7 @@ def fit_energies(
         "data_range": check_number(data_range, "data_range", above=0),
         "replicas": check_count(replicas, "replicas", at_least=1),
         "resamples": check_count(resamples, "resamples"),
-        "seed": check_count(seed, "seed"),
+        "seed": check_seed(seed),
     }
     for name in ("smoothing", "flattening"):
         if settings[name] is not None:
@@ -315,8 +316,7 @@ def _measured_map(measured, bins):
         bins = check_count(bins, "bins", at_least=2 * WINDOW + 1)
     if isinstance(measured, Hits):
         return DetectorMap.from_hits(measured, bins=bins or BINS)
-    if not isinstance(measured, DetectorMap):
-        raise ValueError(f"measured must be Hits or a DetectorMap, got {measured!r:.80}")
+    check_kind(measured, "measured", DetectorMap, "Hits or a DetectorMap")
     if bins is None:
         return measured
     ny, nx = measured.values.shape

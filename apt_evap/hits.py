@@ -1,12 +1,13 @@
 """The one type for simulated and measured ions: columns of equal length, one row per ion."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from numbers import Real
 
 import numpy as np
 
-from apt_evap._arrays import check_array, check_number
+from apt_evap._arrays import check_array, check_kind, check_number, did_you_mean, shown
 from apt_evap.interchange import to_dataframe
 
 
@@ -103,8 +104,12 @@ class Hits:
                 column = _column(name, value)
                 object.__setattr__(self, name, column)
                 lengths[name] = len(column)
-        object.__setattr__(self, "extra", {name: _extra(name, value) for name, value in dict(self.extra or {}).items()})
-        object.__setattr__(self, "units", dict(self.units or {}))
+        for name in ("extra", "units"):
+            given = {} if getattr(self, name) is None else getattr(self, name)
+            check_kind(given, name, Mapping, "a mapping by name of the column")
+            object.__setattr__(self, name, dict(given))
+        self.extra.update({name: _extra(name, value) for name, value in self.extra.items()})
+        check_kind(self.source, "source", str, "text")
         lengths.update((name, len(values)) for name, values in self.extra.items())
         if not lengths:
             raise ValueError("Hits needs at least one column, got none")
@@ -140,7 +145,8 @@ class Hits:
         """
         for name in names:
             if name not in _FLOAT and name not in _WHOLE:
-                raise ValueError(f"Hits has no column {name!r}; its columns are {', '.join(_COLUMNS)}")
+                hint = did_you_mean(name, _COLUMNS)
+                raise ValueError(f"Hits has no column {shown(name)}{hint}; its columns are {', '.join(_COLUMNS)}")
             if getattr(self, name) is None:
                 raise ValueError(
                     f"{self.source or 'these hits'} has no column {name!r}, only {', '.join(self.columns)}"
@@ -275,7 +281,7 @@ class Hits:
             if index.size == 0 and index.dtype == float:
                 index = index.astype(np.intp)
             if index.ndim > 1 or index.dtype.kind not in "biu":
-                raise ValueError(f"Hits are selected by a slice, a mask or indices, got {selection!r:.80}")
+                raise ValueError(f"Hits are selected by a slice, a mask or indices, got {shown(selection)}")
             if index.dtype == bool:
                 if index.shape != (len(self),):
                     raise ValueError(f"the mask must have shape ({len(self)},), got {index.shape}")
@@ -307,7 +313,7 @@ def _extra(name, value):
     """Check one of the further columns."""
     column = np.asarray(value)
     if column.ndim not in (1, 2) or column.dtype == object:
-        raise ValueError(f"extra[{name!r}] must be an array of shape (n,) or (n, k), got {value!r:.80}")
+        raise ValueError(f"extra[{name!r}] must be an array of shape (n,) or (n, k), got {shown(value)}")
     return column
 
 
@@ -318,4 +324,6 @@ def _bounds(limits, name):
         high = np.inf if pair[1] is None else pair[1]
         if isinstance(low, Real) and isinstance(high, Real) and low <= high:
             return low, high
-    raise ValueError(f"{name} must have two bounds (low, high) with low <= high, None for no bound, got {limits!r:.80}")
+    raise ValueError(
+        f"{name} must have two bounds (low, high) with low <= high, None for no bound, got {shown(limits)}"
+    )

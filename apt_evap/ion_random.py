@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.special import ndtri
 
-from apt_evap._arrays import check_array, check_count
+from apt_evap._arrays import check_array, check_count, check_seed
 
 _GAMMA = np.uint64(0x9E3779B97F4A7C15)
 _FIRST = np.uint64(0xBF58476D1CE4E5B9)
@@ -41,9 +41,7 @@ class IonRandom:
     """
 
     def __init__(self, seed, ions):
-        self.seed = check_count(seed, "seed")
-        if self.seed >= 2**64:
-            raise ValueError(f"seed must be below 2^64, got {seed!r}")
+        self.seed = check_seed(seed)
         ions = check_array(ions, "ions", ("n",), dtype=np.int64).view(np.uint64)
         start = _mix(np.array([self.seed], dtype=np.uint64) + _GAMMA)
         self._state = _mix(start + (ions + np.uint64(1)) * _GAMMA)

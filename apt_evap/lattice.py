@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from apt_evap._arrays import check_array, check_number
+from apt_evap._arrays import check_array, check_choice, check_number
 
 _HALF = ((0, 0, 0), (0, 1 / 2, 1 / 2), (1 / 2, 0, 1 / 2), (1 / 2, 1 / 2, 0))
 
@@ -40,9 +40,7 @@ _CHUNK = 2**19  # candidate points expanded at once, about 50 MB of temporaries
 
 def check_structure(structure):
     """Return `structure` if it is known, or say which ones are (ValueError)."""
-    if structure not in BASES:
-        raise ValueError(f"structure must be one of {', '.join(BASES)}, got {structure!r}")
-    return structure
+    return check_choice(structure, "structure", BASES)
 
 
 def cell_lengths(structure, a, c=None):

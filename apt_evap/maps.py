@@ -7,8 +7,9 @@ from functools import cached_property
 import numpy as np
 from scipy import ndimage
 
-from apt_evap._arrays import check_array, check_count, check_number
+from apt_evap._arrays import check_array, check_kind, check_number, check_seed, check_switch
 from apt_evap.binning import bin_edges, count, field_of_view, find_combs
+from apt_evap.hits import Hits
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -82,7 +83,11 @@ class DetectorMap:
             If x or y is missing, no ion was detected, none lies in the extent, or an argument is out of
             range.
         """
-        x, y = hits.require("x", "y")
+        x, y = check_kind(hits, "hits", Hits, "Hits").require("x", "y")
+        if like is not None:
+            check_kind(like, "like", cls, "a DetectorMap")
+        if dither_seed is not None:
+            check_seed(dither_seed, "dither_seed")
         detected = hits.detected
         if not detected.any():
             raise ValueError(f"a map needs detected ions, {hits.source or 'these hits'} has none of {len(hits)}")
@@ -92,7 +97,7 @@ class DetectorMap:
         if dither_seed is not None:
             if combs is None:
                 raise ValueError("dither_seed needs a quantum to dither by, and the coordinates show no comb")
-            random = np.random.default_rng(check_count(dither_seed, "dither_seed"))
+            random = np.random.default_rng(dither_seed)
             x, y = (
                 values + comb.spacing * (random.random(len(values)) - 0.5)
                 for values, comb in zip((x, y), combs, strict=True)
@@ -145,20 +150,24 @@ class DetectorMap:
         ValueError
             If shapes do not fit, edges are not even, values are negative or the mask is empty.
         """
+        is_counts = check_switch(is_counts, "is_counts")
+        check_kind(source, "source", str, "text")
         values = check_array(values, "values", ("ny", "nx"), finite=False)
         x_edges = _check_edges(x_edges, "x_edges", values.shape[1])
         y_edges = _check_edges(y_edges, "y_edges", values.shape[0])
         finite = np.isfinite(values)
         mask = _check_mask(finite if mask is None else mask, values.shape)
-        if not (finite & mask).any() or (values[finite] < 0).any():
-            raise ValueError("values of a map must not be negative, and some must be finite and in the mask")
+        if not (finite & mask).any():
+            raise ValueError("values must be finite somewhere in the mask, got none there")
+        if values[finite].min() < 0:
+            raise ValueError(f"values of a map must be at least 0, got {values[finite].min():g}")
         mask = mask & finite
         values = np.where(finite, values, 0.0)
         ions = None
         if is_counts:
             values = check_array(values, "values", ("ny", "nx"), dtype=np.int64)
             ions = int(values[mask].sum())
-        return cls(values, x_edges, y_edges, mask, bool(is_counts), ions, source=source)
+        return cls(values, x_edges, y_edges, mask, is_counts, ions, source=source)
 
     @cached_property
     def density(self):
@@ -208,9 +217,10 @@ class DetectorMap:
         Raises
         ------
         ValueError
-            If sigma is negative.
+            If sigma is negative, or larger than the map.
         """
-        sigma = check_number(sigma, "sigma", at_least=0, unit="mm")
+        longer = max(self.extent[1] - self.extent[0], self.extent[3] - self.extent[2])
+        sigma = check_number(sigma, "sigma", at_least=0, at_most=longer, unit="mm")
         if sigma == 0:
             return self
         total = float(np.hypot(sigma, self.smoothing))

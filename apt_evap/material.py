@@ -2,9 +2,8 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from difflib import get_close_matches
 
-from apt_evap._arrays import check_count, check_number
+from apt_evap._arrays import check_count, check_kind, check_number, did_you_mean, shown
 from apt_evap.lattice import check_structure, nearest_neighbour_distance
 from apt_evap.units import ELEMENTARY_CHARGE
 
@@ -13,6 +12,9 @@ _TSONG = "Tsong, Surf. Sci. 70, 211 (1978), image-hump model, charge state of lo
 _MULLER = "measured; Mueller and Tsong, Field Ion Microscopy (1969)"
 _IUPAC = "IUPAC standard atomic weights, abridged (Prohaska et al., Pure Appl. Chem. 94, 573, 2022)"
 _SHAIKH = "Shaikh et al., arXiv 2509.13744, appendix on polarization"
+# more is a slip of the unit, 3.52 (Angstrom) for a or 35e9 (V/m): no element has it
+_LONGEST = 2.0
+_HIGHEST_FIELD = 1000.0
 
 
 @dataclass(frozen=True)
@@ -58,22 +60,26 @@ class Material:
 
     def __post_init__(self):
         if not isinstance(self.name, str) or not self.name:
-            raise ValueError(f"name must be a word such as 'Ni', got {self.name!r}")
+            raise ValueError(f"name must be a word such as 'Ni', got {shown(self.name)}")
         check_structure(self.structure)
         checked = {
-            "a": check_number(self.a, "a", above=0, unit="nm"),
-            "evaporation_field": check_number(self.evaporation_field, "evaporation_field", above=0, unit="V/nm"),
-            "charge_state": check_count(self.charge_state, "charge_state", at_least=1),
-            "mass": check_number(self.mass, "mass", above=0, unit="Da"),
-            "sources": dict(self.sources),
+            "a": check_number(self.a, "a", above=0, at_most=_LONGEST, unit="nm"),
+            "evaporation_field": check_number(
+                self.evaporation_field, "evaporation_field", above=0, at_most=_HIGHEST_FIELD, unit="V/nm"
+            ),
+            "charge_state": check_count(self.charge_state, "charge_state", at_least=1, at_most=118),
+            "mass": check_number(self.mass, "mass", at_least=1, at_most=1e4, unit="Da"),
+            "sources": dict(check_kind(self.sources, "sources", Mapping, "a mapping of a field to its source")),
         }
         if (self.structure == "hcp") != (self.c is not None):
             wanted = "be given for hcp" if self.structure == "hcp" else f"be None for {self.structure}"
-            raise ValueError(f"c must {wanted}, got {self.c!r}")
+            raise ValueError(f"c must {wanted}, got {shown(self.c)}")
         if self.c is not None:
-            checked["c"] = check_number(self.c, "c", above=0, unit="nm")
+            checked["c"] = check_number(self.c, "c", above=0, at_most=_LONGEST, unit="nm")
         if self.polarizability is not None:
-            checked["polarizability"] = check_number(self.polarizability, "polarizability", above=0, unit="F m^2")
+            checked["polarizability"] = check_number(
+                self.polarizability, "polarizability", above=0, at_most=1e-30, unit="F m^2"
+            )
         for name, value in checked.items():
             object.__setattr__(self, name, value)
 
@@ -135,20 +141,23 @@ def material(name, **changes):
     known = [item.name for item in fields(Material) if item.name not in ("name", "sources")]
     for change in changes:
         if change not in known:
-            raise ValueError(f"a material has no {change!r}{_nearest(change, known)}; it has {', '.join(known)}")
-    if name not in MATERIALS:
-        raise ValueError(f"no material is named {name!r}{_nearest(name, MATERIALS)}; known are {', '.join(MATERIALS)}")
+            raise ValueError(f"a material has no {change!r}{did_you_mean(change, known)}; it has {', '.join(known)}")
+    if not isinstance(name, str) or name not in MATERIALS:
+        known = f"known are {', '.join(MATERIALS)}, any other is a Material(...) of your own"
+        raise ValueError(f"no material is named {shown(name)}{did_you_mean(name, MATERIALS)}; {known}")
     found = MATERIALS[name]
     return replace(found, **changes, sources=found.sources | dict.fromkeys(changes, "given by the user"))
 
 
-def as_material(value):
+def as_material(value, name="material"):
     """Return a Material as it is, and the known one of a name.
 
     Parameters
     ----------
     value : Material or str
         What the user gave.
+    name : str
+        Name of the argument, for the message.
 
     Returns
     -------
@@ -161,15 +170,7 @@ def as_material(value):
     """
     if isinstance(value, str):
         return material(value)
-    if not isinstance(value, Material):
-        raise ValueError(f"material must be a Material or the name of one, got {value!r}")
-    return value
-
-
-def _nearest(name, known):
-    lower = {word.lower(): word for word in known}
-    close = get_close_matches(str(name).lower(), lower, n=1, cutoff=0.5)
-    return f" (did you mean {lower[close[0]]!r}?)" if close else ""
+    return check_kind(value, name, Material, "a Material or the name of one")
 
 
 def polarization_energy(polarizability, voltage, field_factor, radius, step):

@@ -9,9 +9,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from apt_evap import lattice
-from apt_evap._arrays import check_array, check_number
-from apt_evap.material import Material
-from apt_evap.material import material as known_material
+from apt_evap._arrays import check_array, check_number, check_sequence, check_switch, shown
+from apt_evap.material import Material, as_material
 from apt_evap.poles import plane_normals
 from apt_evap.projection import Projection
 
@@ -42,10 +41,7 @@ class Orientation:
     rotation: float = 0.0
 
     def __post_init__(self):
-        if isinstance(self.material, str):
-            object.__setattr__(self, "material", known_material(self.material))
-        if not isinstance(self.material, Material):
-            raise ValueError(f"material must be a Material or the name of one, got {self.material!r}")
+        object.__setattr__(self, "material", as_material(self.material))
         object.__setattr__(self, "axis", lattice.check_axis(self.material.structure, self.axis))
         object.__setattr__(self, "rotation", check_number(self.rotation, "rotation", unit="degrees"))
 
@@ -77,7 +73,9 @@ class Orientation:
         """
         matrix = check_array(matrix, "matrix", (3, 3))
         if np.abs(matrix @ matrix.T - np.eye(3)).max() > 1e-6 or np.linalg.det(matrix) < 0:
-            raise ValueError("matrix must be a rotation: orthogonal to 1e-6, with a determinant of +1")
+            raise ValueError(
+                f"matrix must be a rotation: orthogonal to 1e-6, with a determinant of +1, got {shown(matrix)}"
+            )
         host = cls(material).material
         vectors = lattice.direction_vectors(host.structure, host.a, host.c)
         axis = tuple((matrix[2] @ np.linalg.inv(vectors)).tolist())
@@ -169,13 +167,16 @@ def fit_orientation(material, planes, places, *, lines=(), scale=None, centre=(0
     Notes
     -----
     The projection is the azimuthal equidistant one. The start is the rotation that aligns the directions best
-    (Kabsch's method). All lattices here have mirror planes: for every indexing of a map there is one of its mirror image
-    that fits as well, with other members of the same families. Only given indices tell the handedness.
+    (Kabsch's method). All lattices here have mirror planes: for every indexing of a map there is one of its mirror
+    image that fits as well, with other members of the same families. Only given indices tell the handedness.
     """
-    host = Orientation(material).material
+    if mirror is not None:
+        check_switch(mirror, "mirror")
+    host = as_material(material)
     normals = plane_normals(host, planes)
     places = check_array(places, "places", (len(normals), 2))
     projection = Projection(1.0 if scale is None else scale, centre)
+    lines = check_sequence(lines, "lines", "pairs of Miller indices and points")
     lines = [_line(host, normals[0], line) for line in lines]
     sine = np.linalg.norm(np.cross(normals[0], normals), axis=1).max()
     if sine < _SAME and not lines:
@@ -185,8 +186,6 @@ def fit_orientation(material, planes, places, *, lines=(), scale=None, centre=(0
     if len(places) > 1 and np.ptp(places, axis=0).max() == 0:
         raise ValueError(f"places must be different for different poles, got {places[0]} for all")
     fits = [_fit(normals, places, lines, projection, scale is None, mirrored) for mirrored in (False, True)]
-    if mirror not in (None, True, False):
-        raise ValueError(f"mirror must be True, False or None, got {mirror!r}")
     # exact data fit either way but for rounding
     chosen = bool(fits[1][2] < 0.999 * fits[0][2] - 1e-9) if mirror is None else bool(mirror)
     matrix, projection, rms, errors = fits[chosen]
@@ -255,7 +254,7 @@ def _offsets(seen, expected):
 
 
 def _scales(normals, places, projection):
-    """Scales to start from [mm/rad]: of all pairs of poles the median of their distance over their angle, and around."""
+    """Scales to start from [mm/rad]: the median over all pairs of poles of distance over angle, and some around."""
     first, second = np.triu_indices(len(normals), 1)
     angles = np.linalg.norm(_offsets(normals[first], normals[second]), axis=1)
     apart = angles > _SAME

@@ -5,12 +5,12 @@ emissions. The built-in ones take two random numbers per ion: the first is the q
 second the azimuth. The model is that of Shaikh et al., arXiv 2509.13744.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from difflib import get_close_matches
 
 import numpy as np
 
-from apt_evap._arrays import check_number
+from apt_evap._arrays import check_kind, check_number, did_you_mean, shown
 from apt_evap.emission import Emissions, Launches, launch_tangentially, rollup_direction, tangent_frame
 from apt_evap.energy import DISTRIBUTIONS, Fixed, Thermal, TruncatedNormal, as_distribution, draw_energies
 from apt_evap.ion_random import IonRandom
@@ -211,11 +211,10 @@ def from_dict(settings):
         If the name or a parameter is unknown, or one is missing.
     """
     known = PERTURBATIONS | DISTRIBUTIONS
-    name = settings.get("name")
-    if name not in known:
-        close = get_close_matches(str(name), known, n=1)
-        hint = f" (did you mean {close[0]!r}?)" if close else ""
-        raise ValueError(f"no perturbation or distribution is named {name!r}{hint}; known are {', '.join(known)}")
+    name = check_kind(settings, "settings", Mapping, "a mapping with a name and parameters").get("name")
+    if not isinstance(name, str) or name not in known:
+        hint = did_you_mean(name, known)
+        raise ValueError(f"no perturbation or distribution is named {shown(name)}{hint}; known are {', '.join(known)}")
     given = {key: value for key, value in settings.items() if key != "name"}
     wanted = {item.name for item in fields(known[name])}
     if set(given) != wanted:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from apt_evap import lattice
-from apt_evap._arrays import check_array, check_count
+from apt_evap._arrays import check_array, check_count, shown
 
 _LARGEST = 9  # indices looked through: of all lattices the 50 families of the widest spacing are among them
 _MOST_FAMILIES = 50
@@ -197,7 +197,7 @@ def _three(material, indices, name, from_four):
             raise ValueError(f"{name} must have a sum of 0 over the first three of four indices, got {indices[off][0]}")
         indices = np.column_stack(from_four(*indices.T))
     if not indices.any(axis=1).all():
-        raise ValueError(f"{name} must not have indices that are all 0")
+        raise ValueError(f"{name} must not have indices that are all 0, got {shown(indices.tolist())}")
     return indices
 
 

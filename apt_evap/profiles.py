@@ -5,7 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from apt_evap._arrays import check_array, check_count, check_number
+from apt_evap._arrays import check_array, check_count, check_kind, check_number, check_sequence
+from apt_evap.binning import MOST_BINS
+from apt_evap.hits import Hits
 from apt_evap.maps import DetectorMap
 
 
@@ -168,8 +170,12 @@ def zone_line_profile(hits, rectangles, *, bins=40):
     of them first, whose bins fit the comb. Simulated ions leave layer by layer and spread more evenly than chance, so
     that Poisson errors are somewhat too large for them.
     """
-    rectangles = [rectangles] if isinstance(rectangles, Rectangle) else list(rectangles)
-    bins = check_count(bins, "bins", at_least=1)
+    if isinstance(rectangles, Rectangle):
+        rectangles = [rectangles]
+    rectangles = check_sequence(rectangles, "rectangles", "Rectangle")
+    for rectangle in rectangles:
+        check_kind(rectangle, "rectangles", Rectangle, "Rectangles")
+    bins = check_count(bins, "bins", at_least=1, at_most=MOST_BINS)
     widths = {rectangle.width for rectangle in rectangles}
     if len(widths) != 1:
         raise ValueError(f"rectangles must be at least one, all of one width, got widths {sorted(widths)} mm")
@@ -195,7 +201,7 @@ class _Places:
             self.x, self.y = (grid[hits.mask] for grid in np.meshgrid(*hits.centres))
             self.values, self.area = hits.values[hits.mask], float(np.prod(hits.bin_size))
         else:
-            detected = hits.detected
+            detected = check_kind(hits, "hits", Hits, "Hits or a DetectorMap").detected
             self.x, self.y = (values[detected] for values in hits.require("x", "y"))
             self.values = self.area = None
         self.counted = self.values is None or hits.is_counts
@@ -203,7 +209,11 @@ class _Places:
 
 def _check_ring(inner, outer, bins):
     inner = check_number(inner, "inner", at_least=0, unit="mm")
-    return inner, check_number(outer, "outer", above=inner, unit="mm"), check_count(bins, "bins", at_least=1)
+    return (
+        inner,
+        check_number(outer, "outer", above=inner, unit="mm"),
+        check_count(bins, "bins", at_least=1, at_most=MOST_BINS),
+    )
 
 
 def _polar(places, centre):

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from apt_evap._arrays import check_array, check_number
+from apt_evap._arrays import check_array, check_number, check_switch
 
 
 @dataclass(frozen=True)
@@ -44,8 +44,7 @@ class Projection:
     def __post_init__(self):
         object.__setattr__(self, "scale", check_number(self.scale, "scale", above=0, unit="mm/rad"))
         object.__setattr__(self, "centre", tuple(check_array(self.centre, "centre", (2,)).tolist()))
-        if self.mirror not in (True, False):
-            raise ValueError(f"mirror must be True or False, got {self.mirror!r}")
+        object.__setattr__(self, "mirror", check_switch(self.mirror, "mirror"))
         if self.compression is not None:
             compression = check_number(self.compression, "compression", above=0)
             object.__setattr__(self, "compression", compression)

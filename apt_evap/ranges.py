@@ -1,11 +1,13 @@
 """Ranges of mass over charge state, which tell the species of measured ions."""
 
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from apt_evap._arrays import check_array
+from apt_evap._arrays import check_array, check_kind, check_sequence, did_you_mean, shown
+from apt_evap.hits import Hits
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -45,14 +47,22 @@ class Ranges:
     source: str = ""
 
     def __post_init__(self):
-        names = tuple(str(name) for name in self.names)
+        check_kind(self.source, "source", str, "text")
+        names = check_sequence(self.names, "names", "names of species")
+        for name in names:
+            check_kind(name, "names", str, "names of species")
         n = len(names)
         if n == 0:
             raise ValueError(f"{self.source or 'Ranges'} must have at least one range, got none")
         low, high = (check_array(getattr(self, name), name, (n,)) for name in ("low", "high"))
         volume = np.full(n, np.nan) if self.volume is None else check_array(self.volume, "volume", (n,), finite=False)
-        colour = ("",) * n if self.colour is None else tuple(self.colour)
-        composition = ({},) * n if self.composition is None else tuple(dict(atoms) for atoms in self.composition)
+        colour = ("",) * n if self.colour is None else check_sequence(self.colour, "colour", "colours")
+        composition = ({},) * n
+        if self.composition is not None:
+            composition = check_sequence(self.composition, "composition", "mappings of an element to its atoms")
+            for atoms in composition:
+                check_kind(atoms, "composition", Mapping, "mappings of an element to its atoms")
+            composition = tuple(dict(atoms) for atoms in composition)
         for name, values in (("colour", colour), ("composition", composition)):
             if len(values) != n:
                 raise ValueError(f"{name} must have one entry for each of the {n} ranges, got {len(values)}")
@@ -94,7 +104,7 @@ class Ranges:
         ndarray of int64, shape (n,)
             Index into the ranges; -1 for an ion in none.
         """
-        (mass,) = hits.require("mass_to_charge")
+        (mass,) = check_kind(hits, "hits", Hits, "Hits").require("mass_to_charge")
         # between two neighbouring bounds one range holds, the first in the file; NaN sorts behind the last bound
         edges = np.unique(np.concatenate([self.low, self.high]))
         holder = np.full(len(edges) + 1, -1)
@@ -121,7 +131,7 @@ class Ranges:
 
     def labels(self, hits, outside="X"):
         """Name of the species of every ion, `outside` for one in no range, array of str of shape (n,)."""
-        return np.array([*self.species_names, outside])[self.species(hits)]
+        return np.array([*self.species_names, check_kind(outside, "outside", str, "text")])[self.species(hits)]
 
     def select(self, hits, *names):
         """Select the ions of one or more species.
@@ -146,7 +156,10 @@ class Ranges:
         known = self.species_names
         for name in names or (None,):
             if name not in known:
-                raise ValueError(f"{self.source or 'these ranges'} have no species {name!r}, only {', '.join(known)}")
+                raise ValueError(
+                    f"{self.source or 'these ranges'} have no species {shown(name)}{did_you_mean(name, known)}, only "
+                    f"{', '.join(known)}"
+                )
         return hits[np.isin(self.species(hits), [known.index(name) for name in names])]
 
     def _warn_of_overlap(self):

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from apt_evap._arrays import check_array, check_number
+from apt_evap._arrays import check_array, check_number, check_sequence, check_switch
 from apt_evap.alignment import (
     FINE,
     MEDIUM,
@@ -72,7 +72,7 @@ class Registration:
         object.__setattr__(self, "scale", check_number(self.scale, "scale", above=0))
         shift = check_array(self.shift, "shift", (2,))
         object.__setattr__(self, "shift", tuple(float(value) for value in shift))
-        object.__setattr__(self, "mirror", bool(self.mirror))
+        object.__setattr__(self, "mirror", check_switch(self.mirror, "mirror"))
         object.__setattr__(self, "ties", tuple(self.ties))
 
     def points(self, x, y):
@@ -232,7 +232,8 @@ def register(
         tried, scales = (np.sqrt(0.5) * ratio, 5 * ratio), None
     else:
         tried = scales = _range(scales, "scales", above=0)
-    mirrors = tuple(dict.fromkeys(bool(mirror) for mirror in ((False, True) if mirrors is None else mirrors)))
+    mirrors = (False, True) if mirrors is None else check_sequence(mirrors, "mirrors", "True and False")
+    mirrors = tuple(dict.fromkeys(check_switch(mirror, "mirrors") for mirror in mirrors))
     if not mirrors:
         raise ValueError("mirrors must hold False, True or both, got none")
     angles = np.arange(0, 360, ROTATION_STEP) if rotations is None else _steps(*rotations, ROTATION_STEP)
@@ -291,7 +292,7 @@ def register_points(simulated_points, measured_points, mirror=None):
     for points, name in ((simulated, "simulated_points"), (measured, "measured_points")):
         if not np.ptp(points, axis=0).any():
             raise ValueError(f"{name} must be different points, got {points[0].tolist()} {len(points)} times")
-    choices = (False, True) if mirror is None else (bool(mirror),)
+    choices = (False, True) if mirror is None else (check_switch(mirror, "mirror"),)
     source, target = (points[:, 0] + 1j * points[:, 1] for points in (simulated, measured))
     found = [_least_squares(source, target, choice) for choice in choices]
     # rounding must not decide where both fit exactly

@@ -13,9 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from apt_evap._arrays import check_count, check_number
+from apt_evap._arrays import check_count, check_kind, check_number, check_sequence, shown
+from apt_evap.energy import HIGHEST_ENERGY
 from apt_evap.units import FLIGHT_TIME
 
+_HIGHEST_DEGREE = 12  # 91 coefficients: no response needs more
+_MOST_LAUNCHES = 1000
 CHUNK = 1 << 16  # ions evaluated at once: their monomials stay below 10 MB
 
 
@@ -41,8 +44,11 @@ class Design:
     rings: tuple
 
     def __post_init__(self):
-        check_count(self.degree, "degree", at_least=0)
-        object.__setattr__(self, "rings", tuple((float(radius), int(count)) for radius, count in self.rings))
+        check_count(self.degree, "degree", at_most=_HIGHEST_DEGREE)
+        rings = [_ring(ring) for ring in check_sequence(self.rings, "rings", "(radius, launches)")]
+        if not rings:
+            raise ValueError("rings must hold at least one (radius, launches), got none")
+        object.__setattr__(self, "rings", tuple(rings))
         matrix = self.monomials(self.velocities)
         if np.linalg.matrix_rank(matrix) < matrix.shape[1]:
             raise ValueError(
@@ -104,6 +110,15 @@ class Design:
         return values
 
 
+def _ring(ring):
+    """Radius and launches of a ring, checked."""
+    pair = check_sequence(ring, "rings", "(radius, launches)")
+    if len(pair) != 2:
+        raise ValueError(f"rings must be pairs (radius, launches), got {shown(ring)}")
+    radius = check_number(pair[0], "radius of a ring in rings", at_least=0)
+    return radius, check_count(pair[1], "launches of a ring in rings", at_least=1, at_most=_MOST_LAUNCHES)
+
+
 @dataclass(frozen=True)
 class ResponseSettings:
     """Flights and polynomials of the responses.
@@ -125,8 +140,10 @@ class ResponseSettings:
     bound: float = 0.2
 
     def __post_init__(self):
-        check_number(self.energy_limit, "energy_limit", above=0, unit="eV")
+        check_number(self.energy_limit, "energy_limit", above=0, at_most=HIGHEST_ENERGY, unit="eV")
         check_number(self.bound, "bound", above=0, unit="mm")
+        for name in ("site", "rolled"):
+            check_kind(getattr(self, name), name, Design, "a Design")
 
     def reduced(self, velocities, masses):
         """Launch velocities [nm/ns], shape (n, 2), in units of the largest velocity of the designs."""
@@ -146,6 +163,10 @@ class Responses(NamedTuple):
     site: np.ndarray
     rolled: np.ndarray
     residuals: np.ndarray
+
+    def __repr__(self):
+        n, _, coefficients = self.site.shape
+        return f"<Responses: {n:,} ions, {coefficients} coefficients from the site, {self.rolled.shape[2]} rolled up>"
 
 
 def flattened(directions, times):

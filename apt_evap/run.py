@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from apt_evap._arrays import check_kind, check_switch, shown
 from apt_evap._files import FileError, check_path
 from apt_evap._version import __version__
 from apt_evap.detector import Detector
@@ -26,6 +27,9 @@ class Flown(NamedTuple):
 
     directions: np.ndarray
     times: np.ndarray
+
+    def __repr__(self):
+        return f"<Flown: directions and times of {len(self.times):,} ions>"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -145,17 +149,19 @@ class Run:
         ValueError
             If the perturbation was not flown and does not follow from responses.
         """
+        check_switch(by_response, "by_response")
         for flown_as, flown in zip(self.perturbations, self.flown, strict=True):
             known = flown_as == perturbation or flown_as == described(perturbation)  # by name and repr in a file
             if known and not by_response:
                 return self._hits(flown.directions, flown.times, perturbation)
         if not callable(getattr(perturbation, "tangential", None)):
+            check_kind(perturbation, "perturbation", "launch", "a perturbation such as Unperturbed() or RollUp(0.2)")
             raise ValueError(
-                f"{perturbation!r} was not flown in this run and does not say how it launches along the surface; "
-                "name it when the run starts: simulation.run(n, emissions=[...])"
+                f"perturbation {shown(perturbation)} was not flown in this run and does not say how it launches along "
+                "the surface; name it when the run starts: simulation.run(n, emissions=[...])"
             )
         if self.responses is None:
-            raise ValueError(f"this run has no responses and {perturbation!r} was not flown in it")
+            raise ValueError(f"this run has no responses and {shown(perturbation)} was not flown in it")
         settings = self.response_settings
         rolled, first, second = perturbation.tangential(self.emissions, IonRandom(self.seed, self.emissions.ions))
         velocities = settings.reduced(np.column_stack([first, second]), self.emissions.masses)

@@ -5,7 +5,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from apt_evap._arrays import check_number
+from apt_evap._arrays import check_choice, check_number
+
+_LONGEST = 1e7  # [nm]: a centimetre is no tip, and volumes keep their digits
 
 
 @dataclass(frozen=True)
@@ -39,13 +41,10 @@ class TaperedCap:
     base: str = "rounded"
 
     def __post_init__(self):
-        radius = check_number(self.apex_radius, "apex_radius", above=0, unit="nm")
-        length = check_number(self.shank_length, "shank_length", above=0, unit="nm")
-        angle = check_number(self.shank_angle, "shank_angle", at_least=0, unit="degrees")
-        if angle >= 45:
-            raise ValueError(f"shank_angle must be below 45 [degrees], got {self.shank_angle!r}")
-        if self.base not in ("rounded", "flat"):
-            raise ValueError(f"base must be 'rounded' or 'flat', got {self.base!r}")
+        radius = check_number(self.apex_radius, "apex_radius", above=0, at_most=_LONGEST, unit="nm")
+        length = check_number(self.shank_length, "shank_length", above=0, at_most=_LONGEST, unit="nm")
+        angle = check_number(self.shank_angle, "shank_angle", at_least=0, below=45, unit="degrees")
+        check_choice(self.base, "base", ("rounded", "flat"))
         for name, value in (("apex_radius", radius), ("shank_length", length), ("shank_angle", angle)):
             object.__setattr__(self, name, value)
 
@@ -99,14 +98,18 @@ class TaperedCap:
             hollow = min(inner) > 0
             core = replace(self, apex_radius=inner[0], shank_length=inner[1]).volume() if hollow else 0.0
             return self.volume() - core
-        sin, cos, foot = self._flank
-        top, upper = self.apex_radius * sin, self.apex_radius * cos
-        bottom, lower, below = -self.shank_length, foot / cos, 0.0
-        if self.base == "rounded":
-            bottom, lower = foot * sin - self.shank_length, foot * cos
-            below = 4 / 3 * math.pi * foot**3 - _cap_volume(foot, foot * sin)
-        frustum = math.pi / 3 * (top - bottom) * (upper**2 + upper * lower + lower**2)
-        return _cap_volume(self.apex_radius, top) + frustum + below
+        if self.base == "flat":
+            return self.volume_above(-self.shank_length)
+        sin, _, foot = self._flank
+        below = 4 / 3 * math.pi * foot**3 - _cap_volume(foot, foot * sin)
+        return self.volume_above(foot * sin - self.shank_length) + below
+
+    def volume_above(self, z):
+        """Volume of the part of the shape above a height `z` on its flank [nm^3]."""
+        sin, cos, _ = self._flank
+        top, upper, lower = self.apex_radius * sin, self.apex_radius * cos, (self.apex_radius - z * sin) / cos
+        frustum = math.pi / 3 * (top - z) * (upper**2 + upper * lower + lower**2)
+        return _cap_volume(self.apex_radius, top) + frustum
 
 
 def _cap_volume(radius, height):

@@ -1,35 +1,38 @@
 """The simulation: atoms leave one by one, their flights follow in parallel, and a run comes out.
 
-Events and flights are a pipeline. While a batch of events happens, the flights of the batch before are flown on copies
-of the surface that replay the events one by one, so each ion flies in exactly the field that its own event left behind,
+Events and flights are a pipeline. While a batch of events happens, the flights of batches before are flown on copies of
+the surface that replay the events one by one, so each ion flies in exactly the field that its own event left behind,
 whatever the number of threads and the size of a batch.
 """
 
 import signal
 import threading
-from concurrent.futures import ThreadPoolExecutor
+import warnings
 from contextlib import contextmanager
 
 import numpy as np
 from tqdm.auto import tqdm
 
-from apt_evap._arrays import check_count, check_number
+from apt_evap._arrays import check_count, check_kind, check_seed, check_sequence, check_switch
 from apt_evap._files import FileError
+from apt_evap._memory import check_copies
 from apt_evap._threads import thread_count
 from apt_evap.checkpoint import Checkpoint, Keeper, Parts, catch_up
 from apt_evap.detector import Detector
 from apt_evap.emission import Emissions, Launches, tangent_frame
-from apt_evap.emitter import EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, Emitter
-from apt_evap.flights import FlightCrew, FlightSettings
+from apt_evap.emitter import EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, ChargeSettings, Emitter, check_voltage
+from apt_evap.flights import FlightCrew, FlightSettings, check_reach
 from apt_evap.ion_random import IonRandom
 from apt_evap.law import Extremal
 from apt_evap.perturbation import Unperturbed
 from apt_evap.response import Responses, ResponseSettings, flattened
 from apt_evap.run import Flown, Run
+from apt_evap.tip import Tip
 from apt_evap.units import FLIGHT_TIME
 from apt_evap.watch import Watch, WatchSettings
 
 BATCH = 256  # events at a time; the results do not depend on it
+BACKLOG = 4  # batches whose flights may wait while events happen
 
 
 class Simulation:
@@ -80,16 +83,22 @@ class Simulation:
         rule=None,
         watch_settings=None,
     ):
-        self.voltage = check_number(voltage, "voltage", above=0, unit="V")
-        self.seed = check_count(seed, "seed")
-        self.detector = detector or Detector()
-        self.law = law or Extremal()
-        self.flight_settings = flight_settings or FlightSettings()
-        self.response_settings = response_settings or ResponseSettings()
-        self.watch_settings = watch_settings or WatchSettings()
+        self.voltage = check_voltage(voltage)
+        self.seed = check_seed(seed)
+        self.detector = Detector() if detector is None else check_kind(detector, "detector", Detector, "a Detector")
+        self.law = Extremal() if law is None else law
+        self.flight_settings = FlightSettings() if flight_settings is None else flight_settings
+        check_kind(self.flight_settings, "flight_settings", FlightSettings, "FlightSettings")
+        self.response_settings = ResponseSettings() if response_settings is None else response_settings
+        check_kind(self.response_settings, "response_settings", ResponseSettings, "ResponseSettings")
+        if charge_settings is not None:
+            check_kind(charge_settings, "charge_settings", ChargeSettings, "ChargeSettings")
+        self.watch_settings = WatchSettings() if watch_settings is None else watch_settings
+        check_kind(self.watch_settings, "watch_settings", WatchSettings, "WatchSettings")
         self.n_threads = thread_count(n_threads)
-        self._check_reach(tip)
+        check_reach(self.flight_settings, check_kind(tip, "tip", Tip, "a Tip"), self.detector)
         self.emitter = Emitter(tip, self.voltage, self.law, charge_settings, self.n_threads, rule)
+        check_copies(len(self.emitter), self.n_threads)
         self.settings = self._settings_of(tip)
         self.n_evaporated = 0
         self._crew = FlightCrew(tip, self.flight_settings, self.n_threads)
@@ -100,7 +109,11 @@ class Simulation:
         return self.emitter.tip
 
     def __repr__(self):
-        return f"<Simulation of {self.tip!r}, {self.voltage:g} V, {self.n_evaporated:,} atoms evaporated>"
+        tip, detector = repr(self.tip).removeprefix("<Tip: ").removesuffix(">"), self.detector
+        return (
+            f"<Simulation: {self.n_evaporated:,} evaporated of {tip}; {self.voltage:g} V, seed {self.seed}, detector "
+            f"of {detector.width:g} mm at {detector.distance:g} mm>"
+        )
 
     def run(self, n_ions, emissions=(), *, responses=True, progress=None, batch_size=BATCH, checkpoint=None):
         """Evaporate atoms and fly their ions.
@@ -140,10 +153,13 @@ class Simulation:
         """
         n_ions = check_count(n_ions, "n_ions", at_least=1)
         batch_size = check_count(batch_size, "batch_size", at_least=1)
-        emissions = tuple(emissions)
+        check_switch(responses, "responses")
+        if progress is not None:
+            check_switch(progress, "progress")
+        emissions = check_sequence(emissions, "emissions", "perturbations")
         for perturbation in emissions:
-            if not callable(getattr(perturbation, "launch", None)):
-                raise ValueError(f"emissions must be perturbations with a method launch, got {perturbation!r}")
+            check_kind(perturbation, "emissions", "launch", "perturbations with a method launch")
+        self._check_atoms(n_ions)
         if not emissions and not responses:
             emissions = (Unperturbed(),)
         if checkpoint is None:
@@ -169,13 +185,13 @@ class Simulation:
             tqdm(
                 total=n_ions, initial=len(parts), unit=" ions", smoothing=0.1, disable=disable, mininterval=0.5
             ) as bar,
-            ThreadPoolExecutor(self.n_threads) as pool,
+            self._crew.at_work(),
             _interruptible() as interrupted,
         ):
 
-            def collect():
-                while waiting:
-                    part = waiting.pop()()
+            def collect(most=0):
+                while len(waiting) > most:
+                    part = waiting.pop(0)()
                     parts.append(part)
                     watch.count(part)
                     bar.set_postfix(watch.shown, refresh=False)
@@ -187,14 +203,14 @@ class Simulation:
                 while started < n_ions and not ended:
                     batch = self.emitter.evaporate(min(batch_size, n_ions - started))
                     started += len(batch)
-                    collect()
-                    waiting.append(self._start_flights(batch, emissions, responses, pool))
-                    if self.n_threads == 1:
-                        collect()
+                    waiting.append(self._start_flights(batch, emissions, responses))
+                    collect(BACKLOG if self.n_threads > 1 else 0)
                     if batch.status == SWEEP_DUE:
                         if watch.due(self.n_evaporated):
+                            collect()
                             watch.look(self.emitter, self.n_evaporated)
-                        self.emitter.relax()
+                        with self._crew.paused():
+                            self.emitter.relax()
                     elif batch.status == EXHAUSTED:
                         ended = "no atom is left that may evaporate"
                     elif batch.status == TOO_SHALLOW:
@@ -228,7 +244,7 @@ class Simulation:
 
     # ---- one batch -------------------------------------------------------------------------------------------------
 
-    def _start_flights(self, batch, emissions, responses, pool):
+    def _start_flights(self, batch, emissions, responses):
         """Begin the flights of a batch; return a function that waits for them and gives the batch as a Run."""
         ions = np.arange(self.n_evaporated, self.n_evaporated + len(batch))
         self.n_evaporated += len(batch)
@@ -247,7 +263,7 @@ class Simulation:
         groups = [(launch.positions[:, None], (launch.velocities * slowness[:, None])[:, None]) for launch in launches]
         if responses:
             groups += self._designs(emitted)
-        flight = self._crew.start(batch, groups, pool)
+        flight = self._crew.start(batch, groups)
 
         def finish():
             ends = flight()
@@ -325,14 +341,13 @@ class Simulation:
             residuals.append(2.0 * self.detector.distance * residual)
         return Responses(*coefficients, np.stack(residuals, axis=1).astype(np.float32))
 
-    def _check_reach(self, tip):
-        """Refuse flights that would end beside the specimen."""
-        height = tip.apex - float(tip.positions[tip.evaporable, 2].min(initial=tip.apex))
-        reach = self.flight_settings.reach * tip.nearest_neighbour_distance
-        if reach < 3 * height:
-            raise ValueError(
-                f"reach must be at least three times the {height:.4g} nm between the apex and the lowest atom that may "
-                f"leave, got {self.flight_settings.reach:g} d_nn, which is {reach:.4g} nm"
+    def _check_atoms(self, n_ions):
+        """Warn of a run that cannot be as long as asked for."""
+        left = self.tip.most_ions - self.emitter.counts["events"]
+        if n_ions > left:
+            warnings.warn(
+                f"n_ions is {n_ions:,} but only about {max(left, 0):,} atoms may leave: the run ends with the last",
+                stacklevel=3,
             )
 
     def _settings_of(self, tip):

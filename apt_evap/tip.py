@@ -1,13 +1,13 @@
 """The specimen: a crystal (or any arrangement of atoms) in the shape of a tip."""
 
-import hashlib
+from collections.abc import Mapping
 from dataclasses import asdict
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from apt_evap import interchange, lattice
-from apt_evap._arrays import check_array, check_count, check_number
+from apt_evap._arrays import check_array, check_kind, check_number, check_seed, check_sequence, digest, shown
 from apt_evap._memory import check_memory
 from apt_evap.alloy import check_solutes, draw_species
 from apt_evap.material import Material, as_material
@@ -15,6 +15,8 @@ from apt_evap.shape import TaperedCap
 
 _ROUNDING = 1e-6  # nearest neighbour distances: sites on the surface stay together whatever their rounding
 _SKIN = 3.2  # neighbour radii held below the surface where hardly an atom leaves: two of them are support
+_LAYER = 0.74  # thickness of the layer of surface atoms [d_nn]: 0.48 a^2 of the surface for each one of fcc
+_WIDEST = 10  # neighbourhood [d_nn]: 6,000 atoms each, more do not fit into the memory
 _SAMPLE = 10_000  # atoms asked for their nearest neighbour
 
 
@@ -108,12 +110,13 @@ class Tip:
             depth = check_number(depth, "depth", above=self.neighbour_radius, unit="nm")
         self._depth = depth
         fractions = check_solutes(solutes, seed)
-        check_memory(self._held_volume() * lattice.atom_density(host.structure, host.a, host.c))
-
         orientation = lattice.rotation_to_axis(host, axis, rotation)
+        density = lattice.atom_density(host.structure, host.a, host.c)
+        check_memory(self._held_volume() * density, shape.volume(_LAYER * d) * density)
+
         shift = origin
         if offset_seed is not None:
-            part = np.random.default_rng(check_count(offset_seed, "offset_seed")).random(3)
+            part = np.random.default_rng(check_seed(offset_seed, "offset_seed")).random(3)
             shift = origin + orientation @ (part * lattice.cell_lengths(host.structure, host.a, host.c))
         self.positions = lattice.lattice_points_in(
             host.structure,
@@ -121,8 +124,8 @@ class Tip:
             host.c,
             orientation,
             shift,
-            self.signed_distance,
-            self._shape.bounds,
+            shape.signed_distance,
+            shape.bounds,
             depth=None if depth is None else self._depth_at,
             tolerance=_ROUNDING * d,
         )
@@ -186,14 +189,15 @@ class Tip:
             If shapes disagree, an index names no element, or two atoms are at the same place.
         """
         tip = cls.__new__(cls)
-        tip._shape = None
+        tip._shape = tip._depth = None
         tip.positions = check_array(positions, "positions", ("n", 3))
         n = len(tip.positions)
         if n < 2:
             raise ValueError(f"positions must hold at least 2 atoms, got {n}")
-        elements = tuple(as_material(element) for element in elements)
+        elements = check_sequence(elements, "elements", "materials, such as ('Ni',)")
         if not elements:
             raise ValueError("elements must name at least one material, got none")
+        elements = tuple(as_material(element, "elements") for element in elements)
         tip._set_elements(elements, check_array(species, "species", (n,), dtype=np.int32))
         if not 0 <= tip.species.min() <= tip.species.max() < len(elements):
             raise ValueError(
@@ -206,16 +210,18 @@ class Tip:
             raise ValueError("positions must be distinct, got two atoms at the same place")
         tip._set_neighbourhood(elements[0].structure, float(np.median(distances)))
         if neighbour_radius is not None:
-            tip.neighbour_radius = check_number(neighbour_radius, "neighbour_radius", above=0, unit="nm")
+            tip.neighbour_radius = check_number(
+                neighbour_radius, "neighbour_radius", above=0, at_most=_WIDEST * float(np.median(distances)), unit="nm"
+            )
         if surface_threshold is not None:
-            tip.surface_threshold = check_number(surface_threshold, "surface_threshold", above=0, unit="nm")
+            tip.surface_threshold = check_number(
+                surface_threshold, "surface_threshold", above=0, at_most=tip.neighbour_radius, unit="nm"
+            )
         low, high = tip.positions.min(axis=0), tip.positions.max(axis=0)
         tip.apex = float(high[2])
         if evaporable is None:
             evaporable = tip.positions[:, 2] >= (low[2] + high[2]) / 2
-        if np.shape(evaporable) != (n,) or np.asarray(evaporable).dtype != bool:
-            raise ValueError(f"evaporable must be true or false for each of the {n} atoms, shape ({n},)")
-        tip.evaporable = np.array(evaporable)
+        tip.evaporable = check_array(evaporable, "evaporable", (n,), dtype=bool).copy()
         tip.support = np.zeros(n, dtype=bool)
         if potential_point is None:
             below = min((high[0] - low[0]) / 2, (high[1] - low[1]) / 2, (high[2] - low[2]) / 2)
@@ -223,7 +229,7 @@ class Tip:
         tip.potential_point = check_array(potential_point, "potential_point", (3,))
         tip.settings = {
             "atoms": n,
-            "sha256": _digest(tip.positions, tip.species, tip.evaporable),
+            "sha256": digest(tip.positions, tip.species, tip.evaporable),
             "elements": [asdict(element) for element in elements],
             "neighbour_radius": tip.neighbour_radius,
             "surface_threshold": tip.surface_threshold,
@@ -270,17 +276,17 @@ class Tip:
         ValueError
             If a setting is unknown or the tip was made from positions.
         """
-        settings = dict(settings)
+        settings = dict(check_kind(settings, "settings", Mapping, "the settings of a tip"))
         if "apex_radius" not in settings:
             raise ValueError(
                 f"settings must hold 'apex_radius' (a tip made from positions needs those), got {', '.join(settings)}"
             )
-        settings["material"] = Material(**settings["material"])
-        settings["solutes"] = {Material(**solute): fraction for solute, fraction in settings.get("solutes") or ()}
         try:
+            settings["material"] = Material(**settings["material"])
+            settings["solutes"] = {Material(**solute): fraction for solute, fraction in settings.get("solutes") or ()}
             return cls(**settings)
-        except TypeError as error:
-            raise ValueError(f"settings of a tip: {error}") from error
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"settings must be those of a tip, got {shown(settings)}: {error}") from error
 
     def __len__(self):
         return len(self.positions)
@@ -288,13 +294,24 @@ class Tip:
     def __repr__(self):
         names = "-".join(element.name for element in self.elements)
         if self._shape is None:
-            return f"<Tip: {len(self)} atoms of {names} from positions>"
+            return f"<Tip: {len(self):,} atoms of {names} from positions>"
         shape = self._shape
         axis = " ".join(f"{index:.4g}" for index in self.settings["axis"])
+        held = "" if self._depth is None else f", held to a depth of {self._depth:.4g} nm"
         return (
-            f"<Tip: {len(self)} atoms of {names} [{axis}], apex radius {shape.apex_radius:.4g} nm, "
-            f"shank {shape.shank_length:.4g} nm at {shape.shank_angle:g} degrees, {shape.base} base>"
+            f"<Tip: {len(self):,} atoms of {names} [{axis}], apex radius {shape.apex_radius:.4g} nm, "
+            f"shank {shape.shank_length:.4g} nm at {shape.shank_angle:g} degrees, {shape.base} base{held}>"
         )
+
+    @property
+    def most_ions(self):
+        """How many atoms may leave, those that a shell does not hold yet included: exact only without `depth`."""
+        held = int(np.count_nonzero(self.evaporable))
+        if self._depth is None:
+            return held
+        host = self.elements[0]
+        volume = self._shape.volume_above(-self._shape.shank_length / 2)
+        return max(held, round(volume * lattice.atom_density(host.structure, host.a, host.c)))
 
     def signed_distance(self, points):
         """Distance from the surface of the shape [nm], negative inside: see `TaperedCap.signed_distance`.
@@ -306,7 +323,7 @@ class Tip:
         """
         if self._shape is None:
             raise ValueError("a tip made from positions has no shape to measure a distance from")
-        return self._shape.signed_distance(points)
+        return self._shape.signed_distance(check_array(points, "points", ("n", 3)))
 
     def deepened(self, by=None):
         """Hold a shell to a greater depth.
@@ -331,7 +348,7 @@ class Tip:
         by = 2 * self.neighbour_radius if by is None else check_number(by, "by", above=0, unit="nm")
         deeper = Tip.from_settings({**self.settings, "depth": self._depth + by})
         rounding = 2 * _ROUNDING * self.nearest_neighbour_distance
-        below = self.signed_distance(deeper.positions) < -(self._depth_at(deeper.positions) + rounding)
+        below = self._shape.signed_distance(deeper.positions) < -(self._depth_at(deeper.positions) + rounding)
         deeper.positions = np.concatenate([self.positions, deeper.positions[below]])
         deeper.species = np.concatenate([self.species, deeper.species[below]])
         deeper._mark()
@@ -362,7 +379,7 @@ class Tip:
         if self._depth is not None:
             skin, ramp = self._ramp
             lost = self.neighbour_radius * (1 + (self._depth - skin) / ramp)  # across one neighbourhood
-            self.support = self.signed_distance(self.positions) < lost - self._depth_at(self.positions)
+            self.support = self._shape.signed_distance(self.positions) < lost - self._depth_at(self.positions)
         self.evaporable = (self.positions[:, 2] >= -self._shape.shank_length / 2) & ~self.support
 
     def _set_neighbourhood(self, structure, distance):
@@ -378,11 +395,3 @@ class Tip:
         self.evaporation_fields = np.array([element.evaporation_field for element in elements])
         self.charge_states = np.array([element.charge_state for element in elements], dtype=np.int32)
         self.masses = np.array([element.mass for element in elements])
-
-
-def _digest(*arrays):
-    """Hash of some arrays, by which atoms given as positions are known again."""
-    digest = hashlib.sha256()
-    for array in arrays:
-        digest.update(np.ascontiguousarray(array))
-    return digest.hexdigest()

@@ -4,9 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from apt_evap._arrays import check_array
+from apt_evap._arrays import check_array, check_kind
 from apt_evap.emission import Emissions, rollup_direction
 from apt_evap.response import unflattened
+from apt_evap.run import Run
 from apt_evap.units import speed_from_energy
 
 
@@ -94,7 +95,7 @@ def _chosen(emissions, ions):
 
 
 def _check(run, ions, energies):
-    if run.responses is None:
+    if check_kind(run, "run", Run, "a Run").responses is None:
         raise ValueError(f"tracks need the responses of the ions, {run!r} has none: run it with responses=True")
     ions = check_array(ions, "ions", ("n",), dtype=np.int64)
     if len(ions) == 0 or ions.min() < 0 or ions.max() >= len(run):

@@ -26,13 +26,14 @@ class WatchSettings:
         with the default settings: 0.0005 to 0.0032 (R = 20 a and 40 a, 4,000 events), with RMS errors of the charges,
         against converged ones, of 0.8 to 2.5 times as much.
     share_bound : float
-        Share of the ions between two looks that never leave, or that the responses mark, above which a warning says so.
+        Share of the ions between two looks that never leave, or that the responses mark, above which a warning says so;
+        in the same runs there were none.
     """
 
     interval: int | None = None
     sample: int = 128
     charge_bound: float = 0.01
-    share_bound: float = 0.1
+    share_bound: float = 0.01
 
     def __post_init__(self):
         if self.interval is not None:
@@ -184,7 +185,7 @@ class Watch:
                 self._warn(
                     what,
                     f"{share:.1%} of the last ions, up to {self._last:,}, {what}, expected at most "
-                    f"{self._settings.share_bound:.0%}: {advice}",
+                    f"{self._settings.share_bound:.2g}: {advice}",
                 )
 
     def _warn(self, what, message):

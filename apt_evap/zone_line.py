@@ -7,7 +7,7 @@ import numpy as np
 from scipy.optimize import approx_fprime, curve_fit
 from scipy.stats import chi2
 
-from apt_evap._arrays import check_number
+from apt_evap._arrays import check_kind, check_number
 from apt_evap.profiles import Profile
 
 EXPONENTS = 1.0, 12.0  # of a fitted line: from one that comes to a point to one that is all but a box
@@ -101,7 +101,7 @@ def fit_zone_line(profile, *, exponent=2.0):
     the fit. A `chi_square` well above `degrees_of_freedom` says that the line is not of this shape; the width then
     depends on how wide the profile is.
     """
-    good = np.isfinite(profile.density)
+    good = np.isfinite(check_kind(profile, "profile", Profile, "a Profile").density)
     position, density, error = (np.asarray(column)[good] for column in profile)
     if len(position) < 8:
         raise ValueError(f"a profile must have at least 8 bins to fit a line, got {len(position)}")

@@ -1,7 +1,7 @@
 """A long run under watch: does its memory grow by more than its results?
 
-    python benchmarks/soak.py                       # 100,000 ions of Ni[111], R = 30 a, one flight each
-    python benchmarks/soak.py --ions 20000 --radius 20 --output soak.png
+    python benchmarks/soak.py                       # 100,000 ions of Ni[111], R = 20 a, one flight each
+    python benchmarks/soak.py --ions 20000 --radius 40 --output soak.png
 
 Records the resident memory while the run goes on, with checkpoints, draws it over the ions, and fails (exit code 1) if
 it grows, after the first fifth of the run, by more than the results take and the bound below.
@@ -75,7 +75,7 @@ def draw(path, ions, memory, expected):
     axes = figure.subplots()
     axes.plot(ions / 1e3, memory / 1e6, label="resident memory")
     axes.plot(ions / 1e3, expected / 1e6, "--", label="at a fifth of the run, and the results since")
-    axes.set(xlabel="ions evaporated / 1000", ylabel="memory / MB", ylim=(0, None), xlim=(0, None))
+    axes.set(xlabel="ions evaporated / 1000", ylabel="memory / MB", ylim=(0, 1.1e-6 * memory.max()), xlim=(0, None))
     axes.legend(loc="lower right")
     figure.savefig(path, dpi=150)
 
@@ -83,7 +83,7 @@ def draw(path, ions, memory, expected):
 def main():
     """Run the soak and judge it."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--radius", type=float, default=30.0, help="apex radius in lattice constants")
+    parser.add_argument("--radius", type=float, default=20.0, help="apex radius in lattice constants")
     parser.add_argument("--ions", type=int, default=100_000)
     parser.add_argument("--responses", action="store_true", help="fly the responses instead of one flight an ion")
     parser.add_argument("--threads", type=int, help="default: all processors")

@@ -11,11 +11,22 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "apt_evap"
 
 FLOORS = (
-    {"units", "_arrays", "_threads", "_memory", "_files", "_version"},
+    {"units", "_arrays", "_threads", "_memory", "_files", "_types", "_version"},
     {"_core"},
     {"lattice", "ranges", "shape", "material", "alloy", "interchange", "projection", "poles", "orientation", "tip"}
     | {"detector", "hits"},
-    {"ion_random", "energy", "emission", "perturbation", "law", "emitter_state", "emitter", "flights", "response"},
+    {
+        "ion_random",
+        "energy",
+        "emission",
+        "perturbation",
+        "law",
+        "charge_settings",
+        "emitter_state",
+        "emitter",
+        "flights",
+        "response",
+    },
     {"watch", "run_file", "run", "checkpoint", "simulation"},
     {"binning", "maps", "cap", "profiles", "zone_line", "tracks", "alignment", "register", "compare"}
     | {"energy_grid", "resample", "study", "fit", "config", "info", "io"},
@@ -25,7 +36,7 @@ FLOOR = {module: number for number, floor in enumerate(FLOORS) for module in flo
 
 UPWARD = {("hits", "maps")}  # Hits.map, a shorthand: inside the method, never when the module is loaded
 MOST_LINES = 400
-LONGER = {"_core/octree.pyx": 560}  # build, moments, walks and sums, all on the same flat arrays
+LONGER = {}
 
 
 def sources():

@@ -4,6 +4,7 @@ import multiprocessing
 import os
 import resource
 import signal
+import threading
 import time
 import warnings
 from pathlib import Path
@@ -11,6 +12,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from tqdm.auto import tqdm
 
 import apt_evap as ae
 from apt_evap import run_file
@@ -66,6 +68,7 @@ N_IONS, KILLS = 300, 20
 
 
 def work(path):
+    tqdm.set_lock(threading.RLock())  # one of this process alone: its own would outlive a kill
     simulation().run(
         N_IONS,
         [ae.RollUp(ENERGY)],
@@ -125,6 +128,7 @@ def crash(path, number, late):
             replace(*names)
 
     os.replace = replace_or_leave
+    tqdm.set_lock(threading.RLock())
     run_small(path, resume=True)
 
 

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from ion_files import apt, apt_section, epos, ions_of, pos, raw, usual_apt
 
 import apt_evap.io._pulses as pulses_module
-import apt_evap.io.epos as epos_module
-import apt_evap.io.raw as raw_module
+import apt_evap.io._records as records_module
 from apt_evap.io import FileError, TruncatedFile, chunks, read
 
 quick = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -20,8 +19,7 @@ quick = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCh
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch):
     """Borders of the blocks in which whole files are looked through fall everywhere."""
-    monkeypatch.setattr(epos_module, "_SURVEY", 5)
-    monkeypatch.setattr(raw_module, "_SURVEY", 5)
+    monkeypatch.setattr(records_module, "_SURVEY", 5)
     monkeypatch.setattr(pulses_module, "_BLOCK", 3)
 
 

@@ -14,7 +14,7 @@ import pytest
 from matplotlib.image import imread
 
 from apt_evap import __version__, cli, plot
-from apt_evap.cli import main
+from apt_evap.cli import EXIT_CODES, main
 from apt_evap.hits import Hits
 from apt_evap.io import write
 from apt_evap.perturbation import Combined, LateralVelocity, RollUp, Unperturbed
@@ -119,6 +119,41 @@ def test_without_responses_the_perturbations_of_the_maps_are_flown(folder, capsy
     run = load("small.h5")
     assert run.responses is None and run.perturbations == (RollUp(0.2),)
     assert main(["map", "small.h5"]) == 0 and main(["info", "small.h5"]) == 0
+
+
+def datasets(path):
+    found = {}
+    with h5py.File(path) as file:
+        file.visititems(lambda name, item: found.update({name: item[()]}) if isinstance(item, h5py.Dataset) else None)
+    return found
+
+
+def test_a_run_is_made_longer_by_resume(folder, made, capsys):
+    assert main(["run", "small.toml", "--ions", "25", "--quiet"]) == 0
+    assert main(["run", "small.toml", "--resume", "--checkpoint", "0"]) == 0
+    assert "60 ions in" in capsys.readouterr().out
+    one, two = datasets(made), datasets("small.h5")
+    assert one.keys() == two.keys() and "entry1/atom_probe/hit_finding/hit_positions" in one
+    assert [name for name in one if one[name].tobytes() != two[name].tobytes()] == []
+    assert load("small.h5").provenance["config"] == "small.toml"
+    assert sorted(os.listdir()) == ["small.h5", "small.png", "small.toml"]
+    assert "seed is 1 there and 2 here" in failed(capsys, "run", "small.toml", "--resume", "--seed", "2", "--quiet")
+
+
+def test_an_unfinished_run_is_resumed_or_begun_anew_as_asked(folder, made, capsys):
+    assert main(["run", "small.toml", "--ions", "25", "--quiet"]) == 0
+    (folder / "small.h5.unfinished").mkdir()
+    os.rename("small.h5", "small.h5.unfinished/ions-000000000000.h5")
+    message = failed(capsys, "run", "small.toml", "--quiet")
+    assert "unfinished run of 25 ions" in message and "--resume goes on with it, --force begins anew" in message
+    assert main(["info", "small.h5.unfinished"]) == 2  # no file: it has to be finished first
+    assert main(["run", "small.toml", "--quiet", "--resume", "--ions", "30"]) == 0
+    assert len(load("small.h5")) == 30
+    os.mkdir("small.h5.unfinished")
+    os.rename("small.h5", "small.h5.unfinished/ions-000000000000.h5")
+    assert main(["run", "small.toml", "--quiet", "--force", "--ions", "5"]) == 0
+    assert len(load("small.h5")) == 5
+    assert sorted(os.listdir()) == ["small.h5", "small.png", "small.toml"]
 
 
 def test_a_second_run_overwrites_the_first_but_nobody_elses_files(folder, capsys):
@@ -325,6 +360,25 @@ def test_map_of_measured_ions_keeps_to_their_comb(measured, monkeypatch):
     assert only.bin_size == pytest.approx((0.5, 0.5)) and only.smoothing == pytest.approx(0.5)
 
 
+def test_what_was_written_is_told_as_json_or_not_at_all(folder, capsys):
+    assert main(["run", "small.toml", "--json", "--map", "small.svg"]) == 0
+    out, err = capsys.readouterr()
+    told = json.loads(out)
+    run = load("small.h5")
+    assert out.count("\n") == 1 and err == ""
+    assert (told["wrote"], told["picture"], told["ions"], told["ended"]) == ("small.h5", "small.svg", 60, "as planned")
+    assert [told[key] for key in ("hit", "missed", "never_left")] == list(run.hits(Unperturbed()).counts.values())
+    assert main(["map", "small.h5", "--json", "--perturbation", "RollUp:0.2", "--bins", "16"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    on_it = int(np.count_nonzero(run.hits(RollUp(0.2)).detected))
+    assert told["wrote"] == "small_map.png" and Path(told["wrote"]).exists()
+    (only,) = told["maps"]
+    assert (only["title"], only["ions"], only["bins"]) == ("roll-up, 0.2 eV", on_it, [16, 16])
+    assert main(["map", "small.h5", "--quiet"]) == 0
+    assert capsys.readouterr() == ("", "")
+    assert "not allowed with argument" in failed(capsys, "map", "small.h5", "--quiet", "--json")
+
+
 def test_map_errors(measured, made, capsys):
     write("ions.pos", Hits(positions=np.zeros((3, 3)), mass_to_charge=np.ones(3)))
     assert (
@@ -427,7 +481,13 @@ def test_version_and_help(capsys):
     assert capsys.readouterr().out == f"apt-evap {__version__}\n"
     for command in ([], ["run"], ["map"], ["info"]):
         assert main([*command, "--help"]) == 0
-        assert "example: apt-evap " in capsys.readouterr().out
+        helped = capsys.readouterr().out
+        assert re.search(r"^ *(example: )?apt-evap (run|map|info) \S+\.\w+", helped, re.M)
+        assert max(map(len, helped.splitlines())) <= 120
+    assert main(["--help"]) == 0
+    helped = capsys.readouterr().out
+    for line in EXIT_CODES.splitlines():
+        assert line in helped
 
 
 def test_a_reader_of_the_output_may_leave(made):

@@ -2,6 +2,7 @@ import copy
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -153,6 +154,16 @@ def test_lengths_are_in_lattice_constants_or_nm(tmp_path, text, length):
     assert math.isclose(config.tip["apex_radius"], length, rel_tol=1e-15)
 
 
+def test_an_axis_of_any_numbers(tmp_path):
+    axis = [0.3015441344842630, 0.5403229287126988, 0.7855713001793464]
+    table = {"material": "Ni", "apex_radius": "6 a", "axis": axis, "rotation": 157.2870473268672}
+    tip = read_config(written(tmp_path, MINIMAL | {"tip": table})).simulation(n_threads=1).tip
+    assert tip.settings["axis"] == axis
+    np.testing.assert_array_equal(
+        tip.positions, Tip("Ni", 6 * material("Ni").a, axis, rotation=157.2870473268672).positions
+    )
+
+
 def test_a_material_of_ones_own(tmp_path):
     own = {"name": "X", "structure": "bcc", "a": 0.3, "evaporation_field": 20, "charge_state": 2, "mass": 50}
     tip = read_config(written(tmp_path, MINIMAL | {"tip": {"material": own, "apex_radius": "6 a"}})).tip
@@ -206,16 +217,16 @@ def test_an_unknown_table_and_a_missing_one(tmp_path):
         ("tip", "depth", True, "depth must be a finite number [nm], got True"),
         ("tip", "axis", [0, 0, 0], "axis"),
         ("tip", "axis", "111", "axis"),
-        ("tip", "base", "round", "base must be 'rounded' or 'flat', got 'round'"),
-        ("tip", "shank_angle", 60, "shank_angle must be below 45 [degrees], got 60"),
+        ("tip", "base", "round", "base must be one of rounded, flat, got 'round' (did you mean 'rounded'?)"),
+        ("tip", "shank_angle", 60, "shank_angle must be a finite number [degrees] at least 0 and below 45, got 60"),
         ("tip", "solutes", 0.1, "solutes must be a table, got 0.1"),
         ("tip", "solutes", {"Cu": "half"}, "fraction of Cu"),
         ("simulation", "ions", 0, "ions must be a whole number of at least 1, got 0"),
         ("simulation", "ions", 1.5, "got 1.5"),
-        ("simulation", "voltage", "1 kV", "voltage must be a finite number [V] above 0, got '1 kV'"),
+        ("simulation", "voltage", "1 kV", "voltage must be a finite number [V] above 0 and at most 1e+06, got '1 kV'"),
         ("simulation", "seed", -1, "seed must be a whole number of at least 0, got -1"),
         ("simulation", "responses", "yes", "responses must be true or false, got 'yes'"),
-        ("detector", "width", 0, "width must be a finite number [mm] above 0, got 0"),
+        ("detector", "width", 0, "width must be a finite number [mm] above 0 and at most 1e+06, got 0"),
         (
             "charges",
             "opening_angle",
@@ -224,8 +235,8 @@ def test_an_unknown_table_and_a_missing_one(tmp_path):
         ),
         ("flights", "most_steps", 0.5, "most_steps must be a whole number"),
         ("responses", "bound", 0, "bound must be a finite number [mm] above 0, got 0"),
-        ("maps", "bins", 0, "bins must be a whole number of at least 1, got 0"),
-        ("maps", "bins", 10**9, "bins must be a finite number at most 16384"),
+        ("maps", "bins", 0, "bins must be a whole number of at least 1 and at most 16,384, got 0"),
+        ("maps", "bins", 10**9, "bins must be a whole number of at least 1 and at most 16,384, got 1000000000"),
         ("maps", "smoothing", -1, "smoothing must be a finite number [mm] at least 0, got -1"),
         ("maps", "panels", [], "panels must be a list of tables such as [[maps.panels]], got []"),
         ("maps", "panels", [{"title": "x"}], "panel 1: perturbation is missing"),

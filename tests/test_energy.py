@@ -32,7 +32,7 @@ def test_moments_agree_with_the_quantiles(mean, ratio):
     assert spread == pytest.approx(energy.true_standard_deviation, rel=1e-6 / ratio**2 + 1e-6)  # cancellation
 
 
-@pytest.mark.parametrize("ratio", [0.01, 0.1, 1.0, 3.16, 1e3])
+@pytest.mark.parametrize("ratio", [0.01, 0.1, 1.0, 3.16, 500.0])
 def test_quantiles_against_scipy_into_the_tails(ratio):
     mean = 0.155
     energy = TruncatedNormal(mean, mean * ratio)
@@ -51,7 +51,7 @@ def test_quantiles_against_scipy_into_the_tails(ratio):
 
 def test_quantiles_are_above_zero():
     edge = np.array([2.0**-53, 0.5, 1 - 2.0**-53])
-    for energy in (TruncatedNormal(0.0, 1.0), TruncatedNormal(0.1, 1e4), Thermal(20.0)):
+    for energy in (TruncatedNormal(0.0, 1.0), TruncatedNormal(1e-3, 100.0), Thermal(20.0)):
         found = energy.quantile(edge)
         assert (found > 0).all() and np.isfinite(found).all()
     np.testing.assert_array_equal(Fixed(0.2).quantile(edge), [0.2] * 3)

@@ -11,6 +11,7 @@ from apt_evap.lattice import (
     COORDINATION,
     atom_density,
     cell_lengths,
+    direction_vectors,
     lattice_points_in,
     nearest_neighbour_distance,
     rotation_to_axis,
@@ -117,6 +118,34 @@ def test_documented_direction_along_x(axis, across):
     np.testing.assert_allclose(rotation_to_axis("fcc", axis) @ across, [1, 0, 0], atol=1e-15)
 
 
+@given(
+    axis=st.tuples(*[st.floats(-3, 3)] * 3).filter(lambda axis: max(map(abs, axis)) > 0.01),
+    length=st.floats(0.01, 100),
+    structure=st.sampled_from([*BASES]),
+)
+@settings(max_examples=60, deadline=None)
+def test_any_axis_comes_onto_z_whatever_its_length(axis, length, structure):
+    matrix = rotation_to_axis(structure, axis)
+    np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-14)
+    assert np.linalg.det(matrix) == pytest.approx(1.0, abs=1e-14)
+    direction = np.array(axis) @ direction_vectors(structure, A)
+    np.testing.assert_allclose(matrix @ direction, [0, 0, np.linalg.norm(direction)], atol=1e-13)
+    longer = [length * number for number in axis]
+    if all(number == round(number) for number in axis) or all(number == round(number) for number in longer):
+        return  # whole numbers have a lattice direction along x
+    edge = np.argmin(np.round(np.abs(matrix[2]), 6))
+    if np.sort(np.abs(matrix[2]))[1] > np.abs(matrix[2]).min() + 1e-5:  # one edge is the most nearly perpendicular
+        # that edge has no part along y, and a positive one along x
+        assert abs(matrix[1, edge]) < 1e-14 and matrix[0, edge] > 0
+        np.testing.assert_allclose(rotation_to_axis(structure, longer), matrix, atol=1e-12)
+
+
+def test_the_bits_of_lattice_directions():
+    # the rule of whole numbers, and its very rounding, stay as they are: runs of before are made again from them
+    assert rotation_to_axis("fcc", (1, 1, 1))[0].tolist() == [0.7071067811865475, 0.0, -0.7071067811865475]
+    np.testing.assert_array_equal(rotation_to_axis("fcc", (1.0, 1.0, 1.0)), rotation_to_axis("fcc", (1, 1, 1)))
+
+
 def test_large_indices_have_a_perpendicular_lattice_direction():
     matrix = rotation_to_axis("fcc", (41, 73, 101))
     np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-14)
@@ -139,7 +168,9 @@ def test_four_indices_are_the_same_directions_as_three():
         ("hcp", (0, 0, 0, 0), "axis must be a direction"),
         ("hcp", (1, 1, 1, 0), r"u \+ v \+ t = 0"),
         ("fcc", (1, 1, -2, 0), r"axis must have shape \(3,\)"),
-        ("fcc", (0.5, 1, 0), "axis must hold whole numbers"),
+        ("hcp", (0.5, 0.1, 0.3, 1.0), r"u \+ v \+ t = 0"),
+        ("fcc", (0.5, math.nan, 0), "axis must be finite"),
+        ("fcc", (1e9, 1, 0), "axis must have its largest number between"),
         ("fcc", "111", "axis"),
         ("cubic", (0, 0, 1), "structure must be one of"),
     ],

@@ -221,7 +221,7 @@ def test_bad_arguments_are_named():
             "y_edges must increase in even steps",
         ),
         (lambda: DetectorMap.from_array(np.ones((3, 2)), even, even), "x_edges must have shape"),
-        (lambda: DetectorMap.from_array(-np.ones((3, 3)), even, even), "must not be negative"),
+        (lambda: DetectorMap.from_array(-np.ones((3, 3)), even, even), "values of a map must be at least 0, got -1"),
         (lambda: DetectorMap.from_array(np.full((3, 3), np.nan), even, even), "mask must leave"),
     ]
     for call, message in cases:

@@ -119,6 +119,9 @@ def test_history_of_a_run(run, tmp_path):
     ions, fields = upper.lines[0].get_data()
     np.testing.assert_allclose(fields, np.median(run.fields.reshape(10, 25), axis=1))
     np.testing.assert_allclose(ions, 12.5 + 25 * np.arange(10), atol=0.5)
+    band = upper.collections[0].get_paths()[0].vertices
+    at_first = band[np.isclose(band[:, 0], ions[0]), 1]
+    assert [at_first.min(), at_first.max()] == pytest.approx(np.percentile(run.fields[:25], [5, 95]))
     # V F_evap / F turns the order around, so that medians go into each other but for the mean of the two middle ones
     np.testing.assert_allclose(
         lower.lines[0].get_ydata(), np.median((1000 * 35.0 / run.fields).reshape(10, 25), axis=1)

@@ -134,7 +134,7 @@ def test_where_ranges_overlap_the_first_wins_and_a_warning_says_so(save):
     assert ranges.labels(of([10, 19.5, 20, 22.5, 24, 29, 30])).tolist() == ["B", "B", "Al", "Al", "Al", "Al", "X"]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        Ranges("ab", [1, 2], [2, 3])  # adjoining ranges do not overlap
+        Ranges(list("ab"), [1, 2], [2, 3])  # adjoining ranges do not overlap
 
 
 @settings(max_examples=50, deadline=None)

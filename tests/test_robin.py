@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 import twins
+
+import apt_evap as ae
 from apt_evap._core.octree import Octree
 from apt_evap._core.robin import Robin
 from apt_evap._core.sweep import InteractionLists
-
-import apt_evap as ae
 from apt_evap.units import COULOMB
 
 DEFAULT_ANGLE = ae.ChargeSettings().opening_angle

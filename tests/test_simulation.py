@@ -54,8 +54,15 @@ def test_batch_size_changes_no_bit(small_tip, plain, batch_size):
 
 
 @pytest.mark.parametrize("n_threads", [2, 3])
-def test_threads_change_no_bit(small_tip, plain, n_threads):
-    assert different(plain, simulate(small_tip, 200, n_threads=n_threads, batch_size=64)) == []
+@pytest.mark.parametrize("batch_size", [7, 64])  # more batches than may wait, and fewer
+def test_threads_change_no_bit(small_tip, plain, n_threads, batch_size):
+    assert different(plain, simulate(small_tip, 200, n_threads=n_threads, batch_size=batch_size)) == []
+
+
+@pytest.mark.parametrize("n_threads", [1, 2])
+def test_a_tree_handed_out_now_and_then_changes_no_bit(small_tip, plain, n_threads, monkeypatch):
+    monkeypatch.setattr("apt_evap.emitter.RECORD", 20)
+    assert different(plain, simulate(small_tip, 200, n_threads=n_threads, batch_size=7)) == []
 
 
 def test_a_run_goes_on_where_the_one_before_ended(small_tip, plain):
@@ -227,7 +234,10 @@ class Half:
         (lambda s: s.run(10, batch_size=0), "batch_size must be a whole number"),
         (lambda s: s.run(10, [3]), "emissions must be perturbations with a method launch, got 3"),
         (lambda s: s.run(10, [Half()]), "must launch 10 ions, one per emission, got 5"),
-        (lambda s: ae.Simulation(s.tip, voltage=-1.0), r"voltage must be a finite number \[V\] above 0, got -1.0"),
+        (
+            lambda s: ae.Simulation(s.tip, voltage=-1.0),
+            r"voltage must be .* \[V\] above 0 and at most 1e\+06, got -1.0",
+        ),
         (lambda s: ae.Simulation(s.tip, seed=-1), "seed must be a whole number"),
         (lambda s: ae.Simulation(s.tip, n_threads=0), "n_threads must be a whole number"),
         (lambda s: ae.FlightSettings(opening_angle=2.0), "opening_angle must be a finite number"),

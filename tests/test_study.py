@@ -99,7 +99,10 @@ def test_the_box_around_a_point_stays_on_the_grid():
 @pytest.mark.parametrize(
     "wrong, words",
     [
-        ({"mechanism": "rollup"}, "mechanism must be one of 'roll-up', 'lateral', 'combined', got 'rollup'"),
+        (
+            {"mechanism": "rollup"},
+            "mechanism must be one of roll-up, lateral, combined, got 'rollup'",
+        ),
         ({"means": (0.1, 0.1)}, "means must be increasing numbers above 0"),
         ({"means": (0.0, 0.1)}, "means must be increasing numbers above 0"),
         ({"rsds": ()}, "rsds must be increasing numbers above 0"),
@@ -333,7 +336,7 @@ def test_gradients_of_the_instrument_do_not_move_the_energies(run, other):
 
 def test_studies_that_cannot_be(run, other, run20):
     measured = seen(other, ROLLUP)
-    with pytest.raises(ValueError, match="needs a run with responses"):
+    with pytest.raises(ValueError, match="run must have responses for fit_energies"):
         ae.fit_energies(run20, measured, registration=HERE)
     with pytest.raises(ValueError, match="measured must be Hits or a DetectorMap, got 3"):
         ae.fit_energies(run, 3, registration=HERE)

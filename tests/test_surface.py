@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 import twins
-from apt_evap._core.surface import Neighbourhood
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 import apt_evap as ae
+from apt_evap._core.surface import Neighbourhood
 
 
 def pair(positions, radius, threshold, support=None):

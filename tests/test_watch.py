@@ -127,7 +127,7 @@ def test_one_warning_past_each_bound(small_tip):
     assert charges.startswith("after 100 ions the charges are ") and "expected at most 1e-06" in charges
     flights = ae.FlightSettings(most_steps=3)
     (share,) = warned(small_tip, flight_settings=flights)
-    assert share.startswith("100.0% of the last ions, up to 100, never left the specimen, expected at most 10%")
+    assert share.startswith("100.0% of the last ions, up to 100, never left the specimen, expected at most 0.01")
     never, marked = warned(small_tip, n=150, flight_settings=flights, responses=True)
     assert "never left" in never and "are marked, as their responses are inexact" in marked
 

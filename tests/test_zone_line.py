@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from scipy.special import ndtr
+from scipy.stats import chi2
 
 import apt_evap as ae
 from apt_evap.profiles import Profile, Rectangle, zone_line_profile
@@ -109,6 +110,8 @@ def test_profiles_of_one_line_differ_by_noise_and_of_two_by_more():
     # chi-square of 39 has a standard deviation of 8.8; the mean of 200 one of 0.6, and small counts add a little
     assert np.mean([compared.chi_square for compared in same]) == pytest.approx(39, abs=3)
     probabilities = np.array([compared.probability for compared in same])
+    assert same[0].degrees_of_freedom == 39
+    np.testing.assert_allclose(probabilities, [chi2.sf(compared.chi_square, 39) for compared in same])
     assert 0.3 < np.mean(probabilities < 0.5) < 0.7
     assert np.median([compared.relative for compared in same]) < 0.03
     wider = compare_profiles(profile_of(1e4 * mean), profile_of(1e6 * expected(sigma=3.0)))

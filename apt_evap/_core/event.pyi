@@ -1,3 +1,5 @@
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -10,6 +12,13 @@ DONE: int
 SWEEP_DUE: int
 EXHAUSTED: int
 TOO_SHALLOW: int
+
+class Start(NamedTuple):
+    n_removed: int
+    charges: NDArray[np.float64]
+    lonely: NDArray[np.int64]
+    lonely_normals: NDArray[np.float64]
+    potential_point: NDArray[np.float64]
 
 class Evaporation:
     def __init__(
@@ -44,10 +53,12 @@ class Evaporation:
     def n_removed(self) -> int: ...
     @property
     def since_sweep(self) -> int: ...
+    n_clipped: int
+    n_unsettled: int
     @property
-    def n_clipped(self) -> int: ...
+    def potential_point(self) -> NDArray[np.float64]: ...
     @property
-    def n_unsettled(self) -> int: ...
+    def start(self) -> Start: ...
     def take_over(self, atoms: Neighbourhood, weights: NDArray[np.float64]) -> None: ...
     def relax(
         self,
@@ -58,8 +69,11 @@ class Evaporation:
         extra: int = 0,
         opening_angle: float = 0.0,
         n_threads: int = 1,
+        start: Start | None = None,
     ) -> tuple[int, float]: ...
-    def keep_inside(self, positions: NDArray[np.float64]) -> NDArray[np.float64]: ...
+    def start_here(self, surface: NDArray[np.int64]) -> Start: ...
+    def keep_inside(self, tree: Octree) -> NDArray[np.float64]: ...
+    def distances(self, tree: Octree) -> NDArray[np.float64]: ...
     def evaporate(
         self,
         journal: Journal,

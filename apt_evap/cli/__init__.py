@@ -11,6 +11,26 @@ from apt_evap.cli._options import INTERRUPTED, SHAPE, say
 
 COMMANDS = (run, map, info, compare)
 
+EXIT_CODES = """\
+exit codes:
+  0    done; what was written is said on stdout, warnings on stderr
+  1    whoever read the output has left (a closed pipe)
+  2    an error, explained in one sentence on stderr; nothing half-written is left behind
+  130  interrupted by Ctrl-C; `run` has saved the ions done so far
+"""
+"""What the exit codes mean, for the help."""
+
+_PATH = """\
+from nothing to a map and back (the first line writes what the others read):
+  apt-evap run examples/ni111.toml                   simulate; writes ni111.h5 and maps of it, ni111.png
+  apt-evap info ni111.h5                             what the run holds: specimen, ions, outcomes
+  apt-evap map ni111.h5 --perturbation RollUp:0.3 -o rolled.png
+                                                     the same ions, all rolled up with 0.3 eV, in a second
+  apt-evap info R5083.epos --json | jq .ions         measured files too; --json for programs
+  apt-evap map R5083.epos --bins 128                 a measured map beside them
+  apt-evap COMMAND --help                            everything a command takes, with examples
+"""
+
 
 def main(arguments=None):
     """Run the command line.
@@ -23,7 +43,7 @@ def main(arguments=None):
     Returns
     -------
     int
-        Exit code: 0 for success, 2 for an error that one sentence on stderr explains, 130 after Ctrl-C.
+        Exit code, as `EXIT_CODES` says.
     """
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_, **__: say("warning", message)
@@ -57,8 +77,9 @@ class _Parser(argparse.ArgumentParser):
 def _parser():
     parser = _Parser(
         prog="apt-evap",
-        description="Field evaporation in atom probe tomography.",
-        epilog="example: apt-evap run examples/ni111.toml",
+        description="Field evaporation in atom probe tomography: simulate a specimen that evaporates atom by atom,\n"
+        "and draw where its ions land under any perturbation of their emission, beside measured ions.",
+        epilog=f"{_PATH}\n{EXIT_CODES}",
         **SHAPE,
     )
     parser.add_argument("--version", action="version", version=f"apt-evap {__version__}")

@@ -1,6 +1,7 @@
-"""What the commands share on the command line: kinds of arguments, and how files are read."""
+"""What the commands share on the command line: kinds of arguments, and how they speak."""
 
 import argparse
+import json
 import sys
 
 from apt_evap._arrays import check_number
@@ -31,7 +32,28 @@ def add_reading_options(parser):
     return group
 
 
+def add_speech(command):
+    """Options of a command that tells what it has done: in sentences, as JSON or not at all."""
+    speech = command.add_mutually_exclusive_group()
+    speech.add_argument("--quiet", action="store_true", help="say nothing but warnings and errors")
+    speech.add_argument("--json", action="store_true", help="say in one line of JSON what was written")
+
+
+def tell(options, line):
+    """Say a line to people, where neither --quiet nor --json is given."""
+    if not (options.quiet or options.json):
+        print(line, flush=True)
+
+
+def tell_json(options, told):
+    """Say a dict in one line to programs, where --json is given."""
+    if options.json:
+        print(json.dumps(told, allow_nan=False), flush=True)
+
+
 def whole(least, most=None):
+    """A kind of argument: a whole number within bounds."""
+
     def whole(text):
         try:
             number = int(text)
@@ -46,6 +68,8 @@ def whole(least, most=None):
 
 
 def _number(unit):
+    """A kind of argument: a number of at least 0."""
+
     def number(text):
         try:
             return check_number(float(text), "it", at_least=0, unit=unit)

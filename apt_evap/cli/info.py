@@ -14,10 +14,12 @@ def add_parser(commands):
         parents=[reading_options()],
         help="say what is in a file",
         description="Say what is in a run or in a file of measured ions.",
-        epilog="example: apt-evap info ni111.h5 --json",
+        epilog="example: apt-evap info ni111.h5\n         apt-evap info R5083.epos --json | jq .columns.voltage",
         **SHAPE,
     )
-    command.add_argument("--json", action="store_true", help="as JSON")
+    command.add_argument(
+        "--json", action="store_true", help="as JSON, for programs; numbers are in the units that the text shows"
+    )
     command.set_defaults(command=_info)
 
 

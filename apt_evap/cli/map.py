@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from apt_evap.cli._files import check_output, is_picture, picture_path, read, save_picture
-from apt_evap.cli._options import SHAPE, reading_options, smoothing, whole
+from apt_evap.cli._options import SHAPE, add_speech, reading_options, smoothing, tell, tell_json, whole
 from apt_evap.config import MOST_BINS, MapSettings, Panel, read_maps, read_perturbation, title_of
 from apt_evap.perturbation import Unperturbed
 from apt_evap.run import Run
@@ -19,11 +19,13 @@ def add_parser(commands):
         parents=[reading_options()],
         help="draw detector maps of a run or of measured ions",
         description="Draw detector maps of a run or of measured ions.",
-        epilog="a perturbation is NAME, NAME:NUMBERS or a TOML table:\n"
+        epilog="example:\n"
+        "  apt-evap map R5083.epos --bins 128\n"
+        "  apt-evap map ni111.h5 --perturbation Unperturbed --perturbation RollUp:0.3,0.1 -o energies.png\n\n"
+        "a perturbation is NAME, NAME:NUMBERS or a TOML table:\n"
         "  Unperturbed              RollUp:0.2 (eV, all ions)    RollUp:0.155,0.155 (mean, standard deviation)\n"
         "  LateralVelocity:0.3,0.1  Combined:0.155,0.155,0.75 (the last number is the share of the roll-up)\n"
-        '  \'{name = "RollUp", energy = {name = "Thermal", temperature = 50}}\'\n\n'
-        "example: apt-evap map ni111.h5 --perturbation Unperturbed --perturbation RollUp:0.3,0.1 -o energies.png",
+        '  \'{name = "RollUp", energy = {name = "Thermal", temperature = 50}}\'',
         **SHAPE,
     )
     command.add_argument("-o", "--output", metavar="MAP.png", help=".png, .pdf or .svg; default: FILE_map.png, here")
@@ -35,6 +37,7 @@ def add_parser(commands):
         "--perturbation", action="append", metavar="P", help="of the ions of a run; repeat it for maps side by side"
     )
     command.add_argument("--force", action="store_true", help="overwrite a file that apt-evap did not make")
+    add_speech(command)
     command.set_defaults(command=_map)
 
 
@@ -54,8 +57,17 @@ def _map(options):
         drawn = held.map(options.bins or _bins_for(np.count_nonzero(held.detected)))
         maps = [_smoothed(drawn, options.smooth)], [Path(options.file).name]
     save_picture(picture, *maps)
-    print(f"wrote {picture}")
+    tell(options, f"wrote {picture}")
+    tell_json(options, {"wrote": str(picture), "file": options.file, "maps": described(*maps)})
     return 0
+
+
+def described(maps, titles):
+    """What each map of a picture shows, in plain types: title, ions on it, bins, and the smoothing [mm]."""
+    return [
+        {"title": title, "ions": int(each.ions), "bins": list(each.values.shape[::-1]), "smoothing": each.smoothing}
+        for each, title in zip(maps, titles, strict=True)
+    ]
 
 
 def _map_settings(run, options):

@@ -6,8 +6,8 @@ from dataclasses import replace
 from apt_evap._files import FileError, check_path
 from apt_evap.checkpoint import Checkpoint
 from apt_evap.cli._files import check_output, is_picture, picture_path, save_picture
-from apt_evap.cli._options import INTERRUPTED, SHAPE, minutes, say, whole
-from apt_evap.cli.map import run_maps
+from apt_evap.cli._options import INTERRUPTED, SHAPE, add_speech, minutes, say, tell, tell_json, whole
+from apt_evap.cli.map import described, run_maps
 from apt_evap.config import read_config
 from apt_evap.run_file import is_run
 
@@ -33,7 +33,7 @@ def add_parser(commands):
     command.add_argument(
         "--checkpoint", type=minutes, default=10.0, metavar="MINUTES", help="time between two checkpoints; default: 10"
     )
-    command.add_argument("--quiet", action="store_true", help="no progress bar, no summary")
+    add_speech(command)
     command.add_argument(
         "--force", action="store_true", help="overwrite files that apt-evap did not make, and unfinished runs"
     )
@@ -50,12 +50,8 @@ def _run(options):
     check_output(output, is_run, options.force)
     check_output(picture, is_picture, options.force)
 
-    def tell(line):
-        if not options.quiet:
-            print(line, flush=True)
-
     simulation = config.simulation(seed=options.seed, n_threads=options.threads)
-    tell(f"{str(simulation.tip).strip('<>')}; {len(simulation.emitter):,} atoms on the surface")
+    tell(options, f"{str(simulation.tip).strip('<>')}; {len(simulation.emitter):,} atoms on the surface")
     began = time.perf_counter()
     checkpoint = Checkpoint(output, options.checkpoint, resume=options.resume, overwrite=options.force)
     provenance = {"config": config.path.name, "maps": config.maps.to_dict()}
@@ -80,18 +76,24 @@ def _run(options):
     run = replace(run, provenance=run.provenance | provenance)
     run.save(output)
     rate = "" if options.resume else f", {len(run) / seconds:,.0f} ions/s"  # it is not known how many are new
-    tell(f"{len(run):,} ions in {seconds:.1f} s{rate}")
+    tell(options, f"{len(run):,} ions in {seconds:.1f} s{rate}")
     for panel in config.maps.panels:
         hit, missed, never_left = run.hits(panel.perturbation).counts.values()
-        tell(f"{panel.title}: {hit:,} hit the detector, {missed:,} missed it, {never_left:,} never left the tip")
+        tell(
+            options, f"{panel.title}: {hit:,} hit the detector, {missed:,} missed it, {never_left:,} never left the tip"
+        )
     if run.responses is not None:
-        tell(f"responses: {run.marked.sum():,} ions marked as inexact")
+        tell(options, f"responses: {run.marked.sum():,} ions marked as inexact")
     if run.ended:
         say("note", f"the run ended before its time: {run.ended}; the {len(run):,} ions so far are kept")
-    tell(f"wrote {output}")
+    tell(options, f"wrote {output}")
     try:
-        save_picture(picture, *run_maps(run, config.maps))
+        maps = run_maps(run, config.maps)
+        save_picture(picture, *maps)
     except ValueError as error:
         raise ValueError(f"no maps are drawn, the run is in {str(output)!r}: {error}") from error
-    tell(f"wrote {picture}")
+    tell(options, f"wrote {picture}")
+    counts = {key: value for key, value in run.summary().items() if key != "ended"}
+    written = {"wrote": str(output), "picture": str(picture), "maps": described(*maps)}
+    tell_json(options, {**written, **counts, "seconds": round(seconds, 3), "ended": run.ended or "as planned"})
     return INTERRUPTED if run.ended == "interrupted" else 0

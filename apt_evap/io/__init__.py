@@ -7,7 +7,7 @@ import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from apt_evap._arrays import check_count
+from apt_evap._arrays import check_count, check_kind, shown
 from apt_evap._files import FileError, TruncatedFile, check_path, open_for_reading
 from apt_evap.hits import Hits
 from apt_evap.io._apt_sections import SIGNATURE
@@ -143,7 +143,7 @@ def write(path, hits, *, format=None, **options):
         reason = "holds a Run (run.save)" if chosen.suffix == ".h5" else "is only read"
         raise FileError(f"hits cannot be written to {str(path)!r}: a {chosen.suffix} file {reason}")
     if not isinstance(hits, Hits):
-        raise ValueError(f"hits must be Hits, such as run.hits(perturbation) gives, got {hits!r:.80}")
+        raise ValueError(f"hits must be Hits, such as run.hits(perturbation) gives, got {shown(hits)}")
     _check_options(path, chosen, "writing", _known(chosen.write, "hits"), options)
     chosen.write(path, hits, **options)
 
@@ -175,7 +175,7 @@ def _options(path, chosen, reader, columns, options):
     if columns is None:
         return options
     if "columns" not in _known(reader):
-        raise FileError(f"{str(path)!r}: reading {chosen.suffix} files takes no columns, got {columns!r:.80}")
+        raise FileError(f"{str(path)!r}: reading {chosen.suffix} files takes no columns, got {shown(columns)}")
     return {**options, "columns": columns}
 
 
@@ -198,7 +198,9 @@ def _by_content(head):
 
 
 def _by_suffix(path, format):
-    suffix = check_path(path).suffix if format is None else "." + str(format).lstrip(".")
+    if format is not None:
+        check_kind(format, "format", str, "a suffix such as '.pos'")
+    suffix = check_path(path).suffix if format is None else "." + format.lstrip(".")
     for candidate in FORMATS:
         if candidate.suffix == suffix.lower():
             return candidate

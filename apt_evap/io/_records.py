@@ -6,10 +6,12 @@ from contextlib import contextmanager
 
 import numpy as np
 
+from apt_evap._arrays import check_choice, check_switch, shown
 from apt_evap._files import FileError, TruncatedFile, open_for_reading, replace_file
 from apt_evap.hits import Outcome
 
 _CHUNK = 1 << 14
+_SURVEY = 1 << 16
 _ORDERS = {"big": ">", "little": "<"}
 
 
@@ -56,6 +58,39 @@ class Words:
                     column[:, word] = rows.view(self._order + dtype)[:, first + word]
         return columns
 
+    def survey(self, fields):
+        """Read the whole file in blocks of a size that stays in the cache."""
+        for start in range(0, self.n, _SURVEY):
+            yield self.read(fields, start, min(start + _SURVEY, self.n))
+
+    def blocks(self, fields, rows, keep, ahead=0):
+        """Read blocks of at most `rows` ions that end with a pulse.
+
+        Parameters
+        ----------
+        fields : dict
+            As for `read`.
+        rows : int
+            Most ions of a block.
+        keep : callable
+            Takes the columns of a block, returns how many of its rows are in whole pulses.
+        ahead : int
+            Rows after a block that `keep` is shown too.
+
+        Yields
+        ------
+        dict of ndarray
+        """
+        start = 0
+        while start < self.n:
+            stop = min(start + rows, self.n)
+            block = self.read(fields, start, min(stop + ahead, self.n))
+            kept = keep(block) if stop < self.n else stop - start
+            block = {name: values[:kept] for name, values in block.items()}
+            yield block
+            del block  # before the next one takes up memory, here and where it was taken
+            start += kept
+
 
 @contextmanager
 def open_words(path, row_size, kind, *, order="big", floats=4, partial=False, byte_order=None, rival=None):
@@ -91,8 +126,9 @@ def open_words(path, row_size, kind, *, order="big", floats=4, partial=False, by
     TruncatedFile
         If the size is no multiple of `row_size` and `partial` is False.
     """
-    if byte_order not in (None, *_ORDERS):
-        raise ValueError(f"byte_order must be None, 'big' or 'little', got {byte_order!r}")
+    check_switch(partial, "partial")
+    if byte_order is not None:
+        check_choice(byte_order, "byte_order", _ORDERS)
     words = row_size // 4
     with open_for_reading(path) as file:
         size = os.fstat(file.fileno()).st_size
@@ -149,8 +185,30 @@ def check_columns(columns, available, path):
         chosen = ()
     for name in chosen or (columns,):
         if name not in available:
-            raise FileError(f"{str(path)!r} has no column {name!r}, expected some of {', '.join(available)}")
+            raise FileError(f"{str(path)!r} has no column {shown(name)}, expected some of {', '.join(available)}")
     return chosen
+
+
+def choose_fields(columns, available, fields, path, also):
+    """Return the names of the columns to read, and the fields that takes.
+
+    Parameters
+    ----------
+    columns, available, path
+        As for `check_columns`.
+    fields : dict
+        All fields of the format by name, as for `Words.read`.
+    also : dict
+        What else has to be read for a column, names by name.
+
+    Returns
+    -------
+    chosen : tuple of str
+    fields : dict
+    """
+    chosen = check_columns(columns, available, path)
+    needed = {*chosen, *(other for name in chosen for other in also.get(name, ()))}
+    return chosen, {name: field for name, field in fields.items() if name in needed}
 
 
 def check_any(chosen, path):

@@ -10,7 +10,7 @@ import numpy as np
 
 from apt_evap.hits import Hits
 from apt_evap.io._pulses import PulseCheck, first_from_equal, pulses_from_first, whole_pulses
-from apt_evap.io._records import check_any, check_columns, choose, open_words, write_words
+from apt_evap.io._records import check_any, choose, choose_fields, open_words, write_words
 
 _ROW = 44
 _FIELDS = {
@@ -27,7 +27,6 @@ _FIELDS = {
 _COLUMNS = (*tuple(_FIELDS)[:-1], "pulse_id", "multiplicity")
 # what else has to be read to know whether a column is there, and its unit
 _WITH = {"x": ("y",), "y": ("x",), "pulse_voltage": ("voltage",), "pulse_id": ("ions",), "multiplicity": ("ions",)}
-_SURVEY = 1 << 16
 
 
 def read_epos(path, *, columns=None, partial=False, byte_order=None):
@@ -61,7 +60,7 @@ def read_epos(path, *, columns=None, partial=False, byte_order=None):
     TruncatedFile
         If the size is no multiple of 44 bytes and `partial` is False.
     """
-    chosen, fields = _chosen(columns, path)
+    chosen, fields = choose_fields(columns, _COLUMNS, _FIELDS, path, _WITH)
     with _open(path, partial, byte_order) as words:
         block = words.read(fields)
         survey = _Survey()
@@ -85,29 +84,25 @@ def chunk_epos(path, rows, *, columns=None, partial=False, byte_order=None):
     ValueError
         If `rows` is less than the ions of one pulse.
     """
-    chosen, fields = _chosen(columns, path)
+    chosen, fields = choose_fields(columns, _COLUMNS, _FIELDS, path, _WITH)
     fields = {**fields, "ions": _FIELDS["ions"]}
     with _open(path, partial, byte_order) as words:
         survey = _Survey()
-        for start in range(0, words.n, _SURVEY):
-            survey.add(words.read(fields, start, min(start + _SURVEY, words.n)))
+        for block in words.survey(fields):
+            survey.add(block)
+            del block
         survey.end(words.cut, path)
         if survey.grouped and rows < survey.pulses.largest:
             raise ValueError(
                 f"rows must be at least {survey.pulses.largest}, the ions of the largest pulse of {str(path)!r}, "
                 f"got {rows}"
             )
-        start = first_pulse = 0
-        while start < words.n:
-            stop = min(start + rows, words.n)
-            block = words.read(fields, start, stop)
-            if survey.grouped and stop < words.n:
-                stop = start + whole_pulses(block["ions"])
-                block = {name: values[: stop - start] for name, values in block.items()}
+        first_pulse = 0
+        for block in words.blocks(fields, rows, lambda block: whole_pulses(block["ions"]) if survey.grouped else rows):
             pulses = np.count_nonzero(block["ions"])
             yield _hits(block, survey, chosen, path, first_pulse)
             first_pulse += pulses
-            start = stop
+            del block
 
 
 class _Survey:
@@ -164,13 +159,6 @@ def _hits(block, survey, chosen, path, first_pulse=0):
     wanted = {name: columns.get(name) for name in chosen}
     check_any(wanted, path)
     return Hits(**wanted, source=str(path))
-
-
-def _chosen(columns, path):
-    """Names of the columns wanted, and the fields to read for them."""
-    chosen = check_columns(columns, _COLUMNS, path)
-    needed = {*chosen, *(other for name in chosen for other in _WITH.get(name, ()))}
-    return chosen, {name: field for name, field in _FIELDS.items() if name in needed}
 
 
 def _open(path, partial, byte_order):

@@ -10,7 +10,7 @@ import numpy as np
 
 from apt_evap.hits import Hits
 from apt_evap.io._pulses import first_from_equal, pulses_from_first
-from apt_evap.io._records import check_any, check_columns, open_words
+from apt_evap.io._records import check_any, choose_fields, open_words
 
 _ROW = 32
 _FIELDS = {
@@ -25,7 +25,7 @@ _FIELDS = {
 }
 _EXTRA = ("reflectron_voltage", "epoch", "pulse_number")
 _COLUMNS = (*_FIELDS, "pulse_id", "multiplicity")
-_SURVEY = 1 << 16
+_WITH = {"pulse_id": ("pulse_number",), "multiplicity": ("pulse_number",)}
 
 
 def read_raw(path, *, columns=None, partial=False, byte_order=None):
@@ -58,7 +58,7 @@ def read_raw(path, *, columns=None, partial=False, byte_order=None):
     TruncatedFile
         If the size is no multiple of 32 bytes and `partial` is False.
     """
-    chosen, fields = _chosen(columns, path)
+    chosen, fields = choose_fields(columns, _COLUMNS, _FIELDS, path, _WITH)
     with _open(path, partial, byte_order) as words:
         block = words.read(fields)
         grouped = "pulse_number" in block and _grouped([block["pulse_number"]], path)
@@ -77,33 +77,27 @@ def chunk_raw(path, rows, *, columns=None, partial=False, byte_order=None):
     ValueError
         If `rows` is less than the ions of one pulse.
     """
-    chosen, fields = _chosen(columns, path)
+    chosen, fields = choose_fields(columns, _COLUMNS, _FIELDS, path, _WITH)
     fields = {**fields, "pulse_number": _FIELDS["pulse_number"]}
     number = {"pulse_number": _FIELDS["pulse_number"]}
     with _open(path, partial, byte_order) as words:
-        starts = range(0, words.n, _SURVEY)
-        grouped = _grouped(
-            (words.read(number, start, min(start + _SURVEY, words.n))["pulse_number"] for start in starts), path
-        )
-        start = first_pulse = 0
-        while start < words.n:
-            stop = min(start + rows, words.n)
-            # one row more tells whether the last pulse ends here
-            block = words.read(fields, start, min(stop + 1, words.n))
-            if stop < words.n:
-                numbers = block["pulse_number"]
-                if grouped:
-                    borders = np.flatnonzero(numbers[1:] != numbers[:-1])
-                    if len(borders) == 0:
-                        raise ValueError(
-                            f"rows must be at least the ions of the largest pulse of {str(path)!r}, more than {rows} "
-                            f"in pulse {numbers[0]}, got {rows}"
-                        )
-                    stop = start + int(borders[-1]) + 1
-                block = {name: values[: stop - start] for name, values in block.items()}
+        grouped = _grouped((block["pulse_number"] for block in words.survey(number)), path)
+
+        def keep(block):
+            numbers = block["pulse_number"]
+            borders = np.flatnonzero(numbers[1:] != numbers[:-1]) if grouped else [rows - 1]
+            if len(borders) == 0:
+                raise ValueError(
+                    f"rows must be at least the ions of the largest pulse of {str(path)!r}, more than {rows} in pulse "
+                    f"{numbers[0]}, got {rows}"
+                )
+            return int(borders[-1]) + 1
+
+        first_pulse = 0
+        for block in words.blocks(fields, rows, keep, ahead=1):  # a row more tells whether the last pulse ends there
             yield _hits(block, grouped, chosen, path, first_pulse)
             first_pulse += np.count_nonzero(first_from_equal(block["pulse_number"]))
-            start = stop
+            del block
 
 
 def _grouped(blocks, path):
@@ -138,12 +132,6 @@ def _hits(block, grouped, chosen, path, first_pulse=0):
     extra = {name: wanted.pop(name) for name in _EXTRA if name in wanted}
     units = {"reflectron_voltage": "V"} if "reflectron_voltage" in extra else {}
     return Hits(**wanted, extra=extra, units=units, source=str(path))
-
-
-def _chosen(columns, path):
-    chosen = check_columns(columns, _COLUMNS, path)
-    needed = set(chosen) | ({"pulse_number"} if {"pulse_id", "multiplicity"} & set(chosen) else set())
-    return chosen, {name: field for name, field in _FIELDS.items() if name in needed}
 
 
 def _open(path, partial, byte_order):

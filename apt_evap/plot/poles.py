@@ -8,7 +8,7 @@ from apt_evap.poles import zones
 
 _COLORS = ("#35b6ff", "#ff9d3b", "#7be07b", "#e58cff")
 _AZIMUTHS = np.radians(np.arange(0.0, 360.5, 0.5))
-_APART = 26  # points between a label and one drawn before, at font size 9
+_APART = 30  # points between a label and one drawn before, at font size 9
 
 
 def poles(ax, orientation, projection, *, families=6, zone_families=None, labels=True, region=None, size=9):
@@ -71,11 +71,15 @@ def poles(ax, orientation, projection, *, families=6, zone_families=None, labels
         ax.scatter(*places[chosen].T, s=areas, facecolors="none", edgecolors="white", linewidths=1.2, zorder=3,
                    path_effects=outline)  # fmt: skip
         written = []
+        box = ax.get_window_extent()  # maps have one scale in x and y, which the axes have only once they are drawn
+        scale = min(box.width / np.ptp(x_limits), box.height / np.ptp(y_limits)) * 72 / ax.figure.dpi
         for index in chosen if labels else ():
-            point = ax.transData.transform(places[index]) * 72 / ax.figure.dpi
+            point = places[index] * scale
             if all(np.hypot(*(point - other)) > _APART * size / 9 for other in written):
                 written.append(point)
-                ax.annotate(found.labels[index], places[index], xytext=(4, 4), textcoords="offset points", size=size,
-                            color="white", path_effects=outline, annotation_clip=True, clip_on=True)  # fmt: skip
+                at_edge = places[index, 0] > x_limits[1] - 0.07 * (x_limits[1] - x_limits[0])
+                ax.annotate(found.labels[index], places[index], xytext=(-4 if at_edge else 4, 4), size=size,
+                            textcoords="offset points", ha="right" if at_edge else "left", color="white",
+                            path_effects=outline, clip_on=True)  # fmt: skip
     ax.set(xlim=x_limits, ylim=y_limits)
     return ax
