@@ -80,8 +80,9 @@ def _compare(options):
     _check_folder(folder, options.force)
     registration = None if options.registration is None else _registration(options.registration)
     measured = _measured(options)
+    run = load(options.run)
     study = fit_energies(
-        load(options.run),
+        run,
         measured,
         options.mechanism,
         registration=registration,
@@ -96,7 +97,7 @@ def _compare(options):
         progress=False if options.quiet else None,
         **{name: getattr(options, name) for name in ("means", "rsds", "rollup_fractions") if getattr(options, name)},
     )
-    _write(study, folder)
+    _write(study, run, folder)
     if not options.quiet:
         print(repr(study).strip("<>"))
         print(f"wrote {', '.join(FILES)} to {folder}")
@@ -181,12 +182,12 @@ def _is_study(path):
         return False
 
 
-def _write(study, folder):
+def _write(study, run, folder):
     """Write all files aside, and put them into the folder once they are complete."""
     try:
         with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as aside:
             for name, write in FILES.items():
-                write(study, Path(aside) / name)
+                write(study, run, Path(aside) / name)
             folder.mkdir(exist_ok=True)
             for name in FILES:
                 os.replace(Path(aside) / name, folder / name)
@@ -194,7 +195,7 @@ def _write(study, folder):
         raise FileError(f"cannot write to {str(folder)!r}: {error.strerror or error}") from error
 
 
-def _write_table(study, path):
+def _write_table(study, run, path):
     with open(path, "w", newline="") as file:
         table = csv.writer(file)
         table.writerow(["rollup_fraction", "rsd", "mean_eV", "ssim", "error", "share_of_resamples"])
@@ -204,16 +205,15 @@ def _write_table(study, path):
             table.writerow([f"{value:.6g}" for value in (*energies, *values)])
 
 
-def _write_overlay(study, path):
-    # both are in the measured frame already
-    ax = plot.overlay(study.maps["optimum"], study.measured, Registration(0.0, 1.0, (0.0, 0.0)), title="registration")
+def _write_overlay(study, run, path):
+    ax = plot.overlay(run.hits(study.optimum.perturbation), study.measured, study.registration)
     ax.figure.savefig(path)
 
 
 FILES = {
-    _STUDY: lambda study, path: study.save(path),
+    _STUDY: lambda study, run, path: study.save(path),
     "ssim.csv": _write_table,
-    "ssim.png": lambda study, path: plot.ssim_matrix(study)[0].figure.savefig(path),
-    "maps.png": lambda study, path: plot.side_by_side(study)[0].figure.savefig(path),
+    "ssim.png": lambda study, run, path: plot.ssim_matrix(study)[0].figure.savefig(path),
+    "maps.png": lambda study, run, path: plot.side_by_side(study)[0].figure.savefig(path),
     "registration.png": _write_overlay,
 }
