@@ -4,7 +4,6 @@ import datetime
 import json
 import warnings
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -22,7 +21,8 @@ from apt_evap.run_file import described, read_run, write_run
 from apt_evap.watch import History
 
 
-class Flown(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Flown:
     """What one perturbation gave in the run: stereographic directions (n, 2) and times of flight (n,) [ns]."""
 
     directions: np.ndarray

@@ -148,8 +148,8 @@ def _write(file, run):
     for index, (perturbation, flown) in enumerate(zip(run.perturbations, run.flown, strict=True)):
         group = simulation.create_group(f"flown/{index}")
         group.attrs["perturbation"] = json.dumps(described(perturbation))
-        _put(group, "directions", flown[0])
-        _put(group, "times", flown[1])
+        _put(group, "directions", flown.directions)
+        _put(group, "times", flown.times)
     if run.responses is not None:
         for name, values in run.responses._asdict().items():
             _put(simulation, f"responses/{name}", values, _UNITS.get(name))
