@@ -12,7 +12,7 @@ from Cython.Build import cythonize
 from setuptools import Extension, setup
 from setuptools.command.build_ext import build_ext
 
-MODULES = ["octree", "sweep", "surface", "robin", "journal", "event", "flight"]
+MODULES = ["morton", "sources", "octree", "sweep", "surface", "robin", "journal", "tournament", "event", "flight"]
 BOUNDS = bool(os.environ.get("APT_EVAP_BOUNDS"))  # check every index: slow, for tools/sanitize.sh
 DIRECTIVES = {
     "language_level": 3,

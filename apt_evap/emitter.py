@@ -19,6 +19,8 @@ from apt_evap.law import Extremal
 from apt_evap.tip import Tip
 from apt_evap.units import COULOMB
 
+RECORD = 16_384  # events after which a batch comes with a tree in any case, so that nobody has to keep the journals
+
 __all__ = ["DONE", "EXHAUSTED", "SWEEP_DUE", "TOO_SHALLOW", "Batch", "ChargeSettings", "Emitter"]
 
 _MOST_EVENTS = 10_000_000  # at a time: 640 MB of results
@@ -43,7 +45,7 @@ class Batch:
     journal : Journal
         What each event changed in the tree.
     tree : Octree or None
-        Copy of the tree before the first event, if it was built anew since the batch before.
+        Copy of the tree before the first event, if it was built anew since the batch before, or that was long ago.
     status : int
         DONE, SWEEP_DUE, EXHAUSTED or TOO_SHALLOW.
     """
@@ -114,7 +116,6 @@ class Emitter:
             self.settings.update_radius * distance,
             self.settings.opening_angle,
         )
-        self._fresh = False
         self._left, self._deepened = [], []  # sites batch by batch; events at which more of the specimen was held
         self.relax(tolerance=self.settings.start_tolerance)
         self.sweep_interval = self.settings.sweep_interval or max(100, len(self) // 300)
@@ -245,7 +246,7 @@ class Emitter:
             n_threads=self.n_threads,
             start=start,
         )
-        self._fresh = True
+        self._recorded = RECORD
         if not outcome[1] < tolerance:
             warnings.warn(
                 f"the charges had not settled after {outcome[0]} sweeps: the last one changed one by {outcome[1]:.1g} "
@@ -307,7 +308,7 @@ class Emitter:
 
     def hand_out_tree(self):
         """Let the next batch come with a copy of the tree, for flights that have not followed the events so far."""
-        self._fresh = True
+        self._recorded = RECORD
 
     def deepen(self):
         """Hold more of the specimen, after `evaporate` came upon atoms that are only held as support.
@@ -347,10 +348,10 @@ class Emitter:
         journal = Journal(self.tip.positions, most)
         site, neighbour = np.empty(most, np.int64), np.empty(most, np.int64)
         charges, normals = np.empty(most), np.empty((most, 3))
-        tree = self._core.tree.copy() if self._fresh else None
-        self._fresh = False
+        tree = self._core.tree.copy() if self._recorded >= RECORD else None
         status = self._core.evaporate(journal, most, self.sweep_interval, site, charges, normals, neighbour)
         n = journal.n_events
+        self._recorded = n if tree is not None else self._recorded + n
         self._left.append(site[:n].copy())
         return Batch(
             site=site[:n],

@@ -107,9 +107,9 @@ def fit_energies(
     Notes
     -----
     The method is that of Shaikh et al., arXiv 2509.13744, with errors added. A resample draws every measured bin from
-    a Poisson distribution, and the ions of the run with replacement (`resample.Sampler`); all energies and baselines
-    see the same draws. It has the noise of the maps once more on top, so that its similarities are lower; their spread
-    is what counts. The registration is held fixed.
+    a Poisson distribution and weighs the ions of the run at random (see `resample`); all energies and baselines see the
+    same draws. The registration is held fixed. Noise of the measured map makes those maps look most alike that have
+    somewhat more contrast than the truth: more ions, or `smoothing`, help.
     """
     grid = EnergyGrid(mechanism, means, rsds, rollup_fractions)
     if check_kind(run, "run", Run, "a Run").responses is None:

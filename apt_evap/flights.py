@@ -1,12 +1,16 @@
 """Flights of a batch of ions, in parallel, each on a copy of the surface that replays the events."""
 
-from dataclasses import dataclass
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
 
 from apt_evap._arrays import check_count, check_number
 from apt_evap._core.flight import LEFT, Flights
+from apt_evap._core.octree import Octree
 from apt_evap.units import COULOMB, NM_PER_MM
 
 _MOST_STEPS = 1_000_000  # flights take some tens
@@ -58,8 +62,19 @@ def check_reach(settings, tip, detector):
         )
 
 
+@dataclass(frozen=True, eq=False)
+class _Record:
+    """The surface after a relaxation, and the journals of the batches since."""
+
+    tree: Octree
+    journals: list = field(default_factory=list)
+
+
 class FlightCrew:
-    """One `Flights` a thread, which take the ions of a batch from one counter.
+    """Threads that take the ions of one batch after the other from its counter.
+
+    Of n threads n - 1 fly while the one that calls lets events happen; that one takes part once it waits for a batch.
+    Each has a copy of the surface, made to follow the events when it comes to fly.
 
     Parameters
     ----------
@@ -72,8 +87,11 @@ class FlightCrew:
     """
 
     def __init__(self, tip, settings, n_threads):
-        self._n_threads = n_threads
-        self._workers = []
+        self._n_helpers = n_threads - 1
+        self._pool = self._record = None
+        self._own = threading.local()  # of each thread: its flights, the record and how many journals they followed
+        self._halt, self._go = np.zeros(1, np.int64), threading.Event()
+        self._go.set()
         self._options = {
             "coulomb": COULOMB,
             "length": tip.nearest_neighbour_distance,
@@ -84,28 +102,47 @@ class FlightCrew:
             "most_steps": settings.most_steps,
         }
 
-    def start(self, batch, groups, pool):
+    @contextmanager
+    def at_work(self):
+        """The threads, as long as there are batches. What is still to be flown at the end is left."""
+        with ThreadPoolExecutor(max(1, self._n_helpers)) as self._pool:
+            try:
+                yield self
+            finally:
+                self._pool.shutdown(wait=False, cancel_futures=True)
+
+    @contextmanager
+    def paused(self):
+        """Let the flights stand still while all threads are needed elsewhere."""
+        self._halt[0] = 1
+        self._go.clear()
+        try:
+            yield
+        finally:
+            self._halt[0] = 0
+            self._go.set()
+
+    def start(self, batch, groups):
         """Begin the flights of a batch.
 
         Parameters
         ----------
         batch : Batch
-            Of n events, the one after that of the call before.
+            Of n events, the one after that of the call before; its first one comes with a tree.
         groups : sequence of (ndarray, ndarray)
             Positions [nm] and velocities [sqrt(V)] of launches, each of shape (n, m, 3): m of every ion, which share
             their steps. NaN for an ion that is not flown.
-        pool : ThreadPoolExecutor
-            Of at least as many threads.
 
         Returns
         -------
         callable
-            Waits, and gives for each group the positions, velocities and reduced times at the end (n, m, ...), NaN
-            where there was no flight, and whether the ion left (n, m).
+            Flies what is left of the batch, and gives for each group the positions, velocities and reduced times at the
+            end (n, m, ...), NaN where there was no flight, and whether the ion left (n, m).
         """
         if batch.tree is not None:
-            while len(self._workers) < self._n_threads:
-                self._workers.append(Flights(batch.tree, **self._options))
+            self._record = _Record(batch.tree)
+        record, number = self._record, len(self._record.journals)
+        record.journals.append(batch.journal)
         n, sizes = len(batch), [group[0].shape[1] for group in groups]
         positions = np.concatenate([group[0] for group in groups], axis=1).reshape(-1, 3)
         velocities = np.concatenate([group[1] for group in groups], axis=1).reshape(-1, 3)
@@ -120,29 +157,23 @@ class FlightCrew:
         ).ravel()
         end = np.empty((int(counts.sum()), 7))
         outcome = np.empty(len(end), np.int8)
-        job = (
-            batch.journal,
-            np.repeat(np.arange(n), len(groups)),
-            np.concatenate([[0], np.cumsum(counts)]),
-            np.ascontiguousarray(positions[flown]),
-            np.ascontiguousarray(velocities[flown]),
-            end,
-            outcome,
-            np.zeros(1, np.int64),
-        )
+        event = np.repeat(np.arange(n), len(groups))
+        start = np.concatenate([[0], np.cumsum(counts)])
+        launches = np.ascontiguousarray(positions[flown]), np.ascontiguousarray(velocities[flown])
+        counter = np.zeros(1, np.int64)
 
-        def work(worker):
-            if batch.tree is not None:
-                worker.begin(batch.tree)
-            else:
-                worker.go_on()
-            worker.fly(*job)
+        def fly():
+            while counter[0] < len(event):
+                self._go.wait()
+                flights = self._caught_up(record, number)
+                flights.fly(batch.journal, event, start, *launches, end, outcome, counter, self._halt)
 
-        futures = [pool.submit(work, worker) for worker in self._workers]
+        helpers = [self._pool.submit(fly) for _ in range(self._n_helpers)]
 
         def wait():
-            for future in futures:
-                future.result()
+            fly()
+            for helper in helpers:
+                helper.result()
             ends = np.full((len(flown), 7), np.nan)
             ends[flown] = end
             left = np.zeros(len(flown), bool)
@@ -152,3 +183,13 @@ class FlightCrew:
             return [(ends[:, a:b, :3], ends[:, a:b, 3:6], ends[:, a:b, 6], left[:, a:b]) for a, b in pairwise(edges)]
 
         return wait
+
+    def _caught_up(self, record, number):
+        """Flights of the calling thread, after the events of all journals of the record before this number."""
+        own = self._own
+        if getattr(own, "record", None) is not record:
+            own.flights, own.record, own.followed = Flights(record.tree, **self._options), record, 0
+        while own.followed < number:
+            own.flights.follow(record.journals[own.followed])
+            own.followed += 1
+        return own.flights

@@ -1,14 +1,13 @@
 """The simulation: atoms leave one by one, their flights follow in parallel, and a run comes out.
 
-Events and flights are a pipeline. While a batch of events happens, the flights of the batch before are flown on copies
-of the surface that replay the events one by one, so each ion flies in exactly the field that its own event left behind,
+Events and flights are a pipeline. While a batch of events happens, the flights of batches before are flown on copies of
+the surface that replay the events one by one, so each ion flies in exactly the field that its own event left behind,
 whatever the number of threads and the size of a batch.
 """
 
 import signal
 import threading
 import warnings
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
 import numpy as np
@@ -33,6 +32,7 @@ from apt_evap.units import FLIGHT_TIME
 from apt_evap.watch import Watch, WatchSettings
 
 BATCH = 256  # events at a time; the results do not depend on it
+BACKLOG = 4  # batches whose flights may wait while events happen
 
 
 class Simulation:
@@ -185,13 +185,13 @@ class Simulation:
             tqdm(
                 total=n_ions, initial=len(parts), unit=" ions", smoothing=0.1, disable=disable, mininterval=0.5
             ) as bar,
-            ThreadPoolExecutor(self.n_threads) as pool,
+            self._crew.at_work(),
             _interruptible() as interrupted,
         ):
 
-            def collect():
-                while waiting:
-                    part = waiting.pop()()
+            def collect(most=0):
+                while len(waiting) > most:
+                    part = waiting.pop(0)()
                     parts.append(part)
                     watch.count(part)
                     bar.set_postfix(watch.shown, refresh=False)
@@ -203,14 +203,14 @@ class Simulation:
                 while started < n_ions and not ended:
                     batch = self.emitter.evaporate(min(batch_size, n_ions - started))
                     started += len(batch)
-                    collect()
-                    waiting.append(self._start_flights(batch, emissions, responses, pool))
-                    if self.n_threads == 1:
-                        collect()
+                    waiting.append(self._start_flights(batch, emissions, responses))
+                    collect(BACKLOG if self.n_threads > 1 else 0)
                     if batch.status == SWEEP_DUE:
                         if watch.due(self.n_evaporated):
+                            collect()
                             watch.look(self.emitter, self.n_evaporated)
-                        self.emitter.relax()
+                        with self._crew.paused():
+                            self.emitter.relax()
                     elif batch.status == EXHAUSTED:
                         ended = "no atom is left that may evaporate"
                     elif batch.status == TOO_SHALLOW:
@@ -244,7 +244,7 @@ class Simulation:
 
     # ---- one batch -------------------------------------------------------------------------------------------------
 
-    def _start_flights(self, batch, emissions, responses, pool):
+    def _start_flights(self, batch, emissions, responses):
         """Begin the flights of a batch; return a function that waits for them and gives the batch as a Run."""
         ions = np.arange(self.n_evaporated, self.n_evaporated + len(batch))
         self.n_evaporated += len(batch)
@@ -263,7 +263,7 @@ class Simulation:
         groups = [(launch.positions[:, None], (launch.velocities * slowness[:, None])[:, None]) for launch in launches]
         if responses:
             groups += self._designs(emitted)
-        flight = self._crew.start(batch, groups, pool)
+        flight = self._crew.start(batch, groups)
 
         def finish():
             ends = flight()

@@ -264,8 +264,8 @@ def fly(flier, journal, events, launches, positions, velocities):
     """Fly groups of so many launches; return ends (m, 7) and outcomes (m,)."""
     end, outcome = np.empty((len(positions), 7)), np.empty(len(positions), np.int8)
     start = np.arange(0, len(positions) + 1, launches)
-    counter = np.zeros(1, np.int64)
-    flier.fly(journal, np.asarray(events), start, positions, velocities, end, outcome, counter)
+    counter, halt = np.zeros((2, 1), np.int64)
+    flier.fly(journal, np.asarray(events), start, positions, velocities, end, outcome, counter, halt)
     return end, outcome
 
 

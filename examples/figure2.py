@@ -19,8 +19,8 @@ from scipy.spatial import cKDTree
 import apt_evap as ae
 
 ENERGIES = np.linspace(0, 1, 51)  # eV
-# nearest neighbours of the atoms: 6 at a kink, 9 within a terrace of (111); and where, seen from the cap's centre
-NEIGHBOURS = (6, 6, 7, 7, 8, 9)
+# nearest neighbours of the atoms: 6 at a kink, 7 at a step, 8 in a row of it; and where, seen from the cap's centre
+NEIGHBOURS = (6, 6, 7, 7, 8, 6)
 DIRECTIONS = ((8, 200), (33, 75), (22, 320), (36, 190), (30, 260), (28, 20))  # polar angle and azimuth [degrees]
 
 
@@ -104,6 +104,8 @@ for (apex_view, detector), (element, axis, mechanism) in zip(
         "lateral 0.5 eV [mm]": reach(lateral.x, lateral.y, still).tolist(),
         "roll [mm]": reach(rolled.x, rolled.y, still).tolist(),
         "then 0.5 eV [mm]": reach(rolled_on.x, rolled_on.y, rolled).tolist(),
+        # how well the polynomials follow the flights: those of an atom amid its neighbours bend beyond them
+        "residual [mm]": run.responses.residuals[ions].max(axis=1).tolist(),
     }
     results[name] = {"settings": run.settings, "color": colors, "marked": int(run.marked.sum()), **table}
     print(f"{name}: how far ions move on the detector, in the farthest direction, by the roll alone and from there")

@@ -11,7 +11,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "apt_evap"
 
 FLOORS = (
-    {"units", "_arrays", "_threads", "_memory", "_files", "_version"},
+    {"units", "_arrays", "_threads", "_memory", "_files", "_types", "_version"},
     {"_core"},
     {"lattice", "ranges", "shape", "material", "alloy", "interchange", "projection", "poles", "orientation", "tip"}
     | {"detector", "hits"},
@@ -36,7 +36,7 @@ FLOOR = {module: number for number, floor in enumerate(FLOORS) for module in flo
 
 UPWARD = {("hits", "maps")}  # Hits.map, a shorthand: inside the method, never when the module is loaded
 MOST_LINES = 400
-LONGER = {"_core/octree.pyx": 560}  # build, moments, walks and sums, all on the same flat arrays
+LONGER = {}
 
 
 def sources():

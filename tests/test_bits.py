@@ -21,12 +21,12 @@ int main(void)
 {
     enum { N = 640 };
     static double x[N], y[N], z[N], q[N], cells[CELL * N];
-    static float fx[N], fy[N], fz[N], fq[N], row[N];
+    static float fx[N], fy[N], fz[N], fq[N], row[N], px[N], py[N], pz[N];
     static int list[N];
     int range[2] = {0, N};
     float targets[3 * GROUP], sums[3 * GROUP] = {0}, dot;
     double wide[3 * GROUP], wide_sums[3 * GROUP] = {0};
-    double origin[3] = {5, 5, 12}, e[3] = {0}, g[3] = {0}, normal[3] = {0.1, 0.2, 0.97};
+    double origin[3] = {5, 5, 12}, e[3] = {0}, normal[3] = {0.1, 0.2, 0.97};
     srand48(7);
     for (int i = 0; i < N; i++) {
         fx[i] = x[i] = drand48() * 10, fy[i] = y[i] = drand48() * 10, fz[i] = z[i] = drand48() * 10;
@@ -44,9 +44,9 @@ int main(void)
     point_cells(N, N, cells, 5, 5, 12, e);
     patch_row(N, fx, fy, fz, 5, 5, 5, normal, row);
     dot = patch_dot(N, row, fx);
-    patch_field(N, fx, fy, fz, fq, 5, 5, 11, g);
+    patch_field(N, fx, fy, fz, N - 1, fy, fz, fx, fq, px, py, pz);
     add(sums, sizeof sums), add(wide_sums, sizeof wide_sums), add(e, sizeof e), add(row, sizeof row);
-    add(&dot, sizeof dot), add(g, sizeof g);
+    add(&dot, sizeof dot), add(px, sizeof px), add(py, sizeof py), add(pz, sizeof pz);
     printf("%016llx %g\n", hash, e[0]);
     return 0;
 }

@@ -37,6 +37,7 @@ def fly(tree, positions, velocities, groups=None, **options):
         end,
         outcome,
         np.zeros(1, np.int64),
+        np.zeros(1, np.int64),
     )
     return end, outcome, flights
 
@@ -320,10 +321,49 @@ def test_flights_follow_the_events(tip12):
     flights = Flights(batch.tree, coulomb=COULOMB, opening_angle=0.3, tolerance=1e-3, most_steps=500, **options(tip12))
     end, outcome = np.empty((30, 7)), np.empty(30, np.int8)
     flights.fly(
-        batch.journal, np.arange(30), np.arange(31), starts, np.zeros((30, 3)), end, outcome, np.zeros(1, np.int64)
+        batch.journal,
+        np.arange(30),
+        np.arange(31),
+        starts,
+        np.zeros((30, 3)),
+        end,
+        outcome,
+        np.zeros(1, np.int64),
+        np.zeros(1, np.int64),
     )
     copy = batch.tree.copy()
     for event in range(30):
         batch.journal.replay_on(copy, event)
         alone, *_ = fly(copy, starts[event : event + 1], np.zeros((1, 3)), **options(tip12, opening_angle=0.3))
         assert np.array_equal(alone[0], end[event])
+
+
+def test_flights_halt_and_go_on(tip12):
+    """Halted, they take no ion; batch by batch the surface is followed to the state it has after all events."""
+    emitter = ae.Emitter(tip12)
+    first, second = emitter.evaporate(10), emitter.evaporate(10)
+    flights = Flights(first.tree, coulomb=COULOMB, opening_angle=0.3, tolerance=1e-3, most_steps=500, **options(tip12))
+    expected = Flights(first.tree, coulomb=COULOMB, opening_angle=0.3, tolerance=1e-3, most_steps=500, **options(tip12))
+    ends = []
+    for flier, halts in ((flights, [1, 0, 1, 0]), (expected, [0, 0])):
+        for batch in (first, second):
+            end, outcome, counter = np.full((10, 7), np.nan), np.full(10, NEVER_LEFT, np.int8), np.zeros(1, np.int64)
+            for halt in halts[: len(halts) // 2]:
+                taken = counter[0]
+                flier.fly(
+                    batch.journal,
+                    np.arange(10),
+                    np.arange(11),
+                    tip12.positions[batch.site],
+                    np.zeros((10, 3)),
+                    end,
+                    outcome,
+                    counter,
+                    np.array([halt]),
+                )
+                assert (counter[0] == taken) == bool(halt)
+            flier.follow(batch.journal)
+            assert (outcome == LEFT).all()
+            ends.append(end)
+    assert np.array_equal(ends[0], ends[2])
+    assert np.array_equal(ends[1], ends[3])

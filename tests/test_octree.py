@@ -5,7 +5,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import apt_evap as ae
-from apt_evap._core.octree import Octree, morton_order
+from apt_evap._core.morton import morton_order, split
+from apt_evap._core.octree import Octree
 from apt_evap._core.sweep import InteractionLists
 
 DEFAULT_ANGLE = ae.ChargeSettings().opening_angle
@@ -150,6 +151,33 @@ def test_morton_order_goes_by_octants(rng):
     assert (np.diff(octant) >= 0).all()
 
 
+@pytest.fixture(scope="module")
+def crowd():
+    """70,000 places, several blocks of the sort and subtrees: a clump, duplicates and a place far away among them."""
+    generator = np.random.default_rng(4)
+    sphere = generator.normal(size=(60_000, 3))
+    sphere /= np.linalg.norm(sphere, axis=1)[:, None]
+    clump, twice = generator.random((5_000, 3)) * 1e-3, sphere[generator.choice(60_000, 4_900)]
+    places = np.concatenate([sphere, clump, twice, np.ones((99, 3)), [[40.0, 0.0, 0.0]]])
+    return places[generator.permutation(len(places))]
+
+
+@pytest.mark.parametrize("n_threads", [1, 2, 3])
+def test_order_is_that_of_the_keys(crowd, n_threads):
+    order, keys = morton_order(crowd, n_threads)
+    expected = twins.morton_keys(crowd)
+    assert np.array_equal(order, np.argsort(expected, kind="stable"))  # those of one key by their number
+    assert np.array_equal(keys, expected[order])
+
+
+@pytest.mark.parametrize("n_threads", [1, 2, 3])
+@pytest.mark.parametrize("leaf_size", [1, 16, 5000])
+def test_nodes_are_those_of_a_plain_recursion(crowd, leaf_size, n_threads):
+    _, keys = morton_order(crowd)
+    expected = np.array(twins.flat(twins.split(keys, leaf_size)))
+    assert np.array_equal(np.stack(split(keys, leaf_size, n_threads), axis=1), expected)
+
+
 # ---- copies, threads -----------------------------------------------------------------------------------------------
 
 
@@ -165,6 +193,16 @@ def test_copy_is_equal_and_independent(surface12, tip12, rng):
     assert not np.array_equal(other.nodes[1], before[1])
     for ours, now in zip(before, (*tree.nodes, tree.positions, tree.charges, tree.atoms), strict=True):
         assert np.array_equal(ours, now)
+
+
+def test_threads_build_the_same_tree(crowd, rng):
+    charges = rng.random(len(crowd))
+    one, two = (Octree(crowd, charges, n_threads=n_threads) for n_threads in (1, 2))
+    for ours, theirs in zip(
+        (*one.nodes, one.positions, one.atoms), (*two.nodes, two.positions, two.atoms), strict=True
+    ):
+        assert np.array_equal(ours, theirs)
+    assert np.array_equal(one.positions, crowd[one.atoms])
 
 
 def test_threads_give_the_same_bits(surface12, tip12, rng):

@@ -54,8 +54,15 @@ def test_batch_size_changes_no_bit(small_tip, plain, batch_size):
 
 
 @pytest.mark.parametrize("n_threads", [2, 3])
-def test_threads_change_no_bit(small_tip, plain, n_threads):
-    assert different(plain, simulate(small_tip, 200, n_threads=n_threads, batch_size=64)) == []
+@pytest.mark.parametrize("batch_size", [7, 64])  # more batches than may wait, and fewer
+def test_threads_change_no_bit(small_tip, plain, n_threads, batch_size):
+    assert different(plain, simulate(small_tip, 200, n_threads=n_threads, batch_size=batch_size)) == []
+
+
+@pytest.mark.parametrize("n_threads", [1, 2])
+def test_a_tree_handed_out_now_and_then_changes_no_bit(small_tip, plain, n_threads, monkeypatch):
+    monkeypatch.setattr("apt_evap.emitter.RECORD", 20)
+    assert different(plain, simulate(small_tip, 200, n_threads=n_threads, batch_size=7)) == []
 
 
 def test_a_run_goes_on_where_the_one_before_ended(small_tip, plain):

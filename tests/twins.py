@@ -1,5 +1,7 @@
 """Slow twins of the compiled core in plain NumPy: the same physics, no tree, no lists, no patches."""
 
+from itertools import pairwise
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -18,6 +20,42 @@ def field(points, atoms, charges):
         with np.errstate(divide="ignore", invalid="ignore"):
             out[i] = np.where(r2 > 1e-12, charges / r2**1.5, 0.0) @ d
     return out
+
+
+def morton_keys(positions):
+    """Key of each position: its octants in the bounding cube, 21 levels of three bits, digit by digit."""
+    low = positions.min(axis=0)
+    edge = max(float((positions.max(axis=0) - low).max()), 1e-9)
+    grid = ((positions - low) * ((2**21 - 1) / edge)).astype(np.int64)
+    keys = np.zeros(len(positions), np.uint64)
+    for level in range(20, -1, -1):
+        octant = (grid >> level & 1) @ [4, 2, 1]
+        keys = keys * np.uint64(8) + octant.astype(np.uint64)
+    return keys
+
+
+def split(keys, leaf_size, first=0, level=20):
+    """Nested [first, last, children] of sorted keys; a range that shares its octant goes one level down."""
+    last = first + len(keys)
+    octants = keys >> np.uint64(3 * max(level, 0)) & np.uint64(7)
+    if len(keys) <= leaf_size or level < 0:
+        return [first, last, []]
+    cuts = np.searchsorted(octants, np.arange(9))
+    parts = [(a, b) for a, b in pairwise(cuts) if b > a]
+    if len(parts) == 1:
+        return split(keys, leaf_size, first, level - 1)
+    return [first, last, [split(keys[a:b], leaf_size, first + a, level - 1) for a, b in parts]]
+
+
+def flat(node, parent=-1, rows=None):
+    """Rows (first, last, parent, skip) of a nested node, in preorder."""
+    rows = [] if rows is None else rows
+    number = len(rows)
+    rows.append([node[0], node[1], parent, 0])
+    for child in node[2]:
+        flat(child, number, rows)
+    rows[number][3] = len(rows)
+    return rows
 
 
 def moments(atoms, charges):

@@ -4,6 +4,7 @@ from apt_evap._core.journal cimport Journal
 from apt_evap._core.octree cimport Octree
 from apt_evap._core.robin cimport ChargingRule, Patch
 from apt_evap._core.surface cimport Neighbourhood
+from apt_evap._core.tournament cimport Tournament
 
 
 cdef class Evaporation:
@@ -21,18 +22,15 @@ cdef class Evaporation:
     cdef double[::1] weight             # (n_atoms,) 1/evaporation field, 0 where an atom may not leave
     cdef int[::1] slot_of               # (n_atoms,) -1 away from the surface
     cdef double[:, ::1] normals         # (capacity, 3) by slot
-    cdef double[::1] rank               # (capacity,) charge times weight
-    cdef int[::1] winner                # tournament over the slots: node i has the better of 2 i and 2 i + 1
-    cdef long leaves
+    cdef Tournament tournament          # of charge times weight
     cdef int[::1] near                  # (most,) slots around the hole
+    cdef float[:, ::1] near_float       # (6, most) where they are, from the hole [nm], and what changes their field
     cdef Patch patch                    # those whose charges are solved; its memory follows
     cdef int[::1] patch_slot
     cdef double[::1] patch_charge
     cdef float[:, ::1] patch_float
 
     cdef void make_room(self, long most)
-    cdef bint better(self, int a, int b) noexcept nogil
-    cdef void settle(self, int slot) noexcept nogil
     cdef long strongest_neighbour(self, long atom) noexcept nogil
     cdef void join(self, int slot, double dx, double dy, double dz) noexcept nogil
     cdef int event(self, long atom, Journal journal) except -1 nogil

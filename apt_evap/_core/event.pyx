@@ -13,21 +13,24 @@ from libc.math cimport sqrt
 import numpy as np
 
 from apt_evap._core.journal cimport Journal
-from apt_evap._core.octree cimport Octree, Sources, sources_field, sources_free, sources_init
+from apt_evap._core.octree cimport Octree
 from apt_evap._core.robin cimport Patch
+from apt_evap._core.sources cimport Sources, sources_field, sources_free, sources_init
 from apt_evap._core.surface cimport MOST_NEAR
 from apt_evap._core.sweep cimport InteractionLists
+from apt_evap._core.tournament cimport Tournament
 
 
 cdef extern from "pair.h":
+    const int GROUP
     const int PATCH_LANES
-    void patch_field(long, const float*, const float*, const float*, const float*, float, float, float,
-                     double*) noexcept nogil
-
+    void patch_field(long, const float*, const float*, const float*, long, const float*, const float*, const float*,
+                     const float*, float*, float*, float*) noexcept nogil
 
 
 cdef enum:
     NOT_SETTLED = 1 << 30   # events since the last relaxation, while there is none
+    FEW = 16384             # surface atoms up to which one thread builds: others cost more than they save
     MOST_PATCH = 4096       # slots at first within the update radius; 18 d_nn of fcc hold some 1,000
     STATUS_DONE = 0
     STATUS_SWEEP_DUE = 1
@@ -84,6 +87,7 @@ cdef class Evaporation:
     cdef void make_room(self, long most):
         # Buffers for so many slots around a hole, and the atoms that come to the surface.
         self.near = np.empty(most + MOST_NEAR, np.int32)
+        self.near_float = np.empty((6, most + MOST_NEAR + GROUP), np.float32)
         self.patch_slot = np.empty(most + MOST_NEAR, np.int32)
         self.patch_charge = np.empty(most + MOST_NEAR)
         self.patch_float = np.empty((4, most + MOST_NEAR), np.float32)
@@ -127,10 +131,12 @@ cdef class Evaporation:
         residual : float
             Largest change of a charge in the last one, relative to the mean charge.
         """
-        cdef long slot, n
+        cdef long n
+        cdef int builders
         surface = self.atoms.surface
         if len(surface) == 0:
             raise ValueError("the specimen has no surface atoms")
+        builders = n_threads if len(surface) > FEW else 1
         self.since_sweep = NOT_SETTLED   # an interruption below leaves a surface that no atom may leave
         if start is None:
             start = self.start_here(surface)
@@ -138,33 +144,23 @@ cdef class Evaporation:
             raise ValueError(f"start must have the charges of {len(surface)} surface atoms, got {len(start.charges)}")
         self.start, self.n_removed, self.potential_point = start, start.n_removed, start.potential_point
         charges = start.charges
-        tree = Octree(np.asarray(self.atoms.positions)[surface], charges, surface,
-                      extra=extra or len(surface) // 8 + MOST_NEAR, n_threads=n_threads)
+        tree = Octree(self.atoms.positions_of(surface, builders), charges, surface,
+                      extra=extra or len(surface) // 8 + MOST_NEAR, n_threads=builders)
         surface = tree.atoms   # in the order of the slots from here on
         n, capacity = tree.n_slots, tree.capacity
         normals = np.zeros((capacity, 3))
-        normals[:n] = self.atoms.normals_of(surface)
+        normals[:n] = self.atoms.normals_of(surface, builders)
         slot_of = np.full(self.atoms.n_atoms, -1, np.int32)
         slot_of[surface] = np.arange(n, dtype=np.int32)
         normals[slot_of[start.lonely]] = start.lonely_normals
         lists = InteractionLists(tree, opening_angle or self.opening_angle, n_threads)
         outcome = self.rule.solve(tree, normals, lists, tolerance=tolerance, most_sweeps=most_sweeps,
                                   double_precision=double_precision, n_threads=n_threads)
-        away = self.keep_inside(tree.positions)
+        away = self.keep_inside(tree)
         self.rule.scale(tree, self.potential / (tree.charges / away).sum())
         rank = np.full(capacity, -1.0)
         rank[:n] = tree.charges * np.asarray(self.weight)[surface]
-        self.tree, self.normals, self.slot_of, self.rank = tree, normals, slot_of, rank
-        self.leaves = 1
-        while self.leaves < capacity:
-            self.leaves *= 2
-        self.winner = np.full(2 * self.leaves, -1, np.int32)
-        np.asarray(self.winner)[self.leaves:self.leaves + n] = np.arange(n)
-        with nogil:
-            for slot in range(self.leaves - 1, 0, -1):
-                self.winner[slot] = self.winner[2 * slot]
-                if self.better(self.winner[2 * slot + 1], self.winner[2 * slot]):
-                    self.winner[slot] = self.winner[2 * slot + 1]
+        self.tree, self.normals, self.slot_of, self.tournament = tree, normals, slot_of, Tournament(tree, rank)
         self.since_sweep = 0
         return outcome
 
@@ -178,37 +174,25 @@ cdef class Evaporation:
             normals = np.asarray(self.normals)[np.asarray(self.slot_of)[lonely]]
         return Start(self.n_removed, charges, lonely, normals, self.potential_point)
 
-    def keep_inside(self, positions):
+    def keep_inside(self, Octree tree):
         """Distances of the surface from the point of the potential; it goes down as evaporation comes close to it."""
-        away = np.linalg.norm(positions - self.potential_point, axis=1)
+        away = self.distances(tree)
         if self.clearance == 0.0:
             self.clearance = away.min()
         for _ in range(100):
             if away.min() >= 0.5 * self.clearance:
                 break
             self.potential_point = self.potential_point - (0.0, 0.0, 0.25 * self.clearance)
-            away = np.linalg.norm(positions - self.potential_point, axis=1)
+            away = self.distances(tree)
         return np.maximum(away, 1e-3 * self.clearance)
 
-    # ---- which atom leaves -----------------------------------------------------------------------------------------
+    def distances(self, Octree tree):
+        """Distances of the surface from the point of the potential [nm]."""
+        n = tree.n_slots
+        columns = np.asarray(tree.x)[:n], np.asarray(tree.y)[:n], np.asarray(tree.z)[:n]
+        return np.sqrt(sum((column - at) ** 2 for column, at in zip(columns, self.potential_point[0])))
 
-    cdef bint better(self, int a, int b) noexcept nogil:
-        # Extremal: the higher rank; equal ranks go by the number of the atom.
-        if a < 0 or b < 0:
-            return b < 0 <= a
-        if self.rank[a] != self.rank[b]:
-            return self.rank[a] > self.rank[b]
-        return self.tree.atom[a] < self.tree.atom[b]
-
-    cdef void settle(self, int slot) noexcept nogil:
-        # Carry a changed rank up the tournament.
-        cdef long node = (self.leaves + slot) // 2
-        cdef int a, b
-        self.winner[self.leaves + slot] = slot
-        while node:
-            a, b = self.winner[2 * node], self.winner[2 * node + 1]
-            self.winner[node] = b if self.better(b, a) else a
-            node //= 2
+    # ---- one event -------------------------------------------------------------------------------------------------
 
     cdef long strongest_neighbour(self, long atom) noexcept nogil:
         # The surface nearest neighbour with the highest charge; -1: there is none.
@@ -236,8 +220,6 @@ cdef class Evaporation:
         self.atoms.normal(self.tree.atom[slot], &self.normals[slot, 0])
         self.patch.n = n + 1
 
-    # ---- one event -------------------------------------------------------------------------------------------------
-
     cdef int event(self, long atom, Journal journal) except -1 nogil:
         cdef Sources sources
         cdef int[MOST_NEAR] fresh
@@ -246,14 +228,20 @@ cdef class Evaporation:
         cdef double pz = self.atoms.positions[atom, 2], charge = self.tree.q[gone], s, nearest
         cdef double dx, dy, dz, over
         cdef Patch* patch = &self.patch
+        cdef float* near_x
+        cdef float* near_y
+        cdef float* near_z
+        cdef float* field_x
+        cdef float* field_y
+        cdef float* field_z
         cdef long n_near, most, i, k, at
         self.n_removed += 1
         self.since_sweep += 1
         self.tree.take_out(gone)
         self.tree.refresh()
         self.slot_of[atom] = -1
-        self.rank[gone] = -1.0
-        self.settle(gone)
+        self.tournament.rank[gone] = -1.0
+        self.tournament.settle(&gone, 1)
         n_fresh = self.atoms.remove(atom, fresh)
 
         # the slots around the hole, without the charge that left
@@ -263,6 +251,8 @@ cdef class Evaporation:
             with gil:
                 self.make_room(2 * n_near + PATCH_LANES)
             n_near = self.tree.within(px, py, pz, self.update_radius, &self.near[0], n_near)
+        near_x, near_y, near_z = &self.near_float[0, 0], &self.near_float[1, 0], &self.near_float[2, 0]
+        field_x, field_y, field_z = &self.near_float[3, 0], &self.near_float[4, 0], &self.near_float[5, 0]
         patch.n = 0
         for i in range(n_near):
             slot = self.near[i]
@@ -272,6 +262,7 @@ cdef class Evaporation:
             self.rule.field[slot, 0] -= over * dx
             self.rule.field[slot, 1] -= over * dy
             self.rule.field[slot, 2] -= over * dz
+            near_x[i], near_y[i], near_z[i] = <float>dx, <float>dy, <float>dz
             if s <= self.patch_radius * self.patch_radius:
                 self.join(slot, dx, dy, dz)
 
@@ -281,7 +272,8 @@ cdef class Evaporation:
         if n_fresh:
             sources_init(&sources)
         for k in range(n_fresh):
-            dx, dy, dz = self.atoms.positions[fresh[k], 0], self.atoms.positions[fresh[k], 1], self.atoms.positions[fresh[k], 2]
+            dx, dy = self.atoms.positions[fresh[k], 0], self.atoms.positions[fresh[k], 1]
+            dz = self.atoms.positions[fresh[k], 2]
             nearest = 1e30
             best = gone
             for i in range(patch.n):
@@ -298,6 +290,7 @@ cdef class Evaporation:
             self.tree.collect(dx, dy, dz, 0.0, self.opening_angle, &sources)
             sources_field(&sources, dx, dy, dz, &self.rule.field[slot, 0])
             self.near[n_near] = slot
+            near_x[n_near], near_y[n_near], near_z[n_near] = <float>(dx - px), <float>(dy - py), <float>(dz - pz)
             n_near += 1
             self.join(slot, dx - px, dy - py, dz - pz)
         if n_fresh:
@@ -323,12 +316,19 @@ cdef class Evaporation:
             journal.slot[at + 1 + i] = slot
             journal.charge[at + 1 + i] = patch.charge[i]
             self.tree.set_charge(slot, patch.charge[i])
-            self.rank[slot] = patch.charge[i] * self.weight[self.tree.atom[slot]]
-            self.settle(slot)
+            self.tournament.rank[slot] = patch.charge[i] * self.weight[self.tree.atom[slot]]
+        self.tournament.settle(patch.slot, patch.n)
+        for i in range((n_near + GROUP - 1) // GROUP * GROUP):
+            if i >= n_near:
+                near_x[i] = near_y[i] = near_z[i] = 1e6
+            field_x[i] = field_y[i] = field_z[i] = 0.0
+        patch_field((n_near + GROUP - 1) // GROUP * GROUP, near_x, near_y, near_z, patch.stride, patch.x, patch.y,
+                    patch.z, patch.change, field_x, field_y, field_z)
         for i in range(n_near):
             slot = self.near[i]
-            patch_field(patch.stride, patch.x, patch.y, patch.z, patch.change, <float>(self.tree.x[slot] - px),
-                        <float>(self.tree.y[slot] - py), <float>(self.tree.z[slot] - pz), &self.rule.field[slot, 0])
+            self.rule.field[slot, 0] += field_x[i]
+            self.rule.field[slot, 1] += field_y[i]
+            self.rule.field[slot, 2] += field_z[i]
         self.tree.refresh()
         journal.n_events += 1
         return 0
@@ -362,8 +362,8 @@ cdef class Evaporation:
         with nogil:
             while journal.n_events < most:
                 n = journal.n_events
-                best = self.winner[1]
-                if self.since_sweep < NOT_SETTLED and (best < 0 or not self.rank[best] > 0.0):
+                best = self.tournament.winner[1]
+                if self.since_sweep < NOT_SETTLED and (best < 0 or not self.tournament.rank[best] > 0.0):
                     status = STATUS_EXHAUSTED
                     break
                 if self.since_sweep >= sweep_interval or self.tree.n_slots + MOST_NEAR > self.tree.x.shape[0]:

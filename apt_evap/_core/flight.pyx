@@ -15,19 +15,24 @@ from libc.stdlib cimport free, malloc
 import numpy as np
 
 from apt_evap._core.journal cimport Journal
-from apt_evap._core.octree cimport Octree, Sources, sources_field, sources_free, sources_init
+from apt_evap._core.octree cimport Octree
+from apt_evap._core.sources cimport Sources, sources_field, sources_free, sources_init
 
 cdef extern from *:
     """
     /* The next piece of work of several threads. */
     static long take_next(long long *counter) { return (long)__atomic_fetch_add(counter, 1, __ATOMIC_RELAXED); }
+    static int is_set(long long *flag) { return __atomic_load_n(flag, __ATOMIC_RELAXED) != 0; }
     """
     long take_next(long long* counter) nogil
-
-LEFT, NEVER_LEFT = range(2)
+    bint is_set(long long* flag) nogil
 
 cdef enum:
     STAGES = 9
+    ION_LEFT = 0
+    ION_NEVER_LEFT = 1   # and what it counts as while it flies
+
+LEFT, NEVER_LEFT = ION_LEFT, ION_NEVER_LEFT
 
 cdef double[9] NODE = [0.0, 1 / 20.0, 1 / 10.0, 3 / 10.0, 1 / 2.0, 7 / 10.0, 9 / 10.0, 1.0, 1.0]
 cdef double[81] STAGE = [
@@ -112,21 +117,26 @@ cdef class Flights:
         self.tree = tree.copy()
         self.n_replayed = 0
 
-    def go_on(self):
-        """Begin another journal on the surface as the one before left it."""
+    def follow(self, Journal journal):
+        """Let the events of a journal happen that have not, and be ready for the journal after it."""
+        with nogil:
+            while self.n_replayed < journal.n_events:
+                journal.replay(self.n_replayed, self.tree)
+                self.n_replayed += 1
         self.n_replayed = 0
 
     def fly(self, Journal journal, const long long[::1] event, const long long[::1] start,
             const double[:, ::1] positions, const double[:, ::1] velocities, double[:, ::1] end,
-            signed char[::1] outcome, long long[::1] counter):
+            signed char[::1] outcome, long long[::1] counter, long long[::1] halt):
         """Fly groups of launches, each in the field that its event left behind.
 
-        Several objects may share the work in threads of their own: `counter` hands out the groups.
+        Several objects may share the work in threads of their own: `counter` hands out the groups. Call `follow` before
+        another journal.
 
         Parameters
         ----------
         journal : Journal
-            The events since `begin`.
+            The events after those followed so far.
         event : ndarray, shape (g,)
             Event of each group, not falling.
         start : ndarray, shape (g + 1,)
@@ -139,10 +149,12 @@ cdef class Flights:
             Filled with LEFT or NEVER_LEFT.
         counter : ndarray, shape (1,)
             The next group.
+        halt : ndarray, shape (1,)
+            Not 0: stop before the next group.
         """
         cdef long group, k, n_groups = event.shape[0]
         with nogil:
-            while True:
+            while not is_set(&halt[0]):
                 group = take_next(&counter[0])
                 if group >= n_groups:
                     break
@@ -154,11 +166,8 @@ cdef class Flights:
                                    &velocities[start[group], 0], &end[start[group], 0], &outcome[start[group]])
                 if start[group + 1] > start[group] + 1:   # one that runs into an atom stops its whole group
                     for k in range(start[group], start[group + 1]):
-                        if outcome[k] == 1:
+                        if outcome[k] == ION_NEVER_LEFT:
                             self.fly_group(1, &positions[k, 0], &velocities[k, 0], &end[k, 0], &outcome[k])
-            while self.n_replayed < journal.n_events:
-                journal.replay(self.n_replayed, self.tree)
-                self.n_replayed += 1
 
     cdef int fly_group(self, long m, const double* positions, const double* velocities, double* end,
                        signed char* outcome) except -1 nogil:
@@ -179,7 +188,7 @@ cdef class Flights:
         a, x = self.work, self.work + STAGES * 3 * m
         v, trial = x + 3 * m, x + 6 * m
         for i in range(m):
-            outcome[i] = 1
+            outcome[i] = ION_NEVER_LEFT
             for axis in range(3):
                 x[3 * i + axis] = positions[3 * i + axis]
                 v[3 * i + axis] = velocities[3 * i + axis]
@@ -198,7 +207,7 @@ cdef class Flights:
             self.evaluate(m, x, a, outcome)
             for stage in range(1, STAGES):
                 for i in range(m):
-                    if outcome[i] == 1:
+                    if outcome[i] == ION_NEVER_LEFT:
                         for axis in range(3):
                             s = 0.0
                             for k in range(stage):
@@ -207,13 +216,13 @@ cdef class Flights:
                 self.evaluate(m, trial, a + 3 * m * stage, outcome)
             largest = 0.0
             for i in range(m):
-                if outcome[i] == 1:
+                if outcome[i] == ION_NEVER_LEFT:
                     largest = max(largest, self.step_error(i, m, dt, a, v, positions, trial))
             self.n_steps += 1
             if largest <= 1.0:
                 time += dt
                 for i in range(m):
-                    if outcome[i] != 1:
+                    if outcome[i] != ION_NEVER_LEFT:
                         continue
                     away = 0.0
                     for axis in range(3):
@@ -225,9 +234,9 @@ cdef class Flights:
                         away += (x[3 * i + axis] - self.centre[axis]) ** 2
                         a[3 * i + axis] = a[3 * (8 * m + i) + axis]
                     if away > self.reach * self.reach:
-                        outcome[i] = 0
+                        outcome[i] = ION_LEFT
                         flying -= 1
-                    if outcome[i] == 0 or steps == self.most_steps - 1:
+                    if outcome[i] == ION_LEFT or steps == self.most_steps - 1:
                         for axis in range(3):
                             end[7 * i + axis] = x[3 * i + axis]
                             end[7 * i + 3 + axis] = v[3 * i + axis]
@@ -239,7 +248,7 @@ cdef class Flights:
             else:
                 dt *= min(4.0, max(0.2, 0.9 * pow(max(largest, 1e-12), -1.0 / 7.0)))
         for i in range(m):
-            if outcome[i] == 1:
+            if outcome[i] == ION_NEVER_LEFT:
                 for axis in range(3):
                     end[7 * i + axis] = x[3 * i + axis]
                     end[7 * i + 3 + axis] = v[3 * i + axis]
@@ -253,7 +262,7 @@ cdef class Flights:
         cdef long i
         cdef int axis
         for i in range(m):
-            if outcome[i] == 1:
+            if outcome[i] == ION_NEVER_LEFT:
                 rr = rv = vv = 0.0
                 for axis in range(3):
                     dx = x[3 * i + axis] - self.centre[axis]
@@ -291,7 +300,7 @@ cdef class Flights:
         cdef double cx = 0.0, cy = 0.0, cz = 0.0, radius = 0.0, dx, dy, dz
         cdef long i, n = 0
         for i in range(m):
-            if outcome[i] == 1:
+            if outcome[i] == ION_NEVER_LEFT:
                 n += 1
                 cx += x[3 * i] + 0.5 * dt * (v[3 * i] + 0.5 * dt * a[3 * i])
                 cy += x[3 * i + 1] + 0.5 * dt * (v[3 * i + 1] + 0.5 * dt * a[3 * i + 1])
@@ -300,7 +309,7 @@ cdef class Flights:
         cy /= n
         cz /= n
         for i in range(m):
-            if outcome[i] == 1:
+            if outcome[i] == ION_NEVER_LEFT:
                 dx, dy, dz = x[3 * i] - cx, x[3 * i + 1] - cy, x[3 * i + 2] - cz
                 radius = max(radius, dx * dx + dy * dy + dz * dz)
                 dx += dt * (v[3 * i] + 0.5 * dt * a[3 * i])
@@ -315,7 +324,7 @@ cdef class Flights:
         cdef long i
         cdef int axis
         for i in range(m):
-            if outcome[i] == 1:
+            if outcome[i] == ION_NEVER_LEFT:
                 sources_field(&self.sources, x[3 * i], x[3 * i + 1], x[3 * i + 2], a + 3 * i)
                 for axis in range(3):
                     a[3 * i + axis] *= self.coulomb

@@ -1,25 +1,6 @@
 """The octree's memory, for the other compiled modules."""
 
-cdef extern from "pair.h":
-    const int CELL
-    const int LANES
-    void point_atoms(long, const double*, const double*, const double*, const double*,
-                     double, double, double, double*) noexcept nogil
-    void point_cells(long, long, const double*, double, double, double, double*) noexcept nogil
-
-
-cdef struct Sources:
-    # What one walk collects for a ball of targets: atoms and cells, ready for the kernels.
-    long n_atoms
-    long n_cells
-    long capacity        # of each column
-    double* atoms        # (4, capacity): x y z q
-    double* cells        # (CELL, capacity)
-
-
-cdef int sources_init(Sources* sources) except -1 nogil
-cdef void sources_free(Sources* sources) noexcept nogil
-cdef void sources_field(const Sources* sources, double px, double py, double pz, double* field) noexcept nogil
+from apt_evap._core.sources cimport Sources
 
 
 cdef class Octree:
@@ -38,6 +19,10 @@ cdef class Octree:
     cdef int[::1] queue                 # (n_nodes,) dirty nodes
     cdef long n_dirty
 
+    cdef enclose(self, int n_threads)
+    cdef void box_of_leaf(self, long node, double* low, double* high) noexcept nogil
+    cdef void ball_of_box(self, long node, const double* low, const double* high) noexcept nogil
+    cdef long following(self, long node, long slot) noexcept nogil
     cdef void set_charge(self, long slot, double charge) noexcept nogil
     cdef void take_out(self, long slot) noexcept nogil
     cdef long put_in(self, long long atom, double px, double py, double pz, int leaf) noexcept nogil

@@ -1,10 +1,6 @@
 import numpy as np
 from numpy.typing import NDArray
 
-MORTON_BITS: int
-
-def morton_order(positions: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.uint64]]: ...
-
 class Octree:
     def __init__(
         self,

@@ -8,74 +8,14 @@ negative: a cell has its centre of charge for origin.
 
 from cython.parallel cimport prange
 from libc.math cimport sqrt
-from libc.stdlib cimport free, malloc, realloc
+
+from apt_evap._core.sources cimport (
+    CELL, LANES, Sources, sources_field, sources_free, sources_grow, sources_init, sources_potential,
+)
 
 import numpy as np
 
-
-MORTON_BITS = 21
-
-
-cdef int sources_init(Sources* sources) except -1 nogil:
-    sources.n_atoms = sources.n_cells = 0
-    sources.capacity = 4096
-    sources.atoms = <double*>malloc(4 * sources.capacity * sizeof(double))
-    sources.cells = <double*>malloc(CELL * sources.capacity * sizeof(double))
-    if sources.atoms == NULL or sources.cells == NULL:
-        with gil:
-            raise MemoryError
-    return 0
-
-
-cdef void sources_free(Sources* sources) noexcept nogil:
-    free(sources.atoms)
-    free(sources.cells)
-    sources.atoms = sources.cells = NULL
-
-
-cdef int sources_grow(Sources* sources) except -1 nogil:
-    # Columns keep their stride: the old ones are spread out over the new, wider ones, last column first.
-    cdef long old = sources.capacity, column, k
-    sources.capacity = 2 * old
-    sources.atoms = <double*>realloc(sources.atoms, 8 * old * sizeof(double))
-    sources.cells = <double*>realloc(sources.cells, 2 * CELL * old * sizeof(double))
-    if sources.atoms == NULL or sources.cells == NULL:
-        with gil:
-            raise MemoryError
-    for column in range(3, 0, -1):
-        for k in range(old - 1, -1, -1):
-            sources.atoms[column * 2 * old + k] = sources.atoms[column * old + k]
-    for column in range(CELL - 1, 0, -1):
-        for k in range(old - 1, -1, -1):
-            sources.cells[column * 2 * old + k] = sources.cells[column * old + k]
-    return 0
-
-
-cdef void sources_field(const Sources* sources, double px, double py, double pz, double* field) noexcept nogil:
-    # Field [e/nm^2] of everything collected, at one point.
-    cdef const double* a = sources.atoms
-    cdef long stride = sources.capacity
-    field[0] = field[1] = field[2] = 0.0
-    point_atoms(sources.n_atoms, a, a + stride, a + 2 * stride, a + 3 * stride, px, py, pz, field)
-    point_cells(sources.n_cells, stride, sources.cells, px, py, pz, field)
-
-
-def morton_order(positions):
-    """Order of the positions along the Morton curve of their bounding cube, with the keys in that order."""
-    low = positions.min(axis=0)
-    edge = max(float((positions.max(axis=0) - low).max()), 1e-9)
-    grid = ((positions - low) * ((2**MORTON_BITS - 1) / edge)).astype(np.uint64)
-    key = np.zeros(len(positions), np.uint64)
-    for axis in range(3):
-        spread = grid[:, axis]
-        for shift, mask in (
-            (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F),
-            (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249),
-        ):
-            spread = (spread | (spread << np.uint64(shift))) & np.uint64(mask)
-        key |= spread << np.uint64(2 - axis)
-    order = np.argsort(key, kind="stable")
-    return order, key[order]
+from apt_evap._core.morton import morton_order, split
 
 
 cdef class Octree:
@@ -99,119 +39,75 @@ cdef class Octree:
 
     def __init__(self, const double[:, ::1] positions, const double[::1] charges, atoms=None, int leaf_size=16,
                  long extra=0, int n_threads=1):
-        cdef long n = positions.shape[0], capacity = n + extra, i
+        cdef long n = positions.shape[0], capacity = n + extra, i, k
+        cdef long long[::1] order
+        cdef bint numbered = atoms is None
+        cdef const long long[::1] numbers = np.empty(0, np.int64) if numbered else np.asarray(atoms, np.int64)
         if n == 0:
             raise ValueError("an octree needs at least one atom, got none")
-        order, keys = morton_order(np.asarray(positions))
+        order, keys = morton_order(positions, n_threads)
+        self.first, self.last, self.parent, self.skip = split(keys, leaf_size, n_threads)
         self.leaf_size = leaf_size
         self.n_slots = self.n_sorted = n
-        slots = np.zeros((4, capacity))
-        slots[:3, :n] = np.asarray(positions)[order].T
-        slots[3, :n] = np.asarray(charges)[order]
-        self.x, self.y, self.z, self.q = slots
-        index = np.full(capacity, -1, np.int64)
-        index[:n] = order if atoms is None else np.asarray(atoms)[order]
-        self.atom = index
+        self.n_nodes = self.first.shape[0]
+        self.x, self.y, self.z, self.q = np.zeros((4, capacity))
+        self.atom = np.full(capacity, -1, np.int64)
         self.leaf = np.full(capacity, -1, np.int32)
         self.next_extra = np.full(capacity, -1, np.int32)
-        self._split(keys)
-        self._enclose(n_threads)
+        self.extra = np.full(self.n_nodes, -1, np.int32)
+        for i in prange(n, nogil=True, schedule="static", num_threads=n_threads):
+            k = order[i]
+            self.x[i], self.y[i], self.z[i], self.q[i] = positions[k, 0], positions[k, 1], positions[k, 2], charges[k]
+            self.atom[i] = k if numbered else numbers[k]
+        self.enclose(n_threads)
         self.dirty = np.zeros(self.n_nodes, np.int8)
         self.queue = np.empty(self.n_nodes, np.int32)
         self.n_dirty = 0
         self.cells = np.zeros((self.n_nodes, CELL))
         self.refresh_all()
 
-    def _split(self, const unsigned long long[::1] keys):
-        # Preorder with an explicit stack; a range whose atoms share the octant goes one level down without a node.
-        cdef long n = self.n_slots, most = 4 * n // max(1, self.leaf_size) + 1024, count = 0, depth = 0
-        cdef long begin, end, middle, low, high, octant, i
-        cdef int level, up
-        cdef bint whole
-        cdef int[::1] first = np.empty(most, np.int32), last = np.empty(most, np.int32)
-        cdef int[::1] parent = np.empty(most, np.int32)
-        cdef long[:, ::1] stack = np.empty((8 * (MORTON_BITS + 2), 4), np.int64)
-        cdef long[9] cut
-        stack[0, 0], stack[0, 1], stack[0, 2], stack[0, 3] = 0, n, 3 * (MORTON_BITS - 1), -1
-        depth = 1
-        while depth:
-            depth -= 1
-            begin, end, level, up = stack[depth, 0], stack[depth, 1], <int>stack[depth, 2], <int>stack[depth, 3]
-            if count == most:
-                most *= 2
-                first = np.resize(np.asarray(first), most)
-                last = np.resize(np.asarray(last), most)
-                parent = np.resize(np.asarray(parent), most)
-            first[count], last[count], parent[count] = <int>begin, <int>end, up
-            whole = end - begin > self.leaf_size
-            while whole and level >= 0:
-                cut[0], cut[8] = begin, end
-                for octant in range(1, 8):
-                    low, high = cut[octant - 1], end
-                    while low < high:
-                        middle = (low + high) // 2
-                        if <long>((keys[middle] >> level) & 7) < octant:
-                            low = middle + 1
-                        else:
-                            high = middle
-                    cut[octant] = low
-                level -= 3
-                for octant in range(7, -1, -1):
-                    if 0 < cut[octant + 1] - cut[octant] < end - begin:
-                        whole = False
-                        stack[depth, 0], stack[depth, 1] = cut[octant], cut[octant + 1]
-                        stack[depth, 2], stack[depth, 3] = level, count
-                        depth += 1
-            count += 1
-        self.n_nodes = count
-        self.first = np.asarray(first)[:count].copy()
-        self.last = np.asarray(last)[:count].copy()
-        self.parent = np.asarray(parent)[:count].copy()
-        self.skip = np.zeros(count, np.int32)
-        self.extra = np.full(count, -1, np.int32)
-        for i in range(count - 1, -1, -1):
-            if self.skip[i] == 0:
-                self.skip[i] = <int>i + 1
-                for begin in range(self.first[i], self.last[i]):
-                    self.leaf[begin] = <int>i
-            if i and self.skip[self.parent[i]] < self.skip[i]:
-                self.skip[self.parent[i]] = self.skip[i]
-
-    def _enclose(self, int n_threads):
-        # Ball of a node: the middle of its bounding box, and the distance to its farthest atom.
-        cdef long node, k
-        cdef double cx, cy, cz, far, s
-        cdef double[:, ::1] low, high
-        first = np.asarray(self.first)
-        columns = self.positions[:self.n_sorted]
-        low = np.empty((self.n_nodes, 3))
-        high = np.empty((self.n_nodes, 3))
-        leaves = np.flatnonzero(np.asarray(self.skip) == np.arange(1, self.n_nodes + 1))
-        starts = first[leaves]
-        np.asarray(low)[:] = np.inf
-        np.asarray(high)[:] = -np.inf
-        np.asarray(low)[leaves] = np.minimum.reduceat(columns, starts)
-        np.asarray(high)[leaves] = np.maximum.reduceat(columns, starts)
-        cdef int up
-        cdef int axis
-        for node in range(self.n_nodes - 1, 0, -1):
-            up = self.parent[node]
-            for axis in range(3):
-                low[up, axis] = min(low[up, axis], low[node, axis])
-                high[up, axis] = max(high[up, axis], high[node, axis])
-        self.ball = np.empty((self.n_nodes, 4))
+    cdef enclose(self, int n_threads):
+        # Leaf of every slot, and ball of every node: middle of its bounding box, and distance to its farthest atom.
+        cdef long node
+        cdef int up, axis
+        cdef double[:, ::1] low = np.full((self.n_nodes, 3), np.inf), high = np.full((self.n_nodes, 3), -np.inf)
         for node in prange(self.n_nodes, nogil=True, schedule="dynamic", chunksize=256, num_threads=n_threads):
-            cx = 0.5 * (low[node, 0] + high[node, 0])
-            cy = 0.5 * (low[node, 1] + high[node, 1])
-            cz = 0.5 * (low[node, 2] + high[node, 2])
-            far = 0.0
-            for k in range(self.first[node], self.last[node]):
-                s = (self.x[k] - cx) ** 2 + (self.y[k] - cy) ** 2 + (self.z[k] - cz) ** 2
-                far = max(far, s)
-            self.ball[node, 0] = cx
-            self.ball[node, 1] = cy
-            self.ball[node, 2] = cz
-            self.ball[node, 3] = sqrt(far)
+            if self.skip[node] == node + 1:
+                self.box_of_leaf(node, &low[node, 0], &high[node, 0])
+        self.ball = np.empty((self.n_nodes, 4))
+        with nogil:
+            for node in range(self.n_nodes - 1, 0, -1):
+                up = self.parent[node]
+                for axis in range(3):
+                    low[up, axis] = min(low[up, axis], low[node, axis])
+                    high[up, axis] = max(high[up, axis], high[node, axis])
+        for node in prange(self.n_nodes, nogil=True, schedule="dynamic", chunksize=256, num_threads=n_threads):
+            self.ball_of_box(node, &low[node, 0], &high[node, 0])
+
+    cdef void box_of_leaf(self, long node, double* low, double* high) noexcept nogil:
+        cdef long k
+        for k in range(self.first[node], self.last[node]):
+            self.leaf[k] = <int>node
+            low[0], high[0] = min(low[0], self.x[k]), max(high[0], self.x[k])
+            low[1], high[1] = min(low[1], self.y[k]), max(high[1], self.y[k])
+            low[2], high[2] = min(low[2], self.z[k]), max(high[2], self.z[k])
+
+    cdef void ball_of_box(self, long node, const double* low, const double* high) noexcept nogil:
+        cdef double far = 0.0
+        cdef double* ball = &self.ball[node, 0]
+        cdef long k
+        cdef int axis
+        for axis in range(3):
+            ball[axis] = 0.5 * (low[axis] + high[axis])
+        for k in range(self.first[node], self.last[node]):
+            far = max(far, (self.x[k] - ball[0]) ** 2 + (self.y[k] - ball[1]) ** 2 + (self.z[k] - ball[2]) ** 2)
+        ball[3] = sqrt(far)
+
+    cdef inline long following(self, long node, long slot) noexcept nogil:
+        # The slot of a leaf after this one: those in order, then those put in later; -1 after the last.
+        if slot + 1 < self.last[node]:
+            return slot + 1
+        return self.extra[node] if slot < self.last[node] else self.next_extra[slot]
 
     # ---- charges and moments ---------------------------------------------------------------------------------------
 
@@ -221,21 +117,16 @@ cdef class Octree:
         cdef double xx = 0.0, xy = 0.0, xz = 0.0, yy = 0.0, yz = 0.0, zz = 0.0
         cdef long k, end = self.skip[node]
         cdef bint is_leaf = end == node + 1
+        cdef double* cell
         if is_leaf:
-            for k in range(self.first[node], self.last[node]):
-                q = self.q[k]
-                charge += q
-                cx += q * self.x[k]
-                cy += q * self.y[k]
-                cz += q * self.z[k]
-            k = self.extra[node]
+            k = self.first[node]
             while k >= 0:
                 q = self.q[k]
                 charge += q
                 cx += q * self.x[k]
                 cy += q * self.y[k]
                 cz += q * self.z[k]
-                k = self.next_extra[k]
+                k = self.following(node, k)
         else:
             k = node + 1
             while k < end:
@@ -252,31 +143,17 @@ cdef class Octree:
         else:
             cx, cy, cz = self.ball[node, 0], self.ball[node, 1], self.ball[node, 2]
         if is_leaf:
-            for k in range(self.first[node], self.last[node]):
-                q, dx, dy, dz = self.q[k], self.x[k] - cx, self.y[k] - cy, self.z[k] - cz
-                xx += q * dx * dx
-                xy += q * dx * dy
-                xz += q * dx * dz
-                yy += q * dy * dy
-                yz += q * dy * dz
-                zz += q * dz * dz
-            k = self.extra[node]
+            k = self.first[node]
             while k >= 0:
                 q, dx, dy, dz = self.q[k], self.x[k] - cx, self.y[k] - cy, self.z[k] - cz
-                xx += q * dx * dx
-                xy += q * dx * dy
-                xz += q * dx * dz
-                yy += q * dy * dy
-                yz += q * dy * dz
-                zz += q * dz * dz
-                k = self.next_extra[k]
-            s = xx + yy + zz
-            xx = 3.0 * xx - s
-            yy = 3.0 * yy - s
-            zz = 3.0 * zz - s
-            xy *= 3.0
-            xz *= 3.0
-            yz *= 3.0
+                s = dx * dx + dy * dy + dz * dz
+                xx += q * (3.0 * dx * dx - s)
+                xy += q * 3.0 * dx * dy
+                xz += q * 3.0 * dx * dz
+                yy += q * (3.0 * dy * dy - s)
+                yz += q * 3.0 * dy * dz
+                zz += q * (3.0 * dz * dz - s)
+                k = self.following(node, k)
         else:
             k = node + 1
             while k < end:
@@ -290,16 +167,9 @@ cdef class Octree:
                 yz += self.cells[k, 8] + q * 3.0 * dy * dz
                 zz += self.cells[k, 9] + q * (3.0 * dz * dz - s)
                 k = self.skip[k]
-        self.cells[node, 0] = cx
-        self.cells[node, 1] = cy
-        self.cells[node, 2] = cz
-        self.cells[node, 3] = charge
-        self.cells[node, 4] = xx
-        self.cells[node, 5] = xy
-        self.cells[node, 6] = xz
-        self.cells[node, 7] = yy
-        self.cells[node, 8] = yz
-        self.cells[node, 9] = zz
+        cell = &self.cells[node, 0]
+        cell[0], cell[1], cell[2], cell[3] = cx, cy, cz, charge
+        cell[4], cell[5], cell[6], cell[7], cell[8], cell[9] = xx, xy, xz, yy, yz, zz
 
     def refresh_all(self):
         """Moments of every node from the charges."""
@@ -383,18 +253,13 @@ cdef class Octree:
                 sources.n_cells += 1
                 node = self.skip[node]
             elif self.skip[node] == node + 1:
-                while sources.n_atoms + self.last[node] - self.first[node] >= sources.capacity:
-                    sources_grow(sources)
-                for k in range(self.first[node], self.last[node]):
-                    if self.atom[k] >= 0:
-                        self.add_atom(k, sources)
-                k = self.extra[node]
+                k = self.first[node]
                 while k >= 0:
                     if sources.n_atoms >= sources.capacity:
                         sources_grow(sources)
                     if self.atom[k] >= 0:
                         self.add_atom(k, sources)
-                    k = self.next_extra[k]
+                    k = self.following(node, k)
                 node += 1
             else:
                 node += 1
@@ -425,20 +290,14 @@ cdef class Octree:
                 node = self.skip[node]
                 continue
             if self.skip[node] == node + 1:
-                for k in range(self.first[node], self.last[node]):
-                    dx, dy, dz = px - self.x[k], py - self.y[k], pz - self.z[k]
-                    if self.atom[k] >= 0 and dx * dx + dy * dy + dz * dz <= radius * radius:
-                        if n < most:
-                            slots[n] = <int>k
-                        n += 1
-                k = self.extra[node]
+                k = self.first[node]
                 while k >= 0:
                     dx, dy, dz = px - self.x[k], py - self.y[k], pz - self.z[k]
                     if self.atom[k] >= 0 and dx * dx + dy * dy + dz * dz <= radius * radius:
                         if n < most:
                             slots[n] = <int>k
                         n += 1
-                    k = self.next_extra[k]
+                    k = self.following(node, k)
             node += 1
         return n
 
@@ -485,24 +344,10 @@ cdef class Octree:
 
     cdef double potential_at(self, double px, double py, double pz, double opening_angle) except? -1 nogil:
         cdef Sources sources
-        cdef double total = 0.0, dx, dy, dz, s, w2
-        cdef long k, stride
-        cdef double* c
+        cdef double total
         sources_init(&sources)
         self.collect(px, py, pz, 0.0, opening_angle, &sources)
-        stride = sources.capacity
-        for k in range(sources.n_atoms):
-            dx, dy, dz = px - sources.atoms[k], py - sources.atoms[stride + k], pz - sources.atoms[2 * stride + k]
-            s = dx * dx + dy * dy + dz * dz
-            if s > 1e-12:
-                total += sources.atoms[3 * stride + k] / sqrt(s)
-        for k in range(sources.n_cells):
-            c = sources.cells + k
-            dx, dy, dz = px - c[0], py - c[stride], pz - c[2 * stride]
-            w2 = 1.0 / (dx * dx + dy * dy + dz * dz)
-            s = c[4 * stride] * dx * dx + c[7 * stride] * dy * dy + c[9 * stride] * dz * dz + 2.0 * (
-                c[5 * stride] * dx * dy + c[6 * stride] * dx * dz + c[8 * stride] * dy * dz)
-            total += sqrt(w2) * (c[3 * stride] + 0.5 * s * w2 * w2)
+        total = sources_potential(&sources, px, py, pz)
         sources_free(&sources)
         return total
 

@@ -205,9 +205,9 @@ def _write_table(study, path):
 
 
 def _write_overlay(study, path):
-    simulated = study.compared(study.maps["optimum"])
-    axes = plot.overlay(simulated, study.compared(study.measured), None)
-    axes.figure.savefig(path, dpi=150)
+    # both are in the measured frame already
+    ax = plot.overlay(study.maps["optimum"], study.measured, Registration(0.0, 1.0, (0.0, 0.0)), title="registration")
+    ax.figure.savefig(path)
 
 
 FILES = {
