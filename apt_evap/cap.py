@@ -10,7 +10,6 @@ from scipy.optimize import least_squares
 from apt_evap._arrays import check_array, check_count, check_kind, check_number, check_sequence
 from apt_evap.perturbation import Unperturbed
 from apt_evap.projection import Projection
-from apt_evap.run import Run
 
 _CAP = math.radians(45)  # launch sites nearer to the axis than this make the sphere: the shank is far
 _NEAR = math.radians(20)  # about the apex, for its field
@@ -74,7 +73,7 @@ def fit_caps(run, windows=None):
     ValueError
         If a window has too few ions near the axis (50).
     """
-    n = len(check_kind(run, "run", Run, "a Run"))
+    n = len(check_kind(run, "run", "hits", "a Run"))
     windows = min(10, max(1, n // 500)) if windows is None else check_count(windows, "windows", at_least=1)
     edges = np.linspace(0, n, windows + 1).astype(int)
     caps = []
@@ -116,7 +115,7 @@ def image_compression(run, caps=None):
     azimuths stands against what poles and zone lines do to their surroundings; within some 15 degrees of a pole on the
     axis all ions are pushed outwards, so that these do not count.
     """
-    hits = check_kind(run, "run", Run, "a Run").hits(Unperturbed())
+    hits = check_kind(run, "run", "hits", "a Run").hits(Unperturbed())
     crystal = np.empty(len(run))
     for cap in _caps_of(run, caps):
         from_centre = run.emissions.positions[cap.first : cap.last] - cap.centre
@@ -225,7 +224,7 @@ def _caps_of(run, caps):
     """The caps given, or those of `fit_caps`."""
     if caps is None:
         return fit_caps(run)
-    check_kind(run, "run", Run, "a Run")
+    check_kind(run, "run", "hits", "a Run")
     caps = check_sequence(caps, "caps", "Cap, as fit_caps gives them")
     return [check_kind(cap, "caps", Cap, "a sequence of Cap, as fit_caps gives them") for cap in caps]
 

@@ -21,13 +21,14 @@ exit codes:
 """What the exit codes mean, for the help."""
 
 _PATH = """\
-from nothing to a map and back (the first line writes what the others read):
+from nothing to a map, and to the energies behind a measured one (the first line writes what the others read):
   apt-evap run examples/ni111.toml                   simulate; writes ni111.h5 and maps of it, ni111.png
   apt-evap info ni111.h5                             what the run holds: specimen, ions, outcomes
   apt-evap map ni111.h5 --perturbation RollUp:0.3 -o rolled.png
                                                      the same ions, all rolled up with 0.3 eV, in a second
   apt-evap info R5083.epos --json | jq .ions         measured files too; --json for programs
   apt-evap map R5083.epos --bins 128                 a measured map beside them
+  apt-evap compare ni111.h5 R5083.epos -o study      the energies for which the run looks most like the measured map
   apt-evap COMMAND --help                            everything a command takes, with examples
 """
 
