@@ -83,7 +83,7 @@ class Study:
     shares : ndarray
         Share of the resamples in which a point is the best.
     resampled : ndarray
-        Similarities in every resample, shape (resamples, *grid.shape).
+        Similarities in every resample, shape (resamples, a, b, c).
     optimum, refined : Optimum
         The best point of the grid, and that of a smooth model around it.
     baselines : dict of Score
