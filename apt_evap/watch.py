@@ -98,9 +98,8 @@ def charge_residuals(emitter, sample, seed):
     Notes
     -----
     (s/2 pi) sum_k q_k n_i . r_ik / r_ik^3 - q_i, with r_ik = r_i - r_k and the area per atom s of the last relaxation
-    (Rolland
-    et al., Microsc. Microanal. 21, 1649, 2015). Each sweep of Robin's iteration about halves the error, so that it is
-    about as large as the residual.
+    (Rolland et al., Microsc. Microanal. 21, 1649, 2015). Each sweep of Robin's iteration about halves the error, so
+    that it is about as large as the residual.
     """
     positions, normals, charges = emitter.positions, emitter.normals, emitter.charges
     chosen = np.flatnonzero(emitter.tip.evaporable[emitter.atoms])

@@ -46,7 +46,7 @@ def profile(profiles, labels=None, ax=None, *, lines=None, xlabel="distance from
         color = f"C{index}"
         errors = one.error if np.isfinite(one.error).any() else None
         if line is not None:
-            label = f"{label or line.kind}: {line.width:.1f} ± {line.width_error:.1f} mm"
+            label = f"{label or line.kind}: {line.width:.2f} ± {line.width_error:.2f} mm"
             fine = np.linspace(one.position[0], one.position[-1], 400)
             ax.plot(fine, line.density(fine), color=color, linewidth=1.5, alpha=0.85)
         ax.errorbar(
@@ -96,7 +96,7 @@ def profile_comparison(first, second, labels=None, axes=None, *, lines=None):
     lower.axhspan(-1, 1, color="0.9", linewidth=0)
     lower.axhline(0, color="0.4", linewidth=0.8)
     lower.bar(compared.position, compared.difference, 0.8 * bin_width, color="0.35")
-    reach = max(4.0, 1.1 * np.nanmax(np.abs(compared.difference)))
+    reach = max(4.0, 1.6 * np.nanmax(np.abs(compared.difference)))  # room for the text above the bars
     lower.set(ylim=(-reach, reach), xlabel="distance from the line [mm]", ylabel="difference\n/ error")
     lower.annotate(
         f"$\\chi^2$ = {compared.chi_square:.0f} for {compared.degrees_of_freedom}", (0.02, 0.95),
