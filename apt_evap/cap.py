@@ -1,13 +1,16 @@
 """What the ions of a run say about the shape of the cap and the way to the detector."""
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
 from apt_evap._arrays import check_array, check_count, check_kind, check_number, check_sequence
+from apt_evap._types import Floats
 from apt_evap.perturbation import Unperturbed
 from apt_evap.projection import Projection
 from apt_evap.run import Run
@@ -52,7 +55,7 @@ class ImageCompression(NamedTuple):
     """The projection of the run onto its detector, for overlays of poles."""
 
 
-def fit_caps(run, windows=None):
+def fit_caps(run: Run, windows: int | None = None) -> tuple[Cap, ...]:
     """Fit a sphere to the launch sites of each of several windows of a run.
 
     The cap recedes and changes its radius as it evaporates; angles on the specimen make sense only about the centre
@@ -74,7 +77,7 @@ def fit_caps(run, windows=None):
     ValueError
         If a window has too few ions near the axis (50).
     """
-    n = len(check_kind(run, "run", Run, "a Run"))
+    n = len(check_kind(run, "run", "hits", "a Run"))
     windows = min(10, max(1, n // 500)) if windows is None else check_count(windows, "windows", at_least=1)
     edges = np.linspace(0, n, windows + 1).astype(int)
     caps = []
@@ -91,7 +94,7 @@ def fit_caps(run, windows=None):
     return tuple(caps)
 
 
-def image_compression(run, caps=None):
+def image_compression(run: Run, caps: Sequence[Cap] | None = None) -> ImageCompression:
     """Read the image compression of a run from its unperturbed hits.
 
     Parameters
@@ -116,7 +119,7 @@ def image_compression(run, caps=None):
     azimuths stands against what poles and zone lines do to their surroundings; within some 15 degrees of a pole on the
     axis all ions are pushed outwards, so that these do not count.
     """
-    hits = check_kind(run, "run", Run, "a Run").hits(Unperturbed())
+    hits = check_kind(run, "run", "hits", "a Run").hits(Unperturbed())
     crystal = np.empty(len(run))
     for cap in _caps_of(run, caps):
         from_centre = run.emissions.positions[cap.first : cap.last] - cap.centre
@@ -153,7 +156,7 @@ def image_compression(run, caps=None):
     return ImageCompression(compression, scatter, low, high, angles, medians, projection)
 
 
-def field_factor(voltage, field, radius):
+def field_factor(voltage: ArrayLike, field: ArrayLike, radius: ArrayLike) -> Any:
     """Field factor k_f of a specimen, in F = V / (k_f R).
 
     Parameters
@@ -189,7 +192,7 @@ def field_factor(voltage, field, radius):
     return float(factor) if factor.ndim == 0 else factor
 
 
-def run_field_factor(run, caps=None):
+def run_field_factor(run: Run, caps: Sequence[Cap] | None = None) -> Floats:
     """Read the field factor of a run from the fields at which its ions left.
 
     Parameters
@@ -225,7 +228,7 @@ def _caps_of(run, caps):
     """The caps given, or those of `fit_caps`."""
     if caps is None:
         return fit_caps(run)
-    check_kind(run, "run", Run, "a Run")
+    check_kind(run, "run", "hits", "a Run")
     caps = check_sequence(caps, "caps", "Cap, as fit_caps gives them")
     return [check_kind(cap, "caps", Cap, "a sequence of Cap, as fit_caps gives them") for cap in caps]
 

@@ -1,11 +1,15 @@
 """Registration: the rotation, scale, shift and mirror that bring a simulated map into the frame of a measured one."""
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from apt_evap._arrays import check_array, check_number, check_sequence, check_switch
+from apt_evap._types import Floats
 from apt_evap.alignment import (
     FINE,
     MEDIUM,
@@ -18,6 +22,7 @@ from apt_evap.alignment import (
     refine,
     search,
 )
+from apt_evap.hits import Hits
 from apt_evap.maps import DetectorMap
 
 DOUBTFUL = 0.5
@@ -75,7 +80,7 @@ class Registration:
         object.__setattr__(self, "mirror", check_switch(self.mirror, "mirror"))
         object.__setattr__(self, "ties", tuple(self.ties))
 
-    def points(self, x, y):
+    def points(self, x: ArrayLike, y: ArrayLike) -> tuple[Floats, Floats]:
         """Move points into the measured frame.
 
         Parameters
@@ -92,7 +97,7 @@ class Registration:
         moved = self._turn * (z.conj() if self.mirror else z) + complex(*self.shift)
         return moved.real, moved.imag
 
-    def hits(self, hits):
+    def hits(self, hits: Hits) -> "Hits":
         """Move hits into the measured frame.
 
         Parameters
@@ -109,7 +114,7 @@ class Registration:
         return replace(hits, x=x, y=y)
 
     @property
-    def inverse(self):
+    def inverse(self) -> "Registration":
         """The transform from the measured into the simulated frame, a Registration without score."""
         rotation = self.rotation if self.mirror else -self.rotation
         back = Registration(rotation, 1 / self.scale, (0.0, 0.0), self.mirror)
@@ -120,14 +125,14 @@ class Registration:
     def _turn(self):
         return self.scale * np.exp(1j * np.radians(self.rotation))
 
-    def to_dict(self):
+    def to_dict(self) -> dict[str, Any]:
         """Return it as plain types that JSON can hold (dict); NaN becomes None."""
         plain = asdict(self)
         plain.update(shift=list(self.shift), ties=[tie.to_dict() for tie in self.ties])
         return {name: None if value != value else value for name, value in plain.items()}
 
     @classmethod
-    def from_dict(cls, settings):
+    def from_dict(cls, settings: dict[str, Any]) -> "Registration":
         """Make it from what `to_dict` returned.
 
         Parameters
@@ -152,17 +157,17 @@ class Registration:
 
 
 def register(
-    simulated,
-    measured,
+    simulated: DetectorMap | Hits,
+    measured: DetectorMap | Hits,
     *,
-    start=None,
-    pole=None,
-    tolerance=None,
-    rotations=None,
-    scales=None,
-    mirrors=None,
-    overlap=0.5,
-):
+    start: Registration | None = None,
+    pole: tuple[Any, ...] | None = None,
+    tolerance: float | None = None,
+    rotations: float | tuple[float, ...] | None = None,
+    scales: float | tuple[float, ...] | None = None,
+    mirrors: Sequence[bool] | None = None,
+    overlap: float = 0.5,
+) -> "Registration":
     """Find the rotation, scale, shift and mirror that bring a simulated map onto a measured one.
 
     Both maps are smoothed a little and divided by themselves, smoothed a lot: what is left are poles and zone lines,
@@ -265,7 +270,9 @@ def register(
     return best
 
 
-def register_points(simulated_points, measured_points, mirror=None):
+def register_points(
+    simulated_points: ArrayLike, measured_points: ArrayLike, mirror: bool | None = None
+) -> "Registration":
     """Find the transform that brings simulated points, such as poles, onto measured ones (least squares).
 
     Parameters

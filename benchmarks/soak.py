@@ -36,7 +36,7 @@ def bytes_of(run):
     """Memory of the results of a run [bytes]."""
     arrays = [value for value in vars(run.emissions).values() if isinstance(value, np.ndarray)]
     arrays += [run.site, run.species, run.charges, run.fields]
-    arrays += [array for flown in run.flown for array in flown]
+    arrays += [array for flown in run.flown for array in (flown.directions, flown.times)]
     arrays += list(run.responses or ())
     return sum(array.nbytes for array in arrays)
 

@@ -127,7 +127,7 @@ def test_figure_2_of_a_small_tip(folder, monkeypatch, capsys):
 def test_figure_7_of_runs_that_are_there(folder, monkeypatch, capsys, run20):
     """The script turns the crystal by 90 degrees; so is the run here, and taken for both radii."""
     first, rolled = run20.flown
-    turned = rolled._replace(directions=rolled.directions @ [[0, 1], [-1, 0]])
+    turned = replace(rolled, directions=rolled.directions @ [[0, 1], [-1, 0]])
     run = replace(run20, flown=(first, turned))
     for name in ("figure7_R20a.h5", "figure7_R30a.h5"):
         run.save(folder / name)

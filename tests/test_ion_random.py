@@ -66,7 +66,7 @@ def test_normal_numbers():
         (2**64, [0], r"seed must be .* at most 18,446"),
         (1.5, [0], "seed must be"),
         (1, [0.5], "ions must hold whole numbers"),
-        (1, 3, r"ions must have shape \(n,\)"),
+        (1, 3, r"ions must be an array of numbers of shape \(n,\)"),
     ],
 )
 def test_bad_keys_are_refused(seed, ions, message):

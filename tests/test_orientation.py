@@ -140,7 +140,7 @@ def test_given_indices_tell_the_handedness_and_the_lattice_does_not():
         ({"planes": [(1, 1, 1), (0, 0, 0)]}, "planes must not have indices that are all 0"),
         ({"lines": [(1, 1, 1)]}, "lines must be pairs of Miller indices and points"),
         ({"lines": [((2, 2, 2), [(3, 3)])]}, "must be another one than that of the first pole"),
-        ({"mirror": "yes"}, "mirror must be True, False or None"),
+        ({"mirror": "yes"}, "mirror must be True or False, got"),
         ({"scale": -1}, "scale must be a finite number"),
         ({"material": 3}, "material must be a Material or the name of one"),
     ],

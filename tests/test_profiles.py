@@ -133,7 +133,10 @@ def test_a_map_counts_only_inside_its_mask():
         (lambda hits: azimuthal_profile(hits, inner=3, outer=2), "outer must be"),
         (lambda hits: radial_profile(hits, (99, 99), outer=1), "there are none between inner and outer"),
         (lambda hits: zone_line_profile(hits, Rectangle((99, 99), 0, 1, 1)), r"there are none in Rectangle\(centre="),
-        (lambda hits: zone_line_profile(hits, AROUND, bins=0), "bins must be a whole number of at least 1, got 0"),
+        (
+            lambda hits: zone_line_profile(hits, AROUND, bins=0),
+            "bins must be a whole number of at least 1 and at most 16,384, got 0",
+        ),
         (
             lambda hits: zone_line_profile(hits, []),
             r"rectangles must be at least one, all of one width, got widths \[\]",

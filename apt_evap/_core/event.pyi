@@ -1,5 +1,3 @@
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -13,12 +11,25 @@ SWEEP_DUE: int
 EXHAUSTED: int
 TOO_SHALLOW: int
 
-class Start(NamedTuple):
-    n_removed: int
-    charges: NDArray[np.float64]
-    lonely: NDArray[np.int64]
-    lonely_normals: NDArray[np.float64]
-    potential_point: NDArray[np.float64]
+class Start:
+    def __init__(
+        self,
+        n_removed: int,
+        charges: NDArray[np.float64],
+        lonely: NDArray[np.int64],
+        lonely_normals: NDArray[np.float64],
+        potential_point: NDArray[np.float64],
+    ) -> None: ...
+    @property
+    def n_removed(self) -> int: ...
+    @property
+    def charges(self) -> NDArray[np.float64]: ...
+    @property
+    def lonely(self) -> NDArray[np.int64]: ...
+    @property
+    def lonely_normals(self) -> NDArray[np.float64]: ...
+    @property
+    def potential_point(self) -> NDArray[np.float64]: ...
 
 class Evaporation:
     def __init__(

@@ -6,8 +6,6 @@ over is smooth, and `relax` (a sweep over the whole surface every so many events
 not depend on the size of the specimen.
 """
 
-from collections import namedtuple
-
 from libc.math cimport sqrt
 
 import numpy as np
@@ -40,10 +38,19 @@ cdef enum:
 DONE, SWEEP_DUE, EXHAUSTED, TOO_SHALLOW = STATUS_DONE, STATUS_SWEEP_DUE, STATUS_EXHAUSTED, STATUS_TOO_SHALLOW
 
 
-Start = namedtuple("Start", "n_removed charges lonely lonely_normals potential_point")
-"""What a relaxation starts from: events so far, charges of the surface atoms in the order of their numbers (n,) [e],
-atoms that keep the normal they had since no neighbour pulls (m,), these normals (m, 3), and the point that has the
-potential (1, 3) [nm]. With the atoms that are left it makes the same charges again, bit by bit."""
+cdef class Start:
+    """What a relaxation starts from; with the atoms that are left it makes the same charges again, bit by bit.
+
+    Events so far, charges of the surface atoms in the order of their numbers (n,) [e], atoms that keep the normal they
+    had since no neighbour pulls (m,), these normals (m, 3), and the point that has the potential (1, 3) [nm].
+    """
+
+    cdef readonly long n_removed
+    cdef readonly object charges, lonely, lonely_normals, potential_point
+
+    def __init__(self, long n_removed, charges, lonely, lonely_normals, potential_point):
+        self.n_removed, self.charges, self.potential_point = n_removed, charges, potential_point
+        self.lonely, self.lonely_normals = lonely, lonely_normals
 
 
 cdef class Evaporation:

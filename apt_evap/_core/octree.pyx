@@ -15,7 +15,7 @@ from apt_evap._core.sources cimport (
 
 import numpy as np
 
-from apt_evap._core.morton import morton_order, split
+import apt_evap._core.morton as morton
 
 
 cdef class Octree:
@@ -45,8 +45,8 @@ cdef class Octree:
         cdef const long long[::1] numbers = np.empty(0, np.int64) if numbered else np.asarray(atoms, np.int64)
         if n == 0:
             raise ValueError("an octree needs at least one atom, got none")
-        order, keys = morton_order(positions, n_threads)
-        self.first, self.last, self.parent, self.skip = split(keys, leaf_size, n_threads)
+        order, keys = morton.morton_order(positions, n_threads)
+        self.first, self.last, self.parent, self.skip = morton.split(keys, leaf_size, n_threads)
         self.leaf_size = leaf_size
         self.n_slots = self.n_sorted = n
         self.n_nodes = self.first.shape[0]

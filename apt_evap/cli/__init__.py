@@ -4,6 +4,8 @@ import argparse
 import os
 import sys
 import warnings
+from collections.abc import Sequence
+from typing import NoReturn
 
 from apt_evap._version import __version__
 from apt_evap.cli import compare, info, map, run
@@ -21,18 +23,19 @@ exit codes:
 """What the exit codes mean, for the help."""
 
 _PATH = """\
-from nothing to a map and back (the first line writes what the others read):
+from nothing to a map, and to the energies behind a measured one (the first line writes what the others read):
   apt-evap run examples/ni111.toml                   simulate; writes ni111.h5 and maps of it, ni111.png
   apt-evap info ni111.h5                             what the run holds: specimen, ions, outcomes
   apt-evap map ni111.h5 --perturbation RollUp:0.3 -o rolled.png
                                                      the same ions, all rolled up with 0.3 eV, in a second
   apt-evap info R5083.epos --json | jq .ions         measured files too; --json for programs
   apt-evap map R5083.epos --bins 128                 a measured map beside them
+  apt-evap compare ni111.h5 R5083.epos -o study      the energies for which the run looks most like the measured map
   apt-evap COMMAND --help                            everything a command takes, with examples
 """
 
 
-def main(arguments=None):
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
     Parameters
@@ -51,7 +54,7 @@ def main(arguments=None):
             try:
                 options = _parser().parse_args(arguments)
             except SystemExit as stop:  # --help and --version
-                return stop.code or 0
+                return stop.code or 0  # type: ignore[return-value]
             code = options.command(options)
             sys.stdout.flush()
             return code
@@ -70,7 +73,7 @@ def main(arguments=None):
 
 
 class _Parser(argparse.ArgumentParser):
-    def error(self, message):
+    def error(self, message: str) -> NoReturn:
         raise ValueError(f"{message} (see {self.prog} --help)")
 
 
