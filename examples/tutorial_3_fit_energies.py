@@ -14,7 +14,7 @@ import sys
 import apt_evap as ae
 
 n_ions = int(sys.argv[1]) if len(sys.argv) > 1 else 15_000
-size, bins = (20, 64) if n_ions >= 5_000 else (10, 24)  # radius in lattice constants; bins across the measured map
+size, bins = (20, 48) if n_ions >= 5_000 else (10, 24)  # radius in lattice constants; bins across the measured map
 n_ions = max(n_ions, 1_500)  # fewer show no pattern to register
 nickel = ae.material("Ni")
 
@@ -53,9 +53,10 @@ print(run)
 # three such places, and three mirrored ones, that fit as well: the others are ``ties``. Always look at the overlay.
 
 guess = run.hits(ae.RollUp(0.1)).map(bins=2 * bins, quantum=None)
-registration = ae.register(guess, measured.map(bins=bins, quantum=None))
+seen = measured.map(bins=bins, quantum=None)
+registration = ae.register(guess, seen)
 print(f"{registration}, correlation {registration.score:.2f}, {len(registration.ties)} ties")
-ae.plot.overlay(guess, measured.map(bins=bins, quantum=None), registration).figure.savefig("overlay.png")
+ae.plot.overlay(guess, seen.smoothed(0.6), registration).figure.savefig("overlay.png")
 
 # %%
 # What is compared: both maps on the same bins, where both show something; each divided by itself, smoothed broadly, so
@@ -65,12 +66,11 @@ ae.plot.overlay(guess, measured.map(bins=bins, quantum=None), registration).figu
 
 study = ae.fit_energies(
     run,
-    measured,
+    seen,
     mechanism="roll-up",
     means=(0.01, 0.0825, 0.155, 0.2275, 0.3),
-    rsds=(0.1, 0.316, 1.0, 3.16),
+    rsds=(0.0316, 0.1, 0.316, 1.0, 3.16),
     registration=registration,
-    bins=bins,
     resamples=100,
 )
 print(study)
