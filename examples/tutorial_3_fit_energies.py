@@ -50,7 +50,8 @@ print(run)
 
 # %%
 # Registration: where the simulated map lies on the measured one. Any energy of the right order does. A [111] axis has
-# three such places, and three mirrored ones, that fit as well: the others are ``ties``. Always look at the overlay.
+# three such places, and three mirrored ones, alike but for noise: what fits as well is in ``ties``. Always look at the
+# overlay.
 
 guess = run.hits(ae.RollUp(0.1)).map(bins=2 * bins, quantum=None)
 seen = measured.map(bins=bins, quantum=None)
