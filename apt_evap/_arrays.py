@@ -3,11 +3,13 @@
 import hashlib
 import math
 import reprlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from numbers import Integral, Real
+from typing import Any
 
 import numpy as np
+from numpy.typing import DTypeLike, NDArray
 
 LARGEST_SEED = 2**64 - 1
 _LARGEST_COUNT = 2**63 - 1  # what the compiled core counts with
@@ -16,7 +18,9 @@ _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 100
 
 
-def check_array(value, name, shape, *, dtype=np.float64, finite=True):
+def check_array(
+    value: Any, name: str, shape: tuple[int | str, ...], *, dtype: DTypeLike = np.float64, finite: bool = True
+) -> NDArray[Any]:
     """Return `value` as a C-contiguous array of `dtype`, or say in one sentence what is wrong.
 
     Parameters
@@ -72,7 +76,16 @@ def _at_first(array, wrong):
     return f"{array[first]} at index {first}"
 
 
-def check_number(value, name, *, above=None, at_least=None, at_most=None, below=None, unit=""):
+def check_number(
+    value: Any,
+    name: str,
+    *,
+    above: float | None = None,
+    at_least: float | None = None,
+    at_most: float | None = None,
+    below: float | None = None,
+    unit: str = "",
+) -> float:
     """Return `value` as a finite float within its bounds, or say in one sentence what is wrong.
 
     Parameters
@@ -111,7 +124,7 @@ def check_number(value, name, *, above=None, at_least=None, at_most=None, below=
     return float(value)
 
 
-def check_count(value, name, *, at_least=0, at_most=_LARGEST_COUNT):
+def check_count(value: Any, name: str, *, at_least: int = 0, at_most: int = _LARGEST_COUNT) -> int:
     """Return `value` as an int from `at_least` to `at_most`, or say in one sentence what is wrong.
 
     Parameters
@@ -141,26 +154,26 @@ def check_count(value, name, *, at_least=0, at_most=_LARGEST_COUNT):
     return int(value)
 
 
-def check_seed(value, name="seed"):
+def check_seed(value: Any, name: str = "seed") -> int:
     """Return a seed, a whole number from 0 to 2^64 - 1, or say what is wrong (ValueError)."""
     return check_count(value, name, at_most=LARGEST_SEED)
 
 
-def check_switch(value, name):
+def check_switch(value: Any, name: str) -> bool:
     """Return `value` if it is true or false, or say what it is (ValueError): "no" counts as neither."""
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name} must be True or False, got {shown(value)}")
     return bool(value)
 
 
-def check_choice(value, name, known):
+def check_choice(value: Any, name: str, known: Iterable[str]) -> str:
     """Return `value` if it is one of the words in `known`, or say which ones are and the nearest (ValueError)."""
     if not isinstance(value, str) or value not in list(known):
         raise ValueError(f"{name} must be one of {', '.join(known)}, got {shown(value)}{did_you_mean(value, known)}")
     return value
 
 
-def check_kind(value, name, kind, wanted):
+def check_kind(value: Any, name: str, kind: Any, wanted: str) -> Any:
     """Return `value` if it is of a type, or say what was wanted.
 
     Parameters
@@ -189,7 +202,7 @@ def check_kind(value, name, kind, wanted):
     return value
 
 
-def check_sequence(value, name, wanted):
+def check_sequence(value: Any, name: str, wanted: str) -> tuple[Any, ...]:
     """Return the members of a sequence as a tuple, or say what was wanted (ValueError); text is no sequence."""
     try:
         if isinstance(value, str | bytes | Mapping):
@@ -199,14 +212,14 @@ def check_sequence(value, name, wanted):
         raise ValueError(f"{name} must be a sequence of {wanted}, got {shown(value)}") from error
 
 
-def did_you_mean(word, known):
+def did_you_mean(word: object, known: Iterable[str]) -> str:
     """A hint at the nearest of the words in `known`, whatever their case; "" if none is near."""
     lower = {name.lower(): name for name in known}
     close = get_close_matches(str(word).lower(), lower, n=1, cutoff=0.5) if isinstance(word, str) else ()
     return f" (did you mean {lower[close[0]]!r}?)" if close else ""
 
 
-def shown(value):
+def shown(value: object) -> str:
     """A value in one short line, for messages."""
     try:
         text = _SHORT.repr(value.item() if isinstance(value, np.generic) else value)
@@ -215,9 +228,9 @@ def shown(value):
     return " ".join(text.split())
 
 
-def digest(*arrays):
+def digest(*arrays: Any) -> str:
     """Hash of some arrays (str), by which they are known again."""
     hashed = hashlib.sha256()
     for array in arrays:
-        hashed.update(np.ascontiguousarray(array))
+        hashed.update(np.ascontiguousarray(array))  # type: ignore[arg-type]
     return hashed.hexdigest()

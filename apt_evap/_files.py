@@ -1,8 +1,12 @@
 """What every reader and writer shares: errors in one sentence, whole files or none."""
 
 import os
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any, BinaryIO
+
+from apt_evap._types import AnyPath
 
 
 class FileError(ValueError):
@@ -13,7 +17,7 @@ class TruncatedFile(FileError):
     """A file that ends in the middle of an ion."""
 
 
-def check_path(path):
+def check_path(path: Any) -> Path:
     """Return `path` as a Path.
 
     Raises
@@ -27,7 +31,7 @@ def check_path(path):
 
 
 @contextmanager
-def open_for_reading(path):
+def open_for_reading(path: AnyPath) -> Iterator[BinaryIO]:
     """Open a file for reading bytes.
 
     Parameters
@@ -54,7 +58,7 @@ def open_for_reading(path):
 
 
 @contextmanager
-def replace_file(path):
+def replace_file(path: AnyPath) -> Iterator[BinaryIO]:
     """Write a file aside, in the same folder, and put it in its place only once it is complete.
 
     Parameters
@@ -90,7 +94,7 @@ def replace_file(path):
         aside.unlink(missing_ok=True)
 
 
-def flush_folder(folder):
+def flush_folder(folder: AnyPath) -> None:
     """Make sure that the names of new files are on the disk too, where the system can do that."""
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)

@@ -16,12 +16,12 @@ def _available_memory():
         return None
 
 
-def needed_memory(atoms, surface_atoms):
+def needed_memory(atoms: float, surface_atoms: float) -> float:
     """Most memory [bytes] that a specimen and its charges take, from how many atoms it has and has on the surface."""
     return _BYTES_PER_ATOM * atoms + _BYTES_PER_SURFACE_ATOM * surface_atoms
 
 
-def check_memory(atoms, surface_atoms):
+def check_memory(atoms: float, surface_atoms: float) -> None:
     """Refuse a specimen that, with its charges, does not fit into the memory that is free.
 
     Parameters
@@ -41,7 +41,7 @@ def check_memory(atoms, surface_atoms):
     )
 
 
-def check_copies(surface_atoms, n_threads):
+def check_copies(surface_atoms: float, n_threads: int) -> None:
     """Refuse more threads than there is memory for, each with a copy of the surface (ValueError)."""
     _check(
         _BYTES_PER_COPIED_ATOM * surface_atoms * n_threads,

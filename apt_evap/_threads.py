@@ -7,7 +7,7 @@ from apt_evap._arrays import check_count
 MOST_THREADS = 1024  # each has a copy of the surface; more is a slip of the keyboard
 
 
-def thread_count(n_threads=None):
+def thread_count(n_threads: int | None = None) -> int:
     """Return the number of threads to use.
 
     Parameters

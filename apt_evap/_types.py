@@ -1,8 +1,11 @@
-"""Names for the arrays in signatures."""
+"""Names for the arrays and files in signatures."""
+
+import os
 
 import numpy as np
 from numpy.typing import NDArray
 
+AnyPath = str | os.PathLike[str]
+Booleans = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
-Booleans = NDArray[np.bool_]

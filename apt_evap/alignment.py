@@ -1,12 +1,15 @@
 """Where one map fits best on another: flattened images, masked correlations, a search and its refinement."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import fft, ndimage, optimize
 
+from apt_evap._types import Booleans, Floats
 from apt_evap.binning import field_of_view
+from apt_evap.maps import DetectorMap
 
 COARSE, MEDIUM, FINE = 40, 60, 100
 """Pixels across the field of view in the search, when its best places are refined, and at the end."""
@@ -34,17 +37,17 @@ class Placement(NamedTuple):
     place: complex
     """Where it comes to lie."""
 
-    def forth(self, points):
+    def forth(self, points: Any) -> Any:
         """Move simulated points into the measured frame."""
         away = points - self.anchor
         return self.place + self._turn * (np.conj(away) if self.mirror else away)
 
-    def back(self, points):
+    def back(self, points: Any) -> Any:
         """Move measured points into the simulated frame."""
         away = (points - self.place) / self._turn
         return self.anchor + (np.conj(away) if self.mirror else away)
 
-    def anchored(self, place):
+    def anchored(self, place: complex) -> "Placement":
         """The same transform with the anchor that comes to lie at `place`."""
         return self._replace(anchor=self.back(place), place=place)
 
@@ -63,7 +66,7 @@ class Fit(NamedTuple):
     """Share of the measured field of view where both do."""
 
     @property
-    def rank(self):
+    def rank(self) -> float:
         """What the search maximises: a match of more of the map counts more, as the error of a mean does."""
         return self.score * np.sqrt(self.overlap)
 
@@ -88,7 +91,7 @@ class Image:
     origin: complex
     bin_size: tuple
 
-    def sample(self, points):
+    def sample(self, points: Any) -> tuple[Floats, Booleans]:
         """Values at points, 0 outside, and whether points are inside; both of the shape of `points`."""
         place = points - self.origin
         index = np.stack([place.imag / self.bin_size[1], place.real / self.bin_size[0]])
@@ -105,7 +108,7 @@ class View:
         The map.
     """
 
-    def __init__(self, map):
+    def __init__(self, map: DetectorMap) -> None:
         # densities are as good as 20 hits per bin, over which field_of_view averages
         values = map.values if map.is_counts else map.values * (20 / map.values[map.mask].mean())
         mask = np.pad(map.mask & field_of_view(np.where(map.mask, values, 0)), 1)
@@ -119,7 +122,7 @@ class View:
         self.diameter = float(2 * np.sqrt(len(points) * width * height / np.pi))
         self.reach = float(np.abs(points - self.centre).max())
 
-    def flatten(self, narrow, broad):
+    def flatten(self, narrow: float, broad: float) -> Image:
         """Density smoothed by `narrow` relative to that smoothed by `broad` [mm], less its mean, as an `Image`.
 
         A tenth of the median density is added to the denominator and the outermost percents are cut off, so that
@@ -133,19 +136,19 @@ class View:
         return Image(values, self.mask.astype(np.uint8), complex(x[0], y[0]), self.map.bin_size)
 
 
-def correlation(a, b):
+def correlation(a: Floats, b: Floats) -> float:
     """Correlation coefficient of two sets of values, 0 if one is constant (float)."""
     a, b = a - a.mean(), b - b.mean()
     norm = np.sqrt((a @ a) * (b @ b))
     return float(a @ b / norm) if norm > 0 else 0.0
 
 
-def spectra(values, inside, size):
+def spectra(values: Any, inside: Any, size: int) -> Any:
     """Fourier transforms of a mask, an image that is 0 outside of it and its square, padded to (size, size)."""
     return fft.rfft2(np.stack([inside, values, values**2]).astype(np.float32), (size, size))
 
 
-def correlate(moving, fixed, size):
+def correlate(moving: Any, fixed: Any, size: int) -> tuple[Floats, Floats]:
     """Correlation coefficients of one image and another that it is shifted over, where both are inside.
 
     Parameters
@@ -176,7 +179,15 @@ def correlate(moving, fixed, size):
     return np.where(good, (ab - a * b / number) / np.sqrt(np.where(good, spread, 1)), 0), shared
 
 
-def search(simulated, measured, rotations, scales, mirrors, least, near=None):
+def search(
+    simulated: View,
+    measured: View,
+    rotations: Any,
+    scales: Any,
+    mirrors: Any,
+    least: float,
+    near: tuple[complex, float] | None = None,
+) -> list[Fit]:
     """Find the best shift for every rotation, scale and mirror.
 
     Parameters
@@ -227,7 +238,7 @@ def search(simulated, measured, rotations, scales, mirrors, least, near=None):
     return sorted(fits, key=lambda fit: -fit.rank)
 
 
-def distinct(fits, most):
+def distinct(fits: Sequence[Fit], most: int) -> list[Fit]:
     """The first `most` fits that are no neighbours in rotation and scale of a better one."""
     kept = []
     for fit in fits:
@@ -236,7 +247,16 @@ def distinct(fits, most):
     return kept
 
 
-def refine(simulated, measured, placement, pixels, least, rotations=None, scales=None, near=None):
+def refine(
+    simulated: View,
+    measured: View,
+    placement: Placement,
+    pixels: int,
+    least: float,
+    rotations: tuple[float, ...] | None = None,
+    scales: tuple[float, ...] | None = None,
+    near: Near | None = None,
+) -> Fit:
     """Maximise the correlation near a placement.
 
     Parameters

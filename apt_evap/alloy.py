@@ -3,12 +3,15 @@
 from collections.abc import Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apt_evap._arrays import check_kind, check_number, check_seed
-from apt_evap.material import as_material
+from apt_evap.material import Material, as_material
 
 
-def check_solutes(solutes, seed):
+def check_solutes(
+    solutes: Mapping[Material, float] | Mapping[str, float] | None, seed: int | None
+) -> dict[Material, float]:
     """Return atomic fractions by Material.
 
     Parameters
@@ -40,7 +43,7 @@ def check_solutes(solutes, seed):
     return fractions
 
 
-def draw_species(n, fractions, seed):
+def draw_species(n: int, fractions: Mapping[Material, float], seed: int | None) -> NDArray[np.int32]:
     """Draw the species of each of n atoms: 0 is the host, the solutes follow in the order of `fractions`.
 
     Parameters

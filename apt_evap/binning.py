@@ -1,12 +1,13 @@
 """Binning of detector coordinates: the comb they lie on, edges that respect it, counts, field of view."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import ndimage
 from skimage.morphology import convex_hull_image
 
 from apt_evap._arrays import check_array, check_count, check_number, shown
+from apt_evap._types import Booleans, Floats, Integers
 
 _CHUNK = 1 << 16
 
@@ -22,7 +23,7 @@ class Comb(NamedTuple):
     origin: float
 
 
-def find_comb(values, sample=100_000):
+def find_comb(values: Floats, sample: int = 100_000) -> Comb | None:
     """Find the comb that coordinates lie on, if they do.
 
     The gaps between the sorted different values, each divided by the smallest ones and rounded, number the
@@ -61,7 +62,7 @@ def find_comb(values, sample=100_000):
     return Comb(float(spacing), float(origin))
 
 
-def find_combs(x, y, quantum="auto"):
+def find_combs(x: Floats, y: Floats, quantum: Any = "auto") -> tuple[Comb, ...] | None:
     """Find or place the combs of both coordinates.
 
     Parameters
@@ -86,8 +87,8 @@ def find_combs(x, y, quantum="auto"):
     if isinstance(quantum, str):
         if quantum != "auto":
             raise ValueError(f"quantum must be 'auto', None or two spacings [mm], got {shown(quantum)}")
-        combs = find_comb(x), find_comb(y)
-        return None if None in combs else combs
+        first, second = find_comb(x), find_comb(y)
+        return None if first is None or second is None else (first, second)
     spacings = check_array(quantum, "quantum", (2,))
     combs = []
     for values, spacing in zip((x, y), spacings, strict=True):
@@ -97,7 +98,13 @@ def find_combs(x, y, quantum="auto"):
     return tuple(combs)
 
 
-def bin_edges(x, y, bins, extent=None, combs=None):
+def bin_edges(
+    x: Floats,
+    y: Floats,
+    bins: int,
+    extent: tuple[float, float, float, float] | None = None,
+    combs: tuple[Comb, ...] | None = None,
+) -> tuple[Floats, Floats]:
     """Edges of bins of one size that cover the extent.
 
     Parameters
@@ -160,7 +167,7 @@ def _multiples(size, combs):
     return min(choices, key=lambda c: (np.log(c[0] / c[1]) ** 2 + np.log(np.sqrt(c[0] * c[1]) / size) ** 2, c))
 
 
-def count(x, y, x_edges, y_edges):
+def count(x: Floats, y: Floats, x_edges: Floats, y_edges: Floats) -> Integers:
     """Count hits in evenly spaced bins; hits outside are not counted, the last edges belong to the last bins.
 
     Parameters
@@ -200,7 +207,7 @@ def count(x, y, x_edges, y_edges):
     return total.reshape(ny, nx)
 
 
-def field_of_view(counts):
+def field_of_view(counts: Integers) -> Booleans:
     """Convex outline of the region where the density, averaged over 20 hits, exceeds a tenth of its median.
 
     Parameters

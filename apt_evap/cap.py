@@ -1,15 +1,19 @@
 """What the ions of a run say about the shape of the cap and the way to the detector."""
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
 from apt_evap._arrays import check_array, check_count, check_kind, check_number, check_sequence
+from apt_evap._types import Floats
 from apt_evap.perturbation import Unperturbed
 from apt_evap.projection import Projection
+from apt_evap.run import Run
 
 _CAP = math.radians(45)  # launch sites nearer to the axis than this make the sphere: the shank is far
 _NEAR = math.radians(20)  # about the apex, for its field
@@ -51,7 +55,7 @@ class ImageCompression(NamedTuple):
     """The projection of the run onto its detector, for overlays of poles."""
 
 
-def fit_caps(run, windows=None):
+def fit_caps(run: Run, windows: int | None = None) -> tuple[Cap, ...]:
     """Fit a sphere to the launch sites of each of several windows of a run.
 
     The cap recedes and changes its radius as it evaporates; angles on the specimen make sense only about the centre
@@ -90,7 +94,7 @@ def fit_caps(run, windows=None):
     return tuple(caps)
 
 
-def image_compression(run, caps=None):
+def image_compression(run: Run, caps: Sequence[Cap] | None = None) -> ImageCompression:
     """Read the image compression of a run from its unperturbed hits.
 
     Parameters
@@ -152,7 +156,7 @@ def image_compression(run, caps=None):
     return ImageCompression(compression, scatter, low, high, angles, medians, projection)
 
 
-def field_factor(voltage, field, radius):
+def field_factor(voltage: ArrayLike, field: ArrayLike, radius: ArrayLike) -> Any:
     """Field factor k_f of a specimen, in F = V / (k_f R).
 
     Parameters
@@ -188,7 +192,7 @@ def field_factor(voltage, field, radius):
     return float(factor) if factor.ndim == 0 else factor
 
 
-def run_field_factor(run, caps=None):
+def run_field_factor(run: Run, caps: Sequence[Cap] | None = None) -> Floats:
     """Read the field factor of a run from the fields at which its ions left.
 
     Parameters

@@ -1,16 +1,17 @@
 """How finely charges are solved, and at which voltage."""
 
 from dataclasses import dataclass
+from typing import Any
 
 from apt_evap._arrays import check_count, check_number
 
 
-def check_voltage(voltage):
+def check_voltage(voltage: Any) -> float:
     """Return the applied voltage [V], above 0 and up to 1 MV, or say what is wrong (ValueError)."""
     return check_number(voltage, "voltage", above=0, at_most=1e6, unit="V")
 
 
-def check_angle(angle):
+def check_angle(angle: Any) -> float:
     """Return an opening angle [rad] from 0 to 1.5, or say what is wrong (ValueError)."""
     return check_number(angle, "opening_angle", at_least=0, at_most=1.5, unit="rad")
 

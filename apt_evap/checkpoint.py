@@ -15,12 +15,14 @@ import time
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from apt_evap._arrays import check_count, check_number, check_switch
 from apt_evap._files import FileError, check_path, flush_folder
-from apt_evap.emitter import EXHAUSTED, SWEEP_DUE, TOO_SHALLOW
+from apt_evap.emitter import EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, Emitter
+from apt_evap.emitter_state import EmitterState
 from apt_evap.run import PART_NAME, Run, load, part_paths
 from apt_evap.run_file import described, is_run, plain, read_state, write_state
 from apt_evap.watch import History
@@ -71,7 +73,7 @@ class Checkpoint:
             check_switch(getattr(self, name), name)
 
     @property
-    def folder(self):
+    def folder(self) -> Path:
         """Folder of the unfinished run."""
         target = Path(os.path.realpath(self.path))
         return target.with_name(target.name + ".unfinished")
@@ -92,7 +94,9 @@ class Keeper:
         Whether it has responses.
     """
 
-    def __init__(self, checkpoint, settings, perturbations, responses):
+    def __init__(
+        self, checkpoint: Checkpoint, settings: dict[str, Any], perturbations: tuple[Any, ...], responses: bool
+    ) -> None:
         self._checkpoint, self._folder = checkpoint, checkpoint.folder
         self._target = Path(os.path.realpath(checkpoint.path))
         self._lock = None
@@ -155,7 +159,7 @@ class Keeper:
                 stacklevel=6,
             )
 
-    def close(self):
+    def close(self) -> None:
         """Let go of the files; a folder without ions goes."""
         if self._lock is None:
             return
@@ -251,13 +255,13 @@ class Keeper:
 
     # ---- writing ---------------------------------------------------------------------------------------------------
 
-    def due(self, ions):
+    def due(self, ions: int) -> bool:
         """Whether it is time for a checkpoint once the run has so many ions."""
         new = ions - self._written_to
         often = self._checkpoint.ions is not None and new >= self._checkpoint.ions
         return new > 0 and (often or time.monotonic() - self._written_at >= 60 * self._checkpoint.minutes)
 
-    def write(self, part, state, first_event):
+    def write(self, part: Run, state: EmitterState, first_event: int) -> bool:
         """Write the next part of the run, then the state it ends in; if that fails, a warning says so.
 
         Returns
@@ -280,7 +284,7 @@ class Keeper:
     def _write_part(self, part):
         part.save(self._folder / PART_NAME.format(int(part.emissions.ions[0])))
 
-    def finish(self, run):
+    def finish(self, run: Run) -> None:
         """Write the file of the run and take the folder away."""
         whole = self._folder / WHOLE_NAME
         run.save(whole)
@@ -303,17 +307,17 @@ class Parts:
         The surface, whose state goes with them.
     """
 
-    def __init__(self, keeper, emitter):
+    def __init__(self, keeper: Keeper | None, emitter: Emitter) -> None:
         self.watch = None
         self.done = [keeper.done] if keeper and keeper.done else []
         self._keeper, self._emitter = keeper, emitter
         self._new = []
         self._first_event = self.done[0].first_event if self.done else emitter.counts["events"]
 
-    def __len__(self):
+    def __len__(self) -> int:
         return sum(map(len, self.done)) + sum(map(len, self._new))
 
-    def append(self, part):
+    def append(self, part: Run) -> None:
         """Add the next part."""
         self._new.append(part)
 
@@ -324,20 +328,20 @@ class Parts:
             self._new = [replace(joined, history=History.join([joined.history, self.watch.take()]))]
         return self._new
 
-    def keep(self):
+    def keep(self) -> None:
         """Write what is new to the disk."""
         if self._keeper and len(self) > sum(map(len, self.done)):
             if self._keeper.write(self._joined()[0], self._emitter.state(), self._first_event):
                 self.done += self._new
                 self._new = []
 
-    def run(self, ended=""):
+    def run(self, ended: str = "") -> Run:
         """Join all parts into one run."""
         run = Run.join([*self.done, *self._joined()])
         return replace(run, state=self._emitter.state(), first_event=self._first_event, ended=ended)
 
 
-def catch_up(emitter, run, batch_size):
+def catch_up(emitter: Emitter, run: Run, batch_size: int) -> None:
     """Bring a new surface to where a run ends, by its state and the events since.
 
     Parameters

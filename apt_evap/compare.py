@@ -1,6 +1,7 @@
 """How alike two detector maps are, and how alike they could be given their noise."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -45,10 +46,10 @@ class Similarity:
     data_range: float
     inside: int
 
-    def __float__(self):
+    def __float__(self) -> float:
         return self.value
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return (
             f"<Similarity: {self.value:.4f}, {self.bins[0]} x {self.bins[1]} bins of "
             f"{self.bin_size[0]:.4g} x {self.bin_size[1]:.4g} mm ({self.inside:,} of them compared), "
@@ -56,7 +57,7 @@ class Similarity:
         )
 
 
-def ssim(map_a, map_b, *, smoothing=0.0, data_range=2.0):
+def ssim(map_a: DetectorMap, map_b: DetectorMap, *, smoothing: float = 0.0, data_range: float = 2.0) -> Similarity:
     """Structural similarity of two maps on the same bins.
 
     Both maps are smoothed, brought to densities relative to their mean in the common mask and compared
@@ -120,7 +121,9 @@ def ssim(map_a, map_b, *, smoothing=0.0, data_range=2.0):
     )
 
 
-def half_ceiling(hits, *, smoothing=0.0, data_range=2.0, seed=0, **options):
+def half_ceiling(
+    hits: Hits | DetectorMap, *, smoothing: float = 0.0, data_range: float = 2.0, seed: int = 0, **options: Any
+) -> Similarity:
     """Structural similarity of two random halves of one measurement: the ceiling that its noise allows.
 
     Each ion falls to either half with equal chance. The halves are noisier than the whole, so that a perfect

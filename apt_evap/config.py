@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 from apt_evap._arrays import check_count, check_number, check_seed, did_you_mean, shown
 from apt_evap._files import FileError, open_for_reading
@@ -15,7 +16,7 @@ from apt_evap.detector import Detector
 from apt_evap.emitter import ChargeSettings, check_voltage
 from apt_evap.energy import Fixed, Thermal, TruncatedNormal
 from apt_evap.material import MATERIALS, Material, material
-from apt_evap.perturbation import RollUp, Unperturbed, from_dict, to_dict
+from apt_evap.perturbation import Perturbation, RollUp, Unperturbed, from_dict, to_dict
 from apt_evap.response import ResponseSettings
 from apt_evap.simulation import FlightSettings, Simulation
 from apt_evap.tip import Tip
@@ -29,7 +30,7 @@ class Panel:
     """One map of a picture: the perturbation of its ions, and the title above it."""
 
     title: str
-    perturbation: object
+    perturbation: Perturbation
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class MapSettings:
     bins: int | None = None
     smoothing: float | None = None
 
-    def to_dict(self):
+    def to_dict(self) -> dict[str, Any]:
         """Return the settings in plain types, as the table [maps] of a TOML file has them."""
         panels = [{"title": panel.title, "perturbation": to_dict(panel.perturbation)} for panel in self.panels]
         return {"panels": panels, "bins": self.bins, "smoothing": self.smoothing}
@@ -100,7 +101,7 @@ class Config:
     maps: MapSettings
     output: str | None
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         host, radius = self.tip["material"].name, self.tip["apex_radius"]
         panels = ", ".join(panel.title for panel in self.maps.panels)
         return (
@@ -108,11 +109,11 @@ class Config:
         )
 
     @property
-    def emissions(self):
+    def emissions(self) -> tuple[Perturbation, ...]:
         """Perturbations to fly beside the responses: none, or without responses those of the maps."""
         return () if self.responses else tuple(dict.fromkeys(panel.perturbation for panel in self.maps.panels))
 
-    def simulation(self, *, seed=None, n_threads=None):
+    def simulation(self, *, seed: int | None = None, n_threads: int | None = None) -> Simulation:
         """Build the specimen and the simulation.
 
         Parameters
@@ -147,7 +148,7 @@ class Config:
             )
 
 
-def read_config(path):
+def read_config(path: str | Path) -> Config:
     """Read a simulation from a TOML file.
 
     The tables are ``[tip]`` (the arguments of `Tip`; lengths in nm or, as text, in lattice constants: "20 a"),
@@ -212,10 +213,10 @@ def read_config(path):
             made.append(kind(**document.get(name, {})))
     with _place(path, "maps"):
         maps = read_maps(document.get("maps", {}))
-    return Config(path, tip, n_ions, responses, voltage, seed, *made, maps, output)
+    return Config(path, tip, n_ions, responses, voltage, seed, *made, maps, output)  # type: ignore[arg-type, call-arg]
 
 
-def read_maps(table):
+def read_maps(table: Mapping[str, Any]) -> MapSettings:
     """Read what maps to draw from a table such as ``[maps]`` of a TOML file.
 
     Parameters
@@ -262,7 +263,7 @@ def read_maps(table):
     return MapSettings(tuple(panels), bins, smoothing)
 
 
-def read_perturbation(settings):
+def read_perturbation(settings: str | Mapping[str, Any]) -> Perturbation:
     """Make a perturbation from a table with its name and parameters, or from text.
 
     Parameters
@@ -316,7 +317,7 @@ def _perturbation_table(text):
     return {"name": name, "energy": values[0] if len(values) == 1 else normal, **share}
 
 
-def title_of(perturbation):
+def title_of(perturbation: Any) -> str:
     """Title of a map of the ions of a perturbation (str), such as "roll-up, normal (0.155, 0.155) eV"."""
     name = type(perturbation).__name__
     words = {"Unperturbed": "unperturbed", "LateralVelocity": "lateral velocity", "RollUp": "roll-up"}

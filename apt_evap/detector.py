@@ -3,8 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apt_evap._arrays import check_choice, check_number
+from apt_evap._types import Floats
 from apt_evap.hits import Outcome
 from apt_evap.units import NM_PER_MM
 
@@ -43,7 +45,7 @@ class Detector:
             checked = check_number(getattr(self, name), name, above=0, at_most=1e6, unit="mm")
             object.__setattr__(self, name, checked)
 
-    def directions(self, positions, velocities, apex):
+    def directions(self, positions: Floats, velocities: Floats, apex: float) -> tuple[Floats, Floats]:
         """Directions in which ions meet the plane, as seen from the apex.
 
         The direction is given stereographically, s = tan(polar angle / 2) (cos, sin)(azimuth): it stays smooth and
@@ -75,7 +77,7 @@ class Detector:
             directions = place[:, :2] / (np.linalg.norm(place, axis=1) + place[:, 2])[:, None]
         return directions, remaining
 
-    def impacts(self, directions, times):
+    def impacts(self, directions: Floats, times: Floats) -> tuple[Floats, Floats, Floats, NDArray[np.int8]]:
         """Where and when ions meet the detector.
 
         Parameters

@@ -3,8 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from apt_evap._arrays import check_array, check_number
+from apt_evap._types import Booleans, Floats
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -62,10 +64,10 @@ class Emissions:
         for name, value in checked.items():
             object.__setattr__(self, name, value)
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.positions)
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         lonely = np.count_nonzero(np.isnan(self.neighbours).any(axis=1))
         return f"<Emissions: {len(self):,} atoms about to leave, {lonely:,} of them without a neighbour to roll onto>"
 
@@ -100,14 +102,14 @@ class Launches:
         object.__setattr__(self, "velocities", check_array(self.velocities, "velocities", (n, 3)))
         object.__setattr__(self, "rolled", check_array(self.rolled, "rolled", (n,), dtype=bool))
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.positions)
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"<Launches: {len(self):,} ions, {np.count_nonzero(self.rolled):,} of them rolled up>"
 
 
-def tangent_frame(normals):
+def tangent_frame(normals: ArrayLike) -> tuple[Floats, Floats]:
     """Two unit vectors at right angles to each normal and to each other.
 
     They are x and y carried from the apex (0, 0, 1) to the normal along the great circle: t1 is near x and
@@ -136,7 +138,7 @@ def tangent_frame(normals):
     return first, np.stack([b, sign + y * y * a, -y], axis=1)
 
 
-def rollup_direction(emissions):
+def rollup_direction(emissions: Emissions) -> tuple[Booleans, Floats, Floats]:
     """Which ions can roll up, and in which direction.
 
     Parameters
@@ -161,7 +163,7 @@ def rollup_direction(emissions):
     return rolled, along[0] * scale, along[1] * scale
 
 
-def launch_tangentially(emissions, rolled, first, second):
+def launch_tangentially(emissions: Emissions, rolled: Booleans, first: Floats, second: Floats) -> Launches:
     """Launches from velocities along the surface: the one way from `tangential` to `launch`.
 
     Parameters

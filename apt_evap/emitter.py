@@ -2,8 +2,10 @@
 
 import warnings
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from apt_evap._arrays import check_array, check_count, check_kind, check_number
 from apt_evap._core.event import DONE, EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, Evaporation, Start
@@ -12,10 +14,11 @@ from apt_evap._core.octree import Octree
 from apt_evap._core.robin import ChargingRule, Robin
 from apt_evap._core.surface import Neighbourhood
 from apt_evap._threads import thread_count
+from apt_evap._types import Floats, Integers
 from apt_evap.charge_settings import ChargeSettings, check_angle, check_voltage
 from apt_evap.emitter_state import EmitterState
 from apt_evap.interchange import to_atoms
-from apt_evap.law import Extremal
+from apt_evap.law import Extremal, Law
 from apt_evap.tip import Tip
 from apt_evap.units import COULOMB
 
@@ -59,10 +62,10 @@ class Batch:
     tree: Octree | None
     status: int
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.site)
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         status = {DONE: "done", SWEEP_DUE: "sweep due", EXHAUSTED: "exhausted", TOO_SHALLOW: "too shallow"}[self.status]
         return f"<Batch: {len(self):,} atoms left one after the other; {status}>"
 
@@ -91,7 +94,15 @@ class Emitter:
         If the voltage is not above 0, or the specimen has no surface atom that may leave.
     """
 
-    def __init__(self, tip, voltage=1000.0, law=None, settings=None, n_threads=None, rule=None):
+    def __init__(
+        self,
+        tip: Tip,
+        voltage: float = 1000.0,
+        law: Law | None = None,
+        settings: ChargeSettings | None = None,
+        n_threads: int | None = None,
+        rule: ChargingRule | None = None,
+    ) -> None:
         self.tip = check_kind(tip, "tip", Tip, "a Tip")
         self.voltage = check_voltage(voltage)
         self.law = Extremal() if law is None else check_kind(law, "law", "weights", "a law with a method weights")
@@ -133,41 +144,41 @@ class Emitter:
     def _weights_of(self, tip):
         return check_array(self.law.weights(tip), "weights of the law", (len(tip.positions),))
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self._core.slots)
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"<Emitter: {len(self):,} surface atoms of {len(self.tip.positions):,} at {self.voltage:g} V>"
 
     @property
-    def atoms(self):
+    def atoms(self) -> Integers:
         """Index of each surface atom in the specimen, shape (n,)."""
         return self._core.tree.atoms[self._core.slots]
 
     @property
-    def positions(self):
+    def positions(self) -> Floats:
         """Positions of the surface atoms [nm], shape (n, 3)."""
         return self._core.tree.positions[self._core.slots]
 
     @property
-    def normals(self):
+    def normals(self) -> Floats:
         """Outward unit normals of the surface atoms, shape (n, 3)."""
         return self._core.slot_normals[self._core.slots]
 
     @property
-    def charges(self):
+    def charges(self) -> Floats:
         """Charges of the surface atoms [e], shape (n,)."""
         return self._core.tree.charges[self._core.slots]
 
     @property
-    def fields(self):
+    def fields(self) -> Floats:
         """Fields just outside the surface atoms [V/nm], shape (n,).
 
         F_i = 4 pi k_e q_i / s, with s the area per surface atom: the field at the outer face of a charged surface.
         """
         return self._field(self.charges)
 
-    def to_atoms(self):
+    def to_atoms(self) -> Any:
         """Return the surface as ase.Atoms [Angstrom]; needs ASE.
 
         Returns
@@ -179,12 +190,12 @@ class Emitter:
         return to_atoms(self.positions, self.tip.elements, self.tip.species[self.atoms], **arrays)
 
     @property
-    def area_per_atom(self):
+    def area_per_atom(self) -> float:
         """Area s of the surface per atom, as of the last relaxation [nm^2]."""
         return self._core.rule.area
 
     @property
-    def counts(self):
+    def counts(self) -> dict[str, int]:
         """Events so far, charges that came out negative and were set to 0, patches that did not settle; dict of int."""
         core = self._core
         return {"events": core.n_removed, "clipped": core.n_clipped, "unsettled": core.n_unsettled}
@@ -192,7 +203,7 @@ class Emitter:
     def _field(self, charges):
         return 4 * np.pi * COULOMB / self.area_per_atom * charges
 
-    def field_at(self, points, opening_angle=0.3):
+    def field_at(self, points: ArrayLike, opening_angle: float = 0.3) -> Floats:
         """Electric field of the surface charges.
 
         Parameters
@@ -210,12 +221,12 @@ class Emitter:
         points, opening_angle = check_array(points, "points", ("m", 3)), check_angle(opening_angle)
         return COULOMB * self._core.tree.fields(points, opening_angle, self.n_threads)
 
-    def potential_at(self, points, opening_angle=0.3):
+    def potential_at(self, points: ArrayLike, opening_angle: float = 0.3) -> Floats:
         """Electric potential of the surface charges [V], shape (m,); parameters as in `field_at`."""
         points, opening_angle = check_array(points, "points", ("m", 3)), check_angle(opening_angle)
         return COULOMB * self._core.tree.potentials(points, opening_angle, self.n_threads)
 
-    def relax(self, tolerance=None):
+    def relax(self, tolerance: float | None = None) -> tuple[int, float]:
         """Bring the whole surface to equilibrium at the applied voltage.
 
         Parameters
@@ -255,7 +266,7 @@ class Emitter:
             )
         return outcome
 
-    def state(self):
+    def state(self) -> EmitterState:
         """What makes the surface again as its last relaxation left it.
 
         Returns
@@ -279,7 +290,7 @@ class Emitter:
             unsettled=unsettled,
         )
 
-    def restore(self, state):
+    def restore(self, state: EmitterState) -> None:
         """Make the surface again that another emitter of the same settings had.
 
         Parameters
@@ -306,11 +317,11 @@ class Emitter:
         start = Start(len(state.sites), state.charges, state.lonely, state.lonely_normals, point)
         self._relax(state.tolerance, state.opening_angle, start)
 
-    def hand_out_tree(self):
+    def hand_out_tree(self) -> None:
         """Let the next batch come with a copy of the tree, for flights that have not followed the events so far."""
         self._recorded = RECORD
 
-    def deepen(self):
+    def deepen(self) -> None:
         """Hold more of the specimen, after `evaporate` came upon atoms that are only held as support.
 
         The atoms held so far keep their numbers.
@@ -330,7 +341,7 @@ class Emitter:
         self._core.take_over(neighbourhood, self._weights_of(tip))
         self.tip = tip
 
-    def evaporate(self, most):
+    def evaporate(self, most: int) -> Batch:
         """Let atoms leave, `most` of them or as many as leave before something has to be done first.
 
         Parameters

@@ -3,14 +3,25 @@
 import math
 from dataclasses import dataclass
 from numbers import Real
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.special import log_ndtr, ndtr, ndtri
 
 from apt_evap._arrays import check_array, check_number, shown
+from apt_evap._types import Floats
 from apt_evap.units import BOLTZMANN
 
 HIGHEST_ENERGY = 100.0  # [eV]: more is a slip of the unit, 155 (meV), or ten times any bond
+
+
+class Distribution(Protocol):
+    """What a distribution of energies of one's own must have; `TruncatedNormal`, `Fixed` and `Thermal` are ones."""
+
+    def quantile(self, u: Floats) -> Floats:
+        """Energy [eV] below which the fraction `u` (in (0, 1), any shape) of the distribution lies."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -39,7 +50,7 @@ class TruncatedNormal:
         object.__setattr__(self, "mean", mean)
         object.__setattr__(self, "standard_deviation", sigma)
 
-    def quantile(self, u):
+    def quantile(self, u: ArrayLike) -> Floats:
         """Energy [eV] below which the fraction `u` (in (0, 1), any shape) of the distribution lies."""
         u = np.asarray(u, dtype=np.float64)
         ratio = self.mean / self.standard_deviation
@@ -49,12 +60,12 @@ class TruncatedNormal:
         return np.maximum(self.mean + self.standard_deviation * deviate, np.finfo(np.float64).tiny)
 
     @property
-    def true_mean(self):
+    def true_mean(self) -> float:
         """Mean of the energies after the cut [eV]."""
         return self.mean + self.standard_deviation * self._hazard()
 
     @property
-    def true_standard_deviation(self):
+    def true_standard_deviation(self) -> float:
         """Standard deviation of the energies after the cut [eV]."""
         hazard = self._hazard()
         ratio = self.mean / self.standard_deviation
@@ -86,7 +97,7 @@ class Fixed:
         energy = check_number(self.energy, "energy", at_least=0, at_most=HIGHEST_ENERGY, unit="eV")
         object.__setattr__(self, "energy", energy)
 
-    def quantile(self, u):
+    def quantile(self, u: ArrayLike) -> Floats:
         """Return the energy [eV] in the shape of `u`."""
         return np.full(np.shape(u), self.energy)
 
@@ -117,7 +128,7 @@ class Thermal:
         kelvin = check_number(self.temperature, "temperature", above=0, at_most=1e5, unit="K")
         object.__setattr__(self, "temperature", kelvin)
 
-    def quantile(self, u):
+    def quantile(self, u: ArrayLike) -> Floats:
         """Energy [eV] below which the fraction `u` (in (0, 1), any shape) of the distribution lies."""
         return -BOLTZMANN * self.temperature * np.log1p(-np.asarray(u, dtype=np.float64))
 
@@ -126,16 +137,16 @@ DISTRIBUTIONS = {kind.__name__: kind for kind in (TruncatedNormal, Fixed, Therma
 """The built-in distributions by name."""
 
 
-def as_distribution(energy):
+def as_distribution(energy: Any) -> Distribution:
     """Return a distribution as it is, a number [eV] as `Fixed`, or say what was expected (ValueError)."""
     if isinstance(energy, Real) and not isinstance(energy, bool):
-        return Fixed(energy)
+        return Fixed(float(energy))
     if not callable(getattr(energy, "quantile", None)):
         raise ValueError(f"energy must be a number [eV] or have a method quantile(u), got {shown(energy)}")
     return energy
 
 
-def draw_energies(distribution, u):
+def draw_energies(distribution: Distribution, u: Floats) -> Floats:
     """Energies of a distribution [eV] at the uniform numbers `u`, shape (n,), checked (ValueError)."""
     energies = check_array(distribution.quantile(u), f"quantiles of {distribution!r}", (len(u),))
     if energies.size and energies.min() < 0:

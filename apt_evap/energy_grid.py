@@ -4,12 +4,14 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.interpolate import make_interp_spline
 from scipy.special import ndtr
 
 from apt_evap._arrays import check_array, check_choice
+from apt_evap._types import Floats, Integers
 from apt_evap.energy import TruncatedNormal
-from apt_evap.perturbation import Combined, LateralVelocity, RollUp
+from apt_evap.perturbation import Combined, LateralVelocity, Perturbation, RollUp
 
 MEANS = (0.01, 0.0825, 0.155, 0.2275, 0.3, 0.3725)
 """Means of the paper's grid [eV]: from 0.01 to 0.3725 in even steps."""
@@ -70,16 +72,16 @@ class EnergyGrid:
             object.__setattr__(self, name, tuple(axis.tolist()))
 
     @property
-    def shape(self):
+    def shape(self) -> tuple[int, int, int]:
         """Numbers of roll-up fractions, relative standard deviations and means."""
         return len(self.rollup_fractions), len(self.rsds), len(self.means)
 
     @property
-    def cells(self):
+    def cells(self) -> list[tuple[int, ...]]:
         """Index (fraction, rsd, mean) of every point of the grid, list of tuple."""
         return list(product(*map(range, self.shape)))
 
-    def values_at(self, index):
+    def values_at(self, index: ArrayLike) -> Floats:
         """Roll-up fraction, relative standard deviation and mean [eV] at an index, whole or between points.
 
         Parameters
@@ -100,20 +102,20 @@ class EnergyGrid:
         rsd = np.where(places[1] == nearest, np.array(self.rsds)[nearest], np.exp(rsd))
         return np.stack([fraction, rsd, mean], axis=-1)
 
-    def perturbation(self, fraction, rsd, mean):
+    def perturbation(self, fraction: float, rsd: float, mean: float) -> Perturbation:
         """Perturbation of a roll-up fraction, a relative standard deviation and a mean [eV]."""
         energy = TruncatedNormal(float(mean), float(rsd * mean))
         if self.mechanism == "combined":
             return Combined(energy, float(fraction))
         return (RollUp if self.mechanism == "roll-up" else LateralVelocity)(energy)
 
-    def share_above(self, energy):
+    def share_above(self, energy: float) -> Floats:
         """Share of the ions with more than an energy [eV] at every point of the grid, shape `shape`."""
         means, rsds = np.array(self.means), np.array(self.rsds)[:, None]
         share = ndtr((means - energy) / (rsds * means)) / ndtr(1 / rsds)
         return np.broadcast_to(share, self.shape)
 
-    def around(self, cell):
+    def around(self, cell: tuple[int, ...]) -> list[Floats]:
         """Half steps within one step of a point of the grid, moved inwards at an end, on every axis.
 
         Parameters
@@ -132,12 +134,12 @@ class EnergyGrid:
         ]
 
 
-def maxima(values):
+def maxima(values: Floats) -> Integers:
     """Indices of the greatest value in each of k matrices, shape (k, a, b, c); int of shape (k, 3)."""
     return np.stack(np.unravel_index(values.reshape(len(values), -1).argmax(axis=1), values.shape[1:]), axis=1)
 
 
-def spline_maxima(places, values):
+def spline_maxima(places: list[Floats], values: Floats) -> Floats:
     """Maxima of cubic splines through the points of `EnergyGrid.around`, to a 20th of a step.
 
     Parameters

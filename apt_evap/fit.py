@@ -1,22 +1,26 @@
 """The search for the emission energies whose simulated map looks most like a measured one."""
 
 import warnings
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import product
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from tqdm.auto import tqdm
 
 from apt_evap._arrays import check_count, check_kind, check_number, check_seed
 from apt_evap._threads import thread_count
+from apt_evap._types import Floats
 from apt_evap.binning import field_of_view
 from apt_evap.energy import Thermal, TruncatedNormal
 from apt_evap.energy_grid import MEANS, RSDS, EnergyGrid, maxima, spline_maxima
 from apt_evap.hits import Hits
 from apt_evap.maps import DetectorMap
-from apt_evap.perturbation import LateralVelocity, Unperturbed, to_dict
-from apt_evap.register import register
+from apt_evap.perturbation import LateralVelocity, Perturbation, Unperturbed, to_dict
+from apt_evap.register import Registration, register
 from apt_evap.resample import WINDOW, Comparison, Sampler
 from apt_evap.run import Run
 from apt_evap.study import Optimum, Score, Study, plain
@@ -29,25 +33,25 @@ _MOST_ROUNDS = 5  # of registration and search
 
 
 def fit_energies(
-    run,
-    measured,
-    mechanism="roll-up",
+    run: Run,
+    measured: Hits | DetectorMap,
+    mechanism: str = "roll-up",
     *,
-    means=MEANS,
-    rsds=RSDS,
-    rollup_fractions=None,
-    registration=None,
-    bins=None,
-    smoothing=None,
-    flattening=None,
-    data_range=2.0,
-    temperature=50.0,
-    replicas=4,
-    resamples=200,
-    seed=0,
-    n_threads=None,
-    progress=None,
-):
+    means: Sequence[float] | None = MEANS,
+    rsds: Sequence[float] | None = RSDS,
+    rollup_fractions: Sequence[float] | None = None,
+    registration: Registration | None = None,
+    bins: int | None = None,
+    smoothing: float | None = None,
+    flattening: float | None = None,
+    data_range: float = 2.0,
+    temperature: float = 50.0,
+    replicas: int = 4,
+    resamples: int = 200,
+    seed: int = 0,
+    n_threads: int | None = None,
+    progress: bool | None = None,
+) -> Study:
     """Find the emission energies for which a run looks most like a measurement.
 
     Maps for every energy follow from the responses of one run. They are carried into the measured frame, binned on the
@@ -187,13 +191,15 @@ def fit_energies(
 class _Search:
     """Similarities of one run with one measured map, in the frame of the registration that `place` gives."""
 
-    def __init__(self, run, measured, grid, settings, n_threads, progress):
+    def __init__(
+        self, run: Run, measured: DetectorMap, grid: EnergyGrid, settings: Any, n_threads: int | None, progress: Any
+    ) -> None:
         self.run, self.measured, self.grid, self.settings = run, measured, grid, settings
         self.n_threads = n_threads
         self.middle = tuple(number // 2 for number in grid.shape)
         self.disable = None if progress is None else not progress
 
-    def place(self, registration, resamples):
+    def place(self, registration: Registration, resamples: int) -> None:
         """Take a registration: find the region that measured and simulated maps show."""
         region = self.measured
         mask = region.mask & field_of_view(np.where(region.mask, region.values, 0))
@@ -210,15 +216,15 @@ class _Search:
         self.comparison = Comparison(region, smoothing, self.flattening, data_range, resamples, (seed, 0))
         self.sampler = Sampler(self.run, registration, region, self.comparison.box, resamples, (seed, 1))
 
-    def perturbation(self, index):
+    def perturbation(self, index: ArrayLike) -> Perturbation:
         """Perturbation at an index of the grid."""
         return self.grid.perturbation(*self.grid.values_at(index))
 
-    def scores(self, perturbation, replicas):
+    def scores(self, perturbation: Any, replicas: int) -> Floats:
         """Similarity of all ions, and of each resample, shape (1 + resamples,)."""
         return self.comparison.similarities(self.sampler.maps(perturbation, replicas))
 
-    def matrix(self, replicas, note, places=None):
+    def matrix(self, replicas: int, note: Any, places: Any = None) -> Floats:
         """Similarities at places on the three axes, the whole grid by default; shape (1 + resamples, a, b, c)."""
         places = [np.arange(number) for number in self.grid.shape] if places is None else places
         tried = [self.perturbation(index) for index in product(*places)]
@@ -235,7 +241,7 @@ class _Search:
             values = np.stack(list(pool.map(scores, tried)), axis=1)
         return values.reshape(-1, *map(len, places))
 
-    def refine(self, values, cells, replicas):
+    def refine(self, values: Floats, cells: Any, replicas: int) -> Floats:
         """Places of the maxima between the points, shape (1 + resamples, 3).
 
         They are looked for within a step of the best point; a resample whose best point lies elsewhere keeps that.
@@ -246,7 +252,7 @@ class _Search:
         near = ((low <= cells) & (cells <= high)).all(axis=1)
         return np.where(near[:, None], found, cells)
 
-    def optimum(self, index, replicas):
+    def optimum(self, index: Any, replicas: int) -> Optimum:
         """The `Optimum` at an index of the grid, shape (1 + resamples, 3), those of the resamples for its intervals."""
         fraction, rsd, mean = self.grid.values_at(index).T
         energies = [TruncatedNormal(m, s * m) for m, s in zip(mean, rsd, strict=True)]
@@ -276,7 +282,7 @@ class _Search:
             at_edge=ends,
         )
 
-    def map_and_scores(self, perturbation, replicas):
+    def map_and_scores(self, perturbation: Any, replicas: int) -> tuple[DetectorMap, Floats]:
         """The simulated map on the measured bins, and its similarities, shape (1 + resamples,)."""
         drawn = self.sampler.maps(perturbation, replicas)
         counts = np.zeros(self.region.values.shape, np.int64)
@@ -288,7 +294,7 @@ class _Search:
         )
         return simulated, self.comparison.similarities(drawn)
 
-    def ceiling(self):
+    def ceiling(self) -> Any:
         """Similarity of two halves of the measured ions, None for densities."""
         if not self.measured.is_counts:
             return None

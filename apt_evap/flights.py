@@ -1,16 +1,22 @@
 """Flights of a batch of ions, in parallel, each on a copy of the surface that replays the events."""
 
 import threading
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
 from apt_evap._arrays import check_count, check_number
 from apt_evap._core.flight import LEFT, Flights
 from apt_evap._core.octree import Octree
+from apt_evap._types import Floats
+from apt_evap.detector import Detector
+from apt_evap.emitter import Batch
+from apt_evap.tip import Tip
 from apt_evap.units import COULOMB, NM_PER_MM
 
 _MOST_STEPS = 1_000_000  # flights take some tens
@@ -46,7 +52,7 @@ class FlightSettings:
         check_count(self.most_steps, "most_steps", at_least=1, at_most=_MOST_STEPS)
 
 
-def check_reach(settings, tip, detector):
+def check_reach(settings: FlightSettings, tip: Tip, detector: Detector) -> None:
     """Refuse flights that would end beside the specimen, or behind the detector."""
     height = tip.apex - float(tip.positions[tip.evaporable, 2].min(initial=tip.apex))
     reach = settings.reach * tip.nearest_neighbour_distance
@@ -86,7 +92,7 @@ class FlightCrew:
         Threads.
     """
 
-    def __init__(self, tip, settings, n_threads):
+    def __init__(self, tip: Tip, settings: FlightSettings, n_threads: int) -> None:
         self._n_helpers = n_threads - 1
         self._pool = self._record = None
         self._own = threading.local()  # of each thread: its flights, the record and how many journals they followed
@@ -103,7 +109,7 @@ class FlightCrew:
         }
 
     @contextmanager
-    def at_work(self):
+    def at_work(self) -> Iterator[Any]:
         """The threads, as long as there are batches. What is still to be flown at the end is left."""
         with ThreadPoolExecutor(max(1, self._n_helpers)) as self._pool:
             try:
@@ -112,7 +118,7 @@ class FlightCrew:
                 self._pool.shutdown(wait=False, cancel_futures=True)
 
     @contextmanager
-    def paused(self):
+    def paused(self) -> Iterator[None]:
         """Let the flights stand still while all threads are needed elsewhere."""
         self._halt[0] = 1
         self._go.clear()
@@ -122,7 +128,7 @@ class FlightCrew:
             self._halt[0] = 0
             self._go.set()
 
-    def start(self, batch, groups):
+    def start(self, batch: Batch, groups: Sequence[tuple[Floats, Floats]]) -> Callable[[], list[tuple[Any, ...]]]:
         """Begin the flights of a batch.
 
         Parameters

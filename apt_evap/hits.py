@@ -4,11 +4,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from numbers import Real
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from apt_evap._arrays import check_array, check_kind, check_number, did_you_mean, shown
+from apt_evap._types import Booleans
 from apt_evap.interchange import to_dataframe
+
+if TYPE_CHECKING:
+    import pandas
+
+    from apt_evap.maps import DetectorMap
 
 
 class Outcome(IntEnum):
@@ -79,19 +87,19 @@ class Hits:
         unknown.
     """
 
-    x: np.ndarray = None
-    y: np.ndarray = None
-    time_of_flight: np.ndarray = None
-    voltage: np.ndarray = None
-    pulse_voltage: np.ndarray = None
-    mass_to_charge: np.ndarray = None
-    positions: np.ndarray = None
-    pulses: np.ndarray = None
-    multiplicity: np.ndarray = None
-    pulse_id: np.ndarray = None
-    site: np.ndarray = None
-    ion: np.ndarray = None
-    outcome: np.ndarray = None
+    x: np.ndarray | None = None
+    y: np.ndarray | None = None
+    time_of_flight: np.ndarray | None = None
+    voltage: np.ndarray | None = None
+    pulse_voltage: np.ndarray | None = None
+    mass_to_charge: np.ndarray | None = None
+    positions: np.ndarray | None = None
+    pulses: np.ndarray | None = None
+    multiplicity: np.ndarray | None = None
+    pulse_id: np.ndarray | None = None
+    site: np.ndarray | None = None
+    ion: np.ndarray | None = None
+    outcome: np.ndarray | None = None
     extra: dict = field(default_factory=dict)
     units: dict = field(default_factory=dict)
     source: str = ""
@@ -122,11 +130,11 @@ class Hits:
                 raise ValueError(f"outcome must hold Outcomes, {min(Outcome)} to {max(Outcome)}, got {low} to {high}")
 
     @property
-    def columns(self):
+    def columns(self) -> tuple[str, ...]:
         """Names of the columns that are there, without those in `extra`, tuple of str."""
         return tuple(name for name in _COLUMNS if getattr(self, name) is not None)
 
-    def require(self, *names):
+    def require(self, *names: str) -> tuple[NDArray[Any], ...]:
         """Return the named columns, or say which one is missing.
 
         Parameters
@@ -154,7 +162,7 @@ class Hits:
         return tuple(getattr(self, name) for name in names)
 
     @property
-    def detected(self):
+    def detected(self) -> Booleans:
         """Mask of the ions with an outcome of HIT and finite detector coordinates, bool of shape (n,).
 
         What is missing is not asked for: measured ions have no outcome, and those of a .pos file no detector
@@ -167,13 +175,13 @@ class Hits:
         return good
 
     @property
-    def counts(self):
+    def counts(self) -> dict[Outcome, int]:
         """Number of ions with each `Outcome`, dict; measured ions (no outcome) have all hit."""
         if self.outcome is None:
             return {outcome: len(self) if outcome == Outcome.HIT else 0 for outcome in Outcome}
         return {outcome: int(np.count_nonzero(self.outcome == outcome)) for outcome in Outcome}
 
-    def map(self, bins=256, **options):
+    def map(self, bins: int = 256, **options: Any) -> "DetectorMap":
         """Count the detected ions on the detector.
 
         Parameters
@@ -192,7 +200,7 @@ class Hits:
 
         return DetectorMap.from_hits(self, bins=bins, **options)
 
-    def to_dataframe(self):
+    def to_dataframe(self) -> "pandas.DataFrame":
         """Return the ions as a pandas DataFrame; needs pandas.
 
         Returns
@@ -207,7 +215,7 @@ class Hits:
             columns |= dict(zip(("position_x", "position_y", "position_z"), self.positions.T, strict=True))
         return to_dataframe(columns | self.extra, source=self.source, units=self.units)
 
-    def within_circle(self, radius, centre=(0.0, 0.0)):
+    def within_circle(self, radius: float, centre: ArrayLike = (0.0, 0.0)) -> "Hits":
         """Select the detected ions within a circle on the detector.
 
         Parameters
@@ -234,7 +242,7 @@ class Hits:
             distance = np.hypot(x - centre[0], y - centre[1])
         return self[self.detected & (distance <= radius)]
 
-    def window(self, **bounds):
+    def window(self, **bounds: tuple[float | None, float | None]) -> "Hits":
         """Select the ions whose columns are within bounds: ``hits.window(voltage=(4e3, 5e3), multiplicity=(2, None))``.
 
         Parameters
@@ -268,13 +276,13 @@ class Hits:
             chosen &= (values >= low) & (values < high)
         return self[chosen]
 
-    def __len__(self):
+    def __len__(self) -> int:
         for name in _COLUMNS:
             if (column := getattr(self, name)) is not None:
                 return len(column)
         return len(next(iter(self.extra.values())))
 
-    def __getitem__(self, selection):
+    def __getitem__(self, selection: slice | ArrayLike) -> "Hits":
         """Return the selected ions as `Hits`; takes a slice, a mask, indices or one index."""
         if not isinstance(selection, slice):
             index = np.asarray(selection)
@@ -291,7 +299,7 @@ class Hits:
         extra = {name: values[selection] for name, values in self.extra.items()}
         return Hits(**chosen, extra=extra, units=self.units, source=self.source)
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         detected = np.count_nonzero(self.detected)
         source = f" from {self.source!r}" if self.source else ""
         return f"<Hits: {len(self):,} ions, {detected:,} detected{source}; {', '.join([*self.columns, *self.extra])}>"

@@ -1,8 +1,11 @@
 """What a run or a file of ions holds, in plain types."""
 
+from typing import Any
+
 import numpy as np
 
 from apt_evap.binning import find_combs
+from apt_evap.hits import Hits
 from apt_evap.run import Run
 
 UNITS = {
@@ -39,7 +42,7 @@ UNITS = {
 """Units of what `describe` gives, by key."""
 
 
-def describe(held):
+def describe(held: Run | Hits) -> dict[str, Any]:
     """Say what a run or ions hold.
 
     Parameters

@@ -1,11 +1,19 @@
 """To and from the types of other packages, which need not be installed: Atoms of ASE, DataFrame of pandas."""
 
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from apt_evap.material import as_material
+from apt_evap._types import Floats
+from apt_evap.material import Material, as_material
+
+if TYPE_CHECKING:
+    import ase
+    import pandas
 
 _ANGSTROM_PER_NM = 10.0
 
@@ -19,7 +27,7 @@ def _needed(name, what):
         raise ImportError(f"{what} needs {package}, which is not installed: pip install {package}") from error
 
 
-def from_atoms(atoms, materials=None):
+def from_atoms(atoms: "ase.Atoms", materials: Mapping[str, Material] | None = None) -> dict[str, Any]:
     """What `Tip.from_positions` needs of an ASE Atoms object.
 
     Parameters
@@ -58,7 +66,9 @@ def from_atoms(atoms, materials=None):
     return found
 
 
-def to_atoms(positions, elements, species, **arrays):
+def to_atoms(
+    positions: Floats, elements: Sequence[Material], species: NDArray[np.integer], **arrays: NDArray[Any]
+) -> "ase.Atoms":
     """Make an ASE Atoms object.
 
     Parameters
@@ -90,7 +100,7 @@ def to_atoms(positions, elements, species, **arrays):
     return atoms
 
 
-def to_dataframe(columns, **attributes):
+def to_dataframe(columns: Mapping[str, NDArray[Any]], **attributes: Any) -> "pandas.DataFrame":
     """Make a pandas DataFrame.
 
     Parameters

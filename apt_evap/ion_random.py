@@ -1,9 +1,11 @@
 """Random numbers keyed by seed and ion: the same for an ion whatever the batch or the threads."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.special import ndtri
 
 from apt_evap._arrays import check_array, check_count, check_seed
+from apt_evap._types import Floats
 
 _GAMMA = np.uint64(0x9E3779B97F4A7C15)
 _FIRST = np.uint64(0xBF58476D1CE4E5B9)
@@ -40,17 +42,17 @@ class IonRandom:
     output of that number of a generator seeded with a hash of `seed`.
     """
 
-    def __init__(self, seed, ions):
+    def __init__(self, seed: int, ions: ArrayLike) -> None:
         self.seed = check_seed(seed)
         ions = check_array(ions, "ions", ("n",), dtype=np.int64).view(np.uint64)
         start = _mix(np.array([self.seed], dtype=np.uint64) + _GAMMA)
         self._state = _mix(start + (ions + np.uint64(1)) * _GAMMA)
         self._column = 0
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"IonRandom(seed={self.seed}, {len(self._state)} ions)"
 
-    def uniform(self, columns=1):
+    def uniform(self, columns: int = 1) -> Floats:
         """Return the next uniform numbers in (0, 1), shape (n, columns)."""
         first = self._column + 1
         self._column += check_count(columns, "columns", at_least=1)
@@ -58,6 +60,6 @@ class IonRandom:
         bits = _mix(self._state[:, None] + steps) >> np.uint64(12)
         return (bits + 0.5) * 2.0**-52
 
-    def normal(self, columns=1):
+    def normal(self, columns: int = 1) -> Floats:
         """Return the next normal numbers of mean 0 and variance 1, shape (n, columns)."""
         return ndtri(self.uniform(columns))

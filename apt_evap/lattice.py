@@ -1,10 +1,14 @@
 """Crystal lattices: unit cells, orientations, and the lattice points inside a shape."""
 
 import math
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from apt_evap._arrays import check_array, check_choice, check_number
+from apt_evap._types import Floats
 
 _HALF = ((0, 0, 0), (0, 1 / 2, 1 / 2), (1 / 2, 0, 1 / 2), (1 / 2, 1 / 2, 0))
 
@@ -38,12 +42,12 @@ _BLOCK = 8  # cells per block edge: a block is cheap to test and its surface lay
 _CHUNK = 2**19  # candidate points expanded at once, about 50 MB of temporaries
 
 
-def check_structure(structure):
+def check_structure(structure: str) -> str:
     """Return `structure` if it is known, or say which ones are (ValueError)."""
     return check_choice(structure, "structure", BASES)
 
 
-def cell_lengths(structure, a, c=None):
+def cell_lengths(structure: str, a: float, c: float | None = None) -> Floats:
     """Edges of the conventional right-angled cell [nm], shape (3,).
 
     Parameters
@@ -64,12 +68,12 @@ def cell_lengths(structure, a, c=None):
     return np.array([a, a, a], dtype=np.float64)
 
 
-def atom_density(structure, a, c=None):
+def atom_density(structure: str, a: float, c: float | None = None) -> float:
     """Atoms per volume [1/nm^3]; parameters as for `cell_lengths`."""
     return len(BASES[structure]) / float(np.prod(cell_lengths(structure, a, c)))
 
 
-def nearest_neighbour_distance(structure, a, c=None):
+def nearest_neighbour_distance(structure: str, a: float, c: float | None = None) -> float:
     """Distance between nearest neighbours [nm]; parameters as for `cell_lengths`."""
     if check_structure(structure) == "hcp":
         height = cell_lengths(structure, a, c)[2]
@@ -77,7 +81,7 @@ def nearest_neighbour_distance(structure, a, c=None):
     return a * {"fcc": math.sqrt(1 / 2), "bcc": math.sqrt(3) / 2, "sc": 1.0, "diamond": math.sqrt(3) / 4}[structure]
 
 
-def direction_vectors(structure, a, c=None):
+def direction_vectors(structure: str, a: float, c: float | None = None) -> Floats:
     """Vectors that the indices of a direction multiply, in units of a, one a row, shape (3, 3).
 
     The cubic axes, or for hcp a1, a2 (120 degrees apart) and c; parameters as for `cell_lengths`.
@@ -88,7 +92,7 @@ def direction_vectors(structure, a, c=None):
     return np.array([[1.0, 0.0, 0.0], [-0.5, math.sqrt(3) / 2, 0.0], [0.0, 0.0, height]])
 
 
-def check_axis(structure, axis, name="axis"):
+def check_axis(structure: str, axis: Sequence[float], name: str = "axis") -> tuple[int | float, ...]:
     """Return a crystal direction as three plain numbers in a tuple, or say what is wrong.
 
     Parameters
@@ -143,7 +147,7 @@ def _perpendicular(structure, indices, vectors):
     return max(map(tuple, shortest.tolist()))
 
 
-def rotation_to_axis(material, axis, rotation=0.0):
+def rotation_to_axis(material: Any, axis: Sequence[int], rotation: float = 0.0) -> Floats:
     """Rotation that brings a crystal direction onto +z.
 
     For whole numbers, of the lattice directions perpendicular to `axis` the shortest is put along +x: [1 0 0] for
@@ -202,8 +206,18 @@ def _to_specimen(coordinates, orientation, origin):
 
 
 def lattice_points_in(
-    structure, a, c, orientation, origin, signed_distance, bounds, *, depth=None, tolerance=0.0, block=_BLOCK
-):
+    structure: str,
+    a: float,
+    c: float | None,
+    orientation: ArrayLike,
+    origin: ArrayLike,
+    signed_distance: Callable[[Floats], Floats],
+    bounds: ArrayLike,
+    *,
+    depth: Callable[[Floats], Floats] | None = None,
+    tolerance: float = 0.0,
+    block: int = _BLOCK,
+) -> Floats:
     """Lattice points inside a shape, or in a shell under its surface.
 
     Space is cut into blocks of cells; only blocks that the signed distance at their centre does not rule out

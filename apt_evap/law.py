@@ -1,8 +1,20 @@
 """Evaporation laws: which atom leaves next."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
+
+from apt_evap._types import Floats
+from apt_evap.tip import Tip
+
+
+class Law(Protocol):
+    """What an evaporation law of one's own must have; `Extremal` is one."""
+
+    def weights(self, tip: Tip) -> Floats:
+        """Return what the field of each atom is multiplied by for the choice, 0 for those that may not leave, (n,)."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -12,7 +24,7 @@ class Extremal:
     The limit of low temperature of the Arrhenius rate nu_0 exp(-C (1 - F/F_evap)/kT) (Vurpillot et al., 2013).
     """
 
-    def weights(self, tip):
+    def weights(self, tip: Tip) -> Floats:
         """Return what the field of each atom is multiplied by for the choice.
 
         Parameters

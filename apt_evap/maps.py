@@ -5,9 +5,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from apt_evap._arrays import check_array, check_kind, check_number, check_seed, check_switch
+from apt_evap._types import Floats, Integers
 from apt_evap.binning import bin_edges, count, field_of_view, find_combs
 from apt_evap.hits import Hits
 
@@ -47,7 +49,16 @@ class DetectorMap:
     source: str = ""
 
     @classmethod
-    def from_hits(cls, hits, bins=256, extent=None, quantum="auto", dither_seed=None, mask=None, like=None):
+    def from_hits(
+        cls,
+        hits: Hits,
+        bins: int = 256,
+        extent: tuple[float, float, float, float] | None = None,
+        quantum: str | tuple[float, float] | None = "auto",
+        dither_seed: int | None = None,
+        mask: ArrayLike | None = None,
+        like: "DetectorMap | None" = None,
+    ) -> "DetectorMap":
         """Count the detected ions in bins that are as good as square.
 
         Measured coordinates lie on a comb; bins that are no multiple of its spacing, the quantum, hold now
@@ -124,7 +135,16 @@ class DetectorMap:
         return cls(counts, x_edges, y_edges, mask, True, ions, quantum=found, source=hits.source)
 
     @classmethod
-    def from_array(cls, values, x_edges, y_edges, mask=None, *, is_counts=False, source=""):
+    def from_array(
+        cls,
+        values: ArrayLike,
+        x_edges: ArrayLike,
+        y_edges: ArrayLike,
+        mask: ArrayLike | None = None,
+        *,
+        is_counts: bool = False,
+        source: str = "",
+    ) -> "DetectorMap":
         """Make a map of a given array, such as a published one.
 
         Parameters
@@ -170,7 +190,7 @@ class DetectorMap:
         return cls(values, x_edges, y_edges, mask, is_counts, ions, source=source)
 
     @cached_property
-    def density(self):
+    def density(self) -> Floats:
         """Hits per area relative to their mean inside the detector, NaN outside of it, shape (ny, nx)."""
         mean = self.values[self.mask].mean()
         if not mean > 0:
@@ -178,28 +198,28 @@ class DetectorMap:
         return np.where(self.mask, self.values / mean, np.nan)
 
     @property
-    def counts(self):
+    def counts(self) -> Integers:
         """Hits per bin, int64 of shape (ny, nx); a ValueError for a map of densities."""
         if not self.is_counts:
             raise ValueError(f"{self!r} holds densities, not counts of ions")
         return self.values
 
     @property
-    def bin_size(self):
+    def bin_size(self) -> tuple[float, ...]:
         """Width and height of a bin [mm]."""
         return tuple(float((edges[-1] - edges[0]) / (len(edges) - 1)) for edges in (self.x_edges, self.y_edges))
 
     @property
-    def extent(self):
+    def extent(self) -> tuple[float, ...]:
         """Where the map reaches: x_min, x_max, y_min, y_max [mm]."""
         return tuple(float(edges[end]) for edges in (self.x_edges, self.y_edges) for end in (0, -1))
 
     @property
-    def centres(self):
+    def centres(self) -> tuple[Floats, ...]:
         """Centres of the bins in x and in y [mm], shapes (nx,) and (ny,)."""
         return tuple((edges[:-1] + edges[1:]) / 2 for edges in (self.x_edges, self.y_edges))
 
-    def smoothed(self, sigma):
+    def smoothed(self, sigma: float) -> "DetectorMap":
         """Smooth the density with a Gaussian that sees only the inside of the detector.
 
         The smoothed density is divided by the smoothed mask, so that it does not fall off at the rim.
@@ -226,7 +246,7 @@ class DetectorMap:
         total = float(np.hypot(sigma, self.smoothing))
         return replace(self, values=self._blurred(sigma), is_counts=False, smoothing=total)
 
-    def flattened(self, sigma):
+    def flattened(self, sigma: float) -> "DetectorMap":
         """Divide the density by itself, smoothed broadly: what varies slowly over the detector goes.
 
         Parameters
@@ -258,7 +278,7 @@ class DetectorMap:
         values = ndimage.gaussian_filter(np.where(self.mask, self.values, 0).astype(float), **blur)
         return np.divide(values, weight, out=np.zeros_like(values), where=self.mask)
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         ny, nx = self.values.shape
         width, height = self.bin_size
         what = "densities" if self.ions is None else f"{self.ions:,} ions"

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 from apt_evap._arrays import check_count, check_kind, check_number, did_you_mean, shown
 from apt_evap.lattice import check_structure, nearest_neighbour_distance
@@ -84,7 +85,7 @@ class Material:
             object.__setattr__(self, name, value)
 
     @property
-    def nearest_neighbour_distance(self):
+    def nearest_neighbour_distance(self) -> float:
         """Distance between nearest neighbours in the bulk [nm]."""
         return nearest_neighbour_distance(self.structure, self.a, self.c)
 
@@ -119,7 +120,7 @@ MATERIALS = {
 """Known materials by name. Ni and Au are seen as 1+ and 2+ side by side: the fields of both are close."""
 
 
-def material(name, **changes):
+def material(name: str, **changes: Any) -> Material:
     """Return a known material, with some of its numbers changed if wanted.
 
     Parameters
@@ -149,7 +150,7 @@ def material(name, **changes):
     return replace(found, **changes, sources=found.sources | dict.fromkeys(changes, "given by the user"))
 
 
-def as_material(value, name="material"):
+def as_material(value: Material | str, name: str = "material") -> Material:
     """Return a Material as it is, and the known one of a name.
 
     Parameters
@@ -173,7 +174,9 @@ def as_material(value, name="material"):
     return check_kind(value, name, Material, "a Material or the name of one")
 
 
-def polarization_energy(polarizability, voltage, field_factor, radius, step):
+def polarization_energy(
+    polarizability: float, voltage: float, field_factor: float, radius: float, step: float
+) -> float:
     """Energy that polarization gives an atom moving one step up the field gradient: a lower bound of E_perp.
 
     Parameters

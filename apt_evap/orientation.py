@@ -1,15 +1,19 @@
 """How the crystal of a specimen is oriented, and how that follows from poles seen on a map."""
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from apt_evap import lattice
 from apt_evap._arrays import check_array, check_number, check_sequence, check_switch, shown
+from apt_evap._types import Floats
 from apt_evap.material import Material, as_material
 from apt_evap.poles import plane_normals
 from apt_evap.projection import Projection
@@ -46,12 +50,12 @@ class Orientation:
         object.__setattr__(self, "rotation", check_number(self.rotation, "rotation", unit="degrees"))
 
     @cached_property
-    def matrix(self):
+    def matrix(self) -> Floats:
         """Rotation from crystal to specimen, shape (3, 3): `matrix @ crystal vector = vector of the specimen`."""
         return lattice.rotation_to_axis(self.material, self.axis, self.rotation)
 
     @classmethod
-    def from_matrix(cls, material, matrix):
+    def from_matrix(cls, material: Any, matrix: ArrayLike) -> "Orientation":
         """Make the orientation that has a rotation matrix.
 
         Parameters
@@ -84,7 +88,7 @@ class Orientation:
         return cls(host, axis, math.degrees(angle))
 
     @classmethod
-    def from_settings(cls, settings):
+    def from_settings(cls, settings: Mapping[str, Any]) -> "Orientation":
         """Make the orientation of a tip from its settings: `Tip.settings`, or ``Run.settings["tip"]``.
 
         Raises
@@ -96,7 +100,7 @@ class Orientation:
             raise ValueError(f"settings must hold the axis of a crystal, got {', '.join(settings)}")
         return cls(Material(**settings["material"]), tuple(settings["axis"]), settings["rotation"])
 
-    def directions(self, crystal_directions):
+    def directions(self, crystal_directions: ArrayLike) -> Floats:
         """Turn vectors in the frame of the crystal into the frame of the specimen, both of shape (n, 3)."""
         return check_array(crystal_directions, "crystal_directions", ("n", 3)) @ self.matrix.T
 
@@ -131,7 +135,16 @@ class FittedOrientation:
     mirrored_rms: float
 
 
-def fit_orientation(material, planes, places, *, lines=(), scale=None, centre=(0.0, 0.0), mirror=False):
+def fit_orientation(
+    material: Any,
+    planes: ArrayLike,
+    places: ArrayLike,
+    *,
+    lines: Sequence[Any] = (),
+    scale: float | None = None,
+    centre: tuple[float, ...] = (0.0, 0.0),
+    mirror: bool | None = False,
+) -> FittedOrientation:
     """Find the orientation of a specimen from poles at known places of a map.
 
     Two poles, or a pole and a zone line through it with a scale, are enough; of more the sum of the squares of the

@@ -7,12 +7,14 @@ second the azimuth. The model is that of Shaikh et al., arXiv 2509.13744.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import Any, Protocol
 
 import numpy as np
 
 from apt_evap._arrays import check_kind, check_number, did_you_mean, shown
+from apt_evap._types import Booleans, Floats
 from apt_evap.emission import Emissions, Launches, launch_tangentially, rollup_direction, tangent_frame
-from apt_evap.energy import DISTRIBUTIONS, Fixed, Thermal, TruncatedNormal, as_distribution, draw_energies
+from apt_evap.energy import DISTRIBUTIONS, Distribution, Fixed, Thermal, TruncatedNormal, as_distribution, draw_energies
 from apt_evap.ion_random import IonRandom
 from apt_evap.units import speed_from_energy
 
@@ -23,7 +25,9 @@ __all__ = [
     "IonRandom",
     "LateralVelocity",
     "Launches",
+    "Perturbation",
     "RollUp",
+    "TangentialPerturbation",
     "Thermal",
     "TruncatedNormal",
     "Unperturbed",
@@ -35,10 +39,26 @@ __all__ = [
 ]
 
 
+class Perturbation(Protocol):
+    """What a perturbation of one's own must have, to be flown; the built-in ones have it."""
+
+    def launch(self, emissions: Emissions, random: IonRandom) -> Launches:
+        """Launch a batch of ions: their positions [nm] and velocities [nm/ns], and who rolled up."""
+        ...
+
+
+class TangentialPerturbation(Perturbation, Protocol):
+    """What it must have besides, to be taken by runs that hold responses: launches along the surface only."""
+
+    def tangential(self, emissions: Emissions, random: IonRandom) -> tuple[Booleans, Floats, Floats]:
+        """Who rolls up, and the velocities along t1 and t2 of `tangent_frame` [nm/ns], each of shape (n,)."""
+        ...
+
+
 class _Tangential:
     """What the built-in perturbations share: `launch` out of `tangential`."""
 
-    def launch(self, emissions, random):
+    def launch(self: TangentialPerturbation, emissions: Emissions, random: IonRandom) -> Launches:
         """Launch a batch of ions.
 
         Parameters
@@ -63,7 +83,7 @@ class _Tangential:
 class Unperturbed(_Tangential):
     """Every ion starts at rest from its site."""
 
-    def tangential(self, emissions, random):
+    def tangential(self, emissions: Emissions, random: IonRandom) -> tuple[Booleans, Floats, Floats]:
         """Nobody rolls, and both velocities along the surface are zero: see `Combined.tangential`."""
         n = len(emissions)
         return np.zeros(n, dtype=bool), np.zeros(n), np.zeros(n)
@@ -79,12 +99,12 @@ class LateralVelocity(_Tangential):
         Energy E: any object with `quantile(u)` [eV], or one number for all ions [eV].
     """
 
-    energy: object
+    energy: Distribution | float
 
     def __post_init__(self):
         object.__setattr__(self, "energy", as_distribution(self.energy))
 
-    def tangential(self, emissions, random):
+    def tangential(self, emissions: Emissions, random: IonRandom) -> tuple[Booleans, Floats, Floats]:
         """Nobody rolls; velocities along t1 and t2 [nm/ns]: see `Combined.tangential`."""
         energy, azimuth = self._drawn(emissions, random)
         speed = speed_from_energy(energy, emissions.masses)
@@ -104,12 +124,12 @@ class RollUp(_Tangential):
         Energy E: any object with `quantile(u)` [eV], or one number for all ions [eV].
     """
 
-    energy: object
+    energy: Distribution | float
 
     def __post_init__(self):
         object.__setattr__(self, "energy", as_distribution(self.energy))
 
-    def tangential(self, emissions, random):
+    def tangential(self, emissions: Emissions, random: IonRandom) -> tuple[Booleans, Floats, Floats]:
         """Who rolls, and the velocities along t1 and t2 [nm/ns]: see `Combined.tangential`."""
         energy, _ = self._drawn(emissions, random)
         speed = speed_from_energy(energy, emissions.masses)
@@ -131,7 +151,7 @@ class Combined(_Tangential):
         Share of the energy that goes into the roll-up, from 0 to 1; at 0 the ion still rolls.
     """
 
-    energy: object
+    energy: Distribution | float
     rollup_fraction: float
 
     def __post_init__(self):
@@ -139,7 +159,7 @@ class Combined(_Tangential):
         object.__setattr__(self, "energy", as_distribution(self.energy))
         object.__setattr__(self, "rollup_fraction", share)
 
-    def tangential(self, emissions, random):
+    def tangential(self, emissions: Emissions, random: IonRandom) -> tuple[Booleans, Floats, Floats]:
         """Who rolls, and how fast along the surface.
 
         Parameters
@@ -170,7 +190,7 @@ PERTURBATIONS = {kind.__name__: kind for kind in (Unperturbed, LateralVelocity, 
 """The built-in perturbations by name."""
 
 
-def to_dict(perturbation):
+def to_dict(perturbation: Any) -> dict[str, Any]:
     """Name and parameters of a perturbation or a distribution, in plain types, for files.
 
     One of a user's own is described by its name and `repr`: enough to know it, not to make it again.
@@ -193,7 +213,7 @@ def to_dict(perturbation):
     }
 
 
-def from_dict(settings):
+def from_dict(settings: Mapping[str, Any]) -> Any:
     """Make the perturbation or distribution again that `to_dict` described.
 
     Parameters

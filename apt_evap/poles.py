@@ -1,13 +1,17 @@
 """Poles and zone axes of a crystal: the lattice planes that show on a map, their directions and their names."""
 
+from collections.abc import Iterable, Sequence
 from itertools import permutations, product
 from math import gcd
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from apt_evap import lattice
 from apt_evap._arrays import check_array, check_count, shown
+from apt_evap._types import Floats
+from apt_evap.material import Material
 
 _LARGEST = 9  # indices looked through: of all lattices the 50 families of the widest spacing are among them
 _MOST_FAMILIES = 50
@@ -46,7 +50,7 @@ class Zones(NamedTuple):
     """Index of the family of each, shape (n,)."""
 
 
-def poles(material, families=8):
+def poles(material: Material, families: int = 8) -> Poles:
     """Poles of a crystal: the families of lattice planes with the widest spacing.
 
     A facet is the larger, and its pole the darker on a map, the higher the steps between its terraces are, so that
@@ -92,7 +96,7 @@ def poles(material, families=8):
     )
 
 
-def zones(material, families=None):
+def zones(material: Material, families: Sequence[Any] | None = None) -> Zones:
     """Zone axes of a crystal; the zone line of one is the great circle across it, on which its poles lie.
 
     Parameters
@@ -127,7 +131,7 @@ def zones(material, families=None):
     return Zones(axes, direction_normals(material, axes), np.array(numbers))
 
 
-def plane_normals(material, planes, name="planes"):
+def plane_normals(material: Material, planes: ArrayLike, name: str = "planes") -> Floats:
     """Unit normals of lattice planes, in the frame of the crystal.
 
     Parameters
@@ -154,7 +158,7 @@ def plane_normals(material, planes, name="planes"):
     return normals / np.linalg.norm(normals, axis=1)[:, None]
 
 
-def direction_normals(material, directions, name="directions"):
+def direction_normals(material: Material, directions: ArrayLike, name: str = "directions") -> Floats:
     """Unit vectors along lattice directions, in the frame of the crystal.
 
     Parameters
@@ -181,7 +185,7 @@ def direction_normals(material, directions, name="directions"):
     return vectors / np.linalg.norm(vectors, axis=1)[:, None]
 
 
-def label(indices):
+def label(indices: Iterable[int]) -> str:
     """Name of a pole or an axis as matplotlib writes it, with bars over negative indices (str)."""
     space = r"\," if max(abs(int(index)) for index in indices) > 9 else ""
     return "$" + space.join(rf"\bar{{{-index}}}" if index < 0 else str(index) for index in map(int, indices)) + "$"

@@ -1,11 +1,13 @@
 """Density of hits along a circle, a radius, or across a zone line, with the errors of counting."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from apt_evap._arrays import check_array, check_count, check_kind, check_number, check_sequence
+from apt_evap._types import Floats
 from apt_evap.binning import MOST_BINS
 from apt_evap.hits import Hits
 from apt_evap.maps import DetectorMap
@@ -53,27 +55,29 @@ class Rectangle:
         for name in ("length", "width"):
             object.__setattr__(self, name, check_number(getattr(self, name), name, above=0, unit="mm"))
 
-    def along_and_across(self, x, y):
+    def along_and_across(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
         """Distances from the centre along the line and across it [mm], shape (n,) each, of places x, y [mm]."""
         cosine, sine = np.cos(np.radians(self.angle)), np.sin(np.radians(self.angle))
         x, y = np.asarray(x, float) - self.centre[0], np.asarray(y, float) - self.centre[1]
         return x * cosine + y * sine, y * cosine - x * sine
 
-    def turned(self, angle):
+    def turned(self, angle: float) -> "Rectangle":
         """The rectangle turned about the middle of the detector by an angle from x towards y [degrees]."""
         cosine, sine = np.cos(np.radians(angle)), np.sin(np.radians(angle))
         x, y = self.centre
         return replace(self, centre=(x * cosine - y * sine, x * sine + y * cosine), angle=self.angle + angle)
 
     @property
-    def corners(self):
+    def corners(self) -> Floats:
         """Corners in turn, counterclockwise [mm], shape (4, 2)."""
         cosine, sine = np.cos(np.radians(self.angle)), np.sin(np.radians(self.angle))
         half = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [self.length / 2, self.width / 2]
         return half @ [[cosine, sine], [-sine, cosine]] + self.centre
 
 
-def azimuthal_profile(hits, centre=(0.0, 0.0), *, inner, outer, bins=72):
+def azimuthal_profile(
+    hits: Hits | DetectorMap, centre: tuple[float, ...] = (0.0, 0.0), *, inner: float, outer: float, bins: int = 72
+) -> Profile:
     """Density of hits in a ring against the azimuth.
 
     Parameters
@@ -106,7 +110,14 @@ def azimuthal_profile(hits, centre=(0.0, 0.0), *, inner, outer, bins=72):
     return _profile((np.arange(bins) + 0.5) * (360 / bins), sector, ring, places, exact, "between inner and outer")
 
 
-def radial_profile(hits, centre=(0.0, 0.0), *, outer, inner=0.0, bins=50):
+def radial_profile(
+    hits: Hits | DetectorMap,
+    centre: tuple[float, ...] = (0.0, 0.0),
+    *,
+    outer: float,
+    inner: float = 0.0,
+    bins: int = 50,
+) -> Profile:
     """Density of hits against the distance from a centre.
 
     Parameters
@@ -140,7 +151,9 @@ def radial_profile(hits, centre=(0.0, 0.0), *, outer, inner=0.0, bins=50):
     return _profile(centres, annulus, ring, places, np.pi * np.diff(edges**2), "between inner and outer")
 
 
-def zone_line_profile(hits, rectangles, *, bins=40):
+def zone_line_profile(
+    hits: Hits | DetectorMap, rectangles: Rectangle | Sequence[Rectangle], *, bins: int = 40
+) -> Profile:
     """Density of hits across a zone line, averaged along it within a rectangle.
 
     Parameters
@@ -196,7 +209,7 @@ def zone_line_profile(hits, rectangles, *, bins=40):
 class _Places:
     """Where hits are: those of ions, each one hit; or the bins of a map, each with its value and its area."""
 
-    def __init__(self, hits):
+    def __init__(self, hits: Hits) -> None:
         if isinstance(hits, DetectorMap):
             self.x, self.y = (grid[hits.mask] for grid in np.meshgrid(*hits.centres))
             self.values, self.area = hits.values[hits.mask], float(np.prod(hits.bin_size))

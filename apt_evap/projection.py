@@ -4,8 +4,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from apt_evap._arrays import check_array, check_number, check_switch
+from apt_evap._types import Floats
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class Projection:
             compression = check_number(self.compression, "compression", above=0)
             object.__setattr__(self, "compression", compression)
 
-    def places(self, directions):
+    def places(self, directions: ArrayLike) -> Floats:
         """Where directions appear.
 
         Parameters
@@ -72,7 +74,7 @@ class Projection:
         share[~ahead] = np.nan
         return np.column_stack([-x if self.mirror else x, y]) * share[:, None] + self.centre
 
-    def directions(self, places):
+    def directions(self, places: ArrayLike) -> Floats:
         """Directions that appear at some places.
 
         Parameters

@@ -5,8 +5,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apt_evap._arrays import check_array, check_kind, check_sequence, did_you_mean, shown
+from apt_evap._types import Integers
 from apt_evap.hits import Hits
 
 
@@ -41,9 +43,9 @@ class Ranges:
     names: tuple
     low: np.ndarray
     high: np.ndarray
-    volume: np.ndarray = None
-    colour: tuple = None
-    composition: tuple = None
+    volume: np.ndarray | None = None
+    colour: tuple | None = None
+    composition: tuple | None = None
     source: str = ""
 
     def __post_init__(self):
@@ -79,19 +81,19 @@ class Ranges:
             object.__setattr__(self, name, tuple(values[i] for i in kept))
         self._warn_of_overlap()
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.names)
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         source = f" from {self.source!r}" if self.source else ""
         return f"<Ranges: {len(self)} of {', '.join(self.species_names)}{source}>"
 
     @property
-    def species_names(self):
+    def species_names(self) -> tuple[str, ...]:
         """Names of the species, each once, in the order of the ranges, tuple of str."""
         return tuple(dict.fromkeys(self.names))
 
-    def index(self, hits):
+    def index(self, hits: Hits) -> Integers:
         """Range of every ion.
 
         Parameters
@@ -113,7 +115,7 @@ class Ranges:
             holder[first[i] : stop[i]] = i
         return holder[np.searchsorted(edges, mass, side="right") - 1]
 
-    def species(self, hits):
+    def species(self, hits: Hits) -> Integers:
         """Species of every ion.
 
         Parameters
@@ -129,11 +131,11 @@ class Ranges:
         number = {name: i for i, name in enumerate(self.species_names)}
         return np.array([number[name] for name in self.names] + [-1])[self.index(hits)]
 
-    def labels(self, hits, outside="X"):
+    def labels(self, hits: Hits, outside: str = "X") -> NDArray[np.str_]:
         """Name of the species of every ion, `outside` for one in no range, array of str of shape (n,)."""
         return np.array([*self.species_names, check_kind(outside, "outside", str, "text")])[self.species(hits)]
 
-    def select(self, hits, *names):
+    def select(self, hits: Hits, *names: str) -> Hits:
         """Select the ions of one or more species.
 
         Parameters

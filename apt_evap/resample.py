@@ -9,10 +9,18 @@ order in the noise (the infinitesimal jackknife of B. Efron, J. R. Statist. Soc.
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy import ndimage, sparse
 from skimage.morphology import disk
+
+from apt_evap._types import Floats
+from apt_evap.hits import Hits
+from apt_evap.maps import DetectorMap
+from apt_evap.perturbation import Perturbation
+from apt_evap.register import Registration
+from apt_evap.run import Run
 
 WINDOW = 5  # as in `ssim`: half width of the window [bins]
 NOISE = 0.1
@@ -43,7 +51,9 @@ class Comparison:
         If no window fits into the mask.
     """
 
-    def __init__(self, measured, smoothing, flattening, data_range, resamples, seed):
+    def __init__(
+        self, measured: DetectorMap, smoothing: float, flattening: float, data_range: float, resamples: int, seed: Any
+    ) -> None:
         inside = ndimage.binary_erosion(measured.mask, disk(WINDOW))
         if not inside.any():
             raise ValueError(
@@ -63,7 +73,7 @@ class Comparison:
             self.measured = np.concatenate([self.measured, values + NOISE * (drawn - values)])
         self._measured = self._moments(self.densities(self.measured))
 
-    def densities(self, maps):
+    def densities(self, maps: Any) -> Floats:
         """Densities as they are compared: flattened, smoothed, relative to their mean; shape (k, ny, nx)."""
         maps = np.where(self.mask, maps, 0.0)
         if self._flattening.any():
@@ -79,7 +89,7 @@ class Comparison:
         weight = _filtered(self.mask.astype(float), sigmas)
         return np.divide(_filtered(maps, sigmas), weight, out=np.zeros_like(maps), where=self.mask)
 
-    def similarities(self, maps):
+    def similarities(self, maps: Floats) -> Floats:
         """Similarity of a map of the box with the measured one, and of its resamples one by one, shape (k,).
 
         Those of the resamples have the noise of all ions, and the mean of the first.
@@ -89,7 +99,7 @@ class Comparison:
             values[1:] = values[0] + (values[1:] - values[1:].mean()) / NOISE
         return values
 
-    def ceiling(self, divisions, seed):
+    def ceiling(self, divisions: int, seed: Any) -> Floats:
         """Similarities of the random halves of the measured counts, shape (divisions,)."""
         random = np.random.default_rng(seed)
         counts = self.measured[0].astype(np.int64)
@@ -131,7 +141,15 @@ class Sampler:
         Seed of the draws.
     """
 
-    def __init__(self, run, registration, measured, box, resamples, seed):
+    def __init__(
+        self,
+        run: Run,
+        registration: Registration,
+        measured: DetectorMap,
+        box: tuple[slice, ...],
+        resamples: int,
+        seed: Any,
+    ) -> None:
         self.run, self.registration, self.resamples = run, registration, resamples
         random = np.random.default_rng(seed)
         self._edges = [
@@ -144,7 +162,7 @@ class Sampler:
         weights = 1 + NOISE * (random.poisson(1.0, shape) - 1)
         self._weights = np.concatenate([np.ones((shape[0], 1)), weights], axis=1, dtype=np.float32)
 
-    def maps(self, perturbation, replicas):
+    def maps(self, perturbation: Perturbation, replicas: int) -> Floats:
         """Hits per bin of all ions and of each resample, shape (1 + resamples, ny, nx).
 
         Parameters
@@ -163,7 +181,7 @@ class Sampler:
         table = sparse.coo_array((ones, (cells, self._groups[ions])), (size, len(self._weights))).tocsr()
         return (table @ self._weights).T.reshape(-1, *self.shape).astype(float)
 
-    def hits(self, perturbation, replica=0):
+    def hits(self, perturbation: Perturbation, replica: int = 0) -> Hits:
         """Hits of one draw in the measured frame; the first is that of the run itself."""
         run = self.run
         if replica:  # a seed next to that of the run may be that of another run

@@ -12,8 +12,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from apt_evap._arrays import check_count, check_kind, check_number, check_sequence, shown
+from apt_evap._types import Floats
 from apt_evap.energy import HIGHEST_ENERGY
 from apt_evap.units import FLIGHT_TIME
 
@@ -56,7 +58,7 @@ class Design:
             )
 
     @property
-    def velocities(self):
+    def velocities(self) -> Floats:
         """Launches in units of the largest velocity, shape (m, 2)."""
         rings = []
         for index, (radius, count) in enumerate(self.rings):
@@ -64,7 +66,7 @@ class Design:
             rings.append(radius * np.stack([np.cos(angles), np.sin(angles)], axis=1))
         return np.concatenate(rings)
 
-    def monomials(self, velocities):
+    def monomials(self, velocities: ArrayLike) -> Floats:
         """Monomials u^i v^j, i + j <= degree, of velocities (u, v) of shape (n, 2); shape (n, coefficients)."""
         u, v = np.asarray(velocities).T
         powers = [(np.ones_like(u), np.ones_like(v))]
@@ -73,7 +75,7 @@ class Design:
         columns = [powers[total - j][0] * powers[j][1] for total in range(self.degree + 1) for j in range(total + 1)]
         return np.stack(columns, axis=1)
 
-    def fit(self, values):
+    def fit(self, values: Floats) -> tuple[NDArray[np.float32], Floats]:
         """Least squares fit.
 
         Parameters
@@ -101,7 +103,7 @@ class Design:
                 residual[ion] = np.inf
         return np.ascontiguousarray(coefficients, np.float32), residual
 
-    def evaluate(self, coefficients, velocities):
+    def evaluate(self, coefficients: NDArray[np.float32], velocities: Floats) -> Floats:
         """Values of the polynomials of n ions, each at a velocity of its own; shape (n, 3)."""
         values = np.empty((len(velocities), 3))
         for begin in range(0, len(velocities), CHUNK):
@@ -145,11 +147,11 @@ class ResponseSettings:
         for name in ("site", "rolled"):
             check_kind(getattr(self, name), name, Design, "a Design")
 
-    def reduced(self, velocities, masses):
+    def reduced(self, velocities: Floats, masses: ArrayLike) -> Floats:
         """Launch velocities [nm/ns], shape (n, 2), in units of the largest velocity of the designs."""
         return velocities * (FLIGHT_TIME * np.sqrt(np.asarray(masses) / (2.0 * self.energy_limit)))[:, None]
 
-    def launched(self, velocities, charge_states):
+    def launched(self, velocities: Floats, charge_states: ArrayLike) -> Floats:
         """Velocities of the designs, in sqrt(V), of ions of some charge states [e]; shape (n, m, 2)."""
         return np.sqrt(2.0 * self.energy_limit / np.asarray(charge_states))[:, None, None] * velocities
 
@@ -164,18 +166,18 @@ class Responses(NamedTuple):
     rolled: np.ndarray
     residuals: np.ndarray
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         n, _, coefficients = self.site.shape
         return f"<Responses: {n:,} ions, {coefficients} coefficients from the site, {self.rolled.shape[2]} rolled up>"
 
 
-def flattened(directions, times):
+def flattened(directions: Floats, times: Floats) -> Floats:
     """The three quantities that are fitted, shape (n, 3), from directions (n, 2) and times of flight (n,)."""
     s2 = np.einsum("ij,ij->i", directions, directions)
     return np.column_stack([directions, times * (1.0 - s2) / (1.0 + s2)])
 
 
-def unflattened(values):
+def unflattened(values: Floats) -> tuple[Floats, Floats]:
     """Directions (n, 2) and times of flight (n,) from the three quantities, the inverse of `flattened`."""
     directions = values[:, :2]
     s2 = np.einsum("ij,ij->i", directions, directions)

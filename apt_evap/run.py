@@ -3,19 +3,23 @@
 import datetime
 import json
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from apt_evap._arrays import check_kind, check_switch, shown
 from apt_evap._files import FileError, check_path
+from apt_evap._types import AnyPath, Booleans
 from apt_evap._version import __version__
 from apt_evap.detector import Detector
 from apt_evap.emission import Emissions
 from apt_evap.emitter_state import EmitterState
 from apt_evap.hits import Hits
 from apt_evap.ion_random import IonRandom
-from apt_evap.perturbation import Unperturbed
+from apt_evap.perturbation import Perturbation, Unperturbed
 from apt_evap.response import Responses, ResponseSettings, unflattened
 from apt_evap.run_file import described, read_run, write_run
 from apt_evap.watch import History
@@ -28,7 +32,7 @@ class Flown:
     directions: np.ndarray
     times: np.ndarray
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"<Flown: directions and times of {len(self.times):,} ions>"
 
 
@@ -103,17 +107,17 @@ class Run:
         }
     )
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.site)
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         flown = ", ".join(_describe(perturbation) for perturbation in self.perturbations)
         responses = "" if self.responses is None else f"responses with {self.marked.sum():,} ions marked"
         held = "; ".join(part for part in (responses, flown and f"flown: {flown}", self.ended) if part)
         return f"<Run: {len(self):,} ions of {', '.join(self.elements)} at {self.voltage:g} V; {held}>"
 
     @property
-    def marked(self):
+    def marked(self) -> Booleans:
         """Ions whose responses miss their own flights by more than the bound, or could not be fitted, bool (n,)."""
         if self.responses is None:
             return np.zeros(len(self), bool)
@@ -122,11 +126,11 @@ class Run:
         return bad[:, 0] | (bad[:, 1] & rolls)
 
     @property
-    def first_perturbation(self):
+    def first_perturbation(self) -> Any:
         """The first one flown in the run; `Unperturbed` where there are only responses."""
         return self.perturbations[0] if self.flown else Unperturbed()
 
-    def hits(self, perturbation, *, by_response=False):
+    def hits(self, perturbation: Perturbation, *, by_response: bool = False) -> Hits:
         """Where the ions land under a perturbation.
 
         One that was flown in the run is taken as flown; any other that launches along the surface (all built-in ones,
@@ -163,7 +167,7 @@ class Run:
         if self.responses is None:
             raise ValueError(f"this run has no responses and {shown(perturbation)} was not flown in it")
         settings = self.response_settings
-        rolled, first, second = perturbation.tangential(self.emissions, IonRandom(self.seed, self.emissions.ions))
+        rolled, first, second = perturbation.tangential(self.emissions, IonRandom(self.seed, self.emissions.ions))  # type: ignore[attr-defined]
         velocities = settings.reduced(np.column_stack([first, second]), self.emissions.masses)
         faster = int(np.count_nonzero(np.einsum("ij,ij->i", velocities, velocities) > 1.0001))
         if faster:
@@ -199,7 +203,7 @@ class Run:
             source=f"simulation, {_describe(perturbation)}",
         )
 
-    def seen_by(self, detector):
+    def seen_by(self, detector: Detector) -> "Run":
         """Let another detector see the ions of this run: only where they are recorded changes.
 
         Parameters
@@ -213,7 +217,7 @@ class Run:
         """
         return replace(self, detector=detector, settings=self.settings | {"detector": vars(detector)})
 
-    def summary(self):
+    def summary(self) -> dict[str, Any]:
         """Counts of what happened, dict: ions, outcomes of the first perturbation, ions that cannot roll, marked."""
         first = self.first_perturbation
         counts = {outcome.name.lower(): count for outcome, count in self.hits(first).counts.items()}
@@ -229,7 +233,7 @@ class Run:
     # ---- parts -----------------------------------------------------------------------------------------------------
 
     @classmethod
-    def join(cls, runs):
+    def join(cls, runs: "Sequence[Run]") -> "Run":
         """Join the parts of one run, in their order, into one."""
         first = runs[0]
         emissions = Emissions(
@@ -256,15 +260,15 @@ class Run:
                 *(np.concatenate(parts) for parts in zip(*(run.responses for run in runs), strict=True))
             )
         history = History.join([run.history for run in runs])
-        return replace(first, emissions=emissions, flown=flown, responses=responses, history=history, **columns)
+        return replace(first, emissions=emissions, flown=flown, responses=responses, history=history, **columns)  # type: ignore[arg-type]
 
-    def ended_by(self, reason):
+    def ended_by(self, reason: str) -> "Run":
         """Return the same run with the reason why it ended before its time."""
         return replace(self, ended=reason)
 
     # ---- files -----------------------------------------------------------------------------------------------------
 
-    def save(self, path):
+    def save(self, path: AnyPath) -> None:
         """Write the run to an HDF5 file, whole or not at all.
 
         Parameters
@@ -280,7 +284,7 @@ class Run:
         write_run(path, self)
 
 
-def load(path, *, partial=False):
+def load(path: AnyPath, *, partial: bool = False) -> Run:
     """Read a run from an HDF5 file that `Run.save` wrote, or from the folder of one that is unfinished.
 
     Parameters
@@ -329,7 +333,7 @@ def _load_parts(folder, partial):
 PART_NAME = "ions-{:012d}.h5"
 
 
-def part_paths(folder):
+def part_paths(folder: Path) -> list[Path]:
     """Files of an unfinished run in the order of their ions."""
     return sorted(folder.glob("ions-*.h5"))
 

@@ -7,11 +7,13 @@ import io
 import json
 import warnings
 from contextlib import contextmanager, suppress
+from typing import Any
 
 import h5py
 import numpy as np
 
 from apt_evap._files import FileError, check_path, open_for_reading, replace_file
+from apt_evap._types import AnyPath
 from apt_evap.detector import Detector
 from apt_evap.emission import Emissions
 from apt_evap.emitter_state import EmitterState
@@ -42,7 +44,7 @@ _UNITS = {
 _READ_ERRORS = (OSError, KeyError, RuntimeError, TypeError, ValueError, AttributeError)
 
 
-def plain(settings):
+def plain(settings: Any) -> Any:
     """Settings as they come back from a file, in the plain types of JSON."""
     return json.loads(json.dumps(settings, default=_plain))
 
@@ -55,7 +57,7 @@ def _plain(value):
     raise TypeError(f"a setting must be a plain number, text or list, got {value!r}")
 
 
-def described(perturbation):
+def described(perturbation: Any) -> dict[str, Any]:
     """What a file says of a perturbation, dict."""
     return perturbation if isinstance(perturbation, dict) else to_dict(perturbation)
 
@@ -63,7 +65,7 @@ def described(perturbation):
 # ---- writing -------------------------------------------------------------------------------------------------------
 
 
-def write_run(path, run):
+def write_run(path: AnyPath, run: Any) -> None:
     """Write a Run to a file, whole or not at all; FileError if it cannot be written."""
     with _writing(path) as file:
         _write(file, run)
@@ -72,7 +74,7 @@ def write_run(path, run):
 class _Sink(io.RawIOBase):
     """A file for HDF5, which crashes where writing fails: the first error is kept, to be raised when it is done."""
 
-    def __init__(self, file):
+    def __init__(self, file: Any) -> None:
         self._file, self._place, self._end, self.error = file, 0, 0, None
 
     def _do(self, method, *arguments):
@@ -82,26 +84,26 @@ class _Sink(io.RawIOBase):
             except OSError as error:
                 self.error = error
 
-    def seek(self, offset, whence=0):
+    def seek(self, offset: int, whence: int = 0) -> int:
         self._place = offset + (0, self._place, self._end)[whence]
         self._do("seek", self._place)
         return self._place
 
-    def tell(self):
+    def tell(self) -> int:
         return self._place
 
-    def write(self, data):
+    def write(self, data: Any) -> int:
         self._do("write", data)
         self._place += len(data)
         self._end = max(self._end, self._place)
         return len(data)
 
-    def truncate(self, size):
+    def truncate(self, size: int | None) -> int:
         self._do("truncate", size)
         self._end = size
         return size
 
-    def flush(self):
+    def flush(self) -> None:
         self._do("flush")
 
 
@@ -183,7 +185,7 @@ def _put_state(group, state, first_event):
     group.attrs["first_event"] = first_event
 
 
-def write_state(path, state, first_event):
+def write_state(path: AnyPath, state: Any, first_event: int) -> None:
     """Write an EmitterState to a file of its own, whole or not at all."""
     with _writing(path) as file:
         _put_state(file, state, first_event)
@@ -192,20 +194,20 @@ def write_state(path, state, first_event):
 # ---- reading -------------------------------------------------------------------------------------------------------
 
 
-def read_run(path, partial=False):
+def read_run(path: AnyPath, partial: bool = False) -> dict[str, Any]:
     """What a file says of a Run, as the arguments of one; FileError if it is missing, damaged or not a run."""
     hint = "" if partial else "; partial=True reads the ions that are whole"
     with _reading(path, hint) as file:
         return _read(file, partial)
 
 
-def read_state(path):
+def read_state(path: AnyPath) -> tuple[Any, int]:
     """The EmitterState in a file of its own, and how many atoms had left before the first ion of its run."""
     with _reading(path) as file:
         return _read_state(file)
 
 
-def is_run(path):
+def is_run(path: AnyPath) -> bool:
     """Whether a file is a run, in this format or another one."""
     with suppress(OSError, RuntimeError), h5py.File(path, "r") as file:
         return str(_text(file, "format")).startswith(_KIND)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from apt_evap._arrays import check_choice, check_number
+from apt_evap._types import Floats
 
 _LONGEST = 1e7  # [nm]: a centimetre is no tip, and volumes keep their digits
 
@@ -54,7 +55,7 @@ class TaperedCap:
         return math.sin(angle), math.cos(angle), self.apex_radius + self.shank_length * math.sin(angle)
 
     @property
-    def bounds(self):
+    def bounds(self) -> Floats:
         """Lower and upper corner of the box around the shape [nm], shape (2, 3)."""
         _, cos, foot = self._flank
         rounded = self.base == "rounded"
@@ -62,7 +63,7 @@ class TaperedCap:
         bottom = -self.shank_length - foot * rounded
         return np.array([[-width, -width, bottom], [width, width, self.apex_radius]])
 
-    def signed_distance(self, points):
+    def signed_distance(self, points: Floats) -> Floats:
         """Distance from the surface [nm], negative inside.
 
         Exact for the rounded base. For the flat one the larger of the distances from the cone and from the
@@ -91,7 +92,7 @@ class TaperedCap:
         distance[foot] = np.sqrt(rho[foot] ** 2 + (z[foot] + self.shank_length) ** 2) - foot_radius
         return distance
 
-    def volume(self, depth=None):
+    def volume(self, depth: float | None = None) -> float:
         """Volume of the shape, or of the shell under its surface down to `depth` [nm^3]."""
         if depth is not None:
             inner = self.apex_radius - depth, self.shank_length - depth * (self.base == "flat")
@@ -104,7 +105,7 @@ class TaperedCap:
         below = 4 / 3 * math.pi * foot**3 - _cap_volume(foot, foot * sin)
         return self.volume_above(foot * sin - self.shank_length) + below
 
-    def volume_above(self, z):
+    def volume_above(self, z: float) -> float:
         """Volume of the part of the shape above a height `z` on its flank [nm^3]."""
         sin, cos, _ = self._flank
         top, upper, lower = self.apex_radius * sin, self.apex_radius * cos, (self.apex_radius - z * sin) / cos

@@ -8,23 +8,26 @@ whatever the number of threads and the size of a batch.
 import signal
 import threading
 import warnings
+from collections.abc import Iterable
 from contextlib import contextmanager
 
 import numpy as np
 from tqdm.auto import tqdm
 
 from apt_evap._arrays import check_count, check_kind, check_seed, check_sequence, check_switch
+from apt_evap._core.robin import ChargingRule
 from apt_evap._files import FileError
 from apt_evap._memory import check_copies
 from apt_evap._threads import thread_count
+from apt_evap._types import AnyPath
 from apt_evap.checkpoint import Checkpoint, Keeper, Parts, catch_up
 from apt_evap.detector import Detector
 from apt_evap.emission import Emissions, Launches, tangent_frame
 from apt_evap.emitter import EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, ChargeSettings, Emitter, check_voltage
 from apt_evap.flights import FlightCrew, FlightSettings, check_reach
 from apt_evap.ion_random import IonRandom
-from apt_evap.law import Extremal
-from apt_evap.perturbation import Unperturbed
+from apt_evap.law import Extremal, Law
+from apt_evap.perturbation import Perturbation, Unperturbed
 from apt_evap.response import Responses, ResponseSettings, flattened
 from apt_evap.run import Flown, Run
 from apt_evap.tip import Tip
@@ -71,18 +74,18 @@ class Simulation:
 
     def __init__(
         self,
-        tip,
-        voltage=1000.0,
-        seed=0,
-        detector=None,
-        law=None,
-        charge_settings=None,
-        flight_settings=None,
-        response_settings=None,
-        n_threads=None,
-        rule=None,
-        watch_settings=None,
-    ):
+        tip: Tip,
+        voltage: float = 1000.0,
+        seed: int = 0,
+        detector: Detector | None = None,
+        law: Law | None = None,
+        charge_settings: ChargeSettings | None = None,
+        flight_settings: FlightSettings | None = None,
+        response_settings: ResponseSettings | None = None,
+        n_threads: int | None = None,
+        rule: ChargingRule | None = None,
+        watch_settings: WatchSettings | None = None,
+    ) -> None:
         self.voltage = check_voltage(voltage)
         self.seed = check_seed(seed)
         self.detector = Detector() if detector is None else check_kind(detector, "detector", Detector, "a Detector")
@@ -104,18 +107,27 @@ class Simulation:
         self._crew = FlightCrew(tip, self.flight_settings, self.n_threads)
 
     @property
-    def tip(self):
+    def tip(self) -> Tip:
         """The specimen, as deep as it is held by now."""
         return self.emitter.tip
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         tip, detector = repr(self.tip).removeprefix("<Tip: ").removesuffix(">"), self.detector
         return (
             f"<Simulation: {self.n_evaporated:,} evaporated of {tip}; {self.voltage:g} V, seed {self.seed}, detector "
             f"of {detector.width:g} mm at {detector.distance:g} mm>"
         )
 
-    def run(self, n_ions, emissions=(), *, responses=True, progress=None, batch_size=BATCH, checkpoint=None):
+    def run(
+        self,
+        n_ions: int,
+        emissions: Iterable[Perturbation] = (),
+        *,
+        responses: bool = True,
+        progress: bool | None = None,
+        batch_size: int = BATCH,
+        checkpoint: Checkpoint | AnyPath | None = None,
+    ) -> Run:
         """Evaporate atoms and fly their ions.
 
         Ctrl-C ends the run after the batch under way, with everything done so far; a second one ends it at once. A run
@@ -227,10 +239,8 @@ class Simulation:
             except Exception as error:  # nothing done is lost: a caller may save it
                 collect()
                 if len(parts):
-                    error.run = parts.run(f"{type(error).__name__}: {error}")
-                    error.add_note(
-                        f"the {len(error.run):,} ions done so far are in the attribute `run` of this exception"
-                    )
+                    error.run = done = parts.run(f"{type(error).__name__}: {error}")  # type: ignore[attr-defined]
+                    error.add_note(f"the {len(done):,} ions done so far are in the attribute `run` of this exception")
                 parts.keep()
                 raise
         run = parts.run(ended)

@@ -2,11 +2,12 @@
 
 import json
 from dataclasses import asdict, dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from apt_evap._files import replace_file
+from apt_evap._types import AnyPath
 from apt_evap._version import __version__
 from apt_evap.energy_grid import EnergyGrid
 from apt_evap.maps import DetectorMap
@@ -58,11 +59,11 @@ class Optimum:
     intervals: dict
     at_edge: tuple
 
-    def to_dict(self):
+    def to_dict(self) -> dict[str, Any]:
         """Return it in plain types, dict."""
         return asdict(self) | {"perturbation": to_dict(self.perturbation), "score": self.score._asdict()}
 
-    def bounded(self, name):
+    def bounded(self, name: str) -> str:
         """Say one of the numbers and its interval, str."""
         value = f"{getattr(self, name):.3g}"
         return f"{value} ({self.intervals[name][0]:.3g} to {self.intervals[name][1]:.3g})" if self.intervals else value
@@ -121,12 +122,12 @@ class Study:
     maps: dict
     settings: dict
 
-    def compared(self, map):
+    def compared(self, map: DetectorMap) -> DetectorMap:
         """Return a map of the measured frame as it is compared: in the common region, flattened and smoothed."""
         flat = replace(map, mask=self.measured.mask).flattened(self.settings["flattening"])
         return flat.smoothed(self.settings["smoothing"])
 
-    def to_dict(self):
+    def to_dict(self) -> dict[str, Any]:
         """Return results and settings in plain types, NaN as None, dict."""
         held = {"made_by": f"apt_evap {__version__}", "grid": asdict(self.grid)}
         held |= {name: getattr(self, name) for name in ("ssim", "errors", "shares", "gain_share")}
@@ -135,7 +136,7 @@ class Study:
         held["baselines"] = {name: score._asdict() for name, score in self.baselines.items()}
         return plain(held | {"settings": self.settings})
 
-    def save(self, path):
+    def save(self, path: AnyPath) -> None:
         """Write results and settings to a JSON file, whole or not at all.
 
         Parameters
@@ -151,7 +152,7 @@ class Study:
         with replace_file(path) as file:
             file.write((json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n").encode())
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         best, refined = self.optimum, self.refined
         combined = self.grid.mechanism == "combined"
         share = f", roll-up fraction {best.rollup_fraction:g}" if combined else ""
@@ -167,7 +168,7 @@ class Study:
         )
 
 
-def plain(value):
+def plain(value: Any) -> Any:
     """Return a value in the types of JSON; NaN and infinities become None."""
     if isinstance(value, dict):
         return {str(key): plain(each) for key, each in value.items()}

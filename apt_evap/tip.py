@@ -1,14 +1,17 @@
 """The specimen: a crystal (or any arrangement of atoms) in the shape of a tip."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from apt_evap import interchange, lattice
 from apt_evap._arrays import check_array, check_kind, check_number, check_seed, check_sequence, digest, shown
 from apt_evap._memory import check_memory
+from apt_evap._types import Floats
 from apt_evap.alloy import check_solutes, draw_species
 from apt_evap.material import Material, as_material
 from apt_evap.shape import TaperedCap
@@ -86,19 +89,19 @@ class Tip:
 
     def __init__(
         self,
-        material,
-        apex_radius,
-        axis=(0, 0, 1),
-        shank_angle=1.5,
-        shank_length=None,
-        base="rounded",
-        rotation=0.0,
-        origin=(0.0, 0.0, 0.0),
-        offset_seed=None,
-        depth=None,
-        solutes=None,
-        seed=None,
-    ):
+        material: Material | str,
+        apex_radius: float,
+        axis: Sequence[int] = (0, 0, 1),
+        shank_angle: float = 1.5,
+        shank_length: float | None = None,
+        base: str = "rounded",
+        rotation: float = 0.0,
+        origin: ArrayLike = (0.0, 0.0, 0.0),
+        offset_seed: int | None = None,
+        depth: float | None = None,
+        solutes: Mapping[Material, float] | Mapping[str, float] | None = None,
+        seed: int | None = None,
+    ) -> None:
         host = as_material(material)
         d = host.nearest_neighbour_distance
         radius = check_number(apex_radius, "apex_radius", at_least=3 * d, unit="nm")
@@ -152,14 +155,14 @@ class Tip:
     @classmethod
     def from_positions(
         cls,
-        positions,
-        species,
-        elements,
-        evaporable=None,
-        neighbour_radius=None,
-        surface_threshold=None,
-        potential_point=None,
-    ):
+        positions: ArrayLike,
+        species: ArrayLike,
+        elements: Iterable[Material | str],
+        evaporable: ArrayLike | None = None,
+        neighbour_radius: float | None = None,
+        surface_threshold: float | None = None,
+        potential_point: ArrayLike | None = None,
+    ) -> "Tip":
         """Make a tip of any arrangement of atoms, its axis along +z.
 
         Parameters
@@ -189,7 +192,7 @@ class Tip:
             If shapes disagree, an index names no element, or two atoms are at the same place.
         """
         tip = cls.__new__(cls)
-        tip._shape = tip._depth = None
+        tip._shape = tip._depth = None  # type: ignore[assignment]
         tip.positions = check_array(positions, "positions", ("n", 3))
         n = len(tip.positions)
         if n < 2:
@@ -208,7 +211,7 @@ class Tip:
         distances = neighbours.query(sample, k=2)[0][:, 1]
         if not distances.min() > 0 or neighbours.query_pairs(1e-3 * float(np.median(distances))):
             raise ValueError("positions must be distinct, got two atoms at the same place")
-        tip._set_neighbourhood(elements[0].structure, float(np.median(distances)))
+        tip._set_neighbourhood(tip.elements[0].structure, float(np.median(distances)))
         if neighbour_radius is not None:
             tip.neighbour_radius = check_number(
                 neighbour_radius, "neighbour_radius", above=0, at_most=_WIDEST * float(np.median(distances)), unit="nm"
@@ -230,7 +233,7 @@ class Tip:
         tip.settings = {
             "atoms": n,
             "sha256": digest(tip.positions, tip.species, tip.evaporable),
-            "elements": [asdict(element) for element in elements],
+            "elements": [asdict(element) for element in tip.elements],
             "neighbour_radius": tip.neighbour_radius,
             "surface_threshold": tip.surface_threshold,
             "potential_point": tip.potential_point.tolist(),
@@ -238,7 +241,7 @@ class Tip:
         return tip
 
     @classmethod
-    def from_atoms(cls, atoms, materials=None, **options):
+    def from_atoms(cls, atoms: Any, materials: Mapping[str, Material] | None = None, **options: Any) -> "Tip":
         """Make a tip of an ASE Atoms object, its axis along +z.
 
         Parameters
@@ -262,13 +265,13 @@ class Tip:
         """
         return cls.from_positions(**(interchange.from_atoms(atoms, materials) | options))
 
-    def to_atoms(self):
+    def to_atoms(self) -> Any:
         """Return the specimen as ase.Atoms [Angstrom], with arrays "evaporable" and "support"; needs ASE."""
         arrays = {"evaporable": self.evaporable, "support": self.support}
         return interchange.to_atoms(self.positions, self.elements, self.species, **arrays)
 
     @classmethod
-    def from_settings(cls, settings):
+    def from_settings(cls, settings: Mapping[str, Any]) -> "Tip":
         """Make the tip again that has these `settings`; one made from positions has none to go by.
 
         Raises
@@ -288,10 +291,10 @@ class Tip:
         except (KeyError, TypeError) as error:
             raise ValueError(f"settings must be those of a tip, got {shown(settings)}: {error}") from error
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.positions)
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         names = "-".join(element.name for element in self.elements)
         if self._shape is None:
             return f"<Tip: {len(self):,} atoms of {names} from positions>"
@@ -304,7 +307,7 @@ class Tip:
         )
 
     @property
-    def most_ions(self):
+    def most_ions(self) -> int:
         """How many atoms may leave, those that a shell does not hold yet included: exact only without `depth`."""
         held = int(np.count_nonzero(self.evaporable))
         if self._depth is None:
@@ -313,7 +316,7 @@ class Tip:
         volume = self._shape.volume_above(-self._shape.shank_length / 2)
         return max(held, round(volume * lattice.atom_density(host.structure, host.a, host.c)))
 
-    def signed_distance(self, points):
+    def signed_distance(self, points: Floats) -> Floats:
         """Distance from the surface of the shape [nm], negative inside: see `TaperedCap.signed_distance`.
 
         Raises
@@ -325,7 +328,7 @@ class Tip:
             raise ValueError("a tip made from positions has no shape to measure a distance from")
         return self._shape.signed_distance(check_array(points, "points", ("n", 3)))
 
-    def deepened(self, by=None):
+    def deepened(self, by: float | None = None) -> "Tip":
         """Hold a shell to a greater depth.
 
         Parameters

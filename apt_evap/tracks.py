@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from apt_evap._arrays import check_array, check_kind
 from apt_evap.emission import Emissions, rollup_direction
@@ -22,7 +23,7 @@ class Tracks(NamedTuple):
     """Launch energies [eV], shape (m,)."""
 
 
-def lateral_tracks(run, ions, energies, azimuths=None):
+def lateral_tracks(run: Run, ions: ArrayLike, energies: ArrayLike, azimuths: ArrayLike | None = None) -> Tracks:
     """Places of chosen ions that start from their sites, for every energy and every direction along the surface.
 
     Parameters
@@ -55,7 +56,7 @@ def lateral_tracks(run, ions, energies, azimuths=None):
     return Tracks(*_places(run, ions, velocities, run.response_settings.site, run.responses.site, shape), energies)
 
 
-def rollup_tracks(run, ions, energies):
+def rollup_tracks(run: Run, ions: ArrayLike, energies: ArrayLike) -> Tracks:
     """Places of chosen ions that roll up, for every energy; NaN for an ion without a neighbour.
 
     Parameters

@@ -5,6 +5,8 @@ Values from CODATA 2018 (Tiesinga et al., Rev. Mod. Phys. 93, 025010, 2021).
 
 import math
 
+from apt_evap._types import Floats
+
 ELEMENTARY_CHARGE = 1.602176634e-19
 """Elementary charge [C]."""
 
@@ -26,7 +28,7 @@ FLIGHT_TIME = math.sqrt(2.0) / SPEED
 """[ns sqrt(V) / nm / sqrt(Da)]: turns the reduced time of a flight (m = charge state = e = 1) into ns."""
 
 
-def speed_from_energy(energy, mass):
+def speed_from_energy(energy: Floats | float, mass: Floats | float) -> Floats:
     """Speed of an ion from its kinetic energy, v = sqrt(2 E / m).
 
     Parameters

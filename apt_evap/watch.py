@@ -1,14 +1,20 @@
 """Watching a run: how well its charges have settled, and the shares of ions that went badly, as it goes on."""
 
 import warnings
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from apt_evap._arrays import check_count, check_number
 from apt_evap._core.sweep import direct_field
+from apt_evap._types import Floats
+from apt_evap.emitter import Emitter
 from apt_evap.hits import Outcome
+
+if TYPE_CHECKING:
+    from apt_evap.run import Run
 
 
 @dataclass(frozen=True)
@@ -68,17 +74,17 @@ class History(NamedTuple):
     field: np.ndarray
 
     @classmethod
-    def empty(cls):
+    def empty(cls) -> "History":
         """A history without a look."""
         return cls(np.empty(0, np.int64), *(np.empty(0) for _ in cls._fields[1:]))
 
     @classmethod
-    def join(cls, parts):
+    def join(cls, parts: "Iterable[History]") -> "History":
         """Join the parts of one history, in their order, into one."""
         return cls(*(np.concatenate(columns) for columns in zip(cls.empty(), *parts, strict=True)))
 
 
-def charge_residuals(emitter, sample, seed):
+def charge_residuals(emitter: Emitter, sample: int, seed: int) -> Floats:
     """How far sampled charges are from what Robin's equation makes of all the others, by direct sums.
 
     Parameters
@@ -98,9 +104,8 @@ def charge_residuals(emitter, sample, seed):
     Notes
     -----
     (s/2 pi) sum_k q_k n_i . r_ik / r_ik^3 - q_i, with r_ik = r_i - r_k and the area per atom s of the last relaxation
-    (Rolland
-    et al., Microsc. Microanal. 21, 1649, 2015). Each sweep of Robin's iteration about halves the error, so that it is
-    about as large as the residual.
+    (Rolland et al., Microsc. Microanal. 21, 1649, 2015). Each sweep of Robin's iteration about halves the error, so
+    that it is about as large as the residual.
     """
     positions, normals, charges = emitter.positions, emitter.normals, emitter.charges
     chosen = np.flatnonzero(emitter.tip.evaporable[emitter.atoms])
@@ -126,7 +131,7 @@ class Watch:
         Parts of the run that are there already.
     """
 
-    def __init__(self, settings, interval, first=0, done=()):
+    def __init__(self, settings: WatchSettings, interval: int, first: int = 0, done: "Sequence[Run]" = ()) -> None:
         self._settings, self._interval = settings, interval
         self._rows = []  # looks whose ions have all been counted, not taken yet
         self._open = None  # ions, RMS and largest residual of a look whose ions are still flying
@@ -137,11 +142,11 @@ class Watch:
         for part in done:
             self.count(part)
 
-    def due(self, ions):
+    def due(self, ions: int) -> bool:
         """Whether it is time for a look after so many ions."""
         return ions - self._last >= self._interval
 
-    def look(self, emitter, ions):
+    def look(self, emitter: Emitter, ions: int) -> None:
         """Check the charges; the shares follow once all of these ions have been counted."""
         residuals = charge_residuals(emitter, self._settings.sample, seed=ions)
         rms, largest = float(np.sqrt(np.mean(residuals**2))), float(np.abs(residuals).max())
@@ -156,7 +161,7 @@ class Watch:
             )
         self._close()
 
-    def count(self, part):
+    def count(self, part: "Run") -> None:
         """Count the ions of the next part of the run."""
         if len(part):
             known = part.emissions.ions >= self._last if self._open is None else slice(None)
@@ -194,13 +199,13 @@ class Watch:
             self._warned.add(what)
             warnings.warn(message, stacklevel=4)
 
-    def take(self):
+    def take(self) -> History:
         """History of the looks since it was last taken."""
         rows, self._rows = self._rows, []
         columns = list(zip(*rows, strict=True)) or History.empty()
         return History(np.array(columns[0], np.int64), *(np.array(column, float) for column in columns[1:]))
 
     @property
-    def shown(self):
+    def shown(self) -> dict[str, Any]:
         """What the progress line shows, dict."""
         return dict(self._shown)

@@ -4,10 +4,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import approx_fprime, curve_fit
 from scipy.stats import chi2
 
 from apt_evap._arrays import check_kind, check_number
+from apt_evap._types import Floats
 from apt_evap.profiles import Profile
 
 EXPONENTS = 1.0, 12.0  # of a fitted line: from one that comes to a point to one that is all but a box
@@ -54,11 +56,11 @@ class ZoneLine:
     degrees_of_freedom: int
 
     @property
-    def kind(self):
+    def kind(self) -> str:
         """The word "enhanced" or "depleted"."""
         return "enhanced" if self.height > 0 else "depleted"
 
-    def density(self, position):
+    def density(self, position: ArrayLike) -> Floats:
         """Density of the line and its background at some positions [mm], in units of the profile, any shape."""
         away = np.asarray(position, float) - self.centre
         return self.background + self.slope * away + self.height * _shape(away, self.width, self.exponent)
@@ -67,7 +69,7 @@ class ZoneLine:
         return f"{self.kind}, {self.width:.2f} ± {self.width_error:.2f} mm wide at {self.centre:+.2f} mm"
 
 
-def fit_zone_line(profile, *, exponent=2.0):
+def fit_zone_line(profile: Profile, *, exponent: float = 2.0) -> ZoneLine:
     r"""Fit a dip or a peak on a linear background to a profile across a zone line.
 
     Parameters
@@ -189,7 +191,7 @@ class ProfileComparison(NamedTuple):
     """Root mean square of the difference of the densities beyond what noise explains; 0 if noise explains all."""
 
 
-def compare_profiles(first, second):
+def compare_profiles(first: Profile, second: Profile) -> ProfileComparison:
     """Compare two profiles bin by bin, in units of the errors.
 
     Parameters

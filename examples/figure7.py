@@ -14,6 +14,8 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
+import numpy as np
+
 import apt_evap as ae
 
 # the energies that Shaikh et al. find for nickel
@@ -99,7 +101,9 @@ for row, (kind, rectangle) in enumerate(RECTANGLES.items()):
     for unused in panels[2 * row : 2 * row + 2, 0]:
         unused.remove()
     beside = figure.add_subplot(panels[0, 0].get_gridspec()[2 * row : 2 * row + 2, 0])
-    density = hits[0].map(bins=150, extent=(-75, 75, -75, 75), quantum=None).smoothed(1.0)
+    density = (
+        hits[0].map(bins=150, extent=(-75, 75, -75, 75), quantum=None, mask=np.ones((150, 150), bool)).smoothed(1.0)
+    )
     ae.plot.detector_map(density, beside, title=f"{kind} lines, {names[0]}")
     ae.plot.rectangles(alike, beside)
     axes = panels[2 * row : 2 * row + 2, 1]

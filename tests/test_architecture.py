@@ -53,13 +53,17 @@ def imports(source, package):
     tree = ast.parse(source)
     at_top = set()
     level = list(tree.body)
+    hints = set()
     while level:  # what runs when the module is loaded: all but the bodies of functions
         node = level.pop()
         if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)):
             continue
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            hints |= set(ast.walk(node))  # never run: names for type hints
+            continue
         at_top.add(node)
         level += ast.iter_child_nodes(node)
-    for node in ast.walk(tree):
+    for node in set(ast.walk(tree)) - hints:
         names = []
         if isinstance(node, ast.Import):
             names = [item.name for item in node.names]
@@ -91,6 +95,7 @@ def all_imports():
 def test_the_reader_of_imports():
     source = "import apt_evap.units\nfrom apt_evap import maps\nfrom . import run\nfrom .io import pos\nimport numpy\n"
     source += "def f():\n    from apt_evap.plot import show\nclass C:\n    import apt_evap.cli\nimport apt_evap\n"
+    source += "if TYPE_CHECKING:\n    from apt_evap.study import Study\n"
     assert set(imports(source, ("apt_evap",))) == {
         ("units", True),
         ("maps", True),

@@ -207,7 +207,7 @@ def test_profiles_with_their_lines(two_profiles, tmp_path):
     ax = plot.profile(two_profiles, ["first", "second"], lines=lines)
     ax.figure.savefig(tmp_path / "a.png")
     texts = [text.get_text() for text in ax.get_legend().get_texts()]
-    assert texts[0] == f"first: {lines[0].width:.1f} ± {lines[0].width_error:.1f} mm"
+    assert texts[0] == f"first: {lines[0].width:.2f} ± {lines[0].width_error:.2f} mm"
     assert ax.get_xlabel() == "distance from the line [mm]" and ax.get_ylim()[0] == 0
     fine, density = ax.lines[0].get_data()
     np.testing.assert_array_equal(density, lines[0].density(fine))

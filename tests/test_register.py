@@ -89,13 +89,14 @@ def test_a_known_transform(low, simulated, scale, mirror, radius, shift, seed):
     assert found.score > 0.75 and found.overlap > 0.98
 
 
-def test_ions_of_their_own(low):
-    """The maps share no ion; so few, 8,000 on either side however often drawn, leave 1.3 % (0.3 % with 40,000)."""
+def test_layers_of_their_own(low):
+    """The maps share no atom: 8,000 of the early layers, 8,000 of the late ones, when the tip is blunter by 2 %."""
     early = together(*(replace(low, seed=seed).hits(ROLLED)[:8000] for seed in range(1, 7)))
-    true = ae.Registration(17.0, 0.2, (6.0, -3.0), True)
-    map = measured(draws(low, FASTER, 4, slice(8000, None)), true, 15, 4)
-    rotation, stretch, distance = off(register(early, map), true, 15)
-    assert rotation < 1 and stretch < 0.03 and distance < 0.02
+    true = ae.Registration(17.0, 0.45, (8.0, 3.0), True)
+    map = measured(draws(low, FASTER, 2, slice(8000, None)), true, 30, 2)
+    found = register(early, map)
+    rotation, stretch, distance = off(found, true, 30)
+    assert found.mirror and rotation < 1 and stretch < 0.03 and distance < 0.02
 
 
 def test_without_flattening_gradients_decide(low, simulated, monkeypatch):
@@ -111,6 +112,7 @@ def test_without_flattening_gradients_decide(low, simulated, monkeypatch):
     assert rotation > 1 or stretch > 0.01 or found.mirror
 
 
+@pytest.mark.filterwarnings("ignore:the maps correlate by only")
 def test_what_is_known_is_kept(low, simulated):
     true = ae.Registration(17.0, 0.45, (8.0, 3.0), True)
     map = measured(draws(low, FASTER, 2), true, 30, 2)
@@ -136,16 +138,14 @@ def test_what_is_known_is_kept(low, simulated):
 def test_a_threefold_pole_with_mirrors_has_ties(run20):
     """fcc [111]: turned by 120 degrees it is the same, and mirrored and turned by 60; unmirrored is preferred."""
     rolled = run20.hits(ROLLED)
-    half = len(rolled) // 2
     true = ae.Registration(17.0, 0.5, (3.0, -2.0))
-    found = register(rolled[:half], true.hits(rolled[half:]), scales=(0.4, 0.6))
-    assert not found.mirror
-    assert len(found.ties) >= 2
+    early, late = rolled[:7500], true.hits(rolled[7500:])
+    found = register(early, late, scales=(0.4, 0.6))
+    assert not found.mirror and any(tie.mirror for tie in found.ties) and len(found.ties) >= 2
     for one in (found, *found.ties):
         equal = (one.rotation - (77 if one.mirror else 17) + 60) % 120 - 60
-        assert abs(equal) < 1 and abs(one.scale / 0.5 - 1) < 0.03
-    assert any(tie.mirror for tie in found.ties)
-    second = register(rolled[:half], true.hits(rolled[half:]), start=ae.Registration(140.0, 0.48, (3.0, -2.0)))
+        assert abs(equal) < 1 and abs(one.scale / 0.5 - 1) < 0.04  # the tip gets blunter
+    second = register(early, late, start=ae.Registration(140.0, 0.48, (3.0, -2.0)))
     assert abs(second.rotation - 137) < 1  # a start chooses
 
 
@@ -305,10 +305,10 @@ def test_overlay(low, simulated, tmp_path):
     labels = [text.get_text() for text in ax.get_legend().get_texts()]
     assert labels == ["simulated, bright", "simulated, dark"]
     # what is bright lies where hits are, once moved
-    dense = map.density >= np.nanmedian(map.density)
+    density = map.density[map.mask]
     x, y = np.meshgrid(*map.centres)
     inside = ax.collections[0].get_paths()[0].contains_points(np.column_stack([x[map.mask], y[map.mask]]))
-    assert dense[map.mask][inside].mean() > dense[map.mask][~inside].mean() + 0.1
+    assert density[inside].mean() > 1.3 * density[~inside].mean()
     partial = plot.overlay(simulated.within_circle(40.0), map, replace(true, score=np.nan, residual=0.25))
     assert partial.get_legend().get_texts()[-1].get_text() == "simulated field of view"
     assert "from points, 0.25 mm off (RMS)" in partial.texts[0].get_text()

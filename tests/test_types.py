@@ -16,12 +16,79 @@ MODULES = sorted(path.stem for path in CORE.glob("*.pyx"))
 OF_CYTHON = {"__pyx_vtable__", "__reduce__", "__setstate__", "__reduce_cython__", "__setstate_cython__", "__new__"}
 
 
-def test_mypy():
-    """On the source tree; quick because mypy follows the annotated signatures only."""
+# what a user writes, and in which lines mypy must find fault
+USE = """
+from dataclasses import dataclass
+import numpy as np
+import apt_evap as ae
+
+@dataclass(frozen=True)
+class FromAbove:
+    height: float
+
+    def launch(self, emissions: ae.Emissions, random: ae.IonRandom) -> ae.Launches:
+        n = len(emissions)
+        return ae.Launches(emissions.positions + self.height, np.zeros((n, 3)), np.zeros(n, bool))
+
+class NoPerturbation:
+    pass
+
+solutes = {"Al": 0.1}
+tip = ae.Tip("Ni", apex_radius=2, axis=(1, 1, 1), solutes=solutes, seed=1)
+wrong = ae.Tip("Ni", apex_radius="20 a")  # error
+simulation = ae.Simulation(tip, voltage=1000, detector=ae.Detector(distance=100.0))
+run = simulation.run(100, emissions=[FromAbove(0.3)])
+hits = run.hits(ae.RollUp(ae.TruncatedNormal(0.155, 0.155)))
+hits = run.hits(ae.LateralVelocity(0.3))
+hits = run.hits(FromAbove(0.3))
+run.hits(NoPerturbation())  # error
+ae.RollUp("0.3 eV")  # error
+name: str = run.voltage  # error
+ae.write("ni.epos", hits)
+ae.plot.detector_map(hits.map(bins=64).smoothed(2.0), title="Ni")
+ae.plot.detector_map(hits)  # error
+charges = simulation.emitter.charges.sum()
+simulation.emitter.charge  # error
+"""
+
+
+def test_mypy(tmp_path):
+    """The package agrees with its hints, and these tell right use from wrong."""
     pytest.importorskip("mypy")
-    command = [sys.executable, "-m", "mypy", "--no-incremental", "--cache-dir", "/dev/null"]
+    use = tmp_path / "use.py"
+    use.write_text(USE)
+    command = [sys.executable, "-m", "mypy", "--cache-dir", str(tmp_path), "apt_evap", str(use)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
+    said = [line for line in done.stdout.splitlines() if ": error:" in line]
+    of_use = {int(line.split(":")[1]) for line in said if line.split(":")[0].endswith("use.py")}
+    assert [line for line in said if not line.split(":")[0].endswith("use.py")] == [], done.stdout
+    assert of_use == {k for k, line in enumerate(USE.splitlines(), 1) if line.endswith("# error")}, done.stdout
+    assert not done.stderr
+
+
+def public_functions():
+    """Functions and methods without an underscore, with where they are."""
+    for path in sorted((ROOT / "apt_evap").rglob("*.py")):
+        holders = [ast.parse(path.read_text())]
+        while holders:
+            holder = holders.pop()
+            for node in holder.body:
+                if isinstance(node, ast.ClassDef):
+                    holders.append(node)
+                elif isinstance(node, ast.FunctionDef) and (node.name[0] != "_" or node.name == "__init__"):
+                    yield f"{path.relative_to(ROOT)}:{node.lineno} {node.name}", node
+
+
+def test_every_public_function_is_annotated():
+    found = dict(public_functions())
+    assert len(found) > 100
+    bare = []
+    for name, node in found.items():
+        given = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs, node.args.vararg, node.args.kwarg]
+        untyped = [arg.arg for arg in given if arg and arg.annotation is None and arg.arg not in ("self", "cls")]
+        if untyped or node.returns is None:
+            bare.append(f"{name}: {', '.join(untyped) or 'what it returns'}")
+    assert bare == []
 
 
 def arguments(node):
@@ -57,7 +124,8 @@ def held(holder):
             continue
         if isinstance(value, type):
             if value.__module__ == holder.__name__:
-                found[name] = held(value)
+                fields = getattr(value, "_fields", None)  # a named tuple
+                found[name] = held(value) if fields is None else dict.fromkeys(fields)
         elif name == "__init__":
             found[name] = None  # its signature is not kept
         elif callable(value):
@@ -83,7 +151,7 @@ def test_stubs_have_the_arguments_of_the_source(module):
     """Of `__init__`, whose signature a compiled class does not keep: the names in the .pyx."""
     source = (CORE / f"{module}.pyx").read_text()
     for node in ast.parse((CORE / f"{module}.pyi").read_text()).body:
-        if isinstance(node, ast.ClassDef):
+        if isinstance(node, ast.ClassDef) and f"cdef class {node.name}" in source:
             inits = [part for part in node.body if getattr(part, "name", "") == "__init__"]
             start = source.index(f"cdef class {node.name}")
             at = source.find("def __init__(", start, (source.find("\ncdef class ", start + 1) + 1) or len(source))

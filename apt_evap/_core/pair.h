@@ -10,8 +10,8 @@
 #include <math.h>
 #include <string.h>
 
-/* musl and macOS have no ifunc: there the baseline of the build serves. */
-#if defined(__GNUC__) && !defined(__clang__) && defined(__x86_64__) && defined(__GLIBC__)
+/* musl and macOS have no ifunc, and GCC before 12 does not know these levels: there the baseline of the build serves. */
+#if defined(__GNUC__) && !defined(__clang__) && __GNUC__ >= 12 && defined(__x86_64__) && defined(__GLIBC__)
 #define APT_CLONES __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default"), unused))
 #elif defined(__GNUC__)
 #define APT_CLONES __attribute__((unused))

@@ -9,9 +9,9 @@ cdef class Neighbourhood:
     cdef readonly double radius         # of the neighbourhood, and edge of a cell of the grid [nm]
     cdef readonly double threshold
     cdef const double[:, ::1] positions # (n, 3) nm, the caller's own array
-    cdef char[::1] alive                # (n,)
-    cdef const char[::1] support              # (n,) atoms that never become surface atoms
-    cdef char[::1] exposed              # (n,) surface atoms
+    cdef signed char[::1] alive                # (n,)
+    cdef const signed char[::1] support              # (n,) atoms that never become surface atoms
+    cdef signed char[::1] exposed              # (n,) surface atoms
     cdef int[::1] count                 # (n,) neighbours within the radius
     cdef double[:, ::1] offset          # (n, 3) sum of (neighbour - atom) over the neighbours [nm]
     cdef double[::1] low                # (3,) corner of the grid of cells [nm]

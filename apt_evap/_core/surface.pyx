@@ -30,7 +30,7 @@ cdef class Neighbourhood:
         Of the first of these atoms: what has left it and what was exposed in it stays so.
     """
 
-    def __init__(self, const double[:, ::1] positions, double radius, double threshold, const char[::1] support,
+    def __init__(self, const double[:, ::1] positions, double radius, double threshold, const signed char[::1] support,
                  int n_threads=1, Neighbourhood before=None):
         cdef long n = positions.shape[0], i
         if n == 0:

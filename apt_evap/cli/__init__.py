@@ -4,6 +4,8 @@ import argparse
 import os
 import sys
 import warnings
+from collections.abc import Sequence
+from typing import NoReturn
 
 from apt_evap._version import __version__
 from apt_evap.cli import compare, info, map, run
@@ -33,7 +35,7 @@ from nothing to a map, and to the energies behind a measured one (the first line
 """
 
 
-def main(arguments=None):
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
     Parameters
@@ -52,7 +54,7 @@ def main(arguments=None):
             try:
                 options = _parser().parse_args(arguments)
             except SystemExit as stop:  # --help and --version
-                return stop.code or 0
+                return stop.code or 0  # type: ignore[return-value]
             code = options.command(options)
             sys.stdout.flush()
             return code
@@ -71,7 +73,7 @@ def main(arguments=None):
 
 
 class _Parser(argparse.ArgumentParser):
-    def error(self, message):
+    def error(self, message: str) -> NoReturn:
         raise ValueError(f"{message} (see {self.prog} --help)")
 
 

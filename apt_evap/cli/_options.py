@@ -3,6 +3,8 @@
 import argparse
 import json
 import sys
+from collections.abc import Callable
+from typing import Any
 
 from apt_evap._arrays import check_number
 
@@ -10,12 +12,12 @@ INTERRUPTED = 130  # 128 + SIGINT, as shells count
 SHAPE = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
 
 
-def say(kind, message):
+def say(kind: str, message: object) -> None:
     """One line on stderr: an error, a warning or a note."""
     print(f"apt-evap: {kind}: {' '.join(str(message).split())}", file=sys.stderr)
 
 
-def reading_options():
+def reading_options() -> argparse.ArgumentParser:
     """Options of a command that reads a FILE."""
     reading = argparse.ArgumentParser(add_help=False)
     reading.add_argument("file", metavar="FILE", help="a run (.h5) or measured ions (.epos, ...)")
@@ -23,7 +25,7 @@ def reading_options():
     return reading
 
 
-def add_reading_options(parser):
+def add_reading_options(parser: argparse.ArgumentParser) -> Any:
     """Options that say how the file of ions is read, as a group of their own."""
     group = parser.add_argument_group("reading of files")
     group.add_argument("--format", metavar="SUFFIX", help="read ions as this format, such as .pos")
@@ -32,26 +34,26 @@ def add_reading_options(parser):
     return group
 
 
-def add_speech(command):
+def add_speech(command: argparse.ArgumentParser) -> None:
     """Options of a command that tells what it has done: in sentences, as JSON or not at all."""
     speech = command.add_mutually_exclusive_group()
     speech.add_argument("--quiet", action="store_true", help="say nothing but warnings and errors")
     speech.add_argument("--json", action="store_true", help="say in one line of JSON what was written")
 
 
-def tell(options, line):
+def tell(options: argparse.Namespace, line: str) -> None:
     """Say a line to people, where neither --quiet nor --json is given."""
     if not (options.quiet or options.json):
         print(line, flush=True)
 
 
-def tell_json(options, told):
+def tell_json(options: argparse.Namespace, told: dict[str, Any]) -> None:
     """Say a dict in one line to programs, where --json is given."""
     if options.json:
         print(json.dumps(told, allow_nan=False), flush=True)
 
 
-def whole(least, most=None):
+def whole(least: int, most: int | None = None) -> Callable[[str], int]:
     """A kind of argument: a whole number within bounds."""
 
     def whole(text):

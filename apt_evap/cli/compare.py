@@ -6,6 +6,7 @@ import json
 import os
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from apt_evap.run_file import is_run
 _STUDY = "study.json"
 
 
-def add_parser(commands):
+def add_parser(commands: Any) -> None:
     """Describe the command."""
     command = commands.add_parser(
         "compare",

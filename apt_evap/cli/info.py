@@ -1,13 +1,14 @@
 """`apt-evap info`: say what is in a file."""
 
 import json
+from typing import Any
 
 from apt_evap.cli._files import read
 from apt_evap.cli._options import SHAPE, reading_options
 from apt_evap.info import UNITS, describe
 
 
-def add_parser(commands):
+def add_parser(commands: Any) -> None:
     """Describe the command."""
     command = commands.add_parser(
         "info",

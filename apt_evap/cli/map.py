@@ -1,18 +1,21 @@
 """`apt-evap map`: draw detector maps of a run or of measured ions."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from apt_evap.cli._files import check_output, is_picture, picture_path, read, save_picture
 from apt_evap.cli._options import SHAPE, add_speech, reading_options, smoothing, tell, tell_json, whole
 from apt_evap.config import MOST_BINS, MapSettings, Panel, read_maps, read_perturbation, title_of
+from apt_evap.maps import DetectorMap
 from apt_evap.perturbation import Unperturbed
 from apt_evap.run import Run
 
 
-def add_parser(commands):
+def add_parser(commands: Any) -> None:
     """Describe the command."""
     command = commands.add_parser(
         "map",
@@ -62,7 +65,7 @@ def _map(options):
     return 0
 
 
-def described(maps, titles):
+def described(maps: Any, titles: Sequence[str]) -> list[dict[str, Any]]:
     """What each map of a picture shows, in plain types: title, ions on it, bins, and the smoothing [mm]."""
     return [
         {"title": title, "ions": int(each.ions), "bins": list(each.values.shape[::-1]), "smoothing": each.smoothing}
@@ -86,7 +89,7 @@ def _map_settings(run, options):
     return settings if options.smooth is None else replace(settings, smoothing=options.smooth)
 
 
-def run_maps(run, settings):
+def run_maps(run: Run, settings: MapSettings) -> tuple[list[DetectorMap], list[str]]:
     """Maps of the whole detector, and their titles."""
     half = run.detector.width / 2
     bins = settings.bins or _bins_for(len(run))

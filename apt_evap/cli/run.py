@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import replace
+from typing import Any
 
 from apt_evap._files import FileError, check_path
 from apt_evap.checkpoint import Checkpoint
@@ -12,7 +13,7 @@ from apt_evap.config import read_config
 from apt_evap.run_file import is_run
 
 
-def add_parser(commands):
+def add_parser(commands: Any) -> None:
     """Describe the command."""
     command = commands.add_parser(
         "run",

@@ -4,11 +4,13 @@ A further format is one module with a reader (and a writer, if it can be written
 """
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from apt_evap._arrays import check_count, check_kind, shown
 from apt_evap._files import FileError, TruncatedFile, check_path, open_for_reading
+from apt_evap._types import AnyPath
 from apt_evap.hits import Hits
 from apt_evap.io._apt_sections import SIGNATURE
 from apt_evap.io.apt import chunk_apt, read_apt
@@ -51,7 +53,7 @@ FORMATS = (
 )
 
 
-def read(path, *, format=None, columns=None, **options):
+def read(path: AnyPath, *, format: str | None = None, columns: Sequence[str] | None = None, **options: Any) -> Any:
     """Read a file of ions; its first bytes tell the format where they can, its suffix otherwise.
 
     Parameters
@@ -82,7 +84,9 @@ def read(path, *, format=None, columns=None, **options):
     return chosen.read(path, **_options(path, chosen, chosen.read, columns, options))
 
 
-def chunks(path, rows, *, format=None, columns=None, **options):
+def chunks(
+    path: AnyPath, rows: int, *, format: str | None = None, columns: Sequence[str] | None = None, **options: Any
+) -> Iterator[Hits]:
     """Read a file of ions that need not fit into memory, in whole pulses.
 
     The chunks joined are what `read` gives: pulse_id goes on from chunk to chunk, and what counts as absent is told by
@@ -116,7 +120,7 @@ def chunks(path, rows, *, format=None, columns=None, **options):
     return chosen.chunks(path, rows, **_options(path, chosen, chosen.chunks, columns, options))
 
 
-def write(path, hits, *, format=None, **options):
+def write(path: AnyPath, hits: Hits, *, format: str | None = None, **options: Any) -> None:
     """Write ions to a file whose suffix tells the format; a warning counts the ions left out.
 
     Parameters

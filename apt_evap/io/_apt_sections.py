@@ -4,10 +4,12 @@ import os
 import struct
 import warnings
 from dataclasses import dataclass, replace
+from typing import BinaryIO
 
 import numpy as np
 
 from apt_evap._files import FileError, TruncatedFile
+from apt_evap._types import AnyPath
 
 SIGNATURE = b"APT\0"
 _SECTION = b"SEC\0"
@@ -30,7 +32,7 @@ class Section:
     values: int
 
 
-def read_sections(file, path, partial):
+def read_sections(file: BinaryIO, path: AnyPath, partial: bool) -> tuple[int, list[Section]]:
     """Read the headers of an .apt file.
 
     Parameters

@@ -2,13 +2,18 @@
 
 import re
 import warnings
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
+from apt_evap._types import AnyPath, Booleans, Floats
+from apt_evap.hits import Hits
 
 _NAMES = {"x": "detector_x", "y": "detector_y"}
 
 
-def points_and_data(path, hits):
+def points_and_data(path: AnyPath, hits: Hits) -> tuple[Booleans | slice, Floats, dict[str, NDArray[Any]]]:
     """Positions, and the columns that go with them, of the ions to write.
 
     Parameters

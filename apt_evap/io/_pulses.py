@@ -1,6 +1,9 @@
 """Which ions share a pulse: the conventions of the formats, checked, and turned into pulse_id and multiplicity."""
 
 import numpy as np
+from numpy.typing import NDArray
+
+from apt_evap._types import Integers
 
 _BLOCK = 1 << 15  # rows that stay in the cache
 
@@ -8,7 +11,7 @@ _BLOCK = 1 << 15  # rows that stay in the cache
 class PulseCheck:
     """Whether a column holds n on the first ion of each pulse and 0 on the other n - 1, block by block."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.rows = 0
         self.largest = 0
         self._first = self._last = None
@@ -16,7 +19,7 @@ class PulseCheck:
         self._wrong = 0
         self._example = ""
 
-    def add(self, ions):
+    def add(self, ions: NDArray[np.integer]) -> None:
         """Go on with the next rows of the column."""
         for start in range(0, len(ions), _BLOCK):
             self._add_block(ions[start : start + _BLOCK])
@@ -50,7 +53,7 @@ class PulseCheck:
             self._note(self.rows + int(first[at]), int(announced[at]), int(sizes[at]), len(wrong))
         self._last, self._announced = self.rows + int(first[-1]), int(announced[-1])
 
-    def problem(self, cut):
+    def problem(self, cut: bool) -> str:
         """Return what is wrong with the whole column, or ""; `cut` says that the end of the file is missing."""
         if self._last is None:
             return "it is zero throughout"
@@ -89,7 +92,7 @@ def _consistent(ions):
     return np.array_equal(np.repeat(several + 1 - before, followers) + np.arange(len(zeros)), zeros)
 
 
-def pulses_from_first(ions, first_pulse=0):
+def pulses_from_first(ions: NDArray[np.uint32], first_pulse: int = 0) -> tuple[Integers, NDArray[np.uint32]]:
     """Pulse and multiplicity of every ion from n on the first ion of each pulse and 0 on the other n - 1.
 
     The column begins with a pulse and was found consistent; the end of its last pulse may be missing. It becomes the
@@ -108,7 +111,7 @@ def pulses_from_first(ions, first_pulse=0):
     return pulse_id, ions
 
 
-def first_from_equal(numbers):
+def first_from_equal(numbers: NDArray[np.integer]) -> NDArray[np.uint32]:
     """Write n on the first ion of each run of equal numbers and 0 on the others."""
     ions = np.zeros(len(numbers), np.uint32)
     if len(numbers):
@@ -117,7 +120,7 @@ def first_from_equal(numbers):
     return ions
 
 
-def first_from_every(multiplicity):
+def first_from_every(multiplicity: NDArray[np.integer]) -> NDArray[np.uint32] | None:
     """Turn n on every ion of a pulse into n on the first and 0 on the others; None where that cannot be."""
     multiplicity = multiplicity.astype(np.int64)
     runs = first_from_equal(multiplicity)
@@ -129,7 +132,7 @@ def first_from_every(multiplicity):
     return np.where(within % multiplicity == 0, multiplicity, 0).astype(np.uint32)
 
 
-def whole_pulses(ions):
+def whole_pulses(ions: NDArray[np.integer]) -> int:
     """Count the rows in whole pulses, given rows that begin with a pulse (n on its first ion, 0 on the others)."""
     last = int(np.flatnonzero(ions)[-1])
     return len(ions) if len(ions) - last >= ions[last] else last

@@ -2,13 +2,17 @@
 
 import os
 import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apt_evap._arrays import check_choice, check_switch, shown
 from apt_evap._files import FileError, TruncatedFile, open_for_reading, replace_file
-from apt_evap.hits import Outcome
+from apt_evap._types import AnyPath
+from apt_evap.hits import Hits, Outcome
 
 _CHUNK = 1 << 14
 _SURVEY = 1 << 16
@@ -18,12 +22,14 @@ _ORDERS = {"big": ">", "little": "<"}
 class Words:
     """The rows of an open file: `n` whole ones, `cut` if the file ends in the middle of one more."""
 
-    def __init__(self, file, path, words, order, n, cut):
+    def __init__(self, file: BinaryIO, path: AnyPath, words: int, order: str, n: int, cut: bool) -> None:
         self.n = n
         self.cut = cut
         self._file, self._path, self._words, self._order = file, path, words, order
 
-    def read(self, fields, start=0, stop=None):
+    def read(
+        self, fields: Mapping[str, tuple[int, int, str]], start: int = 0, stop: int | None = None
+    ) -> dict[str, NDArray[Any]]:
         """Read columns, through a small buffer, into native arrays.
 
         Parameters
@@ -58,12 +64,12 @@ class Words:
                     column[:, word] = rows.view(self._order + dtype)[:, first + word]
         return columns
 
-    def survey(self, fields):
+    def survey(self, fields: dict[str, Any]) -> Iterator[dict[str, NDArray[Any]]]:
         """Read the whole file in blocks of a size that stays in the cache."""
         for start in range(0, self.n, _SURVEY):
             yield self.read(fields, start, min(start + _SURVEY, self.n))
 
-    def blocks(self, fields, rows, keep, ahead=0):
+    def blocks(self, fields: dict[str, Any], rows: int, keep: Callable[..., Any], ahead: int = 0) -> Iterator[Any]:
         """Read blocks of at most `rows` ions that end with a pulse.
 
         Parameters
@@ -93,7 +99,17 @@ class Words:
 
 
 @contextmanager
-def open_words(path, row_size, kind, *, order="big", floats=4, partial=False, byte_order=None, rival=None):
+def open_words(
+    path: AnyPath,
+    row_size: int,
+    kind: str,
+    *,
+    order: str = "big",
+    floats: int = 4,
+    partial: bool = False,
+    byte_order: str | None = None,
+    rival: tuple[str, int] | None = None,
+) -> Iterator[Words]:
     """Open a headerless file and check its size and byte order.
 
     Parameters
@@ -147,7 +163,7 @@ def open_words(path, row_size, kind, *, order="big", floats=4, partial=False, by
         yield Words(file, path, words, _ORDERS[byte_order or order], n, bool(tail))
 
 
-def fill(file, array):
+def fill(file: Any, array: Any) -> int:
     """Read until `array` is full or the file ends; return the number of bytes."""
     target = memoryview(array).cast("B") if array.size else b""
     done = 0
@@ -156,7 +172,7 @@ def fill(file, array):
     return done
 
 
-def check_columns(columns, available, path):
+def check_columns(columns: str | Sequence[str] | None, available: Sequence[str], path: AnyPath) -> tuple[str, ...]:
     """Return the names of the columns to read, or say which one the format does not have.
 
     Parameters
@@ -189,7 +205,9 @@ def check_columns(columns, available, path):
     return chosen
 
 
-def choose_fields(columns, available, fields, path, also):
+def choose_fields(
+    columns: Any, available: Sequence[str], fields: dict[str, Any], path: AnyPath, also: dict[str, Any]
+) -> tuple[tuple[str, ...], dict[str, Any]]:
     """Return the names of the columns to read, and the fields that takes.
 
     Parameters
@@ -211,13 +229,13 @@ def choose_fields(columns, available, fields, path, also):
     return chosen, {name: field for name, field in fields.items() if name in needed}
 
 
-def check_any(chosen, path):
+def check_any(chosen: Any, path: AnyPath) -> None:
     """Complain if there is none of the columns asked for, a dict of name and array or None."""
     if all(values is None for values in chosen.values()):
         raise FileError(f"{str(path)!r} has nothing in {', '.join(chosen)}: absent or zero throughout")
 
 
-def choose(path, hits, columns):
+def choose(path: AnyPath, hits: Hits, columns: Any) -> Any:
     """Choose the ions to write: those that hit and are finite, with a warning that counts the others.
 
     Parameters
@@ -256,7 +274,7 @@ def choose(path, hits, columns):
     return hit & finite
 
 
-def write_words(path, columns, row_size, chosen):
+def write_words(path: AnyPath, columns: Any, row_size: int, chosen: Any) -> None:
     """Write columns side by side as big-endian 4-byte words, chunk by chunk.
 
     Parameters

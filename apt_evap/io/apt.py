@@ -7,12 +7,14 @@ write them. Any section of fixed records, one to an ion, is read; the others are
 import math
 import os
 import warnings
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 
 from apt_evap._files import TruncatedFile, open_for_reading
+from apt_evap._types import AnyPath
 from apt_evap.hits import Hits
 from apt_evap.io._apt_sections import read_sections
 from apt_evap.io._pulses import PulseCheck, first_from_every, pulses_from_first, whole_pulses
@@ -49,7 +51,7 @@ class _Column:
     part: int | None = None
 
 
-def read_apt(path, *, columns=None, partial=False):
+def read_apt(path: AnyPath, *, columns: Sequence[str] | None = None, partial: bool = False) -> Hits:
     """Read an .apt file.
 
     The sections tofc, Mass, XDet_mm and YDet_mm (or Detector Coordinates), Position and Multiplicity become columns
@@ -83,7 +85,9 @@ def read_apt(path, *, columns=None, partial=False):
         return _hits(file, path, chosen, grouping, ions, 0, n)
 
 
-def chunk_apt(path, rows, *, columns=None, partial=False):
+def chunk_apt(
+    path: AnyPath, rows: int, *, columns: Sequence[str] | None = None, partial: bool = False
+) -> Iterator[Hits]:
     """Read an .apt file in `Hits` of at most `rows` ions, one after the other, in whole pulses; else as `read_apt`.
 
     The multiplicity of all ions is held in memory, 4 bytes per ion. Without one, chunks are of `rows` ions.

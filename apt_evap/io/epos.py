@@ -5,9 +5,12 @@ detector coordinates in mm in real files, against the units printed there.
 """
 
 import warnings
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
+from apt_evap._types import AnyPath
 from apt_evap.hits import Hits
 from apt_evap.io._pulses import PulseCheck, first_from_equal, pulses_from_first, whole_pulses
 from apt_evap.io._records import check_any, choose, choose_fields, open_words, write_words
@@ -29,7 +32,9 @@ _COLUMNS = (*tuple(_FIELDS)[:-1], "pulse_id", "multiplicity")
 _WITH = {"x": ("y",), "y": ("x",), "pulse_voltage": ("voltage",), "pulse_id": ("ions",), "multiplicity": ("ions",)}
 
 
-def read_epos(path, *, columns=None, partial=False, byte_order=None):
+def read_epos(
+    path: AnyPath, *, columns: Sequence[str] | None = None, partial: bool = False, byte_order: str | None = None
+) -> Hits:
     """Read an .epos file.
 
     A column of zeros counts as absent (None): positions, mass, time of flight, standing voltage, and detector
@@ -69,7 +74,14 @@ def read_epos(path, *, columns=None, partial=False, byte_order=None):
         return _hits(block, survey, chosen, path)
 
 
-def chunk_epos(path, rows, *, columns=None, partial=False, byte_order=None):
+def chunk_epos(
+    path: AnyPath,
+    rows: int,
+    *,
+    columns: Sequence[str] | None = None,
+    partial: bool = False,
+    byte_order: str | None = None,
+) -> Iterator[Hits]:
     """Read an .epos file in `Hits` of at most `rows` ions, one after the other, in whole pulses.
 
     The file is read twice: what is absent, the unit of the voltages and whether the pulses are consistent is
@@ -120,14 +132,14 @@ def chunk_epos(path, rows, *, columns=None, partial=False, byte_order=None):
 class _Survey:
     """What only the whole file tells: columns of zeros, kilovolts, and whether the pulses are consistent."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.present = set()
         self.highest = {}
         self.pulses = PulseCheck()
         self.grouped = False
 
     @np.errstate(invalid="ignore")
-    def add(self, block):
+    def add(self, block: Any) -> None:
         """Go on with the next rows."""
         for name, values in block.items():
             # mostly the first rows tell
@@ -139,7 +151,7 @@ class _Survey:
         if "ions" in block:
             self.pulses.add(block["ions"])
 
-    def end(self, cut, path):
+    def end(self, cut: bool, path: AnyPath) -> Any:
         """Conclude, and warn of pulses that contradict themselves."""
         if self.present & {"x", "y"}:
             self.present |= {"x", "y"}
@@ -177,7 +189,7 @@ def _open(path, partial, byte_order):
     return open_words(path, _ROW, "an .epos", partial=partial, byte_order=byte_order, rival=("a .pos", 16))
 
 
-def write_epos(path, hits):
+def write_epos(path: AnyPath, hits: Hits) -> None:
     """Write an .epos file; a warning counts the ions left out.
 
     Left out are ions that did not hit the detector and ions with a value that is not finite. Missing columns

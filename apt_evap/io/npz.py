@@ -8,6 +8,7 @@ import zlib
 import numpy as np
 
 from apt_evap._files import FileError, open_for_reading
+from apt_evap._types import AnyPath
 from apt_evap.maps import DetectorMap
 
 # what zip archives and headers of arrays with wrong bytes were seen to raise
@@ -16,7 +17,15 @@ _DAMAGED += (SyntaxError, struct.error, tokenize.TokenError, zlib.error, zipfile
 _MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 1e-3}
 
 
-def read_map(path, *, values=None, x_edges=None, y_edges=None, mask=None, unit=None):
+def read_map(
+    path: AnyPath,
+    *,
+    values: str | None = None,
+    x_edges: str | None = None,
+    y_edges: str | None = None,
+    mask: str | None = None,
+    unit: str | None = None,
+) -> "DetectorMap":
     """Read a detector map from an .npz file.
 
     Arrays are found by their names and shapes, or named. Values are the one array of numbers of two dimensions,

@@ -3,6 +3,9 @@
 Larson et al., Local Electrode Atom Probe Tomography (Springer, 2013), appendix A.
 """
 
+from collections.abc import Iterator, Sequence
+
+from apt_evap._types import AnyPath
 from apt_evap.hits import Hits
 from apt_evap.io._records import check_columns, choose, open_words, write_words
 
@@ -10,7 +13,9 @@ _ROW = 16
 _FIELDS = {"positions": (0, 3, "f4"), "mass_to_charge": (3, 1, "f4")}
 
 
-def read_pos(path, *, columns=None, partial=False, byte_order=None):
+def read_pos(
+    path: AnyPath, *, columns: Sequence[str] | None = None, partial: bool = False, byte_order: str | None = None
+) -> Hits:
     """Read a .pos file.
 
     Parameters
@@ -41,7 +46,14 @@ def read_pos(path, *, columns=None, partial=False, byte_order=None):
         return Hits(**words.read(fields), source=str(path))
 
 
-def chunk_pos(path, rows, *, columns=None, partial=False, byte_order=None):
+def chunk_pos(
+    path: AnyPath,
+    rows: int,
+    *,
+    columns: Sequence[str] | None = None,
+    partial: bool = False,
+    byte_order: str | None = None,
+) -> Iterator[Hits]:
     """Read a .pos file in `Hits` of at most `rows` ions, one after the other; otherwise as `read_pos`.
 
     Yields
@@ -54,7 +66,7 @@ def chunk_pos(path, rows, *, columns=None, partial=False, byte_order=None):
             yield Hits(**words.read(fields, start, min(start + rows, words.n)), source=str(path))
 
 
-def write_pos(path, hits):
+def write_pos(path: AnyPath, hits: Hits) -> None:
     """Write a .pos file; a warning counts the ions left out.
 
     Left out are ions that did not hit the detector and ions whose position or mass is not finite.

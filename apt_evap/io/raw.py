@@ -5,9 +5,11 @@ float32, then an epoch (int32) and the number of the pulse (uint32).
 """
 
 import warnings
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from apt_evap._types import AnyPath
 from apt_evap.hits import Hits
 from apt_evap.io._pulses import first_from_equal, pulses_from_first
 from apt_evap.io._records import check_any, choose_fields, open_words
@@ -28,7 +30,9 @@ _COLUMNS = (*_FIELDS, "pulse_id", "multiplicity")
 _WITH = {"pulse_id": ("pulse_number",), "multiplicity": ("pulse_number",)}
 
 
-def read_raw(path, *, columns=None, partial=False, byte_order=None):
+def read_raw(
+    path: AnyPath, *, columns: Sequence[str] | None = None, partial: bool = False, byte_order: str | None = None
+) -> Hits:
     """Read a Stuttgart .raw file.
 
     Neighbouring ions of equal pulse number share a pulse; the number may wrap around. A pulse number that is zero
@@ -65,7 +69,14 @@ def read_raw(path, *, columns=None, partial=False, byte_order=None):
         return _hits(block, grouped, chosen, path)
 
 
-def chunk_raw(path, rows, *, columns=None, partial=False, byte_order=None):
+def chunk_raw(
+    path: AnyPath,
+    rows: int,
+    *,
+    columns: Sequence[str] | None = None,
+    partial: bool = False,
+    byte_order: str | None = None,
+) -> Iterator[Hits]:
     """Read a .raw file in `Hits` of at most `rows` ions, one after the other, in whole pulses; else as `read_raw`.
 
     Yields

@@ -10,12 +10,13 @@ import warnings
 import numpy as np
 
 from apt_evap._files import FileError, open_for_reading
+from apt_evap._types import AnyPath
 from apt_evap.ranges import Ranges
 
 _MOST = 1 << 22
 
 
-def read_ranges(path):
+def read_ranges(path: AnyPath) -> Ranges:
     """Read the mass ranges of an .rrng file.
 
     Parameters
@@ -58,7 +59,7 @@ def read_ranges(path):
     if announced and announced[0] != str(len(parts)):
         warnings.warn(f"{str(path)!r} announces {announced[0]:.20} ranges and holds {len(parts)}", stacklevel=2)
     names, low, high, volume, colour, composition = zip(*parts, strict=True)
-    return Ranges(names, low, high, volume, colour, composition, source=str(path))
+    return Ranges(names, np.array(low), np.array(high), np.array(volume), colour, composition, source=str(path))
 
 
 def _lines(data):

@@ -3,13 +3,15 @@
 import numpy as np
 
 from apt_evap._files import replace_file
+from apt_evap._types import AnyPath
+from apt_evap.hits import Hits
 from apt_evap.io._points import points_and_data
 
 _CHUNK = 1 << 20
 _TYPES = {"f": "Float", "i": "Int", "u": "UInt"}
 
 
-def write_vtp(path, hits):
+def write_vtp(path: AnyPath, hits: Hits) -> None:
     """Write ions as points of VTK, one vertex each, with all other columns as data of the points.
 
     Positions are in nm, all other columns in the units of `Hits`. Left out are ions whose positions are not finite;

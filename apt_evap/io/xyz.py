@@ -1,15 +1,19 @@
 """Extended XYZ, text that OVITO and ASE read: species and position [Angstrom] of every ion, and its other columns."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from apt_evap._files import replace_file
+from apt_evap._types import AnyPath
+from apt_evap.hits import Hits
 from apt_evap.io._points import points_and_data
 
 _CHUNK = 1 << 14
 _ANGSTROM_PER_NM = 10
 
 
-def write_xyz(path, hits, *, species="X"):
+def write_xyz(path: AnyPath, hits: Hits, *, species: str | Sequence[str] = "X") -> None:
     """Write ions as extended XYZ.
 
     Positions are in Angstrom, with five decimals; all other columns are in the units of `Hits`, float32 with nine and

@@ -1,15 +1,21 @@
 """Figures and colour bars, the same for every picture."""
 
 import sys
+from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 
 OUTSIDE = "0.88"
 """Colour of what is outside the detector."""
 
 
-def add_colorbar(images, ax, label="hits per area / mean"):
+def add_colorbar(
+    images: Sequence[AxesImage], ax: Axes | Sequence[Axes], label: str = "hits per area / mean"
+) -> Colorbar:
     """Add a colour bar for images of one scale, with arrows where it cuts off values.
 
     Parameters
@@ -33,7 +39,7 @@ def add_colorbar(images, ax, label="hits per area / mean"):
     return figure.colorbar(images[0], ax=ax, label=label, extend=extend, fraction=0.05, pad=0.02)
 
 
-def new_figure(size):
+def new_figure(size: tuple[float, float]) -> Figure:
     """Make a figure of (width, height) `size` [inch].
 
     With pyplot imported, as in a notebook, pyplot makes it, so that it is shown; without, as in a batch job,

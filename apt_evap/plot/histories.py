@@ -1,12 +1,18 @@
 """Field and voltage in the course of a run."""
 
+from collections.abc import Sequence
+
 import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
 
 from apt_evap._arrays import check_count
+from apt_evap.hits import Hits
 from apt_evap.plot._figure import new_figure
+from apt_evap.run import Run
 
 
-def history(run, axes=None, *, points=200):
+def history(run: Run | Hits, axes: Sequence[Axes] | None = None, *, points: int = 200) -> NDArray[np.object_]:
     """Draw the field at which atoms left and the voltage it takes, or the voltage of a measurement, against the ions.
 
     The line is the median of successive ions, the band holds 90 % of them.

@@ -1,11 +1,25 @@
 """Detector maps, alone or side by side."""
 
-import numpy as np
+from collections.abc import Sequence
 
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
+
+from apt_evap.maps import DetectorMap
 from apt_evap.plot._figure import OUTSIDE, add_colorbar, new_figure
 
 
-def detector_map(map, ax=None, *, title=None, limits=None, colormap="inferno", colorbar=True, caption=True):
+def detector_map(
+    map: DetectorMap,
+    ax: Axes | None = None,
+    *,
+    title: str | None = None,
+    limits: tuple[float, float] | None = None,
+    colormap: str = "inferno",
+    colorbar: bool = True,
+    caption: bool = True,
+) -> Axes:
     """Draw a detector map.
 
     Parameters
@@ -54,7 +68,14 @@ def detector_map(map, ax=None, *, title=None, limits=None, colormap="inferno", c
     return ax
 
 
-def detector_maps(maps, titles=None, *, limits=None, colormap="inferno", columns=None):
+def detector_maps(
+    maps: Sequence[DetectorMap],
+    titles: Sequence[str] | None = None,
+    *,
+    limits: tuple[float, float] | None = None,
+    colormap: str = "inferno",
+    columns: int | None = None,
+) -> NDArray[np.object_]:
     """Draw several detector maps side by side with one colour scale.
 
     Parameters
@@ -100,7 +121,7 @@ def detector_maps(maps, titles=None, *, limits=None, colormap="inferno", columns
     return axes
 
 
-def color_limits(map):
+def color_limits(map: DetectorMap) -> tuple[float, float]:
     """Robust ends of a colour scale: the 0.5 and 99.5 percentiles of the density inside the detector.
 
     Parameters
@@ -117,7 +138,7 @@ def color_limits(map):
     return (float(low), float(high)) if high > low else (0.0, 2.0)
 
 
-def common_limits(maps):
+def common_limits(maps: Sequence[DetectorMap]) -> tuple[float, float]:
     """One colour scale for maps side by side: the 0.5 and 99.5 percentiles of the densities of all of them.
 
     A low end below a twentieth of the high one becomes 0.
@@ -138,7 +159,7 @@ def common_limits(maps):
     return (float(low) if low > high / 20 else 0.0), float(high)
 
 
-def describe(map):
+def describe(map: DetectorMap) -> str:
     """Number of ions, size of the bins and smoothing of a map, as a caption (str)."""
     width, height = map.bin_size
     square = abs(width / height - 1) < 1e-3

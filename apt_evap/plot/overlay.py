@@ -1,18 +1,30 @@
 """A simulated map drawn over a measured one, as they are registered."""
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from apt_evap.alignment import BROAD, View
+from apt_evap.hits import Hits
 from apt_evap.maps import DetectorMap
 from apt_evap.plot.maps import detector_map
+from apt_evap.register import Registration
 
 BRIGHT, DARK, RIM = "cyan", "lime", "white"
 _SMOOTHING = 0.015
 """Of the contours [diameters of the measured field of view]."""
 
 
-def overlay(simulated, measured, registration, ax=None, *, title=None, colormap="inferno", colorbar=True):
+def overlay(
+    simulated: DetectorMap | Hits,
+    measured: DetectorMap | Hits,
+    registration: Registration,
+    ax: Axes | None = None,
+    *,
+    title: str | None = None,
+    colormap: str = "inferno",
+    colorbar: bool = True,
+) -> Axes:
     """Draw a measured map with contours of the simulated one moved onto it.
 
     Contours are those of the flattened simulated map, half a standard deviation above its mean (what is bright) and

@@ -1,17 +1,34 @@
 """Poles and zone lines over a detector map."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
 
+from apt_evap.maps import DetectorMap
+from apt_evap.orientation import Orientation
 from apt_evap.poles import poles as poles_of
 from apt_evap.poles import zones
+from apt_evap.projection import Projection
 
 _COLORS = ("#35b6ff", "#ff9d3b", "#7be07b", "#e58cff")
 _AZIMUTHS = np.radians(np.arange(0.0, 360.5, 0.5))
 _APART = 30  # points between a label and one drawn before, at font size 9
 
 
-def poles(ax, orientation, projection, *, families=6, zone_families=None, labels=True, region=None, size=9):
+def poles(
+    ax: Axes,
+    orientation: Orientation,
+    projection: Projection,
+    *,
+    families: int = 6,
+    zone_families: Sequence[Any] | None = None,
+    labels: bool = True,
+    region: DetectorMap | None = None,
+    size: float = 9,
+) -> Axes:
     """Draw the poles and zone lines of a specimen over a map.
 
     Parameters

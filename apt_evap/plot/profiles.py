@@ -1,13 +1,26 @@
 """Profiles, the lines fitted to them, two of them compared; rectangles on a map."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.patches import Polygon
+from numpy.typing import NDArray
 
 from apt_evap.plot._figure import new_figure
-from apt_evap.zone_line import compare_profiles
+from apt_evap.profiles import Profile, Rectangle
+from apt_evap.zone_line import ZoneLine, compare_profiles
 
 
-def profile(profiles, labels=None, ax=None, *, lines=None, xlabel="distance from the line [mm]"):
+def profile(
+    profiles: Profile | Sequence[Profile],
+    labels: Sequence[str] | None = None,
+    ax: Axes | None = None,
+    *,
+    lines: Sequence[ZoneLine] | None = None,
+    xlabel: str = "distance from the line [mm]",
+) -> Axes:
     """Draw profiles with their errors, and the lines fitted to them.
 
     Parameters
@@ -46,7 +59,7 @@ def profile(profiles, labels=None, ax=None, *, lines=None, xlabel="distance from
         color = f"C{index}"
         errors = one.error if np.isfinite(one.error).any() else None
         if line is not None:
-            label = f"{label or line.kind}: {line.width:.1f} ± {line.width_error:.1f} mm"
+            label = f"{label or line.kind}: {line.width:.2f} ± {line.width_error:.2f} mm"
             fine = np.linspace(one.position[0], one.position[-1], 400)
             ax.plot(fine, line.density(fine), color=color, linewidth=1.5, alpha=0.85)
         ax.errorbar(
@@ -61,7 +74,14 @@ def profile(profiles, labels=None, ax=None, *, lines=None, xlabel="distance from
     return ax
 
 
-def profile_comparison(first, second, labels=None, axes=None, *, lines=None):
+def profile_comparison(
+    first: Profile,
+    second: Profile,
+    labels: Sequence[str] | None = None,
+    axes: Sequence[Axes] | None = None,
+    *,
+    lines: Sequence[ZoneLine] | None = None,
+) -> NDArray[np.object_]:
     """Draw two profiles of one rectangle, and below them their difference in units of its error.
 
     Parameters
@@ -96,7 +116,7 @@ def profile_comparison(first, second, labels=None, axes=None, *, lines=None):
     lower.axhspan(-1, 1, color="0.9", linewidth=0)
     lower.axhline(0, color="0.4", linewidth=0.8)
     lower.bar(compared.position, compared.difference, 0.8 * bin_width, color="0.35")
-    reach = max(4.0, 1.1 * np.nanmax(np.abs(compared.difference)))
+    reach = max(4.0, 1.6 * np.nanmax(np.abs(compared.difference)))  # room for the text above the bars
     lower.set(ylim=(-reach, reach), xlabel="distance from the line [mm]", ylabel="difference\n/ error")
     lower.annotate(
         f"$\\chi^2$ = {compared.chi_square:.0f} for {compared.degrees_of_freedom}", (0.02, 0.95),
@@ -105,7 +125,9 @@ def profile_comparison(first, second, labels=None, axes=None, *, lines=None):
     return np.array([upper, lower])
 
 
-def rectangles(chosen, ax, *, colors="cyan", labels=None):
+def rectangles(
+    chosen: Rectangle | Sequence[Rectangle], ax: Axes, *, colors: Any = "cyan", labels: Sequence[str] | None = None
+) -> Axes:
     """Draw rectangles on a detector map, with a thin line where the profile is zero.
 
     Parameters

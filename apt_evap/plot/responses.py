@@ -1,25 +1,39 @@
 """Where chosen ions land as the energy of the perturbation grows."""
 
+from typing import Any
+
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
+from numpy.typing import ArrayLike
 
 from apt_evap.plot._figure import new_figure
+from apt_evap.run import Run
 from apt_evap.tracks import lateral_tracks, rollup_tracks
 
 MECHANISMS = ("lateral velocity", "roll-up")
 
 
-def ion_colors(n):
+def ion_colors(n: int) -> list[str]:
     """Colours that tell n chosen ions apart, the same in every picture (list of str)."""
     return [f"C{index % 10}" for index in range(n)]
 
 
 def response(
-    run, ions, mechanism="lateral velocity", ax=None, *, energies=None, colors=None, colormap="viridis",
-    colorbar=True, zoom=None, title=None,
-):  # fmt: skip
+    run: Run,
+    ions: ArrayLike,
+    mechanism: str = "lateral velocity",
+    ax: Axes | None = None,
+    *,
+    energies: ArrayLike | None = None,
+    colors: Any = None,
+    colormap: str = "viridis",
+    colorbar: bool = True,
+    zoom: int | None = None,
+    title: str | None = None,
+) -> Axes:
     """Draw where chosen ions land under launch energies from none to the highest.
 
     For a lateral velocity, every direction along the surface is shown; for roll-up, the track that leads from the

@@ -1,18 +1,32 @@
 """The surface of a specimen, atom by atom, seen from any side."""
 
+from typing import Any
+
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
+from numpy.typing import ArrayLike
 
 from apt_evap._arrays import check_array, check_number
+from apt_evap.emitter import Emitter
 from apt_evap.plot._figure import add_colorbar, new_figure
 
 COLORED_BY = {"fields": "field [V/nm]", "charges": "charge [e]"}
 
 
 def specimen(
-    emitter, color="fields", ax=None, *, elevation=90.0, azimuth=-90.0, label=None, limits=None,
-    colormap="viridis", colorbar=True, title=None,
-):  # fmt: skip
+    emitter: Emitter,
+    color: str | ArrayLike = "fields",
+    ax: Axes | None = None,
+    *,
+    elevation: float = 90.0,
+    azimuth: float = -90.0,
+    label: str | None = None,
+    limits: tuple[float, ...] | None = None,
+    colormap: str = "viridis",
+    colorbar: bool = True,
+    title: str | None = None,
+) -> Axes:
     """Draw the surface atoms of a specimen as discs of their size, those in front over those behind.
 
     Parameters
@@ -93,7 +107,15 @@ def _discs(ax, places, diameter, **colors):
     return discs
 
 
-def mark_atoms(positions, ax, *, colors="black", elevation=90.0, azimuth=-90.0, size=14.0):
+def mark_atoms(
+    positions: ArrayLike,
+    ax: Axes,
+    *,
+    colors: Any = "black",
+    elevation: float = 90.0,
+    azimuth: float = -90.0,
+    size: float = 14.0,
+) -> Axes:
     """Draw a dashed circle around each of some atoms in a picture of the specimen.
 
     Parameters

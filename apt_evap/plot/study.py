@@ -1,16 +1,20 @@
 """Pictures of a study: similarity against energies, and the maps side by side."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.patches import Circle, Rectangle
+from numpy.typing import NDArray
 
 from apt_evap._arrays import check_array, check_number
 from apt_evap.plot._figure import OUTSIDE, add_colorbar, new_figure
 from apt_evap.plot.maps import common_limits, detector_map
+from apt_evap.study import Study
 
 _MARK = "#00d0ff"  # seen on every colour of both maps
 
 
-def ssim_matrix(study, *, colormap="viridis"):
+def ssim_matrix(study: Study, *, colormap: str = "viridis") -> NDArray[np.object_]:
     """Draw the similarity with the measured map against mean and relative standard deviation of the energy.
 
     The best point is framed; a circle is the best place between points, with the interval of 95 % of the resamples.
@@ -80,7 +84,13 @@ def _mark_optima(study, axes):
     ax.errorbar(x, y, **errors, fmt="o", color="r", capsize=3, markersize=9, markerfacecolor="none")
 
 
-def side_by_side(study, *, circle=None, titles=None, colormap="inferno"):
+def side_by_side(
+    study: Study,
+    *,
+    circle: tuple[float, ...] | None = None,
+    titles: Sequence[str] | None = None,
+    colormap: str = "inferno",
+) -> NDArray[np.object_]:
     """Draw the measured map beside the simulated ones, unperturbed and at the optimum, and a part of them magnified.
 
     Maps are drawn as they are compared: flattened and smoothed, inside the region that all show.
