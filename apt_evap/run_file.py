@@ -121,7 +121,10 @@ def _writing(path):
 
 
 def _put_text(item, name, text):
-    """Text of fixed length: in a damaged heap of texts of any length HDF5 hangs or crashes (3 of 960 files)."""
+    """Text that is read back, of fixed length: in a damaged heap of texts of any length HDF5 hangs or crashes.
+
+    It did in 3 of 960 files changed at random; in none of 1,440 with these.
+    """
     content = text.encode()
     if len(content) > _LONGEST_TEXT:
         item.attrs[name] = text
@@ -140,7 +143,7 @@ def _put(group, name, values, units=None):
     chunks = (min(len(values), ROWS), *values.shape[1:]) if values.size else None
     dataset = group.create_dataset(name, data=values, chunks=chunks, fletcher32=chunks is not None)
     if units := units or _UNITS.get(name):
-        _put_text(dataset, "units", units)
+        dataset.attrs["units"] = units
     return dataset
 
 
@@ -150,7 +153,7 @@ def _write(file, run):
     _put_text(file, "elements", json.dumps(run.elements))
     _put_text(file, "ended", run.ended)
     file.attrs["nearest_neighbour_distance"] = run.emissions.nearest_neighbour_distance
-    _put_text(file.create_group(_ENTRY), "NX_class", "NXentry")
+    file.create_group(_ENTRY).attrs["NX_class"] = "NXentry"
     probe, simulation = file.create_group(_ATOM_PROBE), file.create_group(_SIMULATION)
     first = run.hits(run.first_perturbation)
     _put(probe, "evaporation_id", run.emissions.ions)
