@@ -154,6 +154,18 @@ def test_chunks_smaller_than_a_pulse(tmp_path, suffix):
         list(chunks(path, 3))
 
 
+def test_the_last_pulse_of_a_cut_file_may_be_smaller_than_it_says(tmp_path):
+    path = tmp_path / "a.epos"
+    path.write_bytes(epos([2, 0, 9, 0]) + bytes(10))
+    whole = read(path, partial=True)
+    parts = list(chunks(path, 3, partial=True))
+    assert [len(part) for part in parts] == [2, 2] and whole.multiplicity.tolist() == [2, 2, 9, 9]
+    assert np.concatenate([part.pulse_id for part in parts]).tolist() == whole.pulse_id.tolist() == [0, 0, 1, 1]
+    path.write_bytes(epos([2, 0, 9, 0, 0, 0]) + bytes(10))
+    with pytest.raises(ValueError, match=r"rows must be at least 9, .*a\.epos.*got 3"):
+        list(chunks(path, 3, partial=True))
+
+
 def test_arguments(tmp_path):
     path = tmp_path / "a.pos"
     path.write_bytes(pos(3))

@@ -1,5 +1,8 @@
 """Whatever a file holds, a reader gives ions or says in one sentence what is wrong with which file."""
 
+import os
+import subprocess
+import sys
 import warnings
 from pathlib import Path
 
@@ -10,6 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from ion_files import epos, ions_of, pos, raw, usual_apt
 
+import apt_evap as ae
 from apt_evap.hits import Hits
 from apt_evap.io import FORMATS, FileError, chunks, read, read_ranges
 from apt_evap.ranges import Ranges
@@ -158,6 +162,46 @@ def test_hdf5_that_is_no_run(tmp_path, member):
         if member == "format only":
             file.attrs["format"] = FORMAT
     assert check(path) is None
+
+
+DAMAGE = """
+import random, sys, warnings
+import apt_evap as ae
+warnings.simplefilter("ignore")
+whole = open("run.h5", "rb").read()
+for case in range(120):
+    draw, data = random.Random(case), bytearray(whole)
+    if case % 3 == 0:
+        del data[draw.randrange(len(data)) :]
+    elif case % 3 == 1:
+        for _ in range(draw.choice((1, 5, 50))):
+            data[draw.randrange(len(data))] = draw.randrange(256)
+    else:
+        start = draw.randrange(len(data))
+        data[start : start + 512] = bytes(len(data[start : start + 512]))
+    open("damaged.h5", "wb").write(data)
+    try:
+        run = ae.load("damaged.h5") if case % 2 else ae.read("damaged.h5")
+    except ae.FileError as error:
+        assert "damaged.h5" in str(error) and chr(10) not in str(error), error
+    else:
+        assert len(run) == 40 and len(run.hits(ae.Unperturbed())) == 40
+    print(case)
+"""
+
+
+def test_damaged_runs_are_read_or_refused(tmp_path, small_tip):
+    """In a process of its own: HDF5 might take it down."""
+    ae.Simulation(small_tip, n_threads=1).run(40, progress=False).save(tmp_path / "run.h5")
+    done = subprocess.run(
+        [sys.executable, "-c", DAMAGE],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=500,
+        env=os.environ | {"PYTHONPATH": str(Path(ae.__file__).parents[1])},
+    )
+    assert done.returncode == 0 and done.stdout.split()[-1] == "119", (done.stdout[-10:], done.stderr[-500:])
 
 
 @pytest.mark.skipif(not SILICON.exists(), reason="the measured Si.epos is not there")

@@ -214,3 +214,27 @@ def test_another_detector_sees_the_same_ions(run, tmp_path):
     assert (seen.time_of_flight[both] < plane.time_of_flight[both]).mean() > 0.9
     curved.save(tmp_path / "curved.h5")
     assert ae.load(tmp_path / "curved.h5").detector == curved.detector
+
+
+def test_texts_that_are_read_are_of_fixed_length(run, tmp_path):
+    """The heap of texts of any length is what HDF5 hangs in, or crashes, where a file is damaged."""
+    run.save(tmp_path / "a.h5")
+    texts = []
+
+    def look(item):
+        for name in item.attrs:
+            kind = h5py.check_string_dtype(item.attrs.get_id(name).dtype)
+            if kind is not None and name not in ("units", "NX_class"):  # for other programs
+                texts.append(name)
+                assert kind.length is not None, name
+
+    with h5py.File(tmp_path / "a.h5") as file:
+        look(file)
+        file.visititems(lambda name, item: look(item))
+    assert {"format", "settings", "provenance", "elements", "ended", "perturbation"} <= set(texts)
+
+
+def test_texts_longer_than_an_attribute_are_kept(run, tmp_path):
+    words = {"config": "Ω" * 40_000}  # 80 kB in UTF-8
+    replace(run, provenance=run.provenance | words).save(tmp_path / "a.h5")
+    assert ae.load(tmp_path / "a.h5").provenance["config"] == words["config"]

@@ -104,13 +104,25 @@ def chunk_epos(
             survey.add(block)
             del block
         survey.end(words.cut, path)
-        if survey.grouped and rows < survey.pulses.largest:
-            raise ValueError(
-                f"rows must be at least {survey.pulses.largest}, the ions of the largest pulse of {str(path)!r}, "
-                f"got {rows}"
+
+        def too_few(largest):
+            return ValueError(
+                f"rows must be at least {largest}, the ions of the largest pulse of {str(path)!r}, got {rows}"
             )
+
+        def keep(block):
+            if not survey.grouped:
+                return rows
+            kept = whole_pulses(block["ions"])
+            if kept == 0:
+                raise too_few(block["ions"][0])
+            return kept
+
+        # the last pulse of a truncated file may be announced larger than what is left of it
+        if survey.grouped and rows < survey.pulses.largest and not words.cut:
+            raise too_few(survey.pulses.largest)
         first_pulse = 0
-        for block in words.blocks(fields, rows, lambda block: whole_pulses(block["ions"]) if survey.grouped else rows):
+        for block in words.blocks(fields, rows, keep):
             pulses = np.count_nonzero(block["ions"])
             yield _hits(block, survey, chosen, path, first_pulse)
             first_pulse += pulses
