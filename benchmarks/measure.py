@@ -191,7 +191,7 @@ def charge_errors(radius=40, shank=1.0, events=5000, n_threads=2):
     """Charges after events against a converged solution of the same surface, just after and just before relaxations."""
     rows = []
     emitter = Emitter(nickel_tip(radius, shank), n_threads=n_threads)
-    interval = emitter._sweep_interval
+    interval = emitter.sweep_interval
     for count in (events, interval - 1 - events % interval):
         evaporate(emitter, count)
         atoms, charges, since = emitter.atoms, emitter.charges.copy(), emitter._core.since_sweep
@@ -220,7 +220,7 @@ def flights(radii=(20, 40, 80, 120), shank=2.0, ions=256, group=17):
     rows = []
     for radius in radii:
         emitter = Emitter(nickel_tip(radius, shank))
-        batch = emitter.evaporate(min(ions, emitter._sweep_interval))
+        batch = emitter.evaporate(min(ions, emitter.sweep_interval))
         tip, settings = emitter.tip, ae.FlightSettings()
         speed = np.sqrt(2 * 0.5)  # 0.5 eV, charge state 1
         for launches in (1, group):
