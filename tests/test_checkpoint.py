@@ -1,9 +1,10 @@
 """Runs that are killed, interrupted, out of disk or damaged, and go on with the same bits."""
 
-import multiprocessing
 import os
 import resource
 import signal
+import subprocess
+import sys
 import threading
 import time
 import warnings
@@ -19,9 +20,16 @@ from apt_evap import run_file
 from apt_evap.checkpoint import Keeper
 
 ENERGY = ae.TruncatedNormal(0.155, 0.155)
-PROCESSES = multiprocessing.get_context("forkserver") if hasattr(os, "fork") else None
-if PROCESSES:
-    PROCESSES.set_forkserver_preload(["apt_evap"])  # children begin without importing anything
+HERE = str(Path(ae.__file__).parents[1])  # the package under test, installed or not
+KILLABLE = pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
+
+
+def start(function, *arguments):
+    """Begin a function of this file in a process of its own, once that has imported all it needs."""
+    command = [sys.executable, "-P", __file__, function.__name__, *map(str, arguments)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, env=os.environ | {"PYTHONPATH": HERE})
+    process.stdout.readline()
+    return process
 
 
 def simulation(**options):
@@ -78,7 +86,7 @@ def work(path):
     )
 
 
-@pytest.mark.skipif(PROCESSES is None, reason="needs fork")
+@KILLABLE
 def test_killed_at_random_moments_and_resumed_it_has_the_same_bits(tmp_path):
     """SIGKILL at 20 random moments; whenever the run comes to its end before, another one begins."""
     simulation().run(N_IONS, [ae.RollUp(ENERGY)], progress=False).save(tmp_path / "uninterrupted.h5")
@@ -86,22 +94,18 @@ def test_killed_at_random_moments_and_resumed_it_has_the_same_bits(tmp_path):
     kills, whole, shortest = [], 0, None
     while len(kills) < KILLS or any("unfinished" in name for name in os.listdir(tmp_path)):
         path = tmp_path / f"{whole}.h5"
-        process = PROCESSES.Process(target=work, args=(path,))
+        process = start(work, path)
         began = time.monotonic()
-        process.start()
-        if len(kills) < KILLS and shortest is not None:
-            process.join(random.uniform(0, 0.4 * shortest))
-        else:
-            process.join()
-        if process.is_alive():
+        try:
+            process.wait(random.uniform(0, 0.4 * shortest) if len(kills) < KILLS and shortest is not None else None)
+        except subprocess.TimeoutExpired:
             process.kill()
-            process.join()
-            assert process.exitcode == -signal.SIGKILL
+        if process.wait() == -signal.SIGKILL:
             folder = Path(f"{path}.unfinished")
             done = len(list(folder.glob("ions-*.h5")))
             kills.append(done)
             continue
-        assert process.exitcode == 0
+        assert process.returncode == 0
         if len(kills) == 0:
             shortest = time.monotonic() - began
         assert differing(path, tmp_path / "uninterrupted.h5") == []
@@ -132,21 +136,18 @@ def crash(path, number, late):
     run_small(path, resume=True)
 
 
-@pytest.mark.skipif(PROCESSES is None, reason="needs fork")
+@KILLABLE
 @pytest.mark.parametrize("late", [False, True])
 def test_killed_at_every_rename(tmp_path, late):
     run_small(tmp_path / "uninterrupted.h5")
     for number in range(20):
         path = tmp_path / f"{number}.h5"
-        process = PROCESSES.Process(target=crash, args=(path, number, late))
-        process.start()
-        process.join()
-        left = process.exitcode == 9
+        left = start(crash, path, number, int(late)).wait() == 9
         run_small(path, resume=True)
         assert differing(path, tmp_path / "uninterrupted.h5") == []
         if not left:
             break
-    assert process.exitcode == 0
+    assert not left
     assert number >= 3 * 2 + 3  # three parts with their states, the whole file, its place, the folder
     assert not [name for name in os.listdir(tmp_path) if "unfinished" in name]
 
@@ -381,3 +382,9 @@ def test_other_versions_are_told(tmp_path):
         file.attrs["format"] = "apt_evap run 1"
     with pytest.raises(ae.FileError, match=r"is a run in another format, 'apt_evap run 1'; this version reads"):
         ae.load(tmp_path / "run.h5")
+
+
+if __name__ == "__main__":
+    print("ready", flush=True)
+    name, path, *numbers = sys.argv[1:]
+    {"work": work, "crash": crash}[name](Path(path), *map(int, numbers))

@@ -546,7 +546,7 @@ print(json.dumps([memory("VmHWM") - before, len(tip), len(emitter)]))
 @pytest.mark.parametrize("shape", [{"apex_radius": 8.0}, {"apex_radius": 12.0, "depth": 2.0}])
 def test_the_memory_foreseen_is_the_memory_taken(shape, monkeypatch):
     done = subprocess.run(
-        [sys.executable, "-c", PEAK, json.dumps(shape)],
+        [sys.executable, "-P", "-c", PEAK, json.dumps(shape)],
         capture_output=True,
         text=True,
         check=True,
