@@ -128,7 +128,9 @@ class View:
         A tenth of the median density is added to the denominator and the outermost percents are cut off, so that
         neither thinly filled corners nor single bright spots dominate.
         """
-        fine, wide = (self.map.smoothed(sigma).values for sigma in (narrow, broad))
+        x_min, x_max, y_min, y_max = self.map.extent
+        widest = max(x_max - x_min, y_max - y_min)  # a Gaussian of this width is flat over the map
+        fine, wide = (self.map.smoothed(min(sigma, widest)).values for sigma in (narrow, broad))
         ratio = (fine - wide) / (wide + 0.1 * np.median(wide[self.mask]))
         ratio = np.clip(ratio, *np.percentile(ratio[self.mask], [1, 99]))
         values = np.where(self.mask, ratio - ratio[self.mask].mean(), 0.0)

@@ -140,7 +140,7 @@ DISTRIBUTIONS = {kind.__name__: kind for kind in (TruncatedNormal, Fixed, Therma
 def as_distribution(energy: Any) -> Distribution:
     """Return a distribution as it is, a number [eV] as `Fixed`, or say what was expected (ValueError)."""
     if isinstance(energy, Real) and not isinstance(energy, bool):
-        return Fixed(float(energy))
+        return Fixed(energy)  # type: ignore[arg-type]  # any real number; checked there
     if not callable(getattr(energy, "quantile", None)):
         raise ValueError(f"energy must be a number [eV] or have a method quantile(u), got {shown(energy)}")
     return energy

@@ -101,6 +101,14 @@ def test_examples_run(name, folder, monkeypatch, capsys):
     if name == "tutorial_4_own_perturbation.py":
         largest = float(re.search(r"largest ([\d.]+) mm", out)[1])
         assert 0 < largest < ae.ResponseSettings().bound  # above it an ion would have been marked
+    if name == "tutorial_3_fit_energies.py":
+        rotation, scale = re.search(r"^rotated by (\S+)°, scaled by ([\d.]+)", out, re.MULTILINE).groups()
+        # of the hidden transform, or one that [111] makes equal; a bin of 1.5 mm at the rim of 18 mm is 5 degrees
+        assert float(rotation) % 120 == pytest.approx(17, abs=5)
+        assert float(scale) == pytest.approx(0.3, rel=1.5 / 18)
+        low, high = re.search(r"mean of the energies \S+ \((\S+) to (\S+)\) eV, hidden 0.2 eV", out).groups()
+        assert float(low) < 0.2 < float(high)
+        assert "in 100% of the resamples" in out
 
 
 def run_figure(name, monkeypatch, *arguments):
@@ -122,6 +130,29 @@ def test_figure_2_of_a_small_tip(folder, monkeypatch, capsys):
         for column in ("lateral 0.5 eV [mm]", "roll [mm]", "then 0.5 eV [mm]"):
             assert 1 < min(result[column]) < max(result[column]) < 40
     assert "Ni[111]: how far" in capsys.readouterr().out
+
+
+@pytest.mark.filterwarnings("ignore:the maps correlate by only:UserWarning")
+def test_figures_3_to_6_of_small_tips(folder, monkeypatch, capsys):
+    run_figure("figures3to6.py", monkeypatch, *"--radius 8 --ions 1200 --bins 24 --resamples 3 -o out".split())
+    for number in (3, 4, 5, 6):
+        assert (folder / "out" / f"figure{number}.png").stat().st_size > 50_000
+    results = json.loads((folder / "out" / "figures3to6.json").read_text())
+    shapes = {name: np.shape(study["ssim"]) for name, study in results["studies"].items()}
+    assert shapes == {"Al lateral": (1, 6, 6), "Ni roll-up": (1, 6, 6), "Ni combined": (5, 6, 6)}
+    for metal, axis in (("Al", [0, 1, 2]), ("Ni", [1, 1, 1])):
+        simulated, twin = (ae.load(folder / "out" / f"{metal}_{name}_R8a.h5") for name in ("run", "twin"))
+        assert simulated.settings["tip"]["axis"] == axis
+        # two specimens: another origin of the lattice, other random numbers
+        assert simulated.settings["tip"]["offset_seed"] != twin.settings["tip"]["offset_seed"]
+        assert simulated.seed != twin.seed
+    # both mechanisms see the same region; roll-up alone is one of the five fractions
+    alone, both = (results["studies"][name] for name in ("Ni roll-up", "Ni combined"))
+    assert alone["registration"] == both["registration"]
+    assert alone["ssim"][0] == both["ssim"][4]
+    # nickel that rolled up looks like none that did not
+    assert alone["optimum"]["score"]["value"] > alone["baselines"]["unperturbed"]["value"] + 0.5
+    assert "| Ni combined | " in capsys.readouterr().out
 
 
 def test_figure_7_of_runs_that_are_there(folder, monkeypatch, capsys, run20):

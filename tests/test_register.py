@@ -99,19 +99,6 @@ def test_layers_of_their_own(low):
     assert found.mirror and rotation < 1 and stretch < 0.03 and distance < 0.02
 
 
-def test_without_flattening_gradients_decide(low, simulated, monkeypatch):
-    def smooth(view, narrow, broad):
-        x, y = view.map.centres
-        values = np.where(view.mask, view.map.smoothed(narrow).values, 0)
-        return alignment.Image(values, view.mask.astype(np.uint8), complex(x[0], y[0]), view.map.bin_size)
-
-    monkeypatch.setattr(alignment.View, "flatten", smooth)
-    true = ae.Registration(17.0, 0.2, (6.0, -3.0))
-    found = register(simulated, measured(draws(low, FASTER, 1), true, 15, 1))
-    rotation, stretch, _ = off(found, true, 15)
-    assert rotation > 1 or stretch > 0.01 or found.mirror
-
-
 @pytest.mark.filterwarnings("ignore:the maps correlate by only")
 def test_what_is_known_is_kept(low, simulated):
     true = ae.Registration(17.0, 0.45, (8.0, 3.0), True)

@@ -356,6 +356,11 @@ def test_pictures(twin, tmp_path):
     axes = ae.plot.ssim_matrix(study)
     assert len(axes) == 1
     assert len(axes[0].texts) == 36
+    given = axes[0].figure.add_subplot()
+    assert ae.plot.ssim_matrix(study, [given])[0] is given
+    given.remove()
+    with pytest.raises(ValueError, match="axes must be 1, one for each roll-up fraction, got 2"):
+        ae.plot.ssim_matrix(study, [given, given])
     parts = ae.plot.side_by_side(study, circle=(5, -5, 20))
     assert parts[3].get_xlim() == (-15, 25)
     for name, ax in (("matrix.png", axes[0]), ("maps.png", parts[0])):

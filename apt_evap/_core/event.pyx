@@ -6,6 +6,7 @@ over is smooth, and `relax` (a sweep over the whole surface every so many events
 not depend on the size of the specimen.
 """
 
+from cython.parallel cimport prange
 from libc.math cimport sqrt
 
 import numpy as np
@@ -20,8 +21,7 @@ from apt_evap._core.tournament cimport Tournament
 
 
 cdef extern from "pair.h":
-    const int GROUP
-    const int PATCH_LANES
+    const int GROUP, PATCH_LANES
     void patch_field(long, const float*, const float*, const float*, long, const float*, const float*, const float*,
                      const float*, float*, float*, float*) noexcept nogil
 
@@ -138,48 +138,54 @@ cdef class Evaporation:
         residual : float
             Largest change of a charge in the last one, relative to the mean charge.
         """
-        cdef long n
+        cdef long n, slot
         cdef int builders
+        cdef int[::1] slot_of = np.full(self.atoms.n_atoms, -1, np.int32)
+        cdef double[::1] rank
         surface = self.atoms.surface
         if len(surface) == 0:
             raise ValueError("the specimen has no surface atoms")
         builders = n_threads if len(surface) > FEW else 1
         self.since_sweep = NOT_SETTLED   # an interruption below leaves a surface that no atom may leave
         if start is None:
-            start = self.start_here(surface)
+            start = self.start_here(surface, builders)
         elif len(start.charges) != len(surface):
             raise ValueError(f"start must have the charges of {len(surface)} surface atoms, got {len(start.charges)}")
         self.start, self.n_removed, self.potential_point = start, start.n_removed, start.potential_point
-        charges = start.charges
-        tree = Octree(self.atoms.positions_of(surface, builders), charges, surface,
+        tree = Octree(self.atoms.positions_of(surface, builders), start.charges, surface,
                       extra=extra or len(surface) // 8 + MOST_NEAR, n_threads=builders)
         surface = tree.atoms   # in the order of the slots from here on
         n, capacity = tree.n_slots, tree.capacity
         normals = np.zeros((capacity, 3))
         normals[:n] = self.atoms.normals_of(surface, builders)
-        slot_of = np.full(self.atoms.n_atoms, -1, np.int32)
-        slot_of[surface] = np.arange(n, dtype=np.int32)
-        normals[slot_of[start.lonely]] = start.lonely_normals
+        for slot in prange(n, nogil=True, schedule="static", num_threads=builders):
+            slot_of[tree.atom[slot]] = <int>slot
+        normals[np.asarray(slot_of)[start.lonely]] = start.lonely_normals
         lists = InteractionLists(tree, opening_angle or self.opening_angle, n_threads)
         outcome = self.rule.solve(tree, normals, lists, tolerance=tolerance, most_sweeps=most_sweeps,
                                   double_precision=double_precision, n_threads=n_threads)
-        away = self.keep_inside(tree)
-        self.rule.scale(tree, self.potential / (tree.charges / away).sum())
+        self.rule.scale(tree, self.potential / (tree.charges / self.keep_inside(tree)).sum())
         rank = np.full(capacity, -1.0)
-        rank[:n] = tree.charges * np.asarray(self.weight)[surface]
+        for slot in prange(n, nogil=True, schedule="static", num_threads=builders):
+            rank[slot] = tree.q[slot] * self.weight[tree.atom[slot]]
         self.tree, self.normals, self.slot_of, self.tournament = tree, normals, slot_of, Tournament(tree, rank)
         self.since_sweep = 0
         return outcome
 
-    def start_here(self, surface):
+    def start_here(self, const long long[::1] surface, int n_threads=1):
         """What a relaxation of the surface as it is starts from; equal charges if it has none yet."""
-        charges, lonely, normals = np.ones(len(surface)), np.empty(0, np.int64), np.empty((0, 3))
+        cdef double[::1] charges = np.ones(len(surface))
+        cdef char[::1] alone = np.zeros(len(surface), np.int8)
+        cdef long i, slot
+        lonely, normals = np.empty(0, np.int64), np.empty((0, 3))
         if self.tree is not None:
-            slots = np.asarray(self.slot_of)[surface]
-            charges = np.where(slots >= 0, self.tree.charges[slots], 0.0)
-            lonely = surface[(np.asarray(self.atoms.counts)[surface] == 0) & (slots >= 0)]
+            for i in prange(surface.shape[0], nogil=True, schedule="static", num_threads=n_threads):
+                slot = self.slot_of[surface[i]]
+                charges[i] = self.tree.q[slot] if slot >= 0 else 0.0
+                alone[i] = slot >= 0 and self.atoms.count[surface[i]] == 0
+            lonely = np.asarray(surface)[np.asarray(alone).view(bool)]
             normals = np.asarray(self.normals)[np.asarray(self.slot_of)[lonely]]
-        return Start(self.n_removed, charges, lonely, normals, self.potential_point)
+        return Start(self.n_removed, np.asarray(charges), lonely, normals, self.potential_point)
 
     def keep_inside(self, Octree tree):
         """Distances of the surface from the point of the potential; it goes down as evaporation comes close to it."""
@@ -195,9 +201,8 @@ cdef class Evaporation:
 
     def distances(self, Octree tree):
         """Distances of the surface from the point of the potential [nm]."""
-        n = tree.n_slots
-        columns = np.asarray(tree.x)[:n], np.asarray(tree.y)[:n], np.asarray(tree.z)[:n]
-        return np.sqrt(sum((column - at) ** 2 for column, at in zip(columns, self.potential_point[0])))
+        columns = np.asarray(tree.x), np.asarray(tree.y), np.asarray(tree.z)
+        return np.sqrt(sum((column[:tree.n_slots] - at) ** 2 for column, at in zip(columns, self.potential_point[0])))
 
     # ---- one event -------------------------------------------------------------------------------------------------
 
@@ -235,12 +240,7 @@ cdef class Evaporation:
         cdef double pz = self.atoms.positions[atom, 2], charge = self.tree.q[gone], s, nearest
         cdef double dx, dy, dz, over
         cdef Patch* patch = &self.patch
-        cdef float* near_x
-        cdef float* near_y
-        cdef float* near_z
-        cdef float* field_x
-        cdef float* field_y
-        cdef float* field_z
+        cdef float *near_x, *near_y, *near_z, *field_x, *field_y, *field_z
         cdef long n_near, most, i, k, at
         self.n_removed += 1
         self.since_sweep += 1
@@ -325,12 +325,13 @@ cdef class Evaporation:
             self.tree.set_charge(slot, patch.charge[i])
             self.tournament.rank[slot] = patch.charge[i] * self.weight[self.tree.atom[slot]]
         self.tournament.settle(patch.slot, patch.n)
-        for i in range((n_near + GROUP - 1) // GROUP * GROUP):
+        most = (n_near + GROUP - 1) // GROUP * GROUP
+        for i in range(most):
+            field_x[i] = field_y[i] = field_z[i] = 0.0
             if i >= n_near:
                 near_x[i] = near_y[i] = near_z[i] = 1e6
-            field_x[i] = field_y[i] = field_z[i] = 0.0
-        patch_field((n_near + GROUP - 1) // GROUP * GROUP, near_x, near_y, near_z, patch.stride, patch.x, patch.y,
-                    patch.z, patch.change, field_x, field_y, field_z)
+        patch_field(most, near_x, near_y, near_z, patch.stride, patch.x, patch.y, patch.z, patch.change, field_x, field_y,
+                    field_z)
         for i in range(n_near):
             slot = self.near[i]
             self.rule.field[slot, 0] += field_x[i]

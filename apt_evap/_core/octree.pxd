@@ -8,6 +8,7 @@ cdef class Octree:
     cdef readonly long n_sorted         # of these, the ones that stand in the order of the leaves
     cdef readonly long n_nodes
     cdef readonly int leaf_size
+    cdef int n_threads                  # of what is done to the whole tree
     cdef double[::1] x, y, z, q         # (capacity,) nm, e
     cdef long long[::1] atom            # (capacity,) the caller's index; -1 for one taken out
     cdef int[::1] leaf                  # (capacity,) node of each slot

@@ -47,9 +47,8 @@ cdef class Octree:
             raise ValueError("an octree needs at least one atom, got none")
         order, keys = morton.morton_order(positions, n_threads)
         self.first, self.last, self.parent, self.skip = morton.split(keys, leaf_size, n_threads)
-        self.leaf_size = leaf_size
-        self.n_slots = self.n_sorted = n
-        self.n_nodes = self.first.shape[0]
+        self.leaf_size, self.n_threads = leaf_size, n_threads
+        self.n_slots, self.n_sorted, self.n_nodes = n, n, self.first.shape[0]
         self.x, self.y, self.z, self.q = np.zeros((4, capacity))
         self.atom = np.full(capacity, -1, np.int64)
         self.leaf = np.full(capacity, -1, np.int32)
@@ -174,9 +173,13 @@ cdef class Octree:
     def refresh_all(self):
         """Moments of every node from the charges."""
         cdef long node
+        for node in prange(self.n_nodes, nogil=True, schedule="dynamic", chunksize=256, num_threads=self.n_threads):
+            if self.skip[node] == node + 1:
+                self.moments(node)
         with nogil:
             for node in range(self.n_nodes - 1, -1, -1):
-                self.moments(node)
+                if self.skip[node] > node + 1:
+                    self.moments(node)
 
     cdef void mark(self, long node) noexcept nogil:
         while node >= 0 and not self.dirty[node]:
@@ -387,7 +390,7 @@ cdef class Octree:
         """Return an independent tree with the same bits."""
         cdef Octree other = Octree.__new__(Octree)
         other.n_slots, other.n_sorted, other.n_nodes = self.n_slots, self.n_sorted, self.n_nodes
-        other.leaf_size, other.n_dirty = self.leaf_size, self.n_dirty
+        other.leaf_size, other.n_dirty, other.n_threads = self.leaf_size, self.n_dirty, self.n_threads
         other.x, other.y, other.z, other.q = self.x.copy(), self.y.copy(), self.z.copy(), self.q.copy()
         other.atom, other.leaf, other.next_extra = self.atom.copy(), self.leaf.copy(), self.next_extra.copy()
         other.first, other.last, other.skip = self.first, self.last, self.skip

@@ -3,7 +3,9 @@
 from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Rectangle
+from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from apt_evap._arrays import check_array, check_number
@@ -14,7 +16,7 @@ from apt_evap.study import Study
 _MARK = "#00d0ff"  # seen on every colour of both maps
 
 
-def ssim_matrix(study: Study, *, colormap: str = "viridis") -> NDArray[np.object_]:
+def ssim_matrix(study: Study, axes: Sequence[Axes] | None = None, *, colormap: str = "viridis") -> NDArray[np.object_]:
     """Draw the similarity with the measured map against mean and relative standard deviation of the energy.
 
     The best point is framed; a circle is the best place between points, with the interval of 95 % of the resamples.
@@ -23,6 +25,8 @@ def ssim_matrix(study: Study, *, colormap: str = "viridis") -> NDArray[np.object
     ----------
     study : Study
         What `fit_energies` gives.
+    axes : sequence of matplotlib.axes.Axes, optional
+        Where to draw, one for each roll-up fraction, three of them a row; a new figure by default.
     colormap : str
         Name of a colour map of matplotlib.
 
@@ -30,39 +34,49 @@ def ssim_matrix(study: Study, *, colormap: str = "viridis") -> NDArray[np.object
     -------
     ndarray of matplotlib.axes.Axes
         One for each roll-up fraction, shape (n,).
+
+    Raises
+    ------
+    ValueError
+        If there are not as many axes as roll-up fractions.
     """
     grid = study.grid
     layers, rows, columns = grid.shape
     across = min(layers, 3)
-    down = -(-layers // across)
-    figure = new_figure((0.75 * columns * across + 1.8, (0.62 * rows + 1.0) * down))
-    axes = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True).ravel()
+    if axes is None:
+        down = -(-layers // across)
+        figure = new_figure((0.75 * columns * across + 1.8, (0.62 * rows + 1.0) * down))
+        figure.suptitle(f"{grid.mechanism}: structural similarity with the measured map", fontsize="medium")
+        panels = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True).ravel()
+    elif len(axes) == layers:
+        panels = np.array(axes, object)
+    else:
+        raise ValueError(f"axes must be {layers}, one for each roll-up fraction, got {len(axes)}")
     limits = {"vmin": study.ssim.min(), "vmax": study.ssim.max()}
-    for ax, values, fraction in zip(axes, study.ssim, grid.rollup_fractions, strict=False):
+    for ax, values, fraction in zip(panels, study.ssim, grid.rollup_fractions, strict=False):
         image = ax.imshow(values, origin="lower", cmap=colormap, aspect="auto", **limits)
         for (row, column), value in np.ndenumerate(values):
             shade = image.cmap(image.norm(value))
             light = np.dot(shade[:3], (0.299, 0.587, 0.114)) > 0.5
-            ax.text(
-                column, row, f"{value:.3f}", ha="center", va="center", fontsize=8, color="k" if light else "w", zorder=5
-            )
+            text = ax.text(column, row, f"{value:.3f}", ha="center", va="center", fontsize=8, zorder=5)
+            # legible where bars cross it
+            text.set(color="k" if light else "w", path_effects=[withStroke(linewidth=3, foreground=shade)])
         ax.set_xticks(range(columns), [f"{mean:.4g}" for mean in grid.means])
         ax.set_yticks(range(rows), [f"{rsd:.3g}" for rsd in grid.rsds])
         if grid.mechanism == "combined":
             ax.set_title(f"roll-up fraction {fraction:g}", fontsize="medium")
-    for ax in axes[layers:]:
+    for ax in panels[layers:]:
         ax.remove()
-    axes = axes[:layers]
-    for number, ax in enumerate(axes):
+    panels = panels[:layers]
+    for number, ax in enumerate(panels):
         if number + across >= layers:
             ax.set_xlabel("mean energy [eV]")
             ax.tick_params(labelbottom=True)
         if number % across == 0:
             ax.set_ylabel("standard deviation / mean")
-    _mark_optima(study, axes)
-    figure.suptitle(f"{grid.mechanism}: structural similarity with the measured map", fontsize="medium")
-    add_colorbar([ax.images[0] for ax in axes], list(axes), label="SSIM")
-    return axes
+    _mark_optima(study, panels)
+    add_colorbar([ax.images[0] for ax in panels], list(panels), label="SSIM")
+    return panels
 
 
 def _mark_optima(study, axes):
