@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from tqdm.auto import tqdm
 
-from apt_evap._arrays import check_count, check_kind, check_number, check_seed
+from apt_evap._arrays import check_count, check_kind, check_number, check_seed, check_switch
 from apt_evap._threads import thread_count
 from apt_evap._types import Floats
 from apt_evap.binning import field_of_view
@@ -21,7 +21,7 @@ from apt_evap.hits import Hits
 from apt_evap.maps import DetectorMap
 from apt_evap.perturbation import LateralVelocity, Perturbation, Unperturbed, to_dict
 from apt_evap.register import Registration, register
-from apt_evap.resample import WINDOW, Comparison, Sampler
+from apt_evap.resample import WINDOW, Comparison, Sampler, drawn_hits
 from apt_evap.run import Run
 from apt_evap.study import Optimum, Score, Study, plain
 
@@ -29,6 +29,9 @@ BINS = 128
 FLATTENING = 0.15
 """Width of the Gaussian that flattens both maps, over the square root of the area compared."""
 INTERVAL = 95.0  # percent of the resamples
+DRAWN = 10
+"""Simulated over measured ions that draws of the same ions are to come to, where `FEWEST` to `MOST` of them do."""
+FEWEST, MOST = 4, 16
 _MOST_ROUNDS = 5  # of registration and search
 
 
@@ -46,18 +49,19 @@ def fit_energies(
     flattening: float | None = None,
     data_range: float = 2.0,
     temperature: float = 50.0,
-    replicas: int = 4,
+    allow_noise: bool = True,
+    replicas: int | None = None,
     resamples: int = 200,
     seed: int = 0,
     n_threads: int | None = None,
     progress: bool | None = None,
 ) -> Study:
-    """Find the emission energies for which a run looks most like a measurement.
+    r"""Find the emission energies for which a run looks most like a measurement.
 
     Maps for every energy follow from the responses of one run. They are carried into the measured frame, binned on the
-    measured bins and compared by `ssim` where both show something: inside the mask of the measured map and inside the
-    convex outlines (as in `DetectorMap.from_hits`) of that map, of the unperturbed map and of that of the middle of the
-    grid. The same region serves all energies.
+    measured bins and compared by structural similarity where both show something: inside the mask of the measured map
+    and inside the convex outlines (as in `DetectorMap.from_hits`) of that map, of the unperturbed map and of that of
+    the middle of the grid. The same region serves all energies.
 
     Parameters
     ----------
@@ -79,7 +83,8 @@ def fit_energies(
         Bins along the longer side: of measured hits, 128 by default; of a map, those it has are merged by a whole
         factor to come closest, and stay as they are by default.
     smoothing : float, optional
-        Standard deviation of a Gaussian for both maps [mm]; one bin by default.
+        Standard deviation of a Gaussian for both maps [mm]; by default half a bin for counts, one for densities, whose
+        noise is not known.
     flattening : float, optional
         Both maps are divided by themselves, smoothed with this standard deviation [mm]; 0 for not. By default
         0.15 of the square root of the area compared. Gradients across a measured map that come from the instrument, or
@@ -88,8 +93,11 @@ def fit_energies(
         As for `ssim`.
     temperature : float
         Temperature of the thermal baseline, lateral velocities of Maxwell and Boltzmann [K].
-    replicas : int
-        Draws of the energy and direction of every ion, added up: the map of an energy has less noise then.
+    allow_noise : bool
+        Whether the similarity allows for the noise of both maps; see the notes. False for `ssim` as it is.
+    replicas : int, optional
+        Draws of the energy and direction of every ion, added up: the map of an energy has less noise then. By default
+        so many that they come to ten times the measured ions, but from 4 to 16.
     resamples : int
         Draws of all measured and simulated ions with replacement, for the errors; 0 for none.
     seed : int
@@ -112,8 +120,17 @@ def fit_energies(
     -----
     The method is that of Shaikh et al., arXiv 2509.13744, with errors added. A resample draws every measured bin from
     a Poisson distribution and weighs the ions of the run at random (see `resample`); all energies and baselines see the
-    same draws. The registration is held fixed. Noise of the measured map makes those maps look most alike that have
-    somewhat more contrast than the truth: more ions, or `smoothing`, help.
+    same draws. The registration is held fixed.
+
+    Noise is variance, too, and would be taken for contrast: the energies whose map has most contrast would seem best.
+    So the similarity of a window of densities x and y is
+
+    .. math:: \frac{2 μ_x μ_y + C_1}{μ_x^2 + μ_y^2 + C_1} \; \frac{2 σ_{xy} + ν_x + ν_y + C_2}{σ_x^2 + σ_y^2 + C_2}
+
+    with the parts ν of the variances that are noise: Poisson's where the measured map holds counts, and that of the
+    draws where there are several. The true energies have a similarity of about 1. `Study.plain` has similarities
+    without ν, beside which the ceiling stands. Noise of measured densities is not known and stays: their maps look most
+    like those with somewhat more contrast than the truth.
     """
     grid = EnergyGrid(mechanism, means, rsds, rollup_fractions)
     if check_kind(run, "run", Run, "a Run").responses is None:
@@ -121,13 +138,15 @@ def fit_energies(
     thermal = LateralVelocity(Thermal(temperature))
     measured = _measured_map(measured, bins)
     settings = {
-        "smoothing": max(measured.bin_size) if smoothing is None else smoothing,
+        "smoothing": max(measured.bin_size) * (0.5 if measured.is_counts else 1) if smoothing is None else smoothing,
         "flattening": flattening,
         "data_range": check_number(data_range, "data_range", above=0),
-        "replicas": check_count(replicas, "replicas", at_least=1),
+        "allow_noise": check_switch(allow_noise, "allow_noise"),
+        "replicas": _replicas(measured, run) if replicas is None else check_count(replicas, "replicas", at_least=1),
         "resamples": check_count(resamples, "resamples"),
         "seed": check_seed(seed),
     }
+    replicas = settings["replicas"]
     for name in ("smoothing", "flattening"):
         if settings[name] is not None:
             settings[name] = check_number(settings[name], name, at_least=0, unit="mm")
@@ -144,15 +163,15 @@ def fit_energies(
         optimum, refined = (
             search.optimum(index, replicas) for index in (cells, search.refine(values, cells, replicas))
         )
-        baselines, maps = {}, {}
+        scores, plain_scores, maps = {}, {}, {}
         for name, perturbation in (
             ("unperturbed", Unperturbed()),
             ("thermal", thermal),
             ("optimum", optimum.perturbation),
         ):
-            maps[name], baselines[name] = search.map_and_scores(perturbation, 1 if name == "unperturbed" else replicas)
-        gain = search.scores(optimum.perturbation, 1) - baselines["unperturbed"]
-    del baselines["optimum"]
+            draws = 1 if name == "unperturbed" else replicas
+            maps[name], scores[name], plain_scores[name] = search.map_and_scores(perturbation, draws)
+        gain = scores.pop("optimum") - scores["unperturbed"]
     resampled = values[1:]
     wins = np.ravel_multi_index(cells[1:].T, grid.shape)
     return Study(
@@ -163,7 +182,8 @@ def fit_energies(
         resampled=resampled,
         optimum=optimum,
         refined=refined,
-        baselines={name: _score(each) for name, each in baselines.items()},
+        baselines={name: _score(each) for name, each in scores.items()},
+        plain={name: _score(each) for name, each in plain_scores.items()},
         gain=_score(gain),
         gain_share=float((gain[1:] > 0).mean()) if resamples else float("nan"),
         ceiling=search.ceiling(),
@@ -213,16 +233,23 @@ class _Search:
         if self.flattening is None:
             self.flattening = FLATTENING * float(np.sqrt(mask.sum() * np.prod(region.bin_size)))
         seed, smoothing, data_range = (self.settings[name] for name in ("seed", "smoothing", "data_range"))
-        self.comparison = Comparison(region, smoothing, self.flattening, data_range, resamples, (seed, 0))
+        self.comparison = Comparison(
+            region, smoothing, self.flattening, data_range, resamples, (seed, 0), self.settings["allow_noise"]
+        )
         self.sampler = Sampler(self.run, registration, region, self.comparison.box, resamples, (seed, 1))
 
     def perturbation(self, index: ArrayLike) -> Perturbation:
         """Perturbation at an index of the grid."""
         return self.grid.perturbation(*self.grid.values_at(index))
 
+    def hits(self, index: ArrayLike) -> Hits:
+        """Hits of some draws of all ions at an index of the grid, in the frame of the run."""
+        drawn = [drawn_hits(self.run, self.perturbation(index), replica) for replica in range(FEWEST)]
+        return Hits(**{name: np.concatenate([getattr(hits, name) for hits in drawn]) for name in ("x", "y")})
+
     def scores(self, perturbation: Any, replicas: int) -> Floats:
         """Similarity of all ions, and of each resample, shape (1 + resamples,)."""
-        return self.comparison.similarities(self.sampler.maps(perturbation, replicas))
+        return self.comparison.similarities(*self.sampler.maps(perturbation, replicas))
 
     def matrix(self, replicas: int, note: Any, places: Any = None) -> Floats:
         """Similarities at places on the three axes, the whole grid by default; shape (1 + resamples, a, b, c)."""
@@ -282,9 +309,9 @@ class _Search:
             at_edge=ends,
         )
 
-    def map_and_scores(self, perturbation: Any, replicas: int) -> tuple[DetectorMap, Floats]:
-        """The simulated map on the measured bins, and its similarities, shape (1 + resamples,)."""
-        drawn = self.sampler.maps(perturbation, replicas)
+    def map_and_scores(self, perturbation: Any, replicas: int) -> tuple[DetectorMap, Floats, Floats]:
+        """The simulated map on the measured bins, its similarities and those with noise, shape (1 + resamples,)."""
+        drawn, noise = self.sampler.maps(perturbation, replicas)
         counts = np.zeros(self.region.values.shape, np.int64)
         counts[self.comparison.box] = drawn[0]
         ions = int(counts[self.region.mask].sum())
@@ -292,7 +319,7 @@ class _Search:
         simulated = replace(
             self.region, values=counts, is_counts=True, ions=ions, quantum=None, smoothing=0, source=source
         )
-        return simulated, self.comparison.similarities(drawn)
+        return simulated, *(self.comparison.similarities(drawn, noise, plain=plain) for plain in (False, True))
 
     def ceiling(self) -> Any:
         """Similarity of two halves of the measured ions, None for densities."""
@@ -306,14 +333,20 @@ def _registered(search):
     """Register with the middle of the grid, then with the best point, until that stays; the rounds, too."""
     registration, best, rounds = None, search.middle, []
     for _ in range(_MOST_ROUNDS):
-        registration = register(search.run.hits(search.perturbation(best)), search.measured, start=registration)
+        registration = register(search.hits(best), search.measured, start=registration)
         rounds.append({"perturbation": to_dict(search.perturbation(best)), "registration": registration.to_dict()})
         search.place(registration, 0)
-        found = tuple(maxima(search.matrix(1, "registration"))[0])
+        found = tuple(maxima(search.matrix(FEWEST, "registration"))[0])
         if found == best:
             break
         best = found
     return registration, rounds
+
+
+def _replicas(measured, run):
+    """Draws of every ion that come to `DRAWN` times the measured ions, whose number densities do not tell."""
+    drawn = DRAWN * measured.values.sum() / len(run) if measured.is_counts else 2 * FEWEST
+    return int(np.clip(np.ceil(drawn), FEWEST, MOST))
 
 
 def _measured_map(measured, bins):

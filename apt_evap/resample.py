@@ -3,9 +3,17 @@
 What is compared is what `DetectorMap.flattened` and `ssim` give, of stacks of maps. The broad density that a stack is
 flattened by is that of its first map, of which the others are resamples.
 
-Noise lowers the similarity, and least of all that of maps with much contrast. Maps with all their noise once more on
-top would be drawn to other energies. So resamples have a tenth of it, and their deviations count tenfold: the first
-order in the noise (the infinitesimal jackknife of B. Efron, J. R. Statist. Soc. B 54, 83 (1992)).
+Noise is variance, which the structural similarity takes for contrast: with variances s² of signals and n² of noise, a
+simulated signal of c times the contrast has a similarity near 2 c s² / (c² s² + s² + n²), which is greatest for c > 1.
+With the variance of the noise, which is known, in the numerator too, it is greatest, and 1, for c = 1; and nothing is
+divided by a small difference. In a twin experiment (Ni[111], R = 40 a, 150,000 simulated and 200,000 measured ions
+under lateral energies of 0.3 eV, σ/mean 0.316; 20 pairs of draws, 128 bins, 16 draws an ion) the best σ/mean was 0.1 or
+less in 19 of 20 without it, smoothed by a bin, and in all 20 smoothed by half of one. With it, it was 0.316 in all 20
+either way, and half a bin told it from 0.1 by seven standard deviations instead of three.
+
+Maps with all their noise once more on top would again be drawn to other energies. So resamples have a tenth of it, and
+their deviations count tenfold: the first order in the noise (the infinitesimal jackknife of B. Efron, J. R. Statist.
+Soc. B 54, 83 (1992)).
 """
 
 from dataclasses import replace
@@ -25,6 +33,8 @@ from apt_evap.run import Run
 WINDOW = 5  # as in `ssim`: half width of the window [bins]
 NOISE = 0.1
 """Noise of a resample, over that of the ions."""
+NOISE_MAPS = 50
+"""Least number of maps that the variance of the measured noise is taken from: to 20 % in a bin, less in a window."""
 GROUPS = 1 << 16
 """Most ions that are resampled one by one. With 256 groups of ions, errors of similarities came out 20 % too large."""
 
@@ -44,6 +54,8 @@ class Comparison:
         Number of maps drawn for its noise, besides the map itself.
     seed : int
         Seed of the draws.
+    allow_noise : bool
+        Whether noise counts as alike: that of Poisson of measured counts, that of the draws of simulated ions.
 
     Raises
     ------
@@ -52,7 +64,14 @@ class Comparison:
     """
 
     def __init__(
-        self, measured: DetectorMap, smoothing: float, flattening: float, data_range: float, resamples: int, seed: Any
+        self,
+        measured: DetectorMap,
+        smoothing: float,
+        flattening: float,
+        data_range: float,
+        resamples: int,
+        seed: Any,
+        allow_noise: bool = True,
     ) -> None:
         inside = ndimage.binary_erosion(measured.mask, disk(WINDOW))
         if not inside.any():
@@ -68,39 +87,60 @@ class Comparison:
         self._smoothing, self._flattening = smoothing / sizes, flattening / sizes
         values = measured.values[self.box]
         self.measured = values[None].astype(float)
-        if measured.is_counts and resamples:
-            drawn = np.random.default_rng(seed).poisson(values, (resamples, *values.shape))
-            self.measured = np.concatenate([self.measured, values + NOISE * (drawn - values)])
+        self.allow_noise, self._noise = allow_noise, 0.0
+        if measured.is_counts:
+            drawn = np.random.default_rng(seed).poisson(values, (max(resamples, NOISE_MAPS), *values.shape)) - values
+            self._noise = self._variance(self.measured, drawn)
+            self.measured = np.concatenate([self.measured, values + NOISE * drawn[:resamples]])
         self._measured = self._moments(self.densities(self.measured))
 
     def densities(self, maps: Any) -> Floats:
         """Densities as they are compared: flattened, smoothed, relative to their mean; shape (k, ny, nx)."""
+        maps = self._smoothed(maps)
+        mean = maps[:, self.mask].mean(axis=1)[:, None, None]
+        return np.where(self.mask, np.divide(maps, mean, out=np.zeros_like(maps), where=mean > 0), 1.0)
+
+    def _smoothed(self, maps):
         maps = np.where(self.mask, maps, 0.0)
         if self._flattening.any():
             broad = self._blurred(maps[:1], self._flattening)
             maps = np.divide(maps, broad, out=np.zeros_like(maps), where=broad > 0)
-        if self._smoothing.any():
-            maps = self._blurred(maps, self._smoothing)
-        mean = maps[:, self.mask].mean(axis=1)[:, None, None]
-        return np.where(self.mask, np.divide(maps, mean, out=np.zeros_like(maps), where=mean > 0), 1.0)
+        return self._blurred(maps, self._smoothing) if self._smoothing.any() else maps
+
+    def _variance(self, map, noise):
+        """Variance in a window that noise of shape (k, ny, nx) gives the densities of a map, shape (ny, nx)."""
+        first, *noise = self._smoothed(np.concatenate([map, noise]))
+        mean = first[self.mask].mean()
+        noise = np.divide(noise, mean, out=np.zeros_like(noise), where=mean > 0)
+        return (_window(noise**2) - _window(noise) ** 2).mean(axis=0)
 
     def _blurred(self, maps, sigmas):
         """Gaussian that sees only the inside of the mask, as in `DetectorMap.smoothed`."""
         weight = _filtered(self.mask.astype(float), sigmas)
         return np.divide(_filtered(maps, sigmas), weight, out=np.zeros_like(maps), where=self.mask)
 
-    def similarities(self, maps: Floats) -> Floats:
+    def similarities(self, maps: Floats, noise: Floats | None = None, *, plain: bool = False) -> Floats:
         """Similarity of a map of the box with the measured one, and of its resamples one by one, shape (k,).
 
         Those of the resamples have the noise of all ions, and the mean of the first.
+
+        Parameters
+        ----------
+        maps, noise : ndarray
+            What `Sampler.maps` gives.
+        plain : bool
+            Whether to count noise as unlike all the same.
         """
-        values = self._similarities(self._moments(self.densities(maps)), self._measured)
+        allowed = 0.0
+        if self.allow_noise and not plain:
+            allowed = self._noise + (0.0 if noise is None else self._variance(maps[:1], noise[None]))
+        values = self._similarities(self._moments(self.densities(maps)), self._measured, allowed)
         if len(values) > 1:
             values[1:] = values[0] + (values[1:] - values[1:].mean()) / NOISE
         return values
 
     def ceiling(self, divisions: int, seed: Any) -> Floats:
-        """Similarities of the random halves of the measured counts, shape (divisions,)."""
+        """Similarities of the random halves of the measured counts, noise and all, shape (divisions,)."""
         random = np.random.default_rng(seed)
         counts = self.measured[0].astype(np.int64)
         halves = random.binomial(counts, 0.5, (divisions, *counts.shape))
@@ -110,11 +150,11 @@ class Comparison:
         mean = _window(densities)
         return densities, mean, _window(densities**2) - mean**2
 
-    def _similarities(self, first, second):
+    def _similarities(self, first, second, noise=0.0):
         (a, mean_a, var_a), (b, mean_b, var_b) = first, second
         product = mean_a * mean_b
         both = _window(a * b) - product
-        local = (2 * product + self.c1) * (2 * both + self.c2)
+        local = (2 * product + self.c1) * (2 * both + noise + self.c2)
         local /= (mean_a**2 + mean_b**2 + self.c1) * (var_a + var_b + self.c2)
         return local[:, self.inside].mean(axis=1)
 
@@ -162,8 +202,8 @@ class Sampler:
         weights = 1 + NOISE * (random.poisson(1.0, shape) - 1)
         self._weights = np.concatenate([np.ones((shape[0], 1)), weights], axis=1, dtype=np.float32)
 
-    def maps(self, perturbation: Perturbation, replicas: int) -> Floats:
-        """Hits per bin of all ions and of each resample, shape (1 + resamples, ny, nx).
+    def maps(self, perturbation: Perturbation, replicas: int) -> tuple[Floats, Floats | None]:
+        """Hits per bin of all ions and of each resample, and how the draws differ.
 
         Parameters
         ----------
@@ -171,28 +211,33 @@ class Sampler:
             How the ions start.
         replicas : int
             Draws of every ion, added up.
+
+        Returns
+        -------
+        maps : ndarray
+            Shape (1 + resamples, ny, nx).
+        noise : ndarray or None
+            Sum of the draws with weights of sum 0 and mean square 1: as much noise of the draws as in their sum, and no
+            signal; shape (ny, nx). None for a single draw.
         """
         size = int(np.prod(self.shape))
         binned = [self._cells(perturbation, replica) for replica in range(replicas)]
+        noise = None
+        if replicas > 1:
+            weights = np.linspace(-1, 1, replicas)
+            weights /= np.sqrt((weights**2).mean())
+            counts = (np.bincount(cells, minlength=size) for cells, _ in binned)
+            noise = sum(w * count for w, count in zip(weights, counts, strict=True)).reshape(self.shape)
         cells, ions = (np.concatenate(parts) for parts in zip(*binned, strict=True))
         if not self.resamples:
-            return np.bincount(cells, minlength=size).reshape(1, *self.shape).astype(float)
+            return np.bincount(cells, minlength=size).reshape(1, *self.shape).astype(float), noise
         ones = np.ones(len(cells), np.float32)
         table = sparse.coo_array((ones, (cells, self._groups[ions])), (size, len(self._weights))).tocsr()
-        return (table @ self._weights).T.reshape(-1, *self.shape).astype(float)
-
-    def hits(self, perturbation: Perturbation, replica: int = 0) -> Hits:
-        """Hits of one draw in the measured frame; the first is that of the run itself."""
-        run = self.run
-        if replica:  # a seed next to that of the run may be that of another run
-            seed = np.random.SeedSequence((run.seed, replica)).generate_state(1, np.uint64)[0]
-            run = replace(run, seed=int(seed))
-        # what was flown in the run was flown with its own seed
-        return self.registration.hits(run.hits(perturbation, by_response=bool(replica)))
+        return (table @ self._weights).T.reshape(-1, *self.shape).astype(float), noise
 
     def _cells(self, perturbation, replica):
         """Bin of each ion that lies in the box, and which ions these are."""
-        hits = self.hits(perturbation, replica)
+        hits = self.registration.hits(drawn_hits(self.run, perturbation, replica))
         detected = hits.detected
         index = []
         for values, edges in zip((hits.y, hits.x), self._edges, strict=True):
@@ -203,6 +248,15 @@ class Sampler:
         inside = np.flatnonzero(detected)
         row, column = (place[inside].astype(np.int64) for place in index)
         return row * self.shape[1] + column, inside
+
+
+def drawn_hits(run: Run, perturbation: Perturbation, replica: int) -> Hits:
+    """Hits of one draw of the energies and directions of all ions; draw 0 is that of the run itself."""
+    if replica:  # a seed next to that of the run may be that of another run
+        seed = np.random.SeedSequence((run.seed, replica)).generate_state(1, np.uint64)[0]
+        run = replace(run, seed=int(seed))
+    # what was flown in the run was flown with its own seed
+    return run.hits(perturbation, by_response=bool(replica))
 
 
 def _filtered(maps, sigmas, truncate=4.0):

@@ -80,7 +80,8 @@ class Study:
     grid : EnergyGrid
         Mechanism and energies.
     ssim, errors : ndarray
-        Structural similarity at every point of the grid, and its standard deviation over the resamples.
+        Structural similarity at every point of the grid, noise allowed for unless `settings` say otherwise, and its
+        standard deviation over the resamples.
     shares : ndarray
         Share of the resamples in which a point is the best.
     resampled : ndarray
@@ -89,13 +90,14 @@ class Study:
         The best point of the grid, and that of a smooth model around it.
     baselines : dict of Score
         Similarity of "unperturbed" and "thermal" maps.
+    plain : dict of Score
+        Structural similarity, noise and all, of "unperturbed", "thermal" and "optimum": what stands beside the ceiling.
     gain : Score
-        Similarity of the optimum less that of the unperturbed map, in pairs of resamples and with one draw of every
-        ion, so that neither map has less noise than the other.
+        Similarity of the optimum less that of the unperturbed map, in pairs of resamples.
     gain_share : float
         Share of the resamples in which the optimum is better than the unperturbed map.
     ceiling : Score or None
-        Similarity of two random halves of the measured ions; None for a map of densities.
+        Structural similarity of two random halves of the measured ions, noise and all; None for a map of densities.
     registration : Registration
         Carries simulated hits into the measured frame.
     measured : DetectorMap
@@ -114,6 +116,7 @@ class Study:
     optimum: Optimum
     refined: Optimum
     baselines: dict
+    plain: dict
     gain: Score
     gain_share: float
     ceiling: Score | None
@@ -133,7 +136,8 @@ class Study:
         held |= {name: getattr(self, name) for name in ("ssim", "errors", "shares", "gain_share")}
         held |= {name: getattr(self, name).to_dict() for name in ("optimum", "refined", "registration")}
         held |= {name: getattr(self, name) and getattr(self, name)._asdict() for name in ("gain", "ceiling")}
-        held["baselines"] = {name: score._asdict() for name, score in self.baselines.items()}
+        for group in ("baselines", "plain"):
+            held[group] = {name: score._asdict() for name, score in getattr(self, group).items()}
         return plain(held | {"settings": self.settings})
 
     def save(self, path: AnyPath) -> None:
@@ -158,12 +162,14 @@ class Study:
         share = f", roll-up fraction {best.rollup_fraction:g}" if combined else ""
         edge = f" (at the end of the grid in {' and '.join(best.at_edge)})" if best.at_edge else ""
         others = [f"{name} {score}" for name, score in self.baselines.items()]
-        others += [] if self.ceiling is None else [f"two halves of the measured ions {self.ceiling}"]
+        noisy = f";\n noise and all {self.plain['optimum']}, " if self.settings["allow_noise"] else ", "
+        others = ", ".join(others) + (noisy if self.ceiling else "")
+        others += f"two halves of the measured ions {self.ceiling}" if self.ceiling else ""
         between = f"{refined.bounded('mean')} eV, sigma/mean {refined.bounded('rsd')}"
         between += f", roll-up fraction {refined.bounded('rollup_fraction')}" if combined else ""
         return (
             f"<Study: {self.grid.mechanism}, best at {best.mean:g} eV, sigma/mean {best.rsd:g}{share}{edge}, "
-            f"SSIM {best.score}; {', '.join(others)};\n between points {between}; energies "
+            f"SSIM {best.score}; {others};\n between points {between}; energies "
             f"{refined.bounded('true_mean')} ± {refined.bounded('true_standard_deviation')} eV>"
         )
 

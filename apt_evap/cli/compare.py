@@ -58,10 +58,11 @@ def add_parser(commands: Any) -> None:
         help="a JSON file (such as study.json) or ROTATION,SCALE,DX,DY[,mirror] in degrees and mm; found by default",
     )
     command.add_argument("--bins", type=whole(11, MOST_BINS), metavar="N", help="along the longer side")
-    command.add_argument("--smooth", type=smoothing, metavar="MM", help="sigma of a Gaussian; default: one bin")
+    command.add_argument("--smooth", type=smoothing, metavar="MM", help="sigma of a Gaussian; default: half a bin")
     command.add_argument("--flatten", type=smoothing, metavar="MM", help="sigma of a broad Gaussian; 0 for not")
     command.add_argument("--temperature", type=float, default=50.0, metavar="K", help="of the thermal map; default: 50")
-    command.add_argument("--replicas", type=whole(1), default=4, metavar="N", help="draws of every ion; default: 4")
+    command.add_argument("--plain", action="store_true", help="SSIM as it is, without allowance for noise")
+    command.add_argument("--replicas", type=whole(1), metavar="N", help="draws of every ion; default: 4 to 16")
     command.add_argument("--resamples", type=whole(0), default=200, metavar="N", help="for the errors; default: 200")
     command.add_argument("--seed", type=whole(0), default=0, metavar="N", help="of the resamples; default: 0")
     command.add_argument("--threads", type=whole(1), metavar="N", help="default: all processors")
@@ -91,6 +92,7 @@ def _compare(options):
         smoothing=options.smooth,
         flattening=options.flatten,
         temperature=options.temperature,
+        allow_noise=not options.plain,
         replicas=options.replicas,
         resamples=options.resamples,
         seed=options.seed,

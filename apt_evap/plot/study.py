@@ -179,12 +179,14 @@ def _default_circle(study):
 
 def _scores(study):
     """The similarities as text."""
-    lines = [f"SSIM with the measured map, {study.settings['bins_compared']:,} bins"]
+    allowed = study.settings["allow_noise"]
+    lines = [f"SSIM with the measured map, {study.settings['bins_compared']:,} bins" + ", noise allowed for" * allowed]
     lines += [f"{name}: {score}" for name, score in study.baselines.items()]
     lines.append(f"{study.grid.mechanism}: {study.optimum.score}")
-    if study.ceiling is not None:
-        lines.append(f"two halves of the measured ions: {study.ceiling}")
     lines.append(f"gain over unperturbed: {study.gain}")
+    if study.ceiling is not None:
+        lines += [f"noise and all: {study.plain['optimum']}"] * allowed
+        lines.append(f"two halves of the measured ions: {study.ceiling}")
     width, height = study.measured.bin_size
     lines.append(f"bins {width:.3g} × {height:.3g} mm, smoothed by {study.settings['smoothing']:.3g} mm")
     return "\n".join(lines)
