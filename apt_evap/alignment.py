@@ -313,7 +313,7 @@ def refine(
         overlap = np.count_nonzero(shared) / len(points)
         return Fit(placement, correlation(sampled[shared], values[shared]) if overlap >= least else -1.0, overlap)
 
-    low, high = low[free], high[free]
+    low, high = np.minimum(low, 0)[free], np.maximum(high, 0)[free]  # the start is inside but for rounding
     simplex = np.vstack([np.zeros(len(low)), np.diag(np.where(high >= 1, 1.0, -1.0))])
     options = {"initial_simplex": np.clip(simplex, low, high), "xatol": 2e-3, "fatol": 1e-6, "maxiter": 400}
     bounds = optimize.Bounds(low, high)

@@ -122,13 +122,29 @@ class Registration:
         return replace(back, shift=(-float(x), -float(y)))
 
     @property
+    def doubtful(self) -> bool:
+        """Whether maps that have nothing to do with each other may fit as well, bool; False for points."""
+        return self.score * np.sqrt(self.overlap) < DOUBTFUL
+
+    def warn_if_doubtful(self) -> None:
+        """Warn if it is `doubtful`."""
+        if self.doubtful:
+            warnings.warn(
+                f"the registration is doubtful: the maps correlate by only {self.score:.2f} where both show something "
+                f"({self.overlap:.0%} of the measured one), as maps may that have nothing to do with each other; look "
+                "at the overlay of both, make sure that the specimen was simulated along its axis, and give a pole, "
+                "scales or a start where known",
+                stacklevel=3,
+            )
+
+    @property
     def _turn(self):
         return self.scale * np.exp(1j * np.radians(self.rotation))
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as plain types that JSON can hold (dict); NaN becomes None."""
         plain = asdict(self)
-        plain.update(shift=list(self.shift), ties=[tie.to_dict() for tie in self.ties])
+        plain.update(shift=list(self.shift), ties=[tie.to_dict() for tie in self.ties], doubtful=bool(self.doubtful))
         return {name: None if value != value else value for name, value in plain.items()}
 
     @classmethod
@@ -146,6 +162,7 @@ class Registration:
         """
         settings = {name: float("nan") if value is None else value for name, value in settings.items()}
         ties = tuple(cls.from_dict(tie) for tie in settings.pop("ties", ()))
+        settings.pop("doubtful", None)  # follows from the others
         return cls(**settings, ties=ties)
 
     def __str__(self):
@@ -267,13 +284,7 @@ def register(
     fits.sort(key=lambda fit: fit.placement.mirror)  # stable: the best stays first among either kind
     found = [_registration(fit, "search" if near is None else "start" if pole is None else "pole") for fit in fits]
     best = replace(found[0], ties=tuple(found[1:]))
-    if best.score * np.sqrt(best.overlap) < DOUBTFUL:
-        warnings.warn(
-            f"the maps correlate by only {best.score:.2f} where both show something ({best.overlap:.0%} of the "
-            "measured one), as maps may that have nothing to do with each other; look at plot.overlay, and give a "
-            "pole, scales or a start where known",
-            stacklevel=2,
-        )
+    best.warn_if_doubtful()
     return best
 
 

@@ -167,10 +167,13 @@ class Study:
         others += f"two halves of the measured ions {self.ceiling}" if self.ceiling else ""
         between = f"{refined.bounded('mean')} eV, sigma/mean {refined.bounded('rsd')}"
         between += f", roll-up fraction {refined.bounded('rollup_fraction')}" if combined else ""
+        doubtful = ", registration doubtful" if self.registration.doubtful else ""
+        radius = self.settings["run"]["tip"].get("apex_radius")
+        scale = f" at {self.settings['run']['voltage']:g} V" + (f" and R = {radius:.3g} nm" if radius else "")
         return (
-            f"<Study: {self.grid.mechanism}, best at {best.mean:g} eV, sigma/mean {best.rsd:g}{share}{edge}, "
+            f"<Study: {self.grid.mechanism}{doubtful}, best at {best.mean:g} eV, sigma/mean {best.rsd:g}{share}{edge}, "
             f"SSIM {best.score}; {others};\n between points {between}; energies "
-            f"{refined.bounded('true_mean')} ± {refined.bounded('true_standard_deviation')} eV>"
+            f"{refined.bounded('true_mean')} ± {refined.bounded('true_standard_deviation')} eV{scale}>"
         )
 
 

@@ -132,7 +132,7 @@ def test_figure_2_of_a_small_tip(folder, monkeypatch, capsys):
     assert "Ni[111]: how far" in capsys.readouterr().out
 
 
-@pytest.mark.filterwarnings("ignore:the maps correlate by only:UserWarning")
+@pytest.mark.filterwarnings("ignore:the registration is doubtful:UserWarning")
 def test_figures_3_to_6_of_small_tips(folder, monkeypatch, capsys):
     run_figure("figures3to6.py", monkeypatch, *"--radius 8 --ions 1200 --bins 24 --resamples 3 -o out".split())
     for number in (3, 4, 5, 6):

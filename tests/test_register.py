@@ -99,7 +99,7 @@ def test_layers_of_their_own(low):
     assert found.mirror and rotation < 1 and stretch < 0.03 and distance < 0.02
 
 
-@pytest.mark.filterwarnings("ignore:the maps correlate by only")
+@pytest.mark.filterwarnings("ignore:the registration is doubtful")
 def test_what_is_known_is_kept(low, simulated):
     true = ae.Registration(17.0, 0.45, (8.0, 3.0), True)
     map = measured(draws(low, FASTER, 2), true, 30, 2)
@@ -121,7 +121,7 @@ def test_what_is_known_is_kept(low, simulated):
     assert not plain.mirror and plain.score < found.score - 0.1
 
 
-@pytest.mark.filterwarnings("ignore:the maps correlate by only")
+@pytest.mark.filterwarnings("ignore:the registration is doubtful")
 def test_a_threefold_pole_with_mirrors_has_ties(run20):
     """fcc [111]: turned by 120 degrees it is the same, and mirrored and turned by 60; unmirrored is preferred."""
     rolled = run20.hits(ROLLED)
@@ -147,7 +147,7 @@ def test_maps_that_have_nothing_in_common(simulated):
 
 
 @pytest.mark.skipif(not NICKEL.exists(), reason="the measured map of nickel is not there")
-@pytest.mark.filterwarnings("ignore:the maps correlate by only")
+@pytest.mark.filterwarnings("ignore:the registration is doubtful")
 def test_measured_nickel(run20):
     """Its six bright lines, about 60 degrees apart, from 28 degrees on; those simulated with roll-up begin at 30."""
     data = np.load(NICKEL)

@@ -10,6 +10,7 @@ from scipy.stats import truncnorm
 
 import apt_evap as ae
 from apt_evap.energy_grid import EnergyGrid, maxima, spline_maxima
+from apt_evap.fit import _Search
 from apt_evap.perturbation import Combined
 from apt_evap.resample import NOISE, Comparison, Sampler
 
@@ -280,6 +281,18 @@ def test_hidden_energies_are_found(twin):
     assert abs(study.refined.true_mean - hidden.energy.true_mean) < 0.04
     low, high = study.refined.intervals["true_mean"]
     assert low <= study.refined.true_mean <= high and high - low < 0.2
+
+
+def test_a_registration_is_polished(run, other):
+    """From 1.5 degrees, 3 % and 1 mm off, back to the frame in which the map was made."""
+    settings = {"smoothing": 0.6, "flattening": None, "data_range": 2.0, "seed": 0, "allow_noise": True}
+    search = _Search(run, measured_map(other, ROLLUP), EnergyGrid("roll-up"), settings, 1, False)
+    rough = ae.Registration(1.5, 1.03, (1.0, -0.5), score=0.8, overlap=1.0)
+    search.place(rough, 0)
+    found = search.polished(rough, (0, 4, 2))
+    assert abs(found.rotation) < 0.3 and found.scale == pytest.approx(1, abs=0.006)
+    assert np.hypot(*found.shift) < 0.3
+    assert (found.score, found.overlap) == (0.8, 1.0)
 
 
 def test_unperturbed_is_clearly_less_alike(twin):
