@@ -116,15 +116,15 @@ for name, number in (("Al lateral", 5), ("Ni roll-up", 6)):
     )
     ae.plot.side_by_side(study, titles=titles)[0].figure.savefig(options.output / f"figure{number}.png")
 
-print("\n| study | best | between points, 95 % | SSIM | unperturbed | thermal | two halves |")
-print("|---|---|---|---|---|---|---|")
+print("\n| study | best | between points, 95 % | SSIM | unperturbed | thermal | SSIM, noise and all | two halves |")
+print("|---|---|---|---|---|---|---|---|")
 for name, study in studies.items():
     best, refined = study.optimum, study.refined
     combined = name == "Ni combined"
     grid = f"{best.mean:g} eV, {best.rsd:g}" + (f", f {best.rollup_fraction:g}" if combined else "")
     between = f"{refined.bounded('mean')} eV, {refined.bounded('rsd')}"
     between += f", f {refined.bounded('rollup_fraction')}" if combined else ""
-    scores = (best.score, study.baselines["unperturbed"], study.baselines["thermal"], study.ceiling or "unknown")
+    scores = [best.score, *study.baselines.values(), study.plain["optimum"], study.ceiling or "unknown"]
     print("|", " | ".join([name, grid, between, *map(str, scores)]), "|")
 results = {
     "sources": sources,
