@@ -131,13 +131,25 @@ def datasets(path):
 def test_a_run_is_made_longer_by_resume(folder, made, capsys):
     assert main(["run", "small.toml", "--ions", "25", "--quiet"]) == 0
     assert main(["run", "small.toml", "--resume", "--checkpoint", "0"]) == 0
-    assert "60 ions in" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "resumed at 25 of 60 ions\n" in out and "60 ions, 35 of them new, in" in out
+    assert "wrote small.h5" in out
+    before = (folder / "small.h5").stat()
+    assert main(["run", "small.toml", "--resume"]) == 0
+    assert capsys.readouterr().out.endswith("small.h5 is complete: nothing to do\n")
+    assert main(["run", "small.toml", "--resume", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["wrote"] is None and told["ions"] == 60
+    assert (folder / "small.h5").stat().st_mtime_ns == before.st_mtime_ns
     one, two = datasets(made), datasets("small.h5")
     assert one.keys() == two.keys() and "entry1/atom_probe/hit_finding/hit_positions" in one
     assert [name for name in one if one[name].tobytes() != two[name].tobytes()] == []
     assert load("small.h5").provenance["config"] == "small.toml"
     assert sorted(os.listdir()) == ["small.h5", "small.png", "small.toml"]
     assert "seed is 1 there and 2 here" in failed(capsys, "run", "small.toml", "--resume", "--seed", "2", "--quiet")
+    assert "--ions must be at least the 60 that are done already, got 50" in failed(
+        capsys, "run", "small.toml", "--resume", "--ions", "50", "--quiet"
+    )
 
 
 def test_an_unfinished_run_is_resumed_or_begun_anew_as_asked(folder, made, capsys):
@@ -159,10 +171,23 @@ def test_an_unfinished_run_is_resumed_or_begun_anew_as_asked(folder, made, capsy
 def test_a_second_run_overwrites_the_first_but_nobody_elses_files(folder, capsys):
     quick = ["run", "small.toml", "--ions", "5", "--quiet"]
     assert main(quick) == 0
+    assert main(quick[:-1]) == 0
+    assert "replaced small.h5\nwrote small.png\n" in capsys.readouterr().out
     created = (folder / "small.h5").stat().st_mtime_ns, (folder / "small.png").stat().st_mtime_ns
     assert main(quick) == 0
     assert created[0] < (folder / "small.h5").stat().st_mtime_ns
     assert created[1] < (folder / "small.png").stat().st_mtime_ns
+
+    with_seed = "small.h5' holds a run with other settings (seed is 1 there and 2 here): --force replaces it"
+    assert with_seed in failed(capsys, *quick, "--seed", "2")
+    assert "small.h5' holds a run of 5 ions, more than the 4 asked for: --force" in failed(
+        capsys, *quick, "--ions", "4"
+    )
+    load("small.h5").ended_by("interrupted").save("small.h5")
+    assert "a run of 5 ions that is not complete (interrupted): --resume goes on with it, --force begins anew" in (
+        failed(capsys, *quick)
+    )
+    assert main([*quick, "--force"]) == 0
 
     (folder / "small.png").write_bytes(b"a photograph")
     assert "'small.png' exists and was not made by apt-evap: --force overwrites it" in failed(capsys, *quick)
@@ -262,7 +287,34 @@ def test_memory_and_interrupts_are_no_tracebacks_but_bugs_are(folder, capsys, mo
     assert os.listdir() == ["small.toml"]
 
 
-def test_ctrl_c_keeps_what_is_done(folder):
+def test_an_interrupt_of_the_imports_is_no_traceback(tmp_path):
+    (tmp_path / "apt_evap").mkdir()
+    (tmp_path / "apt_evap" / "__init__.py").write_text("raise KeyboardInterrupt")
+    command = f"import sys; sys.path[:0] = {[str(tmp_path), HERE]}; from _apt_evap_shell import main; sys.exit(main())"
+    done = subprocess.run([sys.executable, "-P", "-c", command], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (130, "apt-evap: interrupted\n")
+
+
+def test_progress_without_a_terminal_is_plain_lines(folder, capsys, monkeypatch):
+    monkeypatch.setattr(cli.run, "SECONDS_BETWEEN_LINES", 0.0)
+    assert main(["run", "small.toml", "--ions", "600", "--threads", "1"]) == 0
+    line = r"300 of 600 ions \(50%\), [\d.,]+ ions/s, \d+ s left\n"
+    assert re.search(line, capsys.readouterr().err)
+    assert main(["run", "small.toml", "--ions", "600", "--threads", "1", "--quiet"]) == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_a_run_that_misses_the_detector_says_so(folder, capsys):
+    (folder / "small.toml").write_text(SMALL + "[detector]\nwidth = 40\n")
+    assert main(["run", "small.toml"]) == 0
+    note = (
+        r"note: (\d+) of 60 ions miss the detector, which is 40 mm wide at 100 mm: a larger width or a smaller distance"
+    )
+    assert int(re.search(note, capsys.readouterr().err)[1]) > 30
+
+
+@pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_ctrl_c_and_sigterm_keep_what_is_done(folder, sent, code):
     terminal, end = os.openpty()
     termios.tcsetwinsize(end, (24, 100))
     (folder / "small.toml").write_text(SMALL.replace("6 a", "10 a"))
@@ -281,7 +333,7 @@ def test_ctrl_c_keeps_what_is_done(folder):
         while not re.search(rb"[1-9]\d*/5000", seen):
             assert process.poll() is None
             seen += os.read(terminal, 1000)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(sent)
         deadline = time.monotonic() + 60
         while process.poll() is None and time.monotonic() < deadline:
             try:
@@ -292,10 +344,11 @@ def test_ctrl_c_keeps_what_is_done(folder):
     finally:
         process.kill()
         os.close(terminal)
-    assert process.returncode == 130
+    assert process.returncode == code
     run = load(folder / "small.h5")
     assert run.ended == "interrupted" and 0 < len(run) < 5000
-    assert f"the run ended before its time: interrupted; the {len(run):,} ions so far are kept".encode() in seen
+    said = f"interrupted; {len(run):,} of 5,000 ions are in 'small.h5'; the same command with --resume goes on"
+    assert said.encode() in seen
     assert b"Traceback" not in seen and out.endswith("wrote small.h5\nwrote small.png\n")
     assert sorted(os.listdir(folder)) == ["small.h5", "small.png", "small.toml"]
 
@@ -468,7 +521,7 @@ def test_warnings_of_readers_are_one_line(measured, capsys):
         (["run"], "the following arguments are required: CONFIG.toml (see apt-evap run --help)"),
         (["run", "small.toml", "--ions", "0"], "argument --ions: must be a whole number of at least 1, got '0'"),
         (["run", "small.toml", "--threads", "x"], "argument --threads: must be a whole number of at least 1, got 'x'"),
-        (["run", "small.toml", "--colour"], "unrecognized arguments: --colour"),
+        (["run", "small.toml", "--colour"], "unrecognized arguments: --colour (see apt-evap run --help)"),
         (["info", "a.epos", "--byte-order", "up"], "argument --byte-order: invalid choice: 'up'"),
     ],
 )

@@ -21,14 +21,9 @@ _MARK_KEYS = {".png": "Software", ".pdf": "Creator", ".svg": "Creator"}
 
 def read(options: argparse.Namespace) -> Hits | Run:
     wanted = {"partial": options.partial, "byte_order": options.byte_order}
-    try:
-        return read_file(
-            options.file, format=options.format, **{key: value for key, value in wanted.items() if value is not None}
-        )
-    except FileError as error:
-        # the readers speak of arguments of Python
-        message = str(error).replace("partial=True", "--partial").replace("byte_order=", "--byte-order ")
-        raise FileError(message.replace("format=", "--format ")) from error
+    return read_file(
+        options.file, format=options.format, **{key: value for key, value in wanted.items() if value is not None}
+    )
 
 
 def picture_path(path: AnyPath) -> Path:

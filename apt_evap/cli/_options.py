@@ -2,19 +2,35 @@
 
 import argparse
 import json
+import re
 import sys
 from collections.abc import Callable
 from typing import Any
 
 from apt_evap._arrays import check_number
 
-INTERRUPTED = 130  # 128 + SIGINT, as shells count
+INTERRUPTED, TERMINATED = 130, 143  # 128 + SIGINT and SIGTERM, as shells count
 SHAPE = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
 
 
+# the library speaks of arguments of Python
+_SHELL_WORDS = (
+    ("partial=True", "--partial"),
+    ("resume=True", "--resume"),
+    ("overwrite=True", "--force"),
+    (r"\bbyte_order=", "--byte-order "),
+    (r"\bformat=(?=')", "--format "),
+    (r"\bn_threads\b", "--threads"),
+    (r"\bn_ions\b", "--ions"),
+)
+
+
 def say(kind: str, message: object) -> None:
-    """One line on stderr: an error, a warning or a note."""
-    print(f"apt-evap: {kind}: {' '.join(str(message).split())}", file=sys.stderr)
+    """One line on stderr: an error, a warning or a note, in words of the shell."""
+    text = " ".join(str(message).split())
+    for python, shell in _SHELL_WORDS:
+        text = re.sub(python, shell, text)
+    print(f"apt-evap: {kind}: {text}", file=sys.stderr)
 
 
 def reading_options() -> argparse.ArgumentParser:
