@@ -158,7 +158,12 @@ def test_an_unfinished_run_is_resumed_or_begun_anew_as_asked(folder, made, capsy
     os.rename("small.h5", "small.h5.unfinished/ions-000000000000.h5")
     message = failed(capsys, "run", "small.toml", "--quiet")
     assert "unfinished run of 25 ions" in message and "--resume goes on with it, --force begins anew" in message
-    assert main(["info", "small.h5.unfinished"]) == 2  # no file: it has to be finished first
+    assert main(["info", "small.h5.unfinished"]) == 0
+    told = capsys.readouterr().out
+    assert "unfinished run of 25 ions" in told and "the command that began it, with --resume, goes on" in told
+    assert "No such file or directory; an unfinished run is in 'small.h5.unfinished'" in failed(
+        capsys, "info", "small.h5"
+    )
     assert main(["run", "small.toml", "--quiet", "--resume", "--ions", "30"]) == 0
     assert len(load("small.h5")) == 30
     os.mkdir("small.h5.unfinished")
@@ -243,7 +248,7 @@ def test_wrong_configs_are_one_sentence(folder, capsys):
     assert "'wrong.toml', [tip]: no key is named 'apex' (did you mean 'apex_radius'?)" in wrong("apex_radius", "apex")
     assert "'wrong.toml', [tip]: apex_radius must be a finite number [nm] at least" in wrong("6 a", "1 a")
     assert "'wrong.toml', [simulation]: ions must be a whole number of at least 1, got 'many'" in wrong("60", '"many"')
-    assert "GB are free; give depth=" in wrong("6 a", "90000 a")
+    assert "GB are free; give a depth" in wrong("6 a", "90000 a")
     assert "'wrong.toml' is not a TOML file" in wrong("=", ":")
     assert "cannot read 'none.toml'" in failed(capsys, "run", "none.toml")
 
@@ -473,6 +478,7 @@ def test_info_of_a_run(made, capsys):
     assert main(["info", str(made)]) == 0
     text = capsys.readouterr().out
     assert re.search(r"^ions +60$", text, re.M) and re.search(r"^  apex radius \[nm\] +2\.112$", text, re.M)
+    assert re.search(r"^field before leaving \[V/nm\] +[\d.]+ to [\d.]+ at 1000 V \(only its ratio", text, re.M)
 
 
 def test_info_of_measured_ions(measured, capsys):
@@ -483,7 +489,10 @@ def test_info_of_measured_ions(measured, capsys):
     assert told["detector_extent"] == [40, 40] and told["detector_quantum"] == [0.5, 0.5]
     assert told["multi_hit_share"] == 0.1 and told["largest_multi_hit"] == 2
     assert main(["info", "ions.epos"]) == 0
-    assert re.search(r"^  voltage \[V\] +3000   5000$", capsys.readouterr().out, re.M)
+    text = capsys.readouterr().out
+    assert re.search(r"^  voltage \[V\] +3000 to 5000$", text, re.M)
+    assert re.search(r"^detector extent \[mm\] +40 x 40$", text, re.M)
+    assert re.search(r"^absent or zero throughout +time_of_flight   positions$", text, re.M)
 
 
 def test_info_of_what_cannot_be_read(measured, made, capsys):
@@ -508,6 +517,99 @@ def test_warnings_of_readers_are_one_line(measured, capsys):
     out, err = capsys.readouterr()
     assert "multi_hit_share" not in json.loads(out)
     assert re.fullmatch(r"apt-evap: warning: 'ions.epos' does not tell which ions share a pulse[^\n]+\n", err)
+
+
+# ---- maps in .npz files ----------------------------------------------------------------------------------------------
+
+
+def test_map_and_info_of_a_map(folder, monkeypatch, capsys):
+    edges = np.linspace(-20, 20, 41)
+    values = np.random.default_rng(1).poisson(5.0, (40, 40))
+    np.savez("counts.npz", counts=values, x_edges_mm=edges, y_edges_mm=edges)
+    np.savez("density.npz", d=values / 5, x=edges / 10, y=edges / 10)
+    (only,), titles = drawn_by(monkeypatch, "map", "counts.npz")
+    assert titles == ["counts.npz"] and only.smoothing == 1.0 and only.ions == values.sum()
+    named = ["density.npz", "--arrays", "d,x,y", "--unit", "cm"]
+    ((only,), _) = drawn_by(monkeypatch, "map", *named)
+    assert np.array_equal(only.values, values / 5) and only.smoothing == 0
+    capsys.readouterr()
+    assert main(["info", *named, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["kind"] == "detector map of densities" and told["ions"] is None and told["bins"] == [40, 40]
+    assert told["x"] == [-20, 20] and told["values"] == [values.min() / 5, values.max() / 5]
+    assert main(["info", "counts.npz"]) == 0
+    assert re.search(r"^bin size \[mm\] +1 x 1$", capsys.readouterr().out, re.M)
+    assert "--bins is for ions, 'counts.npz' is a map: its bins are 40 x 40" in failed(
+        capsys, "map", "counts.npz", "--bins", "20"
+    )
+    assert "--mass is for ions, got 'counts.npz'" in failed(capsys, "info", "counts.npz", "--mass", "1,2")
+    assert "'counts.npz' holds a map" in failed(capsys, "map", "counts.npz", "--perturbation", "Unperturbed")
+
+
+# ---- a selection of ions ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def mixed(folder):
+    """1,000 ions of 28 and 58 Da in turn, the voltage rising with their number."""
+    random = np.random.default_rng(2)
+    n = np.arange(1000)
+    x, y = random.uniform(-20, 20, (2, 1000))
+    write("mixed.epos", Hits(x=x, y=y, voltage=3000.0 + n, mass_to_charge=np.where(n % 2, 58.0, 28.0), pulse_id=n))
+    (folder / "mixed.rrng").write_text("[Ranges]\nRange1=27.5 28.5 Si:1\nRange2=57.5 58.5 Ni:1\n")
+    return x.astype(np.float32), y.astype(np.float32)
+
+
+def test_ions_are_selected(mixed, monkeypatch, capsys):
+    x, y = mixed
+
+    def ions(*options):
+        capsys.readouterr()
+        assert main(["info", "mixed.epos", "--json", *options]) == 0
+        told = json.loads(capsys.readouterr().out)
+        assert told.get("selected_of") == 1000
+        return told["ions"]
+
+    assert ions("--mass", "27,29") == ions("--mass", ",28.5") == 500
+    assert ions("--voltage", "3100,3200") == ions("--ions", "900,") == 100
+    assert ions("--circle", "10") == np.count_nonzero(np.hypot(x, y) <= 10)
+    assert ions("--circle", "10,5,-5") == np.count_nonzero(np.hypot(x - 5, y + 5) <= 10)
+    assert ions("--ranges", "mixed.rrng", "--species", "Si,Ni") == 1000
+    both = ["--ranges", "mixed.rrng", "--species", "Si", "--ions", "0,100", "--voltage", "3050,"]
+    assert ions(*both) == 25  # the ions of the file are counted, not those of the species
+    (only,), titles = drawn_by(monkeypatch, "map", "mixed.epos", *both)
+    assert only.ions <= 25 and titles == ["mixed.epos, 25 of 1,000 ions"]
+
+
+def test_ions_of_a_run_are_selected(folder, made, monkeypatch, capsys):
+    run = load(made)
+    maps, _ = drawn_by(monkeypatch, "map", made, "--ions", "20,", "--perturbation", "Unperturbed")
+    assert maps[0].ions == run.hits(Unperturbed())[20:].counts[0]
+    capsys.readouterr()
+    assert main(["info", str(made), "--ions", "20,", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["kind"], told["ions"]) == ("simulation, Unperturbed()", 40)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--mass", "29,27"], "argument --mass: must be two numbers in order, such as 27,29.5, got '29,27'"),
+        (["--circle", "1,2"], "argument --circle: must be a radius, or R,X,Y, such as 15,0,-2 [mm], got '1,2'"),
+        (["--species", "Si"], "--ranges and --species go together"),
+        (["--ranges", "mixed.rrng", "--species", "Sn"], "--species: mixed.rrng have no species 'Sn'"),
+        (["--mass", "1,2"], "no ion is selected of the 1,000 of 'mixed.epos'"),
+    ],
+)
+def test_selections_that_are_refused(mixed, capsys, options, sentence):
+    assert sentence in failed(capsys, "info", "mixed.epos", *options)
+
+
+def test_a_selection_by_a_missing_column_is_refused(folder, capsys):
+    write("ions.pos", Hits(positions=np.zeros((3, 3)), mass_to_charge=np.ones(3)))
+    assert "--voltage: ions.pos has no column 'voltage', only mass_to_charge, positions" in failed(
+        capsys, "info", "ions.pos", "--voltage", "1,2"
+    )
 
 
 # ---- the program -----------------------------------------------------------------------------------------------------

@@ -259,7 +259,7 @@ def test_impossible_tips_are_refused_in_one_sentence(changes, message):
 
 def test_tip_that_does_not_fit_in_memory_is_refused_before_it_is_built(monkeypatch):
     monkeypatch.setattr(_memory, "_available_memory", lambda: 8e9)
-    with pytest.raises(ValueError, match=r"needs about \d+ GB, 8 GB are free; give depth="):
+    with pytest.raises(ValueError, match=r"needs about \d+ GB, 8 GB are free; give a depth"):
         Tip(NICKEL, 250 * NICKEL.a)
     monkeypatch.setattr(_memory, "_available_memory", lambda: None)
     assert len(small()) > 0
