@@ -240,7 +240,7 @@ class Noting:
         return getattr(self.config, name)
 
 
-def test_wrong_configs_are_one_sentence(folder, capsys):
+def test_wrong_configs_are_one_sentence(folder, made, capsys):
     def wrong(old, new):
         (folder / "wrong.toml").write_text(SMALL.replace(old, new))
         return failed(capsys, "run", "wrong.toml")
@@ -251,6 +251,7 @@ def test_wrong_configs_are_one_sentence(folder, capsys):
     assert "GB are free; give a depth" in wrong("6 a", "90000 a")
     assert "'wrong.toml' is not a TOML file" in wrong("=", ":")
     assert "cannot read 'none.toml'" in failed(capsys, "run", "none.toml")
+    assert f"'{made}' is a run: see apt-evap info" in failed(capsys, "run", made)
 
 
 def test_a_run_that_ends_early_says_why(folder, capsys):
@@ -447,6 +448,9 @@ def test_map_errors(measured, made, capsys):
         capsys, "map", "ions.epos", "--perturbation", "Unperturbed"
     )
     assert "did you mean 'RollUp'" in failed(capsys, "map", made, "--perturbation", "Rollup:0.1")
+    assert "RollUp needs energy, got no parameters; an example is RollUp:0.155,0.155" in failed(
+        capsys, "map", made, "--perturbation", "RollUp"
+    )
     assert "argument --bins: must be a whole number from 1 to 16384, got '0'" in failed(
         capsys, "map", made, "--bins", "0"
     )
@@ -620,6 +624,7 @@ def test_a_selection_by_a_missing_column_is_refused(folder, capsys):
     [
         ([], "the following arguments are required: COMMAND (see apt-evap --help)"),
         (["fly"], "invalid choice: 'fly'"),
+        (["mpa"], "invalid choice: 'mpa' (did you mean 'map'?)"),
         (["run"], "the following arguments are required: CONFIG.toml (see apt-evap run --help)"),
         (["run", "small.toml", "--ions", "0"], "argument --ions: must be a whole number of at least 1, got '0'"),
         (["run", "small.toml", "--threads", "x"], "argument --threads: must be a whole number of at least 1, got 'x'"),

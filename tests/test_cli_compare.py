@@ -142,6 +142,7 @@ def test_arrays_by_name(folder, capsys):
         (["run.h5", "map.npz", "--means", "a"], "--means: must be numbers with commas between, got 'a'"),
         (["run.h5", "map.npz", "--means", "0.2,0.1"], "means must be increasing numbers above 0"),
         (["run.h5", "map.npz", "--mechanism", "both"], "invalid choice: 'both'"),
+        (["run.h5", "map.npz", "--mechanism", "rollup"], "invalid choice: 'rollup' (did you mean 'roll-up'?)"),
         (["run.h5", "map.npz", "--rollup-fractions", "0.5"], "rollup_fractions are for the mechanism 'combined'"),
         (["run.h5", "map.npz", "--registration", "1,2"], "--registration must be a .json file or ROTATION,SCALE"),
         (["run.h5", "map.npz", "--registration", "0,-1,0,0"], "scale must be a finite number above 0"),

@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import re
 import signal
 import sys
 import threading
@@ -10,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NoReturn
 
+from apt_evap._arrays import did_you_mean
 from apt_evap._version import __version__
 from apt_evap.cli import compare, info, map, run
 from apt_evap.cli._options import INTERRUPTED, SHAPE, TERMINATED, say
@@ -98,9 +100,12 @@ def _terminated_like_interrupted() -> Iterator[list[int]]:
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
+        if found := re.search(r"invalid choice: '(.+?)' \(choose from (.+)\)", message):
+            hint = did_you_mean(found[1], re.findall(r"[\w-]+", found[2]))
+            message = message.replace(" (choose", f"{hint} (choose")
         raise ValueError(f"{message} (see {self.prog} --help)")
 
-    def parse_known_args(self, args=None, namespace=None):
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         # a command's own parser would leave it to the one above to say so, with the wrong help
         options, unknown = super().parse_known_args(args, namespace)
         if unknown:

@@ -5,6 +5,7 @@ import os
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from apt_evap import plot
 from apt_evap._files import FileError, check_path, replace_file
@@ -58,13 +59,12 @@ def select(hits: Hits, options: argparse.Namespace) -> Hits:
     """The ions that the options select; ValueError if a column is missing, or none is left."""
     if (options.ranges is None) != (options.species is None):
         raise ValueError("--ranges and --species go together: a file of ranges, and which of its species")
-    ranges = None if options.ranges is None else read_ranges(options.ranges)
-    steps = {
+    steps: dict[str, Callable[[Hits, Any], Hits]] = {
         "ions": lambda hits, bounds: hits.window(ion=bounds),  # first: it counts the ions of the file
         "mass": lambda hits, bounds: hits.window(mass_to_charge=bounds),
         "voltage": lambda hits, bounds: hits.window(voltage=bounds),
         "circle": lambda hits, circle: hits.within_circle(*circle),
-        "species": lambda hits, names: ranges.select(hits, *names.split(",")),
+        "species": lambda hits, names: read_ranges(options.ranges).select(hits, *names.split(",")),
     }
     chosen = hits
     for name, step in steps.items():

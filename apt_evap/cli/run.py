@@ -136,13 +136,12 @@ class _Lines:
     """Says on stderr how far a run is, at most once a minute and not in the first one."""
 
     def __init__(self) -> None:
-        self._began = None
+        self._began = self._told = self._first = 0.0
 
     def __call__(self, done: int, n_ions: int) -> None:
         now = time.monotonic()
-        if self._began is None:
-            self._began = self._told = now
-            self._first = done
+        if not self._began:
+            self._began, self._told, self._first = now, now, done
         elif now - self._told >= SECONDS_BETWEEN_LINES and done > self._first:
             self._told = now
             rate = (done - self._first) / (now - self._began)
