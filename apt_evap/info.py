@@ -136,7 +136,9 @@ def _of_hits(hits):
     told = {"kind": "measured ions" if measured else hits.source, "ions": len(hits)}
     told |= {"detected": int(np.count_nonzero(detected)), "columns": columns}
     if measured:
-        told["absent_or_zero_throughout"] = [name for name in _MEASURED if name not in hits.columns]
+        told["absent_or_zero_throughout"] = [
+            name for name in _MEASURED if name not in hits.columns or not np.any(getattr(hits, name))
+        ]
     if hits.x is not None and hits.y is not None and detected.any():
         x, y = hits.x[detected], hits.y[detected]
         told["detector_extent"] = [_plain(np.ptp(x)), _plain(np.ptp(y))]
