@@ -350,24 +350,20 @@ def test_a_complete_run_is_not_written_again_by_resume(tmp_path):
     assert more.emissions.ions[0] == 90
 
 
-def test_ctrl_c_waits_for_files(tmp_path):
-    """However often it is pressed while a checkpoint is written or the folder goes, nothing is left half way."""
+@pytest.mark.parametrize(("at", "kept"), [((5, 6), 0), ((40, 50), 30)])
+def test_ctrl_c_waits_for_files(tmp_path, monkeypatch, at, kept):
+    """Pressed once more at every rename: nothing is left half way, and no folder without ions."""
 
     def pressing(*names):
         signal.raise_signal(signal.SIGINT)
         replace(*names)
 
-    replace, os.replace = os.replace, pressing
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            run_small(tmp_path / "run.h5")
-    finally:
-        os.replace = replace
-    assert ae.Checkpoint(tmp_path / "run.h5").ions_there() > 0
-    assert [path.suffix for path in (tmp_path / "run.h5.unfinished").glob("*") if path.name != "lock"] != []
-    run_small(tmp_path / "run.h5", resume=True)
-    run_small(tmp_path / "whole.h5")
-    assert differing(tmp_path / "run.h5", tmp_path / "whole.h5") == []
+    replace = os.replace
+    monkeypatch.setattr(os, "replace", pressing)
+    with pytest.raises(KeyboardInterrupt):
+        interrupted(tmp_path / "run.h5", at)
+    assert ae.Checkpoint(tmp_path / "run.h5").ions_there() == kept
+    assert [item.name for item in tmp_path.iterdir()] == (["run.h5.unfinished"] if kept else [])
 
 
 def test_the_progress_may_be_told_to_a_function():
