@@ -85,6 +85,7 @@ def check_number(
     at_most: float | None = None,
     below: float | None = None,
     unit: str = "",
+    why: str = "",
 ) -> float:
     """Return `value` as a finite float within its bounds, or say in one sentence what is wrong.
 
@@ -98,6 +99,8 @@ def check_number(
         Bounds; `above` and `below` are exclusive.
     unit : str
         Unit for the message.
+    why : str
+        What the bound is, for the message.
 
     Returns
     -------
@@ -120,6 +123,7 @@ def check_number(
             if bound is not None
         ]
         expected = "a finite number" + (f" [{unit}]" if unit else "") + (" " + " and ".join(bounds) if bounds else "")
+        expected += f" ({why})" if why else ""
         raise ValueError(f"{name} must be {expected}, got {shown(value)}")
     return float(value)
 

@@ -37,7 +37,7 @@ def check_memory(atoms: float, surface_atoms: float) -> None:
     _check(
         needed_memory(atoms, surface_atoms),
         f"a tip of {atoms:.2g} atoms",
-        "give depth=... to hold only the atoms near the surface, a smaller apex_radius or a shorter shank_length",
+        "give a depth, to hold only the atoms near the surface, a smaller apex_radius or a shorter shank_length",
     )
 
 

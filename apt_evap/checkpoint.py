@@ -21,11 +21,10 @@ import numpy as np
 
 from apt_evap._arrays import check_count, check_number, check_switch
 from apt_evap._files import FileError, check_path, flush_folder
-from apt_evap.emitter import EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, Emitter
+from apt_evap._threads import uninterrupted
 from apt_evap.emitter_state import EmitterState
 from apt_evap.run import PART_NAME, Run, load, part_paths
-from apt_evap.run_file import described, is_run, plain, read_state, write_state
-from apt_evap.watch import History
+from apt_evap.run_file import count_ions, described, is_run, plain, read_state, write_state
 
 try:
     import fcntl
@@ -34,6 +33,7 @@ except ImportError:  # not on this system: two processes on one file are not not
 
 
 STATE_NAME, WHOLE_NAME = "state.h5", "whole.h5"
+NOTHING_LEFT = "no atom is left that may evaporate"  # why a run ended that is complete, though shorter than asked for
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,8 @@ class Checkpoint:
         Whether to go on with what is there: an unfinished run, or the file of one that ended. If nothing is there, the
         run begins.
     overwrite : bool
-        Whether to begin anew over an unfinished run, and over a file that is no run.
+        Whether to begin anew over an unfinished run, over the file of one that was interrupted, is longer or has other
+        settings, and over a file that is no run.
     """
 
     path: str | os.PathLike
@@ -78,6 +79,11 @@ class Checkpoint:
         target = Path(os.path.realpath(self.path))
         return target.with_name(target.name + ".unfinished")
 
+    def ions_there(self) -> int:
+        """Ions of the unfinished run, or else of the file; 0 if there is neither."""
+        paths = part_paths(self.folder) or [path for path in (self.path,) if path.exists()]
+        return sum(map(count_ions, paths))
+
 
 class Keeper:
     """Keeps one run on the disk; locked against other processes from `open` to `close`.
@@ -92,19 +98,31 @@ class Keeper:
         Flown in it.
     responses : bool
         Whether it has responses.
+    n_ions : int
+        Ions it is to have in the end.
     """
 
     def __init__(
-        self, checkpoint: Checkpoint, settings: dict[str, Any], perturbations: tuple[Any, ...], responses: bool
+        self,
+        checkpoint: Checkpoint,
+        settings: dict[str, Any],
+        perturbations: tuple[Any, ...],
+        responses: bool,
+        n_ions: int,
     ) -> None:
         self._checkpoint, self._folder = checkpoint, checkpoint.folder
         self._target = Path(os.path.realpath(checkpoint.path))
         self._lock = None
         self._written_at, self._written_to = time.monotonic(), 0
         self.done = None  # what is there already
-        self._open()
+        self._in_file = False  # whether that is in the file only, and not yet in the folder
+        self.complete = False  # whether it is in the file, with nothing left to do
+        self._here = dict(
+            _flat(plain(settings)), responses=responses, flown=[described(each) for each in perturbations]
+        )
         try:
-            self._prepare(settings, perturbations, responses)
+            self._open()
+            self._prepare(n_ions)
         except BaseException:
             self.close()
             raise
@@ -159,15 +177,17 @@ class Keeper:
                 stacklevel=6,
             )
 
+    @uninterrupted()
     def close(self) -> None:
         """Let go of the files; a folder without ions goes."""
-        if self._lock is None:
-            return
         with contextlib.suppress(OSError):
-            if self._folder.is_dir() and not part_paths(self._folder):
+            if self._lock is None:
+                self._folder.rmdir()  # made, and not locked yet; one that somebody else has locked is not empty
+            elif self._folder.is_dir() and not part_paths(self._folder):
                 self._remove_folder()
-        self._lock.close()
-        self._lock = None
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
 
     def _remove_folder(self):
         # renamed first: a folder with some of its files gone is no unfinished run
@@ -180,7 +200,7 @@ class Keeper:
 
     # ---- what is there ---------------------------------------------------------------------------------------------
 
-    def _prepare(self, settings, perturbations, responses):
+    def _prepare(self, n_ions):
         checkpoint, folder = self._checkpoint, self._folder
         try:
             for rest in (
@@ -193,29 +213,55 @@ class Keeper:
             raise self._error(error) from error
         parts = part_paths(folder)
         if checkpoint.resume:
-            if not parts and not self._target.exists():
-                return
-            self.done = load(folder) if parts else load(self._target)
-            self._compare(settings, perturbations, responses)
-            if parts:
-                self.done = self._with_state(self.done)
-            elif self.done.state is None:
-                raise FileError(f"the run in {str(checkpoint.path)!r} cannot be resumed: the file holds no state")
-            else:
-                self._write_part(self.done)
-                write_state(folder / STATE_NAME, self.done.state, self.done.first_event)
-            self._written_to = len(self.done)
-        elif parts and not checkpoint.overwrite:
-            ions = sum(len(load(path)) for path in parts)
+            if parts or self._target.exists():
+                self._go_on(parts, n_ions)
+            return
+        if not checkpoint.overwrite:
+            self._refuse_a_loss(parts, n_ions)
+        for path in (folder / STATE_NAME, *parts[::-1]):
+            path.unlink(missing_ok=True)
+
+    def _go_on(self, parts, n_ions):
+        """Take up what is there."""
+        name, done = str(self._checkpoint.path), load(self._folder if parts else self._target)
+        if differing := self._differing(done):
+            raise FileError(f"the run in {name!r} cannot be resumed with other settings: {differing}")
+        if not np.array_equal(done.emissions.ions, done.emissions.ions[0] + np.arange(len(done))):
+            raise FileError(f"the run in {name!r} cannot be resumed: some of its ions are missing")
+        if len(done) > n_ions:
+            raise FileError(f"n_ions must be at least the {len(done):,} that are done already, got {n_ions:,}")
+        if not parts and done.state is None:
+            raise FileError(f"the run in {name!r} cannot be resumed: the file holds no state")
+        self.done, self._in_file, self._written_to = done, not parts, len(done)
+        self.complete = not parts and not done.ended and len(done) == n_ions
+        if parts:
+            self.done = self._with_state(done)
+
+    def _refuse_a_loss(self, parts, n_ions):
+        """Refuse to begin anew over what this run would not give again."""
+        name, anew = str(self._checkpoint.path), "resume=True goes on with it, overwrite=True begins anew"
+        if parts:
+            ions = sum(map(count_ions, parts))
             raise FileError(
-                f"{str(checkpoint.path)!r} has an unfinished run of {ions:,} ions beside it, in {folder.name!r}: "
-                "resume=True goes on with it, overwrite=True begins anew"
+                f"{name!r} has an unfinished run of {ions:,} ions beside it, in {self._folder.name!r}: {anew}"
             )
-        else:
-            if self._target.exists() and not checkpoint.overwrite and not is_run(self._target):
-                raise FileError(f"{str(checkpoint.path)!r} exists and is no run: overwrite=True replaces it")
-            for path in (folder / STATE_NAME, *parts[::-1]):
-                path.unlink(missing_ok=True)
+        if not self._target.exists():
+            return
+        if not is_run(self._target):
+            raise FileError(f"{name!r} exists and is no run: overwrite=True replaces it")
+        try:
+            done = load(self._target)
+        except FileError as error:
+            raise FileError(f"{error}; overwrite=True replaces it") from error
+        if differing := self._differing(done):
+            raise FileError(f"{name!r} holds a run with other settings ({differing}): overwrite=True replaces it")
+        if done.ended not in ("", NOTHING_LEFT):
+            raise FileError(f"{name!r} holds a run of {len(done):,} ions that is not complete ({done.ended}): {anew}")
+        if len(done) > n_ions:
+            raise FileError(
+                f"{name!r} holds a run of {len(done):,} ions, more than the {n_ions:,} asked for: overwrite=True "
+                "replaces it"
+            )
 
     def _with_state(self, run):
         """The unfinished run with the state beside its parts; without one its events begin at the first."""
@@ -231,27 +277,22 @@ class Keeper:
             state, first_event = None, 0
         return replace(run, state=state, first_event=first_event)
 
-    def _compare(self, settings, perturbations, responses):
-        """Refuse to go on with other settings than those of the beginning."""
-        name, done = str(self._checkpoint.path), self.done
-        here = dict(_flat(plain(settings)), responses=responses, flown=[described(each) for each in perturbations])
-        there = dict(
-            _flat(done.settings),
-            responses=done.responses is not None,
-            flown=[described(each) for each in done.perturbations],
+    def _differing(self, done):
+        """The settings in which a run differs from this one, in words; "" if there are none."""
+        here, there = (
+            self._here,
+            dict(
+                _flat(done.settings),
+                responses=done.responses is not None,
+                flown=[described(each) for each in done.perturbations],
+            ),
         )
         differing = [
             f"{key} is {there.get(key)!r:.60} there and {here.get(key)!r:.60} here"
             for key in dict.fromkeys((*there, *here))
             if there.get(key) != here.get(key)
         ]
-        if differing:
-            more = f", and {len(differing) - 3} more" if len(differing) > 3 else ""
-            raise FileError(
-                f"the run in {name!r} cannot be resumed with other settings: {'; '.join(differing[:3])}{more}"
-            )
-        if not np.array_equal(done.emissions.ions, done.emissions.ions[0] + np.arange(len(done))):
-            raise FileError(f"the run in {name!r} cannot be resumed: some of its ions are missing")
+        return "; ".join(differing[:3]) + (f", and {len(differing) - 3} more" if len(differing) > 3 else "")
 
     # ---- writing ---------------------------------------------------------------------------------------------------
 
@@ -261,6 +302,7 @@ class Keeper:
         often = self._checkpoint.ions is not None and new >= self._checkpoint.ions
         return new > 0 and (often or time.monotonic() - self._written_at >= 60 * self._checkpoint.minutes)
 
+    @uninterrupted()
     def write(self, part: Run, state: EmitterState, first_event: int) -> bool:
         """Write the next part of the run, then the state it ends in; if that fails, a warning says so.
 
@@ -272,6 +314,10 @@ class Keeper:
         self._written_at = time.monotonic()  # not at once again if it fails
         written = False
         try:
+            if self._in_file:
+                self._write_part(self.done)
+                write_state(self._folder / STATE_NAME, self.done.state, self.done.first_event)
+                self._in_file = False
             self._write_part(part)
             self._written_to += len(part)
             written = True
@@ -284,6 +330,7 @@ class Keeper:
     def _write_part(self, part):
         part.save(self._folder / PART_NAME.format(int(part.emissions.ions[0])))
 
+    @uninterrupted()
     def finish(self, run: Run) -> None:
         """Write the file of the run and take the folder away."""
         whole = self._folder / WHOLE_NAME
@@ -294,93 +341,6 @@ class Keeper:
             self._remove_folder()
         except OSError as error:
             raise FileError(f"cannot write {str(self._checkpoint.path)!r}: {error.strerror or error}") from error
-
-
-class Parts:
-    """The parts of a run in memory, and on the disk where a `Keeper` keeps them.
-
-    Parameters
-    ----------
-    keeper : Keeper or None
-        Where they are kept.
-    emitter : Emitter
-        The surface, whose state goes with them.
-    """
-
-    def __init__(self, keeper: Keeper | None, emitter: Emitter) -> None:
-        self.watch = None
-        self.done = [keeper.done] if keeper and keeper.done else []
-        self._keeper, self._emitter = keeper, emitter
-        self._new = []
-        self._first_event = self.done[0].first_event if self.done else emitter.counts["events"]
-
-    def __len__(self) -> int:
-        return sum(map(len, self.done)) + sum(map(len, self._new))
-
-    def append(self, part: Run) -> None:
-        """Add the next part."""
-        self._new.append(part)
-
-    def _joined(self):
-        # the history goes with the last part, as it is taken but once
-        if self._new:
-            joined = Run.join(self._new)
-            self._new = [replace(joined, history=History.join([joined.history, self.watch.take()]))]
-        return self._new
-
-    def keep(self) -> None:
-        """Write what is new to the disk."""
-        if self._keeper and len(self) > sum(map(len, self.done)):
-            if self._keeper.write(self._joined()[0], self._emitter.state(), self._first_event):
-                self.done += self._new
-                self._new = []
-
-    def run(self, ended: str = "") -> Run:
-        """Join all parts into one run."""
-        run = Run.join([*self.done, *self._joined()])
-        return replace(run, state=self._emitter.state(), first_event=self._first_event, ended=ended)
-
-
-def catch_up(emitter: Emitter, run: Run, batch_size: int) -> None:
-    """Bring a new surface to where a run ends, by its state and the events since.
-
-    Parameters
-    ----------
-    emitter : Emitter
-        Of the settings of the run.
-    run : Run
-        What has been done; without a state all its events happen again.
-    batch_size : int
-        Events at a time.
-
-    Raises
-    ------
-    ValueError
-        If atoms have left the emitter, or its events are not those of the run.
-    """
-    if emitter.counts["events"]:
-        raise ValueError(f"a run is resumed by a new Simulation, got one that {emitter.counts['events']:,} atoms left")
-    if run.state is not None:
-        emitter.restore(run.state)
-    ions = emitter.counts["events"] - run.first_event  # ions of the run that have left; those before it count down
-    same = ions <= len(run)
-    while same and ions < len(run):
-        batch = emitter.evaporate(min(batch_size, len(run) - ions))
-        known = slice(max(ions, 0), max(ions + len(batch), 0))
-        kept = slice(len(batch) - (known.stop - known.start), None)
-        same = np.array_equal(batch.site[kept], run.site[known])
-        same = same and np.array_equal(batch.charges[kept], run.charges[known])
-        ions += len(batch)
-        if batch.status == SWEEP_DUE:
-            emitter.relax()
-        elif batch.status == TOO_SHALLOW:
-            emitter.deepen()
-        same = same and batch.status != EXHAUSTED
-    if not same:
-        raise ValueError(
-            "the run cannot be resumed: its events do not come out the same again, as with another version of the "
-            "program, or a surface that was changed by hand"
-        )
 
 
 def _flat(settings, before=""):

@@ -18,6 +18,7 @@ from apt_evap.energy import Fixed, Thermal, TruncatedNormal
 from apt_evap.material import MATERIALS, Material, material
 from apt_evap.perturbation import Perturbation, RollUp, Unperturbed, from_dict, to_dict
 from apt_evap.response import ResponseSettings
+from apt_evap.run_file import is_run
 from apt_evap.simulation import FlightSettings, Simulation
 from apt_evap.tip import Tip
 from apt_evap.watch import WatchSettings
@@ -178,7 +179,8 @@ def read_config(path: str | Path) -> Config:
     try:
         document = tomllib.loads(content.decode())
     except UnicodeDecodeError as error:
-        raise FileError(f"{str(path)!r} is not a TOML file: it is not text in UTF-8") from error
+        what = "a run: see apt-evap info" if is_run(path) else "not a TOML file: it is not text in UTF-8"
+        raise FileError(f"{str(path)!r} is {what}") from error
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise FileError(f"{str(path)!r} is not a TOML file: {error}") from error
     with _place(path):
@@ -243,9 +245,7 @@ def read_maps(table: Mapping[str, Any]) -> MapSettings:
         smoothing = check_number(smoothing, "smoothing", at_least=0, unit="mm")
     if table.get("panels") is None:
         usual = (Unperturbed(), RollUp(TruncatedNormal(0.155, 0.155)))
-        return MapSettings(
-            tuple(Panel(title_of(perturbation), perturbation) for perturbation in usual), bins, smoothing
-        )
+        return MapSettings(tuple(Panel(title_of(each), each) for each in usual), bins, smoothing)
     if not isinstance(table["panels"], list) or not table["panels"]:
         raise ValueError(f"panels must be a list of tables such as [[maps.panels]], got {shown(table['panels'])}")
     panels = []
@@ -287,7 +287,7 @@ def read_perturbation(settings: str | Mapping[str, Any]) -> Perturbation:
         try:
             return read_perturbation(_perturbation_table(settings))
         except ValueError as error:
-            raise ValueError(f"perturbation {settings!r}: {error}") from error
+            raise ValueError(f"perturbation {settings!r}: {error}; an example is RollUp:0.155,0.155") from error
     _check_table(settings, "perturbation")
     for table in (settings, *settings.values()):
         if isinstance(table, Mapping) and not isinstance(table.get("name"), str):

@@ -1,4 +1,4 @@
-"""What a run or a file of ions holds, in plain types."""
+"""What a run, a file of ions or a map holds, in plain types."""
 
 from typing import Any
 
@@ -6,6 +6,7 @@ import numpy as np
 
 from apt_evap.binning import find_combs
 from apt_evap.hits import Hits
+from apt_evap.maps import DetectorMap
 from apt_evap.run import Run
 
 UNITS = {
@@ -20,6 +21,7 @@ UNITS = {
     "position_z": "nm",
     "detector_extent": "mm",
     "detector_quantum": "mm",
+    "bin_size": "mm",
     "distance": "mm",
     "width": "mm",
     "field_before_leaving": "V/nm",
@@ -42,12 +44,15 @@ UNITS = {
 """Units of what `describe` gives, by key."""
 
 
-def describe(held: Run | Hits) -> dict[str, Any]:
-    """Say what a run or ions hold.
+_MEASURED = ("x", "y", "time_of_flight", "voltage", "pulse_voltage", "mass_to_charge", "positions", "pulse_id")
+
+
+def describe(held: Run | Hits | DetectorMap) -> dict[str, Any]:
+    """Say what a run, ions or a map hold.
 
     Parameters
     ----------
-    held : Run or Hits
+    held : Run or Hits or DetectorMap
         What `apt_evap.read` gives.
 
     Returns
@@ -55,7 +60,23 @@ def describe(held: Run | Hits) -> dict[str, Any]:
     dict
         Plain types, what `apt-evap info` prints; a pair is the least and the greatest value. Units are in `UNITS`.
     """
+    if isinstance(held, DetectorMap):
+        return _of_map(held)
     return _of_run(held) if isinstance(held, Run) else _of_hits(held)
+
+
+def _of_map(held):
+    x_min, x_max, y_min, y_max = held.extent
+    return {
+        "kind": "detector map of counts" if held.is_counts else "detector map of densities",
+        "ions": held.ions,
+        "bins": list(held.values.shape[::-1]),
+        "bin_size": [_plain(size) for size in held.bin_size],
+        "x": [_plain(x_min), _plain(x_max)],
+        "y": [_plain(y_min), _plain(y_max)],
+        "values": _extent(held.values[held.mask]),
+        "share_inside_mask": _plain(np.mean(held.mask)),
+    }
 
 
 def _of_run(run):
@@ -111,7 +132,13 @@ def _of_hits(hits):
         )
         columns |= {key: _extent(part) for key, part in parts.items()}
     detected = hits.detected
-    told = {"kind": "measured ions", "ions": len(hits), "detected": int(np.count_nonzero(detected)), "columns": columns}
+    measured = hits.outcome is None
+    told = {"kind": "measured ions" if measured else hits.source, "ions": len(hits)}
+    told |= {"detected": int(np.count_nonzero(detected)), "columns": columns}
+    if measured:
+        told["absent_or_zero_throughout"] = [
+            name for name in _MEASURED if name not in hits.columns or not np.any(getattr(hits, name))
+        ]
     if hits.x is not None and hits.y is not None and detected.any():
         x, y = hits.x[detected], hits.y[detected]
         told["detector_extent"] = [_plain(np.ptp(x)), _plain(np.ptp(y))]

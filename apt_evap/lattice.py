@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from apt_evap._arrays import check_array, check_choice, check_number
+from apt_evap._arrays import check_array, check_choice, check_number, shown
 from apt_evap._types import Floats
 
 _HALF = ((0, 0, 0), (0, 1 / 2, 1 / 2), (1 / 2, 0, 1 / 2), (1 / 2, 1 / 2, 0))
@@ -115,7 +115,13 @@ def check_axis(structure: str, axis: Sequence[float], name: str = "axis") -> tup
         If it is not a direction.
     """
     four = structure == "hcp" and np.shape(axis) == (4,)
-    indices = check_array(axis, name, (4 if four else 3,))
+    try:
+        indices = check_array(axis, name, (4 if four else 3,), finite=False)
+    except ValueError as error:
+        more = ", or four such as [2, -1, -1, 0]" if structure == "hcp" else ""
+        raise ValueError(f"{name} must be three numbers such as [0, 1, 2]{more}, got {shown(axis)}") from error
+    if not np.isfinite(indices).all():
+        raise ValueError(f"{name} must be finite, got {shown(axis)}")
     if four:
         u, v, t, w = indices
         # of whole numbers exactly; else to the rounding of a few decimals

@@ -120,6 +120,20 @@ MATERIALS = {
 """Known materials by name. Ni and Au are seen as 1+ and 2+ side by side: the fields of both are close."""
 
 
+_WORDS = {
+    "aluminium": "Al",
+    "aluminum": "Al",
+    "silicon": "Si",
+    "titanium": "Ti",
+    "iron": "Fe",
+    "nickel": "Ni",
+    "copper": "Cu",
+    "tungsten": "W",
+    "platinum": "Pt",
+    "gold": "Au",
+}
+
+
 def material(name: str, **changes: Any) -> Material:
     """Return a known material, with some of its numbers changed if wanted.
 
@@ -145,7 +159,9 @@ def material(name: str, **changes: Any) -> Material:
             raise ValueError(f"a material has no {change!r}{did_you_mean(change, known)}; it has {', '.join(known)}")
     if not isinstance(name, str) or name not in MATERIALS:
         known = f"known are {', '.join(MATERIALS)}, any other is a Material(...) of your own"
-        raise ValueError(f"no material is named {shown(name)}{did_you_mean(name, MATERIALS)}; {known}")
+        meant = _WORDS.get(name.strip().lower()) if isinstance(name, str) else None
+        hint = did_you_mean(meant or name, MATERIALS)
+        raise ValueError(f"no material is named {shown(name)}{hint}; {known}")
     found = MATERIALS[name]
     return replace(found, **changes, sources=found.sources | dict.fromkeys(changes, "given by the user"))
 

@@ -173,7 +173,8 @@ class Run:
         if faster:
             warnings.warn(
                 f"{faster:,} of {len(self):,} ions launch above the {settings.energy_limit:g} eV of the responses: "
-                "their places are extrapolated; set ResponseSettings(energy_limit=...) for the run",
+                "their places are extrapolated; run with a larger energy_limit, of ResponseSettings or in [responses] "
+                "of a settings file",
                 stacklevel=2,
             )
         values = np.empty((len(self), 3))
@@ -327,10 +328,10 @@ def _load_parts(folder, partial):
         parts.append(part)
     if not parts:
         raise FileError(f"{str(folder)!r} holds no run: expected files {PART_NAME.format(0)!r} and so on")
-    return Run.join(parts).ended_by("unfinished")
+    return Run.join(parts).ended_by(UNFINISHED)
 
 
-PART_NAME = "ions-{:012d}.h5"
+PART_NAME, UNFINISHED = "ions-{:012d}.h5", "unfinished"
 
 
 def part_paths(folder: Path) -> list[Path]:

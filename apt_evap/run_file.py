@@ -210,6 +210,12 @@ def read_state(path: AnyPath) -> tuple[Any, int]:
         return _read_state(file)
 
 
+def count_ions(path: AnyPath) -> int:
+    """Ions of the run in a file; FileError as `read_run`."""
+    with _reading(path) as file:
+        return len(file[f"{_ATOM_PROBE}/evaporation_id"])
+
+
 def is_run(path: AnyPath) -> bool:
     """Whether a file is a run, in this format or another one."""
     with suppress(OSError, RuntimeError), h5py.File(path, "r") as file:

@@ -5,11 +5,8 @@ the surface that replay the events one by one, so each ion flies in exactly the 
 whatever the number of threads and the size of a batch.
 """
 
-import signal
-import threading
 import warnings
-from collections.abc import Iterable
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 
 import numpy as np
 from tqdm.auto import tqdm
@@ -18,9 +15,9 @@ from apt_evap._arrays import check_count, check_kind, check_seed, check_sequence
 from apt_evap._core.robin import ChargingRule
 from apt_evap._files import FileError
 from apt_evap._memory import check_copies
-from apt_evap._threads import thread_count
+from apt_evap._threads import interruptible, thread_count
 from apt_evap._types import AnyPath
-from apt_evap.checkpoint import Checkpoint, Keeper, Parts, catch_up
+from apt_evap.checkpoint import NOTHING_LEFT, Checkpoint, Keeper
 from apt_evap.detector import Detector
 from apt_evap.emission import Emissions, Launches, tangent_frame
 from apt_evap.emitter import EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, ChargeSettings, Emitter, check_voltage
@@ -30,6 +27,7 @@ from apt_evap.law import Extremal, Law
 from apt_evap.perturbation import Perturbation, Unperturbed
 from apt_evap.response import Responses, ResponseSettings, flattened
 from apt_evap.run import Flown, Run
+from apt_evap.run_parts import Parts, catch_up
 from apt_evap.tip import Tip
 from apt_evap.units import FLIGHT_TIME
 from apt_evap.watch import Watch, WatchSettings
@@ -124,7 +122,7 @@ class Simulation:
         emissions: Iterable[Perturbation] = (),
         *,
         responses: bool = True,
-        progress: bool | None = None,
+        progress: bool | Callable[[int, int], object] | None = None,
         batch_size: int = BATCH,
         checkpoint: Checkpoint | AnyPath | None = None,
     ) -> Run:
@@ -143,8 +141,9 @@ class Simulation:
         responses : bool
             Whether to fly what the responses need, so that `Run.hits` takes any built-in perturbation afterwards.
             Without, and without `emissions`, the unperturbed ions are flown.
-        progress : bool, optional
-            Whether to show a progress bar; by default if the output is a terminal or a notebook.
+        progress : bool or callable, optional
+            Whether to show a progress bar; by default if the output is a terminal or a notebook. A function is called
+            after every batch instead, with the ions done and the ions asked for.
         batch_size : int
             Events at a time; the results do not depend on it.
         checkpoint : Checkpoint or str or path-like, optional
@@ -166,7 +165,7 @@ class Simulation:
         n_ions = check_count(n_ions, "n_ions", at_least=1)
         batch_size = check_count(batch_size, "batch_size", at_least=1)
         check_switch(responses, "responses")
-        if progress is not None:
+        if progress is not None and not callable(progress):
             check_switch(progress, "progress")
         emissions = check_sequence(emissions, "emissions", "perturbations")
         for perturbation in emissions:
@@ -178,13 +177,11 @@ class Simulation:
             return self._run(n_ions, emissions, responses, progress, batch_size, None)
         if not isinstance(checkpoint, Checkpoint):
             checkpoint = Checkpoint(checkpoint)
-        with Keeper(checkpoint, self.settings, emissions, responses) as keeper:
+        with Keeper(checkpoint, self.settings, emissions, responses, n_ions) as keeper:
             return self._run(n_ions, emissions, responses, progress, batch_size, keeper)
 
     def _run(self, n_ions, emissions, responses, progress, batch_size, keeper):
         parts = Parts(keeper, self.emitter)
-        if len(parts) > n_ions:
-            raise ValueError(f"n_ions must be at least the {len(parts):,} that are done already, got {n_ions:,}")
         if parts.done:
             catch_up(self.emitter, parts.done[0], BATCH)
             self.n_evaporated = int(parts.done[0].emissions.ions[-1]) + 1
@@ -192,25 +189,30 @@ class Simulation:
         watch = parts.watch = Watch(self.watch_settings, interval, self.n_evaporated - len(parts), parts.done)
         ended = ""
         self.emitter.hand_out_tree()  # somebody may have let atoms evaporate without flights
-        disable = None if progress is None else not progress
+        told = progress if callable(progress) else None
+        disable = True if told else None if progress is None else not progress
         with (
             tqdm(
                 total=n_ions, initial=len(parts), unit=" ions", smoothing=0.1, disable=disable, mininterval=0.5
             ) as bar,
             self._crew.at_work(),
-            _interruptible() as interrupted,
+            interruptible() as interrupted,
         ):
 
             def collect(most=0):
+                nonlocal landed
                 while len(waiting) > most:
                     part = waiting.pop(0)()
                     parts.append(part)
                     watch.count(part)
                     bar.set_postfix(watch.shown, refresh=False)
                     bar.update(len(part))
+                    landed += len(part)
+                    if told:
+                        told(landed, n_ions)
 
             waiting = []
-            started = len(parts)
+            started = landed = len(parts)
             try:
                 while started < n_ions and not ended:
                     batch = self.emitter.evaporate(min(batch_size, n_ions - started))
@@ -224,7 +226,7 @@ class Simulation:
                         with self._crew.paused():
                             self.emitter.relax()
                     elif batch.status == EXHAUSTED:
-                        ended = "no atom is left that may evaporate"
+                        ended = NOTHING_LEFT
                     elif batch.status == TOO_SHALLOW:
                         self.emitter.deepen()
                     if interrupted.is_set() and not ended and started < n_ions:
@@ -244,7 +246,7 @@ class Simulation:
                 parts.keep()
                 raise
         run = parts.run(ended)
-        if keeper:
+        if keeper and not keeper.complete:
             try:
                 keeper.finish(run)
             except FileError as error:
@@ -379,22 +381,3 @@ class Simulation:
             },
             "watch": vars(self.watch_settings),
         }
-
-
-@contextmanager
-def _interruptible():
-    """Turn the first Ctrl-C into a flag, so that the batch under way is kept; the second one interrupts."""
-    flag = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield flag
-        return
-
-    def note(number, frame):
-        flag.set()
-        signal.signal(signal.SIGINT, before)
-
-    before = signal.signal(signal.SIGINT, note)
-    try:
-        yield flag
-    finally:
-        signal.signal(signal.SIGINT, before)

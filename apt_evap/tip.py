@@ -104,7 +104,7 @@ class Tip:
     ) -> None:
         host = as_material(material)
         d = host.nearest_neighbour_distance
-        radius = check_number(apex_radius, "apex_radius", at_least=3 * d, unit="nm")
+        radius = check_number(apex_radius, "apex_radius", at_least=3 * d, unit="nm", why="3 neighbour distances")
         length = 2 * radius if shank_length is None else shank_length
         self._shape = shape = TaperedCap(radius, length, shank_angle, base)
         origin = check_array(origin, "origin", (3,))

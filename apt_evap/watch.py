@@ -157,7 +157,7 @@ class Watch:
                 "charges",
                 f"after {ions:,} ions the charges are {rms:.2g} of the mean charge away from settled ones (RMS of "
                 f"{len(residuals)}), expected at most {self._settings.charge_bound:g}: take a smaller sweep_interval "
-                "or tolerance, or a larger patch_radius",
+                "or tolerance, or a larger patch_radius, of ChargeSettings, [charges] in a file",
             )
         self._close()
 
@@ -184,8 +184,12 @@ class Watch:
     def _judge(self, missed, never_left, marked):
         self._shown |= {"missed": f"{missed:.1%}", "never left": f"{never_left:.1%}", "marked": f"{marked:.1%}"}
         for share, what, advice in (
-            (never_left, "never left the specimen", "more most_steps of the flights may help"),
-            (marked, "are marked, as their responses are inexact", "a smaller energy_limit of the responses helps"),
+            (never_left, "never left the specimen", "more most_steps of FlightSettings, [flights] in a file, may help"),
+            (
+                marked,
+                "are marked, as their responses are inexact",
+                "a smaller energy_limit of ResponseSettings, [responses] in a file, helps",
+            ),
         ):
             if share > self._settings.share_bound:
                 self._warn(

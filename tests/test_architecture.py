@@ -27,7 +27,7 @@ FLOORS = (
         "flights",
         "response",
     },
-    {"watch", "run_file", "run", "checkpoint", "simulation"},
+    {"watch", "run_file", "run", "checkpoint", "run_parts", "simulation"},
     {"binning", "maps", "cap", "profiles", "zone_line", "tracks", "alignment", "register", "compare"}
     | {"energy_grid", "resample", "study", "fit", "config", "info", "io"},
     {"plot", "cli"},

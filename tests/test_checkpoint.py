@@ -263,7 +263,7 @@ def test_a_file_of_somebody_else_is_not_overwritten(tmp_path):
 
 def test_one_process_at_a_time(tmp_path):
     checkpoint = ae.Checkpoint(tmp_path / "run.h5")
-    with Keeper(checkpoint, {}, (), True):
+    with Keeper(checkpoint, {}, (), True, 90):
         with pytest.raises(ae.FileError, match=rf"run\.h5' is being written by process {os.getpid()} on "):
             run_small(tmp_path / "run.h5")
     assert len(run_small(tmp_path / "run.h5")) == 90
@@ -300,6 +300,76 @@ def test_other_settings_are_refused(unfinished):
     with pytest.raises(ValueError, match="resumed by a new Simulation, got one that 5 atoms left"):
         used.run(90, [Interrupting()], **options)
     assert len(interrupted(unfinished, (), resume=True)) == 90
+
+
+@pytest.mark.parametrize(
+    ("there", "message"),
+    [
+        ({"n_ions": 90}, "holds a run of 90 ions, more than the 60 asked for: overwrite=True replaces it"),
+        ({"n_ions": 60, "voltage": 900.0}, r"other settings \(voltage is 900\.0 there and 1000\.0 here\): overwrite"),
+        (
+            {"n_ions": 60, "ended": "interrupted"},
+            r"of 60 ions that is not complete \(interrupted\): resume=True goes on",
+        ),
+    ],
+)
+def test_a_run_that_would_not_come_out_again_is_not_replaced(tmp_path, there, message):
+    ended = there.pop("ended", "")
+    run_small(tmp_path / "run.h5", **there).ended_by(ended).save(tmp_path / "run.h5")
+    before = (tmp_path / "run.h5").read_bytes()
+    with pytest.raises(ae.FileError, match=message):
+        run_small(tmp_path / "run.h5", 60)
+    assert (tmp_path / "run.h5").read_bytes() == before
+    assert [item.name for item in tmp_path.iterdir()] == ["run.h5"]
+    small().run(60, responses=False, progress=False, checkpoint=ae.Checkpoint(tmp_path / "run.h5", overwrite=True))
+    assert len(run_small(tmp_path / "run.h5", 60)) == 60  # the same again, and a longer one, may take its place
+    assert len(run_small(tmp_path / "run.h5", 90)) == 90
+
+
+def test_a_refused_resume_leaves_nothing_behind(tmp_path):
+    run_small(tmp_path / "run.h5", 90)
+    with pytest.raises(ae.FileError, match="n_ions must be at least the 90 that are done already, got 60"):
+        run_small(tmp_path / "run.h5", 60, resume=True)
+    used = small()
+    used.run(5, responses=False, progress=False)
+    with pytest.raises(ValueError, match="resumed by a new Simulation"):
+        used.run(120, responses=False, progress=False, checkpoint=ae.Checkpoint(tmp_path / "run.h5", resume=True))
+    assert [item.name for item in tmp_path.iterdir()] == ["run.h5"]
+
+
+def test_a_complete_run_is_not_written_again_by_resume(tmp_path):
+    run_small(tmp_path / "run.h5", 90)
+    before = os.stat(tmp_path / "run.h5")
+    simulation = small()
+    checkpoint = ae.Checkpoint(tmp_path / "run.h5", resume=True)
+    assert checkpoint.ions_there() == 90
+    assert len(simulation.run(90, responses=False, progress=False, checkpoint=checkpoint)) == 90
+    after = os.stat(tmp_path / "run.h5")
+    assert (after.st_ino, after.st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
+    more = simulation.run(20, responses=False, progress=False)  # it goes on from there
+    assert more.emissions.ions[0] == 90
+
+
+@pytest.mark.parametrize(("at", "kept"), [((5, 6), 0), ((40, 50), 30)])
+def test_ctrl_c_waits_for_files(tmp_path, monkeypatch, at, kept):
+    """Pressed once more at every rename: nothing is left half way, and no folder without ions."""
+
+    def pressing(*names):
+        signal.raise_signal(signal.SIGINT)
+        replace(*names)
+
+    replace = os.replace
+    monkeypatch.setattr(os, "replace", pressing)
+    with pytest.raises(KeyboardInterrupt):
+        interrupted(tmp_path / "run.h5", at)
+    assert ae.Checkpoint(tmp_path / "run.h5").ions_there() == kept
+    assert [item.name for item in tmp_path.iterdir()] == (["run.h5.unfinished"] if kept else [])
+
+
+def test_the_progress_may_be_told_to_a_function():
+    told = []
+    small().run(50, responses=False, progress=lambda done, n_ions: told.append((done, n_ions)), batch_size=20)
+    assert told == [(20, 50), (40, 50), (50, 50)]
 
 
 @pytest.mark.parametrize(

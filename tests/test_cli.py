@@ -131,13 +131,25 @@ def datasets(path):
 def test_a_run_is_made_longer_by_resume(folder, made, capsys):
     assert main(["run", "small.toml", "--ions", "25", "--quiet"]) == 0
     assert main(["run", "small.toml", "--resume", "--checkpoint", "0"]) == 0
-    assert "60 ions in" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "resumed at 25 of 60 ions\n" in out and "60 ions, 35 of them new, in" in out
+    assert "wrote small.h5" in out
+    before = (folder / "small.h5").stat()
+    assert main(["run", "small.toml", "--resume"]) == 0
+    assert capsys.readouterr().out.endswith("small.h5 is complete: nothing to do\n")
+    assert main(["run", "small.toml", "--resume", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["wrote"] is None and told["ions"] == 60
+    assert (folder / "small.h5").stat().st_mtime_ns == before.st_mtime_ns
     one, two = datasets(made), datasets("small.h5")
     assert one.keys() == two.keys() and "entry1/atom_probe/hit_finding/hit_positions" in one
     assert [name for name in one if one[name].tobytes() != two[name].tobytes()] == []
     assert load("small.h5").provenance["config"] == "small.toml"
     assert sorted(os.listdir()) == ["small.h5", "small.png", "small.toml"]
     assert "seed is 1 there and 2 here" in failed(capsys, "run", "small.toml", "--resume", "--seed", "2", "--quiet")
+    assert "--ions must be at least the 60 that are done already, got 50" in failed(
+        capsys, "run", "small.toml", "--resume", "--ions", "50", "--quiet"
+    )
 
 
 def test_an_unfinished_run_is_resumed_or_begun_anew_as_asked(folder, made, capsys):
@@ -146,7 +158,12 @@ def test_an_unfinished_run_is_resumed_or_begun_anew_as_asked(folder, made, capsy
     os.rename("small.h5", "small.h5.unfinished/ions-000000000000.h5")
     message = failed(capsys, "run", "small.toml", "--quiet")
     assert "unfinished run of 25 ions" in message and "--resume goes on with it, --force begins anew" in message
-    assert main(["info", "small.h5.unfinished"]) == 2  # no file: it has to be finished first
+    assert main(["info", "small.h5.unfinished"]) == 0
+    told = capsys.readouterr().out
+    assert "unfinished run of 25 ions" in told and "the command that began it, with --resume, goes on" in told
+    assert "No such file or directory; an unfinished run is in 'small.h5.unfinished'" in failed(
+        capsys, "info", "small.h5"
+    )
     assert main(["run", "small.toml", "--quiet", "--resume", "--ions", "30"]) == 0
     assert len(load("small.h5")) == 30
     os.mkdir("small.h5.unfinished")
@@ -159,10 +176,23 @@ def test_an_unfinished_run_is_resumed_or_begun_anew_as_asked(folder, made, capsy
 def test_a_second_run_overwrites_the_first_but_nobody_elses_files(folder, capsys):
     quick = ["run", "small.toml", "--ions", "5", "--quiet"]
     assert main(quick) == 0
+    assert main(quick[:-1]) == 0
+    assert "replaced small.h5\nwrote small.png\n" in capsys.readouterr().out
     created = (folder / "small.h5").stat().st_mtime_ns, (folder / "small.png").stat().st_mtime_ns
     assert main(quick) == 0
     assert created[0] < (folder / "small.h5").stat().st_mtime_ns
     assert created[1] < (folder / "small.png").stat().st_mtime_ns
+
+    with_seed = "small.h5' holds a run with other settings (seed is 1 there and 2 here): --force replaces it"
+    assert with_seed in failed(capsys, *quick, "--seed", "2")
+    assert "small.h5' holds a run of 5 ions, more than the 4 asked for: --force" in failed(
+        capsys, *quick, "--ions", "4"
+    )
+    load("small.h5").ended_by("interrupted").save("small.h5")
+    assert "a run of 5 ions that is not complete (interrupted): --resume goes on with it, --force begins anew" in (
+        failed(capsys, *quick)
+    )
+    assert main([*quick, "--force"]) == 0
 
     (folder / "small.png").write_bytes(b"a photograph")
     assert "'small.png' exists and was not made by apt-evap: --force overwrites it" in failed(capsys, *quick)
@@ -210,7 +240,7 @@ class Noting:
         return getattr(self.config, name)
 
 
-def test_wrong_configs_are_one_sentence(folder, capsys):
+def test_wrong_configs_are_one_sentence(folder, made, capsys):
     def wrong(old, new):
         (folder / "wrong.toml").write_text(SMALL.replace(old, new))
         return failed(capsys, "run", "wrong.toml")
@@ -218,9 +248,10 @@ def test_wrong_configs_are_one_sentence(folder, capsys):
     assert "'wrong.toml', [tip]: no key is named 'apex' (did you mean 'apex_radius'?)" in wrong("apex_radius", "apex")
     assert "'wrong.toml', [tip]: apex_radius must be a finite number [nm] at least" in wrong("6 a", "1 a")
     assert "'wrong.toml', [simulation]: ions must be a whole number of at least 1, got 'many'" in wrong("60", '"many"')
-    assert "GB are free; give depth=" in wrong("6 a", "90000 a")
+    assert "GB are free; give a depth" in wrong("6 a", "90000 a")
     assert "'wrong.toml' is not a TOML file" in wrong("=", ":")
     assert "cannot read 'none.toml'" in failed(capsys, "run", "none.toml")
+    assert f"'{made}' is a run: see apt-evap info" in failed(capsys, "run", made)
 
 
 def test_a_run_that_ends_early_says_why(folder, capsys):
@@ -262,7 +293,34 @@ def test_memory_and_interrupts_are_no_tracebacks_but_bugs_are(folder, capsys, mo
     assert os.listdir() == ["small.toml"]
 
 
-def test_ctrl_c_keeps_what_is_done(folder):
+def test_an_interrupt_of_the_imports_is_no_traceback(tmp_path):
+    (tmp_path / "apt_evap").mkdir()
+    (tmp_path / "apt_evap" / "__init__.py").write_text("raise KeyboardInterrupt")
+    command = f"import sys; sys.path[:0] = {[str(tmp_path), HERE]}; from _apt_evap_shell import main; sys.exit(main())"
+    done = subprocess.run([sys.executable, "-P", "-c", command], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (130, "apt-evap: interrupted\n")
+
+
+def test_progress_without_a_terminal_is_plain_lines(folder, capsys, monkeypatch):
+    monkeypatch.setattr(cli.run, "SECONDS_BETWEEN_LINES", 0.0)
+    assert main(["run", "small.toml", "--ions", "600", "--threads", "1"]) == 0
+    line = r"300 of 600 ions \(50%\), [\d.,]+ ions/s, \d+ s left\n"
+    assert re.search(line, capsys.readouterr().err)
+    assert main(["run", "small.toml", "--ions", "600", "--threads", "1", "--quiet"]) == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_a_run_that_misses_the_detector_says_so(folder, capsys):
+    (folder / "small.toml").write_text(SMALL + "[detector]\nwidth = 40\n")
+    assert main(["run", "small.toml"]) == 0
+    note = (
+        r"note: (\d+) of 60 ions miss the detector, which is 40 mm wide at 100 mm: a larger width or a smaller distance"
+    )
+    assert int(re.search(note, capsys.readouterr().err)[1]) > 30
+
+
+@pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_ctrl_c_and_sigterm_keep_what_is_done(folder, sent, code):
     terminal, end = os.openpty()
     termios.tcsetwinsize(end, (24, 100))
     (folder / "small.toml").write_text(SMALL.replace("6 a", "10 a"))
@@ -281,7 +339,7 @@ def test_ctrl_c_keeps_what_is_done(folder):
         while not re.search(rb"[1-9]\d*/5000", seen):
             assert process.poll() is None
             seen += os.read(terminal, 1000)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(sent)
         deadline = time.monotonic() + 60
         while process.poll() is None and time.monotonic() < deadline:
             try:
@@ -292,10 +350,11 @@ def test_ctrl_c_keeps_what_is_done(folder):
     finally:
         process.kill()
         os.close(terminal)
-    assert process.returncode == 130
+    assert process.returncode == code
     run = load(folder / "small.h5")
     assert run.ended == "interrupted" and 0 < len(run) < 5000
-    assert f"the run ended before its time: interrupted; the {len(run):,} ions so far are kept".encode() in seen
+    said = f"interrupted; {len(run):,} of 5,000 ions are in 'small.h5'; the same command with --resume goes on"
+    assert said.encode() in seen
     assert b"Traceback" not in seen and out.endswith("wrote small.h5\nwrote small.png\n")
     assert sorted(os.listdir(folder)) == ["small.h5", "small.png", "small.toml"]
 
@@ -389,6 +448,9 @@ def test_map_errors(measured, made, capsys):
         capsys, "map", "ions.epos", "--perturbation", "Unperturbed"
     )
     assert "did you mean 'RollUp'" in failed(capsys, "map", made, "--perturbation", "Rollup:0.1")
+    assert "RollUp needs energy, got no parameters; an example is RollUp:0.155,0.155" in failed(
+        capsys, "map", made, "--perturbation", "RollUp"
+    )
     assert "argument --bins: must be a whole number from 1 to 16384, got '0'" in failed(
         capsys, "map", made, "--bins", "0"
     )
@@ -420,6 +482,7 @@ def test_info_of_a_run(made, capsys):
     assert main(["info", str(made)]) == 0
     text = capsys.readouterr().out
     assert re.search(r"^ions +60$", text, re.M) and re.search(r"^  apex radius \[nm\] +2\.112$", text, re.M)
+    assert re.search(r"^field before leaving \[V/nm\] +[\d.]+ to [\d.]+ at 1000 V \(only its ratio", text, re.M)
 
 
 def test_info_of_measured_ions(measured, capsys):
@@ -430,7 +493,10 @@ def test_info_of_measured_ions(measured, capsys):
     assert told["detector_extent"] == [40, 40] and told["detector_quantum"] == [0.5, 0.5]
     assert told["multi_hit_share"] == 0.1 and told["largest_multi_hit"] == 2
     assert main(["info", "ions.epos"]) == 0
-    assert re.search(r"^  voltage \[V\] +3000   5000$", capsys.readouterr().out, re.M)
+    text = capsys.readouterr().out
+    assert re.search(r"^  voltage \[V\] +3000 to 5000$", text, re.M)
+    assert re.search(r"^detector extent \[mm\] +40 x 40$", text, re.M)
+    assert re.search(r"^absent or zero throughout +time_of_flight   pulse_voltage   positions$", text, re.M)
 
 
 def test_info_of_what_cannot_be_read(measured, made, capsys):
@@ -457,6 +523,99 @@ def test_warnings_of_readers_are_one_line(measured, capsys):
     assert re.fullmatch(r"apt-evap: warning: 'ions.epos' does not tell which ions share a pulse[^\n]+\n", err)
 
 
+# ---- maps in .npz files ----------------------------------------------------------------------------------------------
+
+
+def test_map_and_info_of_a_map(folder, monkeypatch, capsys):
+    edges = np.linspace(-20, 20, 41)
+    values = np.random.default_rng(1).poisson(5.0, (40, 40))
+    np.savez("counts.npz", counts=values, x_edges_mm=edges, y_edges_mm=edges)
+    np.savez("density.npz", d=values / 5, x=edges / 10, y=edges / 10)
+    (only,), titles = drawn_by(monkeypatch, "map", "counts.npz")
+    assert titles == ["counts.npz"] and only.smoothing == 1.0 and only.ions == values.sum()
+    named = ["density.npz", "--arrays", "d,x,y", "--unit", "cm"]
+    ((only,), _) = drawn_by(monkeypatch, "map", *named)
+    assert np.array_equal(only.values, values / 5) and only.smoothing == 0
+    capsys.readouterr()
+    assert main(["info", *named, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["kind"] == "detector map of densities" and told["ions"] is None and told["bins"] == [40, 40]
+    assert told["x"] == [-20, 20] and told["values"] == [values.min() / 5, values.max() / 5]
+    assert main(["info", "counts.npz"]) == 0
+    assert re.search(r"^bin size \[mm\] +1 x 1$", capsys.readouterr().out, re.M)
+    assert "--bins is for ions, 'counts.npz' is a map: its bins are 40 x 40" in failed(
+        capsys, "map", "counts.npz", "--bins", "20"
+    )
+    assert "--mass is for ions, got 'counts.npz'" in failed(capsys, "info", "counts.npz", "--mass", "1,2")
+    assert "'counts.npz' holds a map" in failed(capsys, "map", "counts.npz", "--perturbation", "Unperturbed")
+
+
+# ---- a selection of ions ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def mixed(folder):
+    """1,000 ions of 28 and 58 Da in turn, the voltage rising with their number."""
+    random = np.random.default_rng(2)
+    n = np.arange(1000)
+    x, y = random.uniform(-20, 20, (2, 1000))
+    write("mixed.epos", Hits(x=x, y=y, voltage=3000.0 + n, mass_to_charge=np.where(n % 2, 58.0, 28.0), pulse_id=n))
+    (folder / "mixed.rrng").write_text("[Ranges]\nRange1=27.5 28.5 Si:1\nRange2=57.5 58.5 Ni:1\n")
+    return x.astype(np.float32), y.astype(np.float32)
+
+
+def test_ions_are_selected(mixed, monkeypatch, capsys):
+    x, y = mixed
+
+    def ions(*options):
+        capsys.readouterr()
+        assert main(["info", "mixed.epos", "--json", *options]) == 0
+        told = json.loads(capsys.readouterr().out)
+        assert told.get("selected_of") == 1000
+        return told["ions"]
+
+    assert ions("--mass", "27,29") == ions("--mass", ",28.5") == 500
+    assert ions("--voltage", "3100,3200") == ions("--ions", "900,") == 100
+    assert ions("--circle", "10") == np.count_nonzero(np.hypot(x, y) <= 10)
+    assert ions("--circle", "10,5,-5") == np.count_nonzero(np.hypot(x - 5, y + 5) <= 10)
+    assert ions("--ranges", "mixed.rrng", "--species", "Si,Ni") == 1000
+    both = ["--ranges", "mixed.rrng", "--species", "Si", "--ions", "0,100", "--voltage", "3050,"]
+    assert ions(*both) == 25  # the ions of the file are counted, not those of the species
+    (only,), titles = drawn_by(monkeypatch, "map", "mixed.epos", *both)
+    assert only.ions <= 25 and titles == ["mixed.epos, 25 of 1,000 ions"]
+
+
+def test_ions_of_a_run_are_selected(folder, made, monkeypatch, capsys):
+    run = load(made)
+    maps, _ = drawn_by(monkeypatch, "map", made, "--ions", "20,", "--perturbation", "Unperturbed")
+    assert maps[0].ions == run.hits(Unperturbed())[20:].counts[0]
+    capsys.readouterr()
+    assert main(["info", str(made), "--ions", "20,", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["kind"], told["ions"]) == ("simulation, Unperturbed()", 40)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--mass", "29,27"], "argument --mass: must be two numbers in order, such as 27,29.5, got '29,27'"),
+        (["--circle", "1,2"], "argument --circle: must be a radius, or R,X,Y, such as 15,0,-2 [mm], got '1,2'"),
+        (["--species", "Si"], "--ranges and --species go together"),
+        (["--ranges", "mixed.rrng", "--species", "Sn"], "--species: mixed.rrng have no species 'Sn'"),
+        (["--mass", "1,2"], "no ion is selected of the 1,000 of 'mixed.epos'"),
+    ],
+)
+def test_selections_that_are_refused(mixed, capsys, options, sentence):
+    assert sentence in failed(capsys, "info", "mixed.epos", *options)
+
+
+def test_a_selection_by_a_missing_column_is_refused(folder, capsys):
+    write("ions.pos", Hits(positions=np.zeros((3, 3)), mass_to_charge=np.ones(3)))
+    assert "--voltage: ions.pos has no column 'voltage', only mass_to_charge, positions" in failed(
+        capsys, "info", "ions.pos", "--voltage", "1,2"
+    )
+
+
 # ---- the program -----------------------------------------------------------------------------------------------------
 
 
@@ -465,10 +624,11 @@ def test_warnings_of_readers_are_one_line(measured, capsys):
     [
         ([], "the following arguments are required: COMMAND (see apt-evap --help)"),
         (["fly"], "invalid choice: 'fly'"),
+        (["mpa"], "invalid choice: 'mpa' (did you mean 'map'?)"),
         (["run"], "the following arguments are required: CONFIG.toml (see apt-evap run --help)"),
         (["run", "small.toml", "--ions", "0"], "argument --ions: must be a whole number of at least 1, got '0'"),
         (["run", "small.toml", "--threads", "x"], "argument --threads: must be a whole number of at least 1, got 'x'"),
-        (["run", "small.toml", "--colour"], "unrecognized arguments: --colour"),
+        (["run", "small.toml", "--colour"], "unrecognized arguments: --colour (see apt-evap run --help)"),
         (["info", "a.epos", "--byte-order", "up"], "argument --byte-order: invalid choice: 'up'"),
     ],
 )

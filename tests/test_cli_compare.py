@@ -142,6 +142,7 @@ def test_arrays_by_name(folder, capsys):
         (["run.h5", "map.npz", "--means", "a"], "--means: must be numbers with commas between, got 'a'"),
         (["run.h5", "map.npz", "--means", "0.2,0.1"], "means must be increasing numbers above 0"),
         (["run.h5", "map.npz", "--mechanism", "both"], "invalid choice: 'both'"),
+        (["run.h5", "map.npz", "--mechanism", "rollup"], "invalid choice: 'rollup' (did you mean 'roll-up'?)"),
         (["run.h5", "map.npz", "--rollup-fractions", "0.5"], "rollup_fractions are for the mechanism 'combined'"),
         (["run.h5", "map.npz", "--registration", "1,2"], "--registration must be a .json file or ROTATION,SCALE"),
         (["run.h5", "map.npz", "--registration", "0,-1,0,0"], "scale must be a finite number above 0"),
@@ -156,6 +157,22 @@ def test_arrays_by_name(folder, capsys):
 )
 def test_what_is_refused(folder, capsys, arguments, sentence):
     assert sentence in failed(capsys, *arguments, *([] if "--registration" in arguments else HERE))
+
+
+def test_measured_ions_are_selected(folder, capsys):
+    arguments = ["run.h5", "ions.epos", *QUICK, *HERE, "--quiet"]
+    assert main(["compare", *arguments, "-o", "all"]) == 0
+    assert main(["compare", *arguments, "-o", "part", "--circle", "40"]) == 0
+    held = [json.loads(Path(name, "study.json").read_text())["settings"]["measured"] for name in ("all", "part")]
+    assert held[0] != held[1]
+    assert "--voltage: ions.epos has no column 'voltage'" in failed(capsys, *arguments, "--voltage", "1,2")
+    assert "--ions is for ions, got 'map.npz'" in failed(capsys, "run.h5", "map.npz", *HERE, "--ions", "0,5")
+
+
+def test_a_run_without_responses_is_refused(folder, tip12, capsys):
+    ae.Simulation(tip12).run(50, responses=False, progress=False).save("nr.h5")
+    sentence = "'nr.h5' has no responses: run again with responses = true in [simulation]"
+    assert sentence in failed(capsys, "nr.h5", "map.npz", *HERE)
 
 
 def test_help(capsys):

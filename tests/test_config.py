@@ -1,5 +1,6 @@
 import copy
 import math
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -320,3 +321,17 @@ def test_titles_tell_perturbations_apart():
 def test_maps_round_trip():
     maps = read_maps({"bins": 64, "panels": [{"perturbation": text} for text in PERTURBATIONS]})
     assert read_maps(maps.to_dict()) == maps
+
+
+def test_the_tables_commented_out_in_the_example_are_the_defaults(tmp_path):
+    lines = EXAMPLE.read_text().splitlines()
+    begin = lines.index("# [charges]              # how finely the charges are solved")
+    end = next(number for number, line in enumerate(lines) if line.startswith("[maps]"))
+    shown = [line.removeprefix("#").strip() for line in lines[begin:end]]
+    (tmp_path / "all.toml").write_text("\n".join([*lines[:begin], *shown, *lines[end:]]))
+    shown, usual = read_config(tmp_path / "all.toml"), read_config(EXAMPLE)
+    for name in ("charge_settings", "flight_settings", "response_settings"):
+        assert getattr(shown, name) == getattr(usual, name)
+    for kind in (ChargeSettings, FlightSettings):
+        for item in fields(kind):
+            assert f"# {item.name} = " in "\n".join(lines[begin:end])

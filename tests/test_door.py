@@ -565,7 +565,7 @@ def test_the_memory_foreseen_is_the_memory_taken(shape, monkeypatch):
 def test_what_does_not_fit_is_refused_before_it_is_built(monkeypatch):
     monkeypatch.setattr(_memory, "_available_memory", lambda: 8e9)
     with pytest.raises(
-        ValueError, match=r"^a tip of .*e\+08 atoms needs about \d\d GB, 8 GB are free; give depth=.* sho"
+        ValueError, match=r"^a tip of .*e\+08 atoms needs about \d\d GB, 8 GB are free; give a depth.* sho"
     ):
         ae.Tip("Ni", 10.0, shank_length=1000.0)
     with pytest.raises(ValueError, match=r"needs about .* GB, 8 GB are free"):

@@ -20,7 +20,7 @@ from apt_evap.ranges import Ranges
 from apt_evap.run_file import FORMAT
 
 SILICON = Path(__file__).parents[2] / "shared" / "data" / "Si.epos"
-READ = tuple(entry.suffix for entry in FORMATS if entry.read)
+READ = tuple(entry.suffix for entry in FORMATS if entry.read and entry.suffix != ".npz")  # maps: test_npz.py
 RANGES = b"[Ions]\nNumber=2\nIon1=Si\nIon2=O\n[Ranges]\nNumber=2\nRange1=13,5 14.2 Vol:0.02 Si:1 Color:CCCCCC\n"
 RANGES += b"Range2 = 15.8 16.5 Name:oxide Si:1 O:2\n"
 

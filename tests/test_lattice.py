@@ -167,7 +167,7 @@ def test_four_indices_are_the_same_directions_as_three():
         ("fcc", (0, 0, 0), "axis must be a direction"),
         ("hcp", (0, 0, 0, 0), "axis must be a direction"),
         ("hcp", (1, 1, 1, 0), r"u \+ v \+ t = 0"),
-        ("fcc", (1, 1, -2, 0), r"axis must have shape \(3,\)"),
+        ("fcc", (1, 1, -2, 0), r"axis must be three numbers such as \[0, 1, 2\], got \(1, 1, -2, 0\)"),
         ("hcp", (0.5, 0.1, 0.3, 1.0), r"u \+ v \+ t = 0"),
         ("fcc", (0.5, math.nan, 0), "axis must be finite"),
         ("fcc", (1e9, 1, 0), "axis must have its largest number between"),

@@ -2,14 +2,19 @@
 
 import argparse
 import os
+import re
+import signal
 import sys
+import threading
 import warnings
-from collections.abc import Sequence
-from typing import NoReturn
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, NoReturn
 
+from apt_evap._arrays import did_you_mean
 from apt_evap._version import __version__
 from apt_evap.cli import compare, info, map, run
-from apt_evap.cli._options import INTERRUPTED, SHAPE, say
+from apt_evap.cli._options import INTERRUPTED, SHAPE, TERMINATED, say
 
 COMMANDS = (run, map, info, compare)
 
@@ -19,6 +24,7 @@ exit codes:
   1    whoever read the output has left (a closed pipe)
   2    an error, explained in one sentence on stderr; nothing half-written is left behind
   130  interrupted by Ctrl-C; `run` has saved the ions done so far
+  143  the same by SIGTERM, as batch systems send it
 """
 """What the exit codes mean, for the help."""
 
@@ -48,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     int
         Exit code, as `EXIT_CODES` says.
     """
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), _terminated_like_interrupted() as terminated:
         warnings.showwarning = lambda message, *_, **__: say("warning", message)
         try:
             try:
@@ -57,10 +63,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 return stop.code or 0  # type: ignore[return-value]
             code = options.command(options)
             sys.stdout.flush()
-            return code
+            return TERMINATED if terminated and code == INTERRUPTED else code
         except KeyboardInterrupt:
             print("apt-evap: interrupted", file=sys.stderr)
-            return INTERRUPTED
+            return TERMINATED if terminated else INTERRUPTED
         except BrokenPipeError:
             # whoever read the output has left; what is still buffered must not complain at exit
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -72,9 +78,39 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
 
 
+@contextmanager
+def _terminated_like_interrupted() -> Iterator[list[int]]:
+    """Let SIGTERM do what Ctrl-C does; yields a list that holds the signal once it has come."""
+    came: list[int] = []
+    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
+        yield came
+        return
+
+    def note(number: int, frame: Any) -> None:
+        came.append(number)
+        like = signal.getsignal(signal.SIGINT)
+        (like if callable(like) else signal.default_int_handler)(signal.SIGINT, frame)
+
+    signal.signal(signal.SIGTERM, note)
+    try:
+        yield came
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
+        if found := re.search(r"invalid choice: '(.+?)' \(choose from (.+)\)", message):
+            hint = did_you_mean(found[1], re.findall(r"[\w-]+", found[2]))
+            message = message.replace(" (choose", f"{hint} (choose")
         raise ValueError(f"{message} (see {self.prog} --help)")
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        # a command's own parser would leave it to the one above to say so, with the wrong help
+        options, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return options, unknown
 
 
 def _parser():

@@ -5,6 +5,7 @@ import os
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from apt_evap import plot
 from apt_evap._files import FileError, check_path, replace_file
@@ -12,23 +13,69 @@ from apt_evap._types import AnyPath
 from apt_evap._version import __version__
 from apt_evap.hits import Hits
 from apt_evap.io import read as read_file
+from apt_evap.io import read_ranges
 from apt_evap.maps import DetectorMap
-from apt_evap.run import Run
+from apt_evap.run import Run, load
 
 _MARK = f"apt_evap {__version__}"
 _MARK_KEYS = {".png": "Software", ".pdf": "Creator", ".svg": "Creator"}
 
 
-def read(options: argparse.Namespace) -> Hits | Run:
-    wanted = {"partial": options.partial, "byte_order": options.byte_order}
+def read(options: argparse.Namespace) -> Hits | Run | DetectorMap:
+    """What is in the FILE of a command."""
+    wanted = {"partial": options.partial, "byte_order": options.byte_order, "unit": options.unit}
+    if options.arrays is not None:
+        names = options.arrays.split(",")
+        if len(names) not in (3, 4):
+            raise ValueError(f"--arrays must name values, edges in x and y, and perhaps a mask, got {options.arrays!r}")
+        wanted |= dict(zip(("values", "x_edges", "y_edges", "mask"), names, strict=False))
+    path = Path(options.file)
+    is_map = (options.format or path.suffix).lower().lstrip(".") == "npz"
+    for name in _SELECTING if is_map else ("arrays", "unit"):
+        if getattr(options, name) is not None:
+            what = "ions" if is_map else "a map in an .npz file"
+            raise ValueError(f"--{name} is for {what}, got {options.file!r}")
+    if path.is_dir():
+        return load(path, partial=bool(options.partial))  # an unfinished run
     try:
-        return read_file(
-            options.file, format=options.format, **{key: value for key, value in wanted.items() if value is not None}
-        )
+        given = {key: value for key, value in wanted.items() if value is not None}
+        return read_file(options.file, format=options.format, **given)
     except FileError as error:
-        # the readers speak of arguments of Python
-        message = str(error).replace("partial=True", "--partial").replace("byte_order=", "--byte-order ")
-        raise FileError(message.replace("format=", "--format ")) from error
+        unfinished = Path(f"{path}.unfinished")
+        if unfinished.is_dir() and not path.exists():
+            raise FileError(f"{error}; an unfinished run is in {str(unfinished)!r}") from error
+        raise
+
+
+_SELECTING = ("ions", "mass", "voltage", "circle", "ranges", "species")
+
+
+def selects(options: argparse.Namespace) -> bool:
+    """Whether the options select ions."""
+    return any(getattr(options, name) is not None for name in _SELECTING)
+
+
+def select(hits: Hits, options: argparse.Namespace) -> Hits:
+    """The ions that the options select; ValueError if a column is missing, or none is left."""
+    if (options.ranges is None) != (options.species is None):
+        raise ValueError("--ranges and --species go together: a file of ranges, and which of its species")
+    steps: dict[str, Callable[[Hits, Any], Hits]] = {
+        "ions": lambda hits, bounds: hits.window(ion=bounds),  # first: it counts the ions of the file
+        "mass": lambda hits, bounds: hits.window(mass_to_charge=bounds),
+        "voltage": lambda hits, bounds: hits.window(voltage=bounds),
+        "circle": lambda hits, circle: hits.within_circle(*circle),
+        "species": lambda hits, names: read_ranges(options.ranges).select(hits, *names.split(",")),
+    }
+    chosen = hits
+    for name, step in steps.items():
+        if (value := getattr(options, name)) is not None:
+            try:
+                chosen = step(chosen, value)
+            except ValueError as error:
+                raise ValueError(f"--{name}: {error}") from error
+    if selects(options) and len(chosen) == 0:
+        raise ValueError(f"no ion is selected of the {len(hits):,} of {options.file!r}")
+    return chosen
 
 
 def picture_path(path: AnyPath) -> Path:

@@ -12,12 +12,12 @@ import numpy as np
 
 from apt_evap import plot
 from apt_evap._files import FileError, check_path, open_for_reading
-from apt_evap.cli._files import check_output, read
+from apt_evap.cli._files import check_output, read, select
 from apt_evap.cli._options import SHAPE, add_reading_options, smoothing, whole
 from apt_evap.config import MOST_BINS, read_perturbation
 from apt_evap.energy_grid import MEANS, MECHANISMS, ROLLUP_FRACTIONS, RSDS
 from apt_evap.fit import fit_energies
-from apt_evap.io.npz import read_map
+from apt_evap.maps import DetectorMap
 from apt_evap.register import Registration
 from apt_evap.run import Run, load
 from apt_evap.run_file import is_run
@@ -69,10 +69,6 @@ def add_parser(commands: Any) -> None:
     command.add_argument("--quiet", action="store_true", help="no progress bar, no summary")
     command.add_argument("--force", action="store_true", help="overwrite files that apt-evap did not make")
     reading = add_reading_options(command)
-    reading.add_argument(
-        "--arrays", metavar="V,X,Y[,MASK]", help="names in an .npz of values, edges in x and y, and mask"
-    )
-    reading.add_argument("--unit", metavar="UNIT", help="of the edges in an .npz: mm, cm, m or um")
     reading.add_argument("--perturbation", metavar="P", help="of the ions of MEASURED where it is a run")
     command.set_defaults(command=_compare)
 
@@ -83,6 +79,8 @@ def _compare(options):
     registration = None if options.registration is None else _registration(options.registration)
     measured = _measured(options)
     run = load(options.run)
+    if run.responses is None:
+        raise ValueError(f"{options.run!r} has no responses: run again with responses = true in [simulation]")
     study = fit_energies(
         run,
         measured,
@@ -140,27 +138,20 @@ def _registration(text):
 
 
 def _measured(options):
-    if Path(options.file).suffix.lower() == ".npz" and options.format is None:
-        names = [] if options.arrays is None else options.arrays.split(",")
-        if options.arrays is not None and len(names) not in (3, 4):
-            raise ValueError(f"--arrays must name values, edges in x and y, and perhaps a mask, got {options.arrays!r}")
-        named = dict(zip(("values", "x_edges", "y_edges", "mask"), names, strict=False))
-        return read_map(options.file, unit=options.unit, **named)
-    for name in ("arrays", "unit"):
-        if getattr(options, name) is not None:
-            raise ValueError(f"--{name} is for a map in an .npz file, got {options.file!r}")
     held = read(options)
     if isinstance(held, Run):
         if options.perturbation is None:
             raise ValueError(f"{options.file!r} is a run: say by --perturbation how its ions start")
-        return held.hits(read_perturbation(options.perturbation))
+        return select(held.hits(read_perturbation(options.perturbation)), options)
     if options.perturbation is not None:
         raise ValueError(f"--perturbation is for a run as MEASURED, {options.file!r} holds measured ions")
+    if isinstance(held, DetectorMap):
+        return held
     if held.x is None or held.y is None:
         raise ValueError(
             f"{options.file!r} has no detector coordinates x and y, which a map needs, only {', '.join(held.columns)}"
         )
-    return held
+    return select(held, options)
 
 
 # ---- what goes out -------------------------------------------------------------------------------------------------

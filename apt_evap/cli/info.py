@@ -3,9 +3,11 @@
 import json
 from typing import Any
 
-from apt_evap.cli._files import read
+from apt_evap.cli._files import read, select, selects
 from apt_evap.cli._options import SHAPE, reading_options
 from apt_evap.info import UNITS, describe
+from apt_evap.maps import DetectorMap
+from apt_evap.run import UNFINISHED, Run
 
 
 def add_parser(commands: Any) -> None:
@@ -14,7 +16,7 @@ def add_parser(commands: Any) -> None:
         "info",
         parents=[reading_options()],
         help="say what is in a file",
-        description="Say what is in a run or in a file of measured ions.",
+        description="Say what is in a run (of an unfinished one, give the folder), in a file of ions or a map.",
         epilog="example: apt-evap info ni111.h5\n         apt-evap info R5083.epos --json | jq .columns.voltage",
         **SHAPE,
     )
@@ -26,7 +28,14 @@ def add_parser(commands: Any) -> None:
 
 def _info(options):
     held = read(options)
-    told = {"file": options.file} | describe(held)
+    told = {"file": options.file}
+    if selects(options) and not isinstance(held, DetectorMap):
+        ions = held.hits(held.first_perturbation) if isinstance(held, Run) else held
+        told["selected_of"], held = len(ions), select(ions, options)
+    told |= describe(held)
+    if isinstance(held, Run) and held.ended == UNFINISHED:
+        told["kind"] = f"unfinished run of {len(held):,} ions"
+        told["ended"] = "not yet: the command that began it, with --resume, goes on"
     if options.json:
         print(json.dumps(told, indent=2, allow_nan=False))
     else:
@@ -34,20 +43,28 @@ def _info(options):
     return 0
 
 
-def _lines(told, indent=0):
+def _lines(told, indent=0, of_columns=False):
     labels = {key: f"{key.replace('_', ' ')} [{UNITS[key]}]" if key in UNITS else key.replace("_", " ") for key in told}
     width = max(map(len, labels.values()), default=0)
     for key, value in told.items():
         if isinstance(value, dict) and value:
             yield f"{'':{indent}}{labels[key]}"
-            yield from _lines(value, indent + 2)
+            yield from _lines(value, indent + 2, key == "columns")
         else:
-            yield f"{'':{indent}}{labels[key]:{width}}  {_text(value)}"
+            between = " to " if of_columns or key in _EXTENTS else " x " if key in _SIZES else "   "
+            text = _text(value, between)
+            if key == "field_before_leaving":
+                text += f" at {told['voltage']:g} V (only its ratio to the evaporation field matters)"
+            yield f"{'':{indent}}{labels[key]:{width}}  {text}"
 
 
-def _text(value):
+_EXTENTS = ("field_before_leaving", "x", "y", "values")
+_SIZES = ("bins", "bin_size", "detector_extent", "detector_quantum")
+
+
+def _text(value, between="   "):
     if isinstance(value, list | dict):
-        return "   ".join(_text(item) for item in value) or "none"
+        return between.join(_text(item) for item in value) or "none"
     if isinstance(value, int) and not isinstance(value, bool):
         return f"{value:,}"
     return "none" if value is None else f"{value:g}" if isinstance(value, float) else str(value)

@@ -1,15 +1,16 @@
 """`apt-evap map`: draw detector maps of a run or of measured ions."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from apt_evap.cli._files import check_output, is_picture, picture_path, read, save_picture
+from apt_evap.cli._files import check_output, is_picture, picture_path, read, save_picture, select, selects
 from apt_evap.cli._options import SHAPE, add_speech, reading_options, smoothing, tell, tell_json, whole
 from apt_evap.config import MOST_BINS, MapSettings, Panel, read_maps, read_perturbation, title_of
+from apt_evap.hits import Hits
 from apt_evap.maps import DetectorMap
 from apt_evap.perturbation import Unperturbed
 from apt_evap.run import Run
@@ -21,9 +22,10 @@ def add_parser(commands: Any) -> None:
         "map",
         parents=[reading_options()],
         help="draw detector maps of a run or of measured ions",
-        description="Draw detector maps of a run or of measured ions.",
+        description="Draw detector maps of a run or of measured ions, or a map.",
         epilog="example:\n"
         "  apt-evap map R5083.epos --bins 128\n"
+        "  apt-evap map R5083.epos --ranges R5083.rrng --species Si --voltage 4000, --circle 15 -o silicon.png\n"
         "  apt-evap map ni111.h5 --perturbation Unperturbed --perturbation RollUp:0.3,0.1 -o energies.png\n\n"
         "a perturbation is NAME, NAME:NUMBERS or a TOML table:\n"
         "  Unperturbed              RollUp:0.2 (eV, all ions)    RollUp:0.155,0.155 (mean, standard deviation)\n"
@@ -49,16 +51,24 @@ def _map(options):
     check_output(picture, is_picture, options.force)
     held = read(options)
     if isinstance(held, Run):
-        maps = run_maps(held, _map_settings(held, options))
+        maps = run_maps(held, _map_settings(held, options), lambda hits: select(hits, options))
     elif options.perturbation:
-        raise ValueError(f"--perturbation needs a run (.h5), {options.file!r} holds measured ions")
+        what = "a map" if isinstance(held, DetectorMap) else "measured ions"
+        raise ValueError(f"--perturbation needs a run (.h5), {options.file!r} holds {what}")
+    elif isinstance(held, DetectorMap):
+        if options.bins is not None:
+            raise ValueError(f"--bins is for ions, {options.file!r} is a map: its bins are {_bins_of(held)}")
+        sigma = 0.0 if options.smooth is None and not held.is_counts else options.smooth
+        maps = [_smoothed(held, sigma)], [Path(options.file).name]
     elif held.x is None or held.y is None:
         raise ValueError(
             f"{options.file!r} has no detector coordinates x and y, which a map needs, only {', '.join(held.columns)}"
         )
     else:
-        drawn = held.map(options.bins or _bins_for(np.count_nonzero(held.detected)))
-        maps = [_smoothed(drawn, options.smooth)], [Path(options.file).name]
+        chosen = select(held, options)
+        drawn = chosen.map(options.bins or _bins_for(np.count_nonzero(chosen.detected)))
+        part = f", {len(chosen):,} of {len(held):,} ions" if selects(options) else ""
+        maps = [_smoothed(drawn, options.smooth)], [f"{Path(options.file).name}{part}"]
     save_picture(picture, *maps)
     tell(options, f"wrote {picture}")
     tell_json(options, {"wrote": str(picture), "file": options.file, "maps": described(*maps)})
@@ -66,9 +76,9 @@ def _map(options):
 
 
 def described(maps: Any, titles: Sequence[str]) -> list[dict[str, Any]]:
-    """What each map of a picture shows, in plain types: title, ions on it, bins, and the smoothing [mm]."""
+    """What each map of a picture shows, in plain types: title, ions on it if known, bins, and the smoothing [mm]."""
     return [
-        {"title": title, "ions": int(each.ions), "bins": list(each.values.shape[::-1]), "smoothing": each.smoothing}
+        {"title": title, "ions": each.ions, "bins": list(each.values.shape[::-1]), "smoothing": each.smoothing}
         for each, title in zip(maps, titles, strict=True)
     ]
 
@@ -89,12 +99,14 @@ def _map_settings(run, options):
     return settings if options.smooth is None else replace(settings, smoothing=options.smooth)
 
 
-def run_maps(run: Run, settings: MapSettings) -> tuple[list[DetectorMap], list[str]]:
-    """Maps of the whole detector, and their titles."""
+def run_maps(
+    run: Run, settings: MapSettings, choose: Callable[[Hits], Hits] = lambda hits: hits
+) -> tuple[list[DetectorMap], list[str]]:
+    """Maps of the whole detector, of all ions or those that are chosen, and their titles."""
     half = run.detector.width / 2
     bins = settings.bins or _bins_for(len(run))
     maps = [
-        run.hits(panel.perturbation).map(
+        choose(run.hits(panel.perturbation)).map(
             bins,
             extent=(-half, half, -half, half),
             quantum=None,
@@ -103,6 +115,10 @@ def run_maps(run: Run, settings: MapSettings) -> tuple[list[DetectorMap], list[s
         for panel in settings.panels
     ]
     return [_smoothed(each, settings.smoothing) for each in maps], [panel.title for panel in settings.panels]
+
+
+def _bins_of(drawn):
+    return " x ".join(map(str, drawn.values.shape[::-1]))
 
 
 def _bins_for(ions):

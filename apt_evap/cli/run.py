@@ -1,5 +1,6 @@
 """`apt-evap run`: simulate what a TOML file describes."""
 
+import sys
 import time
 from dataclasses import replace
 from typing import Any
@@ -12,6 +13,9 @@ from apt_evap.cli.map import described, run_maps
 from apt_evap.config import read_config
 from apt_evap.run_file import is_run
 
+SECONDS_BETWEEN_LINES = 60.0
+_GO_ON = "the same command with --resume goes on"
+
 
 def add_parser(commands: Any) -> None:
     """Describe the command."""
@@ -19,8 +23,10 @@ def add_parser(commands: Any) -> None:
         "run",
         help="simulate what a TOML file describes",
         description="Simulate what a TOML file describes, save the run and draw its detector maps.\n"
-        "Ctrl-C ends the simulation and saves what is done. While it goes on it is kept in RUN.h5.unfinished;\n"
-        "killed, it goes on from there with --resume, and gives the same bits as if it had not been.",
+        "Ctrl-C or SIGTERM ends the simulation and saves what is done. While it goes on it is kept in\n"
+        "RUN.h5.unfinished; killed, it goes on from there with --resume, and gives the same bits as if it had not.\n"
+        "Behind the bar: charges, how far from settled they are (RMS over their mean); shares of the last ions that\n"
+        "missed, never left, or are marked, as their responses are inexact. Without a terminal: a line a minute.",
         epilog="example: apt-evap run examples/ni111.toml -o ni.h5 --ions 5000",
         **SHAPE,
     )
@@ -36,7 +42,7 @@ def add_parser(commands: Any) -> None:
     )
     add_speech(command)
     command.add_argument(
-        "--force", action="store_true", help="overwrite files that apt-evap did not make, and unfinished runs"
+        "--force", action="store_true", help="overwrite unfinished and other runs, and files that apt-evap did not make"
     )
     command.set_defaults(command=_run)
 
@@ -56,45 +62,97 @@ def _run(options):
     began = time.perf_counter()
     checkpoint = Checkpoint(output, options.checkpoint, resume=options.resume, overwrite=options.force)
     provenance = {"config": config.path.name, "maps": config.maps.to_dict()}
+    n_ions = options.ions or config.n_ions
+    replaced, unfinished = output.exists(), checkpoint.folder.exists()
+    done = checkpoint.ions_there() if options.resume else 0
+    if 0 < done < n_ions:
+        tell(options, f"resumed at {done:,} of {n_ions:,} ions")
+    lines = not options.quiet and not sys.stderr.isatty()
     try:
         run = simulation.run(
-            options.ions or config.n_ions,
+            n_ions,
             config.emissions,
             responses=config.responses,
-            progress=False if options.quiet else None,
+            progress=False if options.quiet else _Lines() if lines else None,
             checkpoint=checkpoint,
         )
-    except FileError as error:
-        # the checkpoints speak of arguments of Python
-        message = str(error).replace("resume=True", "--resume").replace("overwrite=True", "--force")
-        raise FileError(message) from error
+    except KeyboardInterrupt:
+        if ions := checkpoint.ions_there():
+            where = checkpoint.folder if checkpoint.folder.exists() else output
+            say("note", f"{ions:,} of {n_ions:,} ions are in {str(where)!r}; {_GO_ON}")
+        raise
+    except FileError:
+        raise
     except Exception as error:
         if run := getattr(error, "run", None):
             replace(run, provenance=run.provenance | provenance).save(output)
             say("note", f"the {len(run):,} ions done so far are in {str(output)!r}")
         raise
     seconds = time.perf_counter() - began
+    if done == n_ions and not unfinished:
+        tell(options, f"{output} is complete: nothing to do")
+        tell_json(options, {"wrote": None, "picture": None, "maps": [], **_counts(run, seconds)})
+        return 0
     run = replace(run, provenance=run.provenance | provenance)
     run.save(output)
-    rate = "" if options.resume else f", {len(run) / seconds:,.0f} ions/s"  # it is not known how many are new
-    tell(options, f"{len(run):,} ions in {seconds:.1f} s{rate}")
+    new = "" if not done else f", {len(run) - done:,} of them new,"
+    tell(options, f"{len(run):,} ions{new} in {seconds:.1f} s, {(len(run) - done) / seconds:,.0f} ions/s")
+    most_missed = []
     for panel in config.maps.panels:
         hit, missed, never_left = run.hits(panel.perturbation).counts.values()
+        most_missed += [missed] if 2 * missed > len(run) else []
         tell(
             options, f"{panel.title}: {hit:,} hit the detector, {missed:,} missed it, {never_left:,} never left the tip"
         )
     if run.responses is not None:
         tell(options, f"responses: {run.marked.sum():,} ions marked as inexact")
-    if run.ended:
+    if most_missed:
+        say(
+            "note",
+            f"{max(most_missed):,} of {len(run):,} ions miss the detector, which is {run.detector.width:g} mm wide at "
+            f"{run.detector.distance:g} mm: a larger width or a smaller distance in [detector] catches more of them",
+        )
+    if run.ended == "interrupted":
+        say("note", f"interrupted; {len(run):,} of {n_ions:,} ions are in {str(output)!r}; {_GO_ON}")
+    elif run.ended:
         say("note", f"the run ended before its time: {run.ended}; the {len(run):,} ions so far are kept")
-    tell(options, f"wrote {output}")
+    tell(options, f"{'replaced' if replaced and not options.resume else 'wrote'} {output}")
     try:
         maps = run_maps(run, config.maps)
         save_picture(picture, *maps)
     except ValueError as error:
         raise ValueError(f"no maps are drawn, the run is in {str(output)!r}: {error}") from error
     tell(options, f"wrote {picture}")
-    counts = {key: value for key, value in run.summary().items() if key != "ended"}
     written = {"wrote": str(output), "picture": str(picture), "maps": described(*maps)}
-    tell_json(options, {**written, **counts, "seconds": round(seconds, 3), "ended": run.ended or "as planned"})
+    tell_json(options, {**written, **_counts(run, seconds)})
     return INTERRUPTED if run.ended == "interrupted" else 0
+
+
+def _counts(run, seconds):
+    return run.summary() | {"seconds": round(seconds, 3), "ended": run.ended or "as planned"}
+
+
+class _Lines:
+    """Says on stderr how far a run is, at most once a minute and not in the first one."""
+
+    def __init__(self) -> None:
+        self._began = self._told = self._first = 0.0
+
+    def __call__(self, done: int, n_ions: int) -> None:
+        now = time.monotonic()
+        if not self._began:
+            self._began, self._told, self._first = now, now, done
+        elif now - self._told >= SECONDS_BETWEEN_LINES and done > self._first:
+            self._told = now
+            rate = (done - self._first) / (now - self._began)
+            left, speed = _duration((n_ions - done) / rate), f"{rate:,.0f}" if rate >= 10 else f"{rate:.2g}"
+            line = f"{done:,} of {n_ions:,} ions ({done / n_ions:.0%}), {speed} ions/s, {left} left"
+            print(line, file=sys.stderr, flush=True)
+
+
+def _duration(seconds):
+    """A time in the unit that suits it."""
+    for unit, length in (("h", 3600), ("min", 60)):
+        if seconds >= 2 * length:
+            return f"{seconds / length:.1f} {unit}"
+    return f"{seconds:.0f} s"

@@ -15,6 +15,7 @@ from apt_evap.hits import Hits
 from apt_evap.io._apt_sections import SIGNATURE
 from apt_evap.io.apt import chunk_apt, read_apt
 from apt_evap.io.epos import chunk_epos, read_epos, write_epos
+from apt_evap.io.npz import read_map
 from apt_evap.io.pos import chunk_pos, read_pos, write_pos
 from apt_evap.io.raw import chunk_raw, read_raw
 from apt_evap.io.rrng import read_ranges
@@ -48,6 +49,7 @@ FORMATS = (
     Format(".pos", None, read_pos, write_pos, chunk_pos),
     Format(".apt", SIGNATURE, read_apt, None, chunk_apt),
     Format(".raw", None, read_raw, None, chunk_raw),
+    Format(".npz", b"PK", read_map),
     Format(".xyz", None, None, write_xyz),
     Format(".vtp", None, None, write_vtp),
 )
@@ -59,19 +61,21 @@ def read(path: AnyPath, *, format: str | None = None, columns: Sequence[str] | N
     Parameters
     ----------
     path : str or path-like
-        The file: .pos, .epos, .apt, .raw or .h5.
+        The file: .pos, .epos, .apt, .raw, .h5 or .npz.
     format : str, optional
         Suffix of the format to read it as, such as ".pos", whatever the file is called.
     columns : sequence of str, optional
-        Names of the columns to read, so that only these take up memory; all by default. Not for .h5.
+        Names of the columns to read, so that only these take up memory; all by default. Not for .h5 and
+        .npz.
     **options
         Passed to the reader of the format: ``partial=True`` reads the whole ions of a truncated file (the whole
-        sections of an .apt), ``byte_order="little"`` a .pos or .epos written in the wrong byte order.
+        sections of an .apt), ``byte_order="little"`` a .pos or .epos written in the wrong byte order; those of
+        `read_map` for an .npz.
 
     Returns
     -------
     Hits
-        The ions; for a simulation's .h5 the `Run`, whose ``hits`` method gives them.
+        The ions; for a simulation's .h5 the `Run`, whose ``hits`` method gives them; for an .npz the `DetectorMap`.
 
     Raises
     ------
@@ -142,7 +146,7 @@ def write(path: AnyPath, hits: Hits, *, format: str | None = None, **options: An
     ValueError
         If a column the format cannot do without is missing, or no ion is left to write.
     """
-    chosen = _by_suffix(path, format)
+    chosen = _by_suffix(path, format, "write")
     if chosen.write is None:
         reason = "holds a Run (run.save)" if chosen.suffix == ".h5" else "is only read"
         raise FileError(f"hits cannot be written to {str(path)!r}: a {chosen.suffix} file {reason}")
@@ -157,9 +161,9 @@ def _to_read(path, format):
         head = file.read(64)
     chosen = _by_content(head) if format is None else None
     if chosen is None:
-        chosen = _by_suffix(path, format)
+        chosen = _by_suffix(path, format, "read")
         if chosen.read is None:
-            known = ", ".join(candidate.suffix for candidate in FORMATS if candidate.read)
+            known = _suffixes("read")
             raise FileError(
                 f"{str(path)!r} cannot be read, only written, by its suffix {chosen.suffix!r}, expected one of {known}"
             )
@@ -201,15 +205,18 @@ def _by_content(head):
     return None
 
 
-def _by_suffix(path, format):
+def _suffixes(doing):
+    return ", ".join(candidate.suffix for candidate in FORMATS if getattr(candidate, doing))
+
+
+def _by_suffix(path, format, doing):
     if format is not None:
         check_kind(format, "format", str, "a suffix such as '.pos'")
     suffix = check_path(path).suffix if format is None else "." + format.lstrip(".")
     for candidate in FORMATS:
         if candidate.suffix == suffix.lower():
             return candidate
-    known = ", ".join(candidate.suffix for candidate in FORMATS)
     raise FileError(
         f"the format of {str(path)!r} is not known from "
-        f"{f'its suffix {suffix!r}' if format is None else f'format={format!r}'}, expected one of {known}"
+        f"{f'its suffix {suffix!r}' if format is None else f'format={format!r}'}, expected one of {_suffixes(doing)}"
     )
