@@ -293,14 +293,6 @@ def test_memory_and_interrupts_are_no_tracebacks_but_bugs_are(folder, capsys, mo
     assert os.listdir() == ["small.toml"]
 
 
-def test_an_interrupt_of_the_imports_is_no_traceback(tmp_path):
-    (tmp_path / "apt_evap").mkdir()
-    (tmp_path / "apt_evap" / "__init__.py").write_text("raise KeyboardInterrupt")
-    command = f"import sys; sys.path[:0] = {[str(tmp_path), HERE]}; from _apt_evap_shell import main; sys.exit(main())"
-    done = subprocess.run([sys.executable, "-P", "-c", command], capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (130, "apt-evap: interrupted\n")
-
-
 def test_progress_without_a_terminal_is_plain_lines(folder, capsys, monkeypatch):
     monkeypatch.setattr(cli.run, "SECONDS_BETWEEN_LINES", 0.0)
     assert main(["run", "small.toml", "--ions", "600", "--threads", "1"]) == 0

@@ -27,14 +27,14 @@ wrong = []
 wrong += [f"the archive lacks {name}" for name in ("LICENSE", "README.md", "setup.py", "tests/conftest.py", "docs/api.rst",
           "apt_evap/_core/pair.h", "apt_evap/_core/octree.pxd", "apt_evap/py.typed") if name not in archive]
 wrong += [f"the archive has {name}" for name in archive if name.endswith((".so", ".c")) or name.startswith("build/")]
-wrong += [f"the wheel lacks {name}" for name in python | {"apt_evap/py.typed", "_apt_evap_shell.py"} if name not in wheel]
+wrong += [f"the wheel lacks {name}" for name in python | {"apt_evap/py.typed"} if name not in wheel]
 for module in modules:
     stub, start = f"apt_evap/_core/{module}.pyi", f"apt_evap/_core/{module}."
     wrong += [f"the wheel lacks {stub}"] if stub not in wheel else []
     compiled = any(name.startswith(start) and name.endswith((".so", ".pyd")) for name in wheel)
     wrong += [] if compiled else [f"the wheel lacks the compiled {module}"]
 wrong += [f"the wheel has {name}" for name in wheel if name.endswith((".pyx", ".pxd", ".c", ".h"))]
-wrong += [f"the wheel has {name}" for name in wheel if not name.startswith(("apt_evap/", "apt_evap-", "_apt_evap_shell."))]
+wrong += [f"the wheel has {name}" for name in wheel if not name.startswith(("apt_evap/", "apt_evap-"))]
 if not modules or wrong:
     sys.exit("\n".join(wrong) or "no modules found")
 print(f"{len(archive)} names in the archive, {len(wheel)} in the wheel")
