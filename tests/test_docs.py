@@ -114,9 +114,7 @@ def test_examples_run(name, folder, monkeypatch, capsys):
 def test_a_measured_file_of_ones_own(folder, monkeypatch, capsys):
     """Not every export has voltages, nor a detector about (0, 0)."""
     held = ae.read("R5083.epos")
-    ae.write(
-        "R5084.epos", ae.Hits(x=held.x - 2, y=held.y + 1, positions=held.positions, multiplicity=held.multiplicity)
-    )
+    ae.write("R5084.epos", ae.Hits(x=held.x - 2, y=held.y + 1, positions=held.positions, pulse_id=held.pulse_id))
     for name, voltage in (("R5083.epos", True), ("R5084.epos", False)):
         monkeypatch.setattr(sys, "argv", ["tutorial_2_own_measurement.py", name])
         runpy.run_path(str(ROOT / "examples" / sys.argv[0]), run_name="__main__")
