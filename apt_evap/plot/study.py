@@ -190,7 +190,7 @@ def _default_circle(study):
     axis = [float(value[0]) for value in study.registration.points(np.zeros(1), np.zeros(1))]
     inside = np.hypot(x - axis[0], y - axis[1]).min() < max(map.bin_size)
     middle = axis if inside else (x.mean(), y.mean())
-    return *middle, 0.4 * reach
+    return *middle, 0.5 * reach
 
 
 def _scores(study):
