@@ -124,10 +124,10 @@ def ssim(map_a: DetectorMap, map_b: DetectorMap, *, smoothing: float = 0.0, data
 def half_ceiling(
     hits: Hits | DetectorMap, *, smoothing: float = 0.0, data_range: float = 2.0, seed: int = 0, **options: Any
 ) -> Similarity:
-    """Structural similarity of two random halves of one measurement: the ceiling that its noise allows.
+    """Structural similarity of two random halves of one measurement: a scale for how noisy it is.
 
-    Each ion falls to either half with equal chance. The halves are noisier than the whole, so that a perfect
-    and noiseless simulation may come out higher against the whole.
+    Each ion falls to either half with equal chance. The halves are noisier than the whole, so that a good simulation,
+    which may have more ions besides, can come out higher against the whole.
 
     Parameters
     ----------

@@ -318,7 +318,7 @@ def _perturbation_table(text):
 
 
 def title_of(perturbation: Any) -> str:
-    """Title of a map of the ions of a perturbation (str), such as "roll-up, normal (0.155, 0.155) eV"."""
+    """Title of a map of the ions of a perturbation (str), such as "roll-up, 0.155 ± 0.155 eV"."""
     name = type(perturbation).__name__
     words = {"Unperturbed": "unperturbed", "LateralVelocity": "lateral velocity", "RollUp": "roll-up"}
     title = words.get(name, name)
@@ -330,7 +330,7 @@ def title_of(perturbation: Any) -> str:
     if isinstance(energy, Thermal):
         return f"{title}, {energy.temperature:g} K"
     if isinstance(energy, TruncatedNormal):
-        return f"{title}, normal ({energy.mean:g}, {energy.standard_deviation:g}) eV"
+        return f"{title}, {energy.mean:g} ± {energy.standard_deviation:g} eV"
     return title
 
 

@@ -45,6 +45,12 @@ class Detector:
             checked = check_number(getattr(self, name), name, above=0, at_most=1e6, unit="mm")
             object.__setattr__(self, name, checked)
 
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """Where it reaches: x_min, x_max, y_min, y_max [mm]."""
+        half = self.width / 2
+        return -half, half, -half, half
+
     def directions(self, positions: Floats, velocities: Floats, apex: float) -> tuple[Floats, Floats]:
         """Directions in which ions meet the plane, as seen from the apex.
 

@@ -1,5 +1,7 @@
 """The one type for simulated and measured ions: columns of equal length, one row per ion."""
 
+from __future__ import annotations  # help() says ArrayLike, not the ten types that it stands for
+
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -80,6 +82,12 @@ class Hits:
     source : str
         File name, or what made the ions.
 
+    Attributes
+    ----------
+    extent : tuple of float or None
+        Where the detector of a run reaches: x_min, x_max, y_min, y_max [mm], for all ions of the run as it gives them.
+        None for a selection of them, for ions moved elsewhere, and for measured ions.
+
     Raises
     ------
     ValueError
@@ -103,6 +111,8 @@ class Hits:
     extra: dict = field(default_factory=dict)
     units: dict = field(default_factory=dict)
     source: str = ""
+    # not an argument: a copy with other coordinates (dataclasses.replace) does not take it over
+    extent: tuple[float, float, float, float] | None = field(default=None, init=False)
 
     def __post_init__(self):
         lengths = {}
@@ -181,7 +191,7 @@ class Hits:
             return {outcome: len(self) if outcome == Outcome.HIT else 0 for outcome in Outcome}
         return {outcome: int(np.count_nonzero(self.outcome == outcome)) for outcome in Outcome}
 
-    def map(self, bins: int = 256, **options: Any) -> "DetectorMap":
+    def map(self, bins: int = 256, **options: Any) -> DetectorMap:
         """Count the detected ions on the detector.
 
         Parameters
@@ -200,7 +210,7 @@ class Hits:
 
         return DetectorMap.from_hits(self, bins=bins, **options)
 
-    def to_dataframe(self) -> "pandas.DataFrame":
+    def to_dataframe(self) -> pandas.DataFrame:
         """Return the ions as a pandas DataFrame; needs pandas.
 
         Returns
@@ -215,7 +225,7 @@ class Hits:
             columns |= dict(zip(("position_x", "position_y", "position_z"), self.positions.T, strict=True))
         return to_dataframe(columns | self.extra, source=self.source, units=self.units)
 
-    def within_circle(self, radius: float, centre: ArrayLike = (0.0, 0.0)) -> "Hits":
+    def within_circle(self, radius: float, centre: ArrayLike = (0.0, 0.0)) -> Hits:
         """Select the detected ions within a circle on the detector.
 
         Parameters
@@ -242,7 +252,7 @@ class Hits:
             distance = np.hypot(x - centre[0], y - centre[1])
         return self[self.detected & (distance <= radius)]
 
-    def window(self, **bounds: tuple[float | None, float | None]) -> "Hits":
+    def window(self, **bounds: tuple[float | None, float | None]) -> Hits:
         """Select the ions whose columns are within bounds: ``hits.window(voltage=(4e3, 5e3), multiplicity=(2, None))``.
 
         Parameters
@@ -282,7 +292,7 @@ class Hits:
                 return len(column)
         return len(next(iter(self.extra.values())))
 
-    def __getitem__(self, selection: slice | ArrayLike) -> "Hits":
+    def __getitem__(self, selection: slice | ArrayLike) -> Hits:
         """Return the selected ions as `Hits`; takes a slice, a mask, indices or one index."""
         if not isinstance(selection, slice):
             index = np.asarray(selection)

@@ -1,7 +1,7 @@
 """Maps of the hits on the detector, binned so that the comb of measured coordinates does not show."""
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -36,6 +36,11 @@ class DetectorMap:
         Standard deviation of the Gaussian the density was smoothed with [mm].
     source : str
         What the map was made from.
+
+    Attributes
+    ----------
+    detected : int or None
+        Number of hits that `from_hits` was given, those outside the map or its mask too; None if not known.
     """
 
     values: np.ndarray
@@ -47,6 +52,8 @@ class DetectorMap:
     quantum: tuple | None = None
     smoothing: float = 0.0
     source: str = ""
+    # not an argument: a copy with other values (dataclasses.replace) does not take it over
+    detected: int | None = field(default=None, init=False)
 
     @classmethod
     def from_hits(
@@ -71,16 +78,18 @@ class DetectorMap:
         hits : Hits
             Ions with x and y.
         bins : int
-            Number of bins along the longer side.
+            Number of bins along the longer side; about so many where the hits lie on a comb.
         extent : tuple of float, optional
-            x_min, x_max, y_min, y_max [mm]; that of the hits by default. Bins may reach a little over it.
+            x_min, x_max, y_min, y_max [mm]; by default that of the detector for the hits of a run, that of the hits for
+            measured ones. Bins may reach a little over it.
         quantum : {"auto", None} or tuple of float
             Spacing of the comb in x and y [mm], "auto" to find it in the data, None for continuous data.
         dither_seed : int, optional
             Seed; dithers by one quantum instead of fitting the bins to the comb.
         mask : array_like, optional
-            Which bins are inside the detector; by default the convex outline of the field of view, where the
-            density exceeds a tenth of its median.
+            Which bins are inside the detector. By default all that are for the hits of a run, whose detector is known
+            (`Hits.extent`); for measured ones the convex outline of the field of view, where the density exceeds a
+            tenth of its median.
         like : DetectorMap, optional
             Take edges and mask from this map, for comparison, instead of `bins` and `extent`.
 
@@ -122,6 +131,7 @@ class DetectorMap:
                     stacklevel=2,
                 )
         else:
+            extent = hits.extent if extent is None else extent
             x_edges, y_edges = bin_edges(x, y, bins, extent, combs if dither_seed is None else None)
         counts = count(x, y, x_edges, y_edges)
         if not counts.any():
@@ -129,10 +139,14 @@ class DetectorMap:
                 f"none of {len(x):,} hits lies in x {x_edges[0]:g} to {x_edges[-1]:g}, "
                 f"y {y_edges[0]:g} to {y_edges[-1]:g} mm"
             )
-        mask = field_of_view(counts) if mask is None else _check_mask(mask, counts.shape)
+        if mask is not None:
+            mask = _check_mask(mask, counts.shape)
+        else:
+            mask = field_of_view(counts) if hits.extent is None else _on_detector(x_edges, y_edges, hits.extent)
         found = None if combs is None else tuple(float(comb.spacing) for comb in combs)
         ions = int(counts[mask].sum())
-        return cls(counts, x_edges, y_edges, mask, True, ions, quantum=found, source=hits.source)
+        made = cls(counts, x_edges, y_edges, mask, True, ions, quantum=found, source=hits.source)
+        return made._of(len(x))
 
     @classmethod
     def from_array(
@@ -205,6 +219,14 @@ class DetectorMap:
         return self.values
 
     @property
+    def shown_ions(self) -> str:
+        """How many ions the map shows, such as "945,058 of 945,211 ions" where some lie outside; "" if not known."""
+        if self.ions is None:
+            return ""
+        outside = f" of {self.detected:,}" if self.detected not in (None, self.ions) else ""
+        return f"{self.ions:,}{outside} ions"
+
+    @property
     def bin_size(self) -> tuple[float, ...]:
         """Width and height of a bin [mm]."""
         return tuple(float((edges[-1] - edges[0]) / (len(edges) - 1)) for edges in (self.x_edges, self.y_edges))
@@ -244,7 +266,7 @@ class DetectorMap:
         if sigma == 0:
             return self
         total = float(np.hypot(sigma, self.smoothing))
-        return replace(self, values=self._blurred(sigma), is_counts=False, smoothing=total)
+        return replace(self, values=self._blurred(sigma), is_counts=False, smoothing=total)._of(self.detected)
 
     def flattened(self, sigma: float) -> "DetectorMap":
         """Divide the density by itself, smoothed broadly: what varies slowly over the detector goes.
@@ -269,7 +291,12 @@ class DetectorMap:
             return self
         broad = self._blurred(sigma)
         flat = np.divide(self.values, broad, out=np.zeros_like(broad), where=self.mask & (broad > 0))
-        return replace(self, values=flat, is_counts=False)
+        return replace(self, values=flat, is_counts=False)._of(self.detected)
+
+    def _of(self, detected):
+        """Say how many hits a new map was made of."""
+        object.__setattr__(self, "detected", detected)
+        return self
 
     def _blurred(self, sigma):
         width, height = self.bin_size
@@ -281,7 +308,7 @@ class DetectorMap:
     def __repr__(self) -> str:
         ny, nx = self.values.shape
         width, height = self.bin_size
-        what = "densities" if self.ions is None else f"{self.ions:,} ions"
+        what = "densities" if self.ions is None else self.shown_ions
         smoothing = f", smoothed by {self.smoothing:g} mm" if self.smoothing else ""
         source = f" from {self.source!r}" if self.source else ""
         return f"<DetectorMap: {what}{source}, {nx} x {ny} bins of {width:.4g} x {height:.4g} mm{smoothing}>"
@@ -302,6 +329,14 @@ def _check_mask(mask, shape):
     if not mask.any():
         raise ValueError("mask must leave some bin inside the detector, got none")
     return mask
+
+
+def _on_detector(x_edges, y_edges, extent):
+    """Bins whose centres are on a detector of the given extent."""
+    x, y = ((edges[1:] + edges[:-1]) / 2 for edges in (x_edges, y_edges))
+    columns = (extent[0] <= x) & (x <= extent[1])
+    rows = (extent[2] <= y) & (y <= extent[3])
+    return rows[:, None] & columns
 
 
 def _fits(like, combs):

@@ -358,7 +358,8 @@ def _view(value, name):
     if not isinstance(value, DetectorMap):
         if not hasattr(value, "detected"):
             raise ValueError(f"{name} must be a DetectorMap or Hits, got {value!r:.80}")
-        value = DetectorMap.from_hits(value, bins=_BINS if name == "simulated" else 256)
+        # a copy does not know the detector: bins for where the hits are, not for all of that
+        value = DetectorMap.from_hits(replace(value), bins=_BINS if name == "simulated" else 256)
     return View(value)
 
 

@@ -189,7 +189,7 @@ class Run:
     def _hits(self, directions, times, perturbation):
         x, y, times, outcome = self.detector.impacts(directions, times)
         emissions = self.emissions
-        return Hits(
+        hits = Hits(
             x=x,
             y=y,
             time_of_flight=times,
@@ -203,6 +203,8 @@ class Run:
             units={"charge": "e", "field": "V/nm"},
             source=f"simulation, {_describe(perturbation)}",
         )
+        object.__setattr__(hits, "extent", self.detector.extent)  # frozen; its maps cover the detector
+        return hits
 
     def seen_by(self, detector: Detector) -> "Run":
         """Let another detector see the ions of this run: only where they are recorded changes.

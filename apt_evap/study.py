@@ -12,6 +12,7 @@ from apt_evap._version import __version__
 from apt_evap.energy_grid import EnergyGrid
 from apt_evap.maps import DetectorMap
 from apt_evap.perturbation import to_dict
+from apt_evap.register import Registration
 
 
 class Score(NamedTuple):
@@ -21,7 +22,7 @@ class Score(NamedTuple):
     error: float
 
     def __str__(self):
-        return f"{self.value:.3f}" + (f" ± {self.error:.3f}" if np.isfinite(self.error) else "")
+        return f"{self.value:z.3f}" + (f" ± {self.error:.3f}" if np.isfinite(self.error) else "")
 
 
 @dataclass(frozen=True)
@@ -120,7 +121,7 @@ class Study:
     gain: Score
     gain_share: float
     ceiling: Score | None
-    registration: object
+    registration: Registration
     measured: DetectorMap
     maps: dict
     settings: dict

@@ -4,8 +4,9 @@
 
 Read a LEAP export, look at it, select ions, and draw its map without the stripes of the detector's comb.
 
-``python tutorial_2_own_measurement.py R5083.epos`` takes a file of yours. Without one, a file is made here first: ions
-on a comb of 0.027 mm, as a delay line detector gives them, a dark pole and dark zone lines among them.
+``python tutorial_2_own_measurement.py R5083.epos`` takes a file of yours (.epos, .apt or .raw). Without one, a file is
+made here first: ions on a comb of 0.027 mm, as a delay line detector gives them, a dark pole and dark zone lines among
+them.
 """
 
 import sys
@@ -14,7 +15,7 @@ import numpy as np
 
 import apt_evap as ae
 
-path = sys.argv[1] if len(sys.argv) > 1 and sys.argv[1].endswith((".epos", ".apt", ".raw", ".h5")) else None
+path = sys.argv[1] if len(sys.argv) > 1 and sys.argv[1].endswith((".epos", ".apt", ".raw")) else None
 if path is None:
     path = "measured.epos"
     random = np.random.default_rng(5)
@@ -47,10 +48,18 @@ print("columns:", ", ".join(measured.columns))
 # Ions are selected by masks, by windows of a column, or by a circle on the detector. With an .rrng file, ranges name
 # the species: ``ae.read_ranges("R5083.rrng")``.
 
-late = measured.window(voltage=(4500.0, None))
-inner = late.within_circle(15.0)
-single = inner[inner.multiplicity == 1]
-print(f"{len(late):,} ions above 4.5 kV, {len(inner):,} of them within 15 mm, {len(single):,} alone in a pulse")
+centre = [(column.min() + column.max()) / 2 for column in (measured.x, measured.y)]  # not at 0 in every file
+late = measured.window(ion=(len(measured) // 2, None))  # measured ions are counted by their rows
+inner = late.within_circle(10.0, centre=centre)
+print(f"{len(late):,} ions in the second half, {len(inner):,} of them within 10 mm of {np.round(centre, 1)} mm")
+if measured.mass_to_charge is not None:
+    counts, edges = np.histogram(measured.mass_to_charge, np.arange(0.0, 200.0, 0.5))
+    peak = edges[counts.argmax()], edges[counts.argmax() + 1]
+    print(f"{len(measured.window(mass_to_charge=peak)):,} ions in the highest peak, {peak[0]} to {peak[1]} Da")
+if measured.voltage is not None:
+    print(f"{len(measured.window(voltage=(4500.0, None))):,} ions above 4.5 kV")
+if measured.multiplicity is not None:
+    print(f"{len(measured[measured.multiplicity == 1]):,} ions alone in a pulse")
 
 # %%
 # Bins that are no multiple of the comb's spacing hold now one tooth more, now one less, and show stripes (left). By
@@ -62,7 +71,8 @@ print(f"spacing of the comb: {aware.quantum} mm, bins of {aware.bin_size} mm")
 ae.plot.detector_maps([naive, aware], ["bins of any size", "bins on the comb"])[0].figure.savefig("measured.png")
 
 # %%
-# How alike can a simulation become to this map? Two random halves of the measurement say what its noise allows.
+# How noisy is this map? Two random halves of the measurement are compared: 1 would be no noise at all. It is a scale to
+# judge a simulation by, not its limit: a simulation has more ions than a half, and can come out higher.
 
 for smoothing in (0.0, 0.5, 1.0):
     print(f"smoothed by {smoothing} mm:", ae.half_ceiling(measured, bins=128, smoothing=smoothing))

@@ -67,7 +67,7 @@ error = np.hypot(by_response.x - flown.x, by_response.y - flown.y)[flown.detecte
 print(f"{flown}\nresponses against flights: median {np.median(error):.4f} mm, largest {error.max():.4f} mm")
 
 # %%
-# One run serves every share.
+# One run serves every share. A share changes where ions land, and hardly how many of them hit the detector.
 
 shares = np.linspace(0, 1, 5)
 hit = [run.hits(replace(half, share=share)).counts[ae.Outcome.HIT] for share in shares]

@@ -27,7 +27,8 @@ print(tip)
 
 # %%
 # The cost of an event hardly depends on the size of the tip. Responses take 30 flights an ion; where one perturbation
-# is all that is wanted, one flight an ion is faster.
+# is all that is wanted, one flight an ion is faster. A run of hours is kept on the disk as it goes on with
+# ``checkpoint="large.h5"``, and can be resumed.
 
 began = time.perf_counter()
 simulation = ae.Simulation(tip, seed=1)

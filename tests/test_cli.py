@@ -372,7 +372,7 @@ def drawn_by(monkeypatch, *arguments):
 def test_map_of_a_run_shows_the_whole_detector(folder, made, monkeypatch, capsys):
     maps, titles = drawn_by(monkeypatch, "map", made)
     assert capsys.readouterr().out == "wrote small_map.png\n" and (folder / "small_map.png").exists()
-    assert titles == ["unperturbed", "roll-up, normal (0.155, 0.155) eV"]
+    assert titles == ["unperturbed", "roll-up, 0.155 ± 0.155 eV"]
     run = load(made)
     assert maps[0].ions == run.hits(Unperturbed()).counts[0]
     for each in maps:

@@ -111,6 +111,19 @@ def test_examples_run(name, folder, monkeypatch, capsys):
         assert "in 100% of the resamples" in out
 
 
+def test_a_measured_file_of_ones_own(folder, monkeypatch, capsys):
+    """Not every export has voltages, nor a detector about (0, 0)."""
+    held = ae.read("R5083.epos")
+    ae.write("R5084.epos", ae.Hits(x=held.x - 2, y=held.y + 1, positions=held.positions, pulse_id=held.pulse_id))
+    for name, voltage in (("R5083.epos", True), ("R5084.epos", False)):
+        monkeypatch.setattr(sys, "argv", ["tutorial_2_own_measurement.py", name])
+        runpy.run_path(str(ROOT / "examples" / sys.argv[0]), run_name="__main__")
+        out = capsys.readouterr().out
+        assert ("20,000 ions above 4.5 kV" in out) == voltage and f"from '{name}'" in out
+        inside = np.count_nonzero(np.hypot(held.x[10_000:], held.y[10_000:]) <= 10)
+        assert int(re.search(r"(\d+) of them within 10 mm", out)[1]) == pytest.approx(inside, rel=0.03)  # of 800
+
+
 def run_figure(name, monkeypatch, *arguments):
     monkeypatch.setattr(sys, "argv", [name, *arguments])
     runpy.run_path(str(ROOT / "examples" / name), run_name="__main__")

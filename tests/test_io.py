@@ -206,8 +206,10 @@ def test_missed_and_broken_ions_are_left_out_and_counted(tmp_path, suffix):
         write(path, hits)
     words = np.fromfile(path, ">f4")
     assert np.isfinite(words).all() and len(words) == 2 * (4 if suffix == ".pos" else 11)
-    with pytest.raises(ValueError, match="nothing to write"):
+    with pytest.raises(ValueError, match=r"nothing to write .* of 1 ions 1 did not hit the detector$"):
         write(path, hits[1:2])
+    with pytest.warns(UserWarning, match=r"leaves out 2 of 3 ions: 2 did not hit the detector$"):
+        write(tmp_path / f"b{suffix}", hits[[0, 1, 3]])
     assert read(path).positions.tolist() == [[1, 2, 3], [1, 2, 3]]
 
 

@@ -243,6 +243,16 @@ def test_pictures_share_a_scale_and_state_what_they_show(tmp_path):
         plot.detector_maps([map], ["a", "b"])
 
 
+def test_what_lies_outside_is_counted():
+    x, y = disc(100_000)
+    map = Hits(x=np.append(x, 25.0), y=np.append(y, 0.0)).map(bins=175)
+    inside = int(map.counts[map.mask].sum())
+    for each in (map, map.smoothed(0.5), map.flattened(5.0)):
+        assert plot.describe(each).startswith(f"{inside:,} of 100,001 ions, ") and "of 100,001 ions" in repr(each)
+    whole = Hits(x=x, y=y).map(bins=4, mask=np.ones((4, 4), bool))
+    assert plot.describe(whole).startswith("100,000 ions, ")
+
+
 @pytest.mark.skipif(not SILICON.exists(), reason="the measured Si.epos is not there")
 def test_measured_map_shows_no_stripes():
     hits = read(SILICON)

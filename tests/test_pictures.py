@@ -34,6 +34,44 @@ def discs_of(ax):
     return discs
 
 
+# ---- maps ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("height", [0.6, 1.0, 1.1])
+@pytest.mark.parametrize("title", [None, "0.75 roll-up + 0.25 lateral velocity, 0.155 ± 0.155 eV"])
+@pytest.mark.parametrize("half", [100, 150, 1500])
+def test_nothing_of_a_map_is_cut_off(half, height, title, tmp_path):
+    random = np.random.default_rng(0)
+    edges = np.linspace(-half, half, 21)
+    map = ae.DetectorMap.from_array(random.random((20, 20)), edges, height * edges)
+    (ax,) = axes = plot.detector_maps([map], [title])
+    alone = plot.detector_map(map, title=title)
+    for figure in (ax.figure, alone.figure):
+        figure.savefig(tmp_path / "a.png")
+        boxes = [each.get_tightbbox().transformed(figure.transFigure.inverted()) for each in figure.axes]
+        assert min(box.min.min() for box in boxes) > 0 and max(box.max.max() for box in boxes) < 1
+    assert len(axes) == 1
+
+
+def test_titles_are_broken_at_commas():
+    map = ae.DetectorMap.from_array(np.ones((4, 4)), np.arange(5.0), np.arange(5.0))
+    for title, lines in (
+        ("roll-up, 0.3 ± 0.1 eV", ["roll-up, 0.3 ± 0.1 eV"]),
+        ("0.75 roll-up + 0.25 lateral, 0.155 ± 0.155 eV", ["0.75 roll-up + 0.25 lateral,", "0.155 ± 0.155 eV"]),
+        ("two\nlines", ["two", "lines"]),
+        ("no comma in a title that is too long for one line", ["no comma in a title that is too long", "for one line"]),
+        ("x" * 50, ["x" * 36, "x" * 14]),
+    ):
+        assert plot.detector_map(map, title=title).get_title().splitlines() == lines
+
+
+@pytest.mark.parametrize("n, shape", [(1, (1, 1)), (3, (1, 3)), (4, (2, 2)), (5, (2, 3)), (7, (3, 3))])
+def test_maps_in_rows(n, shape):
+    map = ae.DetectorMap.from_array(np.ones((4, 4)), np.arange(5.0), np.arange(5.0))
+    axes = plot.detector_maps([map] * n)
+    assert len(axes) == n and axes[0].get_gridspec().get_geometry() == shape
+
+
 # ---- specimen ------------------------------------------------------------------------------------------------------
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import ndimage
 
 import apt_evap as ae
 from apt_evap import alignment, plot
@@ -289,13 +290,25 @@ def test_overlay(low, simulated, tmp_path):
     assert caption == "mirrored, rotated by 17.00°, scaled by 0.45, shifted by (8.00, 3.00) mm\n" + (
         "correlation 0.90, 100% of the field of view shared"
     )
-    labels = [text.get_text() for text in ax.get_legend().get_texts()]
+    labels = [text.get_text() for text in ax.figure.legends[0].get_texts()]
     assert labels == ["simulated, bright", "simulated, dark"]
     # what is bright lies where hits are, once moved
     density = map.density[map.mask]
     x, y = np.meshgrid(*map.centres)
     inside = ax.collections[0].get_paths()[0].contains_points(np.column_stack([x[map.mask], y[map.mask]]))
     assert density[inside].mean() > 1.3 * density[~inside].mean()
-    partial = plot.overlay(simulated.within_circle(40.0), map, replace(true, score=np.nan, residual=0.25))
+    beside = ax.figure.axes[1]  # the simulated map, with the same contours
+    for own, other in zip(ax.collections, beside.collections, strict=True):
+        np.testing.assert_array_equal(own.get_paths()[0].vertices, other.get_paths()[0].vertices)
+    # contours are drawn only where the measured map is
+    x, y = np.concatenate([line.get_paths()[0].vertices for line in ax.collections]).T
+    columns, rows = (np.searchsorted(edges[1:-1], at) for edges, at in ((map.x_edges, x), (map.y_edges, y)))
+    assert ndimage.binary_dilation(map.mask)[rows, columns].all() and not map.mask.all()
+    partial = plot.overlay(
+        simulated.within_circle(40.0),
+        map,
+        replace(true, score=np.nan, residual=0.25),
+        plot.new_figure((5, 5)).subplots(),
+    )
     assert partial.get_legend().get_texts()[-1].get_text() == "simulated field of view"
     assert "from points, 0.25 mm off (RMS)" in partial.texts[0].get_text()

@@ -216,6 +216,22 @@ def test_another_detector_sees_the_same_ions(run, tmp_path):
     assert ae.load(tmp_path / "curved.h5").detector == curved.detector
 
 
+def test_maps_of_its_ions_cover_the_detector(run):
+    hits = run.hits(ae.RollUp(ENERGY))
+    map = hits.map(bins=30)
+    assert map.extent == hits.extent == (-150, 150, -150, 150) and map.values.shape == (30, 30)
+    assert map.mask.all() and map.ions == hits.counts[ae.Outcome.HIT] == map.detected
+    # a part of the detector, and what lies beside it
+    part = hits.map(bins=40, extent=(-200, 0, -200, 0))
+    x, y = np.meshgrid(*part.centres)
+    assert np.array_equal(part.mask, (x > -150) & (y > -150))
+    # the detector is not known of ions chosen or moved
+    moved = ae.Registration(0.0, 0.5, (10.0, 0.0)).hits(hits)
+    for other in (hits[::2], hits.within_circle(80.0), moved, replace(hits, y=hits.y / 2)):
+        assert other.extent is None and not other.map(bins=30).mask.all()
+    assert run.seen_by(ae.Detector(width=100.0)).hits(ae.RollUp(ENERGY)).map(bins=30).extent == (-50, 50, -50, 50)
+
+
 def test_texts_that_are_read_are_of_fixed_length(run, tmp_path):
     """The heap of texts of any length is what HDF5 hangs in, or crashes, where a file is damaged."""
     run.save(tmp_path / "a.h5")

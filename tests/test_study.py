@@ -414,6 +414,9 @@ def test_pictures(twin, tmp_path):
     axes = ae.plot.ssim_matrix(study)
     assert len(axes) == 1
     assert len(axes[0].texts) == 36
+    (legend,) = axes[0].figure.legends
+    labels = [text.get_text() for text in legend.get_texts()]
+    assert labels == ["best on the grid", "best between its points, 95 % of the resamples"]
     given = axes[0].figure.add_subplot()
     assert ae.plot.ssim_matrix(study, [given])[0] is given
     given.remove()
@@ -421,6 +424,11 @@ def test_pictures(twin, tmp_path):
         ae.plot.ssim_matrix(study, [given, given])
     parts = ae.plot.side_by_side(study, circle=(5, -5, 20))
     assert parts[3].get_xlim() == (-15, 25)
+    # the measured map has a scale of its own, which its structure fills
+    scales = [ax.images[0].get_clim() for ax in parts]
+    assert scales[0] == scales[3] != scales[1] == scales[2] == scales[4]
+    density = study.compared(study.measured).density
+    assert scales[0] == pytest.approx(np.nanpercentile(density, [2, 99.5]))
     for name, ax in (("matrix.png", axes[0]), ("maps.png", parts[0])):
         ax.figure.savefig(tmp_path / name)
         assert imread(tmp_path / name)[..., :3].std() > 0.1

@@ -265,7 +265,8 @@ def choose(path: AnyPath, hits: Hits, columns: Any) -> Any:
                 good = np.isfinite(values.astype(np.float32, copy=False))
             finite &= good if good.ndim == 1 else good.all(axis=1)
     missed, broken = np.count_nonzero(~hit), np.count_nonzero(hit & ~finite)
-    reasons = f"{missed:,} did not hit the detector and {broken:,} have values that are not finite"
+    counted = (missed, "did not hit the detector"), (broken, "have values that are not finite")
+    reasons = " and ".join(f"{count:,} {what}" for count, what in counted if count)
     if missed + broken == len(hits):
         raise ValueError(f"nothing to write to {str(path)!r}: of {len(hits):,} ions {reasons}")
     if missed + broken == 0:

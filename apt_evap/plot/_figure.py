@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 OUTSIDE = "0.88"
 """Colour of what is outside the detector."""
@@ -39,6 +40,14 @@ def add_colorbar(
     return figure.colorbar(images[0], ax=ax, label=label, extend=extend, fraction=0.05, pad=0.02)
 
 
+class _Layout(ConstrainedLayoutEngine):
+    """Constrained layout, repeated: maps of equal scale in x and y have ticks and labels that depend on their size."""
+
+    def execute(self, fig: Figure) -> None:
+        for _ in range(3):
+            super().execute(fig)
+
+
 def new_figure(size: tuple[float, float]) -> Figure:
     """Make a figure of (width, height) `size` [inch].
 
@@ -56,4 +65,4 @@ def new_figure(size: tuple[float, float]) -> Figure:
     """
     pyplot = sys.modules.get("matplotlib.pyplot")
     make = Figure if pyplot is None else pyplot.figure
-    return make(figsize=size, layout="constrained", dpi=150)
+    return make(figsize=size, layout=_Layout(compress=True, h_pad=0.08, w_pad=0.06), dpi=150)

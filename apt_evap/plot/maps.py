@@ -1,6 +1,8 @@
 """Detector maps, alone or side by side."""
 
 from collections.abc import Sequence
+from math import ceil, sqrt
+from textwrap import fill
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -56,11 +58,12 @@ def detector_map(
     )
     # bins outside the mask are NaN and let the background through
     ax.set(facecolor=OUTSIDE, aspect="equal", xlabel="x [mm]", ylabel="y [mm]")
+    described = _wrap(describe(map), 54)  # what fits above a map of `detector_maps`
     if title:
-        ax.set_title(title, pad=20 if caption else 8)
+        ax.set_title(_wrap(title, 36), pad=10 + 10 * len(described.splitlines()) if caption else 8)
     if caption:
         ax.annotate(
-            describe(map), (0.5, 1), xytext=(0, 5), xycoords="axes fraction", textcoords="offset points",
+            described, (0.5, 1), xytext=(0, 5), xycoords="axes fraction", textcoords="offset points",
             ha="center", fontsize="small", color="0.35",
         )  # fmt: skip
     if colorbar:
@@ -89,7 +92,7 @@ def detector_maps(
     colormap : str
         Name of a colour map of matplotlib.
     columns : int, optional
-        Maps in a row; all of them up to four by default.
+        Maps in a row; by default all of up to three, and as many rows as columns, or one fewer, of more.
 
     Returns
     -------
@@ -105,7 +108,8 @@ def detector_maps(
     titles = [None] * len(maps) if titles is None else list(titles)
     if not maps or len(titles) != len(maps):
         raise ValueError(f"detector_maps needs maps and a title for each, got {len(maps)} and {len(titles)}")
-    columns = min(len(maps), columns or 4)
+    n = len(maps)
+    columns = min(n, columns or (n if n <= 3 else ceil(sqrt(n))))
     rows = -(-len(maps) // columns)
     if limits is None:
         each = np.array([color_limits(map) for map in maps])
@@ -164,7 +168,14 @@ def describe(map: DetectorMap) -> str:
     width, height = map.bin_size
     square = abs(width / height - 1) < 1e-3
     size = f"{width:.3g} mm bins" if square else f"{width:.3g} × {height:.3g} mm bins"
-    parts = [f"{map.ions:,} ions", size] if map.ions is not None else [size]
+    parts = [map.shown_ions, size] if map.ions is not None else [size]
     if map.smoothing:
         parts.append(f"smoothed by {map.smoothing:.3g} mm")
     return ", ".join(parts)
+
+
+def _wrap(text, width):
+    """Break text into lines, at its commas where that will do."""
+    kept = text.replace(" ", "\N{NO-BREAK SPACE}").replace(",\N{NO-BREAK SPACE}", ", ")
+    lines = "\n".join(fill(line, width, break_long_words=False) for line in kept.splitlines())
+    return "\n".join(fill(line.replace("\N{NO-BREAK SPACE}", " "), width) for line in lines.splitlines())

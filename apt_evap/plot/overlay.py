@@ -7,12 +7,17 @@ from matplotlib.lines import Line2D
 from apt_evap.alignment import BROAD, View
 from apt_evap.hits import Hits
 from apt_evap.maps import DetectorMap
+from apt_evap.plot._figure import OUTSIDE, add_colorbar, new_figure
 from apt_evap.plot.maps import detector_map
 from apt_evap.register import Registration
 
 BRIGHT, DARK, RIM = "cyan", "lime", "white"
 _SMOOTHING = 0.015
 """Of the contours [diameters of the measured field of view]."""
+_ABOVE = {
+    "xytext": (0, 5), "xycoords": "axes fraction", "textcoords": "offset points", "ha": "center", "fontsize": "small",
+    "color": "0.35",
+}  # fmt: skip
 
 
 def overlay(
@@ -25,10 +30,10 @@ def overlay(
     colormap: str = "inferno",
     colorbar: bool = True,
 ) -> Axes:
-    """Draw a measured map with contours of the simulated one moved onto it.
+    """Draw a measured map with contours of the simulated one moved onto it, and that one beside it.
 
-    Contours are those of the flattened simulated map, half a standard deviation above its mean (what is bright) and
-    below it (dark); a dashed line is the simulated field of view.
+    Contours are those of the flattened simulated map, where it is brightest and darkest: the outermost eighths of the
+    area. A dashed line is the simulated field of view.
 
     Parameters
     ----------
@@ -37,7 +42,7 @@ def overlay(
     registration : Registration
         What moves the simulated map onto the measured one.
     ax : matplotlib.axes.Axes, optional
-        Where to draw; a new figure by default.
+        Where to draw the measured map, and nothing beside it; a new figure with both by default.
     title : str, optional
         Title above the map.
     colormap : str
@@ -48,10 +53,13 @@ def overlay(
     Returns
     -------
     matplotlib.axes.Axes
-        Its ``figure.savefig`` writes the picture.
+        That of the measured map; its ``figure.savefig`` writes the picture.
     """
     simulated, measured = (m if isinstance(m, DetectorMap) else DetectorMap.from_hits(m) for m in (simulated, measured))
-    ax = detector_map(measured, ax, title=title, colormap=colormap, colorbar=colorbar, caption=False)
+    beside = None
+    if ax is None:
+        ax, beside = new_figure((10.4, 5.2)).subplots(1, 2)
+    detector_map(measured, ax, title=title, colormap=colormap, colorbar=colorbar, caption=False)
     inside, seen = View(simulated), View(measured)
     scale = registration.scale
     image = inside.flatten(_SMOOTHING * seen.diameter / scale, BROAD * seen.diameter / scale)
@@ -59,24 +67,42 @@ def overlay(
     x, y = np.meshgrid(np.linspace(low_x, high_x, 400), np.linspace(low_y, high_y, 400))
     back_x, back_y = registration.inverse.points(x, y)
     values, shown = image.sample(back_x + 1j * back_y)
-    spread = values[shown].std() if shown.any() else 0.0
+    inner = _on(measured, x, y) & shown  # contours beyond the measured map tell nothing
     legend = []
-    if spread > 0:
-        field = np.ma.masked_array(values, ~shown)
-        for sign, color, label in ((1, BRIGHT, "simulated, bright"), (-1, DARK, "simulated, dark")):
-            ax.contour(x, y, field, levels=[sign * spread / 2], colors=color, linewidths=0.9, linestyles="solid")
+    if inner.any() and np.ptp(values[inner]) > 0:
+        field = np.ma.masked_array(values, ~inner)
+        for percent, color, label in ((87.5, BRIGHT, "simulated, bright"), (12.5, DARK, "simulated, dark")):
+            level = np.percentile(values[inner], percent)
+            for panel in (ax,) if beside is None else (ax, beside):
+                panel.contour(x, y, field, levels=[level], colors=color, linewidths=0.9, linestyles="solid")
             legend.append(Line2D([], [], color=color, label=label))
+    if beside is not None:
+        image = beside.imshow(
+            np.where(shown, 1 + values, np.nan), origin="lower", extent=measured.extent, cmap=colormap,
+            vmin=max(0, 1 + values.min()), vmax=1 + values.max(),
+        )  # fmt: skip
+        beside.set(facecolor=OUTSIDE, xlabel="x [mm]", ylabel="y [mm]")
+        beside.annotate("simulated, flattened, as registered", (0.5, 1), **_ABOVE)
+        if colorbar:
+            add_colorbar([image], beside, label="hits per area / mean, flattened")
     if not shown.all():
         ax.contour(x, y, shown.astype(float), levels=[0.5], colors=RIM, linewidths=1.2, linestyles="dashed")
         legend.append(Line2D([], [], color="0.4", linestyle="dashed", label="simulated field of view"))
-    ax.legend(handles=legend, loc="upper center", bbox_to_anchor=(0.5, -0.11), ncols=3, fontsize="small", frameon=False)
-    ax.annotate(
-        _caption(registration), (0.5, 1), xytext=(0, 5), xycoords="axes fraction", textcoords="offset points",
-        ha="center", fontsize="small", color="0.35",
-    )  # fmt: skip
+    how = {"handles": legend, "ncols": 3, "fontsize": "small", "frameon": False}
+    if beside is None:
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.11), **how)
+    else:
+        ax.figure.legend(loc="outside lower center", **how)
+    ax.annotate(_caption(registration), (0.5, 1), **_ABOVE)
     if title:
         ax.set_title(title, pad=34)
     return ax
+
+
+def _on(map, x, y):
+    """Whether points are on bins inside the mask of a map."""
+    columns = np.searchsorted(map.x_edges[1:-1], x)
+    return map.mask[np.searchsorted(map.y_edges[1:-1], y), columns]
 
 
 def _caption(registration):

@@ -19,7 +19,8 @@ _MARK = "#00d0ff"  # seen on every colour of both maps
 def ssim_matrix(study: Study, axes: Sequence[Axes] | None = None, *, colormap: str = "viridis") -> NDArray[np.object_]:
     """Draw the similarity with the measured map against mean and relative standard deviation of the energy.
 
-    The best point is framed; a circle is the best place between points, with the interval of 95 % of the resamples.
+    The best point of the grid is framed; a circle is the best place between points, with the interval of 95 % of the
+    resamples. A new figure has a legend.
 
     Parameters
     ----------
@@ -58,8 +59,8 @@ def ssim_matrix(study: Study, axes: Sequence[Axes] | None = None, *, colormap: s
         for (row, column), value in np.ndenumerate(values):
             shade = image.cmap(image.norm(value))
             light = np.dot(shade[:3], (0.299, 0.587, 0.114)) > 0.5
-            text = ax.text(column, row, f"{value:.3f}", ha="center", va="center", fontsize=8, zorder=5)
-            # legible where bars cross it
+            # in a corner, since the circle is most often near a centre; legible where bars cross it
+            text = ax.text(column - 0.4, row + 0.38, f"{value:z.3f}", ha="left", va="top", fontsize=8, zorder=5)
             text.set(color="k" if light else "w", path_effects=[withStroke(linewidth=3, foreground=shade)])
         ax.set_xticks(range(columns), [f"{mean:.4g}" for mean in grid.means])
         ax.set_yticks(range(rows), [f"{rsd:.3g}" for rsd in grid.rsds])
@@ -74,17 +75,20 @@ def ssim_matrix(study: Study, axes: Sequence[Axes] | None = None, *, colormap: s
             ax.tick_params(labelbottom=True)
         if number % across == 0:
             ax.set_ylabel("standard deviation / mean")
-    _mark_optima(study, panels)
+    marks = _mark_optima(study, panels)
+    if axes is None:
+        figure.legend(handles=marks, loc="outside lower center", ncols=2, frameon=False, fontsize="small")
     add_colorbar([ax.images[0] for ax in panels], list(panels), label="SSIM")
     return panels
 
 
 def _mark_optima(study, axes):
-    """Frame the best point, and put a circle with its interval on the best place between points."""
+    """Frame the best point, and put a circle with its interval on the best place between points; return both."""
     grid, best, refined = study.grid, study.optimum, study.refined
     column, row = grid.means.index(best.mean), grid.rsds.index(best.rsd)
     ax = axes[grid.rollup_fractions.index(best.rollup_fraction)]
-    ax.add_patch(Rectangle((column - 0.48, row - 0.48), 0.96, 0.96, fill=False, edgecolor="r", linewidth=2))
+    frame = Rectangle((column - 0.48, row - 0.48), 0.96, 0.96, fill=False, edgecolor="r", linewidth=2)
+    ax.add_patch(frame).set_label("best on the grid")
 
     def places(values, points):
         return np.interp(values, points, np.arange(len(points)))
@@ -95,7 +99,10 @@ def _mark_optima(study, axes):
         across = places(refined.intervals["mean"], grid.means)
         along = places(np.log(refined.intervals["rsd"]), np.log(grid.rsds))
         errors = {"xerr": np.abs(across - x)[:, None], "yerr": np.abs(along - y)[:, None]}
-    ax.errorbar(x, y, **errors, fmt="o", color="r", capsize=3, markersize=9, markerfacecolor="none")
+    label = "best between its points" + ", 95 % of the resamples" * bool(errors)
+    return frame, ax.errorbar(
+        x, y, **errors, fmt="o", color="r", capsize=3, markersize=9, markerfacecolor="none", label=label
+    )
 
 
 def side_by_side(
@@ -107,7 +114,9 @@ def side_by_side(
 ) -> NDArray[np.object_]:
     """Draw the measured map beside the simulated ones, unperturbed and at the optimum, and a part of them magnified.
 
-    Maps are drawn as they are compared: flattened and smoothed, inside the region that all show.
+    Maps are drawn as they are compared: flattened and smoothed, inside the region that all show. The measured map has a
+    colour scale of its own, from the 2 to the 99.5 percentile, since its contrast may be much lower than that of the
+    simulated ones, which share one.
 
     Parameters
     ----------
@@ -136,16 +145,21 @@ def side_by_side(
             mechanism += f", roll-up fraction {best.rollup_fraction:g}"
         energies = f"{best.mean:g} eV, σ/mean {best.rsd:g}"
         titles = "measured", "simulated, unperturbed", f"simulated, {mechanism}\n{energies}"
-    limits = common_limits(maps)
-    figure = new_figure((13.0, 9.0))
+    # percents below 2 may be a dark rim
+    low, high = np.percentile(maps[0].density[maps[0].mask], [2, 99.5])
+    seen = {"limits": (low, high) if high > low else (0, 2)}
+    simulated = {"limits": common_limits(maps[1:])}
+    how = {"colormap": colormap, "colorbar": False, "caption": False}
+    figure = new_figure((13.0, 8.4))
     axes = figure.subplots(2, 3)
-    for ax, map, title in zip(axes[0], maps, titles, strict=True):
-        detector_map(map, ax, title=title, limits=limits, colormap=colormap, colorbar=False, caption=False)
+    for ax, map, title, scale in zip(axes[0], maps, titles, (seen, simulated, simulated), strict=True):
+        detector_map(map, ax, title=title, **scale, **how)
         _show_inside(ax, map)
-    for ax, map, title in ((axes[1, 0], maps[0], titles[0]), (axes[1, 2], maps[2], "simulated")):
-        detector_map(
-            map, ax, title=f"{title}, magnified", limits=limits, colormap=colormap, colorbar=False, caption=False
-        )
+    for ax, map, title, scale in (
+        (axes[1, 0], maps[0], titles[0], seen),
+        (axes[1, 2], maps[2], "simulated", simulated),
+    ):
+        detector_map(map, ax, title=f"{title}, magnified", **scale, **how)
         ax.images[0].set_clip_path(Circle((x, y), radius, transform=ax.transData))
         ax.set(xlim=(x - radius, x + radius), ylim=(y - radius, y + radius), facecolor="w")
         ax.add_patch(Circle((x, y), radius, fill=False, edgecolor=_MARK, linewidth=3))
@@ -154,7 +168,9 @@ def side_by_side(
     axes[1, 1].axis("off")
     axes[1, 1].text(0.5, 0.5, _scores(study), ha="center", va="center", transform=axes[1, 1].transAxes, linespacing=1.7)
     drawn = [*axes[0], axes[1, 0], axes[1, 2]]
-    add_colorbar([ax.images[0] for ax in drawn], list(axes.ravel()), label="hits per area / mean, flattened")
+    for ax in drawn:
+        label = "hits per area / mean, flattened" if ax in axes[:, 2] else ""
+        add_colorbar([ax.images[0]], ax, label=label)
     return np.array(drawn)
 
 
@@ -174,13 +190,16 @@ def _default_circle(study):
     axis = [float(value[0]) for value in study.registration.points(np.zeros(1), np.zeros(1))]
     inside = np.hypot(x - axis[0], y - axis[1]).min() < max(map.bin_size)
     middle = axis if inside else (x.mean(), y.mean())
-    return *middle, 0.4 * reach
+    return *middle, 0.5 * reach
 
 
 def _scores(study):
     """The similarities as text."""
     allowed = study.settings["allow_noise"]
-    lines = [f"SSIM with the measured map, {study.settings['bins_compared']:,} bins" + ", noise allowed for" * allowed]
+    lines = [
+        "SSIM with the measured map",
+        f"in {study.settings['bins_compared']:,} bins" + ", noise allowed for" * allowed,
+    ]
     lines += [f"{name}: {score}" for name, score in study.baselines.items()]
     lines.append(f"{study.grid.mechanism}: {study.optimum.score}")
     lines.append(f"gain over unperturbed: {study.gain}")
