@@ -29,7 +29,7 @@ FLOORS = (
     },
     {"watch", "run_file", "run", "checkpoint", "run_parts", "simulation"},
     {"binning", "maps", "cap", "profiles", "zone_line", "tracks", "alignment", "register", "compare"}
-    | {"energy_grid", "resample", "study", "fit", "config", "info", "io"},
+    | {"energy_grid", "resample", "study", "energy_search", "fit", "config", "info", "io"},
     {"plot", "cli"},
 )
 FLOOR = {module: number for number, floor in enumerate(FLOORS) for module in floor}

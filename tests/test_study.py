@@ -10,7 +10,7 @@ from scipy.stats import truncnorm
 
 import apt_evap as ae
 from apt_evap.energy_grid import EnergyGrid, maxima, spline_maxima
-from apt_evap.fit import _Search
+from apt_evap.energy_search import EnergySearch
 from apt_evap.perturbation import Combined
 from apt_evap.resample import NOISE, Comparison, Sampler
 
@@ -286,7 +286,7 @@ def test_hidden_energies_are_found(twin):
 def test_a_registration_is_polished(run, other):
     """From 1.5 degrees, 3 % and 1 mm off, back to the frame in which the map was made."""
     settings = {"smoothing": 0.6, "flattening": None, "data_range": 2.0, "seed": 0, "allow_noise": True}
-    search = _Search(run, measured_map(other, ROLLUP), EnergyGrid("roll-up"), settings, 1, False)
+    search = EnergySearch(run, measured_map(other, ROLLUP), EnergyGrid("roll-up"), settings, 1, False)
     rough = ae.Registration(1.5, 1.03, (1.0, -0.5), score=0.8, overlap=1.0)
     search.place(rough, 0)
     found = search.polished(rough, (0, 4, 2))
