@@ -183,13 +183,14 @@ def registered(search: EnergySearch) -> tuple[Registration, list[dict[str, Any]]
     """Register with the middle of the grid, then with the best point, until that stays; polished, and the rounds."""
     registration, best, rounds = None, search.middle, []
     for _ in range(_MOST_ROUNDS):
-        registration = register(search.hits(best), search.measured, start=registration)
+        found = register(search.hits(best), search.measured, start=registration)
+        registration = replace(found, method="search")  # of the first round, which the others start from
         rounds.append({"perturbation": to_dict(search.perturbation(best)), "registration": registration.to_dict()})
         search.place(registration, 0)
-        found = tuple(maxima(search.matrix(ROUGH, "registration"))[0])
-        if found == best:
+        likest = tuple(maxima(search.matrix(ROUGH, "registration"))[0])
+        if likest == best:
             break
-        best = found
+        best = likest
     return search.polished(registration, best), rounds
 
 

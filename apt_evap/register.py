@@ -123,8 +123,8 @@ class Registration:
 
     @property
     def doubtful(self) -> bool:
-        """Whether maps that have nothing to do with each other may fit as well, bool; False for points."""
-        return self.score * np.sqrt(self.overlap) < DOUBTFUL
+        """Whether it was searched for everywhere, and maps that have nothing to do with each other may fit as well."""
+        return self.method == "search" and self.score * np.sqrt(self.overlap) < DOUBTFUL
 
     def warn_if_doubtful(self) -> None:
         """Warn if it is `doubtful`."""
@@ -228,7 +228,7 @@ def register(
     Warns
     -----
     UserWarning
-        If the score is one that maps reach which have nothing to do with each other.
+        If it was searched for everywhere, and the score is one that maps reach which have nothing to do with each other.
 
     Notes
     -----

@@ -82,7 +82,8 @@ class Study:
         Mechanism and energies.
     ssim, errors : ndarray
         Structural similarity at every point of the grid, noise allowed for unless `settings` say otherwise, and its
-        standard deviation over the resamples.
+        standard deviation over the resamples. So allowed for, it is about 1 for the truth, and may come out above: by
+        its error, and where both maps have noise in common, as those of one run.
     shares : ndarray
         Share of the resamples in which a point is the best.
     resampled : ndarray
@@ -164,7 +165,7 @@ class Study:
         edge = f" (at the end of the grid in {' and '.join(best.at_edge)})" if best.at_edge else ""
         others = [f"{name} {score}" for name, score in self.baselines.items()]
         noisy = f";\n noise and all {self.plain['optimum']}, " if self.settings["allow_noise"] else ", "
-        others = ", ".join(others) + (noisy if self.ceiling else "")
+        others = f"{', '.join(others)}, gain over unperturbed {self.gain}" + (noisy if self.ceiling else "")
         others += f"two halves of the measured ions {self.ceiling}" if self.ceiling else ""
         between = f"{refined.bounded('mean')} eV, sigma/mean {refined.bounded('rsd')}"
         between += f", roll-up fraction {refined.bounded('rollup_fraction')}" if combined else ""

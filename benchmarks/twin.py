@@ -53,7 +53,7 @@ def main():
         print(f"\n{mechanism}: {HIDDEN[mechanism]}, {draws} draws of {len(other):,} ions\n{measured}", flush=True)
         began = time.perf_counter()
         study = ae.fit_energies(run, measured, mechanism)
-        print(f"{study}\ngain {study.gain}, in {study.gain_share:.0%} of the resamples")
+        print(f"{study}\nthe optimum is better than the unperturbed map in {study.gain_share:.0%} of the resamples")
         found = study.registration
         print(f"{found}; true {turned}\n{time.perf_counter() - began:.0f} s")
         print(np.array2string(study.ssim[0], precision=3, suppress_small=True))

@@ -200,6 +200,8 @@ def _scores(study):
         "SSIM with the measured map",
         f"in {study.settings['bins_compared']:,} bins" + ", noise allowed for" * allowed,
     ]
+    if study.registration.doubtful:
+        lines.insert(0, f"THE REGISTRATION IS DOUBTFUL: correlation {study.registration.score:.2f}\n")
     lines += [f"{name}: {score}" for name, score in study.baselines.items()]
     lines.append(f"{study.grid.mechanism}: {study.optimum.score}")
     lines.append(f"gain over unperturbed: {study.gain}")
