@@ -67,5 +67,7 @@ def uninterrupted() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
-        if came and callable(before):
-            before(*came[0])
+        for arguments in came:
+            handler = signal.getsignal(signal.SIGINT)  # the first one may have changed it
+            if callable(handler):
+                handler(*arguments)

@@ -228,7 +228,7 @@ def register(
     Warns
     -----
     UserWarning
-        If it was searched for everywhere, and the score is one that maps reach which have nothing to do with each other.
+        If it was searched for everywhere, and has a score that maps reach which have nothing to do with each other.
 
     Notes
     -----
