@@ -1,5 +1,6 @@
 """Figures and colour bars, the same for every picture."""
 
+import importlib
 import sys
 from collections.abc import Sequence
 
@@ -51,8 +52,8 @@ class _Layout(ConstrainedLayoutEngine):
 def new_figure(size: tuple[float, float]) -> Figure:
     """Make a figure of (width, height) `size` [inch].
 
-    With pyplot imported, as in a notebook, pyplot makes it, so that it is shown; without, as in a batch job,
-    it needs no display.
+    In a notebook, or where pyplot has been imported, pyplot makes it, so that it is shown; otherwise, as in a batch
+    job, it needs no display.
 
     Parameters
     ----------
@@ -63,6 +64,8 @@ def new_figure(size: tuple[float, float]) -> Figure:
     -------
     matplotlib.figure.Figure
     """
+    if "ipykernel" in sys.modules:
+        importlib.import_module("matplotlib.pyplot")  # with the backend that puts pictures under their cells
     pyplot = sys.modules.get("matplotlib.pyplot")
     make = Figure if pyplot is None else pyplot.figure
     return make(figsize=size, layout=_Layout(compress=True, h_pad=0.08, w_pad=0.06), dpi=150)
