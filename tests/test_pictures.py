@@ -1,6 +1,10 @@
 """What pictures show is what they were given, with its unit; how they look is looked at."""
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -273,3 +277,15 @@ def test_rectangles_on_a_map():
     plot.rectangles([chosen, chosen.turned(120)], ax, labels=["a", "b"])
     assert [text.get_text() for text in ax.texts[-2:]] == ["a", "b"]
     np.testing.assert_allclose(ax.patches[-2].get_xy()[:4], chosen.corners)
+
+
+def test_a_notebook_shows_its_pictures():
+    """Kernels of notebooks have imported ipykernel; they show what pyplot has made."""
+    code = (
+        "import sys, types; sys.modules['ipykernel'] = types.ModuleType('ipykernel'); import apt_evap as ae; "
+        "made = ae.plot.new_figure((3, 2)); import matplotlib.pyplot as plt; assert plt.gcf() is made"
+    )
+    package = str(Path(ae.__file__).parents[1])
+    environment = os.environ | {"PYTHONPATH": package, "MPLBACKEND": "agg"}
+    done = subprocess.run([sys.executable, "-P", "-c", code], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
