@@ -1,5 +1,6 @@
 """Small specimens, made once for all tests."""
 
+import signal
 import sys
 from pathlib import Path
 
@@ -9,6 +10,9 @@ import pytest
 sys.path.append(str(Path(__file__).parent))  # for twins.py, whatever the import mode
 
 import apt_evap as ae
+
+# a shell that has put the tests into the background lets them ignore Ctrl-C, which some of them press
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
