@@ -78,7 +78,11 @@ def ssim_matrix(study: Study, axes: Sequence[Axes] | None = None, *, colormap: s
     marks = _mark_optima(study, panels)
     if axes is None:
         figure.legend(handles=marks, loc="outside lower center", ncols=2, frameon=False, fontsize="small")
-    add_colorbar([ax.images[0] for ax in panels], list(panels), label="SSIM")
+    add_colorbar(
+        [ax.images[0] for ax in panels],
+        list(panels),
+        label="SSIM, noise allowed for" if study.settings["allow_noise"] else "SSIM",
+    )
     return panels
 
 
