@@ -178,3 +178,18 @@ def test_a_run_without_responses_is_refused(folder, tip12, capsys):
 def test_help(capsys):
     assert main(["compare", "--help"]) == 0
     assert "example: apt-evap compare" in capsys.readouterr().out
+
+
+def test_a_doubtful_registration_is_told_once_and_kept(folder, capsys):
+    """A map that has nothing to do with the run."""
+    random = np.random.default_rng(3)
+    edges = np.linspace(-2, 2, 41)
+    np.savez("noise.npz", counts=random.poisson(30, (40, 40)), x_edges_cm=edges, y_edges_cm=edges)
+    assert main(["compare", "run.h5", "noise.npz", "-o", "noise", *QUICK]) == 0
+    out, err = capsys.readouterr()
+    assert err.count("the registration is doubtful") == 1
+    assert "look at registration.png" in err and "give --registration where it is known" in err
+    assert "roll-up, registration doubtful, best at" in out
+    assert json.loads(Path("noise/study.json").read_text())["registration"]["doubtful"] is True
+    assert main(["compare", "run.h5", "noise.npz", "-o", "given", *QUICK, *HERE]) == 0
+    assert "doubtful" not in "".join(capsys.readouterr())

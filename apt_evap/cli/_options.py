@@ -23,6 +23,8 @@ _SHELL_WORDS = (
     (r"\bformat=(?=')", "--format "),
     (r"\bn_threads\b", "--threads"),
     (r"\bn_ions\b", "--ions"),
+    ("the overlay of both", "registration.png"),
+    ("give a pole, scales or a start where known", "give --registration where it is known"),
 )
 
 
