@@ -91,27 +91,28 @@ def test_killed_at_random_moments_and_resumed_it_has_the_same_bits(tmp_path):
     """SIGKILL at 20 random moments; whenever the run comes to its end before, another one begins."""
     simulation().run(N_IONS, [ae.RollUp(ENERGY)], progress=False).save(tmp_path / "uninterrupted.h5")
     random = np.random.default_rng(3)
-    kills, whole, shortest = [], 0, None
-    while len(kills) < KILLS or any("unfinished" in name for name in os.listdir(tmp_path)):
+    kills, whole, shortest, over = [], 0, None, False
+    while len(kills) < KILLS or over or any("unfinished" in name for name in os.listdir(tmp_path)):
         path = tmp_path / f"{whole}.h5"
+        folder = Path(f"{path}.unfinished")
+        spared = shortest is None or len(kills) >= KILLS or over
         process = start(work, path)
         began = time.monotonic()
         try:
-            process.wait(random.uniform(0, 0.4 * shortest) if len(kills) < KILLS and shortest is not None else None)
+            process.wait(None if spared else random.uniform(0, 0.4 * shortest))
         except subprocess.TimeoutExpired:
             process.kill()
         if process.wait() == -signal.SIGKILL:
-            folder = Path(f"{path}.unfinished")
-            done = len(list(folder.glob("ions-*.h5")))
-            kills.append(done)
+            kills.append(len(list(folder.glob("ions-*.h5"))))
+            over = path.exists() and not folder.exists()  # hit after its end: another one begins
             continue
         assert process.returncode == 0
-        if len(kills) == 0:
-            shortest = time.monotonic() - began
+        shortest = time.monotonic() - began if shortest is None else shortest
         assert differing(path, tmp_path / "uninterrupted.h5") == []
-        assert not Path(f"{path}.unfinished").exists()
-        whole += 1
+        assert not folder.exists()
+        whole, over = whole + 1, False
     print(f"checkpoints there at each of {len(kills)} kills: {kills}; {whole} runs to the end, alone {shortest:.1f} s")
+    assert whole >= 3  # the first, which is not killed, and two that were
     assert max(kills) > 3  # they hit runs that had come some way
     leftover = [name for name in os.listdir(tmp_path) if "unfinished" in name]
     assert leftover == []
