@@ -9,6 +9,10 @@ from apt_evap.emitter import EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, Emitter
 from apt_evap.run import Run
 from apt_evap.watch import History
 
+TOGETHER = 64
+"""Parts that are joined as they come: small arrays that stay between large ones that go keep the memory of these. Left
+one by one, 100,000 ions of R = 20 a took 540 bytes each, of which 144 are results; joined, 155."""
+
 
 class Parts:
     """The parts of a run in memory, and on the disk where a `Keeper` keeps them.
@@ -25,17 +29,25 @@ class Parts:
         self.watch = None
         self.done = [keeper.done] if keeper and keeper.done else []
         self._keeper, self._emitter = keeper, emitter
-        self._new = []
+        self._new, self._latest = [], []
         self._first_event = self.done[0].first_event if self.done else emitter.counts["events"]
 
     def __len__(self) -> int:
-        return sum(map(len, self.done)) + sum(map(len, self._new))
+        return sum(map(len, (*self.done, *self._new, *self._latest)))
 
     def append(self, part: Run) -> None:
         """Add the next part."""
-        self._new.append(part)
+        self._latest.append(part)
+        if len(self._latest) == TOGETHER:
+            self._gather()
+
+    def _gather(self):
+        if self._latest:
+            self._new.append(Run.join(self._latest))
+            self._latest = []
 
     def _joined(self):
+        self._gather()
         # the history goes with the last part, as it is taken but once
         if self._new:
             joined = Run.join(self._new)
