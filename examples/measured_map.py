@@ -42,7 +42,7 @@ parser.add_argument(
     help="roll-up, lateral or combined; by default all three",
 )
 parser.add_argument("--bins", type=int, help="along the longer side of the map; by default as they are")
-parser.add_argument("--smoothing", type=float, help="of both maps [mm]; by default one bin")
+parser.add_argument("--smoothing", type=float, help="of both maps [mm]; by default half a bin, of densities one")
 parser.add_argument("--run", help="take this run of a tip along the right axis instead of a new one")
 parser.add_argument("--full", action="store_true", help="R = 80 a and 300,000 ions instead of R = 20 a and 20,000")
 parser.add_argument("-o", "--output", default="measured_map", help="folder; default: measured_map")

@@ -58,7 +58,9 @@ def add_parser(commands: Any) -> None:
         help="a JSON file (such as study.json) or ROTATION,SCALE,DX,DY[,mirror] in degrees and mm; found by default",
     )
     command.add_argument("--bins", type=whole(11, MOST_BINS), metavar="N", help="along the longer side")
-    command.add_argument("--smooth", type=smoothing, metavar="MM", help="sigma of a Gaussian; default: half a bin")
+    command.add_argument(
+        "--smooth", type=smoothing, metavar="MM", help="sigma of a Gaussian; default: half a bin, of densities one"
+    )
     command.add_argument("--flatten", type=smoothing, metavar="MM", help="sigma of a broad Gaussian; 0 for not")
     command.add_argument("--temperature", type=float, default=50.0, metavar="K", help="of the thermal map; default: 50")
     command.add_argument("--plain", action="store_true", help="SSIM as it is, without allowance for noise")
