@@ -73,7 +73,7 @@ class EnergySearch:
         """The transform near a registration that makes the map of a point of the grid most alike.
 
         Of maps whose lines all meet in one pole `register` may miss the scale: by 1.7 % in a twin experiment (Ni[111],
-        R = 40 a, 200,000 ions, lateral energies), by 0.2 % after this.
+        R = 40 a, 200,000 ions, lateral energies), by 0.2 % after this, and by 0.6 % with the two specimens exchanged.
         """
         region, hits = self.region, self.hits(index)
         bin_size = max(region.bin_size)

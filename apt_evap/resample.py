@@ -89,8 +89,10 @@ class Comparison:
         self.measured = values[None].astype(float)
         self.allow_noise, self._noise = allow_noise, 0.0
         if measured.is_counts:
-            drawn = np.random.default_rng(seed).poisson(values, (max(resamples, NOISE_MAPS), *values.shape)) - values
-            self._noise = self._variance(self.measured, drawn)
+            number = max(resamples, NOISE_MAPS) if allow_noise else resamples
+            drawn = np.random.default_rng(seed).poisson(values, (number, *values.shape)) - values
+            if allow_noise:
+                self._noise = self._variance(self.measured, drawn)
             self.measured = np.concatenate([self.measured, values + NOISE * drawn[:resamples]])
         self._measured = self._moments(self.densities(self.measured))
 

@@ -92,10 +92,10 @@ def test_killed_at_random_moments_and_resumed_it_has_the_same_bits(tmp_path):
     simulation().run(N_IONS, [ae.RollUp(ENERGY)], progress=False).save(tmp_path / "uninterrupted.h5")
     random = np.random.default_rng(3)
     kills, whole, shortest, over = [], 0, None, False
-    while len(kills) < KILLS or over or any("unfinished" in name for name in os.listdir(tmp_path)):
+    while len(kills) < KILLS or whole < 3 or over or any("unfinished" in name for name in os.listdir(tmp_path)):
         path = tmp_path / f"{whole}.h5"
         folder = Path(f"{path}.unfinished")
-        spared = shortest is None or len(kills) >= KILLS or over
+        spared = shortest is None or over or (len(kills) >= KILLS and folder.exists())
         process = start(work, path)
         began = time.monotonic()
         try:
