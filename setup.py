@@ -12,7 +12,7 @@ from Cython.Build import cythonize
 from setuptools import Extension, setup
 from setuptools.command.build_ext import build_ext
 
-MODULES = ["morton", "sources", "octree", "sweep", "surface", "robin", "journal", "tournament", "event", "flight"]
+MODULES = sorted(path.stem for path in Path("apt_evap/_core").glob("*.pyx"))
 BOUNDS = bool(os.environ.get("APT_EVAP_BOUNDS"))  # check every index: slow, for tools/sanitize.sh
 DIRECTIVES = {
     "language_level": 3,
@@ -58,12 +58,11 @@ extensions = [
     Extension(
         f"apt_evap._core.{name}",
         [f"apt_evap/_core/{name}.pyx"],
-        depends=["apt_evap/_core/pair.h", "apt_evap/_core/group.h"],
+        depends=["apt_evap/_core/kernels.h", "apt_evap/_core/kernels_group.h"],
         include_dirs=["apt_evap/_core"],
         libraries=[] if platform.system() == "Windows" else ["m"],
     )
     for name in MODULES
-    if Path(f"apt_evap/_core/{name}.pyx").exists()
 ]
 setup(
     ext_modules=cythonize(

@@ -5,7 +5,7 @@ Values from CODATA 2018 (Tiesinga et al., Rev. Mod. Phys. 93, 025010, 2021).
 
 import math
 
-from apt_evap._types import Floats
+from apt_evap._common.types import Floats
 
 ELEMENTARY_CHARGE = 1.602176634e-19
 """Elementary charge [C]."""

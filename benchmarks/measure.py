@@ -13,12 +13,13 @@ from pathlib import Path
 import numpy as np
 
 import apt_evap as ae
-from apt_evap._core.flight import Flights
+from apt_evap._core.evaporation import SWEEP_DUE, TOO_SHALLOW
+from apt_evap._core.flights import Flights
+from apt_evap._core.interactions import InteractionLists, direct_field
 from apt_evap._core.journal import Journal
 from apt_evap._core.octree import Octree
 from apt_evap._core.robin import Robin
-from apt_evap._core.sweep import InteractionLists, direct_field
-from apt_evap.emitter import SWEEP_DUE, TOO_SHALLOW, Emitter
+from apt_evap.evaporation.emitter import Emitter
 from apt_evap.units import COULOMB
 
 NICKEL = ae.material("Ni")

@@ -25,7 +25,7 @@ modules = {Path(name).stem for name in archive if name.startswith("apt_evap/_cor
 python = {name for name in archive if name.startswith("apt_evap/") and name.endswith(".py")}
 wrong = []
 wrong += [f"the archive lacks {name}" for name in ("LICENSE", "README.md", "setup.py", "tests/conftest.py", "docs/api.rst",
-          "apt_evap/_core/pair.h", "apt_evap/_core/octree.pxd", "apt_evap/py.typed") if name not in archive]
+          "apt_evap/_core/kernels.h", "apt_evap/_core/octree.pxd", "apt_evap/py.typed") if name not in archive]
 wrong += [f"the archive has {name}" for name in archive if name.endswith((".so", ".c")) or name.startswith("build/")]
 wrong += [f"the wheel lacks {name}" for name in python | {"apt_evap/py.typed"} if name not in wheel]
 for module in modules:
@@ -46,7 +46,7 @@ mkdir "$work/source"
 tar -xzf "$archive" -C "$work/source" --strip-components=1
 cd "$work/source"
 "$work/fresh/bin/python" -P - <<'PYTHON'
-import os, apt_evap, apt_evap._core.sweep as sweep
+import os, apt_evap, apt_evap._core.interactions as sweep
 assert "site-packages" in apt_evap.__file__, apt_evap.__file__
 needs_openmp = b"GOMP_" in open(sweep.__file__, "rb").read()
 print("the core was built", "with" if needs_openmp else "without", "OpenMP")

@@ -13,7 +13,7 @@ cd "$(dirname "$0")/.."
 kind=${1:?"say which: address, bounds, thread or valgrind"}
 shift
 tests=("$@")
-core=(tests/test_octree.py tests/test_surface.py tests/test_robin.py tests/test_events.py tests/test_flights.py)
+core=(tests/_core tests/flight)
 build=$PWD/build/$kind
 log=$build/found
 mkdir -p "$build"

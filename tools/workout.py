@@ -8,8 +8,8 @@ import sys
 import numpy as np
 
 import apt_evap as ae
+from apt_evap._core.interactions import InteractionLists
 from apt_evap._core.octree import Octree
-from apt_evap._core.sweep import InteractionLists
 
 ions = int(sys.argv[1]) if len(sys.argv) > 1 else 40
 n_threads = int(sys.argv[2]) if len(sys.argv) > 2 else 3

@@ -1,8 +1,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from apt_evap._core.interactions import InteractionLists
 from apt_evap._core.octree import Octree
-from apt_evap._core.sweep import InteractionLists
 
 class ChargingRule:
     @property

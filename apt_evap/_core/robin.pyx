@@ -10,10 +10,10 @@ from libc.math cimport M_PI, fabsf
 import numpy as np
 
 from apt_evap._core.octree cimport Octree
-from apt_evap._core.sweep cimport InteractionLists
+from apt_evap._core.interactions cimport InteractionLists
 
 
-cdef extern from "pair.h":
+cdef extern from "kernels.h":
     void patch_row(long, const float*, const float*, const float*, float, float, float, const double*,
                    float*) noexcept nogil
     float patch_dot(long, const float*, const float*) noexcept nogil

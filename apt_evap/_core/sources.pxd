@@ -1,6 +1,6 @@
 """What a walk through the octree collects, for those who walk."""
 
-cdef extern from "pair.h":
+cdef extern from "kernels.h":
     const int CELL
     const int LANES
     void point_atoms(long, const double*, const double*, const double*, const double*,

@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from apt_evap import plot
-from apt_evap._files import FileError, check_path, replace_file
-from apt_evap._types import AnyPath
+from apt_evap._common.files import FileError, check_path, replace_file
+from apt_evap._common.types import AnyPath
 from apt_evap._version import __version__
-from apt_evap.hits import Hits
-from apt_evap.io import read as read_file
-from apt_evap.io import read_ranges
-from apt_evap.maps import DetectorMap
-from apt_evap.run import Run, load
+from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.detection.hits import Hits
+from apt_evap.io.formats import read as read_file
+from apt_evap.io.rrng import read_ranges
+from apt_evap.simulation.run import Run, load
 
 _MARK = f"apt_evap {__version__}"
 _MARK_KEYS = {".png": "Software", ".pdf": "Creator", ".svg": "Creator"}

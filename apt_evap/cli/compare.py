@@ -11,16 +11,17 @@ from typing import Any
 import numpy as np
 
 from apt_evap import plot
-from apt_evap._files import FileError, check_path, open_for_reading
+from apt_evap._common.files import FileError, check_path, open_for_reading
 from apt_evap.cli._files import check_output, read, select
 from apt_evap.cli._options import SHAPE, add_reading_options, smoothing, whole
-from apt_evap.config import MOST_BINS, read_perturbation
-from apt_evap.energy_grid import MEANS, MECHANISMS, ROLLUP_FRACTIONS, RSDS
-from apt_evap.fit import fit_energies
-from apt_evap.maps import DetectorMap
-from apt_evap.register import Registration
-from apt_evap.run import Run, load
-from apt_evap.run_file import is_run
+from apt_evap.config.perturbation_text import read_perturbation
+from apt_evap.detection.binning import MOST_BINS
+from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.energy_fit.fit_energies import fit_energies
+from apt_evap.energy_fit.grid import MEANS, MECHANISMS, ROLLUP_FRACTIONS, RSDS
+from apt_evap.registration.register import Registration
+from apt_evap.simulation.run import Run, load
+from apt_evap.simulation.run_hdf5 import is_run
 
 _STUDY = "study.json"
 

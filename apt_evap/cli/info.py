@@ -3,11 +3,11 @@
 import json
 from typing import Any
 
+from apt_evap.analysis.description import UNITS, describe
 from apt_evap.cli._files import read, select, selects
 from apt_evap.cli._options import SHAPE, reading_options
-from apt_evap.info import UNITS, describe
-from apt_evap.maps import DetectorMap
-from apt_evap.run import UNFINISHED, Run
+from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.simulation.run import UNFINISHED, Run
 
 
 def add_parser(commands: Any) -> None:

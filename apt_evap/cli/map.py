@@ -9,11 +9,13 @@ import numpy as np
 
 from apt_evap.cli._files import check_output, is_picture, picture_path, read, save_picture, select, selects
 from apt_evap.cli._options import SHAPE, add_speech, reading_options, smoothing, tell, tell_json, whole
-from apt_evap.config import MOST_BINS, MapSettings, Panel, read_maps, read_perturbation, title_of
-from apt_evap.hits import Hits
-from apt_evap.maps import DetectorMap
-from apt_evap.perturbation import Unperturbed
-from apt_evap.run import Run
+from apt_evap.config.map_panels import MapSettings, Panel, read_maps
+from apt_evap.config.perturbation_text import read_perturbation, title_of
+from apt_evap.detection.binning import MOST_BINS
+from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.detection.hits import Hits
+from apt_evap.emission.perturbations import Unperturbed
+from apt_evap.simulation.run import Run
 
 
 def add_parser(commands: Any) -> None:

@@ -5,13 +5,13 @@ import time
 from dataclasses import replace
 from typing import Any
 
-from apt_evap._files import FileError, check_path
-from apt_evap.checkpoint import Checkpoint
+from apt_evap._common.files import FileError, check_path
 from apt_evap.cli._files import check_output, is_picture, picture_path, save_picture
 from apt_evap.cli._options import INTERRUPTED, SHAPE, add_speech, minutes, say, tell, tell_json, whole
 from apt_evap.cli.map import described, run_maps
-from apt_evap.config import read_config
-from apt_evap.run_file import is_run
+from apt_evap.config.simulation_file import read_config
+from apt_evap.simulation.checkpoint import Checkpoint
+from apt_evap.simulation.run_hdf5 import is_run
 
 SECONDS_BETWEEN_LINES = 60.0
 _GO_ON = "the same command with --resume goes on"

@@ -8,8 +8,8 @@ from typing import BinaryIO
 
 import numpy as np
 
-from apt_evap._files import FileError, TruncatedFile
-from apt_evap._types import AnyPath
+from apt_evap._common.files import FileError, TruncatedFile
+from apt_evap._common.types import AnyPath
 
 SIGNATURE = b"APT\0"
 _SECTION = b"SEC\0"

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apt_evap._types import AnyPath, Booleans, Floats
-from apt_evap.hits import Hits
+from apt_evap._common.types import AnyPath, Booleans, Floats
+from apt_evap.detection.hits import Hits
 
 _NAMES = {"x": "detector_x", "y": "detector_y"}
 

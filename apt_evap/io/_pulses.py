@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from apt_evap._types import Integers
+from apt_evap._common.types import Integers
 
 _BLOCK = 1 << 15  # rows that stay in the cache
 

@@ -9,10 +9,10 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from apt_evap._arrays import check_choice, check_switch, shown
-from apt_evap._files import FileError, TruncatedFile, open_for_reading, replace_file
-from apt_evap._types import AnyPath
-from apt_evap.hits import Hits, Outcome
+from apt_evap._common.files import FileError, TruncatedFile, open_for_reading, replace_file
+from apt_evap._common.types import AnyPath
+from apt_evap._common.validation import check_choice, check_switch, shown
+from apt_evap.detection.hits import Hits, Outcome
 
 _CHUNK = 1 << 14
 _SURVEY = 1 << 16

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from apt_evap._types import AnyPath
-from apt_evap.hits import Hits
+from apt_evap._common.types import AnyPath
+from apt_evap.detection.hits import Hits
 from apt_evap.io._pulses import PulseCheck, first_from_equal, pulses_from_first, whole_pulses
 from apt_evap.io._records import check_any, choose, choose_fields, open_words, write_words
 

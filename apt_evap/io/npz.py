@@ -7,9 +7,9 @@ import zlib
 
 import numpy as np
 
-from apt_evap._files import FileError, open_for_reading
-from apt_evap._types import AnyPath
-from apt_evap.maps import DetectorMap
+from apt_evap._common.files import FileError, open_for_reading
+from apt_evap._common.types import AnyPath
+from apt_evap.detection.detector_map import DetectorMap
 
 # what zip archives and headers of arrays with wrong bytes were seen to raise
 _DAMAGED = (OSError, ValueError, TypeError, EOFError, KeyError, RuntimeError, OverflowError, MemoryError)

@@ -5,8 +5,8 @@ Larson et al., Local Electrode Atom Probe Tomography (Springer, 2013), appendix 
 
 from collections.abc import Iterator, Sequence
 
-from apt_evap._types import AnyPath
-from apt_evap.hits import Hits
+from apt_evap._common.types import AnyPath
+from apt_evap.detection.hits import Hits
 from apt_evap.io._records import check_columns, choose, open_words, write_words
 
 _ROW = 16

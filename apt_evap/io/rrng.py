@@ -9,9 +9,9 @@ import warnings
 
 import numpy as np
 
-from apt_evap._files import FileError, open_for_reading
-from apt_evap._types import AnyPath
-from apt_evap.ranges import Ranges
+from apt_evap._common.files import FileError, open_for_reading
+from apt_evap._common.types import AnyPath
+from apt_evap.detection.mass_ranges import Ranges
 
 _MOST = 1 << 22
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from apt_evap._files import replace_file
-from apt_evap._types import AnyPath
-from apt_evap.hits import Hits
+from apt_evap._common.files import replace_file
+from apt_evap._common.types import AnyPath
+from apt_evap.detection.hits import Hits
 from apt_evap.io._points import points_and_data
 
 _CHUNK = 1 << 20

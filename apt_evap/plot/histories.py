@@ -6,10 +6,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from apt_evap._arrays import check_count
-from apt_evap.hits import Hits
+from apt_evap._common.validation import check_count
+from apt_evap.detection.hits import Hits
 from apt_evap.plot._figure import new_figure
-from apt_evap.run import Run
+from apt_evap.simulation.run import Run
 
 
 def history(run: Run | Hits, axes: Sequence[Axes] | None = None, *, points: int = 200) -> NDArray[np.object_]:

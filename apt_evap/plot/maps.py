@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from apt_evap.maps import DetectorMap
+from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.plot._figure import OUTSIDE, add_colorbar, new_figure
 
 

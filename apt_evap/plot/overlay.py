@@ -4,12 +4,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from apt_evap.alignment import BROAD, View
-from apt_evap.hits import Hits
-from apt_evap.maps import DetectorMap
+from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.detection.hits import Hits
 from apt_evap.plot._figure import OUTSIDE, add_colorbar, new_figure
 from apt_evap.plot.maps import detector_map
-from apt_evap.register import Registration
+from apt_evap.registration.alignment import BROAD, View
+from apt_evap.registration.register import Registration
 
 BRIGHT, DARK, RIM = "cyan", "lime", "white"
 _SMOOTHING = 0.015

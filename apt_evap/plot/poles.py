@@ -7,11 +7,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
 
-from apt_evap.maps import DetectorMap
-from apt_evap.orientation import Orientation
-from apt_evap.poles import poles as poles_of
-from apt_evap.poles import zones
-from apt_evap.projection import Projection
+from apt_evap.crystallography.orientation import Orientation
+from apt_evap.crystallography.poles import poles as poles_of
+from apt_evap.crystallography.poles import zones
+from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.detection.projection import Projection
 
 _COLORS = ("#35b6ff", "#ff9d3b", "#7be07b", "#e58cff")
 _AZIMUTHS = np.radians(np.arange(0.0, 360.5, 0.5))

@@ -9,9 +9,9 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from numpy.typing import ArrayLike
 
+from apt_evap.analysis.response_tracks import lateral_tracks, rollup_tracks
 from apt_evap.plot._figure import new_figure
-from apt_evap.run import Run
-from apt_evap.tracks import lateral_tracks, rollup_tracks
+from apt_evap.simulation.run import Run
 
 MECHANISMS = ("lateral velocity", "roll-up")
 

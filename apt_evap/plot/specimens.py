@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 from numpy.typing import ArrayLike
 
-from apt_evap._arrays import check_array, check_number
-from apt_evap.emitter import Emitter
+from apt_evap._common.validation import check_array, check_number
+from apt_evap.evaporation.emitter import Emitter
 from apt_evap.plot._figure import add_colorbar, new_figure
 
 COLORED_BY = {"fields": "field [V/nm]", "charges": "charge [e]"}

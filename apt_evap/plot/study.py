@@ -8,10 +8,10 @@ from matplotlib.patches import Circle, Rectangle
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from apt_evap._arrays import check_array, check_number
+from apt_evap._common.validation import check_array, check_number
+from apt_evap.energy_fit.study import Study
 from apt_evap.plot._figure import OUTSIDE, add_colorbar, new_figure
 from apt_evap.plot.maps import common_limits, detector_map
-from apt_evap.study import Study
 
 _MARK = "#00d0ff"  # seen on every colour of both maps
 

@@ -1,0 +1,1 @@
+"""Validation of user input, files, memory, threads and types, shared by all rooms."""

@@ -1,0 +1,101 @@
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from apt_evap._core.journal import Journal
+from apt_evap._core.neighbourhood import Neighbourhood
+from apt_evap._core.octree import Octree
+from apt_evap._core.robin import ChargingRule
+
+DONE: int
+SWEEP_DUE: int
+EXHAUSTED: int
+TOO_SHALLOW: int
+
+class Start:
+    def __init__(
+        self,
+        n_removed: int,
+        charges: NDArray[np.float64],
+        lonely: NDArray[np.int64],
+        lonely_normals: NDArray[np.float64],
+        potential_point: NDArray[np.float64],
+    ) -> None: ...
+    @property
+    def n_removed(self) -> int: ...
+    @property
+    def charges(self) -> NDArray[np.float64]: ...
+    @property
+    def lonely(self) -> NDArray[np.int64]: ...
+    @property
+    def lonely_normals(self) -> NDArray[np.float64]: ...
+    @property
+    def potential_point(self) -> NDArray[np.float64]: ...
+
+class Evaporation:
+    def __init__(
+        self,
+        atoms: Neighbourhood,
+        rule: ChargingRule,
+        weights: NDArray[np.float64],
+        potential: float,
+        potential_point: ArrayLike,
+        bond_length: float,
+        patch_radius: float,
+        update_radius: float,
+        opening_angle: float,
+    ) -> None: ...
+    @property
+    def atoms(self) -> Neighbourhood: ...
+    @property
+    def tree(self) -> Octree: ...
+    @property
+    def rule(self) -> ChargingRule: ...
+    @property
+    def potential(self) -> float: ...
+    @property
+    def patch_radius(self) -> float: ...
+    @property
+    def update_radius(self) -> float: ...
+    @property
+    def bond_length(self) -> float: ...
+    @property
+    def opening_angle(self) -> float: ...
+    @property
+    def n_removed(self) -> int: ...
+    @property
+    def since_sweep(self) -> int: ...
+    n_clipped: int
+    n_unsettled: int
+    @property
+    def potential_point(self) -> NDArray[np.float64]: ...
+    @property
+    def start(self) -> Start: ...
+    def take_over(self, atoms: Neighbourhood, weights: NDArray[np.float64]) -> None: ...
+    def relax(
+        self,
+        *,
+        tolerance: float = 1e-4,
+        most_sweeps: int = 200,
+        double_precision: bool = False,
+        extra: int = 0,
+        opening_angle: float = 0.0,
+        n_threads: int = 1,
+        start: Start | None = None,
+    ) -> tuple[int, float]: ...
+    def start_here(self, surface: NDArray[np.int64], n_threads: int = 1) -> Start: ...
+    def keep_inside(self, tree: Octree) -> NDArray[np.float64]: ...
+    def distances(self, tree: Octree) -> NDArray[np.float64]: ...
+    def evaporate(
+        self,
+        journal: Journal,
+        most: int,
+        sweep_interval: int,
+        atom: NDArray[np.int64],
+        charge: NDArray[np.float64],
+        normal: NDArray[np.float64],
+        neighbour: NDArray[np.int64],
+    ) -> int: ...
+    @property
+    def slots(self) -> NDArray[np.int64]: ...
+    @property
+    def slot_normals(self) -> NDArray[np.float64]: ...

@@ -1,0 +1,172 @@
+/* The hot sums: fields of point charges and of quadrupole cells; lengths in nm, charges in e, fields q r/r^3 in e/nm^2.
+ *
+ * Two ways round: `group_*` puts 32 targets into the vector lanes and goes through the sources one by one (a sweep),
+ * `point_*` puts the sources into 8 lanes for one target (a flight). The lanes are fixed and nothing is contracted or
+ * reassociated (-ffp-contract=off), so the bits are the same for SSE2, AVX2 and AVX-512.
+ */
+#ifndef APT_EVAP_PAIR_H
+#define APT_EVAP_PAIR_H
+
+#include <math.h>
+#include <string.h>
+
+/* musl and macOS have no ifunc, and GCC before 12 does not know these levels: there the baseline of the build serves. */
+#if defined(__GNUC__) && !defined(__clang__) && __GNUC__ >= 12 && defined(__x86_64__) && defined(__GLIBC__)
+#define APT_CLONES __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default"), unused))
+#elif defined(__GNUC__)
+#define APT_CLONES __attribute__((unused))
+#else
+#define APT_CLONES
+#endif
+
+#define GROUP 32          /* targets of one group: two or four AVX-512 registers a coordinate */
+#define CELL 10           /* numbers of one cell: centre x y z, charge, quadrupole xx xy xz yy yz zz */
+#define LANES 8           /* sources of one point sum: an AVX-512 register of doubles */
+#define SAME_PLACE 1e-12  /* [nm^2] below this a source is the target itself; atoms are 0.2 nm apart */
+
+#define REAL float
+#define REAL_SQRT sqrtf
+#define GROUP_NAME(name) name##_single
+#include "kernels_group.h"
+#undef REAL
+#undef REAL_SQRT
+#undef GROUP_NAME
+#define REAL double
+#define REAL_SQRT sqrt
+#define GROUP_NAME(name) name##_double
+#include "kernels_group.h"
+#undef REAL
+#undef REAL_SQRT
+#undef GROUP_NAME
+
+/* Adds the field of n point charges at (px, py, pz) to field[3]. */
+APT_CLONES static void point_atoms(long n, const double *restrict x, const double *restrict y, const double *restrict z,
+                                   const double *restrict q, double px, double py, double pz, double *restrict field)
+{
+    double ex[LANES] = {0}, ey[LANES] = {0}, ez[LANES] = {0};
+    for (long k = 0; k + LANES <= n; k += LANES) {
+#pragma omp simd
+        for (int l = 0; l < LANES; l++) {
+            const double dx = px - x[k + l], dy = py - y[k + l], dz = pz - z[k + l];
+            const double s = dx * dx + dy * dy + dz * dz;
+            const double w = s > SAME_PLACE ? q[k + l] / (s * sqrt(s)) : 0.0;
+            ex[l] += w * dx;
+            ey[l] += w * dy;
+            ez[l] += w * dz;
+        }
+    }
+    for (long k = n - n % LANES; k < n; k++) {
+        const double dx = px - x[k], dy = py - y[k], dz = pz - z[k];
+        const double s = dx * dx + dy * dy + dz * dz;
+        const double w = s > SAME_PLACE ? q[k] / (s * sqrt(s)) : 0.0;
+        ex[k % LANES] += w * dx;
+        ey[k % LANES] += w * dy;
+        ez[k % LANES] += w * dz;
+    }
+    for (int l = 0; l < LANES; l++) {
+        field[0] += ex[l];
+        field[1] += ey[l];
+        field[2] += ez[l];
+    }
+}
+
+/* Adds the field of n cells at (px, py, pz) to field[3]; c holds CELL rows of `stride` numbers, n a multiple of LANES
+ * (the caller fills up with cells of no charge). */
+APT_CLONES static void point_cells(long n, long stride, const double *restrict c, double px, double py, double pz,
+                                   double *restrict field)
+{
+    const double *restrict x = c, *restrict y = c + stride, *restrict z = c + 2 * stride, *restrict q = c + 3 * stride;
+    const double *restrict xx = c + 4 * stride, *restrict xy = c + 5 * stride, *restrict xz = c + 6 * stride;
+    const double *restrict yy = c + 7 * stride, *restrict yz = c + 8 * stride, *restrict zz = c + 9 * stride;
+    double ex[LANES] = {0}, ey[LANES] = {0}, ez[LANES] = {0};
+    for (long k = 0; k < n; k += LANES) {
+#pragma omp simd
+        for (int l = 0; l < LANES; l++) {
+            const long j = k + l;
+            const double dx = px - x[j], dy = py - y[j], dz = pz - z[j];
+            const double w2 = 1.0 / (dx * dx + dy * dy + dz * dz);
+            const double w3 = w2 * sqrt(w2), w5 = w3 * w2;
+            const double gx = xx[j] * dx + xy[j] * dy + xz[j] * dz;
+            const double gy = xy[j] * dx + yy[j] * dy + yz[j] * dz;
+            const double gz = xz[j] * dx + yz[j] * dy + zz[j] * dz;
+            const double radial = q[j] * w3 + 2.5 * w5 * w2 * (gx * dx + gy * dy + gz * dz);
+            ex[l] += radial * dx - w5 * gx;
+            ey[l] += radial * dy - w5 * gy;
+            ez[l] += radial * dz - w5 * gz;
+        }
+    }
+    for (int l = 0; l < LANES; l++) {
+        field[0] += ex[l];
+        field[1] += ey[l];
+        field[2] += ez[l];
+    }
+}
+
+/* The sums of a patch of some 300 atoms are in single precision, its coordinates relative to the hole. Rows have a
+ * length that is a multiple of PATCH_LANES, filled up with atoms of no charge: four registers wide, or the additions of
+ * a dot product wait for one another. */
+#define PATCH_LANES 64
+
+/* One row of the Robin matrix: row[k] = n . (p - r_k)/|p - r_k|^3 for the atom at p with normal n. */
+APT_CLONES static void patch_row(long n, const float *restrict x, const float *restrict y, const float *restrict z,
+                                 float px, float py, float pz, const double *normal, float *restrict row)
+{
+    const float nx = (float)normal[0], ny = (float)normal[1], nz = (float)normal[2];
+#pragma omp simd
+    for (long k = 0; k < n; k++) {
+        const float dx = px - x[k], dy = py - y[k], dz = pz - z[k];
+        const float s = dx * dx + dy * dy + dz * dz;
+        row[k] = s > (float)SAME_PLACE ? (nx * dx + ny * dy + nz * dz) / (s * sqrtf(s)) : 0.0f;
+    }
+}
+
+/* Dot product in PATCH_LANES fixed partial sums. */
+APT_CLONES static float patch_dot(long n, const float *restrict a, const float *restrict b)
+{
+    float sum[PATCH_LANES] = {0}, s[16];
+    for (long k = 0; k < n; k += PATCH_LANES) {
+#pragma omp simd
+        for (int l = 0; l < PATCH_LANES; l++)
+            sum[l] += a[k + l] * b[k + l];
+    }
+#pragma omp simd
+    for (int l = 0; l < 16; l++)
+        s[l] = (sum[l] + sum[16 + l]) + (sum[32 + l] + sum[48 + l]);
+    return (((s[0] + s[8]) + (s[4] + s[12])) + ((s[2] + s[10]) + (s[6] + s[14])))
+         + (((s[1] + s[9]) + (s[5] + s[13])) + ((s[3] + s[11]) + (s[7] + s[15])));
+}
+
+/* Adds the field of the patch's n charges q on m targets, all relative to the hole; m is a multiple of GROUP. Targets are
+ * in the lanes: with the sources there, the sum over the lanes takes longer than the terms. The start of the sums is
+ * read and each source has names of its own, or GCC 12 turns the lanes into scalars (16 times slower). */
+APT_CLONES static void patch_field(long m, const float *restrict targets_x, const float *restrict targets_y,
+                                   const float *restrict targets_z, long n, const float *restrict x,
+                                   const float *restrict y, const float *restrict z, const float *restrict q,
+                                   float *restrict field_x, float *restrict field_y, float *restrict field_z)
+{
+    for (long k = 0; k < m; k += GROUP) {
+        float tx[GROUP], ty[GROUP], tz[GROUP], ex[GROUP], ey[GROUP], ez[GROUP];
+        memcpy(tx, targets_x + k, sizeof tx);
+        memcpy(ty, targets_y + k, sizeof ty);
+        memcpy(tz, targets_z + k, sizeof tz);
+        memcpy(ex, field_x + k, sizeof ex);
+        memcpy(ey, field_y + k, sizeof ey);
+        memcpy(ez, field_z + k, sizeof ez);
+        for (long i = 0; i < n; i++) {
+            const float sx = x[i], sy = y[i], sz = z[i], charge = q[i];
+#pragma omp simd
+            for (int l = 0; l < GROUP; l++) {
+                const float dx = tx[l] - sx, dy = ty[l] - sy, dz = tz[l] - sz;
+                const float s = dx * dx + dy * dy + dz * dz;
+                const float w = s > (float)SAME_PLACE ? charge / (s * sqrtf(s)) : 0.0f;
+                ex[l] += w * dx;
+                ey[l] += w * dy;
+                ez[l] += w * dz;
+            }
+        }
+        memcpy(field_x + k, ex, sizeof ex);
+        memcpy(field_y + k, ey, sizeof ey);
+        memcpy(field_z + k, ez, sizeof ez);
+    }
+}
+#endif

@@ -1,0 +1,260 @@
+"""What the ions of a run say about the shape of the cap and the way to the detector."""
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import least_squares
+
+from apt_evap._common.types import Floats
+from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence
+from apt_evap.detection.projection import Projection
+from apt_evap.emission.perturbations import Unperturbed
+from apt_evap.simulation.run import Run
+
+_CAP = math.radians(45)  # launch sites nearer to the axis than this make the sphere: the shank is far
+_NEAR = math.radians(20)  # about the apex, for its field
+_BIN = 2.0  # degrees
+_LEAST_IONS = 30  # for the median of a bin
+_INNER = 15.0  # degrees: nearer to the axis a pole there pushes its ions outwards
+_TOLERANCE = 0.05  # share by which the median of a bin may differ from the fit
+
+
+class Cap(NamedTuple):
+    """Sphere through the launch sites of some ions in a row."""
+
+    first: int
+    """The first of the ions."""
+    last: int
+    """One beyond the last of them."""
+    centre: np.ndarray
+    """Its centre [nm], shape (3,)."""
+    radius: float
+    """Its radius [nm]."""
+
+
+class ImageCompression(NamedTuple):
+    """Angle on the specimen over the angle on the detector, and where this is one number."""
+
+    compression: float
+    """Median over all ions between 15 degrees and `valid_to`."""
+    scatter: float
+    """Half the width of the middle 68 % of the single ions."""
+    valid_from: float
+    """Smallest angle from which on the medians of the bins are within 5 % of `compression` [degrees]."""
+    valid_to: float
+    """Largest angle up to which they are [degrees]."""
+    angles: np.ndarray
+    """Centres of bins of the angle on the specimen [degrees], shape (n,)."""
+    detector_angles: np.ndarray
+    """Median of the angle on the detector in each bin [degrees], shape (n,)."""
+    projection: Projection
+    """The projection of the run onto its detector, for overlays of poles."""
+
+
+def fit_caps(run: Run, windows: int | None = None) -> tuple[Cap, ...]:
+    """Fit a sphere to the launch sites of each of several windows of a run.
+
+    The cap recedes and changes its radius as it evaporates; angles on the specimen make sense only about the centre
+    that it has at that time.
+
+    Parameters
+    ----------
+    run : Run
+        The ions.
+    windows : int, optional
+        Into how many windows the ions are cut; by default ten, but less if they would have less than 500 ions each.
+
+    Returns
+    -------
+    tuple of Cap
+
+    Raises
+    ------
+    ValueError
+        If a window has too few ions near the axis (50).
+    """
+    n = len(check_kind(run, "run", "hits", "a Run"))
+    windows = min(10, max(1, n // 500)) if windows is None else check_count(windows, "windows", at_least=1)
+    edges = np.linspace(0, n, windows + 1).astype(int)
+    caps = []
+    for first, last in pairwise(edges):
+        sites = run.emissions.positions[first:last]
+        centre, radius = np.zeros(3), None
+        for _ in range(3):  # the sites on the cap change with its centre
+            from_centre = sites - centre
+            near = np.arctan2(np.hypot(from_centre[:, 0], from_centre[:, 1]), from_centre[:, 2]) < _CAP
+            if np.count_nonzero(near) < 50:
+                raise ValueError(f"a window of ions must have 50 near the axis, got {np.count_nonzero(near)}")
+            centre, radius = _sphere(sites[near], centre, radius)
+        caps.append(Cap(int(first), int(last), centre, radius))
+    return tuple(caps)
+
+
+def image_compression(run: Run, caps: Sequence[Cap] | None = None) -> ImageCompression:
+    """Read the image compression of a run from its unperturbed hits.
+
+    Parameters
+    ----------
+    run : Run
+        The ions; unperturbed hits must have been flown or follow from its responses.
+    caps : sequence of Cap, optional
+        Spheres about whose centres the angles on the specimen are; by default those of `fit_caps`.
+
+    Returns
+    -------
+    ImageCompression
+
+    Raises
+    ------
+    ValueError
+        If there are too few ions to fit.
+
+    Notes
+    -----
+    theta_detector = theta_crystal / compression (Gault et al., Atom Probe Microscopy, ch. 7). The median over all
+    azimuths stands against what poles and zone lines do to their surroundings; within some 15 degrees of a pole on the
+    axis all ions are pushed outwards, so that these do not count.
+    """
+    hits = check_kind(run, "run", "hits", "a Run").hits(Unperturbed())
+    crystal = np.empty(len(run))
+    for cap in _caps_of(run, caps):
+        from_centre = run.emissions.positions[cap.first : cap.last] - cap.centre
+        across = np.hypot(from_centre[:, 0], from_centre[:, 1])
+        crystal[cap.first : cap.last] = np.degrees(np.arctan2(across, from_centre[:, 2]))
+    radius = np.hypot(hits.x, hits.y)
+    seen = hits.detected
+    # to the corners the square detector shows only some azimuths
+    seen &= radius <= run.detector.width / 2
+    plane = run.detector.projection == "plane"
+    detector = np.degrees(np.arctan(radius / run.detector.distance) if plane else radius / run.detector.distance)
+    number = np.floor(crystal / _BIN).astype(int)
+    # at the rim of the detector only the ions that come in below the average are left
+    whole = [np.mean(seen[number == index]) > 0.99 for index in range(int(90 / _BIN)) if (number == index).any()]
+    last = len(whole) if all(whole) else whole.index(False)
+    bins = [index for index in range(last) if np.count_nonzero(seen & (number == index)) >= _LEAST_IONS]
+    angles = (np.array(bins) + 0.5) * _BIN
+    medians = np.array([np.median(detector[seen & (number == index)]) for index in bins])
+    outer = angles > _INNER
+    if np.count_nonzero(outer) < 3:
+        raise ValueError(
+            f"an image compression needs {_LEAST_IONS} ions in each of 3 bins of {_BIN:g} degrees beyond {_INNER:g}, "
+            f"there are {np.count_nonzero(outer)} such bins"
+        )
+    compression = float(np.median(angles[outer] / medians[outer]))
+    for _ in range(5):  # the range of validity and the median over its ions depend on each other
+        good = np.abs(angles / medians / compression - 1) <= _TOLERANCE
+        low, high = _stretch(angles, good)
+        chosen = seen & (crystal >= max(low, _INNER)) & (crystal < high)
+        ratio = crystal[chosen] / detector[chosen]
+        compression = float(np.median(ratio))
+    scatter = float(np.diff(np.percentile(ratio, [16, 84]))[0] / 2)
+    projection = Projection(run.detector.distance / compression, compression=compression if plane else None)
+    return ImageCompression(compression, scatter, low, high, angles, medians, projection)
+
+
+def field_factor(voltage: ArrayLike, field: ArrayLike, radius: ArrayLike) -> Any:
+    """Field factor k_f of a specimen, in F = V / (k_f R).
+
+    Parameters
+    ----------
+    voltage : float or array_like
+        Applied voltage [V].
+    field : float or array_like
+        Field at the apex [V/nm]; of a measurement the evaporation field of the material.
+    radius : float or array_like
+        Radius of the apex [nm].
+
+    Returns
+    -------
+    float or ndarray
+        1 for a free sphere; 2 to 8 are found for specimens on a shank in front of an electrode.
+
+    Raises
+    ------
+    ValueError
+        If a value is not above 0.
+
+    Notes
+    -----
+    Gomer, Field Emission and Field Ionization (1961).
+    """
+    values = []
+    for name, value in (("voltage", voltage), ("field", field), ("radius", radius)):
+        shape = tuple(f"n{axis}" for axis in range(np.ndim(value)))
+        values.append(check_array(value, name, shape) if shape else np.float64(check_number(value, name, above=0)))
+        if np.size(value) and values[-1].min() <= 0:
+            raise ValueError(f"{name} must be above 0, got {values[-1].min():g}")
+    factor = values[0] / (values[1] * values[2])
+    return float(factor) if factor.ndim == 0 else factor
+
+
+def run_field_factor(run: Run, caps: Sequence[Cap] | None = None) -> Floats:
+    """Read the field factor of a run from the fields at which its ions left.
+
+    Parameters
+    ----------
+    run : Run
+        The ions.
+    caps : sequence of Cap, optional
+        Spheres whose radii are those of the apex; by default those of `fit_caps`.
+
+    Returns
+    -------
+    ndarray
+        The factor of each of the caps, shape (n,): V over the radius and the median field of the atoms within 20
+        degrees of the axis just before they left. These sit at the edges of terraces, where the field is higher than
+        the mean over the cap, so that the factor is smaller than one from the mean field.
+
+    Raises
+    ------
+    ValueError
+        If no ion of a cap left near the axis.
+    """
+    factors = []
+    for cap in _caps_of(run, caps):
+        from_centre = run.emissions.positions[cap.first : cap.last] - cap.centre
+        near = np.arctan2(np.hypot(from_centre[:, 0], from_centre[:, 1]), from_centre[:, 2]) < _NEAR
+        if not near.any():
+            raise ValueError(f"no ion from {cap.first} to {cap.last} left within 20 degrees of the axis")
+        factors.append(field_factor(run.voltage, np.median(run.fields[cap.first : cap.last][near]), cap.radius))
+    return np.array(factors)
+
+
+def _caps_of(run, caps):
+    """The caps given, or those of `fit_caps`."""
+    if caps is None:
+        return fit_caps(run)
+    check_kind(run, "run", "hits", "a Run")
+    caps = check_sequence(caps, "caps", "Cap, as fit_caps gives them")
+    return [check_kind(cap, "caps", Cap, "a sequence of Cap, as fit_caps gives them") for cap in caps]
+
+
+def _sphere(points, centre, radius):
+    """Centre and radius of the sphere nearest to points, outliers counted linearly."""
+    radius = float(np.median(np.linalg.norm(points - centre, axis=1))) if radius is None else radius
+    fit = least_squares(
+        lambda unknowns: np.linalg.norm(points - unknowns[:3], axis=1) - unknowns[3],
+        np.append(centre, radius),
+        jac=lambda unknowns: np.column_stack([_towards(unknowns[:3], points), -np.ones(len(points))]),
+        loss="soft_l1",
+        f_scale=0.01 * radius,
+        x_scale=radius,
+    )
+    return fit.x[:3], float(fit.x[3])
+
+
+def _towards(centre, points):
+    """Unit vectors from points to a centre, shape (n, 3)."""
+    step = centre - points
+    return step / np.linalg.norm(step, axis=1)[:, None]
+
+
+def _stretch(angles, good):
+    """Ends of the longest stretch of good bins [degrees]."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(int), [0]])))
+    first, last = max(zip(edges[::2], edges[1::2], strict=True), key=lambda pair: pair[1] - pair[0])
+    return float(angles[first] - _BIN / 2), float(angles[last - 1] + _BIN / 2)

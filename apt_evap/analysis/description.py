@@ -1,0 +1,161 @@
+"""What a run, a file of ions or a map holds, in plain types."""
+
+from typing import Any
+
+import numpy as np
+
+from apt_evap.detection.binning import find_combs
+from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.detection.hits import Hits
+from apt_evap.simulation.run import Run
+
+UNITS = {
+    "x": "mm",
+    "y": "mm",
+    "time_of_flight": "ns",
+    "voltage": "V",
+    "pulse_voltage": "V",
+    "mass_to_charge": "Da",
+    "position_x": "nm",
+    "position_y": "nm",
+    "position_z": "nm",
+    "detector_extent": "mm",
+    "detector_quantum": "mm",
+    "bin_size": "mm",
+    "distance": "mm",
+    "width": "mm",
+    "field_before_leaving": "V/nm",
+    "energy_limit": "eV",
+    "median_residual": "mm",
+    "marked_above": "mm",
+    "apex_radius": "nm",
+    "shank_length": "nm",
+    "shank_angle": "degrees",
+    "rotation": "degrees",
+    "origin": "nm",
+    "depth": "nm",
+    "a": "nm",
+    "c": "nm",
+    "evaporation_field": "V/nm",
+    "charge_state": "e",
+    "mass": "Da",
+    "polarizability": "F m^2",
+}
+"""Units of what `describe` gives, by key."""
+
+
+_MEASURED = ("x", "y", "time_of_flight", "voltage", "pulse_voltage", "mass_to_charge", "positions", "pulse_id")
+
+
+def describe(held: Run | Hits | DetectorMap) -> dict[str, Any]:
+    """Say what a run, ions or a map hold.
+
+    Parameters
+    ----------
+    held : Run or Hits or DetectorMap
+        What `apt_evap.read` gives.
+
+    Returns
+    -------
+    dict
+        Plain types, what `apt-evap info` prints; a pair is the least and the greatest value. Units are in `UNITS`.
+    """
+    if isinstance(held, DetectorMap):
+        return _of_map(held)
+    return _of_run(held) if isinstance(held, Run) else _of_hits(held)
+
+
+def _of_map(held):
+    x_min, x_max, y_min, y_max = held.extent
+    return {
+        "kind": "detector map of counts" if held.is_counts else "detector map of densities",
+        "ions": held.ions,
+        "bins": list(held.values.shape[::-1]),
+        "bin_size": [_plain(size) for size in held.bin_size],
+        "x": [_plain(x_min), _plain(x_max)],
+        "y": [_plain(y_min), _plain(y_max)],
+        "values": _extent(held.values[held.mask]),
+        "share_inside_mask": _plain(np.mean(held.mask)),
+    }
+
+
+def _of_run(run):
+    summary = run.summary()
+    responses = None
+    if run.responses is not None:
+        settings, residuals = run.response_settings, run.responses.residuals[np.isfinite(run.responses.residuals)]
+        responses = {
+            "energy_limit": settings.energy_limit,
+            "median_residual": _plain(np.median(residuals)) if len(residuals) else None,
+            "marked_above": settings.bound,
+            "marked": summary["marked"],
+        }
+    return {
+        "kind": "simulated run",
+        "version": run.provenance.get("version"),
+        "created": run.provenance.get("created"),
+        "config": run.provenance.get("config"),
+        "ended": run.ended or "as planned",
+        "voltage": run.voltage,
+        "seed": run.seed,
+        "tip": _tip(run.settings["tip"]),
+        "detector": {"distance": run.detector.distance, "width": run.detector.width},
+        "ions": len(run),
+        "species": {name: int((run.species == index).sum()) for index, name in enumerate(run.elements)},
+        "field_before_leaving": _extent(run.fields),
+        "outcomes": {key: summary[key] for key in ("perturbation", "hit", "missed", "never_left")},
+        "without_neighbour_to_roll_onto": summary["without_neighbour"],
+        "perturbations_flown": [str(each["repr"] if isinstance(each, dict) else each) for each in run.perturbations],
+        "responses": responses,
+    }
+
+
+def _tip(settings):
+    """Settings of a tip that are given, without the sources of the materials."""
+    told = {key: value for key, value in settings.items() if value not in (None, [], {})}
+    if "material" in told:
+        host = told["material"].items()
+        told["material"] = {key: value for key, value in host if value is not None and key != "sources"}
+    if "solutes" in told:
+        told["solutes"] = {solute["name"]: fraction for solute, fraction in told["solutes"]}
+    if "elements" in told:
+        told["elements"] = [element["name"] for element in told["elements"]]
+    return told
+
+
+def _of_hits(hits):
+    columns = {}
+    for name in hits.columns:
+        values = getattr(hits, name)
+        parts = (
+            {name: values} if values.ndim == 1 else {f"position_{axis}": values[:, k] for k, axis in enumerate("xyz")}
+        )
+        columns |= {key: _extent(part) for key, part in parts.items()}
+    detected = hits.detected
+    measured = hits.outcome is None
+    told = {"kind": "measured ions" if measured else hits.source, "ions": len(hits)}
+    told |= {"detected": int(np.count_nonzero(detected)), "columns": columns}
+    if measured:
+        told["absent_or_zero_throughout"] = [
+            name for name in _MEASURED if name not in hits.columns or not np.any(getattr(hits, name))
+        ]
+    if hits.x is not None and hits.y is not None and detected.any():
+        x, y = hits.x[detected], hits.y[detected]
+        told["detector_extent"] = [_plain(np.ptp(x)), _plain(np.ptp(y))]
+        combs = find_combs(x, y)
+        told["detector_quantum"] = None if combs is None else [_plain(comb.spacing) for comb in combs]
+    if hits.multiplicity is not None:
+        told["multi_hit_share"] = _plain(np.mean(hits.multiplicity > 1))
+        told["largest_multi_hit"] = int(hits.multiplicity.max())
+    return told
+
+
+def _extent(values):
+    """Least and greatest of the finite values, None if there are none."""
+    finite = values[np.isfinite(values)]
+    return [_plain(finite.min()), _plain(finite.max())] if len(finite) else None
+
+
+def _plain(value):
+    """A number for people: whole ones as they are, others with six digits."""
+    return int(value) if isinstance(value, np.integer) else float(f"{value:.6g}")

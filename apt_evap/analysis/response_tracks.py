@@ -1,0 +1,118 @@
+"""Where chosen ions of a run land as their launch energy and direction change."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from apt_evap._common.validation import check_array, check_kind
+from apt_evap.emission.emissions import Emissions
+from apt_evap.emission.surface_frame import rollup_direction
+from apt_evap.flight.response import unflattened
+from apt_evap.simulation.run import Run
+from apt_evap.units import speed_from_energy
+
+
+class Tracks(NamedTuple):
+    """Places on the detector of n chosen ions at m energies, and at k directions where there are any."""
+
+    x: np.ndarray
+    """[mm], shape (n, m) or (n, m, k); NaN for an ion that flies away from the detector."""
+    y: np.ndarray
+    """[mm], same shape."""
+    energies: np.ndarray
+    """Launch energies [eV], shape (m,)."""
+
+
+def lateral_tracks(run: Run, ions: ArrayLike, energies: ArrayLike, azimuths: ArrayLike | None = None) -> Tracks:
+    """Places of chosen ions that start from their sites, for every energy and every direction along the surface.
+
+    Parameters
+    ----------
+    run : Run
+        A run with responses.
+    ions : array_like of int
+        Which ions of the run, by their place in it, shape (n,).
+    energies : array_like
+        Launch energies [eV], shape (m,), at most the `energy_limit` of the responses.
+    azimuths : array_like, optional
+        Directions, from t1 to t2 of `tangent_frame` [degrees], shape (k,); by default 72 even ones.
+
+    Returns
+    -------
+    Tracks
+        Of shape (n, m, k).
+
+    Raises
+    ------
+    ValueError
+        If the run has no responses, or ions or energies are out of range.
+    """
+    ions, energies = _check(run, ions, energies)
+    azimuths = np.arange(0, 360, 5) if azimuths is None else check_array(azimuths, "azimuths", ("k",))
+    azimuths = np.radians(azimuths)
+    shape = (len(ions), len(energies), len(azimuths))
+    speeds = speed_from_energy(energies, run.emissions.masses[ions][:, None])[:, :, None]
+    velocities = np.stack([speeds * np.cos(azimuths), speeds * np.sin(azimuths)], axis=-1)
+    return Tracks(*_places(run, ions, velocities, run.response_settings.site, run.responses.site, shape), energies)
+
+
+def rollup_tracks(run: Run, ions: ArrayLike, energies: ArrayLike) -> Tracks:
+    """Places of chosen ions that roll up, for every energy; NaN for an ion without a neighbour.
+
+    Parameters
+    ----------
+    run : Run
+        A run with responses.
+    ions : array_like of int
+        Which ions of the run, by their place in it, shape (n,).
+    energies : array_like
+        Launch energies [eV], shape (m,), at most the `energy_limit` of the responses.
+
+    Returns
+    -------
+    Tracks
+        Of shape (n, m).
+
+    Raises
+    ------
+    ValueError
+        If the run has no responses, or ions or energies are out of range.
+    """
+    ions, energies = _check(run, ions, energies)
+    rolls, first, second = rollup_direction(_chosen(run.emissions, ions))
+    speeds = speed_from_energy(energies, run.emissions.masses[ions][:, None])
+    velocities = np.stack([speeds * first[:, None], speeds * second[:, None]], axis=-1)
+    shape = (len(ions), len(energies))
+    x, y = _places(run, ions, velocities, run.response_settings.rolled, run.responses.rolled, shape)
+    x[~rolls] = y[~rolls] = np.nan
+    return Tracks(x, y, energies)
+
+
+def _chosen(emissions, ions):
+    """The emissions of some ions only."""
+    names = ("positions", "normals", "neighbours", "charge_states", "masses", "ions")
+    columns = {name: getattr(emissions, name)[ions] for name in names}
+    return Emissions(**columns, nearest_neighbour_distance=emissions.nearest_neighbour_distance)
+
+
+def _check(run, ions, energies):
+    if check_kind(run, "run", Run, "a Run").responses is None:
+        raise ValueError(f"tracks need the responses of the ions, {run!r} has none: run it with responses=True")
+    ions = check_array(ions, "ions", ("n",), dtype=np.int64)
+    if len(ions) == 0 or ions.min() < 0 or ions.max() >= len(run):
+        raise ValueError(f"ions must be places in the run, 0 to {len(run) - 1}, got {ions}")
+    energies = check_array(energies, "energies", ("m",))
+    limit = run.response_settings.energy_limit
+    if len(energies) == 0 or energies.min() < 0 or energies.max() > limit:
+        raise ValueError(f"energies must be 0 to {limit:g} eV, the limit of the responses, got {energies}")
+    return ions, energies
+
+
+def _places(run, ions, velocities, design, coefficients, shape):
+    """Places on the detector [mm] of launches along the surface [nm/ns] of shape (..., 2)."""
+    repeats = int(np.prod(shape[1:]))
+    reduced = run.response_settings.reduced(velocities.reshape(-1, 2), np.repeat(run.emissions.masses[ions], repeats))
+    values = design.evaluate(np.repeat(coefficients[ions], repeats, axis=0), reduced)
+    x, y, *_ = run.detector.impacts(*unflattened(values))
+    return x.reshape(shape), y.reshape(shape)

@@ -1,0 +1,233 @@
+"""The width of a zone line from a profile across it, and two profiles compared."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import approx_fprime, curve_fit
+from scipy.stats import chi2
+
+from apt_evap._common.types import Floats
+from apt_evap._common.validation import check_kind, check_number
+from apt_evap.analysis.profiles import Profile
+
+EXPONENTS = 1.0, 12.0  # of a fitted line: from one that comes to a point to one that is all but a box
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
+
+
+@dataclass(frozen=True)
+class ZoneLine:
+    """A line on a linear background, fitted to a profile by `fit_zone_line`.
+
+    Parameters
+    ----------
+    centre, width : float
+        Where the line is, and its full width at half height [mm].
+    height : float
+        Density at its centre above the background, in units of the profile: above 0 for an enhanced line, below 0 for
+        a depleted one.
+    background : float
+        Density of the background at the centre.
+    slope : float
+        Slope of the background [1/mm].
+    exponent : float
+        2 for a Gaussian, more for a line that is flat in its middle.
+    centre_error, width_error, height_error, background_error, exponent_error : float
+        Standard deviations; 0 for an exponent that was given.
+    chi_square : float
+        Sum of the squared misfits in units of their errors; NaN for a profile without errors.
+    degrees_of_freedom : int
+        Bins less the numbers fitted.
+    """
+
+    centre: float
+    width: float
+    height: float
+    background: float
+    slope: float
+    exponent: float
+    centre_error: float
+    width_error: float
+    height_error: float
+    background_error: float
+    exponent_error: float
+    chi_square: float
+    degrees_of_freedom: int
+
+    @property
+    def kind(self) -> str:
+        """The word "enhanced" or "depleted"."""
+        return "enhanced" if self.height > 0 else "depleted"
+
+    def density(self, position: ArrayLike) -> Floats:
+        """Density of the line and its background at some positions [mm], in units of the profile, any shape."""
+        away = np.asarray(position, float) - self.centre
+        return self.background + self.slope * away + self.height * _shape(away, self.width, self.exponent)
+
+    def __str__(self):
+        return f"{self.kind}, {self.width:.2f} ± {self.width_error:.2f} mm wide at {self.centre:+.2f} mm"
+
+
+def fit_zone_line(profile: Profile, *, exponent: float = 2.0) -> ZoneLine:
+    r"""Fit a dip or a peak on a linear background to a profile across a zone line.
+
+    Parameters
+    ----------
+    profile : Profile
+        Profile of at least 8 bins.
+    exponent : float, optional
+        Shape of the line, 1 to 12: 2 is a Gaussian. None fits it too, for lines that are flat in their middle, such as
+        dark ones without any hits there; it takes some hundred hits in a bin.
+
+    Returns
+    -------
+    ZoneLine
+
+    Raises
+    ------
+    ValueError
+        If there are too few bins, or no line between the edges of the profile that is wider than half a bin and
+        narrower than the profile.
+
+    Notes
+    -----
+    The density at the distance u from the centre is
+
+    .. math:: b + c u + h \, 2^{-|2 u / w|^p}
+
+    with the width w, the height h and the exponent p; it is averaged over each bin. All bins weigh the same: weights by
+    the errors of counting would make the few hits at the bottom of a dark line decide its width. The errors of the
+    parameters are those that the errors sigma of the bins propagate to, with the covariance P diag(sigma^2) P^T and P
+    the pseudoinverse of the derivatives of the model; without errors of the bins, they follow from the scatter around
+    the fit. A `chi_square` well above `degrees_of_freedom` says that the line is not of this shape; the width then
+    depends on how wide the profile is.
+    """
+    good = np.isfinite(check_kind(profile, "profile", Profile, "a Profile").density)
+    position, density, error = (np.asarray(column)[good] for column in profile)
+    if len(position) < 8:
+        raise ValueError(f"a profile must have at least 8 bins to fit a line, got {len(position)}")
+    if exponent is not None:
+        exponent = check_number(exponent, "exponent", at_least=EXPONENTS[0], at_most=EXPONENTS[1])
+    bin_width = float(np.median(np.diff(position)))
+    span = float(position[-1] - position[0]) + bin_width
+
+    def model(position, centre, width, height, background, slope, exponent=exponent):
+        line = _mean_shape(position - centre, width, exponent, bin_width)
+        return background + slope * (position - centre) + height * line
+
+    start = [*_best_of_grid(position, density, exponent or 2.0, bin_width, span), *([3.0] if exponent is None else [])]
+    lowest = [position[0], bin_width / 2, -np.inf, -np.inf, -np.inf, EXPONENTS[0]][: len(start)]
+    highest = [position[-1], span, np.inf, np.inf, np.inf, EXPONENTS[1]][: len(start)]
+    missing = f"the profile of {len(position)} bins over {span:g} mm shows no line"
+    try:
+        found, covariance = curve_fit(model, position, density, start, bounds=(lowest, highest))
+    except RuntimeError as failure:
+        raise ValueError(f"{missing}: {failure}") from failure
+    at_edge = [np.isclose(found[:2], edge[:2], atol=1e-6 * span) for edge in (lowest, highest)]
+    if np.any(at_edge) or not np.isfinite(covariance).all():
+        raise ValueError(f"{missing}: the fit ran to {found[1]:.3g} mm wide at {found[0]:.3g} mm")
+    if np.isfinite(error).all():
+        change = np.linalg.pinv(approx_fprime(found, lambda values: model(position, *values)))
+        covariance = (change * error**2) @ change.T
+    names = ("centre", "width", "height", "background", "slope", "exponent")
+    values = {"exponent": exponent} | dict(zip(names, found.tolist(), strict=False))
+    errors = {"exponent": 0.0} | dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=False))
+    fitted = model(position, *found)
+    misfit = (density - fitted) / _errors_of(fitted, density, error)
+    return ZoneLine(
+        **values,
+        **{f"{name}_error": errors[name] for name in names if name != "slope"},
+        chi_square=float(misfit @ misfit),
+        degrees_of_freedom=len(position) - len(found),
+    )
+
+
+def _shape(away, width, exponent):
+    """1 at the centre, 1/2 at half the width from it."""
+    return 0.5 ** (np.abs(2 * away / width) ** exponent)
+
+
+def _mean_shape(away, width, exponent, bin_width):
+    """The shape averaged over bins that lie `away` from its centre, by Gauss's quadrature."""
+    return _shape(away[:, None] + bin_width / 2 * _NODES, width, exponent) @ _WEIGHTS / 2
+
+
+def _best_of_grid(position, density, exponent, bin_width, span):
+    """Centre, width, height, background and slope to start from: for each centre and width the rest is linear."""
+    best = (np.inf,)
+    for width in np.geomspace(bin_width, 0.9 * span, 8):
+        for centre in position[1:-1]:
+            away = position - centre
+            line = _mean_shape(away, width, exponent, bin_width)
+            columns = np.stack([line, np.ones_like(away), away], axis=1)
+            values, *_ = np.linalg.lstsq(columns, density, rcond=None)
+            misfit = density - columns @ values
+            best = min(best, (misfit @ misfit, centre, width, *values))
+    return best[1:]
+
+
+def _errors_of(expected, density, error):
+    """Counting errors of expected densities, by the hits per unit of density that density and error tell."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        hits_per_density = np.where(density > 0, density / error**2, 1 / error)
+    return np.sqrt(np.maximum(expected * hits_per_density, 1)) / hits_per_density
+
+
+class ProfileComparison(NamedTuple):
+    """Two profiles of one rectangle, each relative to its own mean."""
+
+    position: np.ndarray
+    """Centres of the bins, shape (bins,)."""
+    difference: np.ndarray
+    """Density of the first less that of the second, in units of its error, shape (bins,)."""
+    chi_square: float
+    """Sum of the squares of the differences."""
+    degrees_of_freedom: int
+    """Bins less one: both have the mean 1."""
+    probability: float
+    """Probability that the noise of counting alone makes a larger chi_square."""
+    relative: float
+    """Root mean square of the difference of the densities beyond what noise explains; 0 if noise explains all."""
+
+
+def compare_profiles(first: Profile, second: Profile) -> ProfileComparison:
+    """Compare two profiles bin by bin, in units of the errors.
+
+    Parameters
+    ----------
+    first, second : Profile
+        Profiles with the same bins and with errors: of hits, or of maps of counts.
+
+    Returns
+    -------
+    ProfileComparison
+
+    Raises
+    ------
+    ValueError
+        If bins differ, or a profile has no errors.
+    """
+    for name, profile in (("first", first), ("second", second)):
+        if not isinstance(profile, Profile):
+            raise ValueError(f"{name} must be a Profile, got {profile!r:.80}")
+        if not np.isfinite(profile.error).any():
+            raise ValueError(f"{name} must have errors, got a profile of densities: count hits instead")
+    if first.position.shape != second.position.shape or not np.allclose(first.position, second.position):
+        raise ValueError(
+            f"the profiles must have the same bins, got {len(first.position)} and {len(second.position)} "
+            f"around {first.position.mean():g} and {second.position.mean():g}"
+        )
+    difference = first.density - second.density
+    error = np.hypot(first.error, second.error)
+    pull = difference / error
+    chi_square, bins = float(np.nansum(pull**2)), int(np.isfinite(pull).sum())
+    beyond = np.nanmean(difference**2) - np.nanmean(error**2)
+    return ProfileComparison(
+        position=first.position,
+        difference=pull,
+        chi_square=chi_square,
+        degrees_of_freedom=bins - 1,
+        probability=float(chi2.sf(chi_square, bins - 1)),
+        relative=float(np.sqrt(max(beyond, 0.0))),
+    )

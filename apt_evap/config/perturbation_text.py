@@ -1,0 +1,81 @@
+"""Perturbations from a table or from text such as RollUp:0.155,0.155."""
+
+import tomllib
+from collections.abc import Mapping
+from typing import Any
+
+from apt_evap._common.validation import shown
+from apt_evap.config.tables import check_table
+from apt_evap.emission.energies import Fixed, Thermal, TruncatedNormal
+from apt_evap.emission.perturbations import Perturbation, from_dict
+
+
+def read_perturbation(settings: str | Mapping[str, Any]) -> Perturbation:
+    """Make a perturbation from a table with its name and parameters, or from text.
+
+    Parameters
+    ----------
+    settings : str or mapping
+        ``{"name": "RollUp", "energy": {"name": "TruncatedNormal", "mean": 0.3, "standard_deviation": 0.1}}``, where a
+        number as energy is the same for every ion [eV]; as text the name alone, ``"RollUp:0.2"`` for the same energy,
+        ``"RollUp:0.3,0.1"`` for a mean and a standard deviation [eV], ``"Combined:0.3,0.1,0.75"`` with the
+        rollup_fraction last, or the table as TOML writes it.
+
+    Returns
+    -------
+    perturbation
+
+    Raises
+    ------
+    ValueError
+        If a name is unknown, or a parameter is unknown, missing or out of its range.
+    """
+    if isinstance(settings, str):
+        try:
+            return read_perturbation(_perturbation_table(settings))
+        except ValueError as error:
+            raise ValueError(f"perturbation {settings!r}: {error}; an example is RollUp:0.155,0.155") from error
+    check_table(settings, "perturbation")
+    for table in (settings, *settings.values()):
+        if isinstance(table, Mapping) and not isinstance(table.get("name"), str):
+            raise ValueError(f"a perturbation or distribution must have a name, got {shown(dict(table))}")
+    perturbation = from_dict(settings)
+    if not callable(getattr(perturbation, "launch", None)):
+        raise ValueError(f"perturbation must be one, such as Unperturbed or RollUp, got {shown(dict(settings))}")
+    return perturbation
+
+
+def _perturbation_table(text):
+    """Table of a perturbation that is given as text."""
+    if text.lstrip().startswith("{"):
+        return tomllib.loads(f"perturbation = {text}")["perturbation"]
+    name, colon, numbers = text.partition(":")
+    if not colon:
+        return {"name": name}
+    try:
+        values = [float(number) for number in numbers.split(",")]
+    except ValueError:
+        raise ValueError(f"expected numbers with commas between them after the colon, got {numbers!r}") from None
+    share = {"rollup_fraction": values.pop()} if name == "Combined" else {}
+    if len(values) not in (1, 2):
+        expected = "1 or 2 numbers (an energy, or mean and standard deviation)"
+        raise ValueError(f"{name} takes {expected}{' and its share of roll-up' if share else ''}, got {numbers!r}")
+    normal = dict(zip(("name", "mean", "standard_deviation"), ("TruncatedNormal", *values), strict=False))
+    return {"name": name, "energy": values[0] if len(values) == 1 else normal, **share}
+
+
+def title_of(perturbation: Any) -> str:
+    """Title of a map of the ions of a perturbation (str), such as "roll-up, 0.155 ± 0.155 eV"."""
+    name = type(perturbation).__name__
+    words = {"Unperturbed": "unperturbed", "LateralVelocity": "lateral velocity", "RollUp": "roll-up"}
+    title = words.get(name, name)
+    if name == "Combined":
+        title = f"{perturbation.rollup_fraction:.3g} roll-up + {1 - perturbation.rollup_fraction:.3g} lateral"
+    energy = getattr(perturbation, "energy", None)
+    if isinstance(energy, Fixed):
+        return f"{title}, {energy.energy:g} eV"
+    if isinstance(energy, Thermal):
+        return f"{title}, {energy.temperature:g} K"
+    if isinstance(energy, TruncatedNormal):
+        return f"{title}, {energy.mean:g} ± {energy.standard_deviation:g} eV"
+    return title

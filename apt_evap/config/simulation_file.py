@@ -1,0 +1,238 @@
+"""Simulations from TOML files: every table and key is checked, and a wrong one is named with what was expected."""
+
+import inspect
+import re
+import tomllib
+from collections.abc import Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+from apt_evap._common.files import FileError, open_for_reading
+from apt_evap._common.validation import check_count, check_number, check_seed, shown
+from apt_evap.config.map_panels import MapSettings, read_maps
+from apt_evap.config.tables import check_keys, check_table
+from apt_evap.detection.detector import Detector
+from apt_evap.emission.perturbations import Perturbation
+from apt_evap.evaporation.settings import ChargeSettings, check_voltage
+from apt_evap.flight.crew import FlightSettings
+from apt_evap.flight.response import ResponseSettings
+from apt_evap.simulation.monitor import WatchSettings
+from apt_evap.simulation.run_hdf5 import is_run
+from apt_evap.simulation.simulation import Simulation
+from apt_evap.specimen.materials import MATERIALS, Material, material
+from apt_evap.specimen.tip import Tip
+
+_LENGTH = re.compile(r"\s*(\S+?)\s*(a|nm)\s*")
+
+
+@dataclass(frozen=True, repr=False)
+class Config:
+    """What a TOML file says about a simulation; made by `read_config`.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    tip : dict
+        Arguments of `Tip`.
+    n_ions : int
+        Number of atoms to evaporate.
+    responses : bool
+        Whether responses are flown; if not, the perturbations of the maps are flown instead.
+    voltage : float
+        Applied voltage [V].
+    seed : int
+        Seed of the random numbers of the perturbations.
+    detector : Detector
+        The detector.
+    charge_settings, flight_settings, response_settings : ChargeSettings, FlightSettings, ResponseSettings
+        How finely everything is computed.
+    watch_settings : WatchSettings
+        How the run is watched.
+    maps : MapSettings
+        Maps to draw of the run.
+    output : str or None
+        Where the run goes.
+    """
+
+    path: Path
+    tip: dict
+    n_ions: int
+    responses: bool
+    voltage: float
+    seed: int
+    detector: Detector
+    charge_settings: ChargeSettings
+    flight_settings: FlightSettings
+    response_settings: ResponseSettings
+    watch_settings: WatchSettings
+    maps: MapSettings
+    output: str | None
+
+    def __repr__(self) -> str:
+        host, radius = self.tip["material"].name, self.tip["apex_radius"]
+        panels = ", ".join(panel.title for panel in self.maps.panels)
+        return (
+            f"<Config {str(self.path)!r}: {self.n_ions:,} ions of {host}, apex radius {radius:.4g} nm; maps: {panels}>"
+        )
+
+    @property
+    def emissions(self) -> tuple[Perturbation, ...]:
+        """Perturbations to fly beside the responses: none, or without responses those of the maps."""
+        return () if self.responses else tuple(dict.fromkeys(panel.perturbation for panel in self.maps.panels))
+
+    def simulation(self, *, seed: int | None = None, n_threads: int | None = None) -> Simulation:
+        """Build the specimen and the simulation.
+
+        Parameters
+        ----------
+        seed : int, optional
+            Instead of that of the file.
+        n_threads : int, optional
+            Threads; by default the processors this process may use.
+
+        Returns
+        -------
+        Simulation
+
+        Raises
+        ------
+        FileError
+            If the specimen is impossible, or the flights do not fit it; the message names the file.
+        """
+        with _place(self.path, "tip"):
+            tip = Tip(**self.tip)
+        with _place(self.path):  # flights against tip or detector: no single table
+            return Simulation(
+                tip,
+                voltage=self.voltage,
+                seed=self.seed if seed is None else seed,
+                detector=self.detector,
+                charge_settings=self.charge_settings,
+                flight_settings=self.flight_settings,
+                response_settings=self.response_settings,
+                watch_settings=self.watch_settings,
+                n_threads=n_threads,
+            )
+
+
+def read_config(path: str | Path) -> Config:
+    """Read a simulation from a TOML file.
+
+    The tables are ``[tip]`` (the arguments of `Tip`; lengths in nm or, as text, in lattice constants: "20 a"),
+    ``[simulation]`` (ions, voltage, seed, responses), ``[detector]``, ``[charges]``, ``[flights]``, ``[responses]``,
+    ``[watch]`` (fields of `Detector`, `ChargeSettings`, `FlightSettings`, `ResponseSettings`, `WatchSettings`) and
+    ``[maps]`` (bins, smoothing and panels, each with a title and a perturbation as in
+    `apt_evap.perturbation.from_dict`). Only ``[tip]`` with a material and an apex_radius, and the ions of
+    ``[simulation]``, have to be there.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file.
+
+    Returns
+    -------
+    Config
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read or is not TOML, or a table, key or value is wrong; the message names it.
+    """
+    with open_for_reading(path) as file:
+        content = file.read()
+    path = Path(path)
+    try:
+        document = tomllib.loads(content.decode())
+    except UnicodeDecodeError as error:
+        what = "a run: see apt-evap info" if is_run(path) else "not a TOML file: it is not text in UTF-8"
+        raise FileError(f"{str(path)!r} is {what}") from error
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise FileError(f"{str(path)!r} is not a TOML file: {error}") from error
+    with _place(path):
+        tables = ("tip", "simulation", "detector", "charges", "flights", "responses", "watch", "maps")
+        check_keys(document, ("output", *tables), ("tip", "simulation"))
+        for name in tables:
+            check_table(document.get(name, {}), f"[{name}]")
+        output = document.get("output")
+        if output is not None and not (isinstance(output, str) and output):
+            raise ValueError(f"output must be a file name such as 'run.h5', got {shown(output)}")
+    with _place(path, "tip"):
+        tip = _tip(document["tip"])
+    with _place(path, "simulation"):
+        simulation = document["simulation"]
+        check_keys(simulation, ("ions", "voltage", "seed", "responses"), ("ions",))
+        n_ions = check_count(simulation["ions"], "ions", at_least=1)
+        voltage = check_voltage(simulation.get("voltage", 1000.0))
+        seed = check_seed(simulation.get("seed", 0))
+        responses = simulation.get("responses", True)
+        if not isinstance(responses, bool):
+            raise ValueError(f"responses must be true or false, got {shown(responses)}")
+    made = []
+    for name, kind, known in (
+        ("detector", Detector, _field_names(Detector)),
+        ("charges", ChargeSettings, _field_names(ChargeSettings)),
+        ("flights", FlightSettings, _field_names(FlightSettings)),
+        ("responses", ResponseSettings, ("energy_limit", "bound")),
+        ("watch", WatchSettings, _field_names(WatchSettings)),
+    ):
+        with _place(path, name):
+            check_keys(document.get(name, {}), known)
+            made.append(kind(**document.get(name, {})))
+    with _place(path, "maps"):
+        maps = read_maps(document.get("maps", {}))
+    return Config(path, tip, n_ions, responses, voltage, seed, *made, maps, output)  # type: ignore[arg-type, call-arg]
+
+
+def _tip(table):
+    """Arguments of `Tip` from the table [tip]."""
+    known = tuple(inspect.signature(Tip).parameters)
+    check_keys(table, known, ("material", "apex_radius"))
+    host = table["material"]
+    if isinstance(host, Mapping):
+        check_keys(host, _field_names(Material), ("name",))
+        changes = {key: value for key, value in host.items() if key != "name"}
+        if host["name"] in list(MATERIALS):
+            host = material(**host)
+        else:
+            check_keys(host, _field_names(Material), ("structure", "a", "evaporation_field", "charge_state", "mass"))
+            host = Material(host["name"], **changes)
+    elif isinstance(host, str):
+        host = material(host)
+    else:
+        raise ValueError(f"material must be a name such as 'Ni' or a table, got {shown(host)}")
+    settings = dict(table, material=host)
+    for name in ("apex_radius", "shank_length", "depth"):
+        if name in settings:
+            settings[name] = _length(settings[name], name, host.a)
+    if isinstance(settings.get("origin"), list):
+        settings["origin"] = [_length(value, "origin", host.a) for value in settings["origin"]]
+    if "solutes" in settings:
+        check_table(settings["solutes"], "solutes")
+    return settings
+
+
+def _length(value, name, a):
+    """Length [nm] of a number [nm] or a text such as "20 a"; `Tip` checks its range."""
+    if not isinstance(value, str):
+        return check_number(value, name, unit="nm")
+    found = _LENGTH.fullmatch(value)
+    try:
+        return float(found[1]) * (a if found[2] == "a" else 1.0)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be a number [nm] or text such as '20 a' or '7 nm', got {shown(value)}") from None
+
+
+def _field_names(kind):
+    return tuple(item.name for item in fields(kind) if item.name != "sources")
+
+
+@contextmanager
+def _place(path, table=None):
+    """Say in front of an error in which file and table it is."""
+    try:
+        yield
+    except ValueError as error:
+        raise FileError(f"{str(path)!r}{f', [{table}]' if table else ''}: {error}") from error

@@ -1,0 +1,1 @@
+"""Poles and zone lines on the detector, and the orientation of a specimen from them."""

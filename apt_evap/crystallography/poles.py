@@ -1,0 +1,239 @@
+"""Poles and zone axes of a crystal: the lattice planes that show on a map, their directions and their names."""
+
+from collections.abc import Iterable, Sequence
+from itertools import permutations, product
+from math import gcd
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from apt_evap._common.types import Floats
+from apt_evap._common.validation import check_array, check_count, shown
+from apt_evap.specimen import lattice
+from apt_evap.specimen.materials import Material
+
+_LARGEST = 9  # indices looked through: of all lattices the 50 families of the widest spacing are among them
+_MOST_FAMILIES = 50
+
+ZONES = {
+    "fcc": ((1, 1, 0), (1, 0, 0)),
+    "bcc": ((1, 0, 0), (1, 1, 1), (1, 1, 0)),
+    "sc": ((1, 0, 0), (1, 1, 0)),
+    "diamond": ((1, 1, 0), (1, 0, 0)),
+    "hcp": ((1, 1, -2, 0), (1, 0, -1, 0), (0, 0, 0, 1)),
+}
+"""Families of zone axes with the most poles of wide spacing, in three indices or for hcp in four."""
+
+
+class Poles(NamedTuple):
+    """Poles of a crystal, family by family."""
+
+    planes: np.ndarray
+    """Miller indices, int64 of shape (n, 3), for hcp Miller-Bravais indices of shape (n, 4)."""
+    normals: np.ndarray
+    """Unit normals in the frame of the crystal, shape (n, 3)."""
+    spacings: np.ndarray
+    """Distance between neighbouring atomic planes [nm], shape (n,)."""
+    labels: tuple
+    """Names of the poles, as matplotlib writes them, with bars over negative indices."""
+
+
+class Zones(NamedTuple):
+    """Zone axes of a crystal, one of each pair of opposite ones."""
+
+    axes: np.ndarray
+    """Indices, int64 of shape (n, 3), for hcp of shape (n, 4)."""
+    directions: np.ndarray
+    """Unit vectors in the frame of the crystal, shape (n, 3)."""
+    families: np.ndarray
+    """Index of the family of each, shape (n,)."""
+
+
+def poles(material: Material, families: int = 8) -> Poles:
+    """Poles of a crystal: the families of lattice planes with the widest spacing.
+
+    A facet is the larger, and its pole the darker on a map, the higher the steps between its terraces are, so that
+    the families come in the order of their spacing: 111, 002, 022, 113, 133, 024, ... for fcc.
+
+    Parameters
+    ----------
+    material : Material
+        The crystal.
+    families : int
+        How many families, up to 50.
+
+    Returns
+    -------
+    Poles
+        Every member of each family. Indices count all atomic planes: 002 for fcc, whose planes are a/2 apart.
+
+    Raises
+    ------
+    ValueError
+        If families is not a whole number from 1 to 50.
+    """
+    families = check_count(families, "families", at_least=1)
+    if families > _MOST_FAMILIES:
+        raise ValueError(f"families must be at most {_MOST_FAMILIES}, got {families}")
+    four = material.structure == "hcp"
+    found = []
+    for h, k, last in product(range(_LARGEST + 1), repeat=3):
+        if gcd(h, k, last) != 1 or h > k or (not four and k > last):
+            continue
+        plane = np.array([h, k, -h - k, last] if four else [h, k, last])
+        multiple, spacing = _stacking(material, plane)
+        # rounded: of families as far apart as each other the one with the smaller indices is first
+        found.append((-round(spacing / material.a, 9), int(np.abs(plane).sum()), tuple((multiple * plane).tolist())))
+    found.sort()
+    members = [(member, -spacing * material.a) for spacing, _, plane in found[:families] for member in _members(plane)]
+    planes = np.array([member for member, _ in members])
+    return Poles(
+        planes,
+        plane_normals(material, planes),
+        np.array([spacing for _, spacing in members]),
+        tuple(label(plane) for plane in planes),
+    )
+
+
+def zones(material: Material, families: Sequence[Any] | None = None) -> Zones:
+    """Zone axes of a crystal; the zone line of one is the great circle across it, on which its poles lie.
+
+    Parameters
+    ----------
+    material : Material
+        The crystal.
+    families : sequence, optional
+        One member of each family, [u v w] or for hcp [u v t w]; by default those of `ZONES`.
+
+    Returns
+    -------
+    Zones
+
+    Raises
+    ------
+    ValueError
+        If an axis is not a lattice direction.
+    """
+    given = ZONES[material.structure] if families is None else families
+    if not len(given):
+        raise ValueError("families of zone axes must be some, got none")
+    width = 4 if material.structure == "hcp" else 3
+    axes, numbers = [], []
+    for number, axis in enumerate(given):
+        axis = check_array(axis, "a zone axis", (width,), dtype=np.int64)
+        direction_normals(material, axis[None])  # says what is wrong with it
+        for member in _members(tuple(axis.tolist())):
+            if tuple(-index for index in member) not in axes:
+                axes.append(member)
+                numbers.append(number)
+    axes = np.array(axes)
+    return Zones(axes, direction_normals(material, axes), np.array(numbers))
+
+
+def plane_normals(material: Material, planes: ArrayLike, name: str = "planes") -> Floats:
+    """Unit normals of lattice planes, in the frame of the crystal.
+
+    Parameters
+    ----------
+    material : Material
+        The crystal.
+    planes : array_like
+        Miller indices (h k l), shape (n, 3), or for hcp also (h k i l) with h + k + i = 0, shape (n, 4).
+    name : str
+        Name of the argument, for the message.
+
+    Returns
+    -------
+    ndarray
+        Shape (n, 3).
+
+    Raises
+    ------
+    ValueError
+        If indices are all zero or do not add up.
+    """
+    planes = _three(material, planes, name, lambda h, k, _, last: (h, k, last))
+    normals = planes @ _reciprocal(material)
+    return normals / np.linalg.norm(normals, axis=1)[:, None]
+
+
+def direction_normals(material: Material, directions: ArrayLike, name: str = "directions") -> Floats:
+    """Unit vectors along lattice directions, in the frame of the crystal.
+
+    Parameters
+    ----------
+    material : Material
+        The crystal.
+    directions : array_like
+        [u v w], shape (n, 3), or for hcp also [u v t w] with u + v + t = 0, shape (n, 4).
+    name : str
+        Name of the argument, for the message.
+
+    Returns
+    -------
+    ndarray
+        Shape (n, 3).
+
+    Raises
+    ------
+    ValueError
+        If indices are all zero or do not add up.
+    """
+    directions = _three(material, directions, name, lambda u, v, t, w: (u - t, v - t, w))
+    vectors = directions @ lattice.direction_vectors(material.structure, material.a, material.c)
+    return vectors / np.linalg.norm(vectors, axis=1)[:, None]
+
+
+def label(indices: Iterable[int]) -> str:
+    """Name of a pole or an axis as matplotlib writes it, with bars over negative indices (str)."""
+    space = r"\," if max(abs(int(index)) for index in indices) > 9 else ""
+    return "$" + space.join(rf"\bar{{{-index}}}" if index < 0 else str(index) for index in map(int, indices)) + "$"
+
+
+def _three(material, indices, name, from_four):
+    """Three indices of each row of three or, for hcp, four."""
+    four = material.structure == "hcp" and np.ndim(indices) == 2 and np.shape(indices)[1] == 4
+    indices = check_array(indices, name, ("n", 4 if four else 3), dtype=np.int64)
+    if four:
+        off = indices[:, :3].sum(axis=1) != 0
+        if off.any():
+            raise ValueError(f"{name} must have a sum of 0 over the first three of four indices, got {indices[off][0]}")
+        indices = np.column_stack(from_four(*indices.T))
+    if not indices.any(axis=1).all():
+        raise ValueError(f"{name} must not have indices that are all 0, got {shown(indices.tolist())}")
+    return indices
+
+
+def _reciprocal(material):
+    """Rows: reciprocal vectors without 2 pi [1/nm]."""
+    return np.linalg.inv(material.a * lattice.direction_vectors(material.structure, material.a, material.c)).T
+
+
+def _members(indices):
+    """All that the symmetry of the lattice makes of three indices (m-3m) or four (6/mmm)."""
+    if len(indices) == 3:
+        signs = product((1, -1), repeat=3)
+        found = {
+            tuple(int(s * i) for s, i in zip(sign, p, strict=True)) for sign in signs for p in permutations(indices)
+        }
+    else:
+        *first, last = indices
+        found = {
+            (*(sign * int(index) for index in p), other * int(last))
+            for p in permutations(first)
+            for sign in (1, -1)
+            for other in (1, -1)
+        }
+    return sorted(found, reverse=True)
+
+
+def _stacking(material, plane):
+    """Even layers of atoms in one repeat of a plane of coprime indices (1 if uneven), and the largest gap [nm]."""
+    reciprocal = plane[[0, 1, -1]] @ _reciprocal(material)
+    sites = np.array(lattice.BASES[material.structure])
+    heights = sites * lattice.cell_lengths(material.structure, material.a, material.c) @ reciprocal
+    heights = np.unique(np.round(heights % 1, 6) % 1)  # in repeats; 6 digits tell any layers of these cells apart
+    gaps = np.diff(np.append(heights, heights[0] + 1))
+    even = np.ptp(gaps) < 1e-5
+    return len(gaps) if even else 1, float(gaps.max() / np.linalg.norm(reciprocal))

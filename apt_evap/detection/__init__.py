@@ -1,0 +1,1 @@
+"""Where ions are recorded: the detector, hits, detector maps, mass ranges, projections."""

@@ -1,0 +1,340 @@
+"""The one type for simulated and measured ions: columns of equal length, one row per ion."""
+
+from __future__ import annotations  # help() says ArrayLike, not the ten types that it stands for
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from numbers import Real
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from apt_evap._common.types import Booleans
+from apt_evap._common.validation import check_array, check_kind, check_number, did_you_mean, shown
+from apt_evap.detection.dataframe import to_dataframe
+from apt_evap.detection.detector_map import DetectorMap
+
+if TYPE_CHECKING:
+    import pandas
+
+
+class Outcome(IntEnum):
+    """What became of a simulated ion."""
+
+    HIT = 0
+    """It hit the detector."""
+    MISSED = 1
+    """It flew past the detector."""
+    NEVER_LEFT = 2
+    """It never got away from the specimen."""
+
+
+_FLOAT = ("x", "y", "time_of_flight", "voltage", "pulse_voltage", "mass_to_charge", "positions")
+_WHOLE = {
+    "pulses": np.uint32,
+    "multiplicity": np.uint32,
+    "pulse_id": np.int64,
+    "site": np.int64,
+    "ion": np.int64,
+    "outcome": np.int8,
+}
+_COLUMNS = (*_FLOAT, *_WHOLE)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class Hits:
+    """Ions as NumPy columns of equal length n; a column that is not there is None.
+
+    Floating point columns keep float32 where given so and are float64 otherwise. Arrays are taken over
+    without a copy where their type and memory order allow.
+
+    Parameters
+    ----------
+    x, y : array_like, optional
+        Detector coordinates [mm], shape (n,).
+    time_of_flight : array_like, optional
+        Time of flight [ns], shape (n,).
+    voltage, pulse_voltage : array_like, optional
+        Standing voltage and height of the pulse [V], shape (n,).
+    mass_to_charge : array_like, optional
+        Mass over charge state [Da], shape (n,).
+    positions : array_like, optional
+        Reconstructed positions of measured ions, launch sites of simulated ones [nm], shape (n, 3).
+    pulses : array_like, optional
+        Pulses since the last pulse with an ion, shape (n,).
+    multiplicity : array_like, optional
+        Number of ions in the pulse of this ion, for every ion, shape (n,).
+    pulse_id : array_like, optional
+        Ions of one pulse share it, shape (n,).
+    site : array_like, optional
+        Index of the atom in the specimen, shape (n,).
+    ion : array_like, optional
+        Place in the sequence of evaporation, shape (n,).
+    outcome : array_like, optional
+        An `Outcome` for every ion, shape (n,). None for measured ions.
+    extra : dict, optional
+        Further columns by name, as a file has them: arrays of any type, shape (n,) or (n, k). A selection carries them.
+    units : dict, optional
+        Units of the further columns by name, where they have one.
+    source : str
+        File name, or what made the ions.
+    extent : tuple of float, optional
+        Where the detector of a run reaches: x_min, x_max, y_min, y_max [mm], for all ions of the run as it gives them.
+        None for a selection of them, for ions moved elsewhere (give None with their new x and y to
+        `dataclasses.replace`), and for measured ions.
+
+    Raises
+    ------
+    ValueError
+        If there is no column at all, a column has the wrong shape or type, lengths differ, or an outcome is
+        unknown.
+    """
+
+    x: np.ndarray | None = None
+    y: np.ndarray | None = None
+    time_of_flight: np.ndarray | None = None
+    voltage: np.ndarray | None = None
+    pulse_voltage: np.ndarray | None = None
+    mass_to_charge: np.ndarray | None = None
+    positions: np.ndarray | None = None
+    pulses: np.ndarray | None = None
+    multiplicity: np.ndarray | None = None
+    pulse_id: np.ndarray | None = None
+    site: np.ndarray | None = None
+    ion: np.ndarray | None = None
+    outcome: np.ndarray | None = None
+    extra: dict = field(default_factory=dict)
+    units: dict = field(default_factory=dict)
+    source: str = ""
+    extent: tuple[float, float, float, float] | None = None
+
+    def __post_init__(self):
+        lengths = {}
+        for name in _COLUMNS:
+            value = getattr(self, name)
+            if value is not None:
+                column = _column(name, value)
+                object.__setattr__(self, name, column)
+                lengths[name] = len(column)
+        for name in ("extra", "units"):
+            given = {} if getattr(self, name) is None else getattr(self, name)
+            check_kind(given, name, Mapping, "a mapping by name of the column")
+            object.__setattr__(self, name, dict(given))
+        self.extra.update({name: _extra(name, value) for name, value in self.extra.items()})
+        check_kind(self.source, "source", str, "text")
+        lengths.update((name, len(values)) for name, values in self.extra.items())
+        if not lengths:
+            raise ValueError("Hits needs at least one column, got none")
+        if len(set(lengths.values())) > 1:
+            listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
+            raise ValueError(f"the columns of Hits must have one length, got {listed}")
+        if self.outcome is not None and len(self):
+            low, high = self.outcome.min(), self.outcome.max()
+            if low < min(Outcome) or high > max(Outcome):
+                raise ValueError(f"outcome must hold Outcomes, {min(Outcome)} to {max(Outcome)}, got {low} to {high}")
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the columns that are there, without those in `extra`, tuple of str."""
+        return tuple(name for name in _COLUMNS if getattr(self, name) is not None)
+
+    def require(self, *names: str) -> tuple[NDArray[Any], ...]:
+        """Return the named columns, or say which one is missing.
+
+        Parameters
+        ----------
+        *names : str
+            Names of columns.
+
+        Returns
+        -------
+        tuple of ndarray
+
+        Raises
+        ------
+        ValueError
+            Naming the missing column and the source.
+        """
+        for name in names:
+            if name not in _FLOAT and name not in _WHOLE:
+                hint = did_you_mean(name, _COLUMNS)
+                raise ValueError(f"Hits has no column {shown(name)}{hint}; its columns are {', '.join(_COLUMNS)}")
+            if getattr(self, name) is None:
+                raise ValueError(
+                    f"{self.source or 'these hits'} has no column {name!r}, only {', '.join(self.columns)}"
+                )
+        return tuple(getattr(self, name) for name in names)
+
+    @property
+    def detected(self) -> Booleans:
+        """Mask of the ions with an outcome of HIT and finite detector coordinates, bool of shape (n,).
+
+        What is missing is not asked for: measured ions have no outcome, and those of a .pos file no detector
+        coordinates.
+        """
+        good = np.ones(len(self), bool) if self.outcome is None else self.outcome == Outcome.HIT
+        for column in (self.x, self.y):
+            if column is not None:
+                good &= np.isfinite(column)
+        return good
+
+    @property
+    def counts(self) -> dict[Outcome, int]:
+        """Number of ions with each `Outcome`, dict; measured ions (no outcome) have all hit."""
+        if self.outcome is None:
+            return {outcome: len(self) if outcome == Outcome.HIT else 0 for outcome in Outcome}
+        return {outcome: int(np.count_nonzero(self.outcome == outcome)) for outcome in Outcome}
+
+    def map(self, bins: int = 256, **options: Any) -> DetectorMap:
+        """Count the detected ions on the detector.
+
+        Parameters
+        ----------
+        bins : int
+            Number of bins along the longer side.
+        **options
+            Passed to `DetectorMap.from_hits`.
+
+        Returns
+        -------
+        DetectorMap
+        """
+        return DetectorMap.from_hits(self, bins=bins, **options)
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """Return the ions as a pandas DataFrame; needs pandas.
+
+        Returns
+        -------
+        pandas.DataFrame
+            One row per ion; positions are position_x, position_y, position_z, and the columns of `extra` follow.
+            ``attrs`` has `source` and `units`.
+        """
+        names = [name for name in self.columns if name != "positions"]
+        columns = {name: getattr(self, name) for name in names}
+        if self.positions is not None:
+            columns |= dict(zip(("position_x", "position_y", "position_z"), self.positions.T, strict=True))
+        return to_dataframe(columns | self.extra, source=self.source, units=self.units)
+
+    def within_circle(self, radius: float, centre: ArrayLike = (0.0, 0.0)) -> Hits:
+        """Select the detected ions within a circle on the detector.
+
+        Parameters
+        ----------
+        radius : float
+            Radius of the circle [mm]; its rim is inside.
+        centre : array_like
+            Its centre [mm], shape (2,).
+
+        Returns
+        -------
+        Hits
+            With pulse_id and multiplicity as they were.
+
+        Raises
+        ------
+        ValueError
+            If there are no detector coordinates, or the circle is none.
+        """
+        x, y = self.require("x", "y")
+        radius = check_number(radius, "radius", above=0, unit="mm")
+        centre = check_array(centre, "centre", (2,))
+        with np.errstate(over="ignore", invalid="ignore"):
+            distance = np.hypot(x - centre[0], y - centre[1])
+        return self[self.detected & (distance <= radius)]
+
+    def window(self, **bounds: tuple[float | None, float | None]) -> Hits:
+        """Select the ions whose columns are within bounds: ``hits.window(voltage=(4e3, 5e3), multiplicity=(2, None))``.
+
+        Parameters
+        ----------
+        **bounds
+            For any column of one value per ion, or of `extra`: (low, high), in its unit, low <= value < high; None
+            is no bound. ``ion`` counts the rows where there is no such column (measured ions). Windows that
+            adjoin share no ion; values that are NaN are in none.
+
+        Returns
+        -------
+        Hits
+            With pulse_id and multiplicity as they were.
+
+        Raises
+        ------
+        ValueError
+            If a column is missing or has several values per ion, or its bounds are not two numbers in order.
+        """
+        chosen = np.ones(len(self), bool)
+        for name, limits in bounds.items():
+            if name in self.extra:
+                values = self.extra[name]
+            elif name == "ion" and self.ion is None:
+                values = np.arange(len(self))
+            else:
+                (values,) = self.require(name)
+            if values.ndim > 1 or values.dtype.kind not in "biuf":
+                raise ValueError(f"{name} must have one number per ion to select by, got shape {values.shape}")
+            low, high = _bounds(limits, name)
+            chosen &= (values >= low) & (values < high)
+        return self[chosen]
+
+    def __len__(self) -> int:
+        for name in _COLUMNS:
+            if (column := getattr(self, name)) is not None:
+                return len(column)
+        return len(next(iter(self.extra.values())))
+
+    def __getitem__(self, selection: slice | ArrayLike) -> Hits:
+        """Return the selected ions as `Hits`; takes a slice, a mask, indices or one index."""
+        if not isinstance(selection, slice):
+            index = np.asarray(selection)
+            if index.size == 0 and index.dtype == float:
+                index = index.astype(np.intp)
+            if index.ndim > 1 or index.dtype.kind not in "biu":
+                raise ValueError(f"Hits are selected by a slice, a mask or indices, got {shown(selection)}")
+            if index.dtype == bool:
+                if index.shape != (len(self),):
+                    raise ValueError(f"the mask must have shape ({len(self)},), got {index.shape}")
+                index = np.flatnonzero(index)
+            selection = np.atleast_1d(index)
+        chosen = {name: getattr(self, name)[selection] for name in self.columns}
+        extra = {name: values[selection] for name, values in self.extra.items()}
+        return Hits(**chosen, extra=extra, units=self.units, source=self.source)
+
+    def __repr__(self) -> str:
+        detected = np.count_nonzero(self.detected)
+        source = f" from {self.source!r}" if self.source else ""
+        return f"<Hits: {len(self):,} ions, {detected:,} detected{source}; {', '.join([*self.columns, *self.extra])}>"
+
+
+def _column(name, value):
+    """Check one column and give it its type."""
+    if name in _WHOLE:
+        if isinstance(value, np.ndarray) and value.ndim == 1 and value.dtype == _WHOLE[name]:
+            return np.ascontiguousarray(value)  # nothing to lose in a cast
+        return check_array(value, name, ("n",), dtype=_WHOLE[name])
+    given = getattr(value, "dtype", None)
+    single = given is not None and given.kind == "f" and given.itemsize == 4
+    shape = ("n", 3) if name == "positions" else ("n",)
+    return check_array(value, name, shape, dtype=np.float32 if single else np.float64, finite=False)
+
+
+def _extra(name, value):
+    """Check one of the further columns."""
+    column = np.asarray(value)
+    if column.ndim not in (1, 2) or column.dtype == object:
+        raise ValueError(f"extra[{name!r}] must be an array of shape (n,) or (n, k), got {shown(value)}")
+    return column
+
+
+def _bounds(limits, name):
+    """Return two bounds, infinite where None."""
+    if not isinstance(limits, str) and np.iterable(limits) and len(pair := tuple(limits)) == 2:
+        low = -np.inf if pair[0] is None else pair[0]
+        high = np.inf if pair[1] is None else pair[1]
+        if isinstance(low, Real) and isinstance(high, Real) and low <= high:
+            return low, high
+    raise ValueError(
+        f"{name} must have two bounds (low, high) with low <= high, None for no bound, got {shown(limits)}"
+    )

@@ -1,0 +1,182 @@
+"""Ranges of mass over charge state, which tell the species of measured ions."""
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apt_evap._common.types import Integers
+from apt_evap._common.validation import check_array, check_kind, check_sequence, did_you_mean, shown
+from apt_evap.detection.hits import Hits
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Ranges:
+    """Ranges of mass over charge state, low <= m/n < high, and the species each of them is taken for.
+
+    Where ranges overlap, the first one wins, with a warning. A range that repeats an earlier one of the same name is
+    dropped.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Species of each range, such as "CrO"; several ranges may be of one species.
+    low, high : array_like
+        Bounds of each range [Da], shape (n,).
+    volume : array_like, optional
+        Volume of its ion in a reconstruction [nm^3], shape (n,); NaN where not known.
+    colour : sequence of str, optional
+        Colour of each range, such as "#FF0000"; "" where there is none.
+    composition : sequence of dict, optional
+        Number of atoms of each element in the ion of each range.
+    source : str
+        File name.
+
+    Raises
+    ------
+    ValueError
+        If there is no range, one is empty, or lengths differ.
+    """
+
+    names: tuple
+    low: np.ndarray
+    high: np.ndarray
+    volume: np.ndarray | None = None
+    colour: tuple | None = None
+    composition: tuple | None = None
+    source: str = ""
+
+    def __post_init__(self):
+        check_kind(self.source, "source", str, "text")
+        names = check_sequence(self.names, "names", "names of species")
+        for name in names:
+            check_kind(name, "names", str, "names of species")
+        n = len(names)
+        if n == 0:
+            raise ValueError(f"{self.source or 'Ranges'} must have at least one range, got none")
+        low, high = (check_array(getattr(self, name), name, (n,)) for name in ("low", "high"))
+        volume = np.full(n, np.nan) if self.volume is None else check_array(self.volume, "volume", (n,), finite=False)
+        colour = ("",) * n if self.colour is None else check_sequence(self.colour, "colour", "colours")
+        composition = ({},) * n
+        if self.composition is not None:
+            composition = check_sequence(self.composition, "composition", "mappings of an element to its atoms")
+            for atoms in composition:
+                check_kind(atoms, "composition", Mapping, "mappings of an element to its atoms")
+            composition = tuple(dict(atoms) for atoms in composition)
+        for name, values in (("colour", colour), ("composition", composition)):
+            if len(values) != n:
+                raise ValueError(f"{name} must have one entry for each of the {n} ranges, got {len(values)}")
+        for name, lower, upper in zip(names, low, high, strict=True):
+            if not lower < upper:
+                raise ValueError(f"low must be below high [Da], got {lower:g} to {upper:g} for {name!r}")
+        first = {}
+        for i, key in enumerate(zip(names, low, high, strict=True)):
+            first.setdefault(key, i)
+        kept = list(first.values())
+        for name, values in (("low", low), ("high", high), ("volume", volume)):
+            object.__setattr__(self, name, values[kept])
+        for name, values in (("names", names), ("colour", colour), ("composition", composition)):
+            object.__setattr__(self, name, tuple(values[i] for i in kept))
+        self._warn_of_overlap()
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __repr__(self) -> str:
+        source = f" from {self.source!r}" if self.source else ""
+        return f"<Ranges: {len(self)} of {', '.join(self.species_names)}{source}>"
+
+    @property
+    def species_names(self) -> tuple[str, ...]:
+        """Names of the species, each once, in the order of the ranges, tuple of str."""
+        return tuple(dict.fromkeys(self.names))
+
+    def index(self, hits: Hits) -> Integers:
+        """Range of every ion.
+
+        Parameters
+        ----------
+        hits : Hits
+            Ions with mass_to_charge.
+
+        Returns
+        -------
+        ndarray of int64, shape (n,)
+            Index into the ranges; -1 for an ion in none.
+        """
+        (mass,) = check_kind(hits, "hits", Hits, "Hits").require("mass_to_charge")
+        # between two neighbouring bounds one range holds, the first in the file; NaN sorts behind the last bound
+        edges = np.unique(np.concatenate([self.low, self.high]))
+        holder = np.full(len(edges) + 1, -1)
+        first, stop = np.searchsorted(edges, self.low), np.searchsorted(edges, self.high)
+        for i in reversed(range(len(self))):
+            holder[first[i] : stop[i]] = i
+        return holder[np.searchsorted(edges, mass, side="right") - 1]
+
+    def species(self, hits: Hits) -> Integers:
+        """Species of every ion.
+
+        Parameters
+        ----------
+        hits : Hits
+            Ions with mass_to_charge.
+
+        Returns
+        -------
+        ndarray of int64, shape (n,)
+            Index into `species_names`; -1 for an ion in no range.
+        """
+        number = {name: i for i, name in enumerate(self.species_names)}
+        return np.array([number[name] for name in self.names] + [-1])[self.index(hits)]
+
+    def labels(self, hits: Hits, outside: str = "X") -> NDArray[np.str_]:
+        """Name of the species of every ion, `outside` for one in no range, array of str of shape (n,)."""
+        return np.array([*self.species_names, check_kind(outside, "outside", str, "text")])[self.species(hits)]
+
+    def select(self, hits: Hits, *names: str) -> Hits:
+        """Select the ions of one or more species.
+
+        Parameters
+        ----------
+        hits : Hits
+            Ions with mass_to_charge.
+        *names : str
+            Names of species.
+
+        Returns
+        -------
+        Hits
+            With pulse_id and multiplicity as they were.
+
+        Raises
+        ------
+        ValueError
+            If there is no such species.
+        """
+        known = self.species_names
+        for name in names or (None,):
+            if name not in known:
+                raise ValueError(
+                    f"{self.source or 'these ranges'} have no species {shown(name)}{did_you_mean(name, known)}, only "
+                    f"{', '.join(known)}"
+                )
+        return hits[np.isin(self.species(hits), [known.index(name) for name in names])]
+
+    def _warn_of_overlap(self):
+        order = np.argsort(self.low, kind="stable")
+        reach = np.maximum.accumulate(self.high[order])
+        pairs = np.flatnonzero(self.low[order][1:] < reach[:-1])
+        if len(pairs):
+            at = pairs[0]
+            holder = order[: at + 1][self.high[order][: at + 1] == reach[at]][0]
+            first, second = sorted((int(holder), int(order[at + 1])))
+            warnings.warn(
+                f"{self.source or 'Ranges'}: {len(pairs)} ranges overlap another, the first in the file wins: "
+                f"{self._text(first)} over {self._text(second)}" + (", ..." if len(pairs) > 1 else ""),
+                stacklevel=4,
+            )
+
+    def _text(self, i):
+        return f"{self.names[i]} {self.low[i]:g}-{self.high[i]:g}"

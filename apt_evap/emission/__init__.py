@@ -1,0 +1,1 @@
+"""How ions start: emissions, the frame along the surface, energy distributions, perturbations, random numbers."""

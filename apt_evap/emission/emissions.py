@@ -1,0 +1,107 @@
+"""A batch of emissions, and the launches of their ions."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from apt_evap._common.validation import check_array, check_number
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Emissions:
+    """A batch of atoms about to leave.
+
+    Parameters
+    ----------
+    positions, normals : array_like
+        Sites [nm] and outward unit normals, shape (n, 3).
+    neighbours : array_like
+        Position of the surface nearest neighbour with the highest charge [nm], shape (n, 3); NaN if none.
+    charge_states : array_like of int
+        Charge of the ion [e], shape (n,).
+    masses : array_like
+        Mass of the ion [Da], shape (n,).
+    ions : array_like of int
+        Number of the ion in the sequence of evaporation, shape (n,).
+    nearest_neighbour_distance : float
+        [nm].
+
+    Raises
+    ------
+    ValueError
+        If shapes disagree, or a value is outside its range.
+    """
+
+    positions: np.ndarray
+    normals: np.ndarray
+    neighbours: np.ndarray
+    charge_states: np.ndarray
+    masses: np.ndarray
+    ions: np.ndarray
+    nearest_neighbour_distance: float
+
+    def __post_init__(self):
+        positions = check_array(self.positions, "positions", ("n", 3))
+        n = len(positions)
+        distance = check_number(self.nearest_neighbour_distance, "nearest_neighbour_distance", above=0, unit="nm")
+        checked = {
+            "positions": positions,
+            "normals": check_array(self.normals, "normals", (n, 3)),
+            "neighbours": check_array(self.neighbours, "neighbours", (n, 3), finite=False),
+            "charge_states": check_array(self.charge_states, "charge_states", (n,), dtype=np.int32),
+            "masses": check_array(self.masses, "masses", (n,)),
+            "ions": check_array(self.ions, "ions", (n,), dtype=np.int64),
+            "nearest_neighbour_distance": distance,
+        }
+        off = np.abs(np.linalg.norm(checked["normals"], axis=1) - 1)
+        if n and off.max() > 1e-6:
+            raise ValueError(f"normals must have length 1, got one that is off by {off.max():.2g}")
+        for name, least in (("charge_states", 1), ("masses", np.finfo(np.float64).tiny)):
+            if n and checked[name].min() < least:
+                raise ValueError(f"{name} must be above 0, got {checked[name].min()}")
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def __repr__(self) -> str:
+        lonely = np.count_nonzero(np.isnan(self.neighbours).any(axis=1))
+        return f"<Emissions: {len(self):,} atoms about to leave, {lonely:,} of them without a neighbour to roll onto>"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Launches:
+    """How a batch of ions starts.
+
+    Parameters
+    ----------
+    positions : array_like
+        Where [nm], shape (n, 3).
+    velocities : array_like
+        How fast [nm/ns], shape (n, 3).
+    rolled : array_like of bool
+        Whether the ion rolled up onto a neighbour first, shape (n,).
+
+    Raises
+    ------
+    ValueError
+        If shapes disagree, or a value is not finite.
+    """
+
+    positions: np.ndarray
+    velocities: np.ndarray
+    rolled: np.ndarray
+
+    def __post_init__(self):
+        positions = check_array(self.positions, "positions", ("n", 3))
+        n = len(positions)
+        object.__setattr__(self, "positions", positions)
+        object.__setattr__(self, "velocities", check_array(self.velocities, "velocities", (n, 3)))
+        object.__setattr__(self, "rolled", check_array(self.rolled, "rolled", (n,), dtype=bool))
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def __repr__(self) -> str:
+        return f"<Launches: {len(self):,} ions, {np.count_nonzero(self.rolled):,} of them rolled up>"

@@ -1,0 +1,154 @@
+"""Distributions of the perturbation energy: any object with `quantile(u)` is one."""
+
+import math
+from dataclasses import dataclass
+from numbers import Real
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import log_ndtr, ndtr, ndtri
+
+from apt_evap._common.types import Floats
+from apt_evap._common.validation import check_array, check_number, shown
+from apt_evap.units import BOLTZMANN
+
+HIGHEST_ENERGY = 100.0  # [eV]: more is a slip of the unit, 155 (meV), or ten times any bond
+
+
+class Distribution(Protocol):
+    """What a distribution of energies of one's own must have; `TruncatedNormal`, `Fixed` and `Thermal` are ones."""
+
+    def quantile(self, u: Floats) -> Floats:
+        """Energy [eV] below which the fraction `u` (in (0, 1), any shape) of the distribution lies."""
+        ...
+
+
+@dataclass(frozen=True)
+class TruncatedNormal:
+    """Normal distribution of the energy, cut off below zero.
+
+    Parameters
+    ----------
+    mean : float
+        Mean of the normal before the cut [eV], at least 0.
+    standard_deviation : float
+        Standard deviation before the cut [eV], above 0; both are at most 100.
+
+    Raises
+    ------
+    ValueError
+        If a number is outside its range.
+    """
+
+    mean: float
+    standard_deviation: float
+
+    def __post_init__(self):
+        sigma = check_number(self.standard_deviation, "standard_deviation", above=0, at_most=HIGHEST_ENERGY, unit="eV")
+        mean = check_number(self.mean, "mean", at_least=0, at_most=HIGHEST_ENERGY, unit="eV")
+        object.__setattr__(self, "mean", mean)
+        object.__setattr__(self, "standard_deviation", sigma)
+
+    def quantile(self, u: ArrayLike) -> Floats:
+        """Energy [eV] below which the fraction `u` (in (0, 1), any shape) of the distribution lies."""
+        u = np.asarray(u, dtype=np.float64)
+        ratio = self.mean / self.standard_deviation
+        lower = ndtr(-ratio) + u * ndtr(ratio)
+        # the tail that is the smaller one keeps all its digits
+        deviate = np.where(lower < 0.5, ndtri(np.minimum(lower, 0.5)), -ndtri((1 - u) * ndtr(ratio)))
+        return np.maximum(self.mean + self.standard_deviation * deviate, np.finfo(np.float64).tiny)
+
+    @property
+    def true_mean(self) -> float:
+        """Mean of the energies after the cut [eV]."""
+        return self.mean + self.standard_deviation * self._hazard()
+
+    @property
+    def true_standard_deviation(self) -> float:
+        """Standard deviation of the energies after the cut [eV]."""
+        hazard = self._hazard()
+        ratio = self.mean / self.standard_deviation
+        return self.standard_deviation * math.sqrt(1 - hazard * (ratio + hazard))
+
+    def _hazard(self):
+        ratio = self.mean / self.standard_deviation
+        return math.exp(-0.5 * ratio * ratio - log_ndtr(ratio)) / math.sqrt(2 * math.pi)
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """The same energy for every ion.
+
+    Parameters
+    ----------
+    energy : float
+        Energy [eV], at least 0 and at most 100.
+
+    Raises
+    ------
+    ValueError
+        If the energy is out of this range or no number.
+    """
+
+    energy: float
+
+    def __post_init__(self):
+        energy = check_number(self.energy, "energy", at_least=0, at_most=HIGHEST_ENERGY, unit="eV")
+        object.__setattr__(self, "energy", energy)
+
+    def quantile(self, u: ArrayLike) -> Floats:
+        """Return the energy [eV] in the shape of `u`."""
+        return np.full(np.shape(u), self.energy)
+
+
+@dataclass(frozen=True)
+class Thermal:
+    """Energy of the thermal motion along the surface: exponential, with the mean k T.
+
+    Parameters
+    ----------
+    temperature : float
+        Temperature [K], above 0 and at most 1e5.
+
+    Raises
+    ------
+    ValueError
+        If the temperature is out of this range.
+
+    Notes
+    -----
+    Each of the two tangential velocities is normal with the variance k T / m (Maxwell-Boltzmann), so that the
+    energy of both is exponential.
+    """
+
+    temperature: float
+
+    def __post_init__(self):
+        kelvin = check_number(self.temperature, "temperature", above=0, at_most=1e5, unit="K")
+        object.__setattr__(self, "temperature", kelvin)
+
+    def quantile(self, u: ArrayLike) -> Floats:
+        """Energy [eV] below which the fraction `u` (in (0, 1), any shape) of the distribution lies."""
+        return -BOLTZMANN * self.temperature * np.log1p(-np.asarray(u, dtype=np.float64))
+
+
+DISTRIBUTIONS = {kind.__name__: kind for kind in (TruncatedNormal, Fixed, Thermal)}
+"""The built-in distributions by name."""
+
+
+def as_distribution(energy: Any) -> Distribution:
+    """Return a distribution as it is, a number [eV] as `Fixed`, or say what was expected (ValueError)."""
+    if isinstance(energy, Real) and not isinstance(energy, bool):
+        return Fixed(energy)  # type: ignore[arg-type]  # any real number; checked there
+    if not callable(getattr(energy, "quantile", None)):
+        raise ValueError(f"energy must be a number [eV] or have a method quantile(u), got {shown(energy)}")
+    return energy
+
+
+def draw_energies(distribution: Distribution, u: Floats) -> Floats:
+    """Energies of a distribution [eV] at the uniform numbers `u`, shape (n,), checked (ValueError)."""
+    energies = check_array(distribution.quantile(u), f"quantiles of {distribution!r}", (len(u),))
+    if energies.size and energies.min() < 0:
+        raise ValueError(f"quantiles of {distribution!r} must be at least 0 [eV], got {energies.min()}")
+    return energies

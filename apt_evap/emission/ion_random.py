@@ -1,0 +1,65 @@
+"""Random numbers keyed by seed and ion: the same for an ion whatever the batch or the threads."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import ndtri
+
+from apt_evap._common.types import Floats
+from apt_evap._common.validation import check_array, check_count, check_seed
+
+_GAMMA = np.uint64(0x9E3779B97F4A7C15)
+_FIRST = np.uint64(0xBF58476D1CE4E5B9)
+_SECOND = np.uint64(0x94D049BB133111EB)
+
+
+def _mix(z):
+    """Finalizer of SplitMix64, on an array of uint64."""
+    z = (z ^ (z >> np.uint64(30))) * _FIRST
+    z = (z ^ (z >> np.uint64(27))) * _SECOND
+    return z ^ (z >> np.uint64(31))
+
+
+class IonRandom:
+    """Random numbers of a batch of ions, each ion with a stream of its own.
+
+    Number `j` of an ion is a function of (seed, ion, j) only. Each call continues with new columns.
+
+    Parameters
+    ----------
+    seed : int
+        Seed, at least 0 and below 2^64.
+    ions : array_like of int
+        Number of each ion in the sequence of evaporation, shape (n,).
+
+    Raises
+    ------
+    ValueError
+        If the seed or an ion's number is no such number.
+
+    Notes
+    -----
+    Each ion has a SplitMix64 generator of its own (Steele, Lea and Flood, OOPSLA 2014). It is seeded with the
+    output of that number of a generator seeded with a hash of `seed`.
+    """
+
+    def __init__(self, seed: int, ions: ArrayLike) -> None:
+        self.seed = check_seed(seed)
+        ions = check_array(ions, "ions", ("n",), dtype=np.int64).view(np.uint64)
+        start = _mix(np.array([self.seed], dtype=np.uint64) + _GAMMA)
+        self._state = _mix(start + (ions + np.uint64(1)) * _GAMMA)
+        self._column = 0
+
+    def __repr__(self) -> str:
+        return f"IonRandom(seed={self.seed}, {len(self._state)} ions)"
+
+    def uniform(self, columns: int = 1) -> Floats:
+        """Return the next uniform numbers in (0, 1), shape (n, columns)."""
+        first = self._column + 1
+        self._column += check_count(columns, "columns", at_least=1)
+        steps = np.arange(first, self._column + 1, dtype=np.uint64) * _GAMMA
+        bits = _mix(self._state[:, None] + steps) >> np.uint64(12)
+        return (bits + 0.5) * 2.0**-52
+
+    def normal(self, columns: int = 1) -> Floats:
+        """Return the next normal numbers of mean 0 and variance 1, shape (n, columns)."""
+        return ndtri(self.uniform(columns))

@@ -1,0 +1,252 @@
+"""Perturbations of the emission: where an ion starts, and how fast along the surface.
+
+A perturbation is any object with one method, ``launch(emissions, random) -> Launches``, over a batch of
+emissions. The built-in ones take two random numbers per ion: the first is the quantile of the energy, the
+second the azimuth. The model is that of Shaikh et al., arXiv 2509.13744.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Protocol
+
+import numpy as np
+
+from apt_evap._common.types import Booleans, Floats
+from apt_evap._common.validation import check_kind, check_number, did_you_mean, shown
+from apt_evap.emission.emissions import Emissions, Launches
+from apt_evap.emission.energies import (
+    DISTRIBUTIONS,
+    Distribution,
+    Fixed,
+    Thermal,
+    TruncatedNormal,
+    as_distribution,
+    draw_energies,
+)
+from apt_evap.emission.ion_random import IonRandom
+from apt_evap.emission.surface_frame import launch_tangentially, rollup_direction, tangent_frame
+from apt_evap.units import speed_from_energy
+
+__all__ = [
+    "Combined",
+    "Emissions",
+    "Fixed",
+    "IonRandom",
+    "LateralVelocity",
+    "Launches",
+    "Perturbation",
+    "RollUp",
+    "TangentialPerturbation",
+    "Thermal",
+    "TruncatedNormal",
+    "Unperturbed",
+    "from_dict",
+    "launch_tangentially",
+    "rollup_direction",
+    "tangent_frame",
+    "to_dict",
+]
+
+
+class Perturbation(Protocol):
+    """What a perturbation of one's own must have, to be flown; the built-in ones have it."""
+
+    def launch(self, emissions: Emissions, random: IonRandom) -> Launches:
+        """Launch a batch of ions: their positions [nm] and velocities [nm/ns], and who rolled up."""
+        ...
+
+
+class TangentialPerturbation(Perturbation, Protocol):
+    """What it must have besides, to be taken by runs that hold responses: launches along the surface only."""
+
+    def tangential(self, emissions: Emissions, random: IonRandom) -> tuple[Booleans, Floats, Floats]:
+        """Who rolls up, and the velocities along t1 and t2 of `tangent_frame` [nm/ns], each of shape (n,)."""
+        ...
+
+
+class _Tangential:
+    """What the built-in perturbations share: `launch` out of `tangential`."""
+
+    def launch(self: TangentialPerturbation, emissions: Emissions, random: IonRandom) -> Launches:
+        """Launch a batch of ions.
+
+        Parameters
+        ----------
+        emissions : Emissions
+            A batch of n.
+        random : IonRandom
+            Random numbers of these ions.
+
+        Returns
+        -------
+        Launches
+        """
+        return launch_tangentially(emissions, *self.tangential(emissions, random))
+
+    def _drawn(self, emissions, random):
+        u = random.uniform(2)
+        return draw_energies(self.energy, u[:, 0]), 2 * np.pi * u[:, 1]
+
+
+@dataclass(frozen=True)
+class Unperturbed(_Tangential):
+    """Every ion starts at rest from its site."""
+
+    def tangential(self, emissions: Emissions, random: IonRandom) -> tuple[Booleans, Floats, Floats]:
+        """Nobody rolls, and both velocities along the surface are zero: see `Combined.tangential`."""
+        n = len(emissions)
+        return np.zeros(n, dtype=bool), np.zeros(n), np.zeros(n)
+
+
+@dataclass(frozen=True)
+class LateralVelocity(_Tangential):
+    """Every ion starts from its site, at |v| = sqrt(2 E/m) in a random direction along the surface.
+
+    Parameters
+    ----------
+    energy : distribution or float
+        Energy E: any object with `quantile(u)` [eV], or one number for all ions [eV].
+    """
+
+    energy: Distribution | float
+
+    def __post_init__(self):
+        object.__setattr__(self, "energy", as_distribution(self.energy))
+
+    def tangential(self, emissions: Emissions, random: IonRandom) -> tuple[Booleans, Floats, Floats]:
+        """Nobody rolls; velocities along t1 and t2 [nm/ns]: see `Combined.tangential`."""
+        energy, azimuth = self._drawn(emissions, random)
+        speed = speed_from_energy(energy, emissions.masses)
+        return np.zeros(len(emissions), dtype=bool), speed * np.cos(azimuth), speed * np.sin(azimuth)
+
+
+@dataclass(frozen=True)
+class RollUp(_Tangential):
+    """Every ion rolls up onto its neighbour of highest charge and starts from there, moving on the same way.
+
+    It starts at p_r = s + d n, at |v| = sqrt(2 E/m) along the part of p_r - p perpendicular to n. An ion
+    without a neighbour does not roll: it starts at rest from its site.
+
+    Parameters
+    ----------
+    energy : distribution or float
+        Energy E: any object with `quantile(u)` [eV], or one number for all ions [eV].
+    """
+
+    energy: Distribution | float
+
+    def __post_init__(self):
+        object.__setattr__(self, "energy", as_distribution(self.energy))
+
+    def tangential(self, emissions: Emissions, random: IonRandom) -> tuple[Booleans, Floats, Floats]:
+        """Who rolls, and the velocities along t1 and t2 [nm/ns]: see `Combined.tangential`."""
+        energy, _ = self._drawn(emissions, random)
+        speed = speed_from_energy(energy, emissions.masses)
+        rolled, first, second = rollup_direction(emissions)
+        return rolled, speed * first, speed * second
+
+
+@dataclass(frozen=True)
+class Combined(_Tangential):
+    """Roll-up with a share of the energy, and a random direction with the rest; the velocities add.
+
+    An ion without a neighbour does not roll: it starts from its site with the random part only.
+
+    Parameters
+    ----------
+    energy : distribution or float
+        Energy E: any object with `quantile(u)` [eV], or one number for all ions [eV].
+    rollup_fraction : float
+        Share of the energy that goes into the roll-up, from 0 to 1; at 0 the ion still rolls.
+    """
+
+    energy: Distribution | float
+    rollup_fraction: float
+
+    def __post_init__(self):
+        share = check_number(self.rollup_fraction, "rollup_fraction", at_least=0, at_most=1)
+        object.__setattr__(self, "energy", as_distribution(self.energy))
+        object.__setattr__(self, "rollup_fraction", share)
+
+    def tangential(self, emissions: Emissions, random: IonRandom) -> tuple[Booleans, Floats, Floats]:
+        """Who rolls, and how fast along the surface.
+
+        Parameters
+        ----------
+        emissions : Emissions
+            A batch of n.
+        random : IonRandom
+            Random numbers of these ions.
+
+        Returns
+        -------
+        tuple of ndarray
+            Whether each ion rolls up, and its velocity along t1 and t2 of `tangent_frame` [nm/ns], each of
+            shape (n,).
+        """
+        energy, azimuth = self._drawn(emissions, random)
+        rolled, first, second = rollup_direction(emissions)
+        rolling = speed_from_energy(self.rollup_fraction * energy, emissions.masses)
+        lateral = speed_from_energy((1 - self.rollup_fraction) * energy, emissions.masses)
+        return (
+            rolled,
+            rolling * first + lateral * np.cos(azimuth),
+            rolling * second + lateral * np.sin(azimuth),
+        )
+
+
+PERTURBATIONS = {kind.__name__: kind for kind in (Unperturbed, LateralVelocity, RollUp, Combined)}
+"""The built-in perturbations by name."""
+
+
+def to_dict(perturbation: Any) -> dict[str, Any]:
+    """Name and parameters of a perturbation or a distribution, in plain types, for files.
+
+    One of a user's own is described by its name and `repr`: enough to know it, not to make it again.
+
+    Parameters
+    ----------
+    perturbation : object
+        A perturbation or a distribution.
+
+    Returns
+    -------
+    dict
+    """
+    name = type(perturbation).__name__
+    if type(perturbation) not in (*PERTURBATIONS.values(), *DISTRIBUTIONS.values()):
+        return {"name": name, "repr": repr(perturbation)}
+    values = {item.name: getattr(perturbation, item.name) for item in fields(perturbation)}
+    return {"name": name} | {
+        key: value if isinstance(value, float) else to_dict(value) for key, value in values.items()
+    }
+
+
+def from_dict(settings: Mapping[str, Any]) -> Any:
+    """Make the perturbation or distribution again that `to_dict` described.
+
+    Parameters
+    ----------
+    settings : mapping
+        Its "name" and parameters.
+
+    Returns
+    -------
+    object
+
+    Raises
+    ------
+    ValueError
+        If the name or a parameter is unknown, or one is missing.
+    """
+    known = PERTURBATIONS | DISTRIBUTIONS
+    name = check_kind(settings, "settings", Mapping, "a mapping with a name and parameters").get("name")
+    if not isinstance(name, str) or name not in known:
+        hint = did_you_mean(name, known)
+        raise ValueError(f"no perturbation or distribution is named {shown(name)}{hint}; known are {', '.join(known)}")
+    given = {key: value for key, value in settings.items() if key != "name"}
+    wanted = {item.name for item in fields(known[name])}
+    if set(given) != wanted:
+        lists = [", ".join(sorted(names)) or "no parameters" for names in (wanted, given)]
+        raise ValueError(f"{name} needs {lists[0]}, got {lists[1]}")
+    return known[name](**{key: from_dict(value) if isinstance(value, dict) else value for key, value in given.items()})

@@ -1,0 +1,88 @@
+"""Where on the surface and which way an ion starts: the tangent frame, the roll-up, the launch."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from apt_evap._common.types import Booleans, Floats
+from apt_evap._common.validation import check_array
+from apt_evap.emission.emissions import Emissions, Launches
+
+
+def tangent_frame(normals: ArrayLike) -> tuple[Floats, Floats]:
+    """Two unit vectors at right angles to each normal and to each other.
+
+    They are x and y carried from the apex (0, 0, 1) to the normal along the great circle: t1 is near x and
+    t2 near y on the cap, t1 x t2 = n, and both change smoothly with the normal but for a jump at n_z = -0.9,
+    deep in the foot.
+
+    Parameters
+    ----------
+    normals : array_like
+        Unit vectors, shape (n, 3).
+
+    Returns
+    -------
+    tuple of ndarray
+        t1 and t2, each of shape (n, 3).
+
+    Notes
+    -----
+    Duff et al., J. Computer Graphics Techniques 6 (1), 1 (2017), with the seam moved from n_z = 0 to -0.9.
+    """
+    x, y, z = check_array(normals, "normals", ("n", 3)).T
+    sign = np.where(z < -0.9, -1.0, 1.0)
+    a = -1 / (sign + z)
+    b = x * y * a
+    first = np.stack([1 + sign * x * x * a, sign * b, -sign * x], axis=1)
+    return first, np.stack([b, sign + y * y * a, -y], axis=1)
+
+
+def rollup_direction(emissions: Emissions) -> tuple[Booleans, Floats, Floats]:
+    """Which ions can roll up, and in which direction.
+
+    Parameters
+    ----------
+    emissions : Emissions
+        A batch of n.
+
+    Returns
+    -------
+    tuple of ndarray
+        Whether there is a neighbour to roll onto, shape (n,), and the components along t1 and t2 of the unit
+        vector from the site to the rolled-up position, perpendicular to the normal, each of shape (n,); zero
+        if there is no neighbour, or if it lies straight along the normal.
+    """
+    rolled = np.isfinite(emissions.neighbours).all(axis=1)
+    step = np.where(rolled[:, None], emissions.neighbours - emissions.positions, 0.0)
+    # the lift d n of the rolled-up position is along the normal and drops out
+    along = [np.einsum("ij,ij->i", step, tangent) for tangent in tangent_frame(emissions.normals)]
+    length = np.hypot(*along)
+    straight = length < 1e-9 * emissions.nearest_neighbour_distance
+    scale = np.where(straight, 0.0, 1 / np.where(straight, 1.0, length))
+    return rolled, along[0] * scale, along[1] * scale
+
+
+def launch_tangentially(emissions: Emissions, rolled: Booleans, first: Floats, second: Floats) -> Launches:
+    """Launches from velocities along the surface: the one way from `tangential` to `launch`.
+
+    Parameters
+    ----------
+    emissions : Emissions
+        A batch of n.
+    rolled : array_like of bool
+        Ions that start at p_r = s + d n, one nearest neighbour distance d above their neighbour s; the others
+        start at their site. Shape (n,).
+    first, second : array_like
+        Velocity along t1 and t2 of `tangent_frame` [nm/ns], shape (n,).
+
+    Returns
+    -------
+    Launches
+    """
+    frame = tangent_frame(emissions.normals)
+    lifted = emissions.neighbours + emissions.nearest_neighbour_distance * emissions.normals
+    return Launches(
+        positions=np.where(np.asarray(rolled)[:, None], lifted, emissions.positions),
+        velocities=np.asarray(first)[:, None] * frame[0] + np.asarray(second)[:, None] * frame[1],
+        rolled=rolled,
+    )

@@ -1,0 +1,1 @@
+"""The emission energies that fit a measured map."""

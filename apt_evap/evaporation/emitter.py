@@ -1,0 +1,376 @@
+"""The emitter: the charged surface of a specimen, and the sequence of atoms that leave it."""
+
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from apt_evap._common.threads import thread_count
+from apt_evap._common.types import Floats, Integers
+from apt_evap._common.validation import check_array, check_count, check_kind, check_number
+from apt_evap._core.evaporation import DONE, EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, Evaporation, Start
+from apt_evap._core.journal import Journal
+from apt_evap._core.neighbourhood import Neighbourhood
+from apt_evap._core.octree import Octree
+from apt_evap._core.robin import ChargingRule, Robin
+from apt_evap.evaporation.law import Extremal, Law
+from apt_evap.evaporation.settings import ChargeSettings, check_angle, check_voltage
+from apt_evap.evaporation.state import EmitterState
+from apt_evap.specimen.ase_atoms import to_atoms
+from apt_evap.specimen.tip import Tip
+from apt_evap.units import COULOMB
+
+RECORD = 16_384  # events after which a batch comes with a tree in any case, so that nobody has to keep the journals
+
+__all__ = ["DONE", "EXHAUSTED", "SWEEP_DUE", "TOO_SHALLOW", "Batch", "ChargeSettings", "Emitter"]
+
+_MOST_EVENTS = 10_000_000  # at a time: 640 MB of results
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Batch:
+    """Atoms that left one after the other.
+
+    Parameters
+    ----------
+    site : ndarray of int64, shape (n,)
+        Index of each atom in the specimen.
+    charges : ndarray, shape (n,)
+        Charge before it left [e].
+    fields : ndarray, shape (n,)
+        Field just outside before it left [V/nm].
+    normals : ndarray, shape (n, 3)
+        Outward unit normal.
+    neighbour : ndarray of int64, shape (n,)
+        Index of the surface nearest neighbour with the highest charge; -1 if there was none.
+    journal : Journal
+        What each event changed in the tree.
+    tree : Octree or None
+        Copy of the tree before the first event, if it was built anew since the batch before, or that was long ago.
+    status : int
+        DONE, SWEEP_DUE, EXHAUSTED or TOO_SHALLOW.
+    """
+
+    site: np.ndarray
+    charges: np.ndarray
+    fields: np.ndarray
+    normals: np.ndarray
+    neighbour: np.ndarray
+    journal: Journal
+    tree: Octree | None
+    status: int
+
+    def __len__(self) -> int:
+        return len(self.site)
+
+    def __repr__(self) -> str:
+        status = {DONE: "done", SWEEP_DUE: "sweep due", EXHAUSTED: "exhausted", TOO_SHALLOW: "too shallow"}[self.status]
+        return f"<Batch: {len(self):,} atoms left one after the other; {status}>"
+
+
+class Emitter:
+    """The charged surface of a specimen.
+
+    Parameters
+    ----------
+    tip : Tip
+        The specimen.
+    voltage : float
+        Applied voltage [V].
+    law : Extremal
+        Which atom leaves next.
+    settings : ChargeSettings
+        How finely the charges are solved.
+    n_threads : int, optional
+        Threads; by default the processors this process may use.
+    rule : ChargingRule, optional
+        How charge settles; by default `Robin`.
+
+    Raises
+    ------
+    ValueError
+        If the voltage is not above 0, or the specimen has no surface atom that may leave.
+    """
+
+    def __init__(
+        self,
+        tip: Tip,
+        voltage: float = 1000.0,
+        law: Law | None = None,
+        settings: ChargeSettings | None = None,
+        n_threads: int | None = None,
+        rule: ChargingRule | None = None,
+    ) -> None:
+        self.tip = check_kind(tip, "tip", Tip, "a Tip")
+        self.voltage = check_voltage(voltage)
+        self.law = Extremal() if law is None else check_kind(law, "law", "weights", "a law with a method weights")
+        self.settings = ChargeSettings() if settings is None else settings
+        check_kind(self.settings, "settings", ChargeSettings, "ChargeSettings")
+        self.rule = (
+            Robin() if rule is None else check_kind(rule, "rule", ChargingRule, "a ChargingRule such as Robin()")
+        )
+        self.n_threads = thread_count(n_threads)
+        distance = tip.nearest_neighbour_distance
+        neighbourhood, weights = self._neighbourhood_of(tip), self._weights_of(tip)
+        if not weights[neighbourhood.surface].any():
+            raise ValueError(f"no surface atom of {tip!r} may leave, expected some evaporable ones")
+        self._core = Evaporation(
+            neighbourhood,
+            self.rule,
+            weights,
+            self.voltage / COULOMB,
+            tip.potential_point,
+            tip.bond_length,
+            self.settings.patch_radius * distance,
+            self.settings.update_radius * distance,
+            self.settings.opening_angle,
+        )
+        self._left, self._deepened = [], []  # sites batch by batch; events at which more of the specimen was held
+        self.relax(tolerance=self.settings.start_tolerance)
+        self.sweep_interval = self.settings.sweep_interval or max(100, len(self) // 300)
+
+    def _neighbourhood_of(self, tip, before=None):
+        return Neighbourhood(
+            tip.positions,
+            tip.neighbour_radius,
+            tip.surface_threshold,
+            tip.support.view(np.int8),
+            self.n_threads,
+            before,
+        )
+
+    def _weights_of(self, tip):
+        return check_array(self.law.weights(tip), "weights of the law", (len(tip.positions),))
+
+    def __len__(self) -> int:
+        return len(self._core.slots)
+
+    def __repr__(self) -> str:
+        return f"<Emitter: {len(self):,} surface atoms of {len(self.tip.positions):,} at {self.voltage:g} V>"
+
+    @property
+    def atoms(self) -> Integers:
+        """Index of each surface atom in the specimen, shape (n,)."""
+        return self._core.tree.atoms[self._core.slots]
+
+    @property
+    def positions(self) -> Floats:
+        """Positions of the surface atoms [nm], shape (n, 3)."""
+        return self._core.tree.positions[self._core.slots]
+
+    @property
+    def normals(self) -> Floats:
+        """Outward unit normals of the surface atoms, shape (n, 3)."""
+        return self._core.slot_normals[self._core.slots]
+
+    @property
+    def charges(self) -> Floats:
+        """Charges of the surface atoms [e], shape (n,)."""
+        return self._core.tree.charges[self._core.slots]
+
+    @property
+    def fields(self) -> Floats:
+        """Fields just outside the surface atoms [V/nm], shape (n,).
+
+        F_i = 4 pi k_e q_i / s, with s the area per surface atom: the field at the outer face of a charged surface.
+        """
+        return self._field(self.charges)
+
+    def to_atoms(self) -> Any:
+        """Return the surface as ase.Atoms [Angstrom]; needs ASE.
+
+        Returns
+        -------
+        ase.Atoms
+            With arrays "charge" [e], "field" [V/nm], "normal" and "atom", the index in the specimen.
+        """
+        arrays = {"charge": self.charges, "field": self.fields, "normal": self.normals, "atom": self.atoms}
+        return to_atoms(self.positions, self.tip.elements, self.tip.species[self.atoms], **arrays)
+
+    @property
+    def area_per_atom(self) -> float:
+        """Area s of the surface per atom, as of the last relaxation [nm^2]."""
+        return self._core.rule.area
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Events so far, charges that came out negative and were set to 0, patches that did not settle; dict of int."""
+        core = self._core
+        return {"events": core.n_removed, "clipped": core.n_clipped, "unsettled": core.n_unsettled}
+
+    def _field(self, charges):
+        return 4 * np.pi * COULOMB / self.area_per_atom * charges
+
+    def field_at(self, points: ArrayLike, opening_angle: float = 0.3) -> Floats:
+        """Electric field of the surface charges.
+
+        Parameters
+        ----------
+        points : array_like, shape (m, 3)
+            Where [nm].
+        opening_angle : float
+            See `ChargeSettings`; 0 sums over all atoms.
+
+        Returns
+        -------
+        ndarray, shape (m, 3)
+            Field [V/nm].
+        """
+        points, opening_angle = check_array(points, "points", ("m", 3)), check_angle(opening_angle)
+        return COULOMB * self._core.tree.fields(points, opening_angle, self.n_threads)
+
+    def potential_at(self, points: ArrayLike, opening_angle: float = 0.3) -> Floats:
+        """Electric potential of the surface charges [V], shape (m,); parameters as in `field_at`."""
+        points, opening_angle = check_array(points, "points", ("m", 3)), check_angle(opening_angle)
+        return COULOMB * self._core.tree.potentials(points, opening_angle, self.n_threads)
+
+    def relax(self, tolerance: float | None = None) -> tuple[int, float]:
+        """Bring the whole surface to equilibrium at the applied voltage.
+
+        Parameters
+        ----------
+        tolerance : float, optional
+            Change of a charge in the last sweep, relative to the mean charge. By default the one of the settings, and
+            with their `relaxation_angle`; one given here is reached with the finer `opening_angle`.
+
+        Returns
+        -------
+        sweeps : int
+            Sweeps done.
+        residual : float
+            The change in the last one.
+        """
+        angle = self.settings.relaxation_angle if tolerance is None else self.settings.opening_angle
+        tolerance = self.settings.tolerance if tolerance is None else tolerance
+        tolerance = check_number(tolerance, "tolerance", above=0, at_most=1)
+        return self._relax(tolerance, angle)
+
+    def _relax(self, tolerance, angle, start=None):
+        counts = self.counts
+        self._relaxed = (tolerance, angle, counts["clipped"], counts["unsettled"])
+        outcome = self._core.relax(
+            tolerance=tolerance,
+            opening_angle=angle,
+            double_precision=tolerance < 1e-6,  # below it the rounding of float32 keeps charges moving
+            n_threads=self.n_threads,
+            start=start,
+        )
+        self._recorded = RECORD
+        if not outcome[1] < tolerance:
+            warnings.warn(
+                f"the charges had not settled after {outcome[0]} sweeps: the last one changed one by {outcome[1]:.1g} "
+                f"of the mean charge, expected {tolerance:.1g}",
+                stacklevel=3,
+            )
+        return outcome
+
+    def state(self) -> EmitterState:
+        """What makes the surface again as its last relaxation left it.
+
+        Returns
+        -------
+        EmitterState
+        """
+        start = self._core.start
+        sites = np.concatenate([np.empty(0, np.int64), *self._left])
+        self._left = [sites]
+        tolerance, angle, clipped, unsettled = self._relaxed
+        return EmitterState(
+            sites=sites[: start.n_removed],
+            charges=start.charges,
+            lonely=start.lonely,
+            lonely_normals=start.lonely_normals,
+            potential_point=tuple(start.potential_point.ravel().tolist()),
+            deepened=tuple(self._deepened),
+            tolerance=tolerance,
+            opening_angle=angle,
+            clipped=clipped,
+            unsettled=unsettled,
+        )
+
+    def restore(self, state: EmitterState) -> None:
+        """Make the surface again that another emitter of the same settings had.
+
+        Parameters
+        ----------
+        state : EmitterState
+            Of the other; the surface becomes what its last relaxation left, and events go on from there.
+
+        Raises
+        ------
+        ValueError
+            If atoms have left already, or the state is of another specimen.
+        """
+        if self.counts["events"]:
+            raise ValueError(f"restore needs a new emitter, got one that {self.counts['events']:,} atoms have left")
+        done = 0
+        for event in state.deepened:
+            self._core.atoms.remove_atoms(state.sites[done:event])
+            self._hold_more()
+            done = event
+        self._core.atoms.remove_atoms(state.sites[done:])
+        self._left, self._deepened = [state.sites], list(state.deepened)
+        self._core.n_clipped, self._core.n_unsettled = state.clipped, state.unsettled
+        point = np.reshape(state.potential_point, (1, 3))
+        start = Start(len(state.sites), state.charges, state.lonely, state.lonely_normals, point)
+        self._relax(state.tolerance, state.opening_angle, start)
+
+    def hand_out_tree(self) -> None:
+        """Let the next batch come with a copy of the tree, for flights that have not followed the events so far."""
+        self._recorded = RECORD
+
+    def deepen(self) -> None:
+        """Hold more of the specimen, after `evaporate` came upon atoms that are only held as support.
+
+        The atoms held so far keep their numbers.
+
+        Raises
+        ------
+        ValueError
+            If the specimen has nothing below: one made from positions.
+        """
+        self._hold_more()
+        self._deepened.append(self._core.n_removed)
+        self.relax()
+
+    def _hold_more(self):
+        tip = self.tip.deepened()
+        neighbourhood = self._neighbourhood_of(tip, self._core.atoms)
+        self._core.take_over(neighbourhood, self._weights_of(tip))
+        self.tip = tip
+
+    def evaporate(self, most: int) -> Batch:
+        """Let atoms leave, `most` of them or as many as leave before something has to be done first.
+
+        Parameters
+        ----------
+        most : int
+            Events at most.
+
+        Returns
+        -------
+        Batch
+            Its status says why it ended: DONE, SWEEP_DUE (call `relax` and go on), EXHAUSTED, TOO_SHALLOW (call
+            `deepen` and go on).
+        """
+        most = check_count(most, "most", at_least=1, at_most=_MOST_EVENTS)
+        journal = Journal(self.tip.positions, most)
+        site, neighbour = np.empty(most, np.int64), np.empty(most, np.int64)
+        charges, normals = np.empty(most), np.empty((most, 3))
+        tree = self._core.tree.copy() if self._recorded >= RECORD else None
+        status = self._core.evaporate(journal, most, self.sweep_interval, site, charges, normals, neighbour)
+        n = journal.n_events
+        self._recorded = n if tree is not None else self._recorded + n
+        self._left.append(site[:n].copy())
+        return Batch(
+            site=site[:n],
+            charges=charges[:n],
+            fields=self._field(charges[:n]),
+            normals=normals[:n],
+            neighbour=neighbour[:n],
+            journal=journal,
+            tree=tree,
+            status=status,
+        )

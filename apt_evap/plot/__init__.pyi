@@ -1,0 +1,20 @@
+# The pictures: read by type checkers, and by the lazy loader in __init__.py.
+from ._figure import add_colorbar as add_colorbar
+from ._figure import new_figure as new_figure
+from .histories import history as history
+from .maps import color_limits as color_limits
+from .maps import common_limits as common_limits
+from .maps import describe as describe
+from .maps import detector_map as detector_map
+from .maps import detector_maps as detector_maps
+from .overlay import overlay as overlay
+from .poles import poles as poles
+from .profiles import profile as profile
+from .profiles import profile_comparison as profile_comparison
+from .profiles import rectangles as rectangles
+from .responses import ion_colors as ion_colors
+from .responses import response as response
+from .specimens import mark_atoms as mark_atoms
+from .specimens import specimen as specimen
+from .study import side_by_side as side_by_side
+from .study import ssim_matrix as ssim_matrix

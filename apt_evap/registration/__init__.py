@@ -1,0 +1,1 @@
+"""Bringing two detector maps into register: rotation, scale, shift and mirror."""

@@ -1,0 +1,343 @@
+"""Where one map fits best on another: flattened images, masked correlations, a search and its refinement."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import fft, ndimage, optimize
+
+from apt_evap._common.types import Booleans, Floats
+from apt_evap.detection.binning import field_of_view
+from apt_evap.detection.detector_map import DetectorMap
+
+COARSE, MEDIUM, FINE = 40, 60, 100
+"""Pixels across the field of view in the search, when its best places are refined, and at the end."""
+BROAD = 1 / 8
+"""Standard deviation of the Gaussian that maps are flattened with, in diameters of the field of view."""
+NARROW = 0.8
+"""Standard deviation of the Gaussian that maps are smoothed with, in pixels."""
+RIM = 0.03
+"""What is cut off at the rim of the field of view, in its diameters."""
+ROTATION_STEP, SCALE_STEP = 6.0, 0.1
+"""Steps of the search [degrees] and in the logarithm of the scale: some two coarse pixels at the rim."""
+
+
+class Placement(NamedTuple):
+    """A similarity transform of points z (complex [mm]) that moves the centre of a simulated field of view."""
+
+    rotation: float
+    """Anticlockwise [degrees]."""
+    scale: float
+    """Measured over simulated lengths."""
+    mirror: bool
+    """Whether y changes its sign first."""
+    anchor: complex
+    """A simulated point."""
+    place: complex
+    """Where it comes to lie."""
+
+    def forth(self, points: Any) -> Any:
+        """Move simulated points into the measured frame."""
+        away = points - self.anchor
+        return self.place + self._turn * (np.conj(away) if self.mirror else away)
+
+    def back(self, points: Any) -> Any:
+        """Move measured points into the simulated frame."""
+        away = (points - self.place) / self._turn
+        return self.anchor + (np.conj(away) if self.mirror else away)
+
+    def anchored(self, place: complex) -> "Placement":
+        """The same transform with the anchor that comes to lie at `place`."""
+        return self._replace(anchor=self.back(place), place=place)
+
+    @property
+    def _turn(self):
+        return self.scale * np.exp(1j * np.radians(self.rotation))
+
+
+class Fit(NamedTuple):
+    """A placement and how well the images fit there."""
+
+    placement: Placement
+    score: float
+    """Correlation coefficient where both show something."""
+    overlap: float
+    """Share of the measured field of view where both do."""
+
+    @property
+    def rank(self) -> float:
+        """What the search maximises: a match of more of the map counts more, as the error of a mean does."""
+        return self.score * np.sqrt(self.overlap)
+
+
+class Near(NamedTuple):
+    """Where a simulated point must come to lie."""
+
+    anchor: complex
+    """The simulated point [mm]."""
+    place: complex
+    """The measured point [mm]."""
+    tolerance: float
+    """How far off it may lie, in x and in y [mm]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """A flattened map, sampled anywhere; coordinates are complex numbers x + iy [mm]."""
+
+    values: np.ndarray
+    mask: np.ndarray
+    origin: complex
+    bin_size: tuple
+
+    def sample(self, points: Any) -> tuple[Floats, Booleans]:
+        """Values at points, 0 outside, and whether points are inside; both of the shape of `points`."""
+        place = points - self.origin
+        index = np.stack([place.imag / self.bin_size[1], place.real / self.bin_size[0]])
+        inside = ndimage.map_coordinates(self.mask, index, order=0, mode="constant") > 0
+        return np.where(inside, ndimage.map_coordinates(self.values, index, order=1, mode="nearest"), 0.0), inside
+
+
+class View:
+    """A map within its field of view, less a rim.
+
+    Parameters
+    ----------
+    map : DetectorMap
+        The map.
+    """
+
+    def __init__(self, map: DetectorMap) -> None:
+        # densities are as good as 20 hits per bin, over which field_of_view averages
+        values = map.values if map.is_counts else map.values * (20 / map.values[map.mask].mean())
+        mask = np.pad(map.mask & field_of_view(np.where(map.mask, values, 0)), 1)
+        width, height = map.bin_size
+        rim = RIM * 2 * np.sqrt(np.count_nonzero(mask) * width * height / np.pi)
+        self.mask = (ndimage.distance_transform_edt(mask, sampling=(height, width)) > rim)[1:-1, 1:-1]
+        self.map = replace(map, mask=self.mask)
+        x, y = np.meshgrid(*map.centres)
+        points = (x + 1j * y)[self.mask]
+        self.centre = complex(points.mean())
+        self.diameter = float(2 * np.sqrt(len(points) * width * height / np.pi))
+        self.reach = float(np.abs(points - self.centre).max())
+
+    def flatten(self, narrow: float, broad: float) -> Image:
+        """Density smoothed by `narrow` relative to that smoothed by `broad` [mm], less its mean, as an `Image`.
+
+        A tenth of the median density is added to the denominator and the outermost percents are cut off, so that
+        neither thinly filled corners nor single bright spots dominate.
+        """
+        x_min, x_max, y_min, y_max = self.map.extent
+        widest = max(x_max - x_min, y_max - y_min)  # a Gaussian of this width is flat over the map
+        fine, wide = (self.map.smoothed(min(sigma, widest)).values for sigma in (narrow, broad))
+        ratio = (fine - wide) / (wide + 0.1 * np.median(wide[self.mask]))
+        ratio = np.clip(ratio, *np.percentile(ratio[self.mask], [1, 99]))
+        values = np.where(self.mask, ratio - ratio[self.mask].mean(), 0.0)
+        x, y = self.map.centres
+        return Image(values, self.mask.astype(np.uint8), complex(x[0], y[0]), self.map.bin_size)
+
+
+def correlation(a: Floats, b: Floats) -> float:
+    """Correlation coefficient of two sets of values, 0 if one is constant (float)."""
+    a, b = a - a.mean(), b - b.mean()
+    norm = np.sqrt((a @ a) * (b @ b))
+    return float(a @ b / norm) if norm > 0 else 0.0
+
+
+def spectra(values: Any, inside: Any, size: int) -> Any:
+    """Fourier transforms of a mask, an image that is 0 outside of it and its square, padded to (size, size)."""
+    return fft.rfft2(np.stack([inside, values, values**2]).astype(np.float32), (size, size))
+
+
+def correlate(moving: Any, fixed: Any, size: int) -> tuple[Floats, Floats]:
+    """Correlation coefficients of one image and another that it is shifted over, where both are inside.
+
+    Parameters
+    ----------
+    moving, fixed : ndarray
+        Their `spectra`.
+    size : int
+        Length of the sides they are padded to.
+
+    Returns
+    -------
+    coefficients, shared : ndarray, shape (size, size)
+        For every shift of the first image in y and x, the correlation coefficient and the number of shared pixels;
+        negative shifts count from the end.
+
+    Notes
+    -----
+    Padfield, IEEE Trans. Image Process. 21, 2706 (2012).
+    """
+    pairs = ((0, 0), (1, 0), (0, 1), (1, 1), (2, 0), (0, 2))
+    products = np.stack([np.conj(moving[i]) * fixed[j] for i, j in pairs])
+    shared, a, b, ab, aa, bb = fft.irfft2(products, (size, size))
+    shared = np.rint(shared)
+    number = np.maximum(shared, 1)
+    spread = np.maximum(aa - a * a / number, 0) * np.maximum(bb - b * b / number, 0)
+    # float32 leaves some 1e-6 of the largest spread where there is none
+    good = spread > 1e-6 * spread.max()
+    return np.where(good, (ab - a * b / number) / np.sqrt(np.where(good, spread, 1)), 0), shared
+
+
+def search(
+    simulated: View,
+    measured: View,
+    rotations: Any,
+    scales: Any,
+    mirrors: Any,
+    least: float,
+    near: tuple[complex, float] | None = None,
+) -> list[Fit]:
+    """Find the best shift for every rotation, scale and mirror.
+
+    Parameters
+    ----------
+    simulated, measured : View
+        The maps.
+    rotations, scales, mirrors : sequence
+        What to try: degrees, numbers, bools.
+    least : float
+        Least share of the measured field of view that both must show.
+    near : Near, optional
+        Bounds of the shift.
+
+    Returns
+    -------
+    list of Fit
+        The best first.
+    """
+    pixel, broad = measured.diameter / COARSE, BROAD * measured.diameter
+    grid = _square(measured.reach, pixel)
+    image = measured.flatten(NARROW * pixel, broad)
+    turned = [image.sample(measured.centre + np.exp(1j * np.radians(turn)) * grid) for turn in rotations]
+    fits = []
+    for scale in scales:
+        image = simulated.flatten(NARROW * pixel / scale, broad / scale)
+        points = _square(simulated.reach * scale, pixel)
+        size = fft.next_fast_len(len(points) + len(grid) - 1, real=True)
+        # shifts of the simulated centre from the measured one, in the frame that turns with the simulated map
+        steps = np.arange(size)
+        steps = (np.where(steps < len(grid), steps, steps - size) + len(points) // 2 - len(grid) // 2) * pixel
+        shifts = steps + 1j * steps[:, None]
+        fixed = [spectra(*values, size) for values in turned]
+        for mirror in mirrors:
+            moving = spectra(*image.sample(simulated.centre + (points.conj() if mirror else points) / scale), size)
+            allowed = True
+            for turn, values, (_, inside) in zip(rotations, fixed, turned, strict=True):
+                if near is not None:
+                    unmoved = Placement(0.0, scale, mirror, simulated.centre, 0j).forth(near.anchor)
+                    target = (near.place - measured.centre) * np.exp(-1j * np.radians(turn))
+                    allowed = np.abs(unmoved + shifts - target) <= max(near.tolerance, pixel)
+                score, shared = correlate(moving, values, size)
+                share = np.minimum(shared / np.count_nonzero(inside), 1)
+                best = np.argmax(np.where(allowed & (share >= least), score * np.sqrt(share), -1))
+                if share.flat[best] >= least:
+                    place = measured.centre + np.exp(1j * np.radians(turn)) * shifts.flat[best]
+                    placement = Placement(float(turn), float(scale), mirror, simulated.centre, complex(place))
+                    fits.append(Fit(placement, float(score.flat[best]), float(share.flat[best])))
+    return sorted(fits, key=lambda fit: -fit.rank)
+
+
+def distinct(fits: Sequence[Fit], most: int) -> list[Fit]:
+    """The first `most` fits that are no neighbours in rotation and scale of a better one."""
+    kept = []
+    for fit in fits:
+        if len(kept) < most and not any(_close(fit.placement, other.placement) for other in kept):
+            kept.append(fit)
+    return kept
+
+
+def refine(
+    simulated: View,
+    measured: View,
+    placement: Placement,
+    pixels: int,
+    least: float,
+    rotations: tuple[float, ...] | None = None,
+    scales: tuple[float, ...] | None = None,
+    near: Near | None = None,
+) -> Fit:
+    """Maximise the correlation near a placement.
+
+    Parameters
+    ----------
+    simulated, measured : View
+        The maps.
+    placement : Placement
+        Where to begin.
+    pixels : int
+        Pixels across the measured field of view.
+    least : float
+        Least share of the measured field of view that both must show.
+    rotations, scales : tuple of float, optional
+        Bounds; equal ones fix the value.
+    near : Near, optional
+        Bounds of the shift.
+
+    Returns
+    -------
+    Fit
+    """
+    pixel, broad = measured.diameter / pixels, BROAD * measured.diameter
+    points = _square(measured.reach, pixel) + measured.centre
+    values, inside = measured.flatten(NARROW * pixel, broad).sample(points)
+    points, values = points[inside], values[inside]
+    image = simulated.flatten(NARROW * pixel / placement.scale, broad / placement.scale)
+    start = placement.anchored(measured.centre)
+    if near is not None:
+        away = placement.forth(near.anchor) - near.place
+        away = complex(*np.clip((away.real, away.imag), -near.tolerance, near.tolerance))
+        start = placement._replace(anchor=near.anchor, place=near.place + away)
+    free = [rotations is None or rotations[0] < rotations[1], scales is None or scales[0] < scales[1], True, True]
+    units = np.array([ROTATION_STEP / 2, SCALE_STEP / 2, pixel, pixel])
+    low, high = np.full(4, -np.inf), np.full(4, np.inf)
+    if rotations is not None:
+        low[0], high[0] = (np.asarray(rotations) - start.rotation) / units[0]
+    if scales is not None:
+        low[1], high[1] = np.log(np.asarray(scales) / start.scale) / units[1]
+    if near is not None:
+        offset = np.array([away.real, away.imag])
+        low[2:], high[2:] = (-near.tolerance - offset) / pixel, (near.tolerance - offset) / pixel
+
+    def placed(steps):
+        turn, stretch, x, y = _spread(steps, free) * units
+        return start._replace(
+            rotation=start.rotation + turn, scale=start.scale * np.exp(stretch), place=start.place + complex(x, y)
+        )
+
+    def fit(steps):
+        placement = placed(steps)
+        sampled, shared = image.sample(placement.back(points))
+        overlap = np.count_nonzero(shared) / len(points)
+        return Fit(placement, correlation(sampled[shared], values[shared]) if overlap >= least else -1.0, overlap)
+
+    low, high = np.minimum(low, 0)[free], np.maximum(high, 0)[free]  # the start is inside but for rounding
+    simplex = np.vstack([np.zeros(len(low)), np.diag(np.where(high >= 1, 1.0, -1.0))])
+    options = {"initial_simplex": np.clip(simplex, low, high), "xatol": 2e-3, "fatol": 1e-6, "maxiter": 400}
+    bounds = optimize.Bounds(low, high)
+    result = optimize.minimize(lambda s: -fit(s).rank, simplex[0], method="Nelder-Mead", bounds=bounds, options=options)
+    return fit(result.x)
+
+
+def _spread(steps, free):
+    whole = np.zeros(4)
+    whole[free] = steps
+    return whole
+
+
+def _close(a, b):
+    turn = abs((a.rotation - b.rotation + 180) % 360 - 180)
+    return (
+        a.mirror == b.mirror
+        and turn <= 1.5 * ROTATION_STEP
+        and abs(np.log(a.scale / b.scale)) <= 1.5 * SCALE_STEP + 1e-9
+    )
+
+
+def _square(reach, pixel):
+    """Points of a square grid around 0 that covers a distance of `reach`, complex of shape (n, n) [mm]."""
+    half = int(np.ceil(reach / pixel))
+    side = np.arange(-half, half + 1) * pixel
+    return side + 1j * side[:, None]

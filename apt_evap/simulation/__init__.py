@@ -1,0 +1,1 @@
+"""The simulation, its runs, their monitoring, files and checkpoints."""

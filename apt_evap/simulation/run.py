@@ -1,0 +1,344 @@
+"""A run: the sequence of atoms that left, and where their ions land under any perturbation; saved in HDF5."""
+
+import datetime
+import json
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from apt_evap._common.files import FileError, check_path
+from apt_evap._common.types import AnyPath, Booleans
+from apt_evap._common.validation import check_kind, check_switch, shown
+from apt_evap._version import __version__
+from apt_evap.detection.detector import Detector
+from apt_evap.detection.hits import Hits
+from apt_evap.emission.emissions import Emissions
+from apt_evap.emission.ion_random import IonRandom
+from apt_evap.emission.perturbations import Perturbation, Unperturbed
+from apt_evap.evaporation.state import EmitterState
+from apt_evap.flight.response import Responses, ResponseSettings, unflattened
+from apt_evap.simulation.history import History
+from apt_evap.simulation.run_hdf5 import described, read_run, write_run
+
+
+@dataclass(frozen=True, eq=False)
+class Flown:
+    """What one perturbation gave in the run: stereographic directions (n, 2) and times of flight (n,) [ns]."""
+
+    directions: np.ndarray
+    times: np.ndarray
+
+    def __repr__(self) -> str:
+        return f"<Flown: directions and times of {len(self.times):,} ions>"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Run:
+    """Atoms in the order in which they left, with what is needed to say where their ions land.
+
+    Made by `Simulation.run` and `load`.
+
+    Parameters
+    ----------
+    emissions : Emissions
+        Sites, normals, neighbours, charge states, masses and numbers of the n ions.
+    site : ndarray of int64, shape (n,)
+        Index of each atom in the specimen.
+    species : ndarray of int32, shape (n,)
+        Index of each atom into `elements`.
+    charges, fields : ndarray, shape (n,)
+        Charge [e] and field just outside [V/nm] of each atom before it left.
+    perturbations : tuple
+        The perturbations flown in the run, or what is known of them from a file.
+    flown : tuple of Flown
+        What each of these gave.
+    responses : Responses or None
+        Polynomials of every ion.
+    seed : int
+        Seed of the random numbers of the perturbations.
+    voltage : float
+        Applied voltage [V].
+    detector : Detector
+        The detector.
+    response_settings : ResponseSettings
+        What the responses were made with.
+    elements : tuple of str
+        Names of the species.
+    settings : dict
+        Everything the run was made with, in plain types.
+    history : History
+        What was seen of the charges and the ions as the run went on.
+    state : EmitterState or None
+        What makes the surface again at the last relaxation of the run, from which it can be resumed.
+    first_event : int
+        Atoms that had left the specimen before the first ion of the run.
+    ended : str
+        Why the run ended before its time; "" if it did not.
+    provenance : dict
+        Version and time.
+    """
+
+    emissions: Emissions
+    site: np.ndarray
+    species: np.ndarray
+    charges: np.ndarray
+    fields: np.ndarray
+    perturbations: tuple
+    flown: tuple
+    responses: Responses | None
+    seed: int
+    voltage: float
+    detector: Detector
+    response_settings: ResponseSettings
+    elements: tuple
+    settings: dict
+    history: History = field(default_factory=History.empty)
+    state: EmitterState | None = None
+    first_event: int = 0
+    ended: str = ""
+    provenance: dict = field(
+        default_factory=lambda: {
+            "version": __version__,
+            "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        }
+    )
+
+    def __len__(self) -> int:
+        return len(self.site)
+
+    def __repr__(self) -> str:
+        flown = ", ".join(_describe(perturbation) for perturbation in self.perturbations)
+        responses = "" if self.responses is None else f"responses with {self.marked.sum():,} ions marked"
+        held = "; ".join(part for part in (responses, flown and f"flown: {flown}", self.ended) if part)
+        return f"<Run: {len(self):,} ions of {', '.join(self.elements)} at {self.voltage:g} V; {held}>"
+
+    @property
+    def marked(self) -> Booleans:
+        """Ions whose responses miss their own flights by more than the bound, or could not be fitted, bool (n,)."""
+        if self.responses is None:
+            return np.zeros(len(self), bool)
+        rolls = np.isfinite(self.emissions.neighbours).all(axis=1)
+        bad = ~(self.responses.residuals <= self.response_settings.bound)
+        return bad[:, 0] | (bad[:, 1] & rolls)
+
+    @property
+    def first_perturbation(self) -> Any:
+        """The first one flown in the run; `Unperturbed` where there are only responses."""
+        return self.perturbations[0] if self.flown else Unperturbed()
+
+    def hits(self, perturbation: Perturbation, *, by_response: bool = False) -> Hits:
+        """Where the ions land under a perturbation.
+
+        One that was flown in the run is taken as flown; any other that launches along the surface (all built-in ones,
+        with any energies) follows from the responses. Every perturbation sees the same random numbers of an ion.
+
+        Parameters
+        ----------
+        perturbation : perturbation
+            How the ions start.
+        by_response : bool
+            Whether to take the responses also for one that was flown, to compare them.
+
+        Returns
+        -------
+        Hits
+            One row per ion, in the order in which the atoms left; `outcome` counts those that miss the detector.
+
+        Raises
+        ------
+        ValueError
+            If the perturbation was not flown and does not follow from responses.
+        """
+        check_switch(by_response, "by_response")
+        for flown_as, flown in zip(self.perturbations, self.flown, strict=True):
+            known = flown_as == perturbation or flown_as == described(perturbation)  # by name and repr in a file
+            if known and not by_response:
+                return self._hits(flown.directions, flown.times, perturbation)
+        if not callable(getattr(perturbation, "tangential", None)):
+            check_kind(perturbation, "perturbation", "launch", "a perturbation such as Unperturbed() or RollUp(0.2)")
+            raise ValueError(
+                f"perturbation {shown(perturbation)} was not flown in this run and does not say how it launches along "
+                "the surface; name it when the run starts: simulation.run(n, emissions=[...])"
+            )
+        if self.responses is None:
+            raise ValueError(f"this run has no responses and {shown(perturbation)} was not flown in it")
+        settings = self.response_settings
+        rolled, first, second = perturbation.tangential(self.emissions, IonRandom(self.seed, self.emissions.ions))  # type: ignore[attr-defined]
+        velocities = settings.reduced(np.column_stack([first, second]), self.emissions.masses)
+        faster = int(np.count_nonzero(np.einsum("ij,ij->i", velocities, velocities) > 1.0001))
+        if faster:
+            warnings.warn(
+                f"{faster:,} of {len(self):,} ions launch above the {settings.energy_limit:g} eV of the responses: "
+                "their places are extrapolated; run with a larger energy_limit, of ResponseSettings or in [responses] "
+                "of a settings file",
+                stacklevel=2,
+            )
+        values = np.empty((len(self), 3))
+        for design, coefficients, chosen in (
+            (settings.site, self.responses.site, ~rolled),
+            (settings.rolled, self.responses.rolled, rolled),
+        ):
+            every = slice(None) if chosen.all() else chosen
+            values[every] = design.evaluate(coefficients[every], velocities[every])
+        return self._hits(*unflattened(values), perturbation)
+
+    def _hits(self, directions, times, perturbation):
+        x, y, times, outcome = self.detector.impacts(directions, times)
+        emissions = self.emissions
+        return Hits(
+            x=x,
+            y=y,
+            time_of_flight=times,
+            voltage=np.full(len(self), self.voltage),
+            mass_to_charge=emissions.masses / emissions.charge_states,
+            positions=emissions.positions,
+            site=self.site,
+            ion=emissions.ions,
+            outcome=outcome,
+            extra={"charge": self.charges, "field": self.fields},
+            units={"charge": "e", "field": "V/nm"},
+            source=f"simulation, {_describe(perturbation)}",
+            extent=self.detector.extent,
+        )
+
+    def seen_by(self, detector: Detector) -> "Run":
+        """Let another detector see the ions of this run: only where they are recorded changes.
+
+        Parameters
+        ----------
+        detector : Detector
+            Another distance, width or projection.
+
+        Returns
+        -------
+        Run
+        """
+        return replace(self, detector=detector, settings=self.settings | {"detector": vars(detector)})
+
+    def summary(self) -> dict[str, Any]:
+        """Counts of what happened, dict: ions, outcomes of the first perturbation, ions that cannot roll, marked."""
+        first = self.first_perturbation
+        counts = {outcome.name.lower(): count for outcome, count in self.hits(first).counts.items()}
+        return {
+            "ions": len(self),
+            "perturbation": _describe(first),
+            **counts,
+            "without_neighbour": int((~np.isfinite(self.emissions.neighbours).all(axis=1)).sum()),
+            "marked": int(self.marked.sum()),
+            "ended": self.ended,
+        }
+
+    # ---- parts -----------------------------------------------------------------------------------------------------
+
+    @classmethod
+    def join(cls, runs: "Sequence[Run]") -> "Run":
+        """Join the parts of one run, in their order, into one."""
+        first = runs[0]
+        emissions = Emissions(
+            **{
+                name: np.concatenate([getattr(run.emissions, name) for run in runs])
+                for name in ("positions", "normals", "neighbours", "charge_states", "masses", "ions")
+            },
+            nearest_neighbour_distance=first.emissions.nearest_neighbour_distance,
+        )
+        columns = {
+            name: np.concatenate([getattr(run, name) for run in runs])
+            for name in ("site", "species", "charges", "fields")
+        }
+        flown = tuple(
+            Flown(
+                np.concatenate([part.directions for part in parts]),
+                np.concatenate([part.times for part in parts]),
+            )
+            for parts in zip(*(run.flown for run in runs), strict=True)
+        )
+        responses = None
+        if first.responses is not None:
+            responses = Responses(
+                *(np.concatenate(parts) for parts in zip(*(run.responses for run in runs), strict=True))
+            )
+        history = History.join([run.history for run in runs])
+        return replace(first, emissions=emissions, flown=flown, responses=responses, history=history, **columns)  # type: ignore[arg-type]
+
+    def ended_by(self, reason: str) -> "Run":
+        """Return the same run with the reason why it ended before its time."""
+        return replace(self, ended=reason)
+
+    # ---- files -----------------------------------------------------------------------------------------------------
+
+    def save(self, path: AnyPath) -> None:
+        """Write the run to an HDF5 file, whole or not at all.
+
+        Parameters
+        ----------
+        path : str or path-like
+            The file to write or overwrite.
+
+        Raises
+        ------
+        FileError
+            If it cannot be written.
+        """
+        write_run(path, self)
+
+
+def load(path: AnyPath, *, partial: bool = False) -> Run:
+    """Read a run from an HDF5 file that `Run.save` wrote, or from the folder of one that is unfinished.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file; or the folder beside it, whose name ends in ".unfinished" (see `Checkpoint`).
+    partial : bool
+        Whether to read, of a damaged file or folder, the ions that are whole; a warning says how many are lost.
+
+    Returns
+    -------
+    Run
+
+    Raises
+    ------
+    FileError
+        If it is missing, unreadable, damaged or not a run.
+    """
+    path = check_path(path)
+    if path.is_dir():
+        return _load_parts(path, partial)
+    return _load_file(path, partial)
+
+
+def _load_file(path, partial=False):
+    arguments = read_run(path, partial)
+    return Run(**arguments | {"flown": tuple(Flown(*flown) for flown in arguments["flown"])})
+
+
+def _load_parts(folder, partial):
+    parts = []
+    for path in part_paths(folder):
+        try:
+            part = _load_file(path, partial)
+        except FileError as error:
+            if not partial:
+                raise
+            warnings.warn(f"{error}: its ions are lost", stacklevel=3)
+            continue
+        parts.append(part)
+    if not parts:
+        raise FileError(f"{str(folder)!r} holds no run: expected files {PART_NAME.format(0)!r} and so on")
+    return Run.join(parts).ended_by(UNFINISHED)
+
+
+PART_NAME, UNFINISHED = "ions-{:012d}.h5", "unfinished"
+
+
+def part_paths(folder: Path) -> list[Path]:
+    """Files of an unfinished run in the order of their ions."""
+    return sorted(folder.glob("ions-*.h5"))
+
+
+def _describe(perturbation):
+    return perturbation.get("repr", json.dumps(perturbation)) if isinstance(perturbation, dict) else repr(perturbation)

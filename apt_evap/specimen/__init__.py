@@ -1,0 +1,1 @@
+"""The specimen: crystals, materials, alloys, the shape of a tip and the shell of atoms that is held."""

@@ -1,0 +1,230 @@
+"""Materials: the numbers a specimen needs of an element, each with its source."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+from apt_evap._common.validation import check_count, check_kind, check_number, did_you_mean, shown
+from apt_evap.specimen.lattice import check_structure, nearest_neighbour_distance
+from apt_evap.units import ELEMENTARY_CHARGE
+
+_KITTEL = "Kittel, Introduction to Solid State Physics, 8th ed. (2005), ch. 1, table 3"
+_TSONG = "Tsong, Surf. Sci. 70, 211 (1978), image-hump model, charge state of lowest field"
+_MULLER = "measured; Mueller and Tsong, Field Ion Microscopy (1969)"
+_IUPAC = "IUPAC standard atomic weights, abridged (Prohaska et al., Pure Appl. Chem. 94, 573, 2022)"
+_SHAIKH = "Shaikh et al., arXiv 2509.13744, appendix on polarization"
+# more is a slip of the unit, 3.52 (Angstrom) for a or 35e9 (V/m): no element has it
+_LONGEST = 2.0
+_HIGHEST_FIELD = 1000.0
+
+
+@dataclass(frozen=True)
+class Material:
+    """A pure element (or the host of an alloy) as a field emitter.
+
+    Parameters
+    ----------
+    name : str
+        Chemical symbol, or any name.
+    structure : str
+        One of fcc, bcc, sc, diamond, hcp.
+    a : float
+        Lattice constant [nm].
+    evaporation_field : float
+        Field at which an atom leaves without a barrier [V/nm].
+    charge_state : int
+        Dominant charge of the ion at the evaporation field [e].
+    mass : float
+        Mass of the ion [Da].
+    c : float, optional
+        Height of the hexagonal cell [nm]; needed for hcp, not allowed for the others.
+    polarizability : float, optional
+        Polarizability of the free atom [F m^2].
+    sources : mapping of str to str
+        Where each number comes from, by the name of the field.
+
+    Raises
+    ------
+    ValueError
+        If a number is outside its range, the structure unknown, or `c` missing or out of place.
+    """
+
+    name: str
+    structure: str
+    a: float
+    evaporation_field: float
+    charge_state: int
+    mass: float
+    c: float | None = None
+    polarizability: float | None = None
+    sources: Mapping[str, str] = field(default_factory=dict, compare=False, repr=False)
+
+    def __post_init__(self):
+        if not isinstance(self.name, str) or not self.name:
+            raise ValueError(f"name must be a word such as 'Ni', got {shown(self.name)}")
+        check_structure(self.structure)
+        checked = {
+            "a": check_number(self.a, "a", above=0, at_most=_LONGEST, unit="nm"),
+            "evaporation_field": check_number(
+                self.evaporation_field, "evaporation_field", above=0, at_most=_HIGHEST_FIELD, unit="V/nm"
+            ),
+            "charge_state": check_count(self.charge_state, "charge_state", at_least=1, at_most=118),
+            "mass": check_number(self.mass, "mass", at_least=1, at_most=1e4, unit="Da"),
+            "sources": dict(check_kind(self.sources, "sources", Mapping, "a mapping of a field to its source")),
+        }
+        if (self.structure == "hcp") != (self.c is not None):
+            wanted = "be given for hcp" if self.structure == "hcp" else f"be None for {self.structure}"
+            raise ValueError(f"c must {wanted}, got {shown(self.c)}")
+        if self.c is not None:
+            checked["c"] = check_number(self.c, "c", above=0, at_most=_LONGEST, unit="nm")
+        if self.polarizability is not None:
+            checked["polarizability"] = check_number(
+                self.polarizability, "polarizability", above=0, at_most=1e-30, unit="F m^2"
+            )
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def nearest_neighbour_distance(self) -> float:
+        """Distance between nearest neighbours in the bulk [nm]."""
+        return nearest_neighbour_distance(self.structure, self.a, self.c)
+
+
+def _element(name, structure, a, evaporation_field, charge_state, mass, *, field_source=_TSONG, **more):
+    sources = {
+        "structure": _KITTEL,
+        "a": _KITTEL,
+        "evaporation_field": field_source,
+        "charge_state": _TSONG,
+        "mass": _IUPAC,
+    }
+    sources |= {"c": _KITTEL} if "c" in more else {}
+    sources |= {"polarizability": _SHAIKH} if "polarizability" in more else {}
+    return Material(name, structure, a, evaporation_field, charge_state, mass, sources=sources, **more)
+
+
+MATERIALS = {
+    element.name: element
+    for element in (
+        _element("Al", "fcc", 0.405, 19.0, 1, 26.982, polarizability=9.8e-40),
+        _element("Si", "diamond", 0.543, 33.0, 2, 28.085),
+        _element("Ti", "hcp", 0.295, 26.0, 2, 47.867, c=0.468),
+        _element("Fe", "bcc", 0.287, 33.0, 2, 55.845),
+        _element("Ni", "fcc", 0.352, 35.0, 1, 58.693, polarizability=6.8e-40),
+        _element("Cu", "fcc", 0.361, 30.0, 1, 63.546),
+        _element("W", "bcc", 0.316, 57.0, 3, 183.84, field_source=_MULLER),
+        _element("Pt", "fcc", 0.392, 48.0, 2, 195.08),
+        _element("Au", "fcc", 0.408, 53.0, 1, 196.97),
+    )
+}
+"""Known materials by name. Ni and Au are seen as 1+ and 2+ side by side: the fields of both are close."""
+
+
+_WORDS = {
+    "aluminium": "Al",
+    "aluminum": "Al",
+    "silicon": "Si",
+    "titanium": "Ti",
+    "iron": "Fe",
+    "nickel": "Ni",
+    "copper": "Cu",
+    "tungsten": "W",
+    "platinum": "Pt",
+    "gold": "Au",
+}
+
+
+def material(name: str, **changes: Any) -> Material:
+    """Return a known material, with some of its numbers changed if wanted.
+
+    Parameters
+    ----------
+    name : str
+        Chemical symbol.
+    **changes
+        Fields of `Material` to replace: ``material("Ni", evaporation_field=36.0)``.
+
+    Returns
+    -------
+    Material
+
+    Raises
+    ------
+    ValueError
+        If the name or a field is unknown, or a new value is outside its range.
+    """
+    known = [item.name for item in fields(Material) if item.name not in ("name", "sources")]
+    for change in changes:
+        if change not in known:
+            raise ValueError(f"a material has no {change!r}{did_you_mean(change, known)}; it has {', '.join(known)}")
+    if not isinstance(name, str) or name not in MATERIALS:
+        known = f"known are {', '.join(MATERIALS)}, any other is a Material(...) of your own"
+        meant = _WORDS.get(name.strip().lower()) if isinstance(name, str) else None
+        hint = did_you_mean(meant or name, MATERIALS)
+        raise ValueError(f"no material is named {shown(name)}{hint}; {known}")
+    found = MATERIALS[name]
+    return replace(found, **changes, sources=found.sources | dict.fromkeys(changes, "given by the user"))
+
+
+def as_material(value: Material | str, name: str = "material") -> Material:
+    """Return a Material as it is, and the known one of a name.
+
+    Parameters
+    ----------
+    value : Material or str
+        What the user gave.
+    name : str
+        Name of the argument, for the message.
+
+    Returns
+    -------
+    Material
+
+    Raises
+    ------
+    ValueError
+        If it is neither, or no material has this name.
+    """
+    if isinstance(value, str):
+        return material(value)
+    return check_kind(value, name, Material, "a Material or the name of one")
+
+
+def polarization_energy(
+    polarizability: float, voltage: float, field_factor: float, radius: float, step: float
+) -> float:
+    """Energy that polarization gives an atom moving one step up the field gradient: a lower bound of E_perp.
+
+    Parameters
+    ----------
+    polarizability : float
+        Polarizability alpha [F m^2].
+    voltage : float
+        Applied voltage V [V].
+    field_factor : float
+        Geometry factor k of F = V/(k r).
+    radius : float
+        Radius of the apex r [nm].
+    step : float
+        Length of the step [nm].
+
+    Returns
+    -------
+    float
+        Energy [eV].
+
+    Raises
+    ------
+    ValueError
+        If a number is outside its range.
+
+    Notes
+    -----
+    E = alpha V^2 / k^2 step / r^3 (Shaikh et al., arXiv 2509.13744, appendix on polarization).
+    """
+    alpha = check_number(polarizability, "polarizability", above=0, unit="F m^2")
+    voltage = check_number(voltage, "voltage", unit="V")
+    factor = check_number(field_factor, "field_factor", above=0)
+    radius = check_number(radius, "radius", above=0, unit="nm")
+    step = check_number(step, "step", at_least=0, unit="nm")
+    return alpha * (voltage / factor) ** 2 * step / radius**3 * 1e18 / ELEMENTARY_CHARGE

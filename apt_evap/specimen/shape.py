@@ -1,0 +1,118 @@
+"""The shape of a tip: a spherical cap on a cone, as a signed distance."""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from apt_evap._common.types import Floats
+from apt_evap._common.validation import check_choice, check_number
+
+_LONGEST = 1e7  # [nm]: a centimetre is no tip, and volumes keep their digits
+
+
+@dataclass(frozen=True)
+class TaperedCap:
+    """A spherical cap on a shank that widens downwards.
+
+    The convex hull of two spheres, tangent everywhere: the cap of radius R around the origin, its apex at
+    z = R, and the foot of radius R + L sin(alpha) around z = -L. Between them is the cone
+    rho cos(alpha) + z sin(alpha) = R. With ``base="flat"`` this cone goes on to z = -L and is cut there.
+
+    Parameters
+    ----------
+    apex_radius : float
+        Radius R of the cap [nm].
+    shank_length : float
+        Length L of the shank [nm].
+    shank_angle : float
+        Half the opening angle alpha of the shank [degrees], at least 0 and below 45.
+    base : str
+        "rounded" or "flat".
+
+    Raises
+    ------
+    ValueError
+        If a number is outside its range, or the base is unknown.
+    """
+
+    apex_radius: float
+    shank_length: float
+    shank_angle: float = 1.5
+    base: str = "rounded"
+
+    def __post_init__(self):
+        radius = check_number(self.apex_radius, "apex_radius", above=0, at_most=_LONGEST, unit="nm")
+        length = check_number(self.shank_length, "shank_length", above=0, at_most=_LONGEST, unit="nm")
+        angle = check_number(self.shank_angle, "shank_angle", at_least=0, below=45, unit="degrees")
+        check_choice(self.base, "base", ("rounded", "flat"))
+        for name, value in (("apex_radius", radius), ("shank_length", length), ("shank_angle", angle)):
+            object.__setattr__(self, name, value)
+
+    @property
+    def _flank(self):
+        angle = math.radians(self.shank_angle)
+        return math.sin(angle), math.cos(angle), self.apex_radius + self.shank_length * math.sin(angle)
+
+    @property
+    def bounds(self) -> Floats:
+        """Lower and upper corner of the box around the shape [nm], shape (2, 3)."""
+        _, cos, foot = self._flank
+        rounded = self.base == "rounded"
+        width = foot if rounded else foot / cos
+        bottom = -self.shank_length - foot * rounded
+        return np.array([[-width, -width, bottom], [width, width, self.apex_radius]])
+
+    def signed_distance(self, points: Floats) -> Floats:
+        """Distance from the surface [nm], negative inside.
+
+        Exact for the rounded base. For the flat one the larger of the distances from the cone and from the
+        plane of the base, which falls short of the distance from the rim outside of it.
+
+        Parameters
+        ----------
+        points : ndarray
+            [nm], shape (n, 3).
+
+        Returns
+        -------
+        ndarray
+            Shape (n,).
+        """
+        sin, cos, foot_radius = self._flank
+        x, y, z = points[:, 0], points[:, 1], points[:, 2]
+        rho = np.sqrt(x * x + y * y)
+        along = rho * sin - z * cos  # down the flank, from where it meets the cap
+        distance = rho * cos + z * sin - self.apex_radius
+        cap = along < 0
+        distance[cap] = np.sqrt(rho[cap] ** 2 + z[cap] ** 2) - self.apex_radius
+        if self.base == "flat":
+            return np.maximum(distance, -self.shank_length - z)
+        foot = along > self.shank_length * cos
+        distance[foot] = np.sqrt(rho[foot] ** 2 + (z[foot] + self.shank_length) ** 2) - foot_radius
+        return distance
+
+    def volume(self, depth: float | None = None) -> float:
+        """Volume of the shape, or of the shell under its surface down to `depth` [nm^3]."""
+        if depth is not None:
+            inner = self.apex_radius - depth, self.shank_length - depth * (self.base == "flat")
+            hollow = min(inner) > 0
+            core = replace(self, apex_radius=inner[0], shank_length=inner[1]).volume() if hollow else 0.0
+            return self.volume() - core
+        if self.base == "flat":
+            return self.volume_above(-self.shank_length)
+        sin, _, foot = self._flank
+        below = 4 / 3 * math.pi * foot**3 - _cap_volume(foot, foot * sin)
+        return self.volume_above(foot * sin - self.shank_length) + below
+
+    def volume_above(self, z: float) -> float:
+        """Volume of the part of the shape above a height `z` on its flank [nm^3]."""
+        sin, cos, _ = self._flank
+        top, upper, lower = self.apex_radius * sin, self.apex_radius * cos, (self.apex_radius - z * sin) / cos
+        frustum = math.pi / 3 * (top - z) * (upper**2 + upper * lower + lower**2)
+        return _cap_volume(self.apex_radius, top) + frustum
+
+
+def _cap_volume(radius, height):
+    """Volume of the part of a sphere above `height`."""
+    return math.pi / 3 * (radius - height) ** 2 * (2 * radius + height)

@@ -1,0 +1,400 @@
+"""The specimen: a crystal (or any arrangement of atoms) in the shape of a tip."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
+
+from apt_evap._common.memory import check_memory
+from apt_evap._common.types import Floats
+from apt_evap._common.validation import check_array, check_kind, check_number, check_seed, check_sequence, digest, shown
+from apt_evap.specimen import ase_atoms, lattice
+from apt_evap.specimen.alloy import check_solutes, draw_species
+from apt_evap.specimen.materials import Material, as_material
+from apt_evap.specimen.shape import TaperedCap
+
+_ROUNDING = 1e-6  # nearest neighbour distances: sites on the surface stay together whatever their rounding
+_SKIN = 3.2  # neighbour radii held below the surface where hardly an atom leaves: two of them are support
+_LAYER = 0.74  # thickness of the layer of surface atoms [d_nn]: 0.48 a^2 of the surface for each one of fcc
+_WIDEST = 10  # neighbourhood [d_nn]: 6,000 atoms each, more do not fit into the memory
+_SAMPLE = 10_000  # atoms asked for their nearest neighbour
+
+
+class Tip:
+    """A crystal in the shape of a field emitter: a spherical cap on a shank that widens downwards.
+
+    The shape is a `TaperedCap`: the centre of the cap is the origin, the apex is at z = R, and the shank
+    points down to z = -L. Atoms below z = -L/2 never evaporate.
+
+    Parameters
+    ----------
+    material : Material or str
+        The crystal; a str is looked up by `material`.
+    apex_radius : float
+        Radius R of the cap [nm].
+    axis : sequence of float
+        Crystal direction along +z, of whole numbers or any others, see `lattice.rotation_to_axis`.
+    shank_angle : float
+        Half the opening angle of the shank [degrees], at least 0 and below 45.
+    shank_length : float, optional
+        Length L of the shank [nm]; 2 R if not given.
+    base : str
+        "rounded" or "flat".
+    rotation : float
+        Rotation of the crystal about z [degrees].
+    origin : sequence of float
+        Where the lattice has an atom [nm]; an atom at the centre of the cap makes the tip symmetric.
+    offset_seed : int, optional
+        Moves the lattice by a random part of its cell on top of `origin`: a tip without symmetry.
+    depth : float, optional
+        Hold only atoms at most this far below the surface of the cap [nm]; None holds all of them. Below z = -R/2,
+        where hardly an atom leaves, only a skin is held. The innermost layer, one neighbourhood thick, is `support`.
+    solutes : mapping, optional
+        Substitutional solutes of a random alloy: atomic fraction by element (str or Material).
+    seed : int, optional
+        Seed of the random alloy, needed with `solutes`.
+
+    Attributes
+    ----------
+    positions : ndarray
+        Atoms [nm], shape (n, 3).
+    elements : tuple of Material
+        The species.
+    species : ndarray of int32
+        Index into `elements`, shape (n,).
+    evaporable, support : ndarray of bool
+        Whether an atom may leave; whether it only completes the neighbourhoods of others, shape (n,).
+    nearest_neighbour_distance, neighbour_radius, surface_threshold : float
+        d_nn [nm]; the radius of the neighbourhood whose mean position tells surface atoms, and how far from
+        that mean a surface atom is [nm], see `lattice.SURFACE_FACTORS`.
+    bond_length : float
+        Atoms closer than this are nearest neighbours [nm], see `lattice.BOND_FACTORS`.
+    evaporation_fields, charge_states, masses : ndarray
+        Of each species [V/nm], [e], [Da].
+    apex : float
+        z of the apex [nm].
+    potential_point : ndarray
+        Where the potential is the applied voltage [nm], shape (3,).
+    settings : dict
+        What the tip was made from, in plain types.
+
+    Raises
+    ------
+    ValueError
+        For a shape that is impossible, or that needs more memory than there is.
+    """
+
+    def __init__(
+        self,
+        material: Material | str,
+        apex_radius: float,
+        axis: Sequence[int] = (0, 0, 1),
+        shank_angle: float = 1.5,
+        shank_length: float | None = None,
+        base: str = "rounded",
+        rotation: float = 0.0,
+        origin: ArrayLike = (0.0, 0.0, 0.0),
+        offset_seed: int | None = None,
+        depth: float | None = None,
+        solutes: Mapping[Material, float] | Mapping[str, float] | None = None,
+        seed: int | None = None,
+    ) -> None:
+        host = as_material(material)
+        d = host.nearest_neighbour_distance
+        radius = check_number(apex_radius, "apex_radius", at_least=3 * d, unit="nm", why="3 neighbour distances")
+        length = 2 * radius if shank_length is None else shank_length
+        self._shape = shape = TaperedCap(radius, length, shank_angle, base)
+        origin = check_array(origin, "origin", (3,))
+        self._set_neighbourhood(host.structure, d)
+        if depth is not None:
+            depth = check_number(depth, "depth", above=self.neighbour_radius, unit="nm")
+        self._depth = depth
+        fractions = check_solutes(solutes, seed)
+        orientation = lattice.rotation_to_axis(host, axis, rotation)
+        density = lattice.atom_density(host.structure, host.a, host.c)
+        check_memory(self._held_volume() * density, shape.volume(_LAYER * d) * density)
+
+        shift = origin
+        if offset_seed is not None:
+            part = np.random.default_rng(check_seed(offset_seed, "offset_seed")).random(3)
+            shift = origin + orientation @ (part * lattice.cell_lengths(host.structure, host.a, host.c))
+        self.positions = lattice.lattice_points_in(
+            host.structure,
+            host.a,
+            host.c,
+            orientation,
+            shift,
+            shape.signed_distance,
+            shape.bounds,
+            depth=None if depth is None else self._depth_at,
+            tolerance=_ROUNDING * d,
+        )
+        self._mark()
+        self._set_elements((host, *fractions), draw_species(len(self), fractions, seed))
+        self.apex = radius
+        self.potential_point = np.zeros(3)
+        whole = all(float(index).is_integer() for index in axis)
+        self.settings = {
+            "material": asdict(host),
+            "apex_radius": radius,
+            "axis": [int(index) if whole else float(index) for index in axis],
+            "shank_angle": shape.shank_angle,
+            "shank_length": shape.shank_length,
+            "base": base,
+            "rotation": float(rotation),
+            "origin": origin.tolist(),
+            "offset_seed": None if offset_seed is None else int(offset_seed),
+            "depth": depth,
+            "solutes": [[asdict(solute), fraction] for solute, fraction in fractions.items()],
+            "seed": None if seed is None else int(seed),
+        }
+
+    @classmethod
+    def from_positions(
+        cls,
+        positions: ArrayLike,
+        species: ArrayLike,
+        elements: Iterable[Material | str],
+        evaporable: ArrayLike | None = None,
+        neighbour_radius: float | None = None,
+        surface_threshold: float | None = None,
+        potential_point: ArrayLike | None = None,
+    ) -> "Tip":
+        """Make a tip of any arrangement of atoms, its axis along +z.
+
+        Parameters
+        ----------
+        positions : array_like
+            Atoms [nm], shape (n, 3).
+        species : array_like of int
+            Index of each atom into `elements`, shape (n,).
+        elements : sequence of Material or str
+            The species; the structure of the first one says how surface atoms are told.
+        evaporable : array_like of bool, optional
+            Which atoms may leave, shape (n,); the upper half of the tip's height if not given, because the
+            rim of a cut base carries the largest charges of all.
+        neighbour_radius, surface_threshold : float, optional
+            [nm]; from the measured nearest neighbour distance (a median) if not given.
+        potential_point : array_like, optional
+            Where the potential is the applied voltage [nm], shape (3,): any point well inside the cap. On the
+            mean axis, as far below the apex as the tip is wide to the side, if not given.
+
+        Returns
+        -------
+        Tip
+
+        Raises
+        ------
+        ValueError
+            If shapes disagree, an index names no element, or two atoms are at the same place.
+        """
+        tip = cls.__new__(cls)
+        tip._shape = tip._depth = None  # type: ignore[assignment]
+        tip.positions = check_array(positions, "positions", ("n", 3))
+        n = len(tip.positions)
+        if n < 2:
+            raise ValueError(f"positions must hold at least 2 atoms, got {n}")
+        elements = check_sequence(elements, "elements", "materials, such as ('Ni',)")
+        if not elements:
+            raise ValueError("elements must name at least one material, got none")
+        elements = tuple(as_material(element, "elements") for element in elements)
+        tip._set_elements(elements, check_array(species, "species", (n,), dtype=np.int32))
+        if not 0 <= tip.species.min() <= tip.species.max() < len(elements):
+            raise ValueError(
+                f"species must be indices from 0 to {len(elements) - 1}, got {tip.species.min()} to {tip.species.max()}"
+            )
+        sample = tip.positions[:: max(1, n // _SAMPLE)]
+        neighbours = cKDTree(tip.positions)
+        distances = neighbours.query(sample, k=2)[0][:, 1]
+        if not distances.min() > 0 or neighbours.query_pairs(1e-3 * float(np.median(distances))):
+            raise ValueError("positions must be distinct, got two atoms at the same place")
+        tip._set_neighbourhood(tip.elements[0].structure, float(np.median(distances)))
+        if neighbour_radius is not None:
+            tip.neighbour_radius = check_number(
+                neighbour_radius, "neighbour_radius", above=0, at_most=_WIDEST * float(np.median(distances)), unit="nm"
+            )
+        if surface_threshold is not None:
+            tip.surface_threshold = check_number(
+                surface_threshold, "surface_threshold", above=0, at_most=tip.neighbour_radius, unit="nm"
+            )
+        low, high = tip.positions.min(axis=0), tip.positions.max(axis=0)
+        tip.apex = float(high[2])
+        if evaporable is None:
+            evaporable = tip.positions[:, 2] >= (low[2] + high[2]) / 2
+        tip.evaporable = check_array(evaporable, "evaporable", (n,), dtype=bool).copy()
+        tip.support = np.zeros(n, dtype=bool)
+        if potential_point is None:
+            below = min((high[0] - low[0]) / 2, (high[1] - low[1]) / 2, (high[2] - low[2]) / 2)
+            potential_point = [*tip.positions[:, :2].mean(axis=0), high[2] - below]
+        tip.potential_point = check_array(potential_point, "potential_point", (3,))
+        tip.settings = {
+            "atoms": n,
+            "sha256": digest(tip.positions, tip.species, tip.evaporable),
+            "elements": [asdict(element) for element in tip.elements],
+            "neighbour_radius": tip.neighbour_radius,
+            "surface_threshold": tip.surface_threshold,
+            "potential_point": tip.potential_point.tolist(),
+        }
+        return tip
+
+    @classmethod
+    def from_atoms(cls, atoms: Any, materials: Mapping[str, Material] | None = None, **options: Any) -> "Tip":
+        """Make a tip of an ASE Atoms object, its axis along +z.
+
+        Parameters
+        ----------
+        atoms : ase.Atoms
+            Positions in Angstrom; the cell is not looked at. An array "evaporable" says which atoms may leave.
+        materials : mapping of str to Material, optional
+            Materials by chemical symbol, in place of those that `material` knows.
+        **options
+            Passed to `from_positions`.
+
+        Returns
+        -------
+        Tip
+            Its `elements` begin with the most frequent one.
+
+        Raises
+        ------
+        ValueError
+            If a symbol has no material, or as `from_positions` does.
+        """
+        return cls.from_positions(**(ase_atoms.from_atoms(atoms, materials) | options))
+
+    def to_atoms(self) -> Any:
+        """Return the specimen as ase.Atoms [Angstrom], with arrays "evaporable" and "support"; needs ASE."""
+        arrays = {"evaporable": self.evaporable, "support": self.support}
+        return ase_atoms.to_atoms(self.positions, self.elements, self.species, **arrays)
+
+    @classmethod
+    def from_settings(cls, settings: Mapping[str, Any]) -> "Tip":
+        """Make the tip again that has these `settings`; one made from positions has none to go by.
+
+        Raises
+        ------
+        ValueError
+            If a setting is unknown or the tip was made from positions.
+        """
+        settings = dict(check_kind(settings, "settings", Mapping, "the settings of a tip"))
+        if "apex_radius" not in settings:
+            raise ValueError(
+                f"settings must hold 'apex_radius' (a tip made from positions needs those), got {', '.join(settings)}"
+            )
+        try:
+            settings["material"] = Material(**settings["material"])
+            settings["solutes"] = {Material(**solute): fraction for solute, fraction in settings.get("solutes") or ()}
+            return cls(**settings)
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"settings must be those of a tip, got {shown(settings)}: {error}") from error
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def __repr__(self) -> str:
+        names = "-".join(element.name for element in self.elements)
+        if self._shape is None:
+            return f"<Tip: {len(self):,} atoms of {names} from positions>"
+        shape = self._shape
+        axis = " ".join(f"{index:.4g}" for index in self.settings["axis"])
+        held = "" if self._depth is None else f", held to a depth of {self._depth:.4g} nm"
+        return (
+            f"<Tip: {len(self):,} atoms of {names} [{axis}], apex radius {shape.apex_radius:.4g} nm, "
+            f"shank {shape.shank_length:.4g} nm at {shape.shank_angle:g} degrees, {shape.base} base{held}>"
+        )
+
+    @property
+    def most_ions(self) -> int:
+        """How many atoms may leave, those that a shell does not hold yet included: exact only without `depth`."""
+        held = int(np.count_nonzero(self.evaporable))
+        if self._depth is None:
+            return held
+        host = self.elements[0]
+        volume = self._shape.volume_above(-self._shape.shank_length / 2)
+        return max(held, round(volume * lattice.atom_density(host.structure, host.a, host.c)))
+
+    def signed_distance(self, points: Floats) -> Floats:
+        """Distance from the surface of the shape [nm], negative inside: see `TaperedCap.signed_distance`.
+
+        Raises
+        ------
+        ValueError
+            If the tip was made from positions.
+        """
+        if self._shape is None:
+            raise ValueError("a tip made from positions has no shape to measure a distance from")
+        return self._shape.signed_distance(check_array(points, "points", ("n", 3)))
+
+    def deepened(self, by: float | None = None) -> "Tip":
+        """Hold a shell to a greater depth.
+
+        Parameters
+        ----------
+        by : float, optional
+            How much deeper [nm]; by default two neighbourhoods.
+
+        Returns
+        -------
+        Tip
+            Its first atoms are those of this one, in the same order.
+
+        Raises
+        ------
+        ValueError
+            If this tip is not a shell: it was made from positions, or holds every atom.
+        """
+        if self._shape is None or self._depth is None:
+            raise ValueError(f"{self!r} is not a shell that could be deepened, it holds every atom there is")
+        by = 2 * self.neighbour_radius if by is None else check_number(by, "by", above=0, unit="nm")
+        deeper = Tip.from_settings({**self.settings, "depth": self._depth + by})
+        rounding = 2 * _ROUNDING * self.nearest_neighbour_distance
+        below = self._shape.signed_distance(deeper.positions) < -(self._depth_at(deeper.positions) + rounding)
+        deeper.positions = np.concatenate([self.positions, deeper.positions[below]])
+        deeper.species = np.concatenate([self.species, deeper.species[below]])
+        deeper._mark()
+        return deeper
+
+    def _depth_at(self, points):
+        """How far below the surface atoms are held [nm], (n,): `depth` in the cap, falling to a skin below."""
+        skin, ramp = self._ramp
+        return skin + (self._depth - skin) * np.clip(1 + points[:, 2] / ramp, 0, 1)
+
+    @property
+    def _ramp(self):
+        """Depth of the skin, and the height over which `depth` falls to it, at a slope of at most 1 [nm]."""
+        skin = min(_SKIN * self.neighbour_radius, self._depth)
+        return skin, max(self._shape.apex_radius / 2, self._depth - skin)
+
+    def _held_volume(self):
+        if self._depth is None:
+            return self._shape.volume()
+        radius, (skin, ramp) = self._shape.apex_radius, self._ramp
+        cap = 2 / 3 * np.pi * (max(0.0, radius - skin) ** 3 - max(0.0, radius - self._depth) ** 3)
+        flank = np.pi * radius * ramp * (self._depth - skin)
+        return min(self._shape.volume(), self._shape.volume(skin) + cap + flank)
+
+    def _mark(self):
+        """Tell the support from the others, and which atoms may leave."""
+        self.support = np.zeros(len(self), dtype=bool)
+        if self._depth is not None:
+            skin, ramp = self._ramp
+            lost = self.neighbour_radius * (1 + (self._depth - skin) / ramp)  # across one neighbourhood
+            self.support = self._shape.signed_distance(self.positions) < lost - self._depth_at(self.positions)
+        self.evaporable = (self.positions[:, 2] >= -self._shape.shank_length / 2) & ~self.support
+
+    def _set_neighbourhood(self, structure, distance):
+        radius, threshold = lattice.SURFACE_FACTORS[structure]
+        self.nearest_neighbour_distance = distance
+        self.bond_length = lattice.BOND_FACTORS[structure] * distance
+        self.neighbour_radius = radius * distance
+        self.surface_threshold = threshold * distance
+
+    def _set_elements(self, elements, species):
+        self.elements = elements
+        self.species = species
+        self.evaporation_fields = np.array([element.evaporation_field for element in elements])
+        self.charge_states = np.array([element.charge_state for element in elements], dtype=np.int32)
+        self.masses = np.array([element.mass for element in elements])

@@ -1,0 +1,612 @@
+"""The door: every public argument, given something bad, is refused in one sentence with its name and the value."""
+
+import json
+import math
+import os
+import re
+import subprocess
+import sys
+import warnings
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import apt_evap as ae
+from apt_evap._common import memory
+from apt_evap._common.validation import shown
+from apt_evap.config.simulation_file import read_config
+from apt_evap.emission.perturbations import from_dict
+from apt_evap.specimen.shape import TaperedCap
+
+NAN, INF = math.nan, math.inf
+NEITHER = [None, "x", "5", True, 1j, [1.0], {}, b"x", object(), np.array([1.0, 2.0])]  # no number
+WILD = [NAN, INF, -INF, 1e300, 10**400, 10**5000]  # no number to compute with
+NUMBER = [*NEITHER, *WILD]
+POSITIVE = [*NUMBER, 0, -1.5]
+COUNT = [*NEITHER, *WILD, 1.5, -1, 2**80, np.float64(2.0)]
+SEED = [*COUNT, 2**64]
+SWITCH = [None, "no", 0, 1.0, [], np.array([True])]
+OBJECT = [True, "x", 0, NAN, [], {}, np.array([1.0, 2.0]), object(), dict]
+TABLE = [True, "x", 3, NAN, [1], np.array([1.0]), object()]
+VECTOR = [
+    None,
+    "x",
+    ("1", "2", "3"),
+    1j,
+    5,
+    [],
+    [1.0, NAN, 0],
+    [1.0, INF, 0],
+    [10**400, 0, 0],
+    [[1.0], [2.0]],
+    object(),
+]
+TEXT = [None, True, 3, NAN, [], b"x", np.array([1.0])]
+COLUMN = ["x", 3, 1j, [[1.0], [2.0]], ["a", "b"], object()]
+WHOLE = ["x", 3, [0.5, 1], [NAN, 1], [2**70, 1]]
+WORD = [*TEXT, "", "no such"]
+
+nickel = ae.material("Ni")
+MATERIAL = {"name": "X", "structure": "fcc", "a": 0.35, "evaporation_field": 35.0, "charge_state": 1, "mass": 58.0}
+TIP = {"material": nickel, "apex_radius": 1.5, "depth": 1.2}
+ATOMS = {"positions": np.indices((5, 5, 5)).reshape(3, -1).T * 0.3, "species": np.zeros(125, int), "elements": ["Ni"]}
+HITS = {"x": [1.0, 2.0], "y": [1.0, 2.0], "ion": [0, 1]}
+RANGES = {"names": ["Ni"], "low": [50.0], "high": [60.0]}
+EMISSIONS = {
+    "positions": np.zeros((1, 3)),
+    "normals": [[0.0, 0.0, 1.0]],
+    "neighbours": np.ones((1, 3)),
+    "charge_states": [1],
+    "masses": [58.0],
+    "ions": [0],
+    "nearest_neighbour_distance": 0.25,
+}
+hits = ae.Hits(x=[1.0, 2, 3], y=[1.0, 2, 4], mass_to_charge=[58.0, 59.0, 59.0], voltage=[1e3, 1e3, 1e3])
+grid = ae.DetectorMap.from_array(np.ones((20, 20)), np.arange(21), np.arange(21))
+ranges = ae.Ranges(**RANGES)
+ring = ae.radial_profile(hits, outer=9.0)
+strip = ae.Rectangle((0.0, 0.0), 0.0, 20.0, 20.0)
+CORNERS = [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)]
+shell = ae.Tip(**TIP)
+
+
+@pytest.fixture(scope="module")
+def ready():
+    """A simulation, its run, and the ions on file."""
+    simulation = ae.Simulation(shell, n_threads=1)
+    run = simulation.run(12, progress=False)
+    bound = {name: partial(getattr(ae, name), run) for name in ("fit_energies", "lateral_tracks")}
+    return {
+        "simulation": simulation,
+        "run": run,
+        "emitter": simulation.emitter,
+        "tracks": bound["lateral_tracks"],
+        "fit_energies": bound["fit_energies"],
+    }
+
+
+# what is called, its good arguments, and the bad values of each argument
+CASES = [
+    (
+        ae.Material,
+        MATERIAL,
+        {
+            "name": [*TEXT, ""],
+            "structure": WORD,
+            "a": [*POSITIVE, 3.52],  # Angstrom
+            "evaporation_field": [*POSITIVE, 35e9],  # V/m
+            "charge_state": [*COUNT, 0, 200],
+            "mass": [*POSITIVE, 0.1, 1e5],
+            "c": [0.5],  # not of fcc
+            "polarizability": [value for value in POSITIVE if value is not None],
+            "sources": [*TABLE, None],
+        },
+    ),
+    (ae.Material, MATERIAL | {"structure": "hcp", "c": 0.5}, {"c": POSITIVE}),
+    (ae.material, {"name": "Ni"}, {"name": [*WORD, "ni", "Co"], "a": POSITIVE, "structure": WORD}),
+    (
+        ae.Tip,
+        TIP,
+        {
+            "material": [*OBJECT, None, "Unobtainium"],
+            "apex_radius": [*POSITIVE, 0.5, 1e9],
+            "axis": [*VECTOR, (0, 0, 0), (1, 1)],
+            "shank_angle": [*NUMBER, -1.0, 45, 90.0],
+            "shank_length": [value for value in POSITIVE if value is not None] + [1e9],
+            "base": WORD,
+            "rotation": NUMBER,
+            "origin": VECTOR,
+            "offset_seed": [value for value in SEED if value is not None],
+            "depth": [value for value in POSITIVE if value is not None] + [0.1],
+            "solutes": [*TABLE, {"Cu": 2.0}, {"Cu": "half"}, {3: 0.1}],
+        },
+    ),
+    (ae.Tip, TIP | {"solutes": {"Cu": 0.1}}, {"seed": SEED}),
+    (
+        ae.Tip.from_positions,
+        ATOMS,
+        {
+            "positions": [*VECTOR, np.zeros((3, 2)), [[0, 0, NAN]], np.zeros((1, 3))],
+            "species": [None, "x", 3, [0.5] * 125, [0] * 124, [-1] * 125, [1] * 125, [2**40] * 125, [NAN] * 125],
+            "elements": [None, "Ni", 3, [], [3], NAN, object()],
+            "evaporable": [3, "x", [True], np.ones(125, int), object()],
+            "neighbour_radius": [value for value in POSITIVE if value is not None] + [1e4],
+            "surface_threshold": [value for value in POSITIVE if value is not None] + [1e4],
+            "potential_point": [value for value in VECTOR if value is not None],
+        },
+    ),
+    (ae.Tip.from_settings, {"settings": shell.settings}, {"settings": [*TABLE, None, {}, {"apex_radius": 3}]}),
+    (shell.signed_distance, {"points": np.zeros((1, 3))}, {"points": VECTOR}),
+    (shell.deepened, {}, {"by": [value for value in POSITIVE if value is not None]}),
+    (TaperedCap, {"apex_radius": 3.0, "shank_length": 3.0}, {"apex_radius": POSITIVE, "shank_length": POSITIVE}),
+    (ae.Detector, {}, {"distance": [*POSITIVE, 1e9], "width": [*POSITIVE, 1e9], "projection": WORD}),
+    (
+        ae.ChargeSettings,
+        {},
+        {
+            "opening_angle": [*NUMBER, -0.1, 3.0],
+            "patch_radius": [*POSITIVE, 100],
+            "update_radius": [*POSITIVE, 5.0, 100],
+            "sweep_interval": [value for value in COUNT if value is not None] + [0],
+            "tolerance": [*POSITIVE, 2.0],
+            "start_tolerance": [*POSITIVE, 2.0],
+            "relaxation_angle": [*NUMBER, -0.1, 3.0],
+        },
+    ),
+    (
+        ae.FlightSettings,
+        {},
+        {
+            "opening_angle": [*NUMBER, -0.1, 3.0],
+            "tolerance": [*POSITIVE, 1.0],
+            "reach": [*POSITIVE, 10],
+            "most_steps": [*COUNT, 0],
+        },
+    ),
+    (
+        ae.ResponseSettings,
+        {},
+        {"energy_limit": [*POSITIVE, 1500], "bound": POSITIVE, "site": [*OBJECT, None], "rolled": [*OBJECT, None]},
+    ),
+    (
+        ae.Design,
+        {"degree": 1, "rings": ((0.0, 1), (1.0, 5))},
+        {
+            "degree": [*COUNT, 50],
+            "rings": [None, 3, "x", [], [1], [(1.0,)], [(NAN, 5)], [(1.0, 0)], [(1.0, 10**9)], [(1.0, 2)], [("a", 1)]],
+        },
+    ),
+    (ae.TruncatedNormal, {"mean": 0.1, "standard_deviation": 0.1}, {"mean": [*NUMBER, -0.1, 155]}),
+    (ae.TruncatedNormal, {"mean": 0.1, "standard_deviation": 0.1}, {"standard_deviation": [*POSITIVE, 155]}),
+    (ae.Fixed, {}, {"energy": [*NUMBER, -0.1, 155]}),
+    (ae.Thermal, {}, {"temperature": [*POSITIVE, 1e9]}),
+    (ae.LateralVelocity, {}, {"energy": [*NUMBER, -0.1, 155]}),
+    (ae.RollUp, {}, {"energy": [*NUMBER, -0.1, 155]}),
+    (ae.Combined, {"energy": 0.1, "rollup_fraction": 0.5}, {"energy": NUMBER, "rollup_fraction": [*NUMBER, -0.1, 1.1]}),
+    (from_dict, {}, {"settings": [*TABLE, None, {}, {"name": 3}, {"name": "Rollup"}, {"name": "RollUp"}]}),
+    (ae.IonRandom, {"seed": 1, "ions": [1]}, {"seed": SEED, "ions": [None, "x", 3, [0.5], [NAN], [2**70]]}),
+    (ae.IonRandom(1, [1]).uniform, {}, {"columns": [*COUNT, 0]}),
+    (
+        ae.Emissions,
+        EMISSIONS,
+        {
+            "positions": VECTOR,
+            "normals": [*VECTOR, [[0, 0, 2.0]], np.zeros((2, 3))],
+            "neighbours": [None, "x", 3, np.zeros((2, 3))],
+            "charge_states": [None, "x", [0], [1.5], [1, 1], [2**70]],
+            "masses": [None, "x", [0.0], [NAN], [1.0, 1.0]],
+            "ions": [None, "x", [0.5], [1, 1], [2**70]],
+            "nearest_neighbour_distance": POSITIVE,
+        },
+    ),
+    (
+        ae.Launches,
+        {"positions": np.zeros((1, 3)), "velocities": np.zeros((1, 3)), "rolled": [False]},
+        {"positions": VECTOR, "velocities": [*VECTOR, np.zeros((2, 3))], "rolled": [None, "x", [1], [True, True]]},
+    ),
+    (ae.tangent_frame, {}, {"normals": VECTOR}),
+    (
+        ae.Hits,
+        HITS,
+        {
+            **dict.fromkeys(("x", "y", "time_of_flight", "voltage"), COLUMN),
+            "positions": ["x", 3, [1.0, 2.0], np.zeros((2, 2))],
+            **dict.fromkeys(("ion", "site", "pulse_id", "multiplicity"), WHOLE),
+            "pulses": [[-1, 2], [2**40, 1]],
+            "outcome": [[0, 7], [-1, 0], [0.5, 0]],
+            "extra": [*TABLE, {"a": 3}, {"a": object()}],
+            "units": TABLE,
+            "source": TEXT,
+        },
+    ),
+    (hits.within_circle, {"radius": 3.0}, {"radius": POSITIVE, "centre": [value for value in VECTOR if value != 5]}),
+    (hits.window, {}, {"voltage": [3, "ab", None, (1,), (2, 1), (NAN, 1), ("a", 1), {}]}),
+    (hits.map, {}, {"bins": [*COUNT, 0, 10**6], "extent": [3, "x", (1, 2), (1, 1, 1, 1), (0, NAN, 0, 1)]}),
+    (
+        hits.map,
+        {"bins": 4},
+        {"quantum": [3, "always", (0, 1), (NAN, 1)], "like": OBJECT, "dither_seed": [1.5, -1, "x"]},
+    ),
+    (hits.map, {"bins": 4}, {"mask": ["x", 3, [[True]], np.ones((4, 3), int)]}),
+    (ae.DetectorMap.from_hits, {}, {"hits": [*OBJECT, None]}),
+    (
+        ae.DetectorMap.from_array,
+        {"values": np.ones((2, 2)), "x_edges": [0, 1, 2], "y_edges": [0, 1, 2]},
+        {
+            "values": ["x", 3, [[-1.0, 1], [1, 1]]],
+            "x_edges": ["x", 3, [0, 1], [0, 2, 1], [0, 1, 5]],
+            "y_edges": ["x", 3, [0, 1], [0, NAN, 1]],
+            "mask": ["x", 3, np.ones((2, 2), int), np.zeros((2, 2), bool)],
+            "is_counts": SWITCH,
+            "source": TEXT,
+        },
+    ),
+    (grid.smoothed, {}, {"sigma": [*NUMBER, -1.0, 100.0]}),
+    (ae.radial_profile, {"hits": hits, "outer": 9.0}, {"hits": [*OBJECT, None], "bins": [*COUNT, 0, 10**6]}),
+    (
+        ae.radial_profile,
+        {"hits": hits, "outer": 9.0},
+        {"inner": [*NUMBER, -1.0], "outer": POSITIVE, "centre": [3, "x"]},
+    ),
+    (ae.azimuthal_profile, {"hits": hits, "inner": 1.0, "outer": 9.0}, {"hits": [*OBJECT, None], "bins": [*COUNT, 0]}),
+    (ae.zone_line_profile, {"hits": hits, "rectangles": strip}, {"hits": [*OBJECT, None], "bins": [*COUNT, 0, 10**6]}),
+    (ae.zone_line_profile, {"hits": hits}, {"rectangles": [None, 3, "x", [], [3], NAN, dict]}),
+    (ae.fit_zone_line, {"profile": ring}, {"profile": [*OBJECT, None], "exponent": [*POSITIVE[1:], 1e3]}),
+    (ae.compare_profiles, {"first": ring, "second": ring}, {"first": [*OBJECT, None], "second": [*OBJECT, None]}),
+    (
+        ae.Rectangle,
+        {"centre": (0, 0), "angle": 0.0, "length": 9.0, "width": 9.0},
+        {"centre": VECTOR, "angle": NUMBER, "length": POSITIVE, "width": POSITIVE},
+    ),
+    (
+        ae.Projection,
+        {"scale": 50.0},
+        {"scale": POSITIVE, "centre": VECTOR, "mirror": SWITCH, "compression": POSITIVE[1:]},
+    ),
+    (
+        ae.Orientation,
+        {"material": "Ni"},
+        {"material": [*OBJECT, None], "axis": [*VECTOR, (0, 0, 0)], "rotation": NUMBER},
+    ),
+    (ae.Orientation.from_matrix, {"material": "Ni"}, {"matrix": [*VECTOR, 2 * np.eye(3), -np.eye(3)]}),
+    (
+        ae.fit_orientation,
+        {"material": "Ni", "planes": [(1, 1, 1), (0, 0, 1)], "places": [(0.0, 0), (9.0, 0)]},
+        {
+            "material": [*OBJECT, None],
+            "planes": [None, 3, "x", [(0, 0, 0), (0, 0, 1)], [(0.5, 0, 0), (0, 0, 1)]],
+            "places": [None, 3, "x", [(0, 0)], [(0, 0), (0, 0)], [(0, 0), (NAN, 0)]],
+            "lines": [None, 3, "x", [3], NAN],
+            "scale": POSITIVE[1:],
+            "centre": VECTOR,
+            "mirror": SWITCH[1:],
+        },
+    ),
+    (
+        ae.Registration,
+        {"rotation": 0.0, "scale": 1.0, "shift": (0.0, 0.0)},
+        {"rotation": NUMBER, "scale": POSITIVE, "shift": VECTOR, "mirror": SWITCH},
+    ),
+    (
+        ae.register,
+        {"simulated": grid, "measured": grid},
+        {
+            "simulated": [*OBJECT, None],
+            "measured": [*OBJECT, None],
+            "overlap": [*POSITIVE, 2.0],
+            "mirrors": [3, "x", []],
+        },
+    ),
+    (
+        ae.register,
+        {"simulated": grid, "measured": grid},
+        {"start": [*OBJECT], "scales": ["x", NAN, -1.0, 0, INF, (2.0, 1.0), (1, 2, 3)]},
+    ),
+    (
+        ae.register_points,
+        {"simulated_points": CORNERS, "measured_points": CORNERS},
+        {"simulated_points": VECTOR, "measured_points": [*VECTOR, [(0, 0)] * 3], "mirror": SWITCH[1:]},
+    ),
+    (
+        ae.field_factor,
+        {"voltage": 1e3, "field": 30.0, "radius": 9.0},
+        {name: [None, "x", 1j, NAN, 0, -1.0, [1.0, NAN], [0.0], 10**400] for name in ("voltage", "field", "radius")},
+    ),
+    (
+        ae.Checkpoint,
+        {"path": "a.h5"},
+        {
+            "path": [None, 3, NAN, [], "a\0b", "a.txt"],
+            "minutes": [*NUMBER, -1.0],
+            "ions": [*COUNT[1:], 0],
+            "resume": SWITCH,
+            "overwrite": SWITCH,
+        },
+    ),
+    (
+        ae.WatchSettings,
+        {},
+        {
+            "interval": [*COUNT[1:], 0],
+            "sample": [*COUNT, 0],
+            "charge_bound": POSITIVE,
+            "share_bound": [*NUMBER, -0.1, 1.1],
+        },
+    ),
+    (ae.read_map, {}, {"path": [None, 3, NAN, [], "a\0b", "none.npz"]}),
+    (ae.ssim, {"map_a": grid, "map_b": grid}, {"map_a": OBJECT, "map_b": [*OBJECT, hits], "data_range": POSITIVE}),
+    (ae.half_ceiling, {"hits": hits}, {"hits": [*OBJECT, None], "seed": SEED}),
+    (
+        ae.Ranges,
+        RANGES,
+        {
+            "names": [None, "Ni", 3, [], [3]],
+            "low": ["x", 3, [NAN], [1.0, 2.0], [70.0]],
+            "high": ["x", 3, [NAN], [1.0, 2.0], [1.0]],
+            "volume": ["x", 3, [1.0, 2.0]],
+            "colour": [3, "red", [], NAN],
+            "composition": [3, "NiO", [3], []],
+            "source": TEXT,
+        },
+    ),
+    (ranges.index, {}, {"hits": [*OBJECT, None]}),
+    (ranges.labels, {"hits": hits}, {"outside": TEXT}),
+    (
+        ae.polarization_energy,
+        {"polarizability": 1e-40, "voltage": 1e3, "field_factor": 3.0, "radius": 10.0, "step": 0.3},
+        {"polarizability": POSITIVE, "voltage": NUMBER, "field_factor": POSITIVE, "radius": POSITIVE, "step": NUMBER},
+    ),
+    (ae.load, {}, {"path": [None, 3, NAN, [], "a\0b", "none.h5"]}),
+    (ae.read, {}, {"path": [None, 3, NAN, [], "a\0b", "none.epos"]}),
+    (ae.read_ranges, {}, {"path": [None, 3, NAN, [], "a\0b", "none.rrng"]}),
+    (ae.write, {"path": "a.epos", "hits": hits}, {"path": [None, 3, NAN, [], "a\0b", "a.txt", "a.h5"]}),
+    (ae.write, {"path": "a.epos", "hits": hits}, {"hits": [*OBJECT, None], "format": [3, True, b".pos", ".txt"]}),
+]
+NEEDS_A_RUN = [
+    (
+        ae.Simulation,
+        {"tip": shell, "n_threads": 1},
+        {
+            "tip": [*OBJECT, None],
+            "voltage": [*POSITIVE, 1e9],
+            "seed": SEED,
+            "n_threads": [value for value in COUNT if value is not None] + [0, 10**6],
+            **dict.fromkeys(("detector", "law", "charge_settings", "flight_settings", "response_settings"), OBJECT),
+            "watch_settings": OBJECT,
+            "rule": OBJECT,
+        },
+    ),
+    (
+        "simulation.run",
+        {"n_ions": 1, "progress": False},
+        {
+            "n_ions": [*COUNT, 0],
+            "emissions": [None, 3, "x", NAN, [3], ae.Unperturbed()],
+            "responses": SWITCH,
+            "progress": [value for value in SWITCH if value is not None],
+            "batch_size": [*COUNT, 0],
+        },
+    ),
+    (ae.Emitter, {"tip": shell}, {"tip": [*OBJECT, None], "voltage": POSITIVE, "law": OBJECT, "settings": OBJECT}),
+    ("emitter.field_at", {"points": [[0.0, 0, 9]]}, {"points": VECTOR, "opening_angle": [*NUMBER, -1.0, 3.0]}),
+    ("emitter.potential_at", {"points": [[0.0, 0, 9]]}, {"points": VECTOR, "opening_angle": [*NUMBER, -1.0, 3.0]}),
+    ("emitter.relax", {}, {"tolerance": [value for value in POSITIVE if value is not None]}),
+    ("emitter.evaporate", {}, {"most": [*COUNT, 0]}),
+    ("run.hits", {"perturbation": ae.Unperturbed()}, {"perturbation": [*OBJECT, None], "by_response": SWITCH}),
+    ("simulation.run", {"n_ions": 1, "progress": False}, {"checkpoint": [True, 3, NAN, [], "a\0b", "a.txt"]}),
+    (ae.fit_caps, {"windows": 1}, {"run": [*OBJECT, None]}),
+    (ae.image_compression, {}, {"run": [*OBJECT, None]}),
+    (ae.run_field_factor, {}, {"run": [*OBJECT, None]}),
+    (ae.lateral_tracks, {"ions": [0], "energies": [0.1]}, {"run": [*OBJECT, None]}),
+    (ae.rollup_tracks, {"ions": [0], "energies": [0.1]}, {"run": [*OBJECT, None]}),
+    (ae.fit_energies, {"measured": hits}, {"run": [*OBJECT, None]}),
+    ("tracks", {"energies": [0.1]}, {"ions": [None, 3, "x", [], [0.5], [-1], [99], [2**70]]}),
+    ("tracks", {"ions": [0]}, {"energies": [None, 3, "x", [], [NAN], [-1.0], [99.0]]}),
+    (
+        "fit_energies",
+        {"measured": hits},
+        {"measured": [*OBJECT, None], "mechanism": WORD, "seed": SEED, "resamples": COUNT},
+    ),
+    ("fit_energies", {"measured": hits}, {"means": [3, "x", [], [NAN], [0.0], [2.0, 1.0]], "data_range": POSITIVE}),
+    ("run.save", {}, {"path": [None, 3, NAN, [], "a\0b", "no such folder/a.h5"]}),
+]
+# where the sentence names the argument by another word: part of a tip by itself, of the whole by the sum
+OTHER_WORDS = {
+    "checkpoint": "path|file",
+    "path": "path|file|cannot (read|write)|format",
+    "format": "format",
+    "hits": "hits",
+    "name": "name",
+    "settings": "settings|perturbation or distribution|RollUp needs",
+    "low": "low|high",
+    "high": "high|low",
+    "positions": "positions",
+    "evaporation_field": "evaporation_field",
+    "opening_angle": "opening_angle|relaxation_angle",
+    "patch_radius": "patch_radius|update_radius",
+    "inner": "inner|outer",
+    "names": "names|Ranges",
+    "solutes": "solutes|Cu",
+    "elements": "elements|Ni",
+    "material": "material",
+}
+
+
+def calls(cases):
+    for function, good, bad in cases:
+        name = function if isinstance(function, str) else getattr(function, "__qualname__", repr(function))
+        for argument, values in bad.items():
+            yield pytest.param(function, good, argument, values, id=f"{name}-{argument}")
+
+
+def check(function, good, argument, values, folder):
+    """Every bad value gives one sentence with the name of the argument, and the value or its shape."""
+    for value in values:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error", RuntimeWarning)  # nothing is computed with it first
+                function(**(good | {argument: value}))
+        except ValueError as error:
+            sentence = str(error)
+        else:
+            pytest.fail(f"{argument}={shown(value)} is taken")
+        value = shown(value) if isinstance(value, int) else value  # too long to print
+        assert re.search(OTHER_WORDS.get(argument, argument), sentence), (value, sentence)
+        assert "\n" not in sentence and len(sentence) < 420, (value, sentence)
+        assert re.search("got|is (named|missing|not known)|(cannot|cannot be) (read|written|write)", sentence), (
+            value,
+            sentence,
+        )
+        listed = isinstance(value, list | tuple | dict | np.ndarray)  # told by their shape or a member
+        assert listed or shown(value) in sentence or str(value) in sentence, (value, sentence)
+    assert not os.listdir(folder)
+
+
+@pytest.mark.parametrize(("function", "good", "argument", "values"), list(calls(CASES)))
+def test_bad_arguments_are_refused_by_name(tmp_path, monkeypatch, function, good, argument, values):
+    monkeypatch.chdir(tmp_path)
+    check(function, good, argument, values, tmp_path)
+
+
+@pytest.mark.parametrize(("function", "good", "argument", "values"), list(calls(NEEDS_A_RUN)))
+def test_bad_arguments_of_a_simulation_are_refused_by_name(
+    tmp_path, monkeypatch, ready, function, good, argument, values
+):
+    monkeypatch.chdir(tmp_path)
+    if isinstance(function, str):
+        owner, _, method = function.partition(".")
+        function = getattr(ready[owner], method) if method else ready[owner]
+    check(function, good, argument, values, tmp_path)
+
+
+def test_every_public_name_with_arguments_is_in_the_table():
+    """A new public class or function has to come to the door, or to say here why it does not."""
+    tried = {getattr(function, "__self__", function) for function, _, _ in (*CASES, *NEEDS_A_RUN)}
+    tried |= {ae.Run, ae.Simulation}
+    taken = {"Unperturbed", "Extremal"}  # no arguments
+    taken |= {"FileError", "TruncatedFile", "Outcome", "Run", "plot", "__version__"}  # made by the package
+    taken |= {"chunks", "Study", "ZoneLine", "History", "Batch"}  # in test_chunks; made by the package
+    missing = {name for name in ae.__all__ if name not in taken and getattr(ae, name) not in tried}
+    assert not missing
+
+
+# ---- what does not fit together --------------------------------------------------------------------------------------
+
+
+def test_a_detector_behind_the_end_of_the_flights():
+    with pytest.raises(ValueError, match=r"distance of the detector must be at least the 0.002816 mm .* got 0.001 mm"):
+        ae.Simulation(shell, detector=ae.Detector(distance=0.001))
+
+
+def test_more_ions_than_atoms_are_said_before_the_run_starts():
+    simulation = ae.Simulation(shell, n_threads=1)
+    shell_and_below = round(simulation.tip.most_ions)
+    with pytest.warns(UserWarning, match=rf"n_ions is 100,000 but only about {shell_and_below:,} atoms may leave"):
+        with pytest.raises(KeyboardInterrupt):
+            simulation.run(100_000, emissions=(_Interrupting(),), progress=False)
+
+
+class _Interrupting:
+    def launch(self, emissions, random):
+        raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("shape", [{}, {"shank_angle": 20.0}, {"base": "flat", "shank_length": 6.0}])
+def test_the_atoms_that_may_leave_a_shell_are_those_of_the_whole(shape):
+    whole, part = ae.Tip(nickel, 3.0, **shape), ae.Tip(nickel, 3.0, **shape, depth=1.2)
+    assert whole.most_ions == whole.evaporable.sum()
+    # the surface is a layer of atoms or none: 0.1 nm of 3 nm, on three sides
+    assert part.most_ions == pytest.approx(whole.most_ions, rel=0.03)
+    assert part.most_ions > 1.2 * part.evaporable.sum()
+
+
+def test_unknown_materials_come_with_the_nearest_known():
+    with pytest.raises(ValueError, match=r"'Nickel' \(did you mean 'Ni'\?\); known are Al, .* any other is a Material"):
+        ae.Tip("Nickel", 5.0)
+
+
+# ---- memory ----------------------------------------------------------------------------------------------------------
+
+PEAK = """
+import json, sys
+import apt_evap as ae
+ae.Simulation, ae.Tip  # names are loaded when they are first used
+def memory(name):
+    with open("/proc/self/status") as lines:
+        return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(name))
+before = memory("VmRSS")
+tip = ae.Tip("Ni", **json.loads(sys.argv[1]))
+emitter = ae.Simulation(tip, n_threads=1).emitter
+print(json.dumps([memory("VmHWM") - before, len(tip), len(emitter)]))
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="Linux says how much memory was used")
+@pytest.mark.parametrize("shape", [{"apex_radius": 8.0}, {"apex_radius": 12.0, "depth": 2.0}])
+def test_the_memory_foreseen_is_the_memory_taken(shape, monkeypatch):
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", PEAK, json.dumps(shape)],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ | {"PYTHONPATH": str(Path(ae.__file__).parents[1])},
+    )
+    peak, atoms, surface = json.loads(done.stdout)
+    seen = []
+    monkeypatch.setattr("apt_evap.specimen.tip.check_memory", lambda *counts: seen.append(counts))
+    ae.Tip("Ni", **shape)
+    (foreseen,) = seen
+    assert foreseen[0] == pytest.approx(atoms, rel=0.03)
+    assert foreseen[1] == pytest.approx(surface, rel=0.15)  # steps and kinks are not in the area
+    assert memory.needed_memory(*foreseen) == pytest.approx(peak, rel=0.3)
+
+
+def test_what_does_not_fit_is_refused_before_it_is_built(monkeypatch):
+    monkeypatch.setattr(memory, "_available_memory", lambda: 8e9)
+    with pytest.raises(
+        ValueError, match=r"^a tip of .*e\+08 atoms needs about \d\d GB, 8 GB are free; give a depth.* sho"
+    ):
+        ae.Tip("Ni", 10.0, shank_length=1000.0)
+    with pytest.raises(ValueError, match=r"needs about .* GB, 8 GB are free"):
+        ae.Tip("Ni", 1e6, depth=1.2)
+    assert len(ae.Tip("Ni", 1.5)) > 0
+    monkeypatch.setattr(memory, "_available_memory", lambda: 1e6)
+    with pytest.raises(
+        ValueError, match=r"n_threads=64, each with a copy of .* needs about 0.0\d+ GB, 0.001 GB are free"
+    ):
+        ae.Simulation(shell, n_threads=64)
+
+
+# ---- what things say of themselves -----------------------------------------------------------------------------------
+
+
+def test_everything_says_in_one_line_what_it_holds(ready, tmp_path):
+    simulation, run, emitter = (ready[name] for name in ("simulation", "run", "emitter"))
+    (tmp_path / "a.toml").write_text('[tip]\nmaterial = "Ni"\napex_radius = "6 a"\n[simulation]\nions = 60\n')
+    launches = ae.Unperturbed().launch(run.emissions, ae.IonRandom(1, run.emissions.ions))
+    told = [
+        (simulation, ["Simulation", "1000 V", "seed 0", "atoms of Ni [0 0 1]", "300 mm at 100 mm"]),
+        (shell, ["Tip", f"{len(shell):,} atoms of Ni [0 0 1]", "1.5 nm", "to a depth of 1.2 nm"]),
+        (emitter, ["Emitter", f"{len(emitter):,} surface atoms", "1000 V"]),
+        (run, ["Run", "12 ions of Ni", "1000 V", "marked"]),
+        (run.hits(ae.Unperturbed()), ["Hits", "12 ions", "detected", "Unperturbed()", "time_of_flight"]),
+        (run.emissions, ["Emissions", "12 atoms", "neighbour"]),
+        (launches, ["Launches", "12 ions", "0 of them rolled up"]),
+        (grid, ["DetectorMap", "densities", "20 x 20 bins of 1 x 1 mm"]),
+        (ranges, ["Ranges", "1 of Ni"]),
+        (nickel, ["Material", "Ni", "fcc", "0.352", "35.0"]),
+        (ae.Detector(), ["Detector", "distance=100.0", "width=300.0"]),
+        (read_config(tmp_path / "a.toml"), ["Config", "a.toml", "60 ions of Ni", "2.112 nm", "roll-up"]),
+        (ae.RollUp(ae.TruncatedNormal(0.3, 0.1)), ["RollUp(energy=TruncatedNormal(mean=0.3, standard_deviation=0.1))"]),
+        (ae.IonRandom(1, [0, 1]), ["IonRandom", "seed=1", "2 ions"]),
+        (ae.ChargeSettings(), ["ChargeSettings", "tolerance=", "opening_angle=0.4"]),
+        (ae.FlightSettings(), ["FlightSettings", "tolerance=", "most_steps=500"]),
+        (ae.ResponseSettings(), ["energy_limit=1.5", "bound=0.2", "degree=4"]),
+    ]
+    for thing, words in told:
+        assert all(word in repr(thing) for word in words), repr(thing)
+        assert "\n" not in repr(thing) and len(repr(thing)) < 260 and "0x" not in repr(thing)
+    assert repr(run.responses) == "<Responses: 12 ions, 15 coefficients from the site, 10 rolled up>"
+    assert "atoms left one after the other" in repr(emitter.evaporate(1))

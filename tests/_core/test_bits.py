@@ -1,0 +1,81 @@
+"""The hot sums have the same bits on every processor: compiled for three of them, with three levels of optimisation."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+CORE = Path(__file__).parents[2] / "apt_evap" / "_core"
+PROGRAM = r"""
+#include "kernels.h"
+#include <stdio.h>
+#include <stdlib.h>
+static unsigned long long hash = 1469598103934665603ULL;
+static void add(const void *p, long n)
+{
+    for (long i = 0; i < n; i++)
+        hash = (hash ^ ((const unsigned char *)p)[i]) * 1099511628211ULL;
+}
+int main(void)
+{
+    enum { N = 640 };
+    static double x[N], y[N], z[N], q[N], cells[CELL * N];
+    static float fx[N], fy[N], fz[N], fq[N], row[N], px[N], py[N], pz[N];
+    static int list[N];
+    int range[2] = {0, N};
+    float targets[3 * GROUP], sums[3 * GROUP] = {0}, dot;
+    double wide[3 * GROUP], wide_sums[3 * GROUP] = {0};
+    double origin[3] = {5, 5, 12}, e[3] = {0}, normal[3] = {0.1, 0.2, 0.97};
+    srand48(7);
+    for (int i = 0; i < N; i++) {
+        fx[i] = x[i] = drand48() * 10, fy[i] = y[i] = drand48() * 10, fz[i] = z[i] = drand48() * 10;
+        q[i] = drand48(), fq[i] = q[i] - 0.5, list[i] = i;
+        for (int j = 0; j < CELL; j++)
+            cells[CELL * i + j] = drand48();
+    }
+    for (int l = 0; l < 3 * GROUP; l++)
+        wide[l] = targets[l] = drand48();
+    group_atoms_single(1, range, x, y, z, q, origin, targets, sums);
+    group_cells_single(N, list, cells, origin, targets, sums);
+    group_atoms_double(1, range, x, y, z, q, origin, wide, wide_sums);
+    group_cells_double(N, list, cells, origin, wide, wide_sums);
+    point_atoms(N - 3, x, y, z, q, 5, 5, 12, e);
+    point_cells(N, N, cells, 5, 5, 12, e);
+    patch_row(N, fx, fy, fz, 5, 5, 5, normal, row);
+    dot = patch_dot(N, row, fx);
+    patch_field(N, fx, fy, fz, N - 1, fy, fz, fx, fq, px, py, pz);
+    add(sums, sizeof sums), add(wide_sums, sizeof wide_sums), add(e, sizeof e), add(row, sizeof row);
+    add(&dot, sizeof dot), add(px, sizeof px), add(py, sizeof py), add(pz, sizeof pz);
+    printf("%016llx %g\n", hash, e[0]);
+    return 0;
+}
+"""
+
+
+def test_bits_do_not_depend_on_the_processor(tmp_path):
+    compiler = shutil.which("gcc")
+    if compiler is None:
+        pytest.skip("needs gcc")
+    # without clones each build has the one processor it is compiled for
+    header = (
+        (CORE / "kernels.h")
+        .read_text()
+        .replace("target_clones(", "unused)) /* target_clones(")
+        .replace('"default"), unused))', '"default"), unused) */')
+    )
+    (tmp_path / "kernels.h").write_text(header)
+    (tmp_path / "kernels_group.h").write_text((CORE / "kernels_group.h").read_text())
+    (tmp_path / "sums.c").write_text(PROGRAM)
+    seen = {}
+    flags = ["-fopenmp", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=off"]
+    for processor in ("x86-64", "x86-64-v3", "x86-64-v4"):
+        for level in ("-O1", "-O3"):
+            build = [compiler, level, f"-march={processor}", *flags, "sums.c", "-o", "sums", "-lm"]
+            if subprocess.run(build, cwd=tmp_path, capture_output=True).returncode:
+                pytest.skip(f"gcc cannot build for {processor}")
+            done = subprocess.run(["./sums"], cwd=tmp_path, capture_output=True, text=True)
+            if done.returncode == 0:  # else this processor lacks the instructions
+                seen[processor, level] = done.stdout
+    assert len(seen) >= 2
+    assert len(set(seen.values())) == 1, seen

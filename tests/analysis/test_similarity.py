@@ -1,0 +1,109 @@
+import numpy as np
+import pytest
+
+from apt_evap.analysis.similarity import half_ceiling, ssim
+from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.detection.hits import Hits
+
+EDGES = np.linspace(-10, 10, 101)
+CENTRES = (EDGES[1:] + EDGES[:-1]) / 2
+GRID_X, GRID_Y = np.meshgrid(CENTRES, CENTRES)
+INSIDE = np.hypot(GRID_X, GRID_Y) < 9.5
+LINES = 1 + 0.5 * np.cos(6 * np.arctan2(GRID_Y, GRID_X))
+
+
+def noisy(mean, seed):
+    """A measured map of LINES with `mean` ions in a bin."""
+    counts = np.random.default_rng(seed).poisson(mean * LINES)
+    return DetectorMap.from_array(counts, EDGES, EDGES, INSIDE, is_counts=True)
+
+
+def test_a_map_equals_itself_whatever_its_unit():
+    a = DetectorMap.from_array(LINES, EDGES, EDGES, INSIDE)
+    b = DetectorMap.from_array(7.5 * LINES, EDGES, EDGES, INSIDE)
+    assert float(ssim(a, b)) == pytest.approx(1, abs=1e-12)
+    assert float(ssim(a, b, smoothing=0.7)) == pytest.approx(1, abs=1e-12)
+
+
+def test_the_measure_is_that_of_wang():
+    a, b = noisy(20, 1), noisy(20, 2)
+    result = ssim(a, b, data_range=3.0)
+    # formula 13 of Wang et al. (2004) written out at one bin, window of half width 5
+    row, column = 50, 47
+    offset = np.arange(-5, 6)
+    window = np.exp(-(offset[:, None] ** 2 + offset**2) / (2 * 1.5**2))
+    window /= window.sum()
+    p, q = (m.values[row - 5 : row + 6, column - 5 : column + 6] / m.values[INSIDE].mean() for m in (a, b))
+    mean_p, mean_q = (window * p).sum(), (window * q).sum()
+    var_p, var_q = (window * (p - mean_p) ** 2).sum(), (window * (q - mean_q) ** 2).sum()
+    both = (window * (p - mean_p) * (q - mean_q)).sum()
+    c1, c2 = (0.01 * 3) ** 2, (0.03 * 3) ** 2
+    expected = (2 * mean_p * mean_q + c1) * (2 * both + c2)
+    expected /= (mean_p**2 + mean_q**2 + c1) * (var_p + var_q + c2)
+    assert result.local[row, column] == pytest.approx(expected, rel=1e-10)
+    assert float(result) == pytest.approx(np.nanmean(result.local), rel=1e-12)
+
+
+def test_what_lies_outside_the_common_mask_does_not_matter():
+    a, b = noisy(20, 1), noisy(20, 2)
+    spoilt = np.where(INSIDE, b.values, 10_000)
+    smaller = INSIDE & (GRID_X < 6)
+    c = DetectorMap.from_array(spoilt, EDGES, EDGES, smaller, is_counts=True)
+    clean = DetectorMap.from_array(b.values, EDGES, EDGES, smaller, is_counts=True)
+    assert float(ssim(a, c)) == float(ssim(a, clean))
+    assert np.isnan(ssim(a, c).local[:, CENTRES > 6]).all()
+
+
+def test_a_dark_rim_does_not_make_noise_look_alike():
+    lit = 2.0 * (np.hypot(GRID_X, GRID_Y) < 9.3)
+    maps = [
+        DetectorMap.from_array(np.random.default_rng(seed).poisson(lit), EDGES, EDGES, INSIDE) for seed in range(20)
+    ]
+    values = [float(ssim(a, b)) for a, b in zip(maps[::2], maps[1::2], strict=True)]
+    # independent noise: near 0, 0.018 from pair to pair, so 0.006 for the mean; windows over the rim add 0.05
+    assert abs(np.mean(values)) < 0.02
+
+
+def test_more_ions_and_smoothing_raise_the_ceiling():
+    few, many = half_ceiling(noisy(5, 1)), half_ceiling(noisy(500, 1))
+    assert 0 < float(few) < float(many) < 1
+    assert float(half_ceiling(noisy(5, 1), smoothing=0.5)) > float(few) + 0.2
+
+
+def test_a_turned_map_is_less_alike_than_the_ceiling():
+    map = noisy(100, 3)
+    turned = DetectorMap.from_array(map.counts.T, EDGES, EDGES, INSIDE, is_counts=True)
+    assert float(ssim(map, turned)) < float(half_ceiling(map)) - 0.3
+
+
+def test_ceiling_is_keyed_by_its_seed_and_takes_hits():
+    x, y = np.random.default_rng(0).uniform(-5, 5, (2, 60_000))
+    hits = Hits(x=x, y=y)
+    first, same, other = (float(half_ceiling(hits, bins=50, seed=seed)) for seed in (1, 1, 2))
+    assert first == same != other
+    assert float(half_ceiling(hits.map(bins=50), seed=1)) == first
+
+
+def test_result_states_what_it_depends_on():
+    text = repr(ssim(noisy(5, 1), noisy(5, 2), smoothing=0.25, data_range=4))
+    for part in ("100 x 100 bins", "0.2 x 0.2 mm", "smoothed by 0.25 mm", "data range 4"):
+        assert part in text
+
+
+def test_maps_that_cannot_be_compared():
+    a = noisy(5, 1)
+    shifted = DetectorMap.from_array(LINES, EDGES + 1, EDGES)
+    small = DetectorMap.from_array(LINES, EDGES, EDGES, np.abs(GRID_X) < 0.5)
+    tiny = DetectorMap.from_array(np.ones((5, 5)), np.arange(6.0), np.arange(6.0))
+    with pytest.raises(ValueError, match=r"same bins.*x_edges"):
+        ssim(a, shifted)
+    with pytest.raises(ValueError, match="share more than a window"):
+        ssim(a, small)
+    with pytest.raises(ValueError, match="at least 11 bins"):
+        ssim(tiny, tiny)
+    with pytest.raises(ValueError, match="not counts"):
+        half_ceiling(small)
+    with pytest.raises(ValueError, match="data_range"):
+        ssim(a, a, data_range=0)
+    with pytest.raises(ValueError, match="takes no bins"):
+        half_ceiling(a, bins=5)

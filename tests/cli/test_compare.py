@@ -1,0 +1,195 @@
+"""`apt-evap compare`: what it writes, what it takes, what it refuses."""
+
+import csv
+import json
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+import apt_evap as ae
+from apt_evap.cli.main import main
+
+ROLLUP = ae.RollUp(ae.TruncatedNormal(0.2, 0.1))
+FILES = {"study.json", "ssim.csv", "ssim.png", "maps.png", "registration.png"}
+QUICK = ["--means", "0.1,0.2,0.3", "--rsds", "0.5,1", "--replicas", "1", "--resamples", "4", "--bins", "24"]
+HERE = ["--registration", "0,1,0,0"]
+
+
+@pytest.fixture(scope="module")
+def made(tip12, tmp_path_factory):
+    """A run, and what would have been measured of another one: ions, a map, a run."""
+    folder = tmp_path_factory.mktemp("made")
+    run, other = (ae.Simulation(tip12, seed=seed).run(2500, progress=False) for seed in (1, 2))
+    run.save(folder / "run.h5")
+    other.save(folder / "other.h5")
+    hits = other.hits(ROLLUP).within_circle(60.0)
+    ae.write(folder / "ions.epos", ae.Hits(x=hits.x, y=hits.y, mass_to_charge=hits.mass_to_charge))
+    map = hits.map(bins=48)
+    edges = {"x_edges_cm": map.x_edges / 10, "y_edges_cm": map.y_edges / 10}
+    np.savez(folder / "map.npz", counts=map.counts, **edges, inside=map.mask)
+    return folder
+
+
+@pytest.fixture
+def folder(made, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for path in made.iterdir():
+        os.link(path, tmp_path / path.name)
+    return tmp_path
+
+
+def failed(capsys, *arguments):
+    """The sentence of a command that fails and leaves nothing behind; what a reader warns of may go before."""
+    before = sorted(str(path) for path in Path().rglob("*"))
+    assert main(["compare", *arguments]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and re.fullmatch(r"(apt-evap: warning: [^\n]+\n)*apt-evap: error: [^\n]+\n", err)
+    assert sorted(str(path) for path in Path().rglob("*")) == before
+    return err
+
+
+def test_everything_is_written(folder, capsys):
+    assert main(["compare", "run.h5", "map.npz", "-o", "study", *QUICK, *HERE]) == 0
+    out, _ = capsys.readouterr()
+    assert "roll-up, best at" in out and "to study" in out
+    assert {path.name for path in Path("study").iterdir()} == FILES
+    held = json.loads(Path("study/study.json").read_text())
+    assert np.shape(held["ssim"]) == (1, 2, 3)
+    assert held["settings"]["replicas"] == 1 and held["settings"]["bins"] == [24, 24]
+    with open("study/ssim.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["ssim"]) for row in rows] == pytest.approx(np.ravel(held["ssim"]), rel=1e-5)
+    assert [float(row["mean_eV"]) for row in rows] == [0.1, 0.2, 0.3] * 2
+    for name in FILES:
+        if name.endswith(".png"):
+            assert imread(f"study/{name}")[..., :3].std() > 0.05
+    # it is what Python gives
+    study = ae.fit_energies(
+        ae.load("run.h5"), ae.read_map("map.npz"), means=(0.1, 0.2, 0.3), rsds=(0.5, 1), replicas=1, resamples=4,
+        bins=24, registration=ae.Registration(0, 1, (0, 0)), progress=False,
+    )  # fmt: skip
+    assert held == study.to_dict()
+
+
+def test_a_folder_of_its_own_is_written_again(folder, capsys):
+    arguments = ["compare", "run.h5", "map.npz", "-o", "study", *QUICK, *HERE, "--quiet"]
+    assert main(arguments) == 0
+    Path("study/notes.txt").write_text("mine")
+    Path("study/maps.png").unlink()
+    assert main([*arguments, "--seed", "5"]) == 0
+    assert capsys.readouterr() == ("", "")
+    assert {path.name for path in Path("study").iterdir()} == FILES | {"notes.txt"}
+    assert json.loads(Path("study/study.json").read_text())["settings"]["seed"] == 5
+
+
+def test_files_of_others_are_kept(folder, capsys):
+    Path("study").mkdir()
+    Path("study/maps.png").write_bytes(b"mine")
+    arguments = ["run.h5", "map.npz", "-o", "study", *QUICK, *HERE]
+    assert "study/maps.png' exists and was not made by apt-evap: --force overwrites it" in failed(capsys, *arguments)
+    assert Path("study/maps.png").read_bytes() == b"mine"
+    assert main(["compare", *arguments, "--force", "--quiet"]) == 0
+    assert Path("study/maps.png").read_bytes() != b"mine"
+    Path("file").touch()
+    for force in ([], ["--force"]):
+        assert "'file'" in failed(capsys, "run.h5", "map.npz", "-o", "file", *force)
+    assert "cannot write 'none/study'" in failed(capsys, "run.h5", "map.npz", "-o", "none/study")
+
+
+def test_ions_and_runs_are_taken_too(folder):
+    assert main(["compare", "run.h5", "ions.epos", *QUICK, *HERE, "--quiet", "--mechanism", "lateral"]) == 0
+    held = json.loads(Path("ions_study/study.json").read_text())
+    assert held["grid"]["mechanism"] == "lateral" and held["ceiling"] is not None
+    arguments = ["run.h5", "other.h5", *QUICK, *HERE, "--quiet", "-o", "again"]
+    assert main(["compare", *arguments, "--perturbation", "RollUp:0.2,0.1"]) == 0
+    assert "RollUp" in json.loads(Path("again/study.json").read_text())["settings"]["measured"]
+
+
+def test_a_registration_from_a_file(folder, capsys):
+    turned = ae.Registration(20.0, 0.9, (1.0, -2.0), True)
+    Path("r.json").write_text(json.dumps(turned.to_dict()))
+    arguments = ["compare", "run.h5", "map.npz", *QUICK, "--quiet"]
+    assert main([*arguments, "-o", "first", "--registration", "r.json"]) == 0
+    assert main([*arguments, "-o", "second", "--registration", "first/study.json"]) == 0
+    assert main([*arguments, "-o", "third", "--registration", "20,0.9,1,-2,mirror"]) == 0
+    held = [json.loads(Path(name, "study.json").read_text()) for name in ("first", "second", "third")]
+    assert held[0] == held[1] == held[2]
+    assert held[0]["registration"] == turned.to_dict()
+    Path("bad.json").write_text("[]")
+    assert "'bad.json' does not hold a registration" in failed(
+        capsys, "run.h5", "map.npz", "--registration", "bad.json"
+    )
+
+
+def test_arrays_by_name(folder, capsys):
+    with np.load("map.npz") as held:
+        renamed = {"n": held["counts"], "a": held["x_edges_cm"], "b": held["y_edges_cm"]}
+    np.savez("named.npz", **renamed)
+    arguments = ["run.h5", "named.npz", *QUICK, *HERE, "--quiet"]
+    assert "named.npz' must hold one array to be the edges" in failed(capsys, *arguments)
+    assert main(["compare", *arguments, "--arrays", "n,a,b", "--unit", "cm"]) == 0
+    assert json.loads(Path("named_study/study.json").read_text())["settings"]["measured_noise"] == "not known"
+
+
+@pytest.mark.parametrize(
+    "arguments, sentence",
+    [
+        (["run.h5"], "the following arguments are required: MEASURED"),
+        (["run.h5", "map.npz", "--means", "a"], "--means: must be numbers with commas between, got 'a'"),
+        (["run.h5", "map.npz", "--means", "0.2,0.1"], "means must be increasing numbers above 0"),
+        (["run.h5", "map.npz", "--mechanism", "both"], "invalid choice: 'both'"),
+        (["run.h5", "map.npz", "--mechanism", "rollup"], "invalid choice: 'rollup' (did you mean 'roll-up'?)"),
+        (["run.h5", "map.npz", "--rollup-fractions", "0.5"], "rollup_fractions are for the mechanism 'combined'"),
+        (["run.h5", "map.npz", "--registration", "1,2"], "--registration must be a .json file or ROTATION,SCALE"),
+        (["run.h5", "map.npz", "--registration", "0,-1,0,0"], "scale must be a finite number above 0"),
+        (["run.h5", "map.npz", "--temperature", "0"], "temperature must be a finite number [K] above 0"),
+        (["run.h5", "map.npz", "--arrays", "counts"], "--arrays must name values, edges in x and y"),
+        (["run.h5", "ions.epos", "--unit", "mm"], "--unit is for a map in an .npz file, got 'ions.epos'"),
+        (["run.h5", "other.h5"], "'other.h5' is a run: say by --perturbation how its ions start"),
+        (["run.h5", "ions.epos", "--perturbation", "Unperturbed"], "'ions.epos' holds measured ions"),
+        (["run.h5", "none.epos"], "cannot read 'none.epos'"),
+        (["ions.epos", "map.npz"], "'ions.epos'"),
+    ],
+)
+def test_what_is_refused(folder, capsys, arguments, sentence):
+    assert sentence in failed(capsys, *arguments, *([] if "--registration" in arguments else HERE))
+
+
+def test_measured_ions_are_selected(folder, capsys):
+    arguments = ["run.h5", "ions.epos", *QUICK, *HERE, "--quiet"]
+    assert main(["compare", *arguments, "-o", "all"]) == 0
+    assert main(["compare", *arguments, "-o", "part", "--circle", "40"]) == 0
+    held = [json.loads(Path(name, "study.json").read_text())["settings"]["measured"] for name in ("all", "part")]
+    assert held[0] != held[1]
+    assert "--voltage: ions.epos has no column 'voltage'" in failed(capsys, *arguments, "--voltage", "1,2")
+    assert "--ions is for ions, got 'map.npz'" in failed(capsys, "run.h5", "map.npz", *HERE, "--ions", "0,5")
+
+
+def test_a_run_without_responses_is_refused(folder, tip12, capsys):
+    ae.Simulation(tip12).run(50, responses=False, progress=False).save("nr.h5")
+    sentence = "'nr.h5' has no responses: run again with responses = true in [simulation]"
+    assert sentence in failed(capsys, "nr.h5", "map.npz", *HERE)
+
+
+def test_help(capsys):
+    assert main(["compare", "--help"]) == 0
+    assert "example: apt-evap compare" in capsys.readouterr().out
+
+
+def test_a_doubtful_registration_is_told_once_and_kept(folder, capsys):
+    """A map that has nothing to do with the run."""
+    random = np.random.default_rng(3)
+    edges = np.linspace(-2, 2, 41)
+    np.savez("noise.npz", counts=random.poisson(30, (40, 40)), x_edges_cm=edges, y_edges_cm=edges)
+    assert main(["compare", "run.h5", "noise.npz", "-o", "noise", *QUICK]) == 0
+    out, err = capsys.readouterr()
+    assert err.count("the registration is doubtful") == 1
+    assert "look at registration.png" in err and "give --registration where it is known" in err
+    assert "roll-up, registration doubtful, best at" in out
+    assert json.loads(Path("noise/study.json").read_text())["registration"]["doubtful"] is True
+    assert main(["compare", "run.h5", "noise.npz", "-o", "given", *QUICK, *HERE]) == 0
+    assert "doubtful" not in "".join(capsys.readouterr())

@@ -1,0 +1,657 @@
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import termios
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+import apt_evap.cli as cli
+from apt_evap import __version__, plot
+from apt_evap.cli.main import EXIT_CODES, main
+from apt_evap.detection.hits import Hits
+from apt_evap.emission.perturbations import Combined, LateralVelocity, RollUp, Unperturbed
+from apt_evap.io.formats import write
+from apt_evap.simulation.run import load
+
+HERE = str(Path(cli.__file__).parents[2])  # the package under test, installed or not
+PROGRAM = "import sys; from apt_evap.cli.main import main; sys.exit(main())"
+SMALL = """
+[tip]
+material = "Ni"
+axis = [1, 1, 1]
+apex_radius = "6 a"
+shank_length = "6 a"
+
+[simulation]
+ions = 60
+seed = 1
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "small.toml").write_text(SMALL)
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A run, made once by the command line."""
+    folder = tmp_path_factory.mktemp("made")
+    (folder / "small.toml").write_text(SMALL)
+    assert main(["run", str(folder / "small.toml"), "-o", str(folder / "small.h5"), "--quiet"]) == 0
+    return folder / "small.h5"
+
+
+@pytest.fixture
+def measured(folder):
+    """An .epos of 4,000 ions on a comb of 0.5 mm, a tenth of them in pulses of two."""
+    random = np.random.default_rng(1)
+    x, y = 0.5 * random.integers(-40, 41, (2, 4000))
+    pulse_id = np.arange(4000)
+    pulse_id[1:400:2] -= 1
+    voltage = np.linspace(3000, 5000, 4000)
+    write("ions.epos", Hits(x=x, y=y, voltage=voltage, mass_to_charge=np.full(4000, 58.0), pulse_id=pulse_id))
+    return folder / "ions.epos"
+
+
+def failed(capsys, *arguments):
+    """The sentence of a command that fails."""
+    before = sorted(os.listdir())
+    assert main([str(argument) for argument in arguments]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and re.fullmatch(r"apt-evap: error: [^\n]+\n", err)
+    assert sorted(os.listdir()) == before
+    return err
+
+
+# ---- run -------------------------------------------------------------------------------------------------------------
+
+
+def test_run_writes_run_and_picture_and_says_so(folder, capsys):
+    assert main(["run", "small.toml", "--threads", "1"]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""  # no bar where there is no terminal
+    run = load("small.h5")
+    hit, missed, never_left = run.hits(Unperturbed()).counts.values()
+    assert f"unperturbed: {hit} hit the detector, {missed} missed it, {never_left} never left" in out
+    assert "60 ions in" in out and out.endswith("wrote small.h5\nwrote small.png\n")
+    assert len(run) == 60 and run.seed == 1 and run.ended == ""
+    assert run.provenance["config"] == "small.toml"
+    assert np.ptp(imread("small.png")[..., :3]) > 0.5
+    assert sorted(os.listdir()) == ["small.h5", "small.png", "small.toml"]
+
+
+def test_options_go_before_the_file(folder, capsys):
+    arguments = ["run", "small.toml", "-o", "other.h5", "--ions", "20", "--seed", "5", "--map", "other.svg", "--quiet"]
+    assert main(arguments) == 0
+    assert capsys.readouterr() == ("", "")
+    run = load("other.h5")
+    assert len(run) == 20 and run.seed == 5
+    assert sorted(os.listdir()) == ["other.h5", "other.svg", "small.toml"]
+
+
+def test_the_output_of_the_file_is_the_default(folder):
+    (folder / "small.toml").write_text('output = "named.h5"\n' + SMALL)
+    assert main(["run", "small.toml", "--ions", "5", "--quiet"]) == 0
+    assert (folder / "named.h5").exists() and (folder / "named.png").exists()
+
+
+def test_the_run_is_that_of_python_whatever_the_threads(folder, made):
+    assert main(["run", "small.toml", "--threads", "2", "--quiet"]) == 0
+    one, two = load(made), load("small.h5")
+    for perturbation in (Unperturbed(), RollUp(0.2)):
+        assert np.array_equal(one.hits(perturbation).x, two.hits(perturbation).x)
+
+
+def test_without_responses_the_perturbations_of_the_maps_are_flown(folder, capsys):
+    (folder / "small.toml").write_text(SMALL + 'responses = false\n[[maps.panels]]\nperturbation = "RollUp:0.2"\n')
+    assert main(["run", "small.toml"]) == 0
+    assert "roll-up, 0.2 eV: " in capsys.readouterr().out
+    run = load("small.h5")
+    assert run.responses is None and run.perturbations == (RollUp(0.2),)
+    assert main(["map", "small.h5"]) == 0 and main(["info", "small.h5"]) == 0
+
+
+def datasets(path):
+    found = {}
+    with h5py.File(path) as file:
+        file.visititems(lambda name, item: found.update({name: item[()]}) if isinstance(item, h5py.Dataset) else None)
+    return found
+
+
+def test_a_run_is_made_longer_by_resume(folder, made, capsys):
+    assert main(["run", "small.toml", "--ions", "25", "--quiet"]) == 0
+    assert main(["run", "small.toml", "--resume", "--checkpoint", "0"]) == 0
+    out = capsys.readouterr().out
+    assert "resumed at 25 of 60 ions\n" in out and "60 ions, 35 of them new, in" in out
+    assert "wrote small.h5" in out
+    before = (folder / "small.h5").stat()
+    assert main(["run", "small.toml", "--resume"]) == 0
+    assert capsys.readouterr().out.endswith("small.h5 is complete: nothing to do\n")
+    assert main(["run", "small.toml", "--resume", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["wrote"] is None and told["ions"] == 60
+    assert (folder / "small.h5").stat().st_mtime_ns == before.st_mtime_ns
+    one, two = datasets(made), datasets("small.h5")
+    assert one.keys() == two.keys() and "entry1/atom_probe/hit_finding/hit_positions" in one
+    assert [name for name in one if one[name].tobytes() != two[name].tobytes()] == []
+    assert load("small.h5").provenance["config"] == "small.toml"
+    assert sorted(os.listdir()) == ["small.h5", "small.png", "small.toml"]
+    assert "seed is 1 there and 2 here" in failed(capsys, "run", "small.toml", "--resume", "--seed", "2", "--quiet")
+    assert "--ions must be at least the 60 that are done already, got 50" in failed(
+        capsys, "run", "small.toml", "--resume", "--ions", "50", "--quiet"
+    )
+
+
+def test_an_unfinished_run_is_resumed_or_begun_anew_as_asked(folder, made, capsys):
+    assert main(["run", "small.toml", "--ions", "25", "--quiet"]) == 0
+    (folder / "small.h5.unfinished").mkdir()
+    os.rename("small.h5", "small.h5.unfinished/ions-000000000000.h5")
+    message = failed(capsys, "run", "small.toml", "--quiet")
+    assert "unfinished run of 25 ions" in message and "--resume goes on with it, --force begins anew" in message
+    assert main(["info", "small.h5.unfinished"]) == 0
+    told = capsys.readouterr().out
+    assert "unfinished run of 25 ions" in told and "the command that began it, with --resume, goes on" in told
+    assert "No such file or directory; an unfinished run is in 'small.h5.unfinished'" in failed(
+        capsys, "info", "small.h5"
+    )
+    assert main(["run", "small.toml", "--quiet", "--resume", "--ions", "30"]) == 0
+    assert len(load("small.h5")) == 30
+    os.mkdir("small.h5.unfinished")
+    os.rename("small.h5", "small.h5.unfinished/ions-000000000000.h5")
+    assert main(["run", "small.toml", "--quiet", "--force", "--ions", "5"]) == 0
+    assert len(load("small.h5")) == 5
+    assert sorted(os.listdir()) == ["small.h5", "small.png", "small.toml"]
+
+
+def test_a_second_run_overwrites_the_first_but_nobody_elses_files(folder, capsys):
+    quick = ["run", "small.toml", "--ions", "5", "--quiet"]
+    assert main(quick) == 0
+    assert main(quick[:-1]) == 0
+    assert "replaced small.h5\nwrote small.png\n" in capsys.readouterr().out
+    created = (folder / "small.h5").stat().st_mtime_ns, (folder / "small.png").stat().st_mtime_ns
+    assert main(quick) == 0
+    assert created[0] < (folder / "small.h5").stat().st_mtime_ns
+    assert created[1] < (folder / "small.png").stat().st_mtime_ns
+
+    with_seed = "small.h5' holds a run with other settings (seed is 1 there and 2 here): --force replaces it"
+    assert with_seed in failed(capsys, *quick, "--seed", "2")
+    assert "small.h5' holds a run of 5 ions, more than the 4 asked for: --force" in failed(
+        capsys, *quick, "--ions", "4"
+    )
+    load("small.h5").ended_by("interrupted").save("small.h5")
+    assert "a run of 5 ions that is not complete (interrupted): --resume goes on with it, --force begins anew" in (
+        failed(capsys, *quick)
+    )
+    assert main([*quick, "--force"]) == 0
+
+    (folder / "small.png").write_bytes(b"a photograph")
+    assert "'small.png' exists and was not made by apt-evap: --force overwrites it" in failed(capsys, *quick)
+    with h5py.File("small.h5", "w") as other:
+        other["measured"] = [1, 2]
+    assert "'small.h5' exists and was not made by apt-evap" in failed(capsys, *quick)
+    (folder / "small.h5").write_bytes(b"text")
+    assert "'small.h5' exists and was not made by apt-evap" in failed(capsys, *quick)
+    assert (folder / "small.h5").read_bytes() == b"text"
+    assert main([*quick, "--force"]) == 0
+    assert len(load("small.h5")) == 5
+
+
+def test_what_cannot_be_written_is_said_before_computing(folder, capsys, monkeypatch):
+    monkeypatch.setattr(cli.run, "read_config", checked := Counting(cli.run.read_config))
+    assert "cannot write 'none/a.h5': No such file or directory" in failed(
+        capsys, "run", "small.toml", "-o", "none/a.h5"
+    )
+    assert "cannot write 'none/a.png'" in failed(capsys, "run", "small.toml", "--map", "none/a.png")
+    (folder / "folder.h5").mkdir()
+    assert "cannot write 'folder.h5': Is a directory" in failed(capsys, "run", "small.toml", "-o", "folder.h5")
+    assert "whose name ends in .h5, got 'a.hdf'" in failed(capsys, "run", "small.toml", "-o", "a.hdf")
+    assert "a picture is a .png, .pdf, .svg file, got 'a.jpg'" in failed(capsys, "run", "small.toml", "--map", "a.jpg")
+    assert [config.simulated for config in checked.given] == [False] * 5
+
+
+class Counting:
+    """Reads configs and notes whether a simulation was built of them."""
+
+    def __init__(self, read):
+        self.read, self.given = read, []
+
+    def __call__(self, path):
+        self.given.append(Noting(self.read(path)))
+        return self.given[-1]
+
+
+class Noting:
+    def __init__(self, config):
+        self.config, self.simulated = config, False
+
+    def __getattr__(self, name):
+        if name == "simulation":
+            self.simulated = True
+        return getattr(self.config, name)
+
+
+def test_wrong_configs_are_one_sentence(folder, made, capsys):
+    def wrong(old, new):
+        (folder / "wrong.toml").write_text(SMALL.replace(old, new))
+        return failed(capsys, "run", "wrong.toml")
+
+    assert "'wrong.toml', [tip]: no key is named 'apex' (did you mean 'apex_radius'?)" in wrong("apex_radius", "apex")
+    assert "'wrong.toml', [tip]: apex_radius must be a finite number [nm] at least" in wrong("6 a", "1 a")
+    assert "'wrong.toml', [simulation]: ions must be a whole number of at least 1, got 'many'" in wrong("60", '"many"')
+    assert "GB are free; give a depth" in wrong("6 a", "90000 a")
+    assert "'wrong.toml' is not a TOML file" in wrong("=", ":")
+    assert "cannot read 'none.toml'" in failed(capsys, "run", "none.toml")
+    assert f"'{made}' is a run: see apt-evap info" in failed(capsys, "run", made)
+
+
+def test_a_run_that_ends_early_says_why(folder, capsys):
+    (folder / "small.toml").write_text(SMALL.replace("6 a", "3 a") + "responses = false\n")
+    assert main(["run", "small.toml", "--ions", "100000"]) == 0
+    run = load("small.h5")
+    assert 0 < len(run) < 100_000 and run.ended
+    assert f"apt-evap: note: the run ended before its time: {run.ended}; the {len(run):,} ions so far" in (
+        capsys.readouterr().err
+    )
+
+
+def test_a_failing_picture_leaves_the_run(folder, capsys, monkeypatch):
+    def break_down(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", break_down)
+    assert main(["run", "small.toml", "--ions", "5", "--quiet"]) == 2
+    err = capsys.readouterr().err
+    assert "no maps are drawn, the run is in 'small.h5': cannot write 'small.png': No space left on device" in err
+    assert sorted(os.listdir()) == ["small.h5", "small.toml"]
+
+
+def test_memory_and_interrupts_are_no_tracebacks_but_bugs_are(folder, capsys, monkeypatch):
+    def raising(error):
+        def run(*_, **__):
+            raise error
+
+        monkeypatch.setattr("apt_evap.simulation.simulation.Simulation.run", run)
+
+    raising(MemoryError())
+    assert "not enough memory" in failed(capsys, "run", "small.toml", "--quiet")
+    raising(KeyboardInterrupt())
+    assert main(["run", "small.toml", "--quiet"]) == 130
+    assert capsys.readouterr().err == "apt-evap: interrupted\n"
+    raising(ZeroDivisionError())
+    with pytest.raises(ZeroDivisionError):
+        main(["run", "small.toml", "--quiet"])
+    assert os.listdir() == ["small.toml"]
+
+
+def test_progress_without_a_terminal_is_plain_lines(folder, capsys, monkeypatch):
+    monkeypatch.setattr(cli.run, "SECONDS_BETWEEN_LINES", 0.0)
+    assert main(["run", "small.toml", "--ions", "600", "--threads", "1"]) == 0
+    line = r"300 of 600 ions \(50%\), [\d.,]+ ions/s, \d+ s left\n"
+    assert re.search(line, capsys.readouterr().err)
+    assert main(["run", "small.toml", "--ions", "600", "--threads", "1", "--quiet"]) == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_a_run_that_misses_the_detector_says_so(folder, capsys):
+    (folder / "small.toml").write_text(SMALL + "[detector]\nwidth = 40\n")
+    assert main(["run", "small.toml"]) == 0
+    note = (
+        r"note: (\d+) of 60 ions miss the detector, which is 40 mm wide at 100 mm: a larger width or a smaller distance"
+    )
+    assert int(re.search(note, capsys.readouterr().err)[1]) > 30
+
+
+@pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_ctrl_c_and_sigterm_keep_what_is_done(folder, sent, code):
+    terminal, end = os.openpty()
+    termios.tcsetwinsize(end, (24, 100))
+    (folder / "small.toml").write_text(SMALL.replace("6 a", "10 a"))
+    process = subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, "run", "small.toml", "--ions", "5000", "--threads", "1"],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": HERE},
+        stdout=subprocess.PIPE,
+        stderr=end,
+        text=True,
+    )
+    os.close(end)
+    seen = b""
+    try:
+        # the bar has started once it counts ions
+        while not re.search(rb"[1-9]\d*/5000", seen):
+            assert process.poll() is None
+            seen += os.read(terminal, 1000)
+        process.send_signal(sent)
+        deadline = time.monotonic() + 60
+        while process.poll() is None and time.monotonic() < deadline:
+            try:
+                seen += os.read(terminal, 1000)
+            except OSError:  # Linux says so that the other end is closed
+                break
+        out, _ = process.communicate(timeout=60)
+    finally:
+        process.kill()
+        os.close(terminal)
+    assert process.returncode == code
+    run = load(folder / "small.h5")
+    assert run.ended == "interrupted" and 0 < len(run) < 5000
+    said = f"interrupted; {len(run):,} of 5,000 ions are in 'small.h5'; the same command with --resume goes on"
+    assert said.encode() in seen
+    assert b"Traceback" not in seen and out.endswith("wrote small.h5\nwrote small.png\n")
+    assert sorted(os.listdir(folder)) == ["small.h5", "small.png", "small.toml"]
+
+
+# ---- map -------------------------------------------------------------------------------------------------------------
+
+
+def drawn_by(monkeypatch, *arguments):
+    """Maps and titles that a command draws."""
+    drawn = {}
+
+    def note(maps, titles, **options):
+        drawn.update(maps=maps, titles=titles)
+        return original(maps, titles, **options)
+
+    original = plot.detector_maps
+    monkeypatch.setattr(plot, "detector_maps", note)
+    assert main([str(argument) for argument in arguments]) == 0
+    monkeypatch.setattr(plot, "detector_maps", original)
+    return drawn["maps"], drawn["titles"]
+
+
+def test_map_of_a_run_shows_the_whole_detector(folder, made, monkeypatch, capsys):
+    maps, titles = drawn_by(monkeypatch, "map", made)
+    assert capsys.readouterr().out == "wrote small_map.png\n" and (folder / "small_map.png").exists()
+    assert titles == ["unperturbed", "roll-up, 0.155 ± 0.155 eV"]
+    run = load(made)
+    assert maps[0].ions == run.hits(Unperturbed()).counts[0]
+    for each in maps:
+        assert each.extent == (-150, 150, -150, 150) and each.mask.all()
+        assert each.values.shape == (32, 32) and each.smoothing == 300 / 32
+
+
+def test_map_of_a_run_under_any_perturbation(folder, made, monkeypatch):
+    wanted = ["--perturbation", "LateralVelocity:0.3", "--perturbation", "Combined:0.3,0.1,0.75"]
+    maps, titles = drawn_by(monkeypatch, "map", made, *wanted, "--bins", "16", "--smooth", "0", "-o", "a.pdf")
+    run = load(made)
+    same = [run.hits(LateralVelocity(0.3)).counts[0], run.hits(Combined(0.3, 1)).counts[0]]
+    assert maps[0].counts.sum() == same[0] and len(titles) == 2
+    assert maps[0].values.shape == (16, 16) and maps[0].smoothing == 0
+    assert drawn_by(monkeypatch, "map", made, "-o", "a.pdf")[1] != titles  # overwrites its own
+
+
+def test_a_run_is_drawn_with_the_maps_of_its_config(folder, monkeypatch):
+    panels = (
+        '[maps]\nbins = 24\nsmoothing = 20\n[[maps.panels]]\ntitle = "side"\nperturbation = "LateralVelocity:0.3"\n'
+    )
+    (folder / "small.toml").write_text(SMALL + panels)
+    ran = drawn_by(monkeypatch, "run", "small.toml", "--quiet")
+    again = drawn_by(monkeypatch, "map", "small.h5")
+    for maps, titles in (ran, again):
+        assert titles == ["side"] and maps[0].values.shape == (24, 24) and maps[0].smoothing == 20
+    assert (folder / "small.png").read_bytes() == (folder / "small_map.png").read_bytes()
+    (maps, _) = drawn_by(monkeypatch, "map", "small.h5", "--bins", "30")
+    assert maps[0].values.shape == (30, 30) and maps[0].smoothing == 10
+
+
+def test_map_of_measured_ions_keeps_to_their_comb(measured, monkeypatch):
+    (only,), titles = drawn_by(monkeypatch, "map", measured)
+    assert titles == ["ions.epos"] and only.quantum == pytest.approx((0.5, 0.5))
+    # 4,000 ions: 64 bins over 81 teeth, so a tooth each
+    assert only.bin_size == pytest.approx((0.5, 0.5)) and only.smoothing == pytest.approx(0.5)
+
+
+def test_what_was_written_is_told_as_json_or_not_at_all(folder, capsys):
+    assert main(["run", "small.toml", "--json", "--map", "small.svg"]) == 0
+    out, err = capsys.readouterr()
+    told = json.loads(out)
+    run = load("small.h5")
+    assert out.count("\n") == 1 and err == ""
+    assert (told["wrote"], told["picture"], told["ions"], told["ended"]) == ("small.h5", "small.svg", 60, "as planned")
+    assert [told[key] for key in ("hit", "missed", "never_left")] == list(run.hits(Unperturbed()).counts.values())
+    assert main(["map", "small.h5", "--json", "--perturbation", "RollUp:0.2", "--bins", "16"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    on_it = int(np.count_nonzero(run.hits(RollUp(0.2)).detected))
+    assert told["wrote"] == "small_map.png" and Path(told["wrote"]).exists()
+    (only,) = told["maps"]
+    assert (only["title"], only["ions"], only["bins"]) == ("roll-up, 0.2 eV", on_it, [16, 16])
+    assert main(["map", "small.h5", "--quiet"]) == 0
+    assert capsys.readouterr() == ("", "")
+    assert "not allowed with argument" in failed(capsys, "map", "small.h5", "--quiet", "--json")
+
+
+def test_map_errors(measured, made, capsys):
+    write("ions.pos", Hits(positions=np.zeros((3, 3)), mass_to_charge=np.ones(3)))
+    assert (
+        "'ions.pos' has no detector coordinates x and y, which a map needs, only mass_to_charge, positions"
+        in failed(capsys, "map", "ions.pos")
+    )
+    assert "--perturbation needs a run (.h5), 'ions.epos' holds measured ions" in failed(
+        capsys, "map", "ions.epos", "--perturbation", "Unperturbed"
+    )
+    assert "did you mean 'RollUp'" in failed(capsys, "map", made, "--perturbation", "Rollup:0.1")
+    assert "RollUp needs energy, got no parameters; an example is RollUp:0.155,0.155" in failed(
+        capsys, "map", made, "--perturbation", "RollUp"
+    )
+    assert "argument --bins: must be a whole number from 1 to 16384, got '0'" in failed(
+        capsys, "map", made, "--bins", "0"
+    )
+    assert "argument --smooth: must be a number [mm] of at least 0, got 'nan'" in failed(
+        capsys, "map", made, "--smooth", "nan"
+    )
+    assert "exists and was not made by apt-evap" not in failed(capsys, "map", "none.epos")
+    Path("ions_map.png").write_bytes(b"a photograph")
+    assert "'ions_map.png' exists and was not made by apt-evap" in failed(capsys, "map", "ions.epos")
+    assert main(["map", "ions.epos", "--force"]) == 0
+
+
+# ---- info ------------------------------------------------------------------------------------------------------------
+
+
+def test_info_of_a_run(made, capsys):
+    assert main(["info", str(made), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    run = load(made)
+    counts = run.hits(Unperturbed()).counts
+    assert told["kind"] == "simulated run" and told["version"] == __version__ and told["ended"] == "as planned"
+    assert told["ions"] == told["species"]["Ni"] == 60 and told["seed"] == 1 and told["voltage"] == 1000
+    assert [told["outcomes"][key] for key in ("hit", "missed", "never_left")] == list(counts.values())
+    assert told["tip"]["axis"] == [1, 1, 1] and told["tip"]["material"]["name"] == "Ni"
+    assert told["responses"]["marked"] == run.marked.sum() and told["perturbations_flown"] == []
+    low, high = told["field_before_leaving"]
+    # six digits are kept
+    assert low == pytest.approx(run.fields.min(), rel=1e-5) and high == pytest.approx(run.fields.max(), rel=1e-5)
+    assert main(["info", str(made)]) == 0
+    text = capsys.readouterr().out
+    assert re.search(r"^ions +60$", text, re.M) and re.search(r"^  apex radius \[nm\] +2\.112$", text, re.M)
+    assert re.search(r"^field before leaving \[V/nm\] +[\d.]+ to [\d.]+ at 1000 V \(only its ratio", text, re.M)
+
+
+def test_info_of_measured_ions(measured, capsys):
+    assert main(["info", "ions.epos", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["ions"] == told["detected"] == 4000
+    assert told["columns"]["x"] == [-20, 20] and told["columns"]["voltage"] == [3000, 5000]
+    assert told["detector_extent"] == [40, 40] and told["detector_quantum"] == [0.5, 0.5]
+    assert told["multi_hit_share"] == 0.1 and told["largest_multi_hit"] == 2
+    assert main(["info", "ions.epos"]) == 0
+    text = capsys.readouterr().out
+    assert re.search(r"^  voltage \[V\] +3000 to 5000$", text, re.M)
+    assert re.search(r"^detector extent \[mm\] +40 x 40$", text, re.M)
+    assert re.search(r"^absent or zero throughout +time_of_flight   pulse_voltage   positions$", text, re.M)
+
+
+def test_info_of_what_cannot_be_read(measured, made, capsys):
+    measured.write_bytes(measured.read_bytes()[:-10])
+    assert "ions.epos' ends in the middle of an ion: 3999 whole ions" in (text := failed(capsys, "info", measured))
+    assert "--partial reads the whole ones" in text
+    assert main(["info", "ions.epos", "--partial", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["ions"] == 3999
+    Path("cut.h5").write_bytes(made.read_bytes()[:5000])
+    assert "cannot read 'cut.h5' as a run" in failed(capsys, "info", "cut.h5")
+    Path("empty.epos").write_bytes(b"")
+    assert "'empty.epos' is empty" in failed(capsys, "info", "empty.epos")
+    assert "cannot read 'none.h5'" in failed(capsys, "info", "none.h5")
+    assert "small.toml' is not known from its suffix '.toml'" in failed(capsys, "info", "small.toml")
+
+
+def test_warnings_of_readers_are_one_line(measured, capsys):
+    content = bytearray(measured.read_bytes())
+    content[43] = 0  # the ions of the first pulse
+    measured.write_bytes(content)
+    assert main(["info", "ions.epos", "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert "multi_hit_share" not in json.loads(out)
+    assert re.fullmatch(r"apt-evap: warning: 'ions.epos' does not tell which ions share a pulse[^\n]+\n", err)
+
+
+# ---- maps in .npz files ----------------------------------------------------------------------------------------------
+
+
+def test_map_and_info_of_a_map(folder, monkeypatch, capsys):
+    edges = np.linspace(-20, 20, 41)
+    values = np.random.default_rng(1).poisson(5.0, (40, 40))
+    np.savez("counts.npz", counts=values, x_edges_mm=edges, y_edges_mm=edges)
+    np.savez("density.npz", d=values / 5, x=edges / 10, y=edges / 10)
+    (only,), titles = drawn_by(monkeypatch, "map", "counts.npz")
+    assert titles == ["counts.npz"] and only.smoothing == 1.0 and only.ions == values.sum()
+    named = ["density.npz", "--arrays", "d,x,y", "--unit", "cm"]
+    ((only,), _) = drawn_by(monkeypatch, "map", *named)
+    assert np.array_equal(only.values, values / 5) and only.smoothing == 0
+    capsys.readouterr()
+    assert main(["info", *named, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["kind"] == "detector map of densities" and told["ions"] is None and told["bins"] == [40, 40]
+    assert told["x"] == [-20, 20] and told["values"] == [values.min() / 5, values.max() / 5]
+    assert main(["info", "counts.npz"]) == 0
+    assert re.search(r"^bin size \[mm\] +1 x 1$", capsys.readouterr().out, re.M)
+    assert "--bins is for ions, 'counts.npz' is a map: its bins are 40 x 40" in failed(
+        capsys, "map", "counts.npz", "--bins", "20"
+    )
+    assert "--mass is for ions, got 'counts.npz'" in failed(capsys, "info", "counts.npz", "--mass", "1,2")
+    assert "'counts.npz' holds a map" in failed(capsys, "map", "counts.npz", "--perturbation", "Unperturbed")
+
+
+# ---- a selection of ions ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def mixed(folder):
+    """1,000 ions of 28 and 58 Da in turn, the voltage rising with their number."""
+    random = np.random.default_rng(2)
+    n = np.arange(1000)
+    x, y = random.uniform(-20, 20, (2, 1000))
+    write("mixed.epos", Hits(x=x, y=y, voltage=3000.0 + n, mass_to_charge=np.where(n % 2, 58.0, 28.0), pulse_id=n))
+    (folder / "mixed.rrng").write_text("[Ranges]\nRange1=27.5 28.5 Si:1\nRange2=57.5 58.5 Ni:1\n")
+    return x.astype(np.float32), y.astype(np.float32)
+
+
+def test_ions_are_selected(mixed, monkeypatch, capsys):
+    x, y = mixed
+
+    def ions(*options):
+        capsys.readouterr()
+        assert main(["info", "mixed.epos", "--json", *options]) == 0
+        told = json.loads(capsys.readouterr().out)
+        assert told.get("selected_of") == 1000
+        return told["ions"]
+
+    assert ions("--mass", "27,29") == ions("--mass", ",28.5") == 500
+    assert ions("--voltage", "3100,3200") == ions("--ions", "900,") == 100
+    assert ions("--circle", "10") == np.count_nonzero(np.hypot(x, y) <= 10)
+    assert ions("--circle", "10,5,-5") == np.count_nonzero(np.hypot(x - 5, y + 5) <= 10)
+    assert ions("--ranges", "mixed.rrng", "--species", "Si,Ni") == 1000
+    both = ["--ranges", "mixed.rrng", "--species", "Si", "--ions", "0,100", "--voltage", "3050,"]
+    assert ions(*both) == 25  # the ions of the file are counted, not those of the species
+    (only,), titles = drawn_by(monkeypatch, "map", "mixed.epos", *both)
+    assert only.ions <= 25 and titles == ["mixed.epos, 25 of 1,000 ions"]
+
+
+def test_ions_of_a_run_are_selected(folder, made, monkeypatch, capsys):
+    run = load(made)
+    maps, _ = drawn_by(monkeypatch, "map", made, "--ions", "20,", "--perturbation", "Unperturbed")
+    assert maps[0].ions == run.hits(Unperturbed())[20:].counts[0]
+    capsys.readouterr()
+    assert main(["info", str(made), "--ions", "20,", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["kind"], told["ions"]) == ("simulation, Unperturbed()", 40)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--mass", "29,27"], "argument --mass: must be two numbers in order, such as 27,29.5, got '29,27'"),
+        (["--circle", "1,2"], "argument --circle: must be a radius, or R,X,Y, such as 15,0,-2 [mm], got '1,2'"),
+        (["--species", "Si"], "--ranges and --species go together"),
+        (["--ranges", "mixed.rrng", "--species", "Sn"], "--species: mixed.rrng have no species 'Sn'"),
+        (["--mass", "1,2"], "no ion is selected of the 1,000 of 'mixed.epos'"),
+    ],
+)
+def test_selections_that_are_refused(mixed, capsys, options, sentence):
+    assert sentence in failed(capsys, "info", "mixed.epos", *options)
+
+
+def test_a_selection_by_a_missing_column_is_refused(folder, capsys):
+    write("ions.pos", Hits(positions=np.zeros((3, 3)), mass_to_charge=np.ones(3)))
+    assert "--voltage: ions.pos has no column 'voltage', only mass_to_charge, positions" in failed(
+        capsys, "info", "ions.pos", "--voltage", "1,2"
+    )
+
+
+# ---- the program -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ([], "the following arguments are required: COMMAND (see apt-evap --help)"),
+        (["fly"], "invalid choice: 'fly'"),
+        (["mpa"], "invalid choice: 'mpa' (did you mean 'map'?)"),
+        (["run"], "the following arguments are required: CONFIG.toml (see apt-evap run --help)"),
+        (["run", "small.toml", "--ions", "0"], "argument --ions: must be a whole number of at least 1, got '0'"),
+        (["run", "small.toml", "--threads", "x"], "argument --threads: must be a whole number of at least 1, got 'x'"),
+        (["run", "small.toml", "--colour"], "unrecognized arguments: --colour (see apt-evap run --help)"),
+        (["info", "a.epos", "--byte-order", "up"], "argument --byte-order: invalid choice: 'up'"),
+    ],
+)
+def test_wrong_arguments_are_one_sentence(folder, capsys, arguments, sentence):
+    assert sentence in failed(capsys, *arguments)
+
+
+def test_version_and_help(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"apt-evap {__version__}\n"
+    for command in ([], ["run"], ["map"], ["info"]):
+        assert main([*command, "--help"]) == 0
+        helped = capsys.readouterr().out
+        assert re.search(r"^ *(example: )?apt-evap (run|map|info) \S+\.\w+", helped, re.M)
+        assert max(map(len, helped.splitlines())) <= 120
+    assert main(["--help"]) == 0
+    helped = capsys.readouterr().out
+    for line in EXIT_CODES.splitlines():
+        assert line in helped
+
+
+def test_a_reader_of_the_output_may_leave(made):
+    read, write_end = os.pipe()
+    os.close(read)
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, "info", str(made)],
+        cwd=made.parent,
+        stdout=write_end,
+        stderr=subprocess.PIPE,
+        env=os.environ | {"PYTHONPATH": HERE},
+    )
+    os.close(write_end)
+    assert done.returncode == 1 and done.stderr == b""

@@ -1,0 +1,340 @@
+import copy
+import math
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from apt_evap._common.files import FileError
+from apt_evap.config.map_panels import read_maps
+from apt_evap.config.perturbation_text import read_perturbation, title_of
+from apt_evap.config.simulation_file import read_config
+from apt_evap.detection.detector import Detector
+from apt_evap.emission import perturbations
+from apt_evap.emission.energies import Fixed, Thermal, TruncatedNormal
+from apt_evap.emission.perturbations import Combined, LateralVelocity, RollUp, Unperturbed
+from apt_evap.evaporation.settings import ChargeSettings
+from apt_evap.flight.crew import FlightSettings
+from apt_evap.simulation.simulation import Simulation
+from apt_evap.specimen.materials import material
+from apt_evap.specimen.tip import Tip
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "ni111.toml"
+MINIMAL = {"tip": {"material": "Ni", "apex_radius": "6 a"}, "simulation": {"ions": 60}}
+EVERY_KEY = {
+    "output": "run.h5",
+    "tip": {
+        "material": {"name": "Ni", "evaporation_field": 36.0},
+        "apex_radius": "6 a",
+        "axis": [0, 1, 2],
+        "shank_angle": 2,
+        "shank_length": 2.5,
+        "base": "flat",
+        "rotation": 10,
+        "origin": ["0.25 a", 0.0, 0.1],
+        "offset_seed": 4,
+        "depth": "1.7 nm",
+        "solutes": {"Cu": 0.25},
+        "seed": 3,
+    },
+    "simulation": {"ions": 60, "voltage": 800, "seed": 7, "responses": False},
+    "detector": {"distance": 90, "width": 80.0},
+    "charges": {
+        "opening_angle": 0.5,
+        "patch_radius": 6.0,
+        "update_radius": 10.0,
+        "sweep_interval": 50,
+        "tolerance": 1e-3,
+        "start_tolerance": 1e-6,
+    },
+    "flights": {"opening_angle": 0.4, "tolerance": 1e-2, "reach": 5000.0, "most_steps": 400},
+    "responses": {"energy_limit": 1.0, "bound": 0.1},
+    "maps": {
+        "bins": 40,
+        "smoothing": 2,
+        "panels": [
+            {"title": "none", "perturbation": "Unperturbed"},
+            {"perturbation": {"name": "RollUp", "energy": {"name": "Fixed", "energy": 0.2}}},
+        ],
+    },
+}
+
+
+def toml(value):
+    """Value as TOML writes it in one line."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f'"{key}" = {toml(item)}' for key, item in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(toml(item) for item in value) + "]"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"' if isinstance(value, str) else repr(value)
+
+
+def written(folder, document):
+    path = folder / "sim.toml"
+    path.write_text("".join(f'"{key}" = {toml(value)}\n' for key, value in document.items()), encoding="utf-8")
+    return path
+
+
+def message(folder, document, build=False):
+    with pytest.raises(FileError) as caught:
+        config = read_config(written(folder, document))
+        if build:
+            config.simulation(n_threads=1)
+    text = str(caught.value)
+    assert "sim.toml" in text and "\n" not in text
+    return text
+
+
+def changed(table, key, value):
+    document = copy.deepcopy(EVERY_KEY)
+    document[table][key] = value
+    return document
+
+
+def test_the_example_is_the_simulation_of_the_readme():
+    config = read_config(EXAMPLE)
+    nickel = material("Ni")
+    assert config.tip["material"] == nickel and config.tip["axis"] == [1, 1, 1] and config.tip["shank_angle"] == 1.5
+    assert config.tip["apex_radius"] == config.tip["shank_length"] == 20 * nickel.a
+    assert (config.n_ions, config.voltage, config.seed, config.output) == (15_000, 1000.0, 1, "ni111.h5")
+    assert config.detector == Detector(100.0, 300.0) and config.responses and config.emissions == ()
+    drawn = [panel.perturbation for panel in config.maps.panels]
+    assert drawn == [Unperturbed(), RollUp(TruncatedNormal(0.155, 0.155))]
+
+
+def test_a_file_builds_the_same_simulation_as_python(tmp_path):
+    config = read_config(written(tmp_path, EVERY_KEY))
+    a = material("Ni").a
+    tip = Tip(
+        material("Ni", evaporation_field=36.0),
+        6 * a,
+        axis=(0, 1, 2),
+        shank_angle=2,
+        shank_length=2.5,
+        base="flat",
+        rotation=10,
+        origin=(0.25 * a, 0.0, 0.1),
+        offset_seed=4,
+        depth=1.7,
+        solutes={"Cu": 0.25},
+        seed=3,
+    )
+    same = Simulation(
+        tip,
+        voltage=800,
+        seed=7,
+        detector=Detector(90, 80),
+        charge_settings=ChargeSettings(0.5, 6.0, 10.0, 50, 1e-3, 1e-6),
+        flight_settings=FlightSettings(0.4, 1e-2, 5000.0, 400),
+        response_settings=config.response_settings,
+        n_threads=1,
+    )
+    simulation = config.simulation(n_threads=1)
+    assert simulation.settings == same.settings
+    assert (simulation.tip.positions == tip.positions).all() and (simulation.tip.species == tip.species).all()
+    assert (config.response_settings.energy_limit, config.response_settings.bound) == (1.0, 0.1)
+    # without responses the maps are of perturbations flown in the run
+    assert config.emissions == (Unperturbed(), RollUp(Fixed(0.2)))
+    assert [panel.title for panel in config.maps.panels] == ["none", "roll-up, 0.2 eV"]
+    assert config.simulation(seed=9, n_threads=1).seed == 9
+
+
+def test_what_is_not_given_is_as_in_python(tmp_path):
+    config = read_config(written(tmp_path, MINIMAL))
+    tip = Tip("Ni", 6 * material("Ni").a)
+    assert config.simulation(n_threads=1).settings == Simulation(tip, n_threads=1).settings
+    assert config.maps == read_maps({}) and config.output is None
+
+
+@pytest.mark.parametrize(("text", "length"), [("20 a", 20 * 0.352), ("1.5e1a", 15 * 0.352), (" 7 nm ", 7.0), (7, 7.0)])
+def test_lengths_are_in_lattice_constants_or_nm(tmp_path, text, length):
+    config = read_config(written(tmp_path, MINIMAL | {"tip": {"material": "Ni", "apex_radius": text}}))
+    # one rounding of the product
+    assert math.isclose(config.tip["apex_radius"], length, rel_tol=1e-15)
+
+
+def test_an_axis_of_any_numbers(tmp_path):
+    axis = [0.3015441344842630, 0.5403229287126988, 0.7855713001793464]
+    table = {"material": "Ni", "apex_radius": "6 a", "axis": axis, "rotation": 157.2870473268672}
+    tip = read_config(written(tmp_path, MINIMAL | {"tip": table})).simulation(n_threads=1).tip
+    assert tip.settings["axis"] == axis
+    np.testing.assert_array_equal(
+        tip.positions, Tip("Ni", 6 * material("Ni").a, axis, rotation=157.2870473268672).positions
+    )
+
+
+def test_a_material_of_ones_own(tmp_path):
+    own = {"name": "X", "structure": "bcc", "a": 0.3, "evaporation_field": 20, "charge_state": 2, "mass": 50}
+    tip = read_config(written(tmp_path, MINIMAL | {"tip": {"material": own, "apex_radius": "6 a"}})).tip
+    assert tip["material"].structure == "bcc" and tip["apex_radius"] == 6 * 0.3
+    del own["mass"]
+    assert "[tip]: mass is missing" in message(tmp_path, MINIMAL | {"tip": {"material": own, "apex_radius": 3}})
+
+
+@pytest.mark.parametrize(
+    ("table", "wrong", "meant"),
+    [
+        ("tip", "apex_radis", "apex_radius"),
+        ("simulation", "ion", "ions"),
+        ("detector", "widht", "width"),
+        ("charges", "patch", "patch_radius"),
+        ("flights", "tolerence", "tolerance"),
+        ("responses", "energy", "energy_limit"),
+        ("maps", "panel", "panels"),
+    ],
+)
+def test_an_unknown_key_is_named_with_the_nearest_known_one(tmp_path, table, wrong, meant):
+    text = message(tmp_path, changed(table, wrong, 1))
+    assert f"[{table}]: no key is named '{wrong}' (did you mean '{meant}'?)" in text
+
+
+def test_an_unknown_table_and_a_missing_one(tmp_path):
+    assert "no key is named 'detectors' (did you mean 'detector'?)" in message(tmp_path, EVERY_KEY | {"detectors": {}})
+    assert "simulation is missing" in message(tmp_path, {"tip": MINIMAL["tip"]})
+    assert "[tip]: apex_radius is missing" in message(tmp_path, MINIMAL | {"tip": {"material": "Ni"}})
+    assert "[simulation]: ions is missing" in message(tmp_path, MINIMAL | {"simulation": {}})
+    assert "[detector] must be a table, got 3" in message(tmp_path, EVERY_KEY | {"detector": 3})
+    assert "output must be a file name" in message(tmp_path, EVERY_KEY | {"output": 3})
+
+
+@pytest.mark.parametrize(
+    ("table", "key", "value", "expected"),
+    [
+        ("tip", "material", "Nickel", "no material is named 'Nickel'"),
+        ("tip", "material", 28, "material must be a name"),
+        ("tip", "material", {"name": "Ni", "field": 1.0}, "no key is named 'field'"),
+        (
+            "tip",
+            "apex_radius",
+            "20 b",
+            "apex_radius must be a number [nm] or text such as '20 a' or '7 nm', got '20 b'",
+        ),
+        ("tip", "apex_radius", "x a", "got 'x a'"),
+        ("tip", "apex_radius", "1 a", "apex_radius must be a finite number [nm] at least 0.7"),
+        ("tip", "apex_radius", "nan a", "apex_radius must be a finite number"),
+        ("tip", "apex_radius", -3, "got -3"),
+        ("tip", "depth", True, "depth must be a finite number [nm], got True"),
+        ("tip", "axis", [0, 0, 0], "axis"),
+        ("tip", "axis", "111", "axis"),
+        ("tip", "base", "round", "base must be one of rounded, flat, got 'round' (did you mean 'rounded'?)"),
+        ("tip", "shank_angle", 60, "shank_angle must be a finite number [degrees] at least 0 and below 45, got 60"),
+        ("tip", "solutes", 0.1, "solutes must be a table, got 0.1"),
+        ("tip", "solutes", {"Cu": "half"}, "fraction of Cu"),
+        ("simulation", "ions", 0, "ions must be a whole number of at least 1, got 0"),
+        ("simulation", "ions", 1.5, "got 1.5"),
+        ("simulation", "voltage", "1 kV", "voltage must be a finite number [V] above 0 and at most 1e+06, got '1 kV'"),
+        ("simulation", "seed", -1, "seed must be a whole number of at least 0, got -1"),
+        ("simulation", "responses", "yes", "responses must be true or false, got 'yes'"),
+        ("detector", "width", 0, "width must be a finite number [mm] above 0 and at most 1e+06, got 0"),
+        (
+            "charges",
+            "opening_angle",
+            3,
+            "opening_angle must be a finite number [rad] at least 0 and at most 1.5, got 3",
+        ),
+        ("flights", "most_steps", 0.5, "most_steps must be a whole number"),
+        ("responses", "bound", 0, "bound must be a finite number [mm] above 0, got 0"),
+        ("maps", "bins", 0, "bins must be a whole number of at least 1 and at most 16,384, got 0"),
+        ("maps", "bins", 10**9, "bins must be a whole number of at least 1 and at most 16,384, got 1000000000"),
+        ("maps", "smoothing", -1, "smoothing must be a finite number [mm] at least 0, got -1"),
+        ("maps", "panels", [], "panels must be a list of tables such as [[maps.panels]], got []"),
+        ("maps", "panels", [{"title": "x"}], "panel 1: perturbation is missing"),
+        ("maps", "panels", [{"perturbation": "Rollup"}], "panel 1: perturbation 'Rollup': no perturbation"),
+        ("maps", "panels", [{"perturbation": "Unperturbed", "title": 1}], "panel 1: title must be text, got 1"),
+        ("maps", "panels", [{"perturbation": {"energy": 1}}], "must have a name"),
+        ("maps", "panels", [{"perturbation": {"name": "Fixed", "energy": 1}}], "such as Unperturbed or RollUp"),
+    ],
+)
+def test_a_wrong_value_is_named_with_what_was_expected(tmp_path, table, key, value, expected):
+    text = message(tmp_path, changed(table, key, value), build=True)
+    assert f"[{table}]: " in text and expected in text
+
+
+PLACES = [(table, key) for table, keys in EVERY_KEY.items() if isinstance(keys, dict) for key in keys]
+JUNK = st.recursive(
+    st.booleans() | st.integers(-3, 3) | st.floats(-2, 2) | st.sampled_from(["", "x", "1 a", "inf a"]),
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(["name", "a", "Cu"]), inner, max_size=2)
+    ),
+    max_leaves=4,
+)
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.sampled_from(PLACES), JUNK)
+def test_no_value_gives_anything_but_a_config_or_one_sentence(tmp_path, place, value):
+    document = changed(*place, value)
+    try:
+        config = read_config(written(tmp_path, document))
+        Tip(**config.tip)
+    except FileError as error:
+        assert f"[{place[0]}]: " in str(error)
+    except ValueError:
+        with pytest.raises(FileError, match=r"sim\.toml', \[tip\]: "):
+            config.simulation(n_threads=1)
+
+
+@pytest.mark.parametrize("content", [b"ions = = 3", b"\x89HDF\r\n\x1a\n\xff\x00", b"[tip]\n[tip]\n"])
+def test_what_is_not_toml_is_called_so(tmp_path, content):
+    path = tmp_path / "a.toml"
+    path.write_bytes(content)
+    with pytest.raises(FileError, match=r"a\.toml' is not a TOML file: "):
+        read_config(path)
+
+
+def test_a_missing_file(tmp_path):
+    with pytest.raises(FileError, match=r"cannot read .*none\.toml': No such file"):
+        read_config(tmp_path / "none.toml")
+
+
+PERTURBATIONS = {
+    "Unperturbed": Unperturbed(),
+    "RollUp:0.2": RollUp(0.2),
+    "LateralVelocity:0.3,0.1": LateralVelocity(TruncatedNormal(0.3, 0.1)),
+    "Combined:0.2,0.75": Combined(0.2, 0.75),
+    "Combined:0.3,0.1,0.75": Combined(TruncatedNormal(0.3, 0.1), 0.75),
+    '{name = "RollUp", energy = {name = "Thermal", temperature = 50}}': RollUp(Thermal(50)),
+}
+
+
+@pytest.mark.parametrize("text", PERTURBATIONS)
+def test_a_perturbation_is_text_or_a_table(text):
+    assert read_perturbation(text) == PERTURBATIONS[text]
+    assert read_perturbation(perturbations.to_dict(PERTURBATIONS[text])) == PERTURBATIONS[text]
+
+
+@pytest.mark.parametrize(
+    "text", ["", "RollUp", "RollUp:", "RollUp:a", "RollUp:1,2,3", "RollUp:-1", "Combined:0.3", "{"]
+)
+def test_a_perturbation_that_is_none_is_named(text):
+    with pytest.raises(ValueError, match=r"^perturbation "):
+        read_perturbation(text)
+
+
+def test_titles_tell_perturbations_apart():
+    titles = {title_of(each) for each in PERTURBATIONS.values()}
+    assert len(titles) == len(PERTURBATIONS) and "roll-up, 50 K" in titles
+
+
+def test_maps_round_trip():
+    maps = read_maps({"bins": 64, "panels": [{"perturbation": text} for text in PERTURBATIONS]})
+    assert read_maps(maps.to_dict()) == maps
+
+
+def test_the_tables_commented_out_in_the_example_are_the_defaults(tmp_path):
+    lines = EXAMPLE.read_text().splitlines()
+    begin = lines.index("# [charges]              # how finely the charges are solved")
+    end = next(number for number, line in enumerate(lines) if line.startswith("[maps]"))
+    shown = [line.removeprefix("#").strip() for line in lines[begin:end]]
+    (tmp_path / "all.toml").write_text("\n".join([*lines[:begin], *shown, *lines[end:]]))
+    shown, usual = read_config(tmp_path / "all.toml"), read_config(EXAMPLE)
+    for name in ("charge_settings", "flight_settings", "response_settings"):
+        assert getattr(shown, name) == getattr(usual, name)
+    for kind in (ChargeSettings, FlightSettings):
+        for item in fields(kind):
+            assert f"# {item.name} = " in "\n".join(lines[begin:end])

@@ -1,0 +1,436 @@
+"""Searches for emission energies: what is compared is what `ssim` compares, and hidden energies are found again."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from scipy.stats import truncnorm
+
+import apt_evap as ae
+from apt_evap.emission.perturbations import Combined
+from apt_evap.energy_fit.grid import EnergyGrid, maxima, spline_maxima
+from apt_evap.energy_fit.resampling import NOISE, Comparison, Sampler
+from apt_evap.energy_fit.search import EnergySearch
+
+EDGES = np.linspace(-60, 60, 49)
+ROLLUP = ae.RollUp(ae.TruncatedNormal(0.155, 0.155))
+LATERAL = ae.LateralVelocity(ae.TruncatedNormal(0.3, 0.316 * 0.3))
+
+
+@pytest.fixture(scope="module")
+def run(tip20):
+    """15,000 ions of Ni[111], R = 20 a, with responses."""
+    return ae.Simulation(tip20, voltage=1000.0, seed=1).run(15_000, progress=False)
+
+
+@pytest.fixture(scope="module")
+def other(nickel):
+    """Of a tip with another origin of the lattice, and with other random numbers: no ion is one of `run`."""
+    tip = ae.Tip(nickel, apex_radius=20 * nickel.a, axis=(1, 1, 1), shank_length=20 * nickel.a, offset_seed=5)
+    return ae.Simulation(tip, voltage=1000.0, seed=2).run(15_000, progress=False)
+
+
+HERE = ae.Registration(0.0, 1.0, (0.0, 0.0))
+
+
+def seen(run, perturbation):
+    """Map of the middle of the detector."""
+    counts = np.zeros((48, 48), int)
+    frame = ae.DetectorMap.from_array(counts + 1, EDGES, EDGES, is_counts=True)
+    return ae.DetectorMap.from_hits(run.hits(perturbation), like=frame)
+
+
+# ---- the grid ------------------------------------------------------------------------------------------------------
+
+
+def test_the_grid_of_the_paper():
+    grid = EnergyGrid("combined")
+    assert grid.shape == (5, 6, 6) and len(grid.cells) == 180
+    assert EnergyGrid("roll-up").shape == EnergyGrid("lateral").shape == (1, 6, 6)
+    # evenly spaced means, relative standard deviations of two per decade as the paper rounds them
+    assert np.allclose(np.diff(grid.means), 0.0725) and np.allclose(np.diff(np.log10(grid.rsds)), 0.5, atol=2e-3)
+    assert grid.perturbation(*grid.values_at((3, 3, 4))) == Combined(ae.TruncatedNormal(0.3, 0.316 * 0.3), 0.75)
+    assert EnergyGrid("roll-up").perturbation(*EnergyGrid("roll-up").values_at((0, 4, 2))) == ROLLUP
+    assert EnergyGrid("lateral").perturbation(*EnergyGrid("lateral").values_at((0, 3, 4))) == LATERAL
+
+
+def test_places_between_points():
+    grid = EnergyGrid("combined")
+    fraction, rsd, mean = grid.values_at((0.5, 4.5, 1.5))
+    assert fraction == 0.125
+    assert rsd == pytest.approx(np.sqrt(3.16), rel=1e-14)
+    assert mean == pytest.approx((0.0825 + 0.155) / 2, rel=1e-14)
+
+
+def test_share_above_an_energy():
+    grid = EnergyGrid("lateral")
+    share = grid.share_above(1.5)
+    for cell in ((0, 5, 5), (0, 4, 3), (0, 0, 0)):
+        _, rsd, mean = grid.values_at(cell)
+        assert share[cell] == pytest.approx(truncnorm.sf(1.5, -1 / rsd, np.inf, mean, rsd * mean), rel=1e-9)
+    assert 0.1 < share[0, 5, 5] < 0.3
+
+
+@pytest.mark.parametrize("free", [(1, 5, 5), (5, 5, 5), (1, 1, 5)])
+def test_maxima_between_points(free):
+    """Of functions with a maximum anywhere in the box, as wide as those of similarities."""
+    places = [np.arange(-1, 1.5, 0.5) + 3 if number == 5 else np.array([2.0]) for number in free]
+    peaks = np.random.default_rng(1).uniform(2.1, 3.9, (30, 3))
+    peaks[:, [number == 1 for number in free]] = 2.0
+    z, y, x = np.meshgrid(*places, indexing="ij")
+    values = np.array([np.exp(-((x - c) ** 2 + (y - b) ** 2 + (z - a) ** 2) / 4) for a, b, c in peaks])
+    found = spline_maxima(places, values)
+    # a 20th of a step from point to point, so half of that; as much again for what a cubic misses
+    assert np.abs(found - peaks).max() < 0.05
+    assert (
+        np.abs(np.array(places, dtype=object)[2][maxima(values)[:, 2]] - peaks[:, 2]).max() > 0.2
+    )  # the points do not
+
+
+def test_the_box_around_a_point_stays_on_the_grid():
+    grid = EnergyGrid("roll-up")
+    fraction, rsd, mean = grid.around((0, 5, 0))
+    assert fraction.tolist() == [0.0]
+    assert rsd.tolist() == [3.0, 3.5, 4.0, 4.5, 5.0]
+    assert mean.tolist() == [0.0, 0.5, 1.0, 1.5, 2.0]
+
+
+@pytest.mark.parametrize(
+    "wrong, words",
+    [
+        (
+            {"mechanism": "rollup"},
+            "mechanism must be one of roll-up, lateral, combined, got 'rollup'",
+        ),
+        ({"means": (0.1, 0.1)}, "means must be increasing numbers above 0"),
+        ({"means": (0.0, 0.1)}, "means must be increasing numbers above 0"),
+        ({"rsds": ()}, "rsds must be increasing numbers above 0"),
+        ({"rollup_fractions": (0.5,)}, "rollup_fractions are for the mechanism 'combined'"),
+        ({"mechanism": "combined", "rollup_fractions": (0.5, 1.5)}, "rollup_fractions must be .* from 0 to 1"),
+    ],
+)
+def test_grids_that_are_none(wrong, words):
+    with pytest.raises(ValueError, match=words):
+        EnergyGrid(**{"mechanism": "roll-up"} | wrong)
+
+
+# ---- many maps at a time -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("smoothing, flattening", [(0.0, 0.0), (2.5, 0.0), (0.0, 15.0), (3.0, 20.0)])
+def test_what_is_compared_is_what_ssim_compares(run, other, smoothing, flattening):
+    x, y = np.meshgrid(EDGES[1:], EDGES[1:])
+    measured = replace(seen(other, ROLLUP), mask=(x**2 + y**2 < 50**2) & (x < 30))
+    comparison = Comparison(measured, smoothing, flattening, 2.0, 0, 0)
+    sampler = Sampler(run, HERE, measured, comparison.box, 0, 0)
+    simulated = replace(seen(run, LATERAL), mask=measured.mask)
+    maps, noise = sampler.maps(LATERAL, 1)
+    assert noise is None
+    assert np.array_equal(maps[0], simulated.counts[comparison.box])
+    flat = [each.flattened(flattening) for each in (measured, simulated)]
+    # the same sums in another order
+    assert comparison.similarities(maps, plain=True)[0] == pytest.approx(
+        float(ae.ssim(*flat, smoothing=smoothing)), abs=1e-12
+    )
+
+
+def test_flattening_takes_gradients_away():
+    x, y = np.meshgrid(EDGES[1:], EDGES[1:])
+    pattern = 1 + 0.4 * np.cos(x / 3) * np.cos(y / 3)
+    a = ae.DetectorMap.from_array(pattern, EDGES, EDGES)
+    b = ae.DetectorMap.from_array(pattern * (1 + 0.5 * x / 60), EDGES, EDGES)
+    assert float(ae.ssim(a, b)) < 0.97
+    # what is left is what the Gaussian cannot follow at the rim
+    assert float(ae.ssim(a.flattened(12.0), b.flattened(12.0))) > 0.995
+    assert a.flattened(0) is a
+
+
+def test_errors_of_measured_maps_are_those_of_new_measurements(run, other):
+    """The error told from one measured map, against the scatter of 200 that are truly independent."""
+    random = np.random.default_rng(4)
+    truth = seen(other, ROLLUP).smoothed(2.5)
+    simulated = run.hits(ROLLUP)
+    frame = ae.DetectorMap.from_array(np.ones((48, 48), int), EDGES, EDGES, is_counts=True)
+    counts = ae.DetectorMap.from_hits(simulated, like=frame).counts.astype(float)
+    values, errors = [], []
+    for seed in range(200):
+        measured = replace(frame, values=random.poisson(3 * truth.values))
+        resamples = 300 if seed < 3 else 0
+        comparison = Comparison(measured, 2.5, 0.0, 2.0, resamples, seed)
+        found = comparison.similarities(np.repeat(counts[None], resamples + 1, axis=0))
+        values.append(found[0])
+        if resamples:
+            errors.append(found[1:].std(ddof=1))
+    # a standard deviation from 200 has an error of 5 %, from 300 one of 4 %: three times both
+    assert errors == pytest.approx(np.full(3, np.std(values, ddof=1)), rel=0.2)
+
+
+def test_noise_of_simulated_maps_is_that_of_their_ions(run, other):
+    """In every bin as many ions as Poisson's distribution says, and bins independent of each other."""
+    measured = seen(other, ROLLUP)
+    sampler = Sampler(run, HERE, measured, (slice(0, 48), slice(0, 48)), 400, 7)
+    maps, _ = sampler.maps(ROLLUP, 1)
+    noise = (maps[1:] - maps[0]) / NOISE
+    assert np.array_equal(maps[0], seen(run, ROLLUP).counts)
+    # mean over 2,304 bins of a variance from 400 resamples: 7 % / sqrt(2304), and of 4-th moments as much
+    assert noise.var(axis=0).sum() == pytest.approx(maps[0].sum(), rel=0.01)
+    assert noise.sum(axis=(1, 2)).var() == pytest.approx(maps[0].sum(), rel=3 * np.sqrt(2 / 400))
+    # replicas of an ion are one ion: nothing is gained for the errors of the run by drawing often
+    twice, _ = sampler.maps(ROLLUP, 2)
+    together = (twice.sum(axis=(1, 2))[1:] - twice[0].sum()) / NOISE / 2
+    assert together.std() == pytest.approx(noise.sum(axis=(1, 2)).std(), rel=0.05)
+
+
+def test_replicas_have_less_noise(run, other):
+    """Maps of two disjoint sets of draws are the more alike the more draws there are."""
+    measured = seen(other, ROLLUP)
+    sampler = Sampler(run, HERE, measured, (slice(0, 48), slice(0, 48)), 0, 0)
+    again = Sampler(replace(run, seed=99), HERE, measured, (slice(0, 48), slice(0, 48)), 0, 0)
+    alike, one = [], seen(run, LATERAL).ions
+    for replicas in (1, 4):
+        maps = [each.maps(LATERAL, replicas)[0][0].astype(int) for each in (sampler, again)]
+        assert maps[0].sum() == pytest.approx(replicas * one, rel=0.05)  # 3 / sqrt(one), rounded up
+        alike.append(float(ae.ssim(*(ae.DetectorMap.from_array(map, EDGES, EDGES, is_counts=True) for map in maps))))
+    assert alike[1] > alike[0] + 0.1
+
+
+def test_noise_that_is_allowed_for_is_that_of_the_maps(run, other):
+    """What is added to the numerator is the variance that noise adds to windows: of measured counts and of draws."""
+    measured, draws = seen(other, ROLLUP), 6
+    comparison = Comparison(measured, 2.5, 15.0, 2.0, 0, 3)
+    whole = (slice(0, 48), slice(0, 48))
+    sampler = Sampler(run, HERE, measured, whole, 0, 0)
+    maps, noise = sampler.maps(LATERAL, draws)
+    told = comparison._variance(maps, noise[None])[comparison.inside].mean()
+    # the same ions drawn anew, forty times: their mean is free of noise
+    again = [Sampler(replace(run, seed=s), HERE, measured, whole, 0, 0).maps(LATERAL, draws)[0] for s in range(40)]
+    again = np.concatenate(again)
+    scatter = comparison._variance(again.mean(axis=0, keepdims=True), (again - again.mean(axis=0)) * np.sqrt(40 / 39))
+    # one estimate from about (48 / 6)^2 windows of ten degrees of freedom: 6 %
+    assert told == pytest.approx(scatter[comparison.inside].mean(), rel=0.2)
+    drawn = np.random.default_rng(8).poisson(measured.values, (200, 48, 48)) - measured.values
+    poisson = comparison._variance(measured.values[None].astype(float), drawn)[comparison.inside].mean()
+    assert comparison._noise[comparison.inside].mean() == pytest.approx(poisson, rel=0.05)
+
+
+def test_noise_does_not_draw_to_more_contrast():
+    """A pattern under Poisson noise: of the same pattern with more or less contrast, its own is most alike."""
+    random = np.random.default_rng(2)
+    x, y = np.meshgrid(EDGES[1:], EDGES[1:])
+    pattern = np.cos(x / 3) * np.cos(y / 4)
+    contrasts = np.array([0.1, 0.15, 0.2, 0.25, 0.3])
+    frame = ae.DetectorMap.from_array(np.ones((48, 48), int), EDGES, EDGES, is_counts=True)
+    alike = {True: [], False: []}
+    for seed in range(20):
+        measured = replace(frame, values=random.poisson(20 * (1 + 0.2 * pattern)))
+        for allowed, found in alike.items():
+            comparison = Comparison(measured, 2.5, 0.0, 2.0, 0, seed, allowed)
+            found.append([float(comparison.similarities(1 + c * pattern[None])[0]) for c in contrasts])
+    allowed, plain = (np.mean(alike[key], axis=0) for key in (True, False))
+    assert contrasts[allowed.argmax()] == 0.2 and allowed[2] == pytest.approx(1, abs=0.02)
+    assert contrasts[plain.argmax()] > 0.2
+
+
+# ---- the study -----------------------------------------------------------------------------------------------------
+
+
+def steps_off(study, truth):
+    """Steps of the grid between the optimum and (fraction, rsd, mean)."""
+    best = study.optimum
+    axes = (study.grid.rollup_fractions, study.grid.rsds, study.grid.means)
+    found = (best.rollup_fraction, best.rsd, best.mean)
+    return [abs(axis.index(a) - axis.index(b)) for axis, a, b in zip(axes, found, truth, strict=True)]
+
+
+TWINS = {"roll-up": (ROLLUP, (1.0, 1.0, 0.155)), "lateral": (LATERAL, (0.0, 0.316, 0.3))}
+
+
+def measured_map(other, perturbation):
+    """Eight draws of the ions of another tip, in bins of 1.25 mm."""
+    edges = np.linspace(-60, 60, 97)
+    frame = ae.DetectorMap.from_array(np.ones((96, 96), int), edges, edges, is_counts=True)
+    runs = [replace(other, seed=seed) for seed in range(10, 18)]
+    draws = [ae.DetectorMap.from_hits(run.hits(perturbation), like=frame).counts for run in runs]
+    return replace(frame, values=sum(draws))
+
+
+@pytest.fixture(scope="module", params=TWINS)
+def twin(request, run, other):
+    """A study of a map with hidden energies."""
+    hidden, truth = TWINS[request.param]
+    measured = measured_map(other, hidden)
+    study = ae.fit_energies(run, measured, request.param, registration=HERE, resamples=40, progress=False)
+    return study, hidden, truth
+
+
+def test_hidden_energies_are_found(twin):
+    study, hidden, truth = twin
+    _, rsd_off, mean_off = steps_off(study, truth)
+    assert mean_off <= 1
+    assert rsd_off <= 1
+    best, hidden_cell = (tuple(axis.index(value) for axis, value in zip(
+        (study.grid.rollup_fractions, study.grid.rsds, study.grid.means), values, strict=True
+    )) for values in ((study.optimum.rollup_fraction, study.optimum.rsd, study.optimum.mean), truth))  # fmt: skip
+    missed = study.ssim[best] - study.ssim[hidden_cell]
+    error = np.std(study.resampled[(..., *best)] - study.resampled[(..., *hidden_cell)], ddof=1)
+    assert missed <= 3 * error
+    assert study.optimum.score.value == study.ssim.max()
+    # energies after the cut, which the map sees: within half a step of the grid
+    assert abs(study.refined.true_mean - hidden.energy.true_mean) < 0.04
+    low, high = study.refined.intervals["true_mean"]
+    assert low <= study.refined.true_mean <= high and high - low < 0.2
+
+
+def test_a_registration_is_polished(run, other):
+    """From 1.5 degrees, 3 % and 1 mm off, back to the frame in which the map was made."""
+    settings = {"smoothing": 0.6, "flattening": None, "data_range": 2.0, "seed": 0, "allow_noise": True}
+    search = EnergySearch(run, measured_map(other, ROLLUP), EnergyGrid("roll-up"), settings, 1, False)
+    rough = ae.Registration(1.5, 1.03, (1.0, -0.5), score=0.8, overlap=1.0)
+    search.place(rough, 0)
+    found = search.polished(rough, (0, 4, 2))
+    assert abs(found.rotation) < 0.3 and found.scale == pytest.approx(1, abs=0.006)
+    assert np.hypot(*found.shift) < 0.3
+    assert (found.score, found.overlap) == (0.8, 1.0)
+
+
+def test_unperturbed_is_clearly_less_alike(twin):
+    study, _, _ = twin
+    unperturbed, best = study.baselines["unperturbed"], study.optimum.score
+    assert unperturbed.error > 0 and best.error > 0
+    assert unperturbed.value + 5 * unperturbed.error < best.value - 5 * best.error
+    assert study.gain.value > 5 * study.gain.error > 0
+    assert study.gain_share == 1
+    assert study.baselines["thermal"].value < best.value - 5 * best.error
+
+
+def test_what_a_study_holds(twin):
+    study, _, _ = twin
+    assert study.ssim.shape == study.errors.shape == study.shares.shape == (1, 6, 6)
+    assert study.resampled.shape == (40, 1, 6, 6)
+    assert study.shares.sum() == pytest.approx(1)
+    assert study.errors == pytest.approx(study.resampled.std(axis=0, ddof=1))
+    # a matrix says what the public functions say
+    draws = study.maps["optimum"]
+    assert float(ae.ssim(study.compared(draws), study.compared(study.measured))) == pytest.approx(
+        study.plain["optimum"].value, abs=1e-9
+    )
+    assert study.settings["replicas"] == 16
+    assert 0 < study.plain["optimum"].value < study.optimum.score.value < 1.05
+    assert 0 < study.ceiling.value < 1
+    text = repr(study)
+    for part in (study.grid.mechanism, f"{study.optimum.score.value:.3f}", "unperturbed", "thermal", "halves"):
+        assert part in text
+
+
+def test_settings_are_recorded(twin, tmp_path):
+    study, _, _ = twin
+    study.save(tmp_path / "study.json")
+    held = json.loads((tmp_path / "study.json").read_text())
+    assert np.array(held["ssim"]) == pytest.approx(study.ssim)
+    assert held["grid"]["means"] == list(study.grid.means)
+    assert held["optimum"]["perturbation"]["energy"]["mean"] == study.optimum.mean
+    assert held["registration"]["scale"] == 1
+    wanted = {"smoothing", "flattening", "data_range", "temperature", "replicas", "resamples", "seed", "bins", "run"}
+    assert wanted <= set(held["settings"])
+    assert held["settings"]["temperature"] == 50
+
+
+def test_results_do_not_depend_on_threads(run, other):
+    measured = seen(other, ROLLUP)
+    options = {"means": (0.1, 0.2, 0.3), "rsds": (0.3, 1.0), "registration": HERE, "replicas": 1, "resamples": 5}
+    one, two = (ae.fit_energies(run, measured, n_threads=n, progress=False, **options) for n in (1, 2))
+    assert np.array_equal(one.ssim, two.ssim) and np.array_equal(one.resampled, two.resampled)
+    assert one.to_dict() == two.to_dict()
+
+
+def test_densities_have_no_noise_of_their_own(run, other):
+    counts = seen(other, ROLLUP)
+    densities = ae.DetectorMap.from_array(counts.values / 3.7, EDGES, EDGES, counts.mask)
+    options = {"means": (0.1, 0.2, 0.3), "rsds": (1.0,), "registration": HERE, "replicas": 1, "resamples": 30}
+    options |= {"smoothing": 2.0, "progress": False}
+    a, b = (ae.fit_energies(run, each, allow_noise=False, **options) for each in (counts, densities))
+    noisy = ae.fit_energies(run, densities, **options)
+    assert np.array_equal(noisy.ssim, b.ssim)  # with one draw there is no other noise
+    assert b.ceiling is None and a.ceiling is not None
+    assert a.ssim == pytest.approx(b.ssim, abs=1e-12)
+    assert (b.errors < a.errors).all() and (b.errors > 0).all()
+
+
+def test_the_axis_of_the_rollup_fraction(run, other):
+    measured = seen(other, ae.Combined(ae.TruncatedNormal(0.2, 0.1), 0.9))
+    study = ae.fit_energies(
+        run, measured, "combined", means=(0.1, 0.2, 0.3), rsds=(0.5,), rollup_fractions=(0.0, 0.5, 0.9),
+        registration=HERE, replicas=1, resamples=0, progress=False,
+    )  # fmt: skip
+    assert study.ssim.shape == (3, 1, 3)
+    assert max(steps_off(study, (0.9, 0.5, 0.2))) <= 1
+    assert np.isnan(study.errors).all() and study.refined.intervals == {} and np.isnan(study.gain.error)
+    assert "±" not in repr(study).split(";")[0]
+    json.dumps(study.to_dict(), allow_nan=False)
+
+
+def test_bins_of_a_map_are_merged(run, other):
+    measured = seen(other, ROLLUP)
+    options = {"means": (0.2,), "rsds": (1.0,), "registration": HERE, "replicas": 1, "resamples": 0}
+    study = ae.fit_energies(run, measured, bins=24, progress=False, **options)
+    assert study.measured.values.shape == (24, 24)
+    assert study.measured.counts[5, 7] == measured.counts[10:12, 14:16].sum()
+    assert study.measured.bin_size == (5.0, 5.0)
+
+
+def test_gradients_of_the_instrument_do_not_move_the_energies(run, other):
+    """A measured map that is three times as bright on one side as on the other."""
+    measured = measured_map(other, ROLLUP)
+    x, _ = measured.centres
+    kept = np.random.default_rng(3).binomial(measured.counts, np.broadcast_to(0.66 + 0.33 * x / 60, (96, 96)))
+    tilted = replace(measured, values=kept)
+    options = {"registration": HERE, "replicas": 2, "resamples": 0, "progress": False}
+    flat = ae.fit_energies(run, tilted, **options)
+    assert max(steps_off(flat, (1.0, 1.0, 0.155))) <= 1
+    assert flat.ssim.max() > ae.fit_energies(run, tilted, flattening=0, **options).ssim.max()
+
+
+def test_studies_that_cannot_be(run, other, run20):
+    measured = seen(other, ROLLUP)
+    with pytest.raises(ValueError, match="run must have responses for fit_energies"):
+        ae.fit_energies(run20, measured, registration=HERE)
+    with pytest.raises(ValueError, match="measured must be Hits or a DetectorMap, got 3"):
+        ae.fit_energies(run, 3, registration=HERE)
+    with pytest.raises(ValueError, match="replicas"):
+        ae.fit_energies(run, measured, registration=HERE, replicas=0)
+    with pytest.raises(ValueError, match="smoothing"):
+        ae.fit_energies(run, measured, registration=HERE, smoothing=-1)
+    with pytest.raises(ValueError, match=r"none of [\d,]+ hits lies in"):
+        ae.fit_energies(run, measured, registration=ae.Registration(0.0, 1.0, (1e6, 0.0)))
+    with pytest.raises(ValueError, match="must hold a window of 11 bins"):
+        small = replace(measured, mask=np.add.outer(np.arange(48), np.arange(48)) < 9)
+        ae.fit_energies(run, small, registration=HERE)
+
+
+def test_pictures(twin, tmp_path):
+    study, _, _ = twin
+    axes = ae.plot.ssim_matrix(study)
+    assert len(axes) == 1
+    assert len(axes[0].texts) == 36
+    (legend,) = axes[0].figure.legends
+    labels = [text.get_text() for text in legend.get_texts()]
+    assert labels == ["best on the grid", "best between its points, 95 % of the resamples"]
+    given = axes[0].figure.add_subplot()
+    assert ae.plot.ssim_matrix(study, [given])[0] is given
+    given.remove()
+    with pytest.raises(ValueError, match="axes must be 1, one for each roll-up fraction, got 2"):
+        ae.plot.ssim_matrix(study, [given, given])
+    parts = ae.plot.side_by_side(study, circle=(5, -5, 20))
+    assert parts[3].get_xlim() == (-15, 25)
+    # the measured map has a scale of its own, which its structure fills
+    scales = [ax.images[0].get_clim() for ax in parts]
+    assert scales[0] == scales[3] != scales[1] == scales[2] == scales[4]
+    density = study.compared(study.measured).density
+    assert scales[0] == pytest.approx(np.nanpercentile(density, [2, 99.5]))
+    for name, ax in (("matrix.png", axes[0]), ("maps.png", parts[0])):
+        ax.figure.savefig(tmp_path / name)
+        assert imread(tmp_path / name)[..., :3].std() > 0.1
+    with pytest.raises(ValueError, match="circle"):
+        ae.plot.side_by_side(study, circle=(0, 0, -1))

@@ -1,0 +1,264 @@
+import os
+import struct
+import sys
+import types
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from apt_evap._common.files import FileError, TruncatedFile
+from apt_evap.detection.hits import Hits, Outcome
+from apt_evap.io.formats import FORMATS, read, write
+
+SILICON = Path(__file__).parents[3] / "shared" / "data" / "Si.epos"
+
+
+def epos_row(x=1.0, y=2.0, z=-3.0, mass=14.0, time=500.0, v=5000.0, pulse=1000.0, dx=4.0, dy=5.0, pulses=3, ions=1):
+    return struct.pack(">9f2I", x, y, z, mass, time, v, pulse, dx, dy, pulses, ions)
+
+
+def save(path, *rows):
+    path.write_bytes(b"".join(rows))
+    return path
+
+
+def test_every_column_of_an_epos_lands_where_it_belongs(tmp_path):
+    hits = read(save(tmp_path / "a.epos", epos_row(), epos_row(x=9.0, pulses=0, dy=-5.5)))
+    assert hits.positions.tolist() == [[1, 2, -3], [9, 2, -3]]
+    assert (hits.x.tolist(), hits.y.tolist()) == ([4, 4], [5, -5.5])
+    assert hits.mass_to_charge[0] == 14 and hits.time_of_flight[0] == 500
+    assert hits.voltage[0] == 5000 and hits.pulse_voltage[0] == 1000
+    assert hits.pulses.tolist() == [3, 0] and hits.multiplicity.tolist() == [1, 1]
+    assert hits.source.endswith("a.epos")
+    assert all(getattr(hits, name).dtype.isnative for name in hits.columns)
+
+
+def test_pos(tmp_path):
+    hits = read(save(tmp_path / "A.POS", struct.pack(">8f", 1, 2, 3, 58, 4, 5, 6, 29)))
+    assert hits.positions.tolist() == [[1, 2, 3], [4, 5, 6]] and hits.mass_to_charge.tolist() == [58, 29]
+    assert hits.x is None
+    with pytest.raises(ValueError, match=r"A\.POS has no column 'x'"):
+        hits.map()
+
+
+def test_kilovolts_become_volts(tmp_path):
+    hits = read(save(tmp_path / "a.epos", epos_row(v=5.5, pulse=1.25)))
+    assert hits.voltage.tolist() == [5500] and hits.pulse_voltage.tolist() == [1250]
+
+
+def test_zero_columns_are_absent_but_a_laser_has_no_pulse_voltage(tmp_path):
+    hits = read(save(tmp_path / "a.epos", epos_row(time=0, v=0, pulse=0, pulses=0)))
+    assert hits.time_of_flight is None and hits.voltage is None and hits.pulse_voltage is None
+    assert hits.pulses.tolist() == [0]
+    assert read(save(tmp_path / "b.epos", epos_row(pulse=0))).pulse_voltage.tolist() == [0]
+
+
+def test_pulses_come_from_the_last_column_alone(tmp_path):
+    ions = [1, 3, 0, 0, 2, 0, 1]
+    hits = read(save(tmp_path / "a.epos", *(epos_row(ions=n, pulses=0) for n in ions)))
+    assert hits.pulse_id.tolist() == [0, 1, 1, 1, 2, 2, 3]
+    assert hits.multiplicity.tolist() == [1, 3, 3, 3, 2, 2, 1]
+
+
+@pytest.mark.parametrize(
+    "ions, problem",
+    [
+        ([0, 0], "zero throughout"),
+        ([0, 1], "first 1 rows"),
+        ([2, 1, 3], "row 0 announces 2 ions .* begins 1 rows later .2 such"),
+        ([1, 0], "row 0"),
+    ],
+)
+def test_inconsistent_pulses_are_told_and_dropped(tmp_path, ions, problem):
+    path = save(tmp_path / "a.epos", *(epos_row(ions=n) for n in ions))
+    with pytest.warns(UserWarning, match=problem):
+        hits = read(path)
+    assert hits.pulse_id is None and hits.multiplicity is None and len(hits) == len(ions)
+
+
+def test_truncated_file_raises_and_partial_reads_the_whole_ions(tmp_path):
+    path = save(tmp_path / "cut.epos", epos_row(), epos_row(ions=3), epos_row(ions=0), epos_row(ions=0)[:-5])
+    with pytest.raises(TruncatedFile, match=r"cut\.epos.* 3 whole ions .* 39 bytes .*partial=True"):
+        read(path)
+    hits = read(path, partial=True)
+    assert len(hits) == 3 and hits.pulse_id.tolist() == [0, 1, 1] and hits.multiplicity.tolist() == [1, 3, 3]
+    with pytest.raises(TruncatedFile, match="less than one ion"):
+        read(save(tmp_path / "tiny.pos", b"1234567"), partial=True)
+
+
+def test_pos_named_epos_and_the_other_way_round(tmp_path):
+    with pytest.raises(TruncatedFile, match=r"partial=True .* probably a \.pos"):
+        read(save(tmp_path / "a.epos", struct.pack(">4f", 1, 2, 3, 4)))
+    assert len(read(tmp_path / "a.epos", format=".pos")) == 1
+    with pytest.raises(FileError, match=r"probably an \.epos"):
+        read(save(tmp_path / "a.pos", epos_row()))
+
+
+def test_little_endian_raises_unless_asked_for(tmp_path):
+    values = np.random.default_rng(1).uniform(-40, 40, (50, 4)).astype("f4")
+    path = save(tmp_path / "a.pos", values.astype("<f4").tobytes())
+    with pytest.raises(FileError, match=r"a\.pos.*little-endian.*byte_order='little'"):
+        read(path)
+    np.testing.assert_array_equal(read(path, byte_order="little").positions, values[:, :3])
+    with pytest.raises(ValueError, match="byte_order"):
+        read(path, byte_order="middle")
+
+
+def test_rows_that_are_not_finite_are_read_but_not_detected(tmp_path):
+    nan = float("nan")
+    hits = read(save(tmp_path / "a.epos", epos_row(), epos_row(x=nan, y=nan, z=nan, dx=nan, v=nan)))
+    assert len(hits) == 2 and hits.detected.tolist() == [True, False] and hits.voltage[0] == 5000
+
+
+@pytest.mark.parametrize("suffix", [".pos", ".epos"])
+def test_files_that_cannot_be_read(tmp_path, suffix):
+    with pytest.raises(FileError, match=rf"empty{suffix}.* is empty"):
+        read(save(tmp_path / f"empty{suffix}"))
+    with pytest.raises(FileError, match=rf"none{suffix}.*No such file"):
+        read(tmp_path / f"none{suffix}")
+    (tmp_path / f"folder{suffix}").mkdir()
+    with pytest.raises(FileError, match="directory"):
+        read(tmp_path / f"folder{suffix}")
+
+
+def test_unknown_formats_options_and_paths(tmp_path):
+    path = save(tmp_path / "a.xyz", b"anything")
+    with pytest.raises(FileError, match=r"suffix '\.xyz', expected one of .*\.epos"):
+        read(path)
+    with pytest.raises(FileError, match="format='doc'"):
+        read(path, format="doc")
+    with pytest.raises(FileError, match="takes partial, byte_order, got 'parts'"):
+        read(save(tmp_path / "a.pos", struct.pack(">4f", 1, 2, 3, 4)), parts=True)
+    with pytest.raises(FileError, match="file name"):
+        read(3)
+    with pytest.raises(FileError, match="does not begin as"):
+        read(save(tmp_path / "a.h5", b"not HDF5"))
+    with pytest.raises(FileError, match=r"run\.save"):
+        write(tmp_path / "b.h5", Hits(x=[1.0]))
+
+
+def test_hdf5_is_handed_to_run_whatever_its_name(tmp_path, monkeypatch):
+    fake = types.ModuleType("apt_evap.simulation.run")
+    fake.load = lambda path: ("loaded", path)
+    monkeypatch.setitem(sys.modules, "apt_evap.simulation.run", fake)
+    path = save(tmp_path / "a.pos", b"\x89HDF\r\n\x1a\n....")
+    assert read(path) == ("loaded", path)
+
+
+def hits_of(values, **columns):
+    return Hits(
+        positions=values[:, :3],
+        mass_to_charge=values[:, 3],
+        time_of_flight=values[:, 4],
+        x=values[:, 5],
+        y=values[:, 6],
+        **columns,
+    )
+
+
+finite = st.floats(-1000, 1000, width=32).filter(lambda value: value == 0 or abs(value) > 1e-6)
+quick = settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+@quick
+@given(values=arrays("f4", st.tuples(st.integers(1, 12), st.just(7)), elements=finite), data=st.data())
+def test_epos_round_trip(tmp_path, values, data):
+    values[:, 4:6] += 2000  # no column of zeros, which would come back as None
+    values[:, :4] += np.float32(0.125)
+    n = len(values)
+    pulse_id = np.sort(data.draw(arrays("i8", n, elements=st.integers(0, n))))
+    before = hits_of(values, pulse_id=pulse_id, pulses=np.arange(n), voltage=np.full(n, 5e3))
+    write(tmp_path / "a.epos", before)
+    after = read(tmp_path / "a.epos", byte_order="big")
+    for name in ("x", "y", "time_of_flight", "voltage", "pulses"):
+        np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
+    np.testing.assert_array_equal(after.positions, values[:, :3])
+    _, which, size = np.unique(pulse_id, return_inverse=True, return_counts=True)
+    np.testing.assert_array_equal(after.pulse_id, which)
+    np.testing.assert_array_equal(after.multiplicity, size[which])
+    first = (tmp_path / "a.epos").read_bytes()
+    write(tmp_path / "a.epos", after)
+    assert (tmp_path / "a.epos").read_bytes() == first
+
+
+def test_selection_recounts_the_ions_per_pulse(tmp_path):
+    rows = [epos_row(ions=n, dx=float(i)) for i, n in enumerate([1, 3, 0, 0, 2, 0])]
+    hits = read(save(tmp_path / "a.epos", *rows))
+    write(tmp_path / "b.epos", hits[[0, 2, 3, 5]])
+    again = read(tmp_path / "b.epos")
+    assert again.multiplicity.tolist() == [1, 2, 2, 1] and again.x.tolist() == [0, 2, 3, 5]
+
+
+@pytest.mark.parametrize("suffix", [".pos", ".epos"])
+def test_missed_and_broken_ions_are_left_out_and_counted(tmp_path, suffix):
+    hits = Hits(
+        x=[1.0, np.nan, 2.0, np.nan, 1e39],
+        y=[1.0, np.nan, 2.0, np.nan, 0.0],
+        positions=np.where(np.arange(5)[:, None] >= 3, [np.nan, 0, 0], [1.0, 2.0, 3.0]),
+        outcome=[Outcome.HIT, Outcome.MISSED, Outcome.HIT, Outcome.NEVER_LEFT, Outcome.HIT],
+    )
+    path = tmp_path / f"a{suffix}"
+    with pytest.warns(UserWarning, match=r"leaves out 3 of 5 ions: 2 did not hit .* 1 have values"):
+        write(path, hits)
+    words = np.fromfile(path, ">f4")
+    assert np.isfinite(words).all() and len(words) == 2 * (4 if suffix == ".pos" else 11)
+    with pytest.raises(ValueError, match=r"nothing to write .* of 1 ions 1 did not hit the detector$"):
+        write(path, hits[1:2])
+    with pytest.warns(UserWarning, match=r"leaves out 2 of 3 ions: 2 did not hit the detector$"):
+        write(tmp_path / f"b{suffix}", hits[[0, 1, 3]])
+    assert read(path).positions.tolist() == [[1, 2, 3], [1, 2, 3]]
+
+
+def test_simulated_ions_are_single_hits_and_missing_columns_zeros(tmp_path):
+    write(tmp_path / "a.epos", Hits(x=[1.0, 2.0], y=[3.0, 4.0], ion=[0, 1]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        hits = read(tmp_path / "a.epos")
+    assert hits.multiplicity.tolist() == [1, 1] and hits.positions is None and hits.mass_to_charge is None
+    with pytest.raises(ValueError, match="no column 'positions'"):
+        write(tmp_path / "a.pos", hits)
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
+    path = tmp_path / "a.pos"
+    write(path, Hits(positions=[[1.0, 2.0, 3.0]]))
+    before = path.read_bytes()
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(FileError, match=r"cannot write .*a\.pos.*No space left"):
+        write(path, Hits(positions=[[4.0, 5.0, 6.0]]))
+    assert os.listdir(tmp_path) == ["a.pos"] and path.read_bytes() == before
+
+
+def test_unwritable_places(tmp_path):
+    hits = Hits(positions=[[1.0, 2.0, 3.0]])
+    with pytest.raises(FileError, match="No such file"):
+        write(tmp_path / "nowhere" / "a.pos", hits)
+    (tmp_path / "b.pos").mkdir()
+    with pytest.raises(FileError, match="directory"):
+        write(tmp_path / "b.pos", hits)
+
+
+@pytest.mark.parametrize("suffix", [entry.suffix for entry in FORMATS if entry.write and entry.read])
+def test_every_format_that_writes_reads_back_more_ions_than_a_chunk(tmp_path, suffix):
+    values = np.random.default_rng(2).uniform(1, 50, (40_000, 7)).astype("f4")
+    write(tmp_path / f"a{suffix}", hits_of(values, pulse_id=np.arange(40_000) // 2))
+    np.testing.assert_array_equal(read(tmp_path / f"a{suffix}").positions, values[:, :3])
+
+
+@pytest.mark.skipif(not SILICON.exists(), reason="the measured Si.epos is not there")
+def test_measured_file_comes_back_to_the_byte(tmp_path):
+    hits = read(SILICON)
+    # facts of the file: 4.1 % of the ions in multi-hits of up to 12
+    assert len(hits) == 945_211 and hits.multiplicity.max() == 12
+    assert np.count_nonzero(hits.multiplicity > 1) / len(hits) == pytest.approx(0.041, abs=5e-4)
+    write(tmp_path / "a.epos", hits)
+    assert (tmp_path / "a.epos").read_bytes() == SILICON.read_bytes()

@@ -1,0 +1,62 @@
+import numpy as np
+import pytest
+
+import apt_evap as ae
+from apt_evap.crystallography.poles import ZONES, zones
+
+
+@pytest.fixture
+def drawn():
+    rng = np.random.default_rng(3)
+    map = ae.DetectorMap.from_array(1 + rng.random((40, 50)), np.linspace(-20, 20, 51), np.linspace(-16, 16, 41))
+    return map, ae.plot.detector_map(map)
+
+
+def places(ax):
+    return np.asarray(ax.collections[0].get_offsets())
+
+
+@pytest.mark.parametrize(
+    ("name", "axis"), [("Ni", (1, 1, 1)), ("W", (0, 1, 1)), ("Si", (0, 0, 1)), ("Ti", (0, 0, 0, 1))]
+)
+def test_the_pole_of_the_axis_is_at_the_centre_and_zone_lines_go_through_it(drawn, name, axis):
+    _, ax = drawn
+    limits = ax.axis()
+    projection = ae.Projection(30.0, (3.0, -2.0))
+    assert ae.plot.poles(ax, ae.Orientation(name, axis), projection, families=5) is ax
+    assert ax.axis() == limits
+    assert np.linalg.norm(places(ax) - projection.centre, axis=1).min() < 1e-9
+    found = zones(ae.material(name))
+    assert len(ax.lines) == len(found.axes) and found.families[-1] == len(ZONES[ae.material(name).structure]) - 1
+    near = [np.nanmin(np.hypot(*(line.get_xydata() - projection.centre).T), initial=9) for line in ax.lines]
+    # the lines are drawn every half degree: 0.26 mm
+    assert np.count_nonzero(np.array(near) < 0.14) == np.count_nonzero(
+        np.abs(ae.Orientation(name, axis).directions(found.directions)[:, 2]) < 1e-9
+    )
+    ax.figure.canvas.draw()  # the labels are such as matplotlib can write
+
+
+def test_only_what_is_inside_the_detector_is_drawn(drawn):
+    map, ax = drawn
+    x, y = np.meshgrid(*map.centres)
+    round_map = ae.DetectorMap.from_array(map.values, map.x_edges, map.y_edges, mask=np.hypot(x, y) < 12)
+    ae.plot.poles(ax, ae.Orientation("Ni", (1, 1, 1)), ae.Projection(20.0), families=8, region=round_map)
+    radii = np.linalg.norm(places(ax), axis=1)
+    assert len(radii) == 10 and radii.max() < 12.6  # half a diagonal of the bins more
+    for line in ax.lines:
+        assert not (np.hypot(*line.get_xydata().T) > 12.6).any()
+
+
+def test_parts_can_be_left_out_and_names_do_not_overlap(drawn):
+    _, ax = drawn
+    orientation, projection = ae.Orientation("Ni", (1, 1, 1)), ae.Projection(12.0)
+    ae.plot.poles(ax, orientation, projection, families=0, zone_families=[(1, 1, 0)], labels=False)
+    assert len(ax.lines) == 6 and not ax.collections
+    before = len(ax.texts)
+    ae.plot.poles(ax, orientation, projection, families=12, zone_families=())
+    names = ax.texts[before:]
+    assert len(ax.lines) == 6 and 5 < len(names) < len(places(ax))
+    ax.figure.draw_without_rendering()
+    boxes = [text.get_window_extent() for text in names]
+    overlapping = [a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i]]
+    assert not any(overlapping)

@@ -1,0 +1,157 @@
+"""Folders are the floors: imports go down only, without circles, read off the files."""
+
+import ast
+import re
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[2] / "apt_evap"
+
+
+def module_of(path, package=PACKAGE):
+    """Dotted name of a file below the package; a folder's `__init__` has that of the folder."""
+    parts = path.relative_to(package).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def room_of(module):
+    """Room of a module: the folder it lies in, or itself where it lies beside the folders."""
+    return module.split(".")[0]
+
+
+def imports(source, package):
+    """Dotted names, without "apt_evap.", that a Python source imports; those for type hints only do not count."""
+    tree = ast.parse(source)
+    hints = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            hints |= set(ast.walk(node))
+    for node in set(ast.walk(tree)) - hints:
+        names = []
+        if isinstance(node, ast.Import):
+            names = [item.name for item in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            inner = [*package[: len(package) - node.level + 1]] if node.level else []
+            start = ".".join([*inner, node.module] if node.module else inner)
+            names = [f"{start}.{item.name}" for item in node.names]
+        for name in names:
+            if name.split(".")[0] == "apt_evap":
+                yield name.partition(".")[2]
+
+
+def cython_imports(source):
+    """The same for a Cython source."""
+    for match in re.finditer(r"^\s*(?:from|cimport|import)\s+apt_evap\.?([\w.]*)", source, re.MULTILINE):
+        yield match[1]
+
+
+def graph_of(package):
+    """Modules that each module of a package imports, by dotted name."""
+    paths = {module_of(path, package): path for path in sorted(package.rglob("*.py")) if path.parent != package}
+    paths |= {module_of(path, package): path for path in package.glob("*.py") if path.name != "__init__.py"}
+    compiled = {module_of(path, package) for path in package.rglob("*.p[yx][xd]")}
+    graph = {module: set() for module in (*paths, *compiled)}
+    for module, path in paths.items():
+        inner = ("apt_evap", *path.relative_to(package).parts[:-1])
+        for name in imports(path.read_text(), inner):
+            graph[module].add(known(name, graph, module))
+    for path in package.rglob("*.p[yx][xd]"):
+        for name in cython_imports(path.read_text()):
+            graph[module_of(path, package)].add(known(name, graph, path.name))
+    return {module: names - {module} for module, names in graph.items()}
+
+
+def known(name, graph, where):
+    """The module that holds an imported name."""
+    while name and name not in graph:
+        name = name.rpartition(".")[0]
+    assert name, f"{where} imports the package itself, whose names are for users"
+    return name
+
+
+def check_floors(package):
+    """Fail on modules, or rooms, that import each other in a circle; return the rooms from the ground up."""
+    graph = graph_of(package)
+    rooms = {}
+    for module, names in graph.items():
+        rooms.setdefault(room_of(module), set()).update(room_of(name) for name in names)
+    rooms = {room: below - {room} for room, below in rooms.items()}
+    for what, each in (("modules", graph), ("rooms", rooms)):
+        try:
+            order = list(TopologicalSorter(each).static_order())
+        except CycleError as error:
+            pytest.fail(f"{what} import each other in a circle: {' <- '.join(error.args[1])}")
+    return order
+
+
+def test_imports_go_down_from_room_to_room():
+    order = check_floors(PACKAGE)
+    assert len(order) > 15
+    for low, high in (
+        ("_common", "_core"),
+        ("_core", "evaporation"),
+        ("specimen", "evaporation"),
+        ("evaporation", "flight"),
+        ("flight", "simulation"),
+        ("simulation", "analysis"),
+        ("simulation", "io"),
+        ("plot", "cli"),
+    ):
+        assert order.index(low) < order.index(high)
+
+
+def copy_of(package, target):
+    for path in (*package.rglob("*.py"), *package.rglob("*.p[yx][xd]")):
+        copy = target / path.relative_to(package)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        copy.write_text(path.read_text())
+    return target
+
+
+@pytest.mark.parametrize(
+    ("module", "line", "what"),
+    [
+        ("specimen/shape.py", "from apt_evap.simulation.run import Run", "rooms"),
+        ("_common/files.py", "import apt_evap.io.formats", "modules"),
+        ("detection/detector_map.py", "from apt_evap.detection.hits import Hits", "modules"),
+        ("detection/binning.py", "def f():\n    from apt_evap.detection.detector_map import DetectorMap", "modules"),
+        ("_core/octree.pyx", "from apt_evap._core.flights cimport Flights", "modules"),
+        ("detection/binning.py", "from apt_evap.crystallography.poles import Poles", "rooms"),
+    ],
+)
+def test_an_upward_import_or_a_circle_is_found(tmp_path, module, line, what):
+    package = copy_of(PACKAGE, tmp_path / "apt_evap")
+    path = package / module
+    path.write_text(path.read_text() + f"\n{line}\n")
+    with pytest.raises(pytest.fail.Exception, match=f"{what} import each other"):
+        check_floors(package)
+
+
+def test_the_package_itself_is_for_users(tmp_path):
+    package = copy_of(PACKAGE, tmp_path / "apt_evap")
+    path = package / "specimen" / "shape.py"
+    path.write_text(path.read_text() + "\nimport apt_evap\n")
+    with pytest.raises(AssertionError, match="for users"):
+        check_floors(package)
+
+
+def test_the_core_knows_nothing_of_the_package():
+    for module, names in graph_of(PACKAGE).items():
+        if room_of(module) == "_core":
+            assert {room_of(name) for name in names} <= {"_core"}, module
+
+
+@pytest.mark.parametrize("room", sorted(path.parent.name for path in PACKAGE.glob("*/__init__.py")))
+def test_a_room_says_what_lives_in_it(room):
+    tree = ast.parse((PACKAGE / room / "__init__.py").read_text())
+    sentence = ast.get_docstring(tree)
+    assert sentence and sentence.endswith(".") and "\n" not in sentence
+    assert not any(isinstance(node, (ast.FunctionDef, ast.ClassDef)) for node in ast.walk(tree))
+
+
+def test_the_tests_mirror_the_rooms():
+    rooms = {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
+    folders = {path.parent.name for path in (PACKAGE.parent / "tests").glob("*/test_*.py")}
+    assert folders - {"project"} <= rooms

@@ -1,0 +1,311 @@
+"""The documentation: its Python runs, its commands and links are right, and every public name is described."""
+
+import enum
+import importlib
+import inspect
+import json
+import re
+import runpy
+import sys
+import textwrap
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import apt_evap as ae
+
+ROOT = Path(__file__).parents[2]
+README = ROOT / "README.md"
+PAGES = sorted((ROOT / "docs").glob("*.rst"))
+
+SMALLER = {"15_000": "300"}  # ions of the README's simulation: minutes on a slow machine, and no less true
+
+
+def python_blocks(path):
+    """The Python blocks of a page, each in front of as many empty lines as put it where it is in the page."""
+    text = path.read_text()
+    if path.suffix == ".md":
+        found = re.finditer(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    else:
+        found = re.finditer(r"^\.\. code-block:: python\n\n((?:(?: {4}.*)?\n)+)", text, re.MULTILINE)
+    return ["\n" * text.count("\n", 0, block.start(1)) + textwrap.dedent(block[1]) for block in found]
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder to work in, with a measured file as the pages name it: hits on a comb, two in every fifth pulse."""
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(1)
+    n = 20_000
+    comb = np.array([0.02725, 0.02602])  # mm, of a delay line detector
+    radius, azimuth = 36.0 * np.sqrt(rng.random(n)), 2 * np.pi * rng.random(n)
+    x, y = (np.rint(radius * part(azimuth) / step) * step for part, step in zip((np.cos, np.sin), comb, strict=True))
+    measured = ae.Hits(
+        x=x,
+        y=y,
+        positions=rng.normal(size=(n, 3)),
+        mass_to_charge=rng.choice([29.0, 58.0], n),
+        time_of_flight=rng.normal(600.0, 5.0, n),
+        voltage=np.full(n, 5000.0),
+        pulse_id=np.cumsum(rng.random(n) > 1 / 6),
+    )
+    ae.write("R5083.epos", measured)
+    return tmp_path
+
+
+def test_blocks_are_found():
+    assert len(python_blocks(README)) == 3
+    assert sum(len(python_blocks(page)) for page in PAGES) >= 10
+    # none is written in a way that is not found
+    assert README.read_text().count("```") == 2 * 3
+    for page in PAGES:
+        assert page.read_text().count("code-block::") == len(python_blocks(page)), page.name
+
+
+@pytest.mark.filterwarnings("ignore:.*leaves out:UserWarning")
+@pytest.mark.parametrize("path", [p for p in (README, *PAGES) if python_blocks(p)], ids=lambda path: path.name)
+def test_python_blocks_run(path, folder, monkeypatch):
+    """All blocks of a page, one after the other, as a reader would."""
+    page = type(sys)("__page__")  # dataclasses look up the module of their class
+    monkeypatch.setitem(sys.modules, "__page__", page)
+    for block in python_blocks(path):
+        for large, small in SMALLER.items():
+            block = block.replace(large, small)
+        exec(compile(block, str(path), "exec"), page.__dict__)
+
+
+def test_what_the_readme_makes(folder, monkeypatch):
+    """The files it names are written, and its own perturbation does what it says."""
+    test_python_blocks_run(README, folder, monkeypatch)
+    page = sys.modules["__page__"]
+    for name in ("ni111.h5", "ni.epos", "rolled.png", "R5083.png"):
+        assert (folder / name).stat().st_size > 0
+    flown = page.run.hits(page.FromAbove(0.3))
+    assert len(flown) == 500
+    assert flown.ion[0] == 300
+    assert not np.array_equal(flown.x, page.run.hits(ae.Unperturbed()).x)
+
+
+TUTORIALS = sorted(path.name for path in (ROOT / "examples").glob("tutorial_*.py"))
+
+
+@pytest.mark.filterwarnings("ignore:.*leaves out:UserWarning")
+@pytest.mark.parametrize("name", TUTORIALS)
+def test_examples_run(name, folder, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [name, "200"])
+    runpy.run_path(str(ROOT / "examples" / name), run_name="__main__")
+    out = capsys.readouterr().out
+    assert "detected" in out or "ions" in out
+    if name == "tutorial_4_own_perturbation.py":
+        largest = float(re.search(r"largest ([\d.]+) mm", out)[1])
+        assert 0 < largest < ae.ResponseSettings().bound  # above it an ion would have been marked
+    if name == "tutorial_3_fit_energies.py":
+        rotation, scale = re.search(r"^rotated by (\S+)°, scaled by ([\d.]+)", out, re.MULTILINE).groups()
+        # of the hidden transform, or one that [111] makes equal; a bin of 1.5 mm at the rim of 18 mm is 5 degrees
+        assert float(rotation) % 120 == pytest.approx(17, abs=5)
+        assert float(scale) == pytest.approx(0.3, rel=1.5 / 18)
+        low, high = re.search(r"mean of the energies \S+ \((\S+) to (\S+)\) eV, hidden 0.2 eV", out).groups()
+        assert float(low) < 0.2 < float(high)
+        assert "in 100% of the resamples" in out
+
+
+def test_a_measured_file_of_ones_own(folder, monkeypatch, capsys):
+    """Not every export has voltages, nor a detector about (0, 0)."""
+    held = ae.read("R5083.epos")
+    ae.write("R5084.epos", ae.Hits(x=held.x - 2, y=held.y + 1, positions=held.positions, pulse_id=held.pulse_id))
+    for name, voltage in (("R5083.epos", True), ("R5084.epos", False)):
+        monkeypatch.setattr(sys, "argv", ["tutorial_2_own_measurement.py", name])
+        runpy.run_path(str(ROOT / "examples" / sys.argv[0]), run_name="__main__")
+        out = capsys.readouterr().out
+        assert ("20,000 ions above 4.5 kV" in out) == voltage and f"from '{name}'" in out
+        inside = np.count_nonzero(np.hypot(held.x[10_000:], held.y[10_000:]) <= 10)
+        assert int(re.search(r"(\d+) of them within 10 mm", out)[1]) == pytest.approx(inside, rel=0.03)  # of 800
+
+
+def run_figure(name, monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", [name, *arguments])
+    runpy.run_path(str(ROOT / "examples" / name), run_name="__main__")
+
+
+def test_figure_2_of_a_small_tip(folder, monkeypatch, capsys):
+    run_figure("figure2.py", monkeypatch, "--radius", "12", "-o", "out")
+    assert (folder / "out" / "figure2.png").stat().st_size > 100_000
+    results = json.loads((folder / "out" / "figure2.json").read_text())["results"]
+    assert set(results) == {"Al[012]", "Ni[111]"}
+    for result in results.values():
+        assert result["settings"]["tip"]["material"]["name"] in ("Al", "Ni")
+        fields = np.array(result["field [V/nm]"])
+        assert fields[result["neighbours"].index(6)] > fields[result["neighbours"].index(8)]  # kinks stick out
+        assert max(result["residual [mm]"]) < ae.ResponseSettings().bound
+        # mm: half an electronvolt moves an ion by millimetres, and the roll alone by about as much
+        for column in ("lateral 0.5 eV [mm]", "roll [mm]", "then 0.5 eV [mm]"):
+            assert 1 < min(result[column]) < max(result[column]) < 40
+    assert "Ni[111]: how far" in capsys.readouterr().out
+
+
+@pytest.mark.filterwarnings("ignore:the registration is doubtful:UserWarning")
+def test_figures_3_to_6_of_small_tips(folder, monkeypatch, capsys):
+    run_figure("figures3to6.py", monkeypatch, *"--radius 8 --ions 1200 --bins 24 --resamples 3 -o out".split())
+    for number in (3, 4, 5, 6):
+        assert (folder / "out" / f"figure{number}.png").stat().st_size > 50_000
+    results = json.loads((folder / "out" / "figures3to6.json").read_text())
+    shapes = {name: np.shape(study["ssim"]) for name, study in results["studies"].items()}
+    assert shapes == {"Al lateral": (1, 6, 6), "Ni roll-up": (1, 6, 6), "Ni combined": (5, 6, 6)}
+    for metal, axis in (("Al", [0, 1, 2]), ("Ni", [1, 1, 1])):
+        simulated, twin = (ae.load(folder / "out" / f"{metal}_{name}_R8a.h5") for name in ("run", "twin"))
+        assert simulated.settings["tip"]["axis"] == axis
+        # two specimens: another origin of the lattice, other random numbers
+        assert simulated.settings["tip"]["offset_seed"] != twin.settings["tip"]["offset_seed"]
+        assert simulated.seed != twin.seed
+    # both mechanisms see the same region; roll-up alone is one of the five fractions
+    alone, both = (results["studies"][name] for name in ("Ni roll-up", "Ni combined"))
+    assert alone["registration"] == both["registration"]
+    assert alone["ssim"][0] == both["ssim"][4]
+    # nickel that rolled up looks like none that did not
+    assert alone["optimum"]["score"]["value"] > alone["baselines"]["unperturbed"]["value"] + 0.5
+    assert "| Ni combined | " in capsys.readouterr().out
+
+
+def test_figure_7_of_runs_that_are_there(folder, monkeypatch, capsys, run20):
+    """The script turns the crystal by 90 degrees; so is the run here, and taken for both radii."""
+    first, rolled = run20.flown
+    turned = replace(rolled, directions=rolled.directions @ [[0, 1], [-1, 0]])
+    run = replace(run20, flown=(first, turned))
+    for name in ("figure7_R20a.h5", "figure7_R30a.h5"):
+        run.save(folder / name)
+    run_figure("figure7.py", monkeypatch, "--redraw", "--bins", "20")
+    assert (folder / "figure7.png").stat().st_size > 100_000
+    printed = capsys.readouterr().out
+    for kind in ("depleted", "enhanced"):
+        assert f"{kind} line, R = 20 a: {kind}, " in printed  # the rectangles are where the lines are
+    results = json.loads((folder / "figure7.json").read_text())
+    assert results["ions"] == {"R = 30 a": 15_000, "R = 20 a": 15_000}
+    assert results["results"]["enhanced"]["chi_square"] == 0  # of one run with itself
+
+
+def test_figure_7_evaporates_to_one_depth(folder, monkeypatch):
+    with pytest.raises(ValueError, match="profile"):  # that few ions show no line
+        run_figure("figure7.py", monkeypatch, "--radii", "6", "4", "--ions", "54")
+    assert [len(ae.load(folder / f"figure7_R{radius}a.h5")) for radius in (6, 4)] == [54, 16]
+
+
+def test_commands_of_the_readme():
+    lines = [line.strip() for line in README.read_text().splitlines()]
+    assert "pip install . && apt-evap run examples/ni111.toml" in lines
+    assert "pip install '.[test]' && pytest" in lines
+
+
+def test_command_lines_are_understood():
+    """Every command line in the pages that is written out is one that the parser takes."""
+    from apt_evap.cli.main import _parser
+
+    found = set()
+    for page in (README, *PAGES):
+        for line in re.findall(r"`{1,2}(apt-evap [^`]+)`|^ {4}(apt-evap .*)$", page.read_text(), re.MULTILINE):
+            found.add(" ".join("".join(line).split()))
+    assert len(found) >= 5
+    for command in found:
+        words = command.split()[1:]
+        if "--help" not in words:
+            _parser().parse_args(words)
+
+
+def test_links_lead_somewhere():
+    for target in re.findall(r"\]\(([^)]+)\)", README.read_text()):
+        assert target.startswith("https://") or (ROOT / target).exists(), target
+    index = (ROOT / "docs" / "index.rst").read_text()
+    listed = re.search(r"toctree::\n(?: +:.*\n)*\n((?: +[\w/]+\n)+)", index)[1].split()
+    listed.remove("generated/gallery/index")  # made of the examples when the pages are built
+    assert sorted([*listed, "index"]) == [page.stem for page in PAGES]
+    # files and modules that pages name in ``double quotes``
+    for page in PAGES:
+        for name in re.findall(r"``((?:\w+|tests/\w+)/[\w.]+|\w+\.(?:py|pyx|h))``", page.read_text()):
+            inside = "/" in name or list((ROOT / "apt_evap").rglob(name))
+            assert (ROOT / name).exists() or (ROOT / "apt_evap" / name).exists() or inside, name
+
+
+def test_the_tests_of_the_accuracy_page_exist():
+    named = re.findall(
+        r"^ +- ((?:\w+/)?test_\w+)$", (ROOT / "docs" / "accuracy_and_speed.rst").read_text(), re.MULTILINE
+    )
+    assert len(named) >= 10
+    for name in named:
+        assert (ROOT / "tests" / f"{name}.py").exists(), name
+
+
+# ---- names ---------------------------------------------------------------------------------------------------------
+
+NAMES = sorted(set(ae.__all__) - {"__version__", "plot"})
+API = (ROOT / "docs" / "api.rst").read_text()
+ENTRIES = re.findall(r"^   ([A-Za-z_][\w.]*)$", API, re.MULTILINE)
+
+
+def sections(documented):
+    """Sections of a numpydoc docstring by title."""
+    parts = re.split(r"^(\w[\w ]*)\n-{3,}$", inspect.getdoc(documented) or "", flags=re.MULTILINE)
+    return {"": parts[0]} | dict(zip(parts[1::2], parts[2::2], strict=True))
+
+
+def named(section):
+    """Names that a section describes."""
+    lines = re.findall(r"^(\*{0,2}\w[\w, *]*)(?: :.*)?$", section, re.MULTILINE)
+    return {name.strip(" *") for line in lines for name in line.split(",")}
+
+
+def parameters(documented):
+    """Names of the parameters to describe; an error and an enumeration have none of their own."""
+    if isinstance(documented, type) and issubclass(documented, Exception | enum.Enum):
+        return []
+    return [name for name in inspect.signature(documented).parameters if name != "self"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_public_names_are_documented(name):
+    documented = getattr(ae, name)
+    found = sections(documented)
+    assert len(found[""].strip()) > 20
+    wanted = parameters(documented)
+    if wanted:
+        assert "Parameters" in found
+        assert set(wanted) <= named(found["Parameters"])
+    if inspect.isfunction(documented) and re.search(r"^    return \S", inspect.getsource(documented), re.MULTILINE):
+        assert "Returns" in found
+    if isinstance(documented, type):
+        for member, value in vars(documented).items():
+            if not member.startswith("_") and (callable(value) or isinstance(value, property | classmethod)):
+                assert inspect.getdoc(getattr(documented, member)), f"{name}.{member} has no docstring"
+
+
+def test_the_reader_of_docstrings():
+    def f(a, b, *c):
+        """Sum.
+
+        Parameters
+        ----------
+        a, b : float
+            Two numbers.
+        *c
+            More.
+
+        Returns
+        -------
+        float
+        """
+
+    assert set(sections(f)) == {"", "Parameters", "Returns"}
+    assert {"a", "b", "c"} <= named(sections(f)["Parameters"])
+    assert parameters(f) == ["a", "b", "c"]
+
+
+@pytest.mark.parametrize("name", ae.__all__)
+def test_public_names_are_in_the_api_page(name):
+    assert name in ENTRIES or f"py:data:: {name}" in API
+
+
+@pytest.mark.parametrize("entry", ENTRIES)
+def test_entries_of_the_api_page_exist(entry):
+    *module, name = entry.split(".")
+    holder = importlib.import_module(".".join(["apt_evap", *module]))
+    assert inspect.getdoc(getattr(holder, name, None) or importlib.import_module(f"apt_evap.{entry}"))

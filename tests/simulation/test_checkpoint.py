@@ -1,0 +1,461 @@
+"""Runs that are killed, interrupted, out of disk or damaged, and go on with the same bits."""
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+import threading
+import time
+import warnings
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from tqdm.auto import tqdm
+
+import apt_evap as ae
+from apt_evap.simulation import run_hdf5
+from apt_evap.simulation.checkpoint import Keeper
+
+ENERGY = ae.TruncatedNormal(0.155, 0.155)
+HERE = str(Path(ae.__file__).parents[1])  # the package under test, installed or not
+KILLABLE = pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
+
+
+def start(function, *arguments):
+    """Begin a function of this file in a process of its own, once that has imported all it needs."""
+    command = [sys.executable, "-P", __file__, function.__name__, *map(str, arguments)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, env=os.environ | {"PYTHONPATH": HERE})
+    process.stdout.readline()
+    return process
+
+
+def simulation(**options):
+    """A shell that deepens within the run, watched from its first relaxation."""
+    nickel = ae.material("Ni")
+    tip = ae.Tip(nickel, apex_radius=6 * nickel.a, axis=(1, 1, 1), depth=3.5 * nickel.a)
+    watch = ae.WatchSettings(interval=150)
+    return ae.Simulation(tip, **{"seed": 5, "n_threads": 1, "watch_settings": watch} | options)
+
+
+def small(**options):
+    tip = ae.Tip("Ni", apex_radius=1.5, axis=(1, 1, 1), shank_length=1.5)
+    return ae.Simulation(tip, seed=5, n_threads=1, **options)
+
+
+def run_small(path, n_ions=90, resume=False, **options):
+    checkpoint = ae.Checkpoint(path, minutes=0, resume=resume)
+    return small(**options).run(n_ions, responses=False, progress=False, batch_size=30, checkpoint=checkpoint)
+
+
+def datasets(path):
+    """Every dataset of a file, by name: its type, its shape and its bytes."""
+    found = {}
+
+    def note(name, item):
+        if isinstance(item, h5py.Dataset):
+            values = item[()]
+            found[name] = (values.dtype.str, values.shape, values.tobytes())
+
+    with h5py.File(path) as file:
+        file.visititems(note)
+    return found
+
+
+def differing(path, other):
+    one, two = datasets(path), datasets(other)
+    assert one.keys() == two.keys()
+    return [name for name in one if one[name] != two[name]]
+
+
+# ---- killed --------------------------------------------------------------------------------------------------------
+
+N_IONS, KILLS = 300, 20
+
+
+def work(path):
+    tqdm.set_lock(threading.RLock())  # one of this process alone: its own would outlive a kill
+    simulation().run(
+        N_IONS,
+        [ae.RollUp(ENERGY)],
+        progress=False,
+        batch_size=20,
+        checkpoint=ae.Checkpoint(path, minutes=0, resume=True),
+    )
+
+
+@KILLABLE
+def test_killed_at_random_moments_and_resumed_it_has_the_same_bits(tmp_path):
+    """SIGKILL at 20 random moments; whenever the run comes to its end before, another one begins."""
+    simulation().run(N_IONS, [ae.RollUp(ENERGY)], progress=False).save(tmp_path / "uninterrupted.h5")
+    random = np.random.default_rng(3)
+    kills, whole, shortest, over = [], 0, None, False
+    while len(kills) < KILLS or whole < 3 or over or any("unfinished" in name for name in os.listdir(tmp_path)):
+        path = tmp_path / f"{whole}.h5"
+        folder = Path(f"{path}.unfinished")
+        spared = shortest is None or over or (len(kills) >= KILLS and folder.exists())
+        process = start(work, path)
+        began = time.monotonic()
+        try:
+            process.wait(None if spared else random.uniform(0, 0.4 * shortest))
+        except subprocess.TimeoutExpired:
+            process.kill()
+        if process.wait() == -signal.SIGKILL:
+            kills.append(len(list(folder.glob("ions-*.h5"))))
+            over = path.exists() and not folder.exists()  # hit after its end: another one begins
+            continue
+        assert process.returncode == 0
+        shortest = time.monotonic() - began if shortest is None else shortest
+        assert differing(path, tmp_path / "uninterrupted.h5") == []
+        assert not folder.exists()
+        whole, over = whole + 1, False
+    print(f"checkpoints there at each of {len(kills)} kills: {kills}; {whole} runs to the end, alone {shortest:.1f} s")
+    assert whole >= 3  # the first, which is not killed, and two that were
+    assert max(kills) > 3  # they hit runs that had come some way
+    leftover = [name for name in os.listdir(tmp_path) if "unfinished" in name]
+    assert leftover == []
+
+
+def crash(path, number, late):
+    """Leave at once, as if killed, at one of the renames that complete a file."""
+    count, replace = 0, os.replace
+
+    def replace_or_leave(*names):
+        nonlocal count
+        count += 1
+        if late:
+            replace(*names)
+        if count > number:
+            os._exit(9)
+        if not late:
+            replace(*names)
+
+    os.replace = replace_or_leave
+    tqdm.set_lock(threading.RLock())
+    run_small(path, resume=True)
+
+
+@KILLABLE
+@pytest.mark.parametrize("late", [False, True])
+def test_killed_at_every_rename(tmp_path, late):
+    run_small(tmp_path / "uninterrupted.h5")
+    for number in range(20):
+        path = tmp_path / f"{number}.h5"
+        left = start(crash, path, number, int(late)).wait() == 9
+        run_small(path, resume=True)
+        assert differing(path, tmp_path / "uninterrupted.h5") == []
+        if not left:
+            break
+    assert not left
+    assert number >= 3 * 2 + 3  # three parts with their states, the whole file, its place, the folder
+    assert not [name for name in os.listdir(tmp_path) if "unfinished" in name]
+
+
+# ---- interrupted ---------------------------------------------------------------------------------------------------
+
+
+class Interrupting(ae.Unperturbed):
+    """Raises SIGINT while ions launch."""
+
+    at = (40, 70)
+
+    def launch(self, emissions, random):
+        for ion in self.at:
+            if emissions.ions[0] <= ion < emissions.ions[0] + len(emissions):
+                signal.raise_signal(signal.SIGINT)
+        return super().launch(emissions, random)
+
+
+def interrupted(path, at, **options):
+    flown = Interrupting()
+    object.__setattr__(flown, "at", at)
+    checkpoint = ae.Checkpoint(path, **options)
+    return small().run(90, [flown], responses=False, progress=False, batch_size=30, checkpoint=checkpoint)
+
+
+def test_ctrl_c_saves_the_run_which_can_be_resumed(tmp_path):
+    run = interrupted(tmp_path / "run.h5", (40,))
+    assert (run.ended, len(run)) == ("interrupted", 60)
+    assert [item.name for item in tmp_path.iterdir()] == ["run.h5"]
+    interrupted(tmp_path / "run.h5", (), resume=True)
+    interrupted(tmp_path / "whole.h5", ())
+    assert ae.load(tmp_path / "run.h5").ended == ""
+    assert differing(tmp_path / "run.h5", tmp_path / "whole.h5") == []
+
+
+def test_a_second_ctrl_c_keeps_what_is_done(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        interrupted(tmp_path / "run.h5", (40, 50))
+    assert len(ae.load(tmp_path / "run.h5.unfinished")) == 30  # the batch before the one that was cut off
+    interrupted(tmp_path / "run.h5", (), resume=True)
+    interrupted(tmp_path / "whole.h5", ())
+    assert differing(tmp_path / "run.h5", tmp_path / "whole.h5") == []
+
+
+def test_a_run_that_ended_can_be_made_longer(tmp_path):
+    short = run_small(tmp_path / "run.h5", 60)
+    assert len(run_small(tmp_path / "run.h5", 90, resume=True)) == 90
+    run_small(tmp_path / "whole.h5", 90)
+    assert differing(tmp_path / "run.h5", tmp_path / "whole.h5") == []
+    short.save(tmp_path / "saved.h5")  # also one that was saved without checkpoints
+    run_small(tmp_path / "saved.h5", 90, resume=True)
+    assert differing(tmp_path / "saved.h5", tmp_path / "whole.h5") == []
+
+
+def test_resuming_what_is_not_there_begins(tmp_path):
+    assert len(run_small(tmp_path / "run.h5", resume=True)) == 90
+
+
+def test_an_error_keeps_what_is_done(tmp_path):
+    class Breaking(ae.Unperturbed):
+        def launch(self, emissions, random):
+            if emissions.ions[-1] > 60:
+                raise RuntimeError("broken on purpose")
+            return super().launch(emissions, random)
+
+    with pytest.raises(RuntimeError, match="on purpose") as caught:
+        small().run(90, [Breaking()], responses=False, progress=False, batch_size=30, checkpoint=tmp_path / "run.h5")
+    assert len(caught.value.run) == 60
+    assert len(ae.load(tmp_path / "run.h5.unfinished")) == 60
+
+
+# ---- files that do not let themselves be written -------------------------------------------------------------------
+
+
+def test_a_full_disk_loses_nothing(tmp_path):
+    """A limit on the size of files, as they meet a full disk: writing fails part of the way."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, before[1]))
+    try:
+        with (
+            pytest.warns(UserWarning, match=r"no checkpoint: cannot write .*File too large; the run goes on"),
+            pytest.raises(ae.FileError, match=r"cannot write .*File too large") as caught,
+        ):
+            run_small(tmp_path / "run.h5")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert len(caught.value.run) == 90
+    caught.value.run.save(tmp_path / "saved.h5")
+    run_small(tmp_path / "run.h5", resume=True)
+    assert differing(tmp_path / "run.h5", tmp_path / "saved.h5") == []
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_read_only_folder_is_refused_before_the_run(tmp_path):
+    (tmp_path / "folder").mkdir(mode=0o500)
+    with pytest.raises(ae.FileError, match=r"cannot write .*run\.h5.*Permission denied"):
+        run_small(tmp_path / "folder" / "run.h5")
+
+
+def test_a_folder_that_is_not_there_is_refused_before_the_run(tmp_path):
+    with pytest.raises(ae.FileError, match=r"cannot write .*No such file"):
+        run_small(tmp_path / "nowhere" / "run.h5")
+
+
+def test_a_file_of_somebody_else_is_not_overwritten(tmp_path):
+    (tmp_path / "run.h5").write_text("my only copy")
+    with pytest.raises(ae.FileError, match=r"run\.h5' exists and is no run"):
+        run_small(tmp_path / "run.h5")
+    assert (tmp_path / "run.h5").read_text() == "my only copy"
+    assert [item.name for item in tmp_path.iterdir()] == ["run.h5"]
+
+
+def test_one_process_at_a_time(tmp_path):
+    checkpoint = ae.Checkpoint(tmp_path / "run.h5")
+    with Keeper(checkpoint, {}, (), True, 90):
+        with pytest.raises(ae.FileError, match=rf"run\.h5' is being written by process {os.getpid()} on "):
+            run_small(tmp_path / "run.h5")
+    assert len(run_small(tmp_path / "run.h5")) == 90
+
+
+@pytest.fixture
+def unfinished(tmp_path):
+    """A run of which 60 ions are done."""
+    with pytest.raises(KeyboardInterrupt):
+        interrupted(tmp_path / "run.h5", (70, 75))
+    assert len(ae.load(tmp_path / "run.h5.unfinished")) == 60
+    return tmp_path / "run.h5"
+
+
+def test_an_unfinished_run_is_not_thrown_away_unasked(unfinished):
+    with pytest.raises(ae.FileError, match=r"unfinished run of 60 ions beside it.*resume=True goes on"):
+        interrupted(unfinished, ())
+    run = interrupted(unfinished, (), overwrite=True)
+    assert len(run) == len(ae.load(unfinished)) == 90
+    assert not Path(f"{unfinished}.unfinished").exists()
+
+
+def test_other_settings_are_refused(unfinished):
+    checkpoint = ae.Checkpoint(unfinished, resume=True)
+    options = {"responses": False, "progress": False, "checkpoint": checkpoint}
+    with pytest.raises(ae.FileError, match=r"detector\.distance is 100\.0 there and 50\.0 here"):
+        small(detector=ae.Detector(distance=50.0)).run(90, [Interrupting()], **options)
+    with pytest.raises(ae.FileError, match=r"flown is .*Interrupting.* there and .*RollUp.* here"):
+        small().run(90, [ae.RollUp(0.2)], **options)
+    with pytest.raises(ValueError, match="n_ions must be at least the 60 that are done already, got 50"):
+        small().run(50, [Interrupting()], **options)
+    used = small()
+    used.run(5, responses=False, progress=False)
+    with pytest.raises(ValueError, match="resumed by a new Simulation, got one that 5 atoms left"):
+        used.run(90, [Interrupting()], **options)
+    assert len(interrupted(unfinished, (), resume=True)) == 90
+
+
+@pytest.mark.parametrize(
+    ("there", "message"),
+    [
+        ({"n_ions": 90}, "holds a run of 90 ions, more than the 60 asked for: overwrite=True replaces it"),
+        ({"n_ions": 60, "voltage": 900.0}, r"other settings \(voltage is 900\.0 there and 1000\.0 here\): overwrite"),
+        (
+            {"n_ions": 60, "ended": "interrupted"},
+            r"of 60 ions that is not complete \(interrupted\): resume=True goes on",
+        ),
+    ],
+)
+def test_a_run_that_would_not_come_out_again_is_not_replaced(tmp_path, there, message):
+    ended = there.pop("ended", "")
+    run_small(tmp_path / "run.h5", **there).ended_by(ended).save(tmp_path / "run.h5")
+    before = (tmp_path / "run.h5").read_bytes()
+    with pytest.raises(ae.FileError, match=message):
+        run_small(tmp_path / "run.h5", 60)
+    assert (tmp_path / "run.h5").read_bytes() == before
+    assert [item.name for item in tmp_path.iterdir()] == ["run.h5"]
+    small().run(60, responses=False, progress=False, checkpoint=ae.Checkpoint(tmp_path / "run.h5", overwrite=True))
+    assert len(run_small(tmp_path / "run.h5", 60)) == 60  # the same again, and a longer one, may take its place
+    assert len(run_small(tmp_path / "run.h5", 90)) == 90
+
+
+def test_a_refused_resume_leaves_nothing_behind(tmp_path):
+    run_small(tmp_path / "run.h5", 90)
+    with pytest.raises(ae.FileError, match="n_ions must be at least the 90 that are done already, got 60"):
+        run_small(tmp_path / "run.h5", 60, resume=True)
+    used = small()
+    used.run(5, responses=False, progress=False)
+    with pytest.raises(ValueError, match="resumed by a new Simulation"):
+        used.run(120, responses=False, progress=False, checkpoint=ae.Checkpoint(tmp_path / "run.h5", resume=True))
+    assert [item.name for item in tmp_path.iterdir()] == ["run.h5"]
+
+
+def test_a_complete_run_is_not_written_again_by_resume(tmp_path):
+    run_small(tmp_path / "run.h5", 90)
+    before = os.stat(tmp_path / "run.h5")
+    simulation = small()
+    checkpoint = ae.Checkpoint(tmp_path / "run.h5", resume=True)
+    assert checkpoint.ions_there() == 90
+    assert len(simulation.run(90, responses=False, progress=False, checkpoint=checkpoint)) == 90
+    after = os.stat(tmp_path / "run.h5")
+    assert (after.st_ino, after.st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
+    more = simulation.run(20, responses=False, progress=False)  # it goes on from there
+    assert more.emissions.ions[0] == 90
+
+
+@pytest.mark.parametrize(("at", "kept"), [((5, 6), 0), ((40, 50), 30)])
+def test_ctrl_c_waits_for_files(tmp_path, monkeypatch, at, kept):
+    """Pressed once more at every rename: nothing is left half way, and no folder without ions."""
+
+    def pressing(*names):
+        signal.raise_signal(signal.SIGINT)
+        replace(*names)
+
+    replace = os.replace
+    monkeypatch.setattr(os, "replace", pressing)
+    with pytest.raises(KeyboardInterrupt):
+        interrupted(tmp_path / "run.h5", at)
+    assert ae.Checkpoint(tmp_path / "run.h5").ions_there() == kept
+    assert [item.name for item in tmp_path.iterdir()] == (["run.h5.unfinished"] if kept else [])
+
+
+def test_the_progress_may_be_told_to_a_function():
+    told = []
+    small().run(50, responses=False, progress=lambda done, n_ions: told.append((done, n_ions)), batch_size=20)
+    assert told == [(20, 50), (40, 50), (50, 50)]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"path": "run.txt"}, r"ends in \.h5, got 'run\.txt'"),
+        ({"path": "run.h5", "minutes": -1}, "minutes must be a finite number"),
+        ({"path": "run.h5", "ions": 0}, "ions must be a whole number"),
+    ],
+)
+def test_settings_that_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        ae.Checkpoint(**options)
+
+
+# ---- damaged files -------------------------------------------------------------------------------------------------
+
+
+def damage(path, name, chunk=0):
+    """Turn the bits of a byte inside of a chunk."""
+    with h5py.File(path) as file:
+        info = file[name].id.get_chunk_info(chunk)
+    with open(path, "r+b") as file:
+        file.seek(info.byte_offset + info.size // 2)
+        byte = file.read(1)[0]
+        file.seek(-1, os.SEEK_CUR)
+        file.write(bytes([byte ^ 0xFF]))
+
+
+def test_a_damaged_chunk_costs_its_ions_only(tmp_path, monkeypatch):
+    monkeypatch.setattr(run_hdf5, "ROWS", 32)
+    run = run_small(tmp_path / "run.h5")
+    damage(tmp_path / "run.h5", "entry1/simulation/fields", 1)
+    with pytest.raises(ae.FileError, match=r"cannot read .*run\.h5' as a run: .*partial=True reads"):
+        ae.load(tmp_path / "run.h5")
+    with pytest.warns(UserWarning, match="run.h5' is damaged: 32 of 90 ions are lost"):
+        whole = ae.load(tmp_path / "run.h5", partial=True)
+    kept = np.r_[0:32, 64:90]
+    assert np.array_equal(whole.emissions.ions, kept)
+    assert np.array_equal(whole.fields, run.fields[kept])
+    assert np.array_equal(whole.hits(ae.Unperturbed()).x, run.hits(ae.Unperturbed()).x[kept], equal_nan=True)
+    assert whole.ended == "damaged: 32 ions are lost"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(ae.load(run_small_copy(tmp_path, run), partial=True)) == 90
+
+
+def run_small_copy(folder, run):
+    run.save(folder / "whole.h5")
+    return folder / "whole.h5"
+
+
+def test_a_damaged_part_costs_its_ions_only(unfinished):
+    folder = Path(f"{unfinished}.unfinished")
+    first = sorted(folder.glob("ions-*.h5"))[0]
+    n = len(ae.load(first))
+    first.write_bytes(first.read_bytes()[:2000])
+    with pytest.raises(ae.FileError, match=first.name):
+        interrupted(unfinished, (), resume=True)
+    if n == 60:
+        with (
+            pytest.warns(UserWarning, match="its ions are lost"),
+            pytest.raises(ae.FileError, match="holds no run"),
+        ):
+            ae.load(folder, partial=True)
+
+
+def test_a_damaged_state_is_made_again(unfinished):
+    path = Path(f"{unfinished}.unfinished") / "state.h5"
+    damage(path, "charges")
+    with pytest.warns(UserWarning, match=r"state\.h5.*all events are computed again"):
+        interrupted(unfinished, (), resume=True)
+    interrupted(unfinished.with_name("whole.h5"), ())
+    assert differing(unfinished, unfinished.with_name("whole.h5")) == []
+
+
+def test_other_versions_are_told(tmp_path):
+    run_small(tmp_path / "run.h5")
+    with h5py.File(tmp_path / "run.h5", "a") as file:
+        file.attrs["format"] = "apt_evap run 1"
+    with pytest.raises(ae.FileError, match=r"is a run in another format, 'apt_evap run 1'; this version reads"):
+        ae.load(tmp_path / "run.h5")
+
+
+if __name__ == "__main__":
+    print("ready", flush=True)
+    name, path, *numbers = sys.argv[1:]
+    {"work": work, "crash": crash}[name](Path(path), *map(int, numbers))
