@@ -40,6 +40,7 @@ from .energy_fit.fit_energies import fit_energies as fit_energies
 from .energy_fit.study import Study as Study
 from .evaporation.emitter import Emitter as Emitter
 from .evaporation.law import Extremal as Extremal
+from .evaporation.rule import Robin as Robin
 from .evaporation.settings import ChargeSettings as ChargeSettings
 from .flight.crew import FlightSettings as FlightSettings
 from .flight.response import Design as Design
@@ -53,6 +54,9 @@ from .registration.register import Registration as Registration
 from .registration.register import register as register
 from .registration.register import register_points as register_points
 from .simulation.checkpoint import Checkpoint as Checkpoint
+from .simulation.ending import Ending as Ending
+from .simulation.ending import RunInterrupted as RunInterrupted
+from .simulation.ending import RunNotSaved as RunNotSaved
 from .simulation.history import History as History
 from .simulation.monitor import WatchSettings as WatchSettings
 from .simulation.run import Run as Run

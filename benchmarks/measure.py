@@ -8,12 +8,12 @@ import json
 import platform
 import resource
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
 import apt_evap as ae
-from apt_evap._core.evaporation import SWEEP_DUE, TOO_SHALLOW
 from apt_evap._core.flights import Flights
 from apt_evap._core.interactions import InteractionLists, direct_field
 from apt_evap._core.journal import Journal
@@ -112,7 +112,7 @@ def solutions(radii=(20, 40, 80), shank=2.0, n_threads=2):
             for tolerance in (1e-3, 1e-6, 1e-10):
                 core.tree.charges = np.ones(core.tree.n_slots)
                 start = time.perf_counter()
-                sweeps, residual = Robin(window=window).solve(
+                sweeps, residual = Robin(window=window).iterate(
                     core.tree,
                     core.slot_normals,
                     lists,
@@ -138,21 +138,20 @@ def solutions(radii=(20, 40, 80), shank=2.0, n_threads=2):
 
 
 def evaporate(emitter, events):
-    """Let atoms leave without flights; return the seconds of events and of relaxations."""
-    seconds = [0.0, 0.0]
-    done = 0
-    while done < events:
+    """Evaporate atoms without flights; return the seconds of events and of relaxations."""
+    relaxations = 0.0
+
+    @contextmanager
+    def timed():
+        nonlocal relaxations
         start = time.perf_counter()
-        batch = emitter.evaporate(min(256, events - done))
-        seconds[0] += time.perf_counter() - start
-        done += len(batch)
-        start = time.perf_counter()
-        if batch.status == SWEEP_DUE:
-            emitter.relax()
-        elif batch.status == TOO_SHALLOW:
-            emitter.deepen()
-        seconds[1] += time.perf_counter() - start
-    return seconds
+        yield
+        relaxations += time.perf_counter() - start
+
+    start = time.perf_counter()
+    for _ in emitter.advance(events, pause=timed):
+        pass
+    return time.perf_counter() - start - relaxations, relaxations
 
 
 def rates(radii=(20, 40, 80, 120), shank=2.0, ions=5000, threads=(1, 2), depth=8.0):
@@ -195,7 +194,7 @@ def charge_errors(radius=40, shank=1.0, events=5000, n_threads=2):
     interval = emitter.sweep_interval
     for count in (events, interval - 1 - events % interval):
         evaporate(emitter, count)
-        atoms, charges, since = emitter.atoms, emitter.charges.copy(), emitter._core.since_sweep
+        atoms, charges, since = emitter.atoms, emitter.charges.copy(), emitter._core.since_relaxation
         emitter.relax(1e-10)
         solved = np.zeros(len(emitter.tip))
         solved[emitter.atoms] = emitter.charges
@@ -257,7 +256,7 @@ def flier_over(tree, tip, settings):
         reach=settings.reach * tip.nearest_neighbour_distance,
         opening_angle=settings.opening_angle,
         tolerance=settings.tolerance,
-        most_steps=settings.most_steps,
+        max_steps=settings.max_steps,
     )
 
 
@@ -280,7 +279,7 @@ def place_errors(radius=40, shank=1.0, events=5000, ions=200, n_threads=2):
         emitter = simulation.emitter
         tree = Octree(np.ascontiguousarray(emitter.positions), emitter.charges.copy())
         normals = np.ascontiguousarray(emitter.normals[tree.atoms])
-        Robin().solve(
+        Robin().iterate(
             tree,
             normals,
             InteractionLists(tree, 0.3, n_threads),
@@ -331,7 +330,7 @@ def response_errors(radii=(20, 80), shank=2.0, events=5000, ions=200, n_threads=
                     "median [mm]": float(np.median(errors)),
                     "95 % [mm]": float(np.quantile(errors, 0.95)),
                     "largest [mm]": float(errors.max()),
-                    "ions marked [%]": 100 * float(run.marked.mean()),
+                    "ions marked [%]": 100 * float(run.flagged.mean()),
                 }
             )
     return {"title": f"responses against flights, energies to 1.5 eV, {ions} ions", "rows": rows}

@@ -36,11 +36,9 @@ class ChosenFirst:
 
     atoms: np.ndarray
 
-    def weights(self, tip):
-        """Weights of the usual law, a million times as large for the chosen atoms."""
-        weights = ae.Extremal().weights(tip)
-        weights[self.atoms] *= 1e6
-        return weights
+    def keys(self, tip, atoms, fields, bonds):
+        """Keys of the usual law, a million times as large for the chosen atoms."""
+        return ae.Extremal().keys(tip, atoms, fields, bonds) * np.where(np.isin(atoms, self.atoms), 1e6, 1.0)
 
 
 def choose(emitter):
@@ -107,7 +105,7 @@ for (apex_view, detector), (element, axis, mechanism) in zip(
         # how well the polynomials follow the flights: those of an atom amid its neighbours bend beyond them
         "residual [mm]": run.responses.residuals[ions].max(axis=1).tolist(),
     }
-    results[name] = {"settings": run.settings, "color": colors, "marked": int(run.marked.sum()), **table}
+    results[name] = {"settings": run.settings, "color": colors, "marked": int(run.flagged.sum()), **table}
     print(f"{name}: how far ions move on the detector, in the farthest direction, by the roll alone and from there")
     print("  ".join(f"{title:>12}" for title in table))
     for row in zip(*table.values(), strict=True):

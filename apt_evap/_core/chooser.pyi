@@ -3,5 +3,8 @@ from numpy.typing import NDArray
 
 from apt_evap._core.octree import Octree
 
-class Tournament:
-    def __init__(self, tree: Octree, rank: NDArray[np.float64]) -> None: ...
+class Chooser:
+    def chosen(self, u: float = 0.5) -> int: ...
+
+class Largest(Chooser):
+    def __init__(self, tree: Octree, key: NDArray[np.float64]) -> None: ...

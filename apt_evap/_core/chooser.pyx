@@ -1,47 +1,71 @@
-"""A tournament over the slots of a tree: who leaves next."""
+"""Choosers: which slot of the tree evaporates next, from the keys that a law gives to the slots."""
 
 import numpy as np
 
 from apt_evap._core.octree cimport Octree
 
 
-cdef class Tournament:
-    """Knows the slot of the highest rank; equal ranks go by the number of the atom.
+cdef class Chooser:
+    """Interface of a chooser over the keys of the slots of a tree."""
+
+    cdef void update(self, const int* slots, long n) noexcept nogil:
+        # The keys of these slots have changed.
+        pass
+
+    cdef int choose(self, double u) noexcept nogil:
+        # The slot that evaporates next, by a random number u in (0, 1) where chance decides; -1: none may leave.
+        return -1
+
+    cdef double total(self) noexcept nogil:
+        # Sum of the keys where they are rates [1/s]; else 0.
+        return 0.0
+
+    def chosen(self, double u=0.5):
+        """The slot that evaporates next (int); -1 if none may leave."""
+        return self.choose(u)
+
+
+cdef class Largest(Chooser):
+    """Chooses the slot of the largest key, by a tournament; equal keys go by the number of the atom.
 
     Parameters
     ----------
     tree : Octree
         Whose slots take part.
-    rank : ndarray, shape (capacity,)
-        Rank of each slot; below 0 where no atom is yet.
+    key : ndarray, shape (capacity,)
+        Key of each slot; not above 0 where no atom may leave.
     """
 
-    def __init__(self, Octree tree, double[::1] rank):
+    def __init__(self, Octree tree, double[::1] key):
         cdef long node
-        self.rank, self.atom = rank, tree.atom
+        self.key, self.atom = key, tree.atom
         self.leaves = 1
-        while self.leaves < rank.shape[0]:
+        while self.leaves < key.shape[0]:
             self.leaves *= 2
         self.winner = np.full(2 * self.leaves, -1, np.int32)
-        self.rising = np.empty(rank.shape[0], np.int32)
+        self.rising = np.empty(key.shape[0], np.int32)
         np.asarray(self.winner)[self.leaves:self.leaves + tree.n_slots] = np.arange(tree.n_slots)
         with nogil:
             for node in range(self.leaves - 1, 0, -1):
                 self.play(node)
 
+    cdef int choose(self, double u) noexcept nogil:
+        cdef int best = self.winner[1]
+        return best if best >= 0 and self.key[best] > 0.0 else -1
+
     cdef bint better(self, int a, int b) noexcept nogil:
         if a < 0 or b < 0:
             return b < 0 <= a
-        if self.rank[a] != self.rank[b]:
-            return self.rank[a] > self.rank[b]
+        if self.key[a] != self.key[b]:
+            return self.key[a] > self.key[b]
         return self.atom[a] < self.atom[b]
 
     cdef void play(self, long node) noexcept nogil:
         cdef int a = self.winner[2 * node], b = self.winner[2 * node + 1]
         self.winner[node] = b if self.better(b, a) else a
 
-    cdef void settle(self, const int* slots, long n) noexcept nogil:
-        # Carry changed ranks up, level by level: slots that are neighbours soon share their matches.
+    cdef void update(self, const int* slots, long n) noexcept nogil:
+        # Carry changed keys up, level by level: slots that are neighbours soon share their matches.
         cdef long i, left
         cdef int node
         for i in range(n):

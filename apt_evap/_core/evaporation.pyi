@@ -1,10 +1,13 @@
+from typing import Any
+
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from apt_evap._core.journal import Journal
+from apt_evap._core.law import LawKernel
 from apt_evap._core.neighbourhood import Neighbourhood
 from apt_evap._core.octree import Octree
-from apt_evap._core.robin import ChargingRule
+from apt_evap._core.rule import ChargingRule
 
 DONE: int
 SWEEP_DUE: int
@@ -18,7 +21,7 @@ class Start:
         charges: NDArray[np.float64],
         lonely: NDArray[np.int64],
         lonely_normals: NDArray[np.float64],
-        potential_point: NDArray[np.float64],
+        rule_state: dict[str, Any],
     ) -> None: ...
     @property
     def n_removed(self) -> int: ...
@@ -29,17 +32,16 @@ class Start:
     @property
     def lonely_normals(self) -> NDArray[np.float64]: ...
     @property
-    def potential_point(self) -> NDArray[np.float64]: ...
+    def rule_state(self) -> dict[str, Any]: ...
 
 class Evaporation:
     def __init__(
         self,
         atoms: Neighbourhood,
         rule: ChargingRule,
-        weights: NDArray[np.float64],
+        law: LawKernel,
         potential: float,
-        potential_point: ArrayLike,
-        bond_length: float,
+        coulomb: float,
         patch_radius: float,
         update_radius: float,
         opening_angle: float,
@@ -51,7 +53,13 @@ class Evaporation:
     @property
     def rule(self) -> ChargingRule: ...
     @property
+    def law(self) -> LawKernel: ...
+    @property
     def potential(self) -> float: ...
+    @property
+    def coulomb(self) -> float: ...
+    @property
+    def field_unit(self) -> float: ...
     @property
     def patch_radius(self) -> float: ...
     @property
@@ -63,19 +71,17 @@ class Evaporation:
     @property
     def n_removed(self) -> int: ...
     @property
-    def since_sweep(self) -> int: ...
+    def since_relaxation(self) -> int: ...
     n_clipped: int
     n_unsettled: int
     @property
-    def potential_point(self) -> NDArray[np.float64]: ...
-    @property
     def start(self) -> Start: ...
-    def take_over(self, atoms: Neighbourhood, weights: NDArray[np.float64]) -> None: ...
+    def take_over(self, atoms: Neighbourhood, law: LawKernel) -> None: ...
     def relax(
         self,
         *,
         tolerance: float = 1e-4,
-        most_sweeps: int = 200,
+        max_sweeps: int = 200,
         double_precision: bool = False,
         extra: int = 0,
         opening_angle: float = 0.0,
@@ -83,19 +89,22 @@ class Evaporation:
         start: Start | None = None,
     ) -> tuple[int, float]: ...
     def start_here(self, surface: NDArray[np.int64], n_threads: int = 1) -> Start: ...
-    def keep_inside(self, tree: Octree) -> NDArray[np.float64]: ...
-    def distances(self, tree: Octree) -> NDArray[np.float64]: ...
     def evaporate(
         self,
         journal: Journal,
-        most: int,
+        max_events: int,
         sweep_interval: int,
         atom: NDArray[np.int64],
         charge: NDArray[np.float64],
+        field: NDArray[np.float64],
         normal: NDArray[np.float64],
         neighbour: NDArray[np.int64],
     ) -> int: ...
     @property
+    def next_slot(self) -> int: ...
+    @property
     def slots(self) -> NDArray[np.int64]: ...
     @property
     def slot_normals(self) -> NDArray[np.float64]: ...
+    @property
+    def slot_fields(self) -> NDArray[np.float64]: ...

@@ -1,35 +1,29 @@
-"""Events: which atom leaves, and what its leaving does to the charges around the hole.
+"""The sequence of events: which atom leaves, and what its leaving does to the charges around the hole.
 
-An event takes the atom with the largest field over evaporation field, exposes what lay under it, and solves the charges
-of a patch around the hole while all others are held: the change falls off as the cube of the distance. What is left
-over is smooth, and `relax` (a sweep over the whole surface every so many events) carries it. The cost of an event does
-not depend on the size of the specimen.
+An event takes the atom that the chooser names by the keys of the law, exposes what lay under it, and lets the charging
+rule solve a patch around the hole while all other charges are held: the change falls off as the cube of the distance.
+What is left over is smooth, and `relax` (a solution for the whole surface every so many events) carries it. The cost of
+an event does not depend on the size of the specimen.
 """
 
 from cython.parallel cimport prange
-from libc.math cimport sqrt
 
 import numpy as np
 
-from apt_evap._core.journal cimport Journal
-from apt_evap._core.octree cimport Octree
-from apt_evap._core.robin cimport Patch
-from apt_evap._core.sources cimport Sources, sources_field, sources_free, sources_init
-from apt_evap._core.neighbourhood cimport MOST_NEAR
 from apt_evap._core.interactions cimport InteractionLists
-from apt_evap._core.chooser cimport Tournament
+from apt_evap._core.journal cimport Journal
+from apt_evap._core.neighbourhood cimport MAX_NEAR
+from apt_evap._core.octree cimport Octree
 
 
 cdef extern from "kernels.h":
     const int GROUP, PATCH_LANES
-    void patch_field(long, const float*, const float*, const float*, long, const float*, const float*, const float*,
-                     const float*, float*, float*, float*) noexcept nogil
 
 
 cdef enum:
-    NOT_SETTLED = 1 << 30   # events since the last relaxation, while there is none
+    NOT_RELAXED = 1 << 30   # events since the last relaxation, while there is none
     FEW = 16384             # surface atoms up to which one thread builds: others cost more than they save
-    MOST_PATCH = 4096       # slots at first within the update radius; 18 d_nn of fcc hold some 1,000
+    ROOM = 4096             # slots at first within the update radius; 18 d_nn of fcc hold about 1,000
     STATUS_DONE = 0
     STATUS_SWEEP_DUE = 1
     STATUS_EXHAUSTED = 2
@@ -42,14 +36,14 @@ cdef class Start:
     """What a relaxation starts from; with the atoms that are left it makes the same charges again, bit by bit.
 
     Events so far, charges of the surface atoms in the order of their numbers (n,) [e], atoms that keep the normal they
-    had since no neighbour pulls (m,), these normals (m, 3), and the point that has the potential (1, 3) [nm].
+    had since no neighbour pulls (m,), these normals (m, 3), and the state of the charging rule (dict of arrays).
     """
 
     cdef readonly long n_removed
-    cdef readonly object charges, lonely, lonely_normals, potential_point
+    cdef readonly object charges, lonely, lonely_normals, rule_state
 
-    def __init__(self, long n_removed, charges, lonely, lonely_normals, potential_point):
-        self.n_removed, self.charges, self.potential_point = n_removed, charges, potential_point
+    def __init__(self, long n_removed, charges, lonely, lonely_normals, rule_state):
+        self.n_removed, self.charges, self.rule_state = n_removed, charges, rule_state
         self.lonely, self.lonely_normals = lonely, lonely_normals
 
 
@@ -61,67 +55,66 @@ cdef class Evaporation:
     atoms : Neighbourhood
         The atoms and their surface.
     rule : ChargingRule
-        How charge settles.
-    weights : ndarray, shape (n,)
-        One over the evaporation field of each atom [nm/V]; 0 for atoms that may not leave.
+        How charge distributes over the surface.
+    law : LawKernel
+        Which atom leaves next.
     potential : float
-        Potential of the specimen, over the Coulomb constant [e/nm].
-    potential_point : ndarray, shape (3,)
-        Point inside the specimen that has this potential [nm]; it moves down the axis as the surface comes close.
-    bond_length : float
-        Atoms closer than this are nearest neighbours [nm].
+        Potential of the specimen over the Coulomb constant [e/nm].
+    coulomb : float
+        Coulomb constant [V nm/e].
     patch_radius, update_radius : float
         Within the first the charges are solved after an event, within the second the fields are kept up to date [nm].
     opening_angle : float
-        Of sweeps and of fields on newly exposed atoms [rad].
+        Of relaxations and of fields on newly exposed atoms [rad].
     """
 
-    def __init__(self, Neighbourhood atoms, ChargingRule rule, const double[::1] weights, double potential,
-                 potential_point, double bond_length, double patch_radius, double update_radius,
-                 double opening_angle):
-        self.atoms, self.rule = atoms, rule
-        self.weight = np.array(weights)
-        self.potential, self.bond_length = potential, bond_length
+    def __init__(self, Neighbourhood atoms, ChargingRule rule, LawKernel law, double potential, double coulomb,
+                 double patch_radius, double update_radius, double opening_angle):
+        self.atoms, self.rule, self.law = atoms, rule, law
+        self.potential, self.coulomb, self.bond_length = potential, coulomb, atoms.bond_length
         self.patch_radius, self.update_radius, self.opening_angle = patch_radius, update_radius, opening_angle
-        self.potential_point = np.array(potential_point, dtype=np.float64).reshape(1, 3)
         self.n_removed = self.n_clipped = self.n_unsettled = 0
-        self.since_sweep = NOT_SETTLED
-        self.clearance = 0.0
+        self.since_relaxation = NOT_RELAXED
         self.has_support = bool(np.asarray(atoms.support).any())
         self.slot_of = np.full(atoms.n_atoms, -1, np.int32)
-        self.make_room(MOST_PATCH)
+        self.make_room(ROOM)
 
-    cdef void make_room(self, long most):
+    cdef void make_room(self, long room):
         # Buffers for so many slots around a hole, and the atoms that come to the surface.
-        self.near = np.empty(most + MOST_NEAR, np.int32)
-        self.near_float = np.empty((6, most + MOST_NEAR + GROUP), np.float32)
-        self.patch_slot = np.empty(most + MOST_NEAR, np.int32)
-        self.patch_charge = np.empty(most + MOST_NEAR)
-        self.patch_float = np.empty((4, most + MOST_NEAR), np.float32)
+        self.hole_slot = np.empty(room + MAX_NEAR, np.int32)
+        self.hole_float = np.empty((3, room + MAX_NEAR + GROUP), np.float32)
+        self.hole.slot = &self.hole_slot[0]
+        self.hole.near_x, self.hole.near_y = &self.hole_float[0, 0], &self.hole_float[1, 0]
+        self.hole.near_z = &self.hole_float[2, 0]
+        self.patch_slot = np.empty(room + MAX_NEAR, np.int32)
+        self.patch_charge = np.empty(room + MAX_NEAR)
+        self.patch_float = np.empty((4, room + MAX_NEAR), np.float32)
         self.patch.slot, self.patch.charge = &self.patch_slot[0], &self.patch_charge[0]
         self.patch.x, self.patch.y = &self.patch_float[0, 0], &self.patch_float[1, 0]
         self.patch.z, self.patch.change = &self.patch_float[2, 0], &self.patch_float[3, 0]
+        self.strength, self.key = np.empty(room + MAX_NEAR), np.empty(room + MAX_NEAR)
+        self.key_atom, self.key_bonds = np.empty(room + MAX_NEAR, np.int64), np.empty(room + MAX_NEAR, np.int32)
 
-    def take_over(self, Neighbourhood atoms, const double[::1] weights):
-        """Go on with more atoms: the first of them are those held so far. Call `relax` next."""
+    def take_over(self, Neighbourhood atoms, LawKernel law):
+        """Continue with more atoms: the first of them are those held so far. Call `relax` next."""
         cdef int[::1] slot_of = np.full(atoms.n_atoms, -1, np.int32)
         np.asarray(slot_of)[:self.atoms.n_atoms] = self.slot_of
-        self.since_sweep = NOT_SETTLED
+        self.since_relaxation = NOT_RELAXED
         self.has_support = bool(np.asarray(atoms.support).any())
-        self.atoms, self.weight, self.slot_of = atoms, np.array(weights), slot_of
+        self.atoms, self.law, self.slot_of = atoms, law, slot_of
 
-    def relax(self, *, double tolerance=1e-4, int most_sweeps=200, bint double_precision=False, long extra=0,
+    def relax(self, *, double tolerance=1e-4, int max_sweeps=200, bint double_precision=False, long extra=0,
               double opening_angle=0.0, int n_threads=1, start=None):
-        """Build the tree anew and iterate over the whole surface; bring the potential to the voltage.
+        """Rebuild the tree and solve the charges of the whole surface at its potential.
 
         Parameters
         ----------
         tolerance : float
             Largest change of a charge in a sweep, relative to the mean charge, at which to stop.
-        most_sweeps : int
+        max_sweeps : int
             Sweeps after which to stop in any case.
         double_precision : bool
-            Sweeps in float64; needed for tolerances below 1e-6.
+            Sums in float64; needed for tolerances below 1e-6.
         extra : int
             Room for atoms that come to the surface before the next relaxation; by default an eighth of the surface.
         opening_angle : float
@@ -140,20 +133,20 @@ cdef class Evaporation:
         """
         cdef long n, slot
         cdef int builders
-        cdef int[::1] slot_of = np.full(self.atoms.n_atoms, -1, np.int32)
-        cdef double[::1] rank
+        cdef int[::1] slot_of = np.full(self.atoms.n_atoms, -1, np.int32), bonds
+        cdef double[::1] key, strength
         surface = self.atoms.surface
         if len(surface) == 0:
             raise ValueError("the specimen has no surface atoms")
         builders = n_threads if len(surface) > FEW else 1
-        self.since_sweep = NOT_SETTLED   # an interruption below leaves a surface that no atom may leave
+        self.since_relaxation = NOT_RELAXED   # an interruption below leaves a surface that no atom may leave
         if start is None:
             start = self.start_here(surface, builders)
         elif len(start.charges) != len(surface):
             raise ValueError(f"start must have the charges of {len(surface)} surface atoms, got {len(start.charges)}")
-        self.start, self.n_removed, self.potential_point = start, start.n_removed, start.potential_point
+        self.start, self.n_removed, self.rule.state = start, start.n_removed, start.rule_state
         tree = Octree(self.atoms.positions_of(surface, builders), start.charges, surface,
-                      extra=extra or len(surface) // 8 + MOST_NEAR, n_threads=builders)
+                      extra=extra or len(surface) // 8 + MAX_NEAR, n_threads=builders)
         surface = tree.atoms   # in the order of the slots from here on
         n, capacity = tree.n_slots, tree.capacity
         normals = np.zeros((capacity, 3))
@@ -162,14 +155,18 @@ cdef class Evaporation:
             slot_of[tree.atom[slot]] = <int>slot
         normals[np.asarray(slot_of)[start.lonely]] = start.lonely_normals
         lists = InteractionLists(tree, opening_angle or self.opening_angle, n_threads)
-        outcome = self.rule.solve(tree, normals, lists, tolerance=tolerance, most_sweeps=most_sweeps,
-                                  double_precision=double_precision, n_threads=n_threads)
-        self.rule.scale(tree, self.potential / (tree.charges / self.keep_inside(tree)).sum())
-        rank = np.full(capacity, -1.0)
+        outcome = self.rule.solve(tree, normals, lists, potential=self.potential, tolerance=tolerance,
+                                  max_sweeps=max_sweeps, double_precision=double_precision, n_threads=n_threads)
+        self.field_unit = self.rule.field_unit(self.coulomb)
+        self.law.begin(self.field_unit)
+        bonds, strength = np.empty(n, np.int32), self.rule.strengths(tree)
         for slot in prange(n, nogil=True, schedule="static", num_threads=builders):
-            rank[slot] = tree.q[slot] * self.weight[tree.atom[slot]]
-        self.tree, self.normals, self.slot_of, self.tournament = tree, normals, slot_of, Tournament(tree, rank)
-        self.since_sweep = 0
+            bonds[slot] = self.atoms.bonds[tree.atom[slot]]
+        key = np.full(capacity, -1.0)
+        self.law.keys(n, &strength[0], &tree.atom[0], &bonds[0], &key[0])
+        self.tree, self.normals, self.slot_of = tree, normals, slot_of
+        self.chooser = self.law.chooser(tree, key)
+        self.since_relaxation = 0
         return outcome
 
     def start_here(self, const long long[::1] surface, int n_threads=1):
@@ -185,30 +182,13 @@ cdef class Evaporation:
                 alone[i] = slot >= 0 and self.atoms.count[surface[i]] == 0
             lonely = np.asarray(surface)[np.asarray(alone).view(bool)]
             normals = np.asarray(self.normals)[np.asarray(self.slot_of)[lonely]]
-        return Start(self.n_removed, np.asarray(charges), lonely, normals, self.potential_point)
-
-    def keep_inside(self, Octree tree):
-        """Distances of the surface from the point of the potential; it goes down as evaporation comes close to it."""
-        away = self.distances(tree)
-        if self.clearance == 0.0:
-            self.clearance = away.min()
-        for _ in range(100):
-            if away.min() >= 0.5 * self.clearance:
-                break
-            self.potential_point = self.potential_point - (0.0, 0.0, 0.25 * self.clearance)
-            away = self.distances(tree)
-        return np.maximum(away, 1e-3 * self.clearance)
-
-    def distances(self, Octree tree):
-        """Distances of the surface from the point of the potential [nm]."""
-        columns = np.asarray(tree.x), np.asarray(tree.y), np.asarray(tree.z)
-        return np.sqrt(sum((column[:tree.n_slots] - at) ** 2 for column, at in zip(columns, self.potential_point[0])))
+        return Start(self.n_removed, np.asarray(charges), lonely, normals, self.rule.state)
 
     # ---- one event -------------------------------------------------------------------------------------------------
 
     cdef long strongest_neighbour(self, long atom) noexcept nogil:
         # The surface nearest neighbour with the highest charge; -1: there is none.
-        cdef int[MOST_NEAR] others
+        cdef int[MAX_NEAR] others
         cdef int n = self.atoms.near(atom, others), i
         cdef long best = -1, other
         cdef double dx, dy, dz
@@ -232,130 +212,130 @@ cdef class Evaporation:
         self.atoms.normal(self.tree.atom[slot], &self.normals[slot, 0])
         self.patch.n = n + 1
 
+    cdef int judge(self, const int* slots, long n) except -1 nogil:
+        # New keys of some slots whose fields or bonds have changed.
+        cdef long i
+        if n == 0:
+            return 0
+        for i in range(n):
+            self.strength[i] = self.rule.strength(self.tree, slots[i])
+            self.key_atom[i] = self.tree.atom[slots[i]]
+            self.key_bonds[i] = self.atoms.bonds[self.key_atom[i]]
+        self.law.keys(n, &self.strength[0], &self.key_atom[0], &self.key_bonds[0], &self.key[0])
+        for i in range(n):
+            self.chooser.key[slots[i]] = self.key[i]
+        self.chooser.update(slots, n)
+        return 0
+
     cdef int event(self, long atom, Journal journal) except -1 nogil:
-        cdef Sources sources
-        cdef int[MOST_NEAR] fresh
-        cdef int gone = self.slot_of[atom], n_fresh, slot, best
-        cdef double px = self.atoms.positions[atom, 0], py = self.atoms.positions[atom, 1]
-        cdef double pz = self.atoms.positions[atom, 2], charge = self.tree.q[gone], s, nearest
-        cdef double dx, dy, dz, over
+        cdef int[MAX_NEAR] fresh
+        cdef int gone = self.slot_of[atom], n_fresh, slot
+        cdef double dx, dy, dz, s
+        cdef Hole* hole = &self.hole
         cdef Patch* patch = &self.patch
-        cdef float *near_x, *near_y, *near_z, *field_x, *field_y, *field_z
-        cdef long n_near, most, i, k, at
+        cdef long room, i, at
+        hole.x, hole.y, hole.z = self.atoms.positions[atom, 0], self.atoms.positions[atom, 1], self.atoms.positions[atom, 2]
+        hole.charge = self.tree.q[gone]
         self.n_removed += 1
-        self.since_sweep += 1
+        self.since_relaxation += 1
         self.tree.take_out(gone)
         self.tree.refresh()
         self.slot_of[atom] = -1
-        self.tournament.rank[gone] = -1.0
-        self.tournament.settle(&gone, 1)
+        self.chooser.key[gone] = -1.0
+        self.chooser.update(&gone, 1)
         n_fresh = self.atoms.remove(atom, fresh)
 
         # the slots around the hole, without the charge that left
-        most = self.near.shape[0] - MOST_NEAR - PATCH_LANES
-        n_near = self.tree.within(px, py, pz, self.update_radius, &self.near[0], most)
-        if n_near > most:
+        room = self.hole_slot.shape[0] - MAX_NEAR - PATCH_LANES
+        hole.n = self.tree.within(hole.x, hole.y, hole.z, self.update_radius, hole.slot, room)
+        if hole.n > room:
             with gil:
-                self.make_room(2 * n_near + PATCH_LANES)
-            n_near = self.tree.within(px, py, pz, self.update_radius, &self.near[0], n_near)
-        near_x, near_y, near_z = &self.near_float[0, 0], &self.near_float[1, 0], &self.near_float[2, 0]
-        field_x, field_y, field_z = &self.near_float[3, 0], &self.near_float[4, 0], &self.near_float[5, 0]
-        patch.n = 0
-        for i in range(n_near):
-            slot = self.near[i]
-            dx, dy, dz = self.tree.x[slot] - px, self.tree.y[slot] - py, self.tree.z[slot] - pz
+                self.make_room(2 * hole.n + PATCH_LANES)
+            hole.n = self.tree.within(hole.x, hole.y, hole.z, self.update_radius, hole.slot, hole.n)
+        patch.n = patch.n_clipped = 0
+        patch.unsettled = False
+        for i in range(hole.n):
+            slot = hole.slot[i]
+            dx, dy, dz = self.tree.x[slot] - hole.x, self.tree.y[slot] - hole.y, self.tree.z[slot] - hole.z
+            hole.near_x[i], hole.near_y[i], hole.near_z[i] = <float>dx, <float>dy, <float>dz
             s = dx * dx + dy * dy + dz * dz
-            over = charge / (s * sqrt(s)) if s > 1e-12 else 0.0
-            self.rule.field[slot, 0] -= over * dx
-            self.rule.field[slot, 1] -= over * dy
-            self.rule.field[slot, 2] -= over * dz
-            near_x[i], near_y[i], near_z[i] = <float>dx, <float>dy, <float>dz
             if s <= self.patch_radius * self.patch_radius:
                 self.join(slot, dx, dy, dz)
+        self.rule.removed(self.tree, hole)
+        self.expose(fresh, n_fresh, gone, journal)
 
-        # the atoms that came to the surface join the leaf of the slot nearest to them, without charge at first
-        journal.room(patch.n + n_fresh + 1, n_fresh)
+        # new charges of the patch, and what they change in the fields around it
+        patch.stride = (patch.n + PATCH_LANES - 1) // PATCH_LANES * PATCH_LANES
+        for i in range(patch.n, patch.stride):
+            patch.x[i] = patch.y[i] = patch.z[i] = 1e6
+            patch.change[i] = 0.0
+        for i in range(hole.n, (hole.n + GROUP - 1) // GROUP * GROUP):
+            hole.near_x[i] = hole.near_y[i] = hole.near_z[i] = 1e6
+        if patch.n:
+            self.rule.solve_patch(self.tree, self.normals, hole, patch)
+        self.n_clipped += patch.n_clipped
+        self.n_unsettled += patch.unsettled
+        at = journal.start[journal.n_events]
+        journal.slot[at] = gone
+        journal.charge[at] = 0.0
+        journal.start[journal.n_events + 1] = at + 1 + patch.n
+        for i in range(patch.n):
+            journal.slot[at + 1 + i] = patch.slot[i]
+            journal.charge[at + 1 + i] = patch.charge[i]
+            self.tree.set_charge(patch.slot[i], patch.charge[i])
+        self.tree.refresh()
+        self.judge(patch.slot, patch.n)
+        journal.n_events += 1
+        return 0
+
+    cdef int expose(self, const int* fresh, int n_fresh, int gone, Journal journal) except -1 nogil:
+        # The atoms that came to the surface join the leaf of the slot nearest to them, without charge at first.
+        cdef double px, py, pz, s, nearest
+        cdef Hole* hole = &self.hole
+        cdef int slot, best
+        cdef long i, k, at
+        journal.room(self.patch.n + n_fresh + 1, n_fresh)
         journal.fresh_start[journal.n_events + 1] = journal.fresh_start[journal.n_events] + n_fresh
-        if n_fresh:
-            sources_init(&sources)
         for k in range(n_fresh):
-            dx, dy = self.atoms.positions[fresh[k], 0], self.atoms.positions[fresh[k], 1]
-            dz = self.atoms.positions[fresh[k], 2]
+            px, py = self.atoms.positions[fresh[k], 0], self.atoms.positions[fresh[k], 1]
+            pz = self.atoms.positions[fresh[k], 2]
             nearest = 1e30
             best = gone
-            for i in range(patch.n):
-                slot = patch.slot[i]
-                s = (self.tree.x[slot] - dx) ** 2 + (self.tree.y[slot] - dy) ** 2 + (self.tree.z[slot] - dz) ** 2
+            for i in range(self.patch.n):
+                slot = self.patch.slot[i]
+                s = (self.tree.x[slot] - px) ** 2 + (self.tree.y[slot] - py) ** 2 + (self.tree.z[slot] - pz) ** 2
                 if s < nearest:
                     nearest = s
                     best = slot
             at = journal.fresh_start[journal.n_events] + k
             journal.fresh_atom[at] = fresh[k]
             journal.fresh_leaf[at] = self.tree.leaf[best]
-            slot = <int>self.tree.put_in(fresh[k], dx, dy, dz, self.tree.leaf[best])
+            slot = <int>self.tree.put_in(fresh[k], px, py, pz, self.tree.leaf[best])
             self.slot_of[fresh[k]] = slot
-            self.tree.collect(dx, dy, dz, 0.0, self.opening_angle, &sources)
-            sources_field(&sources, dx, dy, dz, &self.rule.field[slot, 0])
-            self.near[n_near] = slot
-            near_x[n_near], near_y[n_near], near_z[n_near] = <float>(dx - px), <float>(dy - py), <float>(dz - pz)
-            n_near += 1
-            self.join(slot, dx - px, dy - py, dz - pz)
-        if n_fresh:
-            sources_free(&sources)
-
-        # new charges of the patch, and what they change in the fields around it
-        at = journal.start[journal.n_events]
-        journal.slot[at] = gone
-        journal.charge[at] = 0.0
-        journal.start[journal.n_events + 1] = at + 1 + patch.n
-        patch.stride = (patch.n + PATCH_LANES - 1) // PATCH_LANES * PATCH_LANES
-        for i in range(patch.n, patch.stride):
-            patch.x[i] = patch.y[i] = patch.z[i] = 1e6
-            patch.change[i] = 0.0
-        if patch.n and self.rule.solve_patch(self.tree, self.normals, patch) > 0:
-            self.n_unsettled += 1
-        for i in range(patch.n):
-            slot = patch.slot[i]
-            if patch.charge[i] < 0.0:   # a cell's moments stand on its centre of charge: none may be negative
-                patch.change[i] = <float>-self.tree.q[slot]
-                patch.charge[i] = 0.0
-                self.n_clipped += 1
-            journal.slot[at + 1 + i] = slot
-            journal.charge[at + 1 + i] = patch.charge[i]
-            self.tree.set_charge(slot, patch.charge[i])
-            self.tournament.rank[slot] = patch.charge[i] * self.weight[self.tree.atom[slot]]
-        self.tournament.settle(patch.slot, patch.n)
-        most = (n_near + GROUP - 1) // GROUP * GROUP
-        for i in range(most):
-            field_x[i] = field_y[i] = field_z[i] = 0.0
-            if i >= n_near:
-                near_x[i] = near_y[i] = near_z[i] = 1e6
-        patch_field(most, near_x, near_y, near_z, patch.stride, patch.x, patch.y, patch.z, patch.change, field_x, field_y,
-                    field_z)
-        for i in range(n_near):
-            slot = self.near[i]
-            self.rule.field[slot, 0] += field_x[i]
-            self.rule.field[slot, 1] += field_y[i]
-            self.rule.field[slot, 2] += field_z[i]
-        self.tree.refresh()
-        journal.n_events += 1
+            self.rule.exposed(self.tree, slot, self.opening_angle)
+            i = hole.n
+            hole.slot[i] = slot
+            hole.near_x[i], hole.near_y[i] = <float>(px - hole.x), <float>(py - hole.y)
+            hole.near_z[i] = <float>(pz - hole.z)
+            hole.n = i + 1
+            self.join(slot, px - hole.x, py - hole.y, pz - hole.z)
         return 0
 
-    def evaporate(self, Journal journal, long most, long sweep_interval, long long[::1] atom, double[::1] charge,
-                  double[:, ::1] normal, long long[::1] neighbour):
-        """Let atoms leave until `most` are in the journal, or something has to be done first.
+    def evaporate(self, Journal journal, long max_events, long sweep_interval, long long[::1] atom,
+                  double[::1] charge, double[::1] field, double[:, ::1] normal, long long[::1] neighbour):
+        """Evaporate atoms until `max_events` are in the journal, or something has to be done first.
 
         Parameters
         ----------
         journal : Journal
             Filled; must be new.
-        most : int
+        max_events : int
             Events at most.
         sweep_interval : int
             Events after which a relaxation is due.
-        atom, charge, normal, neighbour : ndarray, shapes (most,), (most,), (most, 3), (most,)
-            Filled, for each event, with the atom that left, its charge [e], its normal, and its surface nearest
-            neighbour of the highest charge (-1: none).
+        atom, charge, field, normal, neighbour : ndarray, shapes (m,), (m,), (m,), (m, 3), (m,)
+            Filled, for each of `max_events` events, with the atom that left, its charge [e], the field just outside
+            before it left [V/nm], its normal, and its surface nearest neighbour of the highest charge (-1: none).
 
         Returns
         -------
@@ -365,16 +345,16 @@ cdef class Evaporation:
         """
         cdef long n, leaving
         cdef int status = STATUS_DONE, best, axis
-        if journal.start.shape[0] <= most:
-            raise ValueError(f"journal must have room for {most} events")
+        if journal.start.shape[0] <= max_events:
+            raise ValueError(f"journal must have room for {max_events} events")
         with nogil:
-            while journal.n_events < most:
+            while journal.n_events < max_events:
                 n = journal.n_events
-                best = self.tournament.winner[1]
-                if self.since_sweep < NOT_SETTLED and (best < 0 or not self.tournament.rank[best] > 0.0):
+                best = self.chooser.choose(0.5)
+                if self.since_relaxation < NOT_RELAXED and best < 0:
                     status = STATUS_EXHAUSTED
                     break
-                if self.since_sweep >= sweep_interval or self.tree.n_slots + MOST_NEAR > self.tree.x.shape[0]:
+                if self.since_relaxation >= sweep_interval or self.tree.n_slots + MAX_NEAR > self.tree.x.shape[0]:
                     status = STATUS_SWEEP_DUE
                     break
                 leaving = self.tree.atom[best]
@@ -383,11 +363,17 @@ cdef class Evaporation:
                     break
                 atom[n] = leaving
                 charge[n] = self.tree.q[best]
+                field[n] = self.field_unit * self.rule.strength(self.tree, best)
                 for axis in range(3):
                     normal[n, axis] = self.normals[best, axis]
                 neighbour[n] = self.strongest_neighbour(leaving)
                 self.event(leaving, journal)
         return status
+
+    @property
+    def next_slot(self):
+        """Slot of the atom that would leave next (int); -1 if none may."""
+        return self.chooser.choose(0.5)
 
     @property
     def slots(self):
@@ -398,3 +384,8 @@ cdef class Evaporation:
     def slot_normals(self):
         """Outward unit normals by slot, shape (capacity, 3)."""
         return np.asarray(self.normals)
+
+    @property
+    def slot_fields(self):
+        """Field just outside by slot [V/nm], shape (n_slots,)."""
+        return self.field_unit * self.rule.strengths(self.tree)

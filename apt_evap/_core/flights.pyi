@@ -18,7 +18,7 @@ class Flights:
         reach: float,
         opening_angle: float,
         tolerance: float,
-        most_steps: int,
+        max_steps: int,
     ) -> None: ...
     @property
     def n_steps(self) -> int: ...

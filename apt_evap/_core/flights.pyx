@@ -81,7 +81,7 @@ cdef class Flights:
         Full angle under which a cell is taken as a whole [rad]; 0 sums over all atoms.
     tolerance : float
         Of the position relative to the path and of the velocity, in a step.
-    most_steps : int
+    max_steps : int
         Steps after which an ion counts as one that never left.
     """
 
@@ -90,7 +90,7 @@ cdef class Flights:
     cdef Sources sources
     cdef double coulomb, length, reach, opening_angle, tolerance
     cdef double[3] centre
-    cdef long most_steps
+    cdef long max_steps
     cdef long room
     cdef double* work          # (STAGES + 3, room, 3): accelerations, then position, velocity, trial position
     cdef readonly long n_steps, n_evaluations, n_pairs
@@ -101,9 +101,9 @@ cdef class Flights:
         sources_init(&self.sources)
 
     def __init__(self, Octree tree, *, double coulomb, double length, centre, double reach, double opening_angle,
-                 double tolerance, long most_steps):
+                 double tolerance, long max_steps):
         self.coulomb, self.length, self.reach = coulomb, length, reach
-        self.opening_angle, self.tolerance, self.most_steps = opening_angle, tolerance, most_steps
+        self.opening_angle, self.tolerance, self.max_steps = opening_angle, tolerance, max_steps
         self.centre[0], self.centre[1], self.centre[2] = centre
         self.n_steps = self.n_evaluations = self.n_pairs = 0
         self.begin(tree)
@@ -201,7 +201,7 @@ cdef class Flights:
             s = sqrt(a[3 * i] ** 2 + a[3 * i + 1] ** 2 + a[3 * i + 2] ** 2)
             length = sqrt(v[3 * i] ** 2 + v[3 * i + 1] ** 2 + v[3 * i + 2] ** 2)
             dt = min(dt, 0.2 * self.length / (length + sqrt(0.2 * self.length * s) + 1e-30))
-        for steps in range(self.most_steps):
+        for steps in range(self.max_steps):
             dt = min(dt, self.time_to_reach(m, x, v, outcome))
             self.gather(m, x, v, a, outcome, dt)
             self.evaluate(m, x, a, outcome)
@@ -236,7 +236,7 @@ cdef class Flights:
                     if away > self.reach * self.reach:
                         outcome[i] = ION_LEFT
                         flying -= 1
-                    if outcome[i] == ION_LEFT or steps == self.most_steps - 1:
+                    if outcome[i] == ION_LEFT or steps == self.max_steps - 1:
                         for axis in range(3):
                             end[7 * i + axis] = x[3 * i + axis]
                             end[7 * i + 3 + axis] = v[3 * i + axis]

@@ -12,15 +12,15 @@ from apt_evap._core.octree cimport Octree
 cdef class Journal:
     """What each event of a batch changed in the tree, to be replayed on a copy of it bit by bit."""
 
-    def __init__(self, const double[:, ::1] positions, long most):
+    def __init__(self, const double[:, ::1] positions, long max_events):
         self.n_events = 0
         self.positions = positions
-        self.start = np.zeros(most + 1, np.int64)
-        self.fresh_start = np.zeros(most + 1, np.int64)
-        self.slot = np.empty(most * 256, np.int32)
-        self.charge = np.empty(most * 256)
-        self.fresh_atom = np.empty(most * 8, np.int32)
-        self.fresh_leaf = np.empty(most * 8, np.int32)
+        self.start = np.zeros(max_events + 1, np.int64)
+        self.fresh_start = np.zeros(max_events + 1, np.int64)
+        self.slot = np.empty(max_events * 256, np.int32)
+        self.charge = np.empty(max_events * 256)
+        self.fresh_atom = np.empty(max_events * 8, np.int32)
+        self.fresh_leaf = np.empty(max_events * 8, np.int32)
 
     cdef int room(self, long changes, long fresh) except -1 nogil:
         # Space for one more event.

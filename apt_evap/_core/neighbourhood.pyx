@@ -24,6 +24,8 @@ cdef class Neighbourhood:
         Offset of the centre of mass above which an atom is at the surface [nm].
     support : ndarray of int8, shape (n,)
         1 for atoms that complete the neighbourhoods of others but are never surface atoms themselves.
+    bond_length : float
+        Atoms closer than this are nearest neighbours [nm]; at most the radius.
     n_threads : int
         Threads.
     before : Neighbourhood, optional
@@ -31,18 +33,19 @@ cdef class Neighbourhood:
     """
 
     def __init__(self, const double[:, ::1] positions, double radius, double threshold, const signed char[::1] support,
-                 int n_threads=1, Neighbourhood before=None):
+                 double bond_length=0.0, int n_threads=1, Neighbourhood before=None):
         cdef long n = positions.shape[0], i
         if n == 0:
             raise ValueError("a specimen needs at least one atom, got none")
         self.n_atoms = n
-        self.radius, self.threshold = radius, threshold
+        self.radius, self.threshold, self.bond_length = radius, threshold, bond_length
         if n >= 2**31:
             raise ValueError(f"a specimen holds fewer than 2**31 atoms, got {n}")
         self.positions, self.support = positions, support
         self.alive = np.ones(n, np.int8)
         self.exposed = np.zeros(n, np.int8)
         self.count = np.zeros(n, np.int32)
+        self.bonds = np.zeros(n, np.int8)
         self.offset = np.zeros((n, 3))
         if before is not None:
             np.asarray(self.alive)[:before.n_atoms] = before.alive
@@ -66,10 +69,10 @@ cdef class Neighbourhood:
         if before is not None:
             np.asarray(self.exposed)[:before.n_atoms] |= before.exposed
         if np.asarray(self.count).min() < 0:
-            raise ValueError(f"radius must hold at most {MOST_NEAR} atoms around each atom, got {radius!r} nm")
+            raise ValueError(f"radius must hold at most {MAX_NEAR} atoms around each atom, got {radius!r} nm")
 
     cdef int near(self, long atom, int* others) noexcept nogil:
-        # The atoms still there within the radius of one atom, in the order of the cells; -1: more than MOST_NEAR.
+        # The atoms still there within the radius of one atom, in the order of the cells; -1: more than MAX_NEAR.
         cdef double px = self.positions[atom, 0], py = self.positions[atom, 1], pz = self.positions[atom, 2]
         cdef double dx, dy, dz, reach = self.radius * self.radius
         cdef long ci = <long>floor((px - self.low[0]) / self.radius), cj = <long>floor((py - self.low[1]) / self.radius)
@@ -84,21 +87,26 @@ cdef class Neighbourhood:
                     dy = self.positions[other, 1] - py
                     dz = self.positions[other, 2] - pz
                     if self.alive[other] and other != atom and dx * dx + dy * dy + dz * dz <= reach:
-                        if n == MOST_NEAR:
+                        if n == MAX_NEAR:
                             return -1
                         others[n] = other
                         n += 1
         return n
 
     cdef void gather(self, long atom) noexcept nogil:
-        # Count and sum of offsets of the neighbours; a count of -1 says there were too many.
-        cdef int[MOST_NEAR] others
+        # Count, bonds and sum of offsets of the neighbours; a count of -1 says there were too many.
+        cdef int[MAX_NEAR] others
         cdef int n = self.near(atom, others), i
+        cdef double step, s, bond = self.bond_length * self.bond_length
         cdef int axis
         self.count[atom] = n
         for i in range(n):
+            s = 0.0
             for axis in range(3):
-                self.offset[atom, axis] += self.positions[others[i], axis] - self.positions[atom, axis]
+                step = self.positions[others[i], axis] - self.positions[atom, axis]
+                self.offset[atom, axis] += step
+                s += step * step
+            self.bonds[atom] += s <= bond
 
     cdef bint judge(self, long atom) noexcept nogil:
         # Whether the atom is at the surface by its neighbours; one alone in space is.
@@ -116,16 +124,21 @@ cdef class Neighbourhood:
 
     cdef int remove(self, long atom, int* fresh) noexcept nogil:
         # Takes an atom away, renews the normals around it; lists the atoms that came to the surface, returns how many.
-        cdef int[MOST_NEAR] others
+        cdef int[MAX_NEAR] others
         cdef int n = self.near(atom, others), i, other, n_fresh = 0
+        cdef double step, s, bond = self.bond_length * self.bond_length
         cdef int axis
         self.alive[atom] = 0
         self.exposed[atom] = 0
         for i in range(n):
             other = others[i]
             self.count[other] -= 1
+            s = 0.0
             for axis in range(3):
-                self.offset[other, axis] -= self.positions[atom, axis] - self.positions[other, axis]
+                step = self.positions[atom, axis] - self.positions[other, axis]
+                self.offset[other, axis] -= step
+                s += step * step
+            self.bonds[other] -= s <= bond
             if self.judge(other) and not self.exposed[other]:
                 self.exposed[other] = 1
                 fresh[n_fresh] = other
@@ -134,7 +147,7 @@ cdef class Neighbourhood:
 
     cdef bint reaches_support(self, long atom) noexcept nogil:
         # Whether taking this atom away could expose atoms that are only held as support.
-        cdef int[MOST_NEAR] others
+        cdef int[MAX_NEAR] others
         cdef int n = self.near(atom, others), i
         for i in range(n):
             if self.support[others[i]]:
@@ -143,12 +156,12 @@ cdef class Neighbourhood:
 
     def remove_atom(self, long atom):
         """Take one atom away; return the atoms that came to the surface by it, shape (m,)."""
-        cdef int[::1] fresh = np.empty(MOST_NEAR, np.int32)
+        cdef int[::1] fresh = np.empty(MAX_NEAR, np.int32)
         return np.asarray(fresh)[:self.remove(atom, &fresh[0])].copy()
 
     def remove_atoms(self, const long long[::1] atoms):
         """Take atoms away one after the other, as events do; ValueError for one that is not there."""
-        cdef int[::1] fresh = np.empty(MOST_NEAR, np.int32)
+        cdef int[::1] fresh = np.empty(MAX_NEAR, np.int32)
         cdef long i
         for i in range(atoms.shape[0]):
             if not (0 <= atoms[i] < self.n_atoms and self.alive[atoms[i]]):
@@ -185,6 +198,11 @@ cdef class Neighbourhood:
     def counts(self):
         """Number of neighbours within the radius, shape (n,)."""
         return np.asarray(self.count)
+
+    @property
+    def bond_counts(self):
+        """Number of nearest neighbours, closer than `bond_length`, shape (n,)."""
+        return np.asarray(self.bonds).astype(np.int32)
 
     @property
     def offsets(self):

@@ -3,27 +3,28 @@ from numpy.typing import NDArray
 
 from apt_evap._core.interactions import InteractionLists
 from apt_evap._core.octree import Octree
+from apt_evap._core.rule import FieldRule
 
-class ChargingRule:
-    @property
-    def area(self) -> float: ...
-    def scale(self, tree: Octree, factor: float) -> None: ...
-
-class Robin(ChargingRule):
+class Robin(FieldRule):
     def __init__(self, tolerance: float = 1e-5, window: int = 8) -> None: ...
     @property
     def tolerance(self) -> float: ...
     @property
     def window(self) -> int: ...
-    def solve(
+    @property
+    def point(self) -> NDArray[np.float64]: ...
+    def iterate(
         self,
         tree: Octree,
         normals: NDArray[np.float64],
         lists: InteractionLists,
         *,
         tolerance: float = 1e-6,
-        most_sweeps: int = 200,
+        max_sweeps: int = 200,
         double_precision: bool = False,
         n_threads: int = 1,
     ) -> tuple[int, float]: ...
+    def scale(self, tree: Octree, factor: float) -> None: ...
+    def keep_inside(self, tree: Octree) -> NDArray[np.float64]: ...
+    def distances(self, tree: Octree) -> NDArray[np.float64]: ...
     def mixed(self, maps: list[NDArray[np.float64]], steps: list[NDArray[np.float64]]) -> NDArray[np.float64]: ...

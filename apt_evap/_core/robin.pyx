@@ -9,7 +9,10 @@ from libc.math cimport M_PI, fabsf
 
 import numpy as np
 
+from apt_evap._core.interactions import direct_field
+
 from apt_evap._core.octree cimport Octree
+from apt_evap._core.rule cimport FieldRule, Patch
 from apt_evap._core.interactions cimport InteractionLists
 
 
@@ -19,26 +22,12 @@ cdef extern from "kernels.h":
     float patch_dot(long, const float*, const float*) noexcept nogil
 
 
-cdef class ChargingRule:
-    """How charge settles on the surface atoms.
-
-    A rule keeps the field of all the others on each slot of the tree (`field`) and the area per atom, and gives two
-    things: `solve`, the charges of the whole surface, and `solve_patch`, those of a few atoms while all others are held.
-    """
-
-    def scale(self, Octree tree, double factor):
-        """Multiply all charges, and the fields they make, by a factor."""
-        tree.charges = np.asarray(tree.charges) * factor
-        np.asarray(self.field)[:] *= factor
-
-    cdef int solve_patch(self, Octree tree, double[:, ::1] normals, Patch* patch) except -1 nogil:
-        # New charges of a patch, from the fields on its slots and the old charges in the tree; 1: not settled.
-        with gil:
-            raise NotImplementedError(f"{type(self).__name__} has no solve_patch")
-
-
-cdef class Robin(ChargingRule):
+cdef class Robin(FieldRule):
     """Robin's iteration.
+
+    The charge of an atom on a conductor is what the field of all the others along its normal induces. The iteration
+    leaves the total charge free; a point inside the specimen is brought to the potential, and moves down the axis as the
+    surface comes close to it.
 
     Parameters
     ----------
@@ -49,14 +38,89 @@ cdef class Robin(ChargingRule):
     """
 
     def __init__(self, double tolerance=1e-5, int window=8):
+        if not 0.0 < tolerance <= 1.0:
+            raise ValueError(f"tolerance of Robin must be above 0 and at most 1, got {tolerance!r}")
+        if not 0 <= window <= 32:
+            raise ValueError(f"window of Robin must be 0 to 32 sweeps, got {window}")
         self.tolerance = tolerance
         self.window = window
         self.area = 1.0
+        self.clearance = 0.0
+        self.point = np.zeros((1, 3))
         self.grow(512)
 
+    def __repr__(self):
+        return f"Robin(tolerance={self.tolerance!r}, window={self.window})"
+
+    def __eq__(self, other):
+        return type(other) is type(self) and other.settings() == self.settings()
+
+    def __hash__(self):
+        return hash((self.tolerance, self.window))
+
+    def settings(self):
+        """Parameters of the rule, dict."""
+        return {"tolerance": self.tolerance, "window": self.window}
+
+    def begin(self, point):
+        """Take the point inside the specimen [nm], shape (3,), that is to have the potential."""
+        self.point = np.array(point, dtype=np.float64).reshape(1, 3)
+
+    @property
+    def state(self):
+        """The point that has the potential [nm], as "potential_point"."""
+        return {"potential_point": self.point.ravel()}
+
+    @state.setter
+    def state(self, values):
+        self.point = np.array(values["potential_point"], dtype=np.float64).reshape(1, 3)
+
+    def solve(self, Octree tree, double[:, ::1] normals, InteractionLists lists, *, double potential, double tolerance,
+              int max_sweeps=200, bint double_precision=False, int n_threads=1):
+        """Iterate over the whole surface, then scale all charges to the potential: see `ChargingRule.solve`."""
+        outcome = self.iterate(tree, normals, lists, tolerance=tolerance, max_sweeps=max_sweeps,
+                               double_precision=double_precision, n_threads=n_threads)
+        self.scale(tree, potential / (tree.charges / self.keep_inside(tree)).sum())
+        return outcome
+
+    def scale(self, Octree tree, double factor):
+        """Multiply all charges, and the fields they make, by a factor."""
+        tree.charges = np.asarray(tree.charges) * factor
+        np.asarray(self.field)[:] *= factor
+
+    def keep_inside(self, Octree tree):
+        """Distances of the surface from the point of the potential [nm]; it moves down where the surface comes close."""
+        away = self.distances(tree)
+        if self.clearance == 0.0:
+            self.clearance = away.min()
+        for _ in range(100):
+            if away.min() >= 0.5 * self.clearance:
+                break
+            self.point = self.point - (0.0, 0.0, 0.25 * self.clearance)
+            away = self.distances(tree)
+        return np.maximum(away, 1e-3 * self.clearance)
+
+    def distances(self, Octree tree):
+        """Distances of the surface from the point of the potential [nm]."""
+        columns = np.asarray(tree.x), np.asarray(tree.y), np.asarray(tree.z)
+        return np.sqrt(sum((column[:tree.n_slots] - at) ** 2 for column, at in zip(columns, self.point[0])))
+
+    def residuals(self, positions, normals, charges, chosen):
+        """How far charges are from Robin's equation: see `ChargingRule.residuals`.
+
+        Notes
+        -----
+        (s/2 pi) sum_k q_k n_i . r_ik / r_ik^3 - q_i, with r_ik = r_i - r_k and the area per atom s of the last
+        relaxation (Rolland et al., Microsc. Microanal. 21, 1649, 2015). Each sweep of Robin's iteration about halves the
+        error, so that it is about as large as the residual.
+        """
+        field = direct_field(positions[chosen], positions, charges)
+        settled = self.area / (2 * np.pi) * np.einsum("ij,ij->i", field, normals[chosen])
+        return (settled - charges[chosen]) / charges.mean()
+
     @cython.wraparound(True)
-    def solve(self, Octree tree, const double[:, ::1] normals, InteractionLists lists, *, double tolerance=1e-6,
-              int most_sweeps=200, bint double_precision=False, int n_threads=1):
+    def iterate(self, Octree tree, const double[:, ::1] normals, InteractionLists lists, *, double tolerance=1e-6,
+                int max_sweeps=200, bint double_precision=False, int n_threads=1):
         """Iterate over the whole surface from the charges the tree has.
 
         Parameters
@@ -69,7 +133,7 @@ cdef class Robin(ChargingRule):
             Of this tree.
         tolerance : float
             Largest change of a charge in a sweep, relative to the mean charge, at which to stop.
-        most_sweeps : int
+        max_sweeps : int
             Sweeps after which to stop in any case.
         double_precision : bool
             Needed for tolerances below 1e-6.
@@ -92,7 +156,7 @@ cdef class Robin(ChargingRule):
         charges = tree.charges
         total = charges.sum()
         maps, steps = [], []   # of the last sweeps: what Robin's iteration made of the charges, and by how much
-        for sweeps in range(1, most_sweeps + 1):
+        for sweeps in range(1, max_sweeps + 1):
             lists.sweep(self.field, double_precision, n_threads)
             flux = np.maximum(np.einsum("ij,ij->i", field, normal), 0.0)   # a site deep in a notch stays without charge
             if not flux.sum() > 0.0:
@@ -123,11 +187,11 @@ cdef class Robin(ChargingRule):
         step_changes = [steps[-1] - step for step in steps[:-1]]
         gram = np.array([[np.einsum("i,i", a, b) for b in step_changes] for a in step_changes])
         right = np.array([np.einsum("i,i", a, steps[-1]) for a in step_changes])
-        gram += 1e-12 * np.trace(gram) * np.eye(len(gram))   # equal steps: any share will do
-        shares = np.linalg.solve(gram, right)
+        gram += 1e-12 * np.trace(gram) * np.eye(len(gram))   # equal steps: any fractions will do
+        fractions = np.linalg.solve(gram, right)
         charges = maps[-1].copy()
-        for share, other in zip(shares, maps[:-1]):
-            charges -= share * (maps[-1] - other)
+        for fraction, other in zip(fractions, maps[:-1]):
+            charges -= fraction * (maps[-1] - other)
         return charges
 
     cdef int grow(self, long stride) except -1 nogil:
@@ -137,7 +201,7 @@ cdef class Robin(ChargingRule):
                 self.residual = np.zeros(stride, np.float32)
         return 0
 
-    cdef int solve_patch(self, Octree tree, double[:, ::1] normals, Patch* patch) except -1 nogil:
+    cdef int patch_charges(self, Octree tree, double[:, ::1] normals, Patch* patch) except -1 nogil:
         # Gauss-Seidel on the changes: x_i = r_i + (s/2 pi) sum_k K_ik x_k with the residual r_i of the old charges.
         cdef double c = self.area / (2.0 * M_PI), mean = 0.0
         cdef float new, largest
@@ -164,4 +228,5 @@ cdef class Robin(ChargingRule):
                 break
         for i in range(patch.n):
             patch.charge[i] = tree.q[patch.slot[i]] + patch.change[i]
-        return largest > self.tolerance * mean
+        patch.unsettled = largest > self.tolerance * mean
+        return 0

@@ -88,7 +88,7 @@ def _of_run(run):
             "energy_limit": settings.energy_limit,
             "median_residual": _plain(np.median(residuals)) if len(residuals) else None,
             "marked_above": settings.bound,
-            "marked": summary["marked"],
+            "flagged": summary["flagged"],
         }
     return {
         "kind": "simulated run",

@@ -8,7 +8,7 @@ import numpy as np
 
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence
-from apt_evap.detection.binning import MOST_BINS
+from apt_evap.detection.binning import MAX_BINS
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 
@@ -188,7 +188,7 @@ def zone_line_profile(
     rectangles = check_sequence(rectangles, "rectangles", "Rectangle")
     for rectangle in rectangles:
         check_kind(rectangle, "rectangles", Rectangle, "Rectangles")
-    bins = check_count(bins, "bins", at_least=1, at_most=MOST_BINS)
+    bins = check_count(bins, "bins", at_least=1, at_most=MAX_BINS)
     widths = {rectangle.width for rectangle in rectangles}
     if len(widths) != 1:
         raise ValueError(f"rectangles must be at least one, all of one width, got widths {sorted(widths)} mm")
@@ -225,7 +225,7 @@ def _check_ring(inner, outer, bins):
     return (
         inner,
         check_number(outer, "outer", above=inner, unit="mm"),
-        check_count(bins, "bins", at_least=1, at_most=MOST_BINS),
+        check_count(bins, "bins", at_least=1, at_most=MAX_BINS),
     )
 
 

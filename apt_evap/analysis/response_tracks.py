@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from apt_evap._common.validation import check_array, check_kind
-from apt_evap.emission.emissions import Emissions
 from apt_evap.emission.surface_frame import rollup_direction
-from apt_evap.flight.response import unflattened
+from apt_evap.flight.response import Responses
 from apt_evap.simulation.run import Run
 from apt_evap.units import speed_from_energy
 
@@ -51,10 +50,9 @@ def lateral_tracks(run: Run, ions: ArrayLike, energies: ArrayLike, azimuths: Arr
     ions, energies = _check(run, ions, energies)
     azimuths = np.arange(0, 360, 5) if azimuths is None else check_array(azimuths, "azimuths", ("k",))
     azimuths = np.radians(azimuths)
-    shape = (len(ions), len(energies), len(azimuths))
     speeds = speed_from_energy(energies, run.emissions.masses[ions][:, None])[:, :, None]
     velocities = np.stack([speeds * np.cos(azimuths), speeds * np.sin(azimuths)], axis=-1)
-    return Tracks(*_places(run, ions, velocities, run.response_settings.site, run.responses.site, shape), energies)
+    return Tracks(*_places(run, ions, velocities, rolled=False), energies)
 
 
 def rollup_tracks(run: Run, ions: ArrayLike, energies: ArrayLike) -> Tracks:
@@ -80,20 +78,12 @@ def rollup_tracks(run: Run, ions: ArrayLike, energies: ArrayLike) -> Tracks:
         If the run has no responses, or ions or energies are out of range.
     """
     ions, energies = _check(run, ions, energies)
-    rolls, first, second = rollup_direction(_chosen(run.emissions, ions))
+    rolls, first, second = rollup_direction(run.emissions[ions])
     speeds = speed_from_energy(energies, run.emissions.masses[ions][:, None])
     velocities = np.stack([speeds * first[:, None], speeds * second[:, None]], axis=-1)
-    shape = (len(ions), len(energies))
-    x, y = _places(run, ions, velocities, run.response_settings.rolled, run.responses.rolled, shape)
+    x, y = _places(run, ions, velocities, rolled=True)
     x[~rolls] = y[~rolls] = np.nan
     return Tracks(x, y, energies)
-
-
-def _chosen(emissions, ions):
-    """The emissions of some ions only."""
-    names = ("positions", "normals", "neighbours", "charge_states", "masses", "ions")
-    columns = {name: getattr(emissions, name)[ions] for name in names}
-    return Emissions(**columns, nearest_neighbour_distance=emissions.nearest_neighbour_distance)
 
 
 def _check(run, ions, energies):
@@ -109,10 +99,13 @@ def _check(run, ions, energies):
     return ions, energies
 
 
-def _places(run, ions, velocities, design, coefficients, shape):
-    """Places on the detector [mm] of launches along the surface [nm/ns] of shape (..., 2)."""
-    repeats = int(np.prod(shape[1:]))
-    reduced = run.response_settings.reduced(velocities.reshape(-1, 2), np.repeat(run.emissions.masses[ions], repeats))
-    values = design.evaluate(np.repeat(coefficients[ions], repeats, axis=0), reduced)
-    x, y, *_ = run.detector.impacts(*unflattened(values))
+def _places(run, ions, velocities, rolled):
+    """Places on the detector [mm], shape (...), of launches along the surface [nm/ns] of shape (..., 2)."""
+    shape = velocities.shape[:-1]
+    every = np.repeat(ions, int(np.prod(shape[1:])))
+    responses = Responses(*(part[every] for part in run.responses))
+    first, second = velocities.reshape(-1, 2).T
+    starts = np.full(len(every), rolled)
+    landed = run.response_model.evaluate(responses, starts, first, second, run.emissions.masses[every])
+    x, y, *_ = run.detector.impacts(*landed)
     return x.reshape(shape), y.reshape(shape)

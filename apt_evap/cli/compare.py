@@ -15,7 +15,7 @@ from apt_evap._common.files import FileError, check_path, open_for_reading
 from apt_evap.cli._files import check_output, read, select
 from apt_evap.cli._options import SHAPE, add_reading_options, smoothing, whole
 from apt_evap.config.perturbation_text import read_perturbation
-from apt_evap.detection.binning import MOST_BINS
+from apt_evap.detection.binning import MAX_BINS
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.energy_fit.fit_energies import fit_energies
 from apt_evap.energy_fit.grid import MEANS, MECHANISMS, ROLLUP_FRACTIONS, RSDS
@@ -58,7 +58,7 @@ def add_parser(commands: Any) -> None:
         metavar="R",
         help="a JSON file (such as study.json) or ROTATION,SCALE,DX,DY[,mirror] in degrees and mm; found by default",
     )
-    command.add_argument("--bins", type=whole(11, MOST_BINS), metavar="N", help="along the longer side")
+    command.add_argument("--bins", type=whole(11, MAX_BINS), metavar="N", help="along the longer side")
     command.add_argument(
         "--smooth", type=smoothing, metavar="MM", help="sigma of a Gaussian; default: half a bin, of densities one"
     )

@@ -7,7 +7,8 @@ from apt_evap.analysis.description import UNITS, describe
 from apt_evap.cli._files import read, select, selects
 from apt_evap.cli._options import SHAPE, reading_options
 from apt_evap.detection.detector_map import DetectorMap
-from apt_evap.simulation.run import UNFINISHED, Run
+from apt_evap.simulation.ending import Ending
+from apt_evap.simulation.run import Run
 
 
 def add_parser(commands: Any) -> None:
@@ -33,7 +34,7 @@ def _info(options):
         ions = held.hits(held.first_perturbation) if isinstance(held, Run) else held
         told["selected_of"], held = len(ions), select(ions, options)
     told |= describe(held)
-    if isinstance(held, Run) and held.ended == UNFINISHED:
+    if isinstance(held, Run) and held.ended == Ending.UNFINISHED:
         told["kind"] = f"unfinished run of {len(held):,} ions"
         told["ended"] = "not yet: the command that began it, with --resume, goes on"
     if options.json:

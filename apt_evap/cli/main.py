@@ -15,6 +15,7 @@ from apt_evap._common.validation import did_you_mean
 from apt_evap._version import __version__
 from apt_evap.cli import compare, info, map, run
 from apt_evap.cli._options import INTERRUPTED, SHAPE, TERMINATED, say
+from apt_evap.simulation.ending import RunInterrupted
 
 COMMANDS = (run, map, info, compare)
 
@@ -73,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 1
         except MemoryError as error:
             say("error", str(error) or "not enough memory")
-        except (ValueError, OSError) as error:
+        except (ValueError, OSError, RunInterrupted) as error:
             say("error", error)
         return 2
 

@@ -11,7 +11,7 @@ from apt_evap.cli._files import check_output, is_picture, picture_path, read, sa
 from apt_evap.cli._options import SHAPE, add_speech, reading_options, smoothing, tell, tell_json, whole
 from apt_evap.config.map_panels import MapSettings, Panel, read_maps
 from apt_evap.config.perturbation_text import read_perturbation, title_of
-from apt_evap.detection.binning import MOST_BINS
+from apt_evap.detection.binning import MAX_BINS
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.perturbations import Unperturbed
@@ -37,7 +37,7 @@ def add_parser(commands: Any) -> None:
     )
     command.add_argument("-o", "--output", metavar="MAP.png", help=".png, .pdf or .svg; default: FILE_map.png, here")
     command.add_argument(
-        "--bins", type=whole(1, MOST_BINS), metavar="N", help="along the longer side; default: about sqrt(ions)"
+        "--bins", type=whole(1, MAX_BINS), metavar="N", help="along the longer side; default: about sqrt(ions)"
     )
     command.add_argument("--smooth", type=smoothing, metavar="MM", help="sigma of a Gaussian; default: one bin")
     command.add_argument(

@@ -11,6 +11,7 @@ from apt_evap.cli._options import INTERRUPTED, SHAPE, add_speech, minutes, say, 
 from apt_evap.cli.map import described, run_maps
 from apt_evap.config.simulation_file import read_config
 from apt_evap.simulation.checkpoint import Checkpoint
+from apt_evap.simulation.ending import Ending, RunInterrupted
 from apt_evap.simulation.run_hdf5 import is_run
 
 SECONDS_BETWEEN_LINES = 60.0
@@ -81,12 +82,9 @@ def _run(options):
             where = checkpoint.folder if checkpoint.folder.exists() else output
             say("note", f"{ions:,} of {n_ions:,} ions are in {str(where)!r}; {_GO_ON}")
         raise
-    except FileError:
-        raise
-    except Exception as error:
-        if run := getattr(error, "run", None):
-            replace(run, provenance=run.provenance | provenance).save(output)
-            say("note", f"the {len(run):,} ions done so far are in {str(output)!r}")
+    except RunInterrupted as error:
+        replace(error.run, provenance=error.run.provenance | provenance).save(output)
+        say("note", f"the {len(error.run):,} ions done so far are in {str(output)!r}")
         raise
     seconds = time.perf_counter() - began
     if done == n_ions and not unfinished:
@@ -105,14 +103,14 @@ def _run(options):
             options, f"{panel.title}: {hit:,} hit the detector, {missed:,} missed it, {never_left:,} never left the tip"
         )
     if run.responses is not None:
-        tell(options, f"responses: {run.marked.sum():,} ions marked as inexact")
+        tell(options, f"responses: {run.flagged.sum():,} ions flagged as inexact")
     if most_missed:
         say(
             "note",
             f"{max(most_missed):,} of {len(run):,} ions miss the detector, which is {run.detector.width:g} mm wide at "
             f"{run.detector.distance:g} mm: a larger width or a smaller distance in [detector] catches more of them",
         )
-    if run.ended == "interrupted":
+    if run.ended == Ending.INTERRUPTED:
         say("note", f"interrupted; {len(run):,} of {n_ions:,} ions are in {str(output)!r}; {_GO_ON}")
     elif run.ended:
         say("note", f"the run ended before its time: {run.ended}; the {len(run):,} ions so far are kept")
@@ -125,7 +123,7 @@ def _run(options):
     tell(options, f"wrote {picture}")
     written = {"wrote": str(output), "picture": str(picture), "maps": described(*maps)}
     tell_json(options, {**written, **_counts(run, seconds)})
-    return INTERRUPTED if run.ended == "interrupted" else 0
+    return INTERRUPTED if run.ended == Ending.INTERRUPTED else 0
 
 
 def _counts(run, seconds):

@@ -7,7 +7,7 @@ from typing import Any
 from apt_evap._common.validation import check_count, check_number, shown
 from apt_evap.config.perturbation_text import read_perturbation, title_of
 from apt_evap.config.tables import check_keys, check_table
-from apt_evap.detection.binning import MOST_BINS
+from apt_evap.detection.binning import MAX_BINS
 from apt_evap.emission.energies import TruncatedNormal
 from apt_evap.emission.perturbations import Perturbation, RollUp, Unperturbed, to_dict
 
@@ -66,7 +66,7 @@ def read_maps(table: Mapping[str, Any]) -> MapSettings:
     check_keys(table, ("panels", "bins", "smoothing"))
     bins, smoothing = table.get("bins"), table.get("smoothing")
     if bins is not None:
-        bins = check_count(bins, "bins", at_least=1, at_most=MOST_BINS)
+        bins = check_count(bins, "bins", at_least=1, at_most=MAX_BINS)
     if smoothing is not None:
         smoothing = check_number(smoothing, "smoothing", at_least=0, unit="mm")
     if table.get("panels") is None:

@@ -14,7 +14,8 @@ from apt_evap.config.map_panels import MapSettings, read_maps
 from apt_evap.config.tables import check_keys, check_table
 from apt_evap.detection.detector import Detector
 from apt_evap.emission.perturbations import Perturbation
-from apt_evap.evaporation.settings import ChargeSettings, check_voltage
+from apt_evap.evaporation.settings import ChargeSettings
+from apt_evap.evaporation.voltage import check_voltage
 from apt_evap.flight.crew import FlightSettings
 from apt_evap.flight.response import ResponseSettings
 from apt_evap.simulation.monitor import WatchSettings

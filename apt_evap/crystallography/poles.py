@@ -14,7 +14,7 @@ from apt_evap.specimen import lattice
 from apt_evap.specimen.materials import Material
 
 _LARGEST = 9  # indices looked through: of all lattices the 50 families of the widest spacing are among them
-_MOST_FAMILIES = 50
+_MAX_FAMILIES = 50
 
 ZONES = {
     "fcc": ((1, 1, 0), (1, 0, 0)),
@@ -74,8 +74,8 @@ def poles(material: Material, families: int = 8) -> Poles:
         If families is not a whole number from 1 to 50.
     """
     families = check_count(families, "families", at_least=1)
-    if families > _MOST_FAMILIES:
-        raise ValueError(f"families must be at most {_MOST_FAMILIES}, got {families}")
+    if families > _MAX_FAMILIES:
+        raise ValueError(f"families must be at most {_MAX_FAMILIES}, got {families}")
     four = material.structure == "hcp"
     found = []
     for h, k, last in product(range(_LARGEST + 1), repeat=3):

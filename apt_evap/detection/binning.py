@@ -12,8 +12,8 @@ from apt_evap._common.validation import check_array, check_count, check_number, 
 _CHUNK = 1 << 16
 
 
-MOST_BINS = 16384  # along a side: 2 GB of counts
-MOST_BY_CHANCE = 32  # so few different values may lie on a comb by chance: eight of a normal distribution did
+MAX_BINS = 16384  # along a side: 2 GB of counts
+MAX_BY_CHANCE = 32  # so few different values may lie on a comb by chance: eight of a normal distribution did
 
 
 class Comb(NamedTuple):
@@ -46,12 +46,12 @@ def find_comb(values: Floats, sample: int = 100_000) -> Comb | None:
     teeth = np.unique(values)
     rounding = float(np.spacing(np.abs(teeth).max())) if len(teeth) else 0.0
     teeth = teeth.astype(np.float64)
-    if len(teeth) < MOST_BY_CHANCE or len(teeth) > 0.9 * len(values):
+    if len(teeth) < MAX_BY_CHANCE or len(teeth) > 0.9 * len(values):
         return None
     # values of one tooth may differ in their last bits
     teeth = teeth[np.diff(teeth, prepend=-np.inf) > 8 * rounding]
     gaps = np.diff(teeth)
-    if len(gaps) < MOST_BY_CHANCE - 1:
+    if len(gaps) < MAX_BY_CHANCE - 1:
         return None
     low = np.percentile(gaps, 2)
     number = np.concatenate([[0], np.cumsum(np.rint(gaps / np.median(gaps[gaps < 1.5 * low])))])
@@ -128,7 +128,7 @@ def bin_edges(
     ValueError
         If `bins` or `extent` make no sense.
     """
-    bins = check_count(bins, "bins", at_least=1, at_most=MOST_BINS)
+    bins = check_count(bins, "bins", at_least=1, at_most=MAX_BINS)
     if extent is None:
         extent = (x.min(), x.max(), y.min(), y.max())
     low_x, high_x, low_y, high_y = (float(value) for value in check_array(extent, "extent", (4,)))

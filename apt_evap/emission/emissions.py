@@ -1,10 +1,16 @@
 """A batch of emissions, and the launches of their ions."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from apt_evap._common.types import Booleans, Floats
 from apt_evap._common.validation import check_array, check_number
+from apt_evap.units import FLIGHT_TIME
+
+COLUMNS = ("positions", "normals", "neighbours", "charge_states", "masses", "ions")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -65,6 +71,27 @@ class Emissions:
     def __len__(self) -> int:
         return len(self.positions)
 
+    def __getitem__(self, chosen: Any) -> "Emissions":
+        """Return the chosen atoms as `Emissions`; takes a slice, a mask or indices."""
+        columns = {name: getattr(self, name)[chosen] for name in COLUMNS}
+        return Emissions(**columns, nearest_neighbour_distance=self.nearest_neighbour_distance)
+
+    @classmethod
+    def join(cls, parts: "Sequence[Emissions]") -> "Emissions":
+        """Join batches, in their order, into one."""
+        columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS}
+        return cls(**columns, nearest_neighbour_distance=parts[0].nearest_neighbour_distance)
+
+    @property
+    def can_roll(self) -> Booleans:
+        """Whether each has a neighbour to roll onto, bool (n,)."""
+        return np.isfinite(self.neighbours).all(axis=1)
+
+    @property
+    def slowness(self) -> Floats:
+        """Time of flight [ns] per reduced time [nm/sqrt(V)], sqrt(m/n) in units of `FLIGHT_TIME`, shape (n,)."""
+        return FLIGHT_TIME * np.sqrt(self.masses / self.charge_states)
+
     def __repr__(self) -> str:
         lonely = np.count_nonzero(np.isnan(self.neighbours).any(axis=1))
         return f"<Emissions: {len(self):,} atoms about to leave, {lonely:,} of them without a neighbour to roll onto>"
@@ -105,3 +132,12 @@ class Launches:
 
     def __repr__(self) -> str:
         return f"<Launches: {len(self):,} ions, {np.count_nonzero(self.rolled):,} of them rolled up>"
+
+
+def check_launches(perturbation: Any, launches: Any, n: int) -> Launches:
+    """Return what a perturbation launched, or say what is wrong (ValueError): n `Launches`."""
+    if not isinstance(launches, Launches):
+        raise ValueError(f"launch of {perturbation!r:.80} must return Launches, got {launches!r:.80}")
+    if len(launches) != n:
+        raise ValueError(f"{perturbation!r} must launch {n} ions, one per emission, got {len(launches)}")
+    return launches

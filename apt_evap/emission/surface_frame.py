@@ -62,16 +62,52 @@ def rollup_direction(emissions: Emissions) -> tuple[Booleans, Floats, Floats]:
     return rolled, along[0] * scale, along[1] * scale
 
 
+def rolled_positions(emissions: Emissions) -> Floats:
+    """Positions p_r = s + d n, one nearest neighbour distance d above the neighbour s that each ion rolls onto.
+
+    Parameters
+    ----------
+    emissions : Emissions
+        A batch of n.
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+        Positions [nm]; NaN for an ion without a neighbour.
+    """
+    return emissions.neighbours + emissions.nearest_neighbour_distance * emissions.normals
+
+
+def along_surface(normals: ArrayLike, first: Floats, second: Floats) -> Floats:
+    """Vectors along the surface from their components in the tangent frame.
+
+    Parameters
+    ----------
+    normals : array_like, shape (n, 3)
+        Outward unit normals.
+    first, second : ndarray, shape (n,) or (n, m)
+        Components along t1 and t2 of `tangent_frame`, of one or of m vectors at each normal.
+
+    Returns
+    -------
+    ndarray, shape (n, 3) or (n, m, 3)
+    """
+    frame = tangent_frame(normals)
+    if np.ndim(first) == 2:
+        frame = frame[0][:, None], frame[1][:, None]
+    return first[..., None] * frame[0] + second[..., None] * frame[1]
+
+
 def launch_tangentially(emissions: Emissions, rolled: Booleans, first: Floats, second: Floats) -> Launches:
-    """Launches from velocities along the surface: the one way from `tangential` to `launch`.
+    """Launches with velocities along the surface.
 
     Parameters
     ----------
     emissions : Emissions
         A batch of n.
     rolled : array_like of bool
-        Ions that start at p_r = s + d n, one nearest neighbour distance d above their neighbour s; the others
-        start at their site. Shape (n,).
+        Ions that start at the position they rolled up to, see `rolled_positions`; the others start at their site.
+        Shape (n,).
     first, second : array_like
         Velocity along t1 and t2 of `tangent_frame` [nm/ns], shape (n,).
 
@@ -79,10 +115,8 @@ def launch_tangentially(emissions: Emissions, rolled: Booleans, first: Floats, s
     -------
     Launches
     """
-    frame = tangent_frame(emissions.normals)
-    lifted = emissions.neighbours + emissions.nearest_neighbour_distance * emissions.normals
     return Launches(
-        positions=np.where(np.asarray(rolled)[:, None], lifted, emissions.positions),
-        velocities=np.asarray(first)[:, None] * frame[0] + np.asarray(second)[:, None] * frame[1],
+        positions=np.where(np.asarray(rolled)[:, None], rolled_positions(emissions), emissions.positions),
+        velocities=along_surface(emissions.normals, np.asarray(first), np.asarray(second)),
         rolled=rolled,
     )

@@ -27,7 +27,7 @@ ROUGH = 4
 FLATTENING = 0.15
 """Width of the Gaussian that flattens both maps, over the square root of the area compared."""
 INTERVAL = 95.0  # percent of the resamples
-_MOST_ROUNDS = 5  # of registration and search
+_MAX_ROUNDS = 5  # of registration and search
 
 
 class EnergySearch:
@@ -189,7 +189,7 @@ class EnergySearch:
 def registered(search: EnergySearch) -> tuple[Registration, list[dict[str, Any]]]:
     """Register with the middle of the grid, then with the best point, until that stays; polished, and the rounds."""
     registration, best, rounds = None, search.middle, []
-    for _ in range(_MOST_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         found = register(search.hits(best), search.measured, start=registration)
         registration = replace(found, method="search")  # of the first round, which the others start from
         rounds.append({"perturbation": to_dict(search.perturbation(best)), "registration": registration.to_dict()})

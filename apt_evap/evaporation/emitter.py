@@ -1,12 +1,15 @@
 """The emitter: the charged surface of a specimen, and the sequence of atoms that leave it."""
 
 import warnings
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from apt_evap._common.describe import describe
 from apt_evap._common.threads import thread_count
 from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_array, check_count, check_kind, check_number
@@ -14,19 +17,22 @@ from apt_evap._core.evaporation import DONE, EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, 
 from apt_evap._core.journal import Journal
 from apt_evap._core.neighbourhood import Neighbourhood
 from apt_evap._core.octree import Octree
-from apt_evap._core.robin import ChargingRule, Robin
-from apt_evap.evaporation.law import Extremal, Law
-from apt_evap.evaporation.settings import ChargeSettings, check_angle, check_voltage
+from apt_evap._core.rule import ChargingRule
+from apt_evap.evaporation.law import Extremal, Law, check_law, kernel_of
+from apt_evap.evaporation.rule import Rule, rule_for
+from apt_evap.evaporation.settings import ChargeSettings, check_angle
 from apt_evap.evaporation.state import EmitterState
+from apt_evap.evaporation.voltage import check_voltage
 from apt_evap.specimen.ase_atoms import to_atoms
 from apt_evap.specimen.tip import Tip
 from apt_evap.units import COULOMB
 
 RECORD = 16_384  # events after which a batch comes with a tree in any case, so that nobody has to keep the journals
+BATCH = 256  # events at a time; results do not depend on it
 
-__all__ = ["DONE", "EXHAUSTED", "SWEEP_DUE", "TOO_SHALLOW", "Batch", "ChargeSettings", "Emitter"]
+__all__ = ["BATCH", "DONE", "EXHAUSTED", "SWEEP_DUE", "TOO_SHALLOW", "Batch", "Emitter"]
 
-_MOST_EVENTS = 10_000_000  # at a time: 640 MB of results
+_MAX_EVENTS = 10_000_000  # at a time: 720 MB of results
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -79,14 +85,15 @@ class Emitter:
         The specimen.
     voltage : float
         Applied voltage [V].
-    law : Extremal
-        Which atom leaves next.
+    law : law, optional
+        Which atom leaves next; by default `Extremal`. One of your own: see `apt_evap.evaporation.law.Law`.
     settings : ChargeSettings
         How finely the charges are solved.
     n_threads : int, optional
         Threads; by default the processors this process may use.
-    rule : ChargingRule, optional
-        How charge settles; by default `Robin`.
+    rule : charging rule, optional
+        How charge distributes over the surface; by default `Robin`. One of your own: see
+        `apt_evap.evaporation.rule.Rule`.
 
     Raises
     ------
@@ -101,34 +108,36 @@ class Emitter:
         law: Law | None = None,
         settings: ChargeSettings | None = None,
         n_threads: int | None = None,
-        rule: ChargingRule | None = None,
+        rule: ChargingRule | Rule | None = None,
     ) -> None:
         self.tip = check_kind(tip, "tip", Tip, "a Tip")
         self.voltage = check_voltage(voltage)
-        self.law = Extremal() if law is None else check_kind(law, "law", "weights", "a law with a method weights")
+        self.law = Extremal() if law is None else law
+        check_law(self.law)
         self.settings = ChargeSettings() if settings is None else settings
         check_kind(self.settings, "settings", ChargeSettings, "ChargeSettings")
-        self.rule = (
-            Robin() if rule is None else check_kind(rule, "rule", ChargingRule, "a ChargingRule such as Robin()")
-        )
+        self.rule = rule_for(rule)
+        self.rule.begin(tip.potential_point)
         self.n_threads = thread_count(n_threads)
         distance = tip.nearest_neighbour_distance
-        neighbourhood, weights = self._neighbourhood_of(tip), self._weights_of(tip)
-        if not weights[neighbourhood.surface].any():
-            raise ValueError(f"no surface atom of {tip!r} may leave, expected some evaporable ones")
         self._core = Evaporation(
-            neighbourhood,
+            self._neighbourhood_of(tip),
             self.rule,
-            weights,
+            kernel_of(self.law, tip),
             self.voltage / COULOMB,
-            tip.potential_point,
-            tip.bond_length,
+            COULOMB,
             self.settings.patch_radius * distance,
             self.settings.update_radius * distance,
             self.settings.opening_angle,
         )
         self._left, self._deepened = [], []  # sites batch by batch; events at which more of the specimen was held
+        if not tip.evaporable[self._core.atoms.surface].any():
+            raise ValueError(f"{tip!r} has no evaporable surface atom")
         self.relax(tolerance=self.settings.start_tolerance)
+        if self._core.next_slot < 0:
+            raise ValueError(
+                f"law {describe(self.law)['name']} gives no surface atom of {tip!r} a key above 0: no atom may leave"
+            )
         self.sweep_interval = self.settings.sweep_interval or max(100, len(self) // 300)
 
     def _neighbourhood_of(self, tip, before=None):
@@ -137,12 +146,10 @@ class Emitter:
             tip.neighbour_radius,
             tip.surface_threshold,
             tip.support.view(np.int8),
+            tip.bond_length,
             self.n_threads,
             before,
         )
-
-    def _weights_of(self, tip):
-        return check_array(self.law.weights(tip), "weights of the law", (len(tip.positions),))
 
     def __len__(self) -> int:
         return len(self._core.slots)
@@ -174,9 +181,15 @@ class Emitter:
     def fields(self) -> Floats:
         """Fields just outside the surface atoms [V/nm], shape (n,).
 
-        F_i = 4 pi k_e q_i / s, with s the area per surface atom: the field at the outer face of a charged surface.
+        What the law sees. By Robin's rule F_i = 4 pi k_e q_i / s, with s the area per surface atom: the field at the
+        outer face of a charged surface.
         """
-        return self._field(self.charges)
+        return self._core.slot_fields[self._core.slots]
+
+    @property
+    def bonds(self) -> Integers:
+        """Nearest neighbours of the surface atoms that are still there, shape (n,)."""
+        return self._core.atoms.bond_counts[self.atoms]
 
     def to_atoms(self) -> Any:
         """Return the surface as ase.Atoms [Angstrom]; needs ASE.
@@ -192,16 +205,13 @@ class Emitter:
     @property
     def area_per_atom(self) -> float:
         """Area s of the surface per atom, as of the last relaxation [nm^2]."""
-        return self._core.rule.area
+        return self.rule.area
 
     @property
     def counts(self) -> dict[str, int]:
         """Events so far, charges that came out negative and were set to 0, patches that did not settle; dict of int."""
         core = self._core
         return {"events": core.n_removed, "clipped": core.n_clipped, "unsettled": core.n_unsettled}
-
-    def _field(self, charges):
-        return 4 * np.pi * COULOMB / self.area_per_atom * charges
 
     def field_at(self, points: ArrayLike, opening_angle: float = 0.3) -> Floats:
         """Electric field of the surface charges.
@@ -267,7 +277,7 @@ class Emitter:
         return outcome
 
     def state(self) -> EmitterState:
-        """What makes the surface again as its last relaxation left it.
+        """What rebuilds the surface as its last relaxation left it.
 
         Returns
         -------
@@ -282,16 +292,16 @@ class Emitter:
             charges=start.charges,
             lonely=start.lonely,
             lonely_normals=start.lonely_normals,
-            potential_point=tuple(start.potential_point.ravel().tolist()),
             deepened=tuple(self._deepened),
             tolerance=tolerance,
             opening_angle=angle,
             clipped=clipped,
             unsettled=unsettled,
+            rule_state=start.rule_state,
         )
 
     def restore(self, state: EmitterState) -> None:
-        """Make the surface again that another emitter of the same settings had.
+        """Rebuild the surface that another emitter of the same settings had.
 
         Parameters
         ----------
@@ -313,8 +323,7 @@ class Emitter:
         self._core.atoms.remove_atoms(state.sites[done:])
         self._left, self._deepened = [state.sites], list(state.deepened)
         self._core.n_clipped, self._core.n_unsettled = state.clipped, state.unsettled
-        point = np.reshape(state.potential_point, (1, 3))
-        start = Start(len(state.sites), state.charges, state.lonely, state.lonely_normals, point)
+        start = Start(len(state.sites), state.charges, state.lonely, state.lonely_normals, state.rule_state)
         self._relax(state.tolerance, state.opening_angle, start)
 
     def hand_out_tree(self) -> None:
@@ -338,39 +347,78 @@ class Emitter:
     def _hold_more(self):
         tip = self.tip.deepened()
         neighbourhood = self._neighbourhood_of(tip, self._core.atoms)
-        self._core.take_over(neighbourhood, self._weights_of(tip))
+        self._core.take_over(neighbourhood, kernel_of(self.law, tip))
         self.tip = tip
 
-    def evaporate(self, most: int) -> Batch:
-        """Let atoms leave, `most` of them or as many as leave before something has to be done first.
+    def evaporate(self, max_events: int) -> Batch:
+        """Evaporate up to `max_events` atoms.
+
+        Stops early if the surface must be relaxed, the shell deepened, or no atom is left; `advance` does that by
+        itself.
 
         Parameters
         ----------
-        most : int
+        max_events : int
             Events at most.
 
         Returns
         -------
         Batch
-            Its status says why it ended: DONE, SWEEP_DUE (call `relax` and go on), EXHAUSTED, TOO_SHALLOW (call
-            `deepen` and go on).
+            Its status says why it ended: DONE, SWEEP_DUE (call `relax` and continue), EXHAUSTED, TOO_SHALLOW (call
+            `deepen` and continue).
         """
-        most = check_count(most, "most", at_least=1, at_most=_MOST_EVENTS)
-        journal = Journal(self.tip.positions, most)
-        site, neighbour = np.empty(most, np.int64), np.empty(most, np.int64)
-        charges, normals = np.empty(most), np.empty((most, 3))
+        n = check_count(max_events, "max_events", at_least=1, at_most=_MAX_EVENTS)
+        journal = Journal(self.tip.positions, n)
+        site, neighbour = np.empty(n, np.int64), np.empty(n, np.int64)
+        charges, fields, normals = np.empty(n), np.empty(n), np.empty((n, 3))
         tree = self._core.tree.copy() if self._recorded >= RECORD else None
-        status = self._core.evaporate(journal, most, self.sweep_interval, site, charges, normals, neighbour)
+        status = self._core.evaporate(journal, n, self.sweep_interval, site, charges, fields, normals, neighbour)
         n = journal.n_events
         self._recorded = n if tree is not None else self._recorded + n
         self._left.append(site[:n].copy())
         return Batch(
             site=site[:n],
             charges=charges[:n],
-            fields=self._field(charges[:n]),
+            fields=fields[:n],
             normals=normals[:n],
             neighbour=neighbour[:n],
             journal=journal,
             tree=tree,
             status=status,
         )
+
+    def advance(
+        self,
+        n_events: int,
+        batch_size: int = BATCH,
+        pause: Callable[[], AbstractContextManager[Any]] = nullcontext,
+    ) -> Iterator[Batch]:
+        """Evaporate atoms batch by batch; relaxes the surface and deepens the shell between them.
+
+        Parameters
+        ----------
+        n_events : int
+            Atoms to evaporate.
+        batch_size : int
+            Events at a time; the sequence does not depend on it.
+        pause : callable, optional
+            Gives a context in which the surface is relaxed or the shell deepened: what needs the processors, or the
+            specimen as it was, stands still in it.
+
+        Yields
+        ------
+        Batch
+            May be empty. What its status asks for is done once the next batch is asked for, so that the surface can be
+            looked at before. The last one is EXHAUSTED if no atom is left.
+        """
+        n_events = check_count(n_events, "n_events", at_least=0)
+        batch_size = check_count(batch_size, "batch_size", at_least=1, at_most=_MAX_EVENTS)
+        while n_events > 0:
+            batch = self.evaporate(min(batch_size, n_events))
+            n_events -= len(batch)
+            yield batch
+            if batch.status == EXHAUSTED:
+                return
+            if batch.status in (SWEEP_DUE, TOO_SHALLOW):
+                with pause():
+                    self.relax() if batch.status == SWEEP_DUE else self.deepen()

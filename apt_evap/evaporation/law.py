@@ -5,15 +5,37 @@ from typing import Protocol
 
 import numpy as np
 
-from apt_evap._common.types import Floats
+from apt_evap._common.types import Floats, Integers
+from apt_evap._core.law import LawKernel, PythonLaw, WeightedField
 from apt_evap.specimen.tip import Tip
 
 
 class Law(Protocol):
-    """What an evaporation law of one's own must have; `Extremal` is one."""
+    """Interface of an evaporation law.
 
-    def weights(self, tip: Tip) -> Floats:
-        """Return what the field of each atom is multiplied by for the choice, 0 for those that may not leave, (n,)."""
+    A law in Python has a method `keys`, which is called after every event for the about 300 atoms around the hole. One
+    that has a method ``kernel(tip)`` besides, which returns a compiled `LawKernel`, runs at full speed.
+    """
+
+    def keys(self, tip: Tip, atoms: Integers, fields: Floats, bonds: Integers) -> Floats:
+        """Return the key of each atom: the atom of the largest key leaves next.
+
+        Parameters
+        ----------
+        tip : Tip
+            The specimen.
+        atoms : ndarray of int64, shape (n,)
+            Indices of surface atoms in the specimen.
+        fields : ndarray, shape (n,)
+            Field just outside of each [V/nm].
+        bonds : ndarray of int32, shape (n,)
+            Nearest neighbours of each that are still there.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            Keys; 0 or less for atoms that may not leave. Equal keys go by the number of the atom.
+        """
         ...
 
 
@@ -24,17 +46,22 @@ class Extremal:
     The limit of low temperature of the Arrhenius rate nu_0 exp(-C (1 - F/F_evap)/kT) (Vurpillot et al., 2013).
     """
 
-    def weights(self, tip: Tip) -> Floats:
-        """Return what the field of each atom is multiplied by for the choice.
+    def kernel(self, tip: Tip) -> LawKernel:
+        """Return the compiled law for a specimen: F / F_evap, 0 for atoms that may not leave."""
+        return WeightedField(np.where(tip.evaporable, 1.0 / tip.evaporation_fields[tip.species], 0.0))
 
-        Parameters
-        ----------
-        tip : Tip
-            The specimen.
+    def keys(self, tip: Tip, atoms: Integers, fields: Floats, bonds: Integers) -> Floats:
+        """Return the field over the evaporation field of each atom: see `Law.keys`."""
+        return np.where(tip.evaporable[atoms], fields / tip.evaporation_fields[tip.species[atoms]], 0.0)
 
-        Returns
-        -------
-        ndarray, shape (n,)
-            One over the evaporation field [nm/V]; 0 for atoms that may not leave.
-        """
-        return np.where(tip.evaporable, 1.0 / tip.evaporation_fields[tip.species], 0.0)
+
+def check_law(law: object) -> None:
+    """Refuse what is not a law (ValueError)."""
+    if not any(callable(getattr(law, name, None)) for name in ("kernel", "keys")):
+        raise ValueError(f"law must be an evaporation law with a method keys, such as Extremal(), got {law!r:.80}")
+
+
+def kernel_of(law: Law, tip: Tip) -> LawKernel:
+    """Return the compiled kernel of a law for a specimen; that of a law in Python calls it."""
+    make = getattr(law, "kernel", None)
+    return PythonLaw(law, tip) if make is None else make(tip)

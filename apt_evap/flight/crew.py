@@ -16,10 +16,11 @@ from apt_evap._core.flights import LEFT, Flights
 from apt_evap._core.octree import Octree
 from apt_evap.detection.detector import Detector
 from apt_evap.evaporation.emitter import Batch
+from apt_evap.flight.landing import Ends
 from apt_evap.specimen.tip import Tip
 from apt_evap.units import COULOMB, NM_PER_MM
 
-_MOST_STEPS = 1_000_000  # flights take some tens
+_MAX_STEPS = 1_000_000  # flights take some tens
 
 
 @dataclass(frozen=True)
@@ -36,20 +37,20 @@ class FlightSettings:
     reach : float
         Distance from the apex, in nearest neighbour distances, at which a flight ends and the ion goes straight on;
         11,314 is 8,000 lattice constants of fcc, as in Shaikh et al.
-    most_steps : int
+    max_steps : int
         Steps after which an ion counts as one that never left.
     """
 
     opening_angle: float = 0.3
     tolerance: float = 1e-3
     reach: float = 11314.0
-    most_steps: int = 500
+    max_steps: int = 500
 
     def __post_init__(self):
         check_number(self.opening_angle, "opening_angle", at_least=0, at_most=1.0, unit="rad")
         check_number(self.tolerance, "tolerance", above=0, at_most=0.1)
         check_number(self.reach, "reach", at_least=100, unit="d_nn")
-        check_count(self.most_steps, "most_steps", at_least=1, at_most=_MOST_STEPS)
+        check_count(self.max_steps, "max_steps", at_least=1, at_most=_MAX_STEPS)
 
 
 def check_reach(settings: FlightSettings, tip: Tip, detector: Detector) -> None:
@@ -105,7 +106,7 @@ class FlightCrew:
             "reach": settings.reach * tip.nearest_neighbour_distance,
             "opening_angle": settings.opening_angle,
             "tolerance": settings.tolerance,
-            "most_steps": settings.most_steps,
+            "max_steps": settings.max_steps,
         }
 
     @contextmanager
@@ -128,7 +129,7 @@ class FlightCrew:
             self._halt[0] = 0
             self._go.set()
 
-    def start(self, batch: Batch, groups: Sequence[tuple[Floats, Floats]]) -> Callable[[], list[tuple[Any, ...]]]:
+    def start(self, batch: Batch, groups: Sequence[tuple[Floats, Floats]]) -> Callable[[], list[Ends]]:
         """Begin the flights of a batch.
 
         Parameters
@@ -142,8 +143,7 @@ class FlightCrew:
         Returns
         -------
         callable
-            Flies what is left of the batch, and gives for each group the positions, velocities and reduced times at the
-            end (n, m, ...), NaN where there was no flight, and whether the ion left (n, m).
+            Flies what is left of the batch, and gives the `Ends` of each group.
         """
         if batch.tree is not None:
             self._record = _Record(batch.tree)
@@ -186,7 +186,9 @@ class FlightCrew:
             left[flown] = outcome == LEFT
             ends, left = ends.reshape(n, sum(sizes), 7), left.reshape(n, sum(sizes))
             edges = np.cumsum([0, *sizes])
-            return [(ends[:, a:b, :3], ends[:, a:b, 3:6], ends[:, a:b, 6], left[:, a:b]) for a, b in pairwise(edges)]
+            return [
+                Ends(ends[:, a:b, :3], ends[:, a:b, 3:6], ends[:, a:b, 6], left[:, a:b]) for a, b in pairwise(edges)
+            ]
 
         return wait
 

@@ -8,19 +8,26 @@ What is fitted is the stereographic direction (see `Detector.directions`) and th
 polar angle: smoother than the place itself, which grows without bound for ions that fly along the detector.
 """
 
+import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from apt_evap._common.types import Floats
+from apt_evap._common.types import Booleans, Floats
 from apt_evap._common.validation import check_count, check_kind, check_number, check_sequence, shown
+from apt_evap._common.warnings import ResponseWarning
+from apt_evap.detection.detector import Detector
+from apt_evap.emission.emissions import Emissions
 from apt_evap.emission.energies import HIGHEST_ENERGY
+from apt_evap.emission.surface_frame import along_surface, rolled_positions
+from apt_evap.flight.landing import Ends, land
 from apt_evap.units import FLIGHT_TIME
 
 _HIGHEST_DEGREE = 12  # 91 coefficients: no response needs more
-_MOST_LAUNCHES = 1000
+_MAX_LAUNCHES = 1000
 CHUNK = 1 << 16  # ions evaluated at once: their monomials stay below 10 MB
 
 
@@ -118,7 +125,7 @@ def _ring(ring):
     if len(pair) != 2:
         raise ValueError(f"rings must be pairs (radius, launches), got {shown(ring)}")
     radius = check_number(pair[0], "radius of a ring in rings", at_least=0)
-    return radius, check_count(pair[1], "launches of a ring in rings", at_least=1, at_most=_MOST_LAUNCHES)
+    return radius, check_count(pair[1], "launches of a ring in rings", at_least=1, at_most=_MAX_LAUNCHES)
 
 
 @dataclass(frozen=True)
@@ -169,6 +176,121 @@ class Responses(NamedTuple):
     def __repr__(self) -> str:
         n, _, coefficients = self.site.shape
         return f"<Responses: {n:,} ions, {coefficients} coefficients from the site, {self.rolled.shape[2]} rolled up>"
+
+
+class ResponseModel:
+    """The responses of a run: which launches are flown for them, the fit, and the hits that follow.
+
+    Parameters
+    ----------
+    settings : ResponseSettings
+        Designs of the launches, energy limit and bound.
+    detector : Detector
+        The detector.
+    """
+
+    def __init__(self, settings: ResponseSettings, detector: Detector) -> None:
+        self.settings, self.detector = settings, detector
+
+    def launches(self, emissions: Emissions) -> list[tuple[Floats, Floats]]:
+        """Launches of the two designs, from the site and rolled up.
+
+        Parameters
+        ----------
+        emissions : Emissions
+            A batch of n.
+
+        Returns
+        -------
+        list of (ndarray, ndarray)
+            Positions [nm] and velocities [sqrt(V)] of each design, shape (n, m, 3); NaN for ions that cannot roll.
+        """
+        groups = []
+        starts = emissions.positions, rolled_positions(emissions)
+        for design, start in zip((self.settings.site, self.settings.rolled), starts, strict=True):
+            speeds = self.settings.launched(design.velocities, emissions.charge_states)
+            velocities = along_surface(emissions.normals, speeds[..., 0], speeds[..., 1])
+            groups.append((np.broadcast_to(start[:, None], velocities.shape), velocities))
+        return groups
+
+    def fit(self, ends: Sequence[Ends], slowness: Floats, apex: float) -> Responses:
+        """Fit the polynomials to the ends of these launches.
+
+        Parameters
+        ----------
+        ends : sequence of Ends
+            Of the launches of the two designs, for n ions.
+        slowness : ndarray, shape (n,)
+            See `Emissions.slowness`.
+        apex : float
+            z of the apex [nm].
+
+        Returns
+        -------
+        Responses
+        """
+        coefficients, residuals = [], []
+        for design, each in zip((self.settings.site, self.settings.rolled), ends, strict=True):
+            directions, times = land(each, slowness, self.detector, apex)
+            n, m = times.shape
+            values = flattened(directions.reshape(-1, 2), times.ravel()).reshape(n, m, 3)
+            fitted, residual = design.fit(values)
+            coefficients.append(fitted)
+            # a small change of the stereographic direction is half as large on a plane at unit distance
+            residuals.append(2.0 * self.detector.distance * residual)
+        return Responses(*coefficients, np.stack(residuals, axis=1).astype(np.float32))
+
+    def evaluate(
+        self, responses: Responses, rolled: Booleans, first: Floats, second: Floats, masses: Floats
+    ) -> tuple[Floats, Floats]:
+        """Directions and times of flight of ions that launch along the surface.
+
+        Parameters
+        ----------
+        responses : Responses
+            Of n ions.
+        rolled : ndarray of bool, shape (n,)
+            Ions that rolled up.
+        first, second : ndarray, shape (n,)
+            Velocities along t1 and t2 of `tangent_frame` [nm/ns].
+        masses : ndarray, shape (n,)
+            Masses [Da].
+
+        Returns
+        -------
+        directions : ndarray, shape (n, 2)
+            Stereographic directions.
+        times : ndarray, shape (n,)
+            Times of flight [ns].
+
+        Warns
+        -----
+        ResponseWarning
+            If ions launch above the energy limit: their places are extrapolated.
+        """
+        velocities = self.settings.reduced(np.column_stack([first, second]), masses)
+        faster = int(np.count_nonzero(np.einsum("ij,ij->i", velocities, velocities) > 1.0001))
+        if faster:
+            warnings.warn(
+                f"{faster:,} of {len(velocities):,} ions launch above the {self.settings.energy_limit:g} eV of the "
+                "responses: their places are extrapolated; run with a larger energy_limit, of ResponseSettings or in "
+                "[responses] of a settings file",
+                ResponseWarning,
+                stacklevel=3,
+            )
+        values = np.empty((len(velocities), 3))
+        for design, coefficients, chosen in (
+            (self.settings.site, responses.site, ~rolled),
+            (self.settings.rolled, responses.rolled, rolled),
+        ):
+            every = slice(None) if chosen.all() else chosen
+            values[every] = design.evaluate(coefficients[every], velocities[every])
+        return unflattened(values)
+
+    def flagged(self, responses: Responses, can_roll: Booleans) -> Booleans:
+        """Ions whose responses miss their own flights by more than the bound, or could not be fitted, bool (n,)."""
+        bad = ~(responses.residuals <= self.settings.bound)
+        return bad[:, 0] | (bad[:, 1] & can_roll)
 
 
 def flattened(directions: Floats, times: Floats) -> Floats:

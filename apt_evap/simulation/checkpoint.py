@@ -23,6 +23,7 @@ from apt_evap._common.files import FileError, check_path, flush_folder
 from apt_evap._common.interrupts import uninterrupted
 from apt_evap._common.validation import check_count, check_number, check_switch
 from apt_evap.evaporation.state import EmitterState
+from apt_evap.simulation.ending import Ending
 from apt_evap.simulation.run import PART_NAME, Run, load, part_paths
 from apt_evap.simulation.run_hdf5 import count_ions, described, is_run, plain, read_state, write_state
 
@@ -33,7 +34,6 @@ except ImportError:  # not on this system: two processes on one file are not not
 
 
 STATE_NAME, WHOLE_NAME = "state.h5", "whole.h5"
-NOTHING_LEFT = "no atom is left that may evaporate"  # why a run ended that is complete, though shorter than asked for
 
 
 @dataclass(frozen=True)
@@ -255,7 +255,7 @@ class Keeper:
             raise FileError(f"{error}; overwrite=True replaces it") from error
         if differing := self._differing(done):
             raise FileError(f"{name!r} holds a run with other settings ({differing}): overwrite=True replaces it")
-        if done.ended not in ("", NOTHING_LEFT):
+        if done.ended not in (Ending.COMPLETE, Ending.EXHAUSTED):
             raise FileError(f"{name!r} holds a run of {len(done):,} ions that is not complete ({done.ended}): {anew}")
         if len(done) > n_ions:
             raise FileError(

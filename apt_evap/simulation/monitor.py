@@ -1,4 +1,4 @@
-"""Watching a run: how well its charges have settled, and the shares of ions that went badly, as it goes on."""
+"""The monitor of a run: how well its charges have converged, and the fractions of ions that went badly."""
 
 import warnings
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ import numpy as np
 
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_count, check_number
-from apt_evap._core.interactions import direct_field
+from apt_evap._common.warnings import ChargesWarning, ResponseWarning, RunWarning
 from apt_evap.detection.hits import Outcome
 from apt_evap.evaporation.emitter import Emitter
 from apt_evap.simulation.history import History
@@ -32,26 +32,26 @@ class WatchSettings:
         RMS residual of the charges, relative to the mean charge, above which a warning says so. Measured on Ni[111]
         with the default settings: 0.0005 to 0.0032 (R = 20 a and 40 a, 4,000 events), with RMS errors of the charges,
         against converged ones, of 0.8 to 2.5 times as much.
-    share_bound : float
-        Share of the ions between two looks that never leave, or that the responses mark, above which a warning says so;
-        in the same runs there were none.
+    fraction_bound : float
+        Fraction of the ions between two looks that never leave, or whose responses are inexact, above which a warning
+        says so; in the same runs there were none.
     """
 
     interval: int | None = None
     sample: int = 128
     charge_bound: float = 0.01
-    share_bound: float = 0.01
+    fraction_bound: float = 0.01
 
     def __post_init__(self):
         if self.interval is not None:
             check_count(self.interval, "interval", at_least=1)
         check_count(self.sample, "sample", at_least=1)
         check_number(self.charge_bound, "charge_bound", above=0)
-        check_number(self.share_bound, "share_bound", at_least=0, at_most=1)
+        check_number(self.fraction_bound, "fraction_bound", at_least=0, at_most=1)
 
 
 def charge_residuals(emitter: Emitter, sample: int, seed: int) -> Floats:
-    """How far sampled charges are from what Robin's equation makes of all the others, by direct sums.
+    """How far sampled charges are from the equation of the charging rule, by direct sums.
 
     Parameters
     ----------
@@ -65,24 +65,16 @@ def charge_residuals(emitter: Emitter, sample: int, seed: int) -> Floats:
     Returns
     -------
     ndarray, shape (sample,)
-        Residuals over the mean charge of the surface.
-
-    Notes
-    -----
-    (s/2 pi) sum_k q_k n_i . r_ik / r_ik^3 - q_i, with r_ik = r_i - r_k and the area per atom s of the last relaxation
-    (Rolland et al., Microsc. Microanal. 21, 1649, 2015). Each sweep of Robin's iteration about halves the error, so
-    that it is about as large as the residual.
+        Residuals over the mean charge of the surface; NaN for a rule that cannot say.
     """
     positions, normals, charges = emitter.positions, emitter.normals, emitter.charges
     chosen = np.flatnonzero(emitter.tip.evaporable[emitter.atoms])
     if len(chosen) > sample:
         chosen = np.sort(np.random.default_rng(seed).choice(chosen, sample, replace=False))
-    field = direct_field(positions[chosen], positions, charges)
-    settled = emitter.area_per_atom / (2 * np.pi) * np.einsum("ij,ij->i", field, normals[chosen])
-    return (settled - charges[chosen]) / charges.mean()
+    return emitter.rule.residuals(positions, normals, charges, chosen)
 
 
-class Watch:
+class Monitor:
     """Looks at a run as it goes on.
 
     Parameters
@@ -104,7 +96,7 @@ class Watch:
         self._since = []  # outcomes, marks and fields of the ions since the last look, batch by batch
         self._counted, self._warned = first, set()
         self._last = max((int(part.history.ions[-1]) for part in done if len(part.history.ions)), default=first)
-        self._shown = {}
+        self._latest = {}
         for part in done:
             self.count(part)
 
@@ -113,16 +105,17 @@ class Watch:
         return ions - self._last >= self._interval
 
     def look(self, emitter: Emitter, ions: int) -> None:
-        """Check the charges; the shares follow once all of these ions have been counted."""
+        """Check the charges; the fractions follow once all of these ions have been counted."""
         residuals = charge_residuals(emitter, self._settings.sample, seed=ions)
         rms, largest = float(np.sqrt(np.mean(residuals**2))), float(np.abs(residuals).max())
         self._last, self._open = ions, (ions, rms, largest)
-        self._shown["charges"] = f"{rms:.1e}"
-        if not rms <= self._settings.charge_bound:
+        self._latest["charges"] = f"{rms:.1e}"
+        if rms > self._settings.charge_bound:
             self._warn(
+                ChargesWarning,
                 "charges",
-                f"after {ions:,} ions the charges are {rms:.2g} of the mean charge away from settled ones (RMS of "
-                f"{len(residuals)}), expected at most {self._settings.charge_bound:g}: take a smaller sweep_interval "
+                f"after {ions:,} ions the residuals of the charges are {rms:.2g} of the mean charge (RMS of "
+                f"{len(residuals)}), above the bound of {self._settings.charge_bound:g}: take a smaller sweep_interval "
                 "or tolerance, or a larger patch_radius, of ChargeSettings, [charges] in a file",
             )
         self._close()
@@ -132,7 +125,7 @@ class Watch:
         if len(part):
             known = part.emissions.ions >= self._last if self._open is None else slice(None)
             hits = part.hits(part.first_perturbation)
-            self._since.append((hits.outcome[known], part.marked[known], part.fields[known]))
+            self._since.append((hits.outcome[known], part.flagged[known], part.fields[known]))
             self._counted = int(part.emissions.ions[-1]) + 1
         self._close()
 
@@ -140,34 +133,41 @@ class Watch:
         if self._open is None or self._counted < self._open[0]:
             return
         if self._since:
-            outcome, marked, fields = (np.concatenate(columns) for columns in zip(*self._since, strict=True))
-            shares = [float(np.mean(outcome == kind)) for kind in (Outcome.MISSED, Outcome.NEVER_LEFT)]
-            shares.append(float(np.mean(marked)))
-            self._rows.append((*self._open, *shares, float(np.mean(fields))))
-            self._judge(*shares)
+            outcome, flagged, fields = (np.concatenate(columns) for columns in zip(*self._since, strict=True))
+            fractions = [float(np.mean(outcome == kind)) for kind in (Outcome.MISSED, Outcome.NEVER_LEFT)]
+            fractions.append(float(np.mean(flagged)))
+            self._rows.append((*self._open, *fractions, float(np.mean(fields))))
+            self._judge(*fractions)
         self._open, self._since = None, []
 
-    def _judge(self, missed, never_left, marked):
-        self._shown |= {"missed": f"{missed:.1%}", "never left": f"{never_left:.1%}", "marked": f"{marked:.1%}"}
-        for share, what, advice in (
-            (never_left, "never left the specimen", "more most_steps of FlightSettings, [flights] in a file, may help"),
+    def _judge(self, missed, never_left, flagged):
+        self._latest |= {"missed": f"{missed:.1%}", "never left": f"{never_left:.1%}", "flagged": f"{flagged:.1%}"}
+        for fraction, kind, what, advice in (
             (
-                marked,
-                "are marked, as their responses are inexact",
+                never_left,
+                RunWarning,
+                "never left the specimen",
+                "more max_steps of FlightSettings, [flights] in a file, may help",
+            ),
+            (
+                flagged,
+                ResponseWarning,
+                "have inexact responses",
                 "a smaller energy_limit of ResponseSettings, [responses] in a file, helps",
             ),
         ):
-            if share > self._settings.share_bound:
+            if fraction > self._settings.fraction_bound:
                 self._warn(
+                    kind,
                     what,
-                    f"{share:.1%} of the last ions, up to {self._last:,}, {what}, expected at most "
-                    f"{self._settings.share_bound:.2g}: {advice}",
+                    f"{fraction:.1%} of the last ions, up to {self._last:,}, {what}, expected at most "
+                    f"{self._settings.fraction_bound:.2g}: {advice}",
                 )
 
-    def _warn(self, what, message):
+    def _warn(self, kind, what, message):
         if what not in self._warned:  # once in a run, not at every look
             self._warned.add(what)
-            warnings.warn(message, stacklevel=4)
+            warnings.warn(message, kind, stacklevel=6)
 
     def take(self) -> History:
         """History of the looks since it was last taken."""
@@ -176,6 +176,6 @@ class Watch:
         return History(np.array(columns[0], np.int64), *(np.array(column, float) for column in columns[1:]))
 
     @property
-    def shown(self) -> dict[str, Any]:
-        """What the progress line shows, dict."""
-        return dict(self._shown)
+    def latest(self) -> dict[str, Any]:
+        """What the progress line shows of the latest look, dict."""
+        return dict(self._latest)

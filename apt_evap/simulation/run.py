@@ -20,7 +20,8 @@ from apt_evap.emission.emissions import Emissions
 from apt_evap.emission.ion_random import IonRandom
 from apt_evap.emission.perturbations import Perturbation, Unperturbed
 from apt_evap.evaporation.state import EmitterState
-from apt_evap.flight.response import Responses, ResponseSettings, unflattened
+from apt_evap.flight.response import ResponseModel, Responses, ResponseSettings
+from apt_evap.simulation.ending import Ending
 from apt_evap.simulation.history import History
 from apt_evap.simulation.run_hdf5 import described, read_run, write_run
 
@@ -112,18 +113,21 @@ class Run:
 
     def __repr__(self) -> str:
         flown = ", ".join(_describe(perturbation) for perturbation in self.perturbations)
-        responses = "" if self.responses is None else f"responses with {self.marked.sum():,} ions marked"
+        responses = "" if self.responses is None else f"responses, {self.flagged.sum():,} of them flagged"
         held = "; ".join(part for part in (responses, flown and f"flown: {flown}", self.ended) if part)
         return f"<Run: {len(self):,} ions of {', '.join(self.elements)} at {self.voltage:g} V; {held}>"
 
     @property
-    def marked(self) -> Booleans:
+    def response_model(self) -> ResponseModel:
+        """The responses of the run: launches, fit and evaluation."""
+        return ResponseModel(self.response_settings, self.detector)
+
+    @property
+    def flagged(self) -> Booleans:
         """Ions whose responses miss their own flights by more than the bound, or could not be fitted, bool (n,)."""
         if self.responses is None:
             return np.zeros(len(self), bool)
-        rolls = np.isfinite(self.emissions.neighbours).all(axis=1)
-        bad = ~(self.responses.residuals <= self.response_settings.bound)
-        return bad[:, 0] | (bad[:, 1] & rolls)
+        return self.response_model.flagged(self.responses, self.emissions.can_roll)
 
     @property
     def first_perturbation(self) -> Any:
@@ -166,25 +170,10 @@ class Run:
             )
         if self.responses is None:
             raise ValueError(f"this run has no responses and {shown(perturbation)} was not flown in it")
-        settings = self.response_settings
-        rolled, first, second = perturbation.tangential(self.emissions, IonRandom(self.seed, self.emissions.ions))  # type: ignore[attr-defined]
-        velocities = settings.reduced(np.column_stack([first, second]), self.emissions.masses)
-        faster = int(np.count_nonzero(np.einsum("ij,ij->i", velocities, velocities) > 1.0001))
-        if faster:
-            warnings.warn(
-                f"{faster:,} of {len(self):,} ions launch above the {settings.energy_limit:g} eV of the responses: "
-                "their places are extrapolated; run with a larger energy_limit, of ResponseSettings or in [responses] "
-                "of a settings file",
-                stacklevel=2,
-            )
-        values = np.empty((len(self), 3))
-        for design, coefficients, chosen in (
-            (settings.site, self.responses.site, ~rolled),
-            (settings.rolled, self.responses.rolled, rolled),
-        ):
-            every = slice(None) if chosen.all() else chosen
-            values[every] = design.evaluate(coefficients[every], velocities[every])
-        return self._hits(*unflattened(values), perturbation)
+        emissions = self.emissions
+        rolled, first, second = perturbation.tangential(emissions, IonRandom(self.seed, emissions.ions))  # type: ignore[attr-defined]
+        landed = self.response_model.evaluate(self.responses, rolled, first, second, emissions.masses)
+        return self._hits(*landed, perturbation)
 
     def _hits(self, directions, times, perturbation):
         x, y, times, outcome = self.detector.impacts(directions, times)
@@ -220,15 +209,15 @@ class Run:
         return replace(self, detector=detector, settings=self.settings | {"detector": vars(detector)})
 
     def summary(self) -> dict[str, Any]:
-        """Counts of what happened, dict: ions, outcomes of the first perturbation, ions that cannot roll, marked."""
+        """Counts of what happened, dict: ions, outcomes of the first perturbation, ions that cannot roll, flagged."""
         first = self.first_perturbation
         counts = {outcome.name.lower(): count for outcome, count in self.hits(first).counts.items()}
         return {
             "ions": len(self),
             "perturbation": _describe(first),
             **counts,
-            "without_neighbour": int((~np.isfinite(self.emissions.neighbours).all(axis=1)).sum()),
-            "marked": int(self.marked.sum()),
+            "without_neighbour": int((~self.emissions.can_roll).sum()),
+            "flagged": int(self.flagged.sum()),
             "ended": self.ended,
         }
 
@@ -238,13 +227,7 @@ class Run:
     def join(cls, runs: "Sequence[Run]") -> "Run":
         """Join the parts of one run, in their order, into one."""
         first = runs[0]
-        emissions = Emissions(
-            **{
-                name: np.concatenate([getattr(run.emissions, name) for run in runs])
-                for name in ("positions", "normals", "neighbours", "charge_states", "masses", "ions")
-            },
-            nearest_neighbour_distance=first.emissions.nearest_neighbour_distance,
-        )
+        emissions = Emissions.join([run.emissions for run in runs])
         columns = {
             name: np.concatenate([getattr(run, name) for run in runs])
             for name in ("site", "species", "charges", "fields")
@@ -329,10 +312,10 @@ def _load_parts(folder, partial):
         parts.append(part)
     if not parts:
         raise FileError(f"{str(folder)!r} holds no run: expected files {PART_NAME.format(0)!r} and so on")
-    return Run.join(parts).ended_by(UNFINISHED)
+    return Run.join(parts).ended_by(Ending.UNFINISHED)
 
 
-PART_NAME, UNFINISHED = "ions-{:012d}.h5", "unfinished"
+PART_NAME = "ions-{:012d}.h5"
 
 
 def part_paths(folder: Path) -> list[Path]:

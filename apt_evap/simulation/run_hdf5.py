@@ -7,6 +7,7 @@ import io
 import json
 import warnings
 from contextlib import contextmanager, suppress
+from dataclasses import fields
 from typing import Any
 
 import h5py
@@ -180,7 +181,12 @@ def _write(file, run):
 
 
 def _put_state(group, state, first_event):
-    for name, value in vars(state).items():
+    for name, value in (vars(state) | state.rule_state).items():
+        if name == "rule_state":
+            continue
+        if name in state.rule_state:
+            group.attrs[name] = value
+            continue
         if isinstance(value, np.ndarray):
             _put(group, name, value)
         else:
@@ -314,13 +320,14 @@ def _read_state(group):
     values = {name: group[name][()] for name in group} | dict(group.attrs)
     values.pop("format", None)  # of a file of its own
     first_event = int(values.pop("first_event"))
-    for name in ("potential_point", "deepened"):
-        values[name] = tuple(values[name].tolist())
+    values["deepened"] = tuple(values["deepened"].tolist())
     for name in ("clipped", "unsettled"):
         values[name] = int(values[name])
     for name in ("tolerance", "opening_angle"):
         values[name] = float(values[name])
-    return EmitterState(**values), first_event
+    own = {item.name for item in fields(EmitterState)}
+    rule_state = {name: value for name, value in values.items() if name not in own}
+    return EmitterState(**{name: values[name] for name in own & set(values)}, rule_state=rule_state), first_event
 
 
 def _known(description):

@@ -9,34 +9,33 @@ import warnings
 from collections.abc import Callable, Iterable
 
 import numpy as np
-from tqdm.auto import tqdm
 
-from apt_evap._common.files import FileError
+from apt_evap._common.describe import describe
 from apt_evap._common.interrupts import interruptible
 from apt_evap._common.memory import check_copies
 from apt_evap._common.threads import thread_count
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_count, check_kind, check_seed, check_sequence, check_switch
-from apt_evap._core.evaporation import EXHAUSTED, SWEEP_DUE, TOO_SHALLOW
-from apt_evap._core.robin import ChargingRule
+from apt_evap._common.warnings import RunWarning
+from apt_evap._core.rule import ChargingRule
 from apt_evap.detection.detector import Detector
-from apt_evap.emission.emissions import Emissions, Launches
+from apt_evap.emission.emissions import Emissions, check_launches
 from apt_evap.emission.ion_random import IonRandom
 from apt_evap.emission.perturbations import Perturbation, Unperturbed
-from apt_evap.emission.surface_frame import tangent_frame
-from apt_evap.evaporation.emitter import Emitter
+from apt_evap.evaporation.emitter import BATCH, Emitter
 from apt_evap.evaporation.law import Extremal, Law
-from apt_evap.evaporation.settings import ChargeSettings, check_voltage
+from apt_evap.evaporation.rule import Rule
+from apt_evap.evaporation.settings import ChargeSettings
+from apt_evap.evaporation.voltage import check_voltage
 from apt_evap.flight.crew import FlightCrew, FlightSettings, check_reach
-from apt_evap.flight.response import Responses, ResponseSettings, flattened
-from apt_evap.simulation.checkpoint import NOTHING_LEFT, Checkpoint, Keeper
-from apt_evap.simulation.monitor import Watch, WatchSettings
+from apt_evap.flight.landing import land
+from apt_evap.flight.response import ResponseModel, ResponseSettings
+from apt_evap.simulation.checkpoint import Checkpoint, Keeper
+from apt_evap.simulation.monitor import WatchSettings
+from apt_evap.simulation.recorder import Recorder
 from apt_evap.simulation.run import Flown, Run
-from apt_evap.simulation.run_parts import Parts, catch_up
 from apt_evap.specimen.tip import Tip
-from apt_evap.units import FLIGHT_TIME
 
-BATCH = 256  # events at a time; the results do not depend on it
 BACKLOG = 4  # batches whose flights may wait while events happen
 
 
@@ -53,8 +52,8 @@ class Simulation:
         Seed of the random numbers of the perturbations.
     detector : Detector, optional
         By default a square of 300 mm at 100 mm.
-    law : Extremal, optional
-        Which atom leaves next.
+    law : law, optional
+        Which atom leaves next; by default `Extremal`.
     charge_settings : ChargeSettings, optional
         How finely charges are solved.
     flight_settings : FlightSettings, optional
@@ -63,10 +62,10 @@ class Simulation:
         Flights and polynomials of the responses.
     n_threads : int, optional
         Threads; by default the processors this process may use. The results do not depend on it.
-    rule : ChargingRule, optional
-        How charge settles; by default Robin's iteration.
+    rule : charging rule, optional
+        How charge distributes over the surface; by default `Robin`.
     watch_settings : WatchSettings, optional
-        How the run is watched as it goes on.
+        How the run is monitored.
 
     Raises
     ------
@@ -85,7 +84,7 @@ class Simulation:
         flight_settings: FlightSettings | None = None,
         response_settings: ResponseSettings | None = None,
         n_threads: int | None = None,
-        rule: ChargingRule | None = None,
+        rule: ChargingRule | Rule | None = None,
         watch_settings: WatchSettings | None = None,
     ) -> None:
         self.voltage = check_voltage(voltage)
@@ -163,8 +162,9 @@ class Simulation:
         FileError
             If the file of the checkpoints cannot be written, belongs to somebody else or does not fit.
         ValueError
-            If an argument is out of its range, or a perturbation has no `launch`. Whatever is raised once ions are done
-            has them in its attribute `run`.
+            If an argument is out of its range, or a perturbation has no `launch`.
+        RunInterrupted
+            If an error ends the run after some of its ions; they are in its attribute `run`.
         """
         n_ions = check_count(n_ions, "n_ions", at_least=1)
         batch_size = check_count(batch_size, "batch_size", at_least=1)
@@ -185,109 +185,77 @@ class Simulation:
             return self._run(n_ions, emissions, responses, progress, batch_size, keeper)
 
     def _run(self, n_ions, emissions, responses, progress, batch_size, keeper):
-        parts = Parts(keeper, self.emitter)
-        if parts.done:
-            catch_up(self.emitter, parts.done[0], BATCH)
-            self.n_evaporated = int(parts.done[0].emissions.ions[-1]) + 1
-        interval = self.watch_settings.interval or 10 * self.emitter.sweep_interval
-        watch = parts.watch = Watch(self.watch_settings, interval, self.n_evaporated - len(parts), parts.done)
-        ended = ""
+        self._catch_up(keeper.done if keeper else None)
         self.emitter.hand_out_tree()  # somebody may have let atoms evaporate without flights
-        told = progress if callable(progress) else None
-        disable = True if told else None if progress is None else not progress
+        backlog = BACKLOG if self.n_threads > 1 else 0
         with (
-            tqdm(
-                total=n_ions, initial=len(parts), unit=" ions", smoothing=0.1, disable=disable, mininterval=0.5
-            ) as bar,
             self._crew.at_work(),
             interruptible() as interrupted,
+            Recorder(self.emitter, self.watch_settings, n_ions, self.n_evaporated, progress, keeper) as recorder,
         ):
+            for batch in self.emitter.advance(recorder.missing, batch_size, self._crew.paused):
+                part = self._start_flights(batch, emissions, responses)
+                recorder.add(batch, part, self.n_evaporated, backlog)
+                if interrupted.is_set():
+                    recorder.interrupt()
+                    break
+        return recorder.run
 
-            def collect(most=0):
-                nonlocal landed
-                while len(waiting) > most:
-                    part = waiting.pop(0)()
-                    parts.append(part)
-                    watch.count(part)
-                    bar.set_postfix(watch.shown, refresh=False)
-                    bar.update(len(part))
-                    landed += len(part)
-                    if told:
-                        told(landed, n_ions)
+    def _catch_up(self, done):
+        """Bring a new surface to where a run ends that is resumed, by its state and the events since.
 
-            waiting = []
-            started = landed = len(parts)
-            try:
-                while started < n_ions and not ended:
-                    batch = self.emitter.evaporate(min(batch_size, n_ions - started))
-                    started += len(batch)
-                    waiting.append(self._start_flights(batch, emissions, responses))
-                    collect(BACKLOG if self.n_threads > 1 else 0)
-                    if batch.status == SWEEP_DUE:
-                        if watch.due(self.n_evaporated):
-                            collect()
-                            watch.look(self.emitter, self.n_evaporated)
-                        with self._crew.paused():
-                            self.emitter.relax()
-                    elif batch.status == EXHAUSTED:
-                        ended = NOTHING_LEFT
-                    elif batch.status == TOO_SHALLOW:
-                        self.emitter.deepen()
-                    if interrupted.is_set() and not ended and started < n_ions:
-                        ended = "interrupted"
-                    if keeper and keeper.due(started):
-                        collect()
-                        parts.keep()
-                collect()
-            except KeyboardInterrupt:  # the second Ctrl-C: what is in a checkpoint's run stays
-                parts.keep()
-                raise
-            except Exception as error:  # nothing done is lost: a caller may save it
-                collect()
-                if len(parts):
-                    error.run = done = parts.run(f"{type(error).__name__}: {error}")  # type: ignore[attr-defined]
-                    error.add_note(f"the {len(done):,} ions done so far are in the attribute `run` of this exception")
-                parts.keep()
-                raise
-        run = parts.run(ended)
-        if keeper and not keeper.complete:
-            try:
-                keeper.finish(run)
-            except FileError as error:
-                error.run = run
-                raise
-        return run
+        Raises ValueError if atoms have left the emitter, or its events are not those of the run.
+        """
+        if done is None:
+            return
+        emitter = self.emitter
+        if left := emitter.counts["events"]:
+            raise ValueError(f"a run is resumed by a new Simulation, got one that {left:,} atoms left")
+        if done.state is not None:
+            emitter.restore(done.state)
+        ions = emitter.counts["events"] - done.first_event  # ions of the run that have left; those before it count down
+        same = ions <= len(done)
+        for batch in emitter.advance(max(len(done) - ions, 0)):
+            known = slice(max(ions, 0), max(ions + len(batch), 0))
+            kept = slice(len(batch) - (known.stop - known.start), None)
+            same = same and np.array_equal(batch.site[kept], done.site[known])
+            same = same and np.array_equal(batch.charges[kept], done.charges[known])
+            ions += len(batch)
+            if not same:
+                break
+        if not same or ions != len(done):
+            raise ValueError(
+                "the run cannot be resumed: its events do not come out the same again, as with another version of the "
+                "program, another kind of processor, or a surface that was changed by hand"
+            )
+        self.n_evaporated = int(done.emissions.ions[-1]) + 1
 
     # ---- one batch -------------------------------------------------------------------------------------------------
 
     def _start_flights(self, batch, emissions, responses):
-        """Begin the flights of a batch; return a function that waits for them and gives the batch as a Run."""
+        """Begin the flights of a batch; return a function that waits for them and returns the batch as a Run."""
         ions = np.arange(self.n_evaporated, self.n_evaporated + len(batch))
         self.n_evaporated += len(batch)
         emitted = self._emissions(batch, ions)
-        nobody = Launches(emitted.positions, emitted.positions, np.zeros(len(batch), bool))
         launches = [
-            perturbation.launch(emitted, IonRandom(self.seed, ions)) if len(batch) else nobody
-            for perturbation in emissions
+            check_launches(perturbation, perturbation.launch(emitted, IonRandom(self.seed, ions)), len(batch))
+            for perturbation in (emissions if len(batch) else ())
         ]
-        for perturbation, launch in zip(emissions, launches, strict=True):
-            if len(launch.positions) != len(batch):
-                raise ValueError(
-                    f"{perturbation!r} must launch {len(batch)} ions, one per emission, got {len(launch.positions)}"
-                )
-        slowness = FLIGHT_TIME * np.sqrt(emitted.masses / emitted.charge_states)  # ns per reduced time
+        slowness = emitted.slowness
+        nobody = np.empty((0, 1, 3))
         groups = [(launch.positions[:, None], (launch.velocities * slowness[:, None])[:, None]) for launch in launches]
+        groups += [(nobody, nobody)] * (len(emissions) - len(launches))
+        model = ResponseModel(self.response_settings, self.detector)
         if responses:
-            groups += self._designs(emitted)
+            groups += model.launches(emitted)
         flight = self._crew.start(batch, groups)
 
         def finish():
-            ends = flight()
+            ends, apex = flight(), self.tip.apex
             flown = []
-            for position, velocity, time, left in ends[: len(emissions)]:
-                directions, times = self._landed(position[:, 0], velocity[:, 0], time[:, 0], left[:, 0], slowness)
-                flown.append(Flown(directions, times))
-            fitted = self._fit(ends[len(emissions) :], slowness) if responses else None
+            for each in ends[: len(emissions)]:
+                directions, times = land(each, slowness, self.detector, apex)
+                flown.append(Flown(directions[:, 0], times[:, 0]))
             return Run(
                 emissions=emitted,
                 site=batch.site,
@@ -296,7 +264,7 @@ class Simulation:
                 fields=batch.fields,
                 perturbations=emissions,
                 flown=tuple(flown),
-                responses=fitted,
+                responses=model.fit(ends[len(emissions) :], slowness, apex) if responses else None,
                 seed=self.seed,
                 voltage=self.voltage,
                 detector=self.detector,
@@ -321,48 +289,13 @@ class Simulation:
             nearest_neighbour_distance=self.tip.nearest_neighbour_distance,
         )
 
-    def _designs(self, emitted):
-        """Launches of the two designs: positions and velocities of shape (n, m, 3)."""
-        settings = self.response_settings
-        first, second = tangent_frame(emitted.normals)
-        lifted = emitted.neighbours + emitted.nearest_neighbour_distance * emitted.normals
-        groups = []
-        for design, start in ((settings.site, emitted.positions), (settings.rolled, lifted)):
-            speeds = settings.launched(design.velocities, emitted.charge_states)
-            velocities = speeds[..., :1] * first[:, None] + speeds[..., 1:] * second[:, None]
-            groups.append((np.broadcast_to(start[:, None], velocities.shape), velocities))
-        return groups
-
-    def _landed(self, position, velocity, time, left, slowness):
-        """Stereographic directions (n, 2) and times of flight (n,) [ns]; NaN where an ion never left."""
-        directions, remaining = self.detector.directions(position, velocity, self.tip.apex)
-        directions[~left] = np.nan
-        return directions, np.where(left, (time + remaining) * slowness, np.nan)
-
-    def _fit(self, ends, slowness):
-        coefficients, residuals = [], []
-        designs = (self.response_settings.site, self.response_settings.rolled)
-        for design, (position, velocity, time, left) in zip(designs, ends, strict=True):
-            n, m = left.shape
-            directions, times = self._landed(
-                position.reshape(-1, 3),
-                velocity.reshape(-1, 3),
-                time.ravel(),
-                left.ravel(),
-                np.repeat(slowness, m),
-            )
-            fitted, residual = design.fit(flattened(directions, times).reshape(n, m, 3))
-            coefficients.append(fitted)
-            # a small change of the stereographic direction is half as large on a plane at unit distance
-            residuals.append(2.0 * self.detector.distance * residual)
-        return Responses(*coefficients, np.stack(residuals, axis=1).astype(np.float32))
-
     def _check_atoms(self, n_ions):
         """Warn of a run that cannot be as long as asked for."""
-        left = self.tip.most_ions - self.emitter.counts["events"]
+        left = self.tip.max_ions - self.emitter.counts["events"]
         if n_ions > left:
             warnings.warn(
                 f"n_ions is {n_ions:,} but only about {max(left, 0):,} atoms may leave: the run ends with the last",
+                RunWarning,
                 stacklevel=3,
             )
 
@@ -373,8 +306,8 @@ class Simulation:
             "voltage": self.voltage,
             "seed": self.seed,
             "detector": vars(self.detector),
-            "law": {"name": type(self.law).__name__, "repr": repr(self.law)},
-            "rule": type(self.emitter.rule).__name__,
+            "law": describe(self.law),
+            "rule": describe(self.emitter.rule),
             "charges": vars(self.emitter.settings),
             "flights": vars(self.flight_settings),
             "responses": {

@@ -307,7 +307,7 @@ class Tip:
         )
 
     @property
-    def most_ions(self) -> int:
+    def max_ions(self) -> int:
         """How many atoms may leave, those that a shell does not hold yet included: exact only without `depth`."""
         held = int(np.count_nonzero(self.evaporable))
         if self._depth is None:

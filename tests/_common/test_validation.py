@@ -162,7 +162,7 @@ CASES = [
             "opening_angle": [*NUMBER, -0.1, 3.0],
             "tolerance": [*POSITIVE, 1.0],
             "reach": [*POSITIVE, 10],
-            "most_steps": [*COUNT, 0],
+            "max_steps": [*COUNT, 0],
         },
     ),
     (
@@ -332,7 +332,7 @@ CASES = [
             "interval": [*COUNT[1:], 0],
             "sample": [*COUNT, 0],
             "charge_bound": POSITIVE,
-            "share_bound": [*NUMBER, -0.1, 1.1],
+            "fraction_bound": [*NUMBER, -0.1, 1.1],
         },
     ),
     (ae.read_map, {}, {"path": [None, 3, NAN, [], "a\0b", "none.npz"]}),
@@ -502,7 +502,7 @@ def test_a_detector_behind_the_end_of_the_flights():
 
 def test_more_ions_than_atoms_are_said_before_the_run_starts():
     simulation = ae.Simulation(shell, n_threads=1)
-    shell_and_below = round(simulation.tip.most_ions)
+    shell_and_below = round(simulation.tip.max_ions)
     with pytest.warns(UserWarning, match=rf"n_ions is 100,000 but only about {shell_and_below:,} atoms may leave"):
         with pytest.raises(KeyboardInterrupt):
             simulation.run(100_000, emissions=(_Interrupting(),), progress=False)
@@ -516,10 +516,10 @@ class _Interrupting:
 @pytest.mark.parametrize("shape", [{}, {"shank_angle": 20.0}, {"base": "flat", "shank_length": 6.0}])
 def test_the_atoms_that_may_leave_a_shell_are_those_of_the_whole(shape):
     whole, part = ae.Tip(nickel, 3.0, **shape), ae.Tip(nickel, 3.0, **shape, depth=1.2)
-    assert whole.most_ions == whole.evaporable.sum()
+    assert whole.max_ions == whole.evaporable.sum()
     # the surface is a layer of atoms or none: 0.1 nm of 3 nm, on three sides
-    assert part.most_ions == pytest.approx(whole.most_ions, rel=0.03)
-    assert part.most_ions > 1.2 * part.evaporable.sum()
+    assert part.max_ions == pytest.approx(whole.max_ions, rel=0.03)
+    assert part.max_ions > 1.2 * part.evaporable.sum()
 
 
 def test_unknown_materials_come_with_the_nearest_known():
@@ -602,7 +602,7 @@ def test_everything_says_in_one_line_what_it_holds(ready, tmp_path):
         (ae.RollUp(ae.TruncatedNormal(0.3, 0.1)), ["RollUp(energy=TruncatedNormal(mean=0.3, standard_deviation=0.1))"]),
         (ae.IonRandom(1, [0, 1]), ["IonRandom", "seed=1", "2 ions"]),
         (ae.ChargeSettings(), ["ChargeSettings", "tolerance=", "opening_angle=0.4"]),
-        (ae.FlightSettings(), ["FlightSettings", "tolerance=", "most_steps=500"]),
+        (ae.FlightSettings(), ["FlightSettings", "tolerance=", "max_steps=500"]),
         (ae.ResponseSettings(), ["energy_limit=1.5", "bound=0.2", "degree=4"]),
     ]
     for thing, words in told:

@@ -3,20 +3,14 @@ import pytest
 
 import apt_evap as ae
 from apt_evap._core.evaporation import DONE, EXHAUSTED, SWEEP_DUE, TOO_SHALLOW
+from apt_evap._core.law import WeightedField
 
 
 def evaporate(emitter, n):
-    """Let n atoms leave as a simulation does; return the indices of the atoms."""
-    sites = []
-    while n:
-        batch = emitter.evaporate(n)
-        sites.append(batch.site)
-        n -= len(batch)
-        if batch.status == SWEEP_DUE:
-            emitter.relax()
-        else:
-            assert batch.status == DONE
-    return np.concatenate(sites)
+    """Evaporate n atoms as a simulation does; return the indices of the atoms."""
+    sites = np.concatenate([batch.site for batch in emitter.advance(n, batch_size=n)])
+    assert len(sites) == n
+    return sites
 
 
 def charges_by_atom(emitter):
@@ -131,10 +125,10 @@ class Given:
     """A law of given weights."""
 
     def __init__(self, weights):
-        self.given = weights
+        self.weights = weights
 
-    def weights(self, tip):
-        return self.given
+    def kernel(self, tip):
+        return WeightedField(self.weights)
 
 
 def test_ties_go_by_number(small_tip):
@@ -296,7 +290,7 @@ def test_refuses_a_specimen_from_which_nothing_may_leave(nickel, small_tip):
     tip = ae.Tip.from_positions(
         small_tip.positions, small_tip.species, [nickel], evaporable=np.zeros(len(small_tip), bool)
     )
-    with pytest.raises(ValueError, match="may leave"):
+    with pytest.raises(ValueError, match="has no evaporable surface atom"):
         ae.Emitter(tip)
 
 

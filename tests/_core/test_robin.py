@@ -16,7 +16,7 @@ def solved(positions, normals, opening_angle=0.0, tolerance=1e-10, start=None, *
     start = np.ones(len(positions)) if start is None else start
     tree = Octree(np.ascontiguousarray(positions), start)
     rule = Robin()
-    sweeps, residual = rule.solve(
+    sweeps, residual = rule.iterate(
         tree,
         np.ascontiguousarray(normals[tree.atoms]),
         InteractionLists(tree, opening_angle, 2),
@@ -206,7 +206,7 @@ def test_a_warm_start_needs_few_sweeps(surface12):
 
 def test_too_few_sweeps_are_reported(surface12):
     positions, normals, _ = surface12
-    *_, sweeps, residual = solved(positions, normals, DEFAULT_ANGLE, most_sweeps=3)
+    *_, sweeps, residual = solved(positions, normals, DEFAULT_ANGLE, max_sweeps=3)
     assert sweeps == 3
     assert residual > 1e-10
 

@@ -33,7 +33,7 @@ def test_tracks_are_where_the_run_has_its_hits(run):
 
 def test_tracks_are_where_flights_land(run):
     """Against the flights themselves, in the directions that were drawn for them."""
-    good = ~run.marked & np.isfinite(run.emissions.neighbours).all(axis=1)
+    good = ~run.flagged & np.isfinite(run.emissions.neighbours).all(axis=1)
     flown = {kind: run.hits(kind(ENERGY)) for kind in (ae.LateralVelocity, ae.RollUp)}
     for hits in flown.values():
         good &= hits.detected

@@ -50,7 +50,7 @@ EVERY_KEY = {
         "tolerance": 1e-3,
         "start_tolerance": 1e-6,
     },
-    "flights": {"opening_angle": 0.4, "tolerance": 1e-2, "reach": 5000.0, "most_steps": 400},
+    "flights": {"opening_angle": 0.4, "tolerance": 1e-2, "reach": 5000.0, "max_steps": 400},
     "responses": {"energy_limit": 1.0, "bound": 0.1},
     "maps": {
         "bins": 40,
@@ -237,7 +237,7 @@ def test_an_unknown_table_and_a_missing_one(tmp_path):
             3,
             "opening_angle must be a finite number [rad] at least 0 and at most 1.5, got 3",
         ),
-        ("flights", "most_steps", 0.5, "most_steps must be a whole number"),
+        ("flights", "max_steps", 0.5, "max_steps must be a whole number"),
         ("responses", "bound", 0, "bound must be a finite number [mm] above 0, got 0"),
         ("maps", "bins", 0, "bins must be a whole number of at least 1 and at most 16,384, got 0"),
         ("maps", "bins", 10**9, "bins must be a whole number of at least 1 and at most 16,384, got 1000000000"),

@@ -21,7 +21,7 @@ def fly(tree, positions, velocities, groups=None, **options):
         "reach": 8000 * 0.352,
         "opening_angle": 0.0,
         "tolerance": DEFAULT.tolerance,
-        "most_steps": DEFAULT.most_steps,
+        "max_steps": DEFAULT.max_steps,
     }
     flights = Flights(tree, **(settings | options))
     m = len(positions)
@@ -93,7 +93,7 @@ def test_order_of_one_step():
     outwards = np.array([[0.5, 0.8, 0.1]])
     steps, errors = [], []
     for length in lengths:  # the first step is set by a length; a tolerance without bound accepts it
-        end, outcome, _ = fly(POINT, START, outwards, coulomb=1.0, length=length, tolerance=1e30, most_steps=1)
+        end, outcome, _ = fly(POINT, START, outwards, coulomb=1.0, length=length, tolerance=1e30, max_steps=1)
         assert outcome[0] == NEVER_LEFT
         steps.append(end[0, 6])
         errors.append(errors_against_hyperbola(end[0], velocity=outwards[0])[:2].max())
@@ -130,7 +130,7 @@ def test_a_charge_state_only_rescales_time():
 
 
 def test_an_ion_without_steps_never_leaves():
-    end, outcome, _ = fly(POINT, START, PUSH, most_steps=5)
+    end, outcome, _ = fly(POINT, START, PUSH, max_steps=5)
     assert outcome[0] == NEVER_LEFT
     assert np.isfinite(end).all()
     _, outcome, _ = fly(POINT, START, PUSH)
@@ -318,7 +318,7 @@ def test_flights_follow_the_events(tip12):
     emitter = ae.Emitter(tip12)
     batch = emitter.evaporate(30)
     starts = tip12.positions[batch.site]
-    flights = Flights(batch.tree, coulomb=COULOMB, opening_angle=0.3, tolerance=1e-3, most_steps=500, **options(tip12))
+    flights = Flights(batch.tree, coulomb=COULOMB, opening_angle=0.3, tolerance=1e-3, max_steps=500, **options(tip12))
     end, outcome = np.empty((30, 7)), np.empty(30, np.int8)
     flights.fly(
         batch.journal,
@@ -342,8 +342,8 @@ def test_flights_halt_and_go_on(tip12):
     """Halted, they take no ion; batch by batch the surface is followed to the state it has after all events."""
     emitter = ae.Emitter(tip12)
     first, second = emitter.evaporate(10), emitter.evaporate(10)
-    flights = Flights(first.tree, coulomb=COULOMB, opening_angle=0.3, tolerance=1e-3, most_steps=500, **options(tip12))
-    expected = Flights(first.tree, coulomb=COULOMB, opening_angle=0.3, tolerance=1e-3, most_steps=500, **options(tip12))
+    flights = Flights(first.tree, coulomb=COULOMB, opening_angle=0.3, tolerance=1e-3, max_steps=500, **options(tip12))
+    expected = Flights(first.tree, coulomb=COULOMB, opening_angle=0.3, tolerance=1e-3, max_steps=500, **options(tip12))
     ends = []
     for flier, halts in ((flights, [1, 0, 1, 0]), (expected, [0, 0])):
         for batch in (first, second):

@@ -173,7 +173,7 @@ def test_higher_degree_is_better(tip12):
 
 
 def test_bad_fits_are_marked(run):
-    assert not run.marked.any()
+    assert not run.flagged.any()
     bad = run.responses.residuals.copy()
     bad[3, 0], bad[5, 1], bad[7, 0] = 0.3, 0.3, np.nan
     marked = replace(run, responses=Responses(run.responses.site, run.responses.rolled, bad)).marked

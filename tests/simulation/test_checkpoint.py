@@ -215,7 +215,7 @@ def test_an_error_keeps_what_is_done(tmp_path):
                 raise RuntimeError("broken on purpose")
             return super().launch(emissions, random)
 
-    with pytest.raises(RuntimeError, match="on purpose") as caught:
+    with pytest.raises(ae.RunInterrupted, match="on purpose") as caught:
         small().run(90, [Breaking()], responses=False, progress=False, batch_size=30, checkpoint=tmp_path / "run.h5")
     assert len(caught.value.run) == 60
     assert len(ae.load(tmp_path / "run.h5.unfinished")) == 60
@@ -231,7 +231,7 @@ def test_a_full_disk_loses_nothing(tmp_path):
     try:
         with (
             pytest.warns(UserWarning, match=r"no checkpoint: cannot write .*File too large; the run goes on"),
-            pytest.raises(ae.FileError, match=r"cannot write .*File too large") as caught,
+            pytest.raises(ae.RunNotSaved, match=r"cannot write .*File too large") as caught,
         ):
             run_small(tmp_path / "run.h5")
     finally:

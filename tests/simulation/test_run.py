@@ -129,7 +129,7 @@ def test_one_that_says_its_velocities_along_the_surface_is_not_refused(run):
 def test_without_responses(small_tip):
     run = ae.Simulation(small_tip, seed=7).run(10, responses=False, progress=False)
     assert run.perturbations == (ae.Unperturbed(),)
-    assert not run.marked.any()
+    assert not run.flagged.any()
     assert len(run.hits(ae.Unperturbed())) == 10
     with pytest.raises(ValueError, match="no responses"):
         run.hits(ae.RollUp(ENERGY))

@@ -92,13 +92,10 @@ def test_the_sequence_is_that_of_the_emitter(small_tip, plain):
     """The simulation relaxes when the emitter asks for it, and not otherwise: the same atoms at the same charges."""
     emitter = ae.Emitter(small_tip)
     sites, charges, sweeps = [], [], 0
-    while sum(map(len, sites)) < 200:
-        batch = emitter.evaporate(200 - sum(map(len, sites)))
+    for batch in emitter.advance(200, batch_size=200):
         sites.append(batch.site)
         charges.append(batch.charges)
-        if batch.status == SWEEP_DUE:
-            emitter.relax()
-            sweeps += 1
+        sweeps += batch.status == SWEEP_DUE
     assert sweeps >= 1
     assert np.array_equal(np.concatenate(sites), plain.site)
     assert np.array_equal(np.concatenate(charges), plain.charges)
@@ -130,13 +127,13 @@ def test_a_detector_further_away_magnifies(small_tip):
 
 
 def test_ions_that_never_leave_are_counted(small_tip):
-    run = simulate(small_tip, 20, flight_settings=ae.FlightSettings(most_steps=3), emissions=[ae.Unperturbed()])
+    run = simulate(small_tip, 20, flight_settings=ae.FlightSettings(max_steps=3), emissions=[ae.Unperturbed()])
     assert run.summary()["never_left"] == 20
     hits = run.hits(ae.Unperturbed())
     assert (hits.outcome == ae.Outcome.NEVER_LEFT).all()
     assert np.isnan(hits.x).all()
     assert not hits.detected.any()
-    assert run.marked.all()  # there is nothing to fit
+    assert run.flagged.all()  # there is nothing to fit
     assert run.hits(ae.LateralVelocity(0.1)).counts[ae.Outcome.NEVER_LEFT] == 20
 
 
@@ -156,7 +153,7 @@ def test_ions_without_a_neighbour_do_not_roll_and_are_counted(lonely_tip):
     assert lonely[0]  # it sticks out furthest, so it goes first
     assert run.site[0] == len(lonely_tip) - 1
     assert run.summary()["without_neighbour"] == lonely.sum() < 40
-    assert not run.marked[0]  # a roll-up that cannot be is no bad fit
+    assert not run.flagged[0]  # a roll-up that cannot be is no bad fit
     unflown = replace(run, perturbations=(), flown=())
     still = run.hits(ae.Unperturbed())
     for source in (run, unflown):
@@ -398,10 +395,11 @@ class Breaking:
 
 
 def test_an_exception_keeps_what_is_done(small_tip):
-    with pytest.raises(RuntimeError, match="broken on purpose") as caught:
+    with pytest.raises(ae.RunInterrupted, match="broken on purpose; the 100 ions done before are in") as caught:
         ae.Simulation(small_tip, seed=1).run(200, [Breaking()], responses=False, progress=False, batch_size=50)
     assert len(caught.value.run) == 100
     assert caught.value.run.ended == "RuntimeError: broken on purpose"
+    assert isinstance(caught.value.__cause__, RuntimeError)
 
 
 def test_reach_must_be_beyond_the_specimen(small_tip):

@@ -1,0 +1,257 @@
+"""Charging rules: the contract, what rules share that keep the field on every slot, and rules written in Python."""
+
+from libc.math cimport M_PI, sqrt
+
+import numpy as np
+
+from apt_evap._core.interactions cimport InteractionLists
+from apt_evap._core.octree cimport Octree
+from apt_evap._core.sources cimport sources_field, sources_free, sources_init
+
+
+cdef extern from "kernels.h":
+    const int GROUP
+    void patch_field(long, const float*, const float*, const float*, long, const float*, const float*, const float*,
+                     const float*, float*, float*, float*) noexcept nogil
+
+
+cdef class ChargingRule:
+    """Interface of a charging rule: how charge distributes over the surface atoms.
+
+    Compiled rules implement the five methods below `solve` in Cython (``rule.pxd``); a rule in Python is wrapped by
+    `PythonRule`. The strength of a slot is the field just outside of it in a unit that `field_unit` gives: the charge,
+    unless a rule says otherwise.
+    """
+
+    def solve(self, Octree tree, double[:, ::1] normals, InteractionLists lists, *, double potential, double tolerance,
+              int max_sweeps=200, bint double_precision=False, int n_threads=1):
+        """Solve the charges of the whole surface and bring it to its potential.
+
+        Parameters
+        ----------
+        tree : Octree
+            Its charges are the start, and are replaced.
+        normals : ndarray, shape (n, 3)
+            Outward unit normals in the order of the slots.
+        lists : InteractionLists
+            Of this tree.
+        potential : float
+            Potential of the specimen over the Coulomb constant [e/nm].
+        tolerance : float
+            Largest relative change of a charge in a sweep at which to stop.
+        max_sweeps : int
+            Sweeps after which to stop in any case.
+        double_precision : bool
+            Sums in float64; needed for tolerances below 1e-6.
+        n_threads : int
+            Threads.
+
+        Returns
+        -------
+        sweeps : int
+            Sweeps done.
+        residual : float
+            Largest change of a charge in the last one, relative to the mean charge.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no solve")
+
+    def begin(self, point):
+        """Take a point well inside the specimen [nm], shape (3,), before the first relaxation."""
+
+    @property
+    def state(self):
+        """What a relaxation starts from besides the charges, dict of arrays by name; kept in files."""
+        return {}
+
+    @state.setter
+    def state(self, values):
+        pass
+
+    def settings(self):
+        """Parameters of the rule in plain types (dict): ``type(rule)(**rule.settings())`` is the same rule."""
+        return {}
+
+    def fresh(self):
+        """Return a rule of the same settings that has seen no surface."""
+        return type(self)(**self.settings())
+
+    def field_unit(self, double coulomb):
+        """Field just outside a slot of strength 1 [V/nm]: 4 pi k_e / area for a charge on its area of the surface."""
+        return 4.0 * M_PI * coulomb / self.area
+
+    def strengths(self, Octree tree):
+        """Strength of every slot of the tree, shape (n_slots,)."""
+        cdef double[::1] values = np.empty(tree.n_slots)
+        cdef long slot
+        with nogil:
+            for slot in range(tree.n_slots):
+                values[slot] = self.strength(tree, slot)
+        return np.asarray(values)
+
+    def residuals(self, positions, normals, charges, chosen):
+        """How far charges are from the rule's own equation, by direct sums over all others.
+
+        Parameters
+        ----------
+        positions, normals : ndarray, shape (n, 3)
+            Surface atoms [nm] and outward unit normals.
+        charges : ndarray, shape (n,)
+            Charges [e].
+        chosen : ndarray of int, shape (m,)
+            Atoms to check.
+
+        Returns
+        -------
+        ndarray, shape (m,)
+            Residuals over the mean charge; NaN for a rule that cannot say.
+        """
+        return np.full(len(chosen), np.nan)
+
+    cdef void removed(self, Octree tree, const Hole* hole) noexcept nogil:
+        # An atom has left, with its charge: the tree does not hold it any more.
+        pass
+
+    cdef int exposed(self, Octree tree, long slot, double opening_angle) except -1 nogil:
+        # An atom without charge has come to the surface, in this slot of the tree.
+        return 0
+
+    cdef int solve_patch(self, Octree tree, double[:, ::1] normals, const Hole* hole, Patch* patch) except -1 nogil:
+        # Solve the charges of the patch while all others are held, and spread the change over the slots of the hole.
+        with gil:
+            raise NotImplementedError(f"{type(self).__name__} has no solve_patch")
+
+    cdef double strength(self, Octree tree, long slot) noexcept nogil:
+        # Field just outside a slot, in units of `field_unit`.
+        return tree.q[slot]
+
+
+cdef class FieldRule(ChargingRule):
+    """A rule that keeps the field of all the others on every slot, and whose charges are never negative."""
+
+    def __cinit__(self, *args, **kwargs):
+        sources_init(&self.sources)
+
+    def __dealloc__(self):
+        sources_free(&self.sources)
+
+    cdef void removed(self, Octree tree, const Hole* hole) noexcept nogil:
+        cdef double dx, dy, dz, s, over
+        cdef long i
+        cdef int slot
+        for i in range(hole.n):
+            slot = hole.slot[i]
+            dx, dy, dz = tree.x[slot] - hole.x, tree.y[slot] - hole.y, tree.z[slot] - hole.z
+            s = dx * dx + dy * dy + dz * dz
+            over = hole.charge / (s * sqrt(s)) if s > 1e-12 else 0.0
+            self.field[slot, 0] -= over * dx
+            self.field[slot, 1] -= over * dy
+            self.field[slot, 2] -= over * dz
+
+    cdef int exposed(self, Octree tree, long slot, double opening_angle) except -1 nogil:
+        tree.collect(tree.x[slot], tree.y[slot], tree.z[slot], 0.0, opening_angle, &self.sources)
+        sources_field(&self.sources, tree.x[slot], tree.y[slot], tree.z[slot], &self.field[slot, 0])
+        return 0
+
+    cdef int solve_patch(self, Octree tree, double[:, ::1] normals, const Hole* hole, Patch* patch) except -1 nogil:
+        cdef long i, room = (hole.n + GROUP - 1) // GROUP * GROUP
+        cdef int slot
+        cdef float *field_x
+        cdef float *field_y
+        cdef float *field_z
+        self.patch_charges(tree, normals, patch)
+        for i in range(patch.n):
+            if patch.charge[i] < 0.0:   # a cell's moments stand on its centre of charge: none may be negative
+                patch.change[i] = <float>-tree.q[patch.slot[i]]
+                patch.charge[i] = 0.0
+                patch.n_clipped += 1
+        if room > self.spread.shape[1]:
+            with gil:
+                self.spread = np.empty((3, 2 * room), np.float32)
+        field_x, field_y, field_z = &self.spread[0, 0], &self.spread[1, 0], &self.spread[2, 0]
+        for i in range(room):
+            field_x[i] = field_y[i] = field_z[i] = 0.0
+        patch_field(room, hole.near_x, hole.near_y, hole.near_z, patch.stride, patch.x, patch.y, patch.z, patch.change,
+                    field_x, field_y, field_z)
+        for i in range(hole.n):
+            slot = hole.slot[i]
+            self.field[slot, 0] += field_x[i]
+            self.field[slot, 1] += field_y[i]
+            self.field[slot, 2] += field_z[i]
+        return 0
+
+    cdef int patch_charges(self, Octree tree, double[:, ::1] normals, Patch* patch) except -1 nogil:
+        # New charges of a patch and their changes, from the fields on its slots and the charges in the tree.
+        with gil:
+            raise NotImplementedError(f"{type(self).__name__} has no patch_charges")
+
+
+cdef class PythonRule(FieldRule):
+    """A charging rule written in Python, behind the contract of the compiled ones.
+
+    Parameters
+    ----------
+    rule : object
+        With the methods of `apt_evap.evaporation.rule.Rule`.
+    """
+
+    def __init__(self, rule):
+        self.rule = rule
+        self.area = 1.0
+
+    def settings(self):
+        """The rule itself: it has no others."""
+        return {"rule": self.rule}
+
+    def solve(self, Octree tree, double[:, ::1] normals, InteractionLists lists, *, double potential, double tolerance,
+              int max_sweeps=200, bint double_precision=False, int n_threads=1):
+        """Solve the charges of the whole surface: see `ChargingRule.solve`."""
+        cdef long n = tree.n_slots
+        self.field = np.zeros((tree.x.shape[0], 3))
+
+        def field_of(charges):
+            tree.charges = np.ascontiguousarray(charges, np.float64)
+            lists.sweep(self.field, double_precision, n_threads)
+            return np.asarray(self.field)[:n].copy()
+
+        charges, area = self.rule.solve(
+            tree.positions, np.asarray(normals)[:n].copy(), tree.charges.copy(), field_of, potential, tolerance
+        )
+        charges = np.ascontiguousarray(charges, np.float64)
+        if charges.shape != (n,) or not (charges >= 0.0).all() or not area > 0.0:
+            raise ValueError(
+                f"solve of {type(self.rule).__name__} must return {n} charges, none negative, and the area per atom, "
+                f"got charges of shape {charges.shape} and the area {area!r:.80}"
+            )
+        self.area = area
+        before = tree.charges.copy()
+        field_of(charges)
+        change = float(np.abs(charges - before).max() / charges.mean())
+        return 1, min(change, 0.5 * tolerance)   # the rule has judged for itself when to stop
+
+    def residuals(self, positions, normals, charges, chosen):
+        """What the rule says itself, if it has a method of this name: see `ChargingRule.residuals`."""
+        own = getattr(self.rule, "residuals", None)
+        return np.full(len(chosen), np.nan) if own is None else own(positions, normals, charges, chosen)
+
+    cdef int patch_charges(self, Octree tree, double[:, ::1] normals, Patch* patch) except -1 nogil:
+        cdef long i
+        cdef double[::1] solved
+        with gil:
+            slots = np.asarray(<int[:patch.n]> patch.slot)
+            solved = np.ascontiguousarray(
+                self.rule.solve_patch(
+                    np.stack([np.asarray(tree.x)[slots], np.asarray(tree.y)[slots], np.asarray(tree.z)[slots]], axis=1),
+                    np.asarray(normals)[slots],
+                    np.asarray(tree.q)[slots],
+                    np.asarray(self.field)[slots],
+                ),
+                np.float64,
+            )
+            if solved.shape[0] != patch.n:
+                raise ValueError(
+                    f"solve_patch of {type(self.rule).__name__} must return {patch.n} charges, got {solved.shape[0]}"
+                )
+            for i in range(patch.n):
+                patch.charge[i] = solved[i]
+                patch.change[i] = <float>(solved[i] - tree.q[patch.slot[i]])
+        return 0

@@ -1,0 +1,50 @@
+"""From the end of a flight to the detector: direction and time of flight."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from apt_evap._common.types import Booleans, Floats
+from apt_evap.detection.detector import Detector
+
+
+class Ends(NamedTuple):
+    """Where flights ended, beyond the field: m launches of each of n ions."""
+
+    positions: Floats
+    """[nm], shape (n, m, 3); NaN where there was no flight."""
+    velocities: Floats
+    """[sqrt(V)], shape (n, m, 3)."""
+    times: Floats
+    """Reduced times [nm/sqrt(V)], shape (n, m)."""
+    left: Booleans
+    """Whether the ion left, shape (n, m)."""
+
+
+def land(ends: Ends, slowness: Floats, detector: Detector, apex: float) -> tuple[Floats, Floats]:
+    """Continue flights that have left the field straight to the detector.
+
+    Parameters
+    ----------
+    ends : Ends
+        Of m launches of each of n ions.
+    slowness : ndarray, shape (n,)
+        Time of flight per reduced time, see `Emissions.slowness`.
+    detector : Detector
+        The detector.
+    apex : float
+        z of the apex [nm].
+
+    Returns
+    -------
+    directions : ndarray, shape (n, m, 2)
+        Stereographic directions, see `Detector.directions`; NaN where an ion never left.
+    times : ndarray, shape (n, m)
+        Times of flight [ns]; NaN where an ion never left.
+    """
+    n, m = ends.left.shape
+    left = ends.left.ravel()
+    directions, remaining = detector.directions(ends.positions.reshape(-1, 3), ends.velocities.reshape(-1, 3), apex)
+    directions[~left] = np.nan
+    times = np.where(left, (ends.times.ravel() + remaining) * np.repeat(slowness, m), np.nan)
+    return directions.reshape(n, m, 2), times.reshape(n, m)
