@@ -1,7 +1,7 @@
 """The specimen: a crystal (or any arrangement of atoms) in the shape of a tip."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -15,9 +15,10 @@ from apt_evap.specimen import ase_atoms, lattice
 from apt_evap.specimen.alloy import check_solutes, draw_species
 from apt_evap.specimen.materials import Material, as_material
 from apt_evap.specimen.shape import TaperedCap
+from apt_evap.specimen.shell import Shell
+from apt_evap.specimen.surface_criterion import SurfaceCriterion
 
 _ROUNDING = 1e-6  # nearest neighbour distances: sites on the surface stay together whatever their rounding
-_SKIN = 3.2  # neighbour radii held below the surface where hardly an atom leaves: two of them are support
 _LAYER = 0.74  # thickness of the layer of surface atoms [d_nn]: 0.48 a^2 of the surface for each one of fcc
 _WIDEST = 10  # neighbourhood [d_nn]: 6,000 atoms each, more do not fit into the memory
 _SAMPLE = 10_000  # atoms asked for their nearest neighbour
@@ -67,11 +68,8 @@ class Tip:
         Index into `elements`, shape (n,).
     evaporable, support : ndarray of bool
         Whether an atom may leave; whether it only completes the neighbourhoods of others, shape (n,).
-    nearest_neighbour_distance, neighbour_radius, surface_threshold : float
-        d_nn [nm]; the radius of the neighbourhood whose mean position tells surface atoms, and how far from
-        that mean a surface atom is [nm], see `lattice.SURFACE_FACTORS`.
-    bond_length : float
-        Atoms closer than this are nearest neighbours [nm], see `lattice.BOND_FACTORS`.
+    criterion : SurfaceCriterion
+        Distances that tell surface atoms and nearest neighbours.
     evaporation_fields, charge_states, masses : ndarray
         Of each species [V/nm], [e], [Da].
     apex : float
@@ -106,16 +104,16 @@ class Tip:
         d = host.nearest_neighbour_distance
         radius = check_number(apex_radius, "apex_radius", at_least=3 * d, unit="nm", why="3 neighbour distances")
         length = 2 * radius if shank_length is None else shank_length
-        self._shape = shape = TaperedCap(radius, length, shank_angle, base)
+        shape = TaperedCap(radius, length, shank_angle, base)
         origin = check_array(origin, "origin", (3,))
-        self._set_neighbourhood(host.structure, d)
+        self.criterion = SurfaceCriterion.of(host.structure, d)
         if depth is not None:
             depth = check_number(depth, "depth", above=self.neighbour_radius, unit="nm")
-        self._depth = depth
+        self._shell = Shell(shape, depth, self.neighbour_radius)
         fractions = check_solutes(solutes, seed)
         orientation = lattice.rotation_to_axis(host, axis, rotation)
         density = lattice.atom_density(host.structure, host.a, host.c)
-        check_memory(self._held_volume() * density, shape.volume(_LAYER * d) * density)
+        check_memory(self._shell.volume() * density, shape.volume(_LAYER * d) * density)
 
         shift = origin
         if offset_seed is not None:
@@ -129,7 +127,7 @@ class Tip:
             shift,
             shape.signed_distance,
             shape.bounds,
-            depth=None if depth is None else self._depth_at,
+            depth=None if depth is None else self._shell.depth_at,
             tolerance=_ROUNDING * d,
         )
         self._mark()
@@ -192,7 +190,7 @@ class Tip:
             If shapes disagree, an index names no element, or two atoms are at the same place.
         """
         tip = cls.__new__(cls)
-        tip._shape = tip._depth = None  # type: ignore[assignment]
+        tip._shell = None  # type: ignore[assignment]
         tip.positions = check_array(positions, "positions", ("n", 3))
         n = len(tip.positions)
         if n < 2:
@@ -211,15 +209,16 @@ class Tip:
         distances = neighbours.query(sample, k=2)[0][:, 1]
         if not distances.min() > 0 or neighbours.query_pairs(1e-3 * float(np.median(distances))):
             raise ValueError("positions must be distinct, got two atoms at the same place")
-        tip._set_neighbourhood(tip.elements[0].structure, float(np.median(distances)))
+        distance = float(np.median(distances))
+        tip.criterion = SurfaceCriterion.of(tip.elements[0].structure, distance)
         if neighbour_radius is not None:
-            tip.neighbour_radius = check_number(
-                neighbour_radius, "neighbour_radius", above=0, at_most=_WIDEST * float(np.median(distances)), unit="nm"
-            )
+            radius = check_number(neighbour_radius, "neighbour_radius", above=0, at_most=_WIDEST * distance, unit="nm")
+            tip.criterion = replace(tip.criterion, neighbour_radius=radius)
         if surface_threshold is not None:
-            tip.surface_threshold = check_number(
+            threshold = check_number(
                 surface_threshold, "surface_threshold", above=0, at_most=tip.neighbour_radius, unit="nm"
             )
+            tip.criterion = replace(tip.criterion, surface_threshold=threshold)
         low, high = tip.positions.min(axis=0), tip.positions.max(axis=0)
         tip.apex = float(high[2])
         if evaporable is None:
@@ -291,16 +290,36 @@ class Tip:
         except (KeyError, TypeError) as error:
             raise ValueError(f"settings must be those of a tip, got {shown(settings)}: {error}") from error
 
+    @property
+    def nearest_neighbour_distance(self) -> float:
+        """Nearest neighbour distance d_nn [nm]."""
+        return self.criterion.nearest_neighbour_distance
+
+    @property
+    def neighbour_radius(self) -> float:
+        """Radius of the neighbourhood whose mean position tells surface atoms [nm]."""
+        return self.criterion.neighbour_radius
+
+    @property
+    def surface_threshold(self) -> float:
+        """Least distance of a surface atom from the mean of its neighbourhood [nm]."""
+        return self.criterion.surface_threshold
+
+    @property
+    def bond_length(self) -> float:
+        """Atoms closer than this are nearest neighbours [nm]."""
+        return self.criterion.bond_length
+
     def __len__(self) -> int:
         return len(self.positions)
 
     def __repr__(self) -> str:
         names = "-".join(element.name for element in self.elements)
-        if self._shape is None:
+        if self._shell is None:
             return f"<Tip: {len(self):,} atoms of {names} from positions>"
-        shape = self._shape
+        shape, depth = self._shell.shape, self._shell.depth
         axis = " ".join(f"{index:.4g}" for index in self.settings["axis"])
-        held = "" if self._depth is None else f", held to a depth of {self._depth:.4g} nm"
+        held = "" if depth is None else f", held to a depth of {depth:.4g} nm"
         return (
             f"<Tip: {len(self):,} atoms of {names} [{axis}], apex radius {shape.apex_radius:.4g} nm, "
             f"shank {shape.shank_length:.4g} nm at {shape.shank_angle:g} degrees, {shape.base} base{held}>"
@@ -310,10 +329,10 @@ class Tip:
     def max_ions(self) -> int:
         """How many atoms may leave, those that a shell does not hold yet included: exact only without `depth`."""
         held = int(np.count_nonzero(self.evaporable))
-        if self._depth is None:
+        if self._shell is None or self._shell.depth is None:
             return held
-        host = self.elements[0]
-        volume = self._shape.volume_above(-self._shape.shank_length / 2)
+        host, shape = self.elements[0], self._shell.shape
+        volume = shape.volume_above(-shape.shank_length / 2)
         return max(held, round(volume * lattice.atom_density(host.structure, host.a, host.c)))
 
     def signed_distance(self, points: Floats) -> Floats:
@@ -324,9 +343,9 @@ class Tip:
         ValueError
             If the tip was made from positions.
         """
-        if self._shape is None:
+        if self._shell is None:
             raise ValueError("a tip made from positions has no shape to measure a distance from")
-        return self._shape.signed_distance(check_array(points, "points", ("n", 3)))
+        return self._shell.shape.signed_distance(check_array(points, "points", ("n", 3)))
 
     def deepened(self, by: float | None = None) -> "Tip":
         """Hold a shell to a greater depth.
@@ -346,51 +365,21 @@ class Tip:
         ValueError
             If this tip is not a shell: it was made from positions, or holds every atom.
         """
-        if self._shape is None or self._depth is None:
+        if self._shell is None or self._shell.depth is None:
             raise ValueError(f"{self!r} is not a shell that could be deepened, it holds every atom there is")
         by = 2 * self.neighbour_radius if by is None else check_number(by, "by", above=0, unit="nm")
-        deeper = Tip.from_settings({**self.settings, "depth": self._depth + by})
+        deeper = Tip.from_settings({**self.settings, "depth": self._shell.depth + by})
         rounding = 2 * _ROUNDING * self.nearest_neighbour_distance
-        below = self._shape.signed_distance(deeper.positions) < -(self._depth_at(deeper.positions) + rounding)
+        below = self._shell.below(deeper.positions, rounding)
         deeper.positions = np.concatenate([self.positions, deeper.positions[below]])
         deeper.species = np.concatenate([self.species, deeper.species[below]])
         deeper._mark()
         return deeper
 
-    def _depth_at(self, points):
-        """How far below the surface atoms are held [nm], (n,): `depth` in the cap, falling to a skin below."""
-        skin, ramp = self._ramp
-        return skin + (self._depth - skin) * np.clip(1 + points[:, 2] / ramp, 0, 1)
-
-    @property
-    def _ramp(self):
-        """Depth of the skin, and the height over which `depth` falls to it, at a slope of at most 1 [nm]."""
-        skin = min(_SKIN * self.neighbour_radius, self._depth)
-        return skin, max(self._shape.apex_radius / 2, self._depth - skin)
-
-    def _held_volume(self):
-        if self._depth is None:
-            return self._shape.volume()
-        radius, (skin, ramp) = self._shape.apex_radius, self._ramp
-        cap = 2 / 3 * np.pi * (max(0.0, radius - skin) ** 3 - max(0.0, radius - self._depth) ** 3)
-        flank = np.pi * radius * ramp * (self._depth - skin)
-        return min(self._shape.volume(), self._shape.volume(skin) + cap + flank)
-
     def _mark(self):
         """Tell the support from the others, and which atoms may leave."""
-        self.support = np.zeros(len(self), dtype=bool)
-        if self._depth is not None:
-            skin, ramp = self._ramp
-            lost = self.neighbour_radius * (1 + (self._depth - skin) / ramp)  # across one neighbourhood
-            self.support = self._shape.signed_distance(self.positions) < lost - self._depth_at(self.positions)
-        self.evaporable = (self.positions[:, 2] >= -self._shape.shank_length / 2) & ~self.support
-
-    def _set_neighbourhood(self, structure, distance):
-        radius, threshold = lattice.SURFACE_FACTORS[structure]
-        self.nearest_neighbour_distance = distance
-        self.bond_length = lattice.BOND_FACTORS[structure] * distance
-        self.neighbour_radius = radius * distance
-        self.surface_threshold = threshold * distance
+        self.support = self._shell.support(self.positions)
+        self.evaporable = self._shell.evaporable(self.positions, self.support)
 
     def _set_elements(self, elements, species):
         self.elements = elements
