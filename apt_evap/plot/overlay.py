@@ -6,9 +6,9 @@ from matplotlib.lines import Line2D
 
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
-from apt_evap.plot._figure import OUTSIDE, add_colorbar, new_figure
+from apt_evap.plot._figure import OUTSIDE, add_colorbar, new_figure, set_title
 from apt_evap.plot.maps import detector_map
-from apt_evap.registration.alignment import BROAD, View
+from apt_evap.registration.correlation_search import BROAD, View
 from apt_evap.registration.register import Registration
 
 BRIGHT, DARK, RIM = "cyan", "lime", "white"
@@ -94,8 +94,7 @@ def overlay(
     else:
         ax.figure.legend(loc="outside lower center", **how)
     ax.annotate(_caption(registration), (0.5, 1), **_ABOVE)
-    if title:
-        ax.set_title(title, pad=34)
+    set_title(ax, title, pad=34)
     return ax
 
 
