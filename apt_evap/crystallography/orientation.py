@@ -241,7 +241,7 @@ def _fit(normals, places, lines, projection, free, mirror):
         found = scale * math.exp(fit.x[3]) if free else scale
         tries.append((fit.cost, found, rotation, fit))
     reach = np.linalg.norm(places - projection.centre, axis=1).max()
-    tries = [each for each in tries if reach <= each[1] * math.pi / 2] or tries
+    tries = [each for each in tries if reach <= Projection(each[1]).rim] or tries
     # two poles may fit exactly in two ways: of equals the one with the smaller angles
     least = min(each[0] for each in tries)
     _, scale, rotation, fit = max(
@@ -272,7 +272,7 @@ def _scales(normals, places, projection):
     angles = np.linalg.norm(_offsets(normals[first], normals[second]), axis=1)
     apart = angles > _SAME
     ratio = np.median(np.linalg.norm(places[first] - places[second], axis=1)[apart] / angles[apart])
-    least = np.linalg.norm(places - projection.centre, axis=1).max() / (math.pi / 2)
+    least = np.linalg.norm(places - projection.centre, axis=1).max() / Projection(1.0).rim
     return [max(ratio * factor, least) for factor in (0.7, 1.0, 1.4, 2.5)]
 
 
