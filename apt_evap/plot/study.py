@@ -81,7 +81,7 @@ def ssim_matrix(study: Study, axes: Sequence[Axes] | None = None, *, colormap: s
     add_colorbar(
         [ax.images[0] for ax in panels],
         list(panels),
-        label="SSIM, noise allowed for" if study.settings["allow_noise"] else "SSIM",
+        label="SSIM, noise allowed for" if study.settings.allow_noise else "SSIM",
     )
     return panels
 
@@ -199,10 +199,10 @@ def _default_circle(study):
 
 def _scores(study):
     """The similarities as text."""
-    allowed = study.settings["allow_noise"]
+    allowed = study.settings.allow_noise
     lines = [
         "SSIM with the measured map",
-        f"in {study.settings['bins_compared']:,} bins" + ", noise allowed for" * allowed,
+        f"in {study.provenance['bins_compared']:,} bins" + ", noise allowed for" * allowed,
     ]
     if study.registration.doubtful:
         lines.insert(0, f"THE REGISTRATION IS DOUBTFUL: correlation {study.registration.score:.2f}\n")
@@ -213,5 +213,5 @@ def _scores(study):
         lines += [f"noise and all: {study.plain['optimum']}"] * allowed
         lines.append(f"two halves of the measured ions: {study.ceiling}")
     width, height = study.measured.bin_size
-    lines.append(f"bins {width:.3g} × {height:.3g} mm, smoothed by {study.settings['smoothing']:.3g} mm")
+    lines.append(f"bins {width:.3g} × {height:.3g} mm, smoothed by {study.settings.smoothing:.3g} mm")
     return "\n".join(lines)
