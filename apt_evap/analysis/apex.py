@@ -83,7 +83,7 @@ def fit_caps(run: Run, windows: int | None = None) -> tuple[Cap, ...]:
     caps = []
     for first, last in pairwise(edges):
         sites = run.emissions.positions[first:last]
-        centre, radius = np.zeros(3), None
+        centre, radius = np.zeros(3), float("nan")
         for _ in range(3):  # the sites on the cap change with its centre
             from_centre = sites - centre
             near = polar_angles(from_centre) < _CAP
@@ -232,7 +232,8 @@ def _caps_of(run, caps):
 
 def _sphere(points, centre, radius):
     """Centre and radius of the sphere nearest to points, outliers counted linearly."""
-    radius = float(np.median(np.linalg.norm(points - centre, axis=1))) if radius is None else radius
+    if math.isnan(radius):
+        radius = float(np.median(np.linalg.norm(points - centre, axis=1)))
     fit = least_squares(
         lambda unknowns: np.linalg.norm(points - unknowns[:3], axis=1) - unknowns[3],
         np.append(centre, radius),

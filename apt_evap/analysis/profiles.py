@@ -209,15 +209,20 @@ def zone_line_profile(
 class _Places:
     """Where hits are: those of ions, each one hit; or the bins of a map, each with its value and its area."""
 
-    def __init__(self, hits: Hits) -> None:
+    x: Floats
+    y: Floats
+    values: Floats | None = None
+    area: float | None = None
+
+    def __init__(self, hits: Hits | DetectorMap) -> None:
         if isinstance(hits, DetectorMap):
             self.x, self.y = (grid[hits.mask] for grid in np.meshgrid(*hits.centres))
             self.values, self.area = hits.values[hits.mask], float(np.prod(hits.bin_size))
+            self.counted = hits.is_counts
         else:
             detected = check_kind(hits, "hits", Hits, "Hits or a DetectorMap").detected
             self.x, self.y = (values[detected] for values in hits.require("x", "y"))
-            self.values = self.area = None
-        self.counted = self.values is None or hits.is_counts
+            self.counted = True
 
 
 def _check_ring(inner, outer, bins):

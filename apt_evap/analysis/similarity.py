@@ -160,8 +160,11 @@ def ssim(map_a: DetectorMap, map_b: DetectorMap, *, smoothing: float = 0.0, data
             f"the masks of the two maps must share more than a window of {2 * WINDOW + 1} bins, they share "
             f"{np.count_nonzero(common)} bins"
         )
-    images = [np.where(common, replace(m.smoothed(smoothing), mask=common).density, 1.0) for m in (map_a, map_b)]
-    local = local_similarity(*map(local_moments, images), data_range)
+    first, second = (
+        local_moments(np.where(common, replace(each.smoothed(smoothing), mask=common).density, 1.0))
+        for each in (map_a, map_b)
+    )
+    local = local_similarity(first, second, data_range)
     return Similarity(
         value=float(local[inside].mean()),
         local=np.where(inside, local, np.nan),

@@ -203,8 +203,16 @@ def fit_orientation(
     chosen = bool(fits[1][2] < 0.999 * fits[0][2] - 1e-9) if mirror is None else bool(mirror)
     matrix, projection, rms, errors = fits[chosen]
     residuals = np.linalg.norm(projection.places(normals @ matrix.T) - places, axis=1)
-    found = Orientation.from_matrix(host, matrix)
-    return FittedOrientation(found, projection, residuals, rms, *errors, mirrored_rms=fits[not chosen][2])
+    angle_error, scale_error = errors
+    return FittedOrientation(
+        orientation=Orientation.from_matrix(host, matrix),
+        projection=projection,
+        residuals=residuals,
+        rms=rms,
+        angle_error=angle_error,
+        scale_error=scale_error,
+        mirrored_rms=fits[not chosen][2],
+    )
 
 
 def _line(host, first, line):

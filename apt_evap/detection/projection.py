@@ -176,7 +176,7 @@ class Projection:
         """Distance from the centre at which the last directions appear [mm]; infinite up to a compression of 1."""
         if self.compression is not None and self.compression <= 1:
             return math.inf
-        return self.scale * float(radius_of(np.float64(self.last_angle), self.compression))
+        return self.scale * float(radius_of(np.array(self.last_angle), self.compression))
 
     def compressed(self, compression: float) -> "Projection":
         """The projection of a specimen whose polar angles are `compression` times those seen by this one."""

@@ -112,8 +112,9 @@ class Comparison:
         """Similarities of the random halves of the measured counts, noise and all, shape (divisions,)."""
         random = np.random.default_rng(seed)
         counts = self.measured[0].astype(np.int64)
-        halves = random.binomial(counts, 0.5, (divisions, *counts.shape))
-        return self._mean_similarity(*(local_moments(self.densities(part)) for part in (halves, counts - halves)))
+        half = random.binomial(counts, 0.5, (divisions, *counts.shape)).astype(float)
+        first, second = (local_moments(self.densities(part)) for part in (half, counts - half))
+        return self._mean_similarity(first, second)
 
     def _mean_similarity(self, first, second, noise=0.0):
         local = local_similarity(first, second, self.settings.data_range, noise)

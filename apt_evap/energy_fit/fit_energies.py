@@ -34,8 +34,8 @@ def fit_energies(
     measured: Hits | DetectorMap,
     mechanism: str = "roll-up",
     *,
-    means: Sequence[float] | None = MEANS,
-    rsds: Sequence[float] | None = RSDS,
+    means: Sequence[float] = MEANS,
+    rsds: Sequence[float] = RSDS,
     rollup_fractions: Sequence[float] | None = None,
     registration: Registration | None = None,
     bins: int | None = None,
@@ -131,7 +131,7 @@ def fit_energies(
     without ν, beside which the ceiling stands. Noise of measured densities is not known and stays: their maps look most
     like those with somewhat more contrast than the truth.
     """
-    grid = EnergyGrid(mechanism, means, rsds, rollup_fractions)
+    grid = EnergyGrid(mechanism, means, rsds, rollup_fractions)  # type: ignore[arg-type]
     if check_kind(run, "run", Run, "a Run").responses is None:
         raise ValueError(f"run must have responses for fit_energies, got {run!r}")
     measured = _measured_map(measured, bins)

@@ -73,7 +73,8 @@ class EnergySearch:
     def hits(self, index: ArrayLike) -> Hits:
         """Hits of some draws of all ions at an index of the grid, in the frame of the run."""
         drawn = [drawn_hits(self.run, self.perturbation(index), replica) for replica in range(ROUGH)]
-        return Hits(**{name: np.concatenate([getattr(hits, name) for hits in drawn]) for name in ("x", "y")})
+        x, y = (np.concatenate([getattr(hits, name) for hits in drawn]) for name in ("x", "y"))
+        return Hits(x=x, y=y)
 
     def polished(self, registration: Registration, index: ArrayLike) -> Registration:
         """The transform near a registration that makes the map of a point of the grid most alike.
@@ -182,9 +183,10 @@ class EnergySearch:
             source=source,
             detected=None,
         )
-        return simulated, *(self.comparison.similarities(drawn, noise, plain=plain) for plain in (False, True))
+        similarities = self.comparison.similarities
+        return simulated, similarities(drawn, noise), similarities(drawn, noise, plain=True)
 
-    def ceiling(self) -> Any:
+    def ceiling(self) -> Score | None:
         """Similarity of two halves of the measured ions, None for densities."""
         if not self.measured.is_counts:
             return None
@@ -194,7 +196,8 @@ class EnergySearch:
 
 def registered(search: EnergySearch) -> tuple[Registration, list[dict[str, Any]]]:
     """Register with the middle of the grid, then with the best point, until that stays; polished, and the rounds."""
-    registration, best, rounds = None, search.middle, []
+    registration: Any = None
+    best, rounds = search.middle, []
     for _ in range(_MOST_ROUNDS):
         registration = register(search.hits(best), search.measured, start=registration)
         registration = replace(registration, method="search")  # of the first round, which the others start from

@@ -156,7 +156,7 @@ def search(
     scales: Any,
     mirrors: Any,
     least: float,
-    near: tuple[complex, float] | None = None,
+    near: Near | None = None,
 ) -> list[Fit]:
     """Find the best shift for every rotation, scale and mirror.
 

@@ -273,8 +273,8 @@ def register(
     mirrors = tuple(dict.fromkeys(check_switch(mirror, "mirrors") for mirror in mirrors))
     if not mirrors:
         raise ValueError("mirrors must hold False, True or both, got none")
-    angles = np.arange(0, 360, ROTATION_STEP) if rotations is None else _steps(*rotations, ROTATION_STEP)
-    fits = search(simulated, measured, angles, np.exp(_steps(*np.log(tried), SCALE_STEP)), mirrors, least, near)
+    angles = np.arange(0, 360, ROTATION_STEP) if rotations is None else _steps(rotations, ROTATION_STEP)
+    fits = search(simulated, measured, angles, np.exp(_steps(np.log(tried), SCALE_STEP)), mirrors, least, near)
     if not fits:
         raise ValueError(
             f"the maps must share {least:.0%} of the measured field of view (overlap), and do not for scales of "
@@ -289,8 +289,9 @@ def register(
     fits = sorted(fits, key=lambda fit: -fit.rank)
     fits = distinct([fit for fit in fits if fit.rank > fits[0].rank - _noise(fits[0], FINE)], _KEPT)
     fits.sort(key=lambda fit: fit.transform.mirror)  # stable: the best stays first among either kind
-    found = [_registration(fit, "search" if near is None else "start" if pole is None else "pole") for fit in fits]
-    best = replace(found[0], ties=tuple(found[1:]))
+    method = "search" if near is None else "start" if pole is None else "pole"
+    best, *ties = (_registration(fit, method) for fit in fits)
+    best = replace(best, ties=tuple(ties))
     best.warn_if_doubtful()
     return best
 
@@ -326,9 +327,9 @@ def register_points(
             raise ValueError(f"{name} must be different points, got {points[0].tolist()} {len(points)} times")
     choices = (False, True) if mirror is None else (check_switch(mirror, "mirror"),)
     source, target = (points[:, 0] + 1j * points[:, 1] for points in (simulated, measured))
-    found = [_least_squares(source, target, choice) for choice in choices]
+    fits = [_least_squares(source, target, choice) for choice in choices]
     # rounding must not decide where both fit exactly
-    best = min(found, key=lambda one: (round(one.residual / np.ptp(target.real + target.imag), 9), one.mirror))
+    best = min(fits, key=lambda one: (round(one.residual / np.ptp(target.real + target.imag), 9), one.mirror))
     if not best.scale > 0:
         raise ValueError("simulated_points and measured_points must be alike but for rotation, scale and shift")
     return best
@@ -376,7 +377,8 @@ def _range(value, name, **limits):
     return low, check_number(high, name, at_least=low)
 
 
-def _steps(low, high, step):
+def _steps(ends, step):
+    low, high = ends
     return np.linspace(low, high, int(np.ceil((high - low) / step)) + 1)
 
 

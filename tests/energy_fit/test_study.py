@@ -334,8 +334,8 @@ def test_settings_are_recorded(twin, tmp_path):
     assert saved["optimum"]["perturbation"]["energy"]["mean"] == study.optimum.mean
     assert saved["registration"]["scale"] == 1
     # as files of before have them
-    names = "smoothing flattening data_range allow_noise replicas resamples seed temperature bins bin_size bins_compared"
-    names += " measured measured_noise registered share_above_energy_limit run"
+    names = "smoothing flattening data_range allow_noise replicas resamples seed temperature"
+    names += " bins bin_size bins_compared measured measured_noise registered share_above_energy_limit run"
     assert list(saved["settings"]) == names.split()
     assert saved["settings"] | asdict(study.settings) == saved["settings"]
     assert study.settings.temperature == 50 and study.settings.flattening > 0
