@@ -121,25 +121,25 @@ def fit_zone_line(profile: Profile, *, exponent: float = 2.0) -> ZoneLine:
     highest = [position[-1], span, np.inf, np.inf, np.inf, EXPONENTS[1]][: len(start)]
     missing = f"the profile of {len(position)} bins over {span:g} mm shows no line"
     try:
-        found, covariance = curve_fit(model, position, density, start, bounds=(lowest, highest))
+        parameters, covariance = curve_fit(model, position, density, start, bounds=(lowest, highest))
     except RuntimeError as failure:
         raise ValueError(f"{missing}: {failure}") from failure
-    at_edge = [np.isclose(found[:2], edge[:2], atol=1e-6 * span) for edge in (lowest, highest)]
+    at_edge = [np.isclose(parameters[:2], edge[:2], atol=1e-6 * span) for edge in (lowest, highest)]
     if np.any(at_edge) or not np.isfinite(covariance).all():
-        raise ValueError(f"{missing}: the fit ran to {found[1]:.3g} mm wide at {found[0]:.3g} mm")
+        raise ValueError(f"{missing}: the fit ran to {parameters[1]:.3g} mm wide at {parameters[0]:.3g} mm")
     if np.isfinite(error).all():
-        change = np.linalg.pinv(approx_fprime(found, lambda values: model(position, *values)))
+        change = np.linalg.pinv(approx_fprime(parameters, lambda values: model(position, *values)))
         covariance = (change * error**2) @ change.T
     names = ("centre", "width", "height", "background", "slope", "exponent")
-    values = {"exponent": exponent} | dict(zip(names, found.tolist(), strict=False))
+    values = {"exponent": exponent} | dict(zip(names, parameters.tolist(), strict=False))
     errors = {"exponent": 0.0} | dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=False))
-    fitted = model(position, *found)
+    fitted = model(position, *parameters)
     misfit = (density - fitted) / _errors_of(fitted, density, error)
     return ZoneLine(
         **values,
         **{f"{name}_error": errors[name] for name in names if name != "slope"},
         chi_square=float(misfit @ misfit),
-        degrees_of_freedom=len(position) - len(found),
+        degrees_of_freedom=len(position) - len(parameters),
     )
 
 

@@ -238,16 +238,16 @@ def _fit(normals, places, lines, projection, free, mirror):
 
         def misfit(unknowns, rotation=rotation, scale=scale):
             turned = (Rotation.from_rotvec(unknowns[:3]) * rotation).as_matrix()
-            shown = Projection(scale * math.exp(unknowns[3]) if free else scale, projection.centre, mirror)
+            trial = Projection(scale * math.exp(unknowns[3]) if free else scale, projection.centre, mirror)
             # on the sphere, times the scale: finite for any rotation
-            seen, expected = shown.directions(places), normals @ turned.T
-            parts = [_offsets(seen, expected).ravel()]
-            parts += [np.arcsin(shown.directions(points) @ (turned @ zone)) for zone, _, points in lines]
-            return shown.scale * np.concatenate(parts)
+            measured, expected = trial.directions(places), normals @ turned.T
+            parts = [_offsets(measured, expected).ravel()]
+            parts += [np.arcsin(trial.directions(points) @ (turned @ zone)) for zone, _, points in lines]
+            return trial.scale * np.concatenate(parts)
 
         fit = least_squares(misfit, np.zeros(4 if free else 3), x_scale=0.1, xtol=1e-12, ftol=1e-12, gtol=1e-12)
-        found = scale * math.exp(fit.x[3]) if free else scale
-        tries.append((fit.cost, found, rotation, fit))
+        fitted_scale = scale * math.exp(fit.x[3]) if free else scale
+        tries.append((fit.cost, fitted_scale, rotation, fit))
     reach = np.linalg.norm(places - projection.centre, axis=1).max()
     tries = [each for each in tries if reach <= Projection(each[1]).rim] or tries
     # two poles may fit exactly in two ways: of equals the one with the smaller angles
@@ -266,11 +266,11 @@ def _fit(normals, places, lines, projection, free, mirror):
     return matrix, Projection(scale, projection.centre, mirror), rms, errors
 
 
-def _offsets(seen, expected):
+def _offsets(first, second):
     """Rotation vectors from unit vectors to others, as long as the angle between them, shape (n, 3)."""
-    across = np.cross(seen, expected)
+    across = np.cross(first, second)
     sine = np.linalg.norm(across, axis=1)
-    angle = np.arctan2(sine, np.einsum("ij,ij->i", seen, expected))
+    angle = np.arctan2(sine, np.einsum("ij,ij->i", first, second))
     return across * np.divide(angle, sine, out=np.ones_like(sine), where=sine > 0)[:, None]
 
 
@@ -286,11 +286,11 @@ def _scales(normals, places, projection):
 
 def _aligned(normals, places, lines, projection):
     """The rotation that brings poles and lines nearest to where they are seen."""
-    seen, crystal = [projection.directions(places)], [normals]
+    specimen, crystal = [projection.directions(places)], [normals]
     for _, tangent, points in lines:
         there = projection.directions(points)
-        angle = np.arctan2(np.linalg.norm(np.cross(there, seen[0][0]), axis=1), there @ seen[0][0])
-        seen.append(there)
+        angle = np.arctan2(np.linalg.norm(np.cross(there, specimen[0][0]), axis=1), there @ specimen[0][0])
+        specimen.append(there)
         crystal.append(np.cos(angle)[:, None] * normals[0] + np.sin(angle)[:, None] * tangent)
-    seen, crystal = np.concatenate(seen), np.concatenate(crystal)
-    return Rotation.align_vectors(seen, crystal)[0]
+    specimen, crystal = np.concatenate(specimen), np.concatenate(crystal)
+    return Rotation.align_vectors(specimen, crystal)[0]

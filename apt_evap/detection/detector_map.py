@@ -142,9 +142,9 @@ class DetectorMap:
             mask = _check_mask(mask, counts.shape)
         else:
             mask = field_of_view(counts) if hits.extent is None else _on_detector(x_edges, y_edges, hits.extent)
-        found = None if combs is None else tuple(float(comb.spacing) for comb in combs)
+        spacings = None if combs is None else tuple(float(comb.spacing) for comb in combs)
         ions = int(counts[mask].sum())
-        return cls(counts, x_edges, y_edges, mask, True, ions, quantum=found, source=hits.source, detected=len(x))
+        return cls(counts, x_edges, y_edges, mask, True, ions, quantum=spacings, source=hits.source, detected=len(x))
 
     @classmethod
     def from_array(

@@ -176,6 +176,6 @@ def describe(map: DetectorMap) -> str:
 
 def _wrap(text, width):
     """Break text into lines, at its commas where that will do."""
-    kept = text.replace(" ", "\N{NO-BREAK SPACE}").replace(",\N{NO-BREAK SPACE}", ", ")
-    lines = "\n".join(fill(line, width, break_long_words=False) for line in kept.splitlines())
+    unbroken = text.replace(" ", "\N{NO-BREAK SPACE}").replace(",\N{NO-BREAK SPACE}", ", ")
+    lines = "\n".join(fill(line, width, break_long_words=False) for line in unbroken.splitlines())
     return "\n".join(fill(line.replace("\N{NO-BREAK SPACE}", " "), width) for line in lines.splitlines())

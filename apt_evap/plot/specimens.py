@@ -69,12 +69,12 @@ def specimen(
     else:
         values = check_array(color, "color", (len(emitter),), finite=False)
     right, up, towards = _viewed_from(elevation, azimuth)
-    shown = np.flatnonzero(emitter.normals @ towards > 1e-9)  # the others face away; symmetric ones lie across
-    positions = emitter.positions[shown]
-    shown = shown[np.argsort(positions @ towards, kind="stable")]  # what is drawn last is in front
-    positions, values = emitter.positions[shown], values[shown]
+    facing = np.flatnonzero(emitter.normals @ towards > 1e-9)  # the others face away; symmetric ones lie across
+    positions = emitter.positions[facing]
+    facing = facing[np.argsort(positions @ towards, kind="stable")]  # what is drawn last is in front
+    positions, values = emitter.positions[facing], values[facing]
     if limits is None:
-        counted = values[emitter.tip.evaporable[emitter.atoms[shown]]]
+        counted = values[emitter.tip.evaporable[emitter.atoms[facing]]]
         limits = np.nanpercentile(counted if len(counted) else values, [1, 99.5])
     diameter = emitter.tip.nearest_neighbour_distance
     places = np.column_stack([positions @ right, positions @ up])

@@ -212,11 +212,11 @@ def search(
 
 def distinct(fits: Sequence[Fit], most: int) -> list[Fit]:
     """The first `most` fits that are no neighbours in rotation and scale of a better one."""
-    kept = []
+    best = []
     for fit in fits:
-        if len(kept) < most and not any(_close(fit.transform, other.transform) for other in kept):
-            kept.append(fit)
-    return kept
+        if len(best) < most and not any(_close(fit.transform, other.transform) for other in best):
+            best.append(fit)
+    return best
 
 
 def refine(
