@@ -1,12 +1,10 @@
-"""The width of a zone line from a profile across it, and two profiles compared."""
+"""Width of a zone line, fitted to a profile across it."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import approx_fprime, curve_fit
-from scipy.stats import chi2
 
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_kind, check_number
@@ -172,62 +170,3 @@ def _errors_of(expected, density, error):
     with np.errstate(divide="ignore", invalid="ignore"):
         hits_per_density = np.where(density > 0, density / error**2, 1 / error)
     return np.sqrt(np.maximum(expected * hits_per_density, 1)) / hits_per_density
-
-
-class ProfileComparison(NamedTuple):
-    """Two profiles of one rectangle, each relative to its own mean."""
-
-    position: np.ndarray
-    """Centres of the bins, shape (bins,)."""
-    difference: np.ndarray
-    """Density of the first less that of the second, in units of its error, shape (bins,)."""
-    chi_square: float
-    """Sum of the squares of the differences."""
-    degrees_of_freedom: int
-    """Bins less one: both have the mean 1."""
-    probability: float
-    """Probability that the noise of counting alone makes a larger chi_square."""
-    relative: float
-    """Root mean square of the difference of the densities beyond what noise explains; 0 if noise explains all."""
-
-
-def compare_profiles(first: Profile, second: Profile) -> ProfileComparison:
-    """Compare two profiles bin by bin, in units of the errors.
-
-    Parameters
-    ----------
-    first, second : Profile
-        Profiles with the same bins and with errors: of hits, or of maps of counts.
-
-    Returns
-    -------
-    ProfileComparison
-
-    Raises
-    ------
-    ValueError
-        If bins differ, or a profile has no errors.
-    """
-    for name, profile in (("first", first), ("second", second)):
-        if not isinstance(profile, Profile):
-            raise ValueError(f"{name} must be a Profile, got {profile!r:.80}")
-        if not np.isfinite(profile.error).any():
-            raise ValueError(f"{name} must have errors, got a profile of densities: count hits instead")
-    if first.position.shape != second.position.shape or not np.allclose(first.position, second.position):
-        raise ValueError(
-            f"the profiles must have the same bins, got {len(first.position)} and {len(second.position)} "
-            f"around {first.position.mean():g} and {second.position.mean():g}"
-        )
-    difference = first.density - second.density
-    error = np.hypot(first.error, second.error)
-    pull = difference / error
-    chi_square, bins = float(np.nansum(pull**2)), int(np.isfinite(pull).sum())
-    beyond = np.nanmean(difference**2) - np.nanmean(error**2)
-    return ProfileComparison(
-        position=first.position,
-        difference=pull,
-        chi_square=chi_square,
-        degrees_of_freedom=bins - 1,
-        probability=float(chi2.sf(chi_square, bins - 1)),
-        relative=float(np.sqrt(max(beyond, 0.0))),
-    )

@@ -151,18 +151,7 @@ class Projection:
         return np.column_stack([(-x if self.mirror else x) * stretch, y * stretch, np.cos(angle)])
 
     def angles(self, places: ArrayLike) -> Floats:
-        """Polar angles of the directions that appear at some places.
-
-        Parameters
-        ----------
-        places : array_like
-            x and y [mm], shape (n, 2).
-
-        Returns
-        -------
-        ndarray
-            From the axis [rad], shape (n,).
-        """
+        """Polar angles [rad], shape (n,), of the directions that appear at places x and y [mm], shape (n, 2)."""
         x, y = (check_array(places, "places", ("n", 2), finite=False) - self.centre).T
         return angle_of(np.hypot(x, y) / self.scale, self.compression)
 
