@@ -8,6 +8,7 @@ from .analysis.apex import image_compression as image_compression
 from .analysis.apex import run_field_factor as run_field_factor
 from .analysis.profiles import Rectangle as Rectangle
 from .analysis.profiles import azimuthal_profile as azimuthal_profile
+from .analysis.profiles import compare_profiles as compare_profiles
 from .analysis.profiles import radial_profile as radial_profile
 from .analysis.profiles import zone_line_profile as zone_line_profile
 from .analysis.response_tracks import lateral_tracks as lateral_tracks
@@ -15,7 +16,6 @@ from .analysis.response_tracks import rollup_tracks as rollup_tracks
 from .analysis.similarity import half_ceiling as half_ceiling
 from .analysis.similarity import ssim as ssim
 from .analysis.zone_line import ZoneLine as ZoneLine
-from .analysis.zone_line import compare_profiles as compare_profiles
 from .analysis.zone_line import fit_zone_line as fit_zone_line
 from .crystallography.orientation import Orientation as Orientation
 from .crystallography.orientation import fit_orientation as fit_orientation

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence
-from apt_evap.detection.projection import Projection
+from apt_evap.detection.projection import Projection, polar_angles
 from apt_evap.emission.perturbations import Unperturbed
 from apt_evap.simulation.run import Run
 
@@ -83,10 +83,10 @@ def fit_caps(run: Run, windows: int | None = None) -> tuple[Cap, ...]:
     caps = []
     for first, last in pairwise(edges):
         sites = run.emissions.positions[first:last]
-        centre, radius = np.zeros(3), None
+        centre, radius = np.zeros(3), float("nan")
         for _ in range(3):  # the sites on the cap change with its centre
             from_centre = sites - centre
-            near = np.arctan2(np.hypot(from_centre[:, 0], from_centre[:, 1]), from_centre[:, 2]) < _CAP
+            near = polar_angles(from_centre) < _CAP
             if np.count_nonzero(near) < 50:
                 raise ValueError(f"a window of ions must have 50 near the axis, got {np.count_nonzero(near)}")
             centre, radius = _sphere(sites[near], centre, radius)
@@ -123,21 +123,18 @@ def image_compression(run: Run, caps: Sequence[Cap] | None = None) -> ImageCompr
     crystal = np.empty(len(run))
     for cap in _caps_of(run, caps):
         from_centre = run.emissions.positions[cap.first : cap.last] - cap.centre
-        across = np.hypot(from_centre[:, 0], from_centre[:, 1])
-        crystal[cap.first : cap.last] = np.degrees(np.arctan2(across, from_centre[:, 2]))
-    radius = np.hypot(hits.x, hits.y)
-    seen = hits.detected
+        crystal[cap.first : cap.last] = np.degrees(polar_angles(from_centre))
     # to the corners the square detector shows only some azimuths
-    seen &= radius <= run.detector.width / 2
-    plane = run.detector.projection == "plane"
-    detector = np.degrees(np.arctan(radius / run.detector.distance) if plane else radius / run.detector.distance)
+    inside = hits.detected & (np.hypot(hits.x, hits.y) <= run.detector.width / 2)
+    onto_detector = run.detector.seen_from_apex
+    detector = np.degrees(onto_detector.angles(np.column_stack([hits.x, hits.y])))
     number = np.floor(crystal / _BIN).astype(int)
     # at the rim of the detector only the ions that come in below the average are left
-    whole = [np.mean(seen[number == index]) > 0.99 for index in range(int(90 / _BIN)) if (number == index).any()]
+    whole = [np.mean(inside[number == index]) > 0.99 for index in range(int(90 / _BIN)) if (number == index).any()]
     last = len(whole) if all(whole) else whole.index(False)
-    bins = [index for index in range(last) if np.count_nonzero(seen & (number == index)) >= _LEAST_IONS]
+    bins = [index for index in range(last) if np.count_nonzero(inside & (number == index)) >= _LEAST_IONS]
     angles = (np.array(bins) + 0.5) * _BIN
-    medians = np.array([np.median(detector[seen & (number == index)]) for index in bins])
+    medians = np.array([np.median(detector[inside & (number == index)]) for index in bins])
     outer = angles > _INNER
     if np.count_nonzero(outer) < 3:
         raise ValueError(
@@ -148,11 +145,11 @@ def image_compression(run: Run, caps: Sequence[Cap] | None = None) -> ImageCompr
     for _ in range(5):  # the range of validity and the median over its ions depend on each other
         good = np.abs(angles / medians / compression - 1) <= _TOLERANCE
         low, high = _stretch(angles, good)
-        chosen = seen & (crystal >= max(low, _INNER)) & (crystal < high)
+        chosen = inside & (crystal >= max(low, _INNER)) & (crystal < high)
         ratio = crystal[chosen] / detector[chosen]
         compression = float(np.median(ratio))
     scatter = float(np.diff(np.percentile(ratio, [16, 84]))[0] / 2)
-    projection = Projection(run.detector.distance / compression, compression=compression if plane else None)
+    projection = onto_detector.compressed(compression)
     return ImageCompression(compression, scatter, low, high, angles, medians, projection)
 
 
@@ -217,7 +214,7 @@ def run_field_factor(run: Run, caps: Sequence[Cap] | None = None) -> Floats:
     factors = []
     for cap in _caps_of(run, caps):
         from_centre = run.emissions.positions[cap.first : cap.last] - cap.centre
-        near = np.arctan2(np.hypot(from_centre[:, 0], from_centre[:, 1]), from_centre[:, 2]) < _NEAR
+        near = polar_angles(from_centre) < _NEAR
         if not near.any():
             raise ValueError(f"no ion from {cap.first} to {cap.last} left within 20 degrees of the axis")
         factors.append(field_factor(run.voltage, np.median(run.fields[cap.first : cap.last][near]), cap.radius))
@@ -235,7 +232,8 @@ def _caps_of(run, caps):
 
 def _sphere(points, centre, radius):
     """Centre and radius of the sphere nearest to points, outliers counted linearly."""
-    radius = float(np.median(np.linalg.norm(points - centre, axis=1))) if radius is None else radius
+    if math.isnan(radius):
+        radius = float(np.median(np.linalg.norm(points - centre, axis=1)))
     fit = least_squares(
         lambda unknowns: np.linalg.norm(points - unknowns[:3], axis=1) - unknowns[3],
         np.append(centre, radius),

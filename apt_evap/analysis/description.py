@@ -47,12 +47,12 @@ UNITS = {
 _MEASURED = ("x", "y", "time_of_flight", "voltage", "pulse_voltage", "mass_to_charge", "positions", "pulse_id")
 
 
-def describe(held: Run | Hits | DetectorMap) -> dict[str, Any]:
-    """Say what a run, ions or a map hold.
+def describe(data: Run | Hits | DetectorMap) -> dict[str, Any]:
+    """Contents of a run, of ions or of a map.
 
     Parameters
     ----------
-    held : Run or Hits or DetectorMap
+    data : Run or Hits or DetectorMap
         What `apt_evap.read` gives.
 
     Returns
@@ -60,22 +60,22 @@ def describe(held: Run | Hits | DetectorMap) -> dict[str, Any]:
     dict
         Plain types, what `apt-evap info` prints; a pair is the least and the greatest value. Units are in `UNITS`.
     """
-    if isinstance(held, DetectorMap):
-        return _of_map(held)
-    return _of_run(held) if isinstance(held, Run) else _of_hits(held)
+    if isinstance(data, DetectorMap):
+        return _of_map(data)
+    return _of_run(data) if isinstance(data, Run) else _of_hits(data)
 
 
-def _of_map(held):
-    x_min, x_max, y_min, y_max = held.extent
+def _of_map(map):
+    x_min, x_max, y_min, y_max = map.extent
     return {
-        "kind": "detector map of counts" if held.is_counts else "detector map of densities",
-        "ions": held.ions,
-        "bins": list(held.values.shape[::-1]),
-        "bin_size": [_plain(size) for size in held.bin_size],
+        "kind": "detector map of counts" if map.is_counts else "detector map of densities",
+        "ions": map.ions,
+        "bins": list(map.values.shape[::-1]),
+        "bin_size": [_plain(size) for size in map.bin_size],
         "x": [_plain(x_min), _plain(x_max)],
         "y": [_plain(y_min), _plain(y_max)],
-        "values": _extent(held.values[held.mask]),
-        "share_inside_mask": _plain(np.mean(held.mask)),
+        "values": _extent(map.values[map.mask]),
+        "share_inside_mask": _plain(np.mean(map.mask)),
     }
 
 
@@ -112,15 +112,15 @@ def _of_run(run):
 
 def _tip(settings):
     """Settings of a tip that are given, without the sources of the materials."""
-    told = {key: value for key, value in settings.items() if value not in (None, [], {})}
-    if "material" in told:
-        host = told["material"].items()
-        told["material"] = {key: value for key, value in host if value is not None and key != "sources"}
-    if "solutes" in told:
-        told["solutes"] = {solute["name"]: fraction for solute, fraction in told["solutes"]}
-    if "elements" in told:
-        told["elements"] = [element["name"] for element in told["elements"]]
-    return told
+    contents = {key: value for key, value in settings.items() if value not in (None, [], {})}
+    if "material" in contents:
+        host = contents["material"].items()
+        contents["material"] = {key: value for key, value in host if value is not None and key != "sources"}
+    if "solutes" in contents:
+        contents["solutes"] = {solute["name"]: fraction for solute, fraction in contents["solutes"]}
+    if "elements" in contents:
+        contents["elements"] = [element["name"] for element in contents["elements"]]
+    return contents
 
 
 def _of_hits(hits):
@@ -133,21 +133,21 @@ def _of_hits(hits):
         columns |= {key: _extent(part) for key, part in parts.items()}
     detected = hits.detected
     measured = hits.outcome is None
-    told = {"kind": "measured ions" if measured else hits.source, "ions": len(hits)}
-    told |= {"detected": int(np.count_nonzero(detected)), "columns": columns}
+    contents = {"kind": "measured ions" if measured else hits.source, "ions": len(hits)}
+    contents |= {"detected": int(np.count_nonzero(detected)), "columns": columns}
     if measured:
-        told["absent_or_zero_throughout"] = [
+        contents["absent_or_zero_throughout"] = [
             name for name in _MEASURED if name not in hits.columns or not np.any(getattr(hits, name))
         ]
     if hits.x is not None and hits.y is not None and detected.any():
         x, y = hits.x[detected], hits.y[detected]
-        told["detector_extent"] = [_plain(np.ptp(x)), _plain(np.ptp(y))]
+        contents["detector_extent"] = [_plain(np.ptp(x)), _plain(np.ptp(y))]
         combs = find_combs(x, y)
-        told["detector_quantum"] = None if combs is None else [_plain(comb.spacing) for comb in combs]
+        contents["detector_quantum"] = None if combs is None else [_plain(comb.spacing) for comb in combs]
     if hits.multiplicity is not None:
-        told["multi_hit_share"] = _plain(np.mean(hits.multiplicity > 1))
-        told["largest_multi_hit"] = int(hits.multiplicity.max())
-    return told
+        contents["multi_hit_share"] = _plain(np.mean(hits.multiplicity > 1))
+        contents["largest_multi_hit"] = int(hits.multiplicity.max())
+    return contents
 
 
 def _extent(values):

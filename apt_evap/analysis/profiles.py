@@ -1,10 +1,11 @@
-"""Density of hits along a circle, a radius, or across a zone line, with the errors of counting."""
+"""Density of hits along a circle, a radius or across a zone line, with counting errors; two profiles compared."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import chi2
 
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence
@@ -206,18 +207,81 @@ def zone_line_profile(
     return _profile(centres, np.concatenate(strips), np.concatenate(chosen), places, exact, where)
 
 
+class ProfileComparison(NamedTuple):
+    """Two profiles of one rectangle, each relative to its own mean."""
+
+    position: np.ndarray
+    """Centres of the bins, shape (bins,)."""
+    difference: np.ndarray
+    """Density of the first less that of the second, in units of its error, shape (bins,)."""
+    chi_square: float
+    """Sum of the squares of the differences."""
+    degrees_of_freedom: int
+    """Bins less one: both have the mean 1."""
+    probability: float
+    """Probability that the noise of counting alone makes a larger chi_square."""
+    relative: float
+    """Root mean square of the difference of the densities beyond what noise explains; 0 if noise explains all."""
+
+
+def compare_profiles(first: Profile, second: Profile) -> ProfileComparison:
+    """Compare two profiles bin by bin, in units of the errors.
+
+    Parameters
+    ----------
+    first, second : Profile
+        Profiles with the same bins and with errors: of hits, or of maps of counts.
+
+    Returns
+    -------
+    ProfileComparison
+
+    Raises
+    ------
+    ValueError
+        If bins differ, or a profile has no errors.
+    """
+    for name, profile in (("first", first), ("second", second)):
+        check_kind(profile, name, Profile, "a Profile")
+        if not np.isfinite(profile.error).any():
+            raise ValueError(f"{name} must have errors, got a profile of densities: count hits instead")
+    if first.position.shape != second.position.shape or not np.allclose(first.position, second.position):
+        raise ValueError(
+            f"the profiles must have the same bins, got {len(first.position)} and {len(second.position)} "
+            f"around {first.position.mean():g} and {second.position.mean():g}"
+        )
+    difference = first.density - second.density
+    error = np.hypot(first.error, second.error)
+    pull = difference / error
+    chi_square, bins = float(np.nansum(pull**2)), int(np.isfinite(pull).sum())
+    beyond = np.nanmean(difference**2) - np.nanmean(error**2)
+    return ProfileComparison(
+        position=first.position,
+        difference=pull,
+        chi_square=chi_square,
+        degrees_of_freedom=bins - 1,
+        probability=float(chi2.sf(chi_square, bins - 1)),
+        relative=float(np.sqrt(max(beyond, 0.0))),
+    )
+
+
 class _Places:
     """Where hits are: those of ions, each one hit; or the bins of a map, each with its value and its area."""
 
-    def __init__(self, hits: Hits) -> None:
+    x: Floats
+    y: Floats
+    values: Floats | None = None
+    area: float | None = None
+
+    def __init__(self, hits: Hits | DetectorMap) -> None:
         if isinstance(hits, DetectorMap):
             self.x, self.y = (grid[hits.mask] for grid in np.meshgrid(*hits.centres))
             self.values, self.area = hits.values[hits.mask], float(np.prod(hits.bin_size))
+            self.counted = hits.is_counts
         else:
             detected = check_kind(hits, "hits", Hits, "Hits or a DetectorMap").detected
             self.x, self.y = (values[detected] for values in hits.require("x", "y"))
-            self.values = self.area = None
-        self.counted = self.values is None or hits.is_counts
+            self.counted = True
 
 
 def _check_ring(inner, outer, bins):

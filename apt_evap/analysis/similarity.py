@@ -1,19 +1,78 @@
-"""How alike two detector maps are, and how alike they could be given their noise."""
+"""Structural similarity of two detector maps, and of two halves of one, which its noise limits."""
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import ndimage
-from skimage.metrics import structural_similarity
-from skimage.morphology import disk
 
+from apt_evap._common.types import Booleans, Floats
 from apt_evap._common.validation import check_kind, check_number, check_seed
-from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.detection.detector_map import DetectorMap, gaussian
 from apt_evap.detection.hits import Hits
 
-_WINDOW = 5
-"""Half width [bins] of the Gaussian window, cut off at 3.5 standard deviations of 1.5 bins."""
+SIGMA, TRUNCATE = 1.5, 3.5
+"""Standard deviation of the Gaussian window [bins], and where it is cut off, in standard deviations."""
+WINDOW = int(SIGMA * TRUNCATE + 0.5)
+"""Half width of the window [bins]."""
+
+
+class Moments(NamedTuple):
+    """Densities with their mean and variance in the window about every bin, all of shape (..., ny, nx)."""
+
+    density: np.ndarray
+    mean: np.ndarray
+    variance: np.ndarray
+
+
+def window_mean(values: Floats) -> Floats:
+    """Mean in the window about every bin, of maps of shape (..., ny, nx)."""
+    return gaussian(values, SIGMA, TRUNCATE)
+
+
+def window_fits(mask: Booleans) -> Booleans:
+    """Whether the disc of radius `WINDOW` about a bin lies inside a mask, bool of shape (ny, nx)."""
+    step = np.arange(-WINDOW, WINDOW + 1)
+    return ndimage.binary_erosion(mask, step[:, None] ** 2 + step**2 <= WINDOW**2)
+
+
+def local_moments(density: Floats) -> Moments:
+    """The `Moments` of densities, shape (..., ny, nx)."""
+    mean = window_mean(density)
+    return Moments(density, mean, window_mean(density**2) - mean**2)
+
+
+def local_similarity(first: Moments, second: Moments, data_range: float, noise: float | Floats = 0.0) -> Floats:
+    r"""Structural similarity in the window about every bin.
+
+    Parameters
+    ----------
+    first, second : Moments
+        Those of two maps, or of two stacks of maps, one by one.
+    data_range : float
+        Range L of the densities.
+    noise : float or ndarray
+        Sum of the variances of the noise of both maps, which counts as alike, shape (ny, nx); none by default.
+
+    Returns
+    -------
+    ndarray
+        Shape (..., ny, nx); it means something where `window_fits`.
+
+    Notes
+    -----
+    With means μ, variances σ^2 and the covariance σ_xy in the window, and the noise ν,
+
+    .. math:: \frac{2 μ_x μ_y + C_1}{μ_x^2 + μ_y^2 + C_1} \; \frac{2 σ_{xy} + ν + C_2}{σ_x^2 + σ_y^2 + C_2}
+
+    where C_1 = (0.01 L)^2 and C_2 = (0.03 L)^2 (Wang, Bovik, Sheikh and Simoncelli, IEEE Trans. Image Process. 13, 600
+    (2004), equation 13, for which ν = 0).
+    """
+    c1, c2 = (0.01 * data_range) ** 2, (0.03 * data_range) ** 2
+    product = first.mean * second.mean
+    covariance = window_mean(first.density * second.density) - product
+    local = (2 * product + c1) * (2 * covariance + noise + c2)
+    return local / ((first.mean**2 + second.mean**2 + c1) * (first.variance + second.variance + c2))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -87,7 +146,7 @@ def ssim(map_a: DetectorMap, map_b: DetectorMap, *, smoothing: float = 0.0, data
     Notes
     -----
     Wang, Bovik, Sheikh and Simoncelli, IEEE Trans. Image Process. 13, 600 (2004): Gaussian windows of
-    1.5 bins, K1 = 0.01, K2 = 0.03, by scikit-image.
+    1.5 bins, K1 = 0.01, K2 = 0.03 (`local_similarity`).
     """
     smoothing = check_number(smoothing, "smoothing", at_least=0, unit="mm")
     data_range = check_number(data_range, "data_range", above=0)
@@ -95,21 +154,17 @@ def ssim(map_a: DetectorMap, map_b: DetectorMap, *, smoothing: float = 0.0, data
         check_kind(each, name, DetectorMap, "a DetectorMap")
     _check_bins(map_a, map_b)
     common = map_a.mask & map_b.mask
-    inside = ndimage.binary_erosion(common, disk(_WINDOW))
+    inside = window_fits(common)
     if not inside.any():
         raise ValueError(
-            f"the masks of the two maps must share more than a window of {2 * _WINDOW + 1} bins, they share "
+            f"the masks of the two maps must share more than a window of {2 * WINDOW + 1} bins, they share "
             f"{np.count_nonzero(common)} bins"
         )
-    images = [np.where(common, replace(m.smoothed(smoothing), mask=common).density, 1.0) for m in (map_a, map_b)]
-    _, local = structural_similarity(
-        *images,
-        data_range=data_range,
-        gaussian_weights=True,
-        sigma=1.5,
-        use_sample_covariance=False,
-        full=True,
+    first, second = (
+        local_moments(np.where(common, replace(each.smoothed(smoothing), mask=common).density, 1.0))
+        for each in (map_a, map_b)
     )
+    local = local_similarity(first, second, data_range)
     return Similarity(
         value=float(local[inside].mean()),
         local=np.where(inside, local, np.nan),
@@ -174,5 +229,5 @@ def _check_bins(map_a, map_b):
                 f"the two maps must have the same bins, got {map_a!r} and {map_b!r} with {name} from "
                 f"{a[0]:g} to {a[-1]:g} and {b[0]:g} to {b[-1]:g} mm"
             )
-        if len(a) - 1 < 11:
-            raise ValueError(f"ssim needs at least 11 bins along a side, got {len(a) - 1} from {name}")
+        if len(a) - 1 < 2 * WINDOW + 1:
+            raise ValueError(f"ssim needs at least {2 * WINDOW + 1} bins along a side, got {len(a) - 1} from {name}")

@@ -1,12 +1,10 @@
-"""The width of a zone line from a profile across it, and two profiles compared."""
+"""Width of a zone line, fitted to a profile across it."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import approx_fprime, curve_fit
-from scipy.stats import chi2
 
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_kind, check_number
@@ -121,25 +119,25 @@ def fit_zone_line(profile: Profile, *, exponent: float = 2.0) -> ZoneLine:
     highest = [position[-1], span, np.inf, np.inf, np.inf, EXPONENTS[1]][: len(start)]
     missing = f"the profile of {len(position)} bins over {span:g} mm shows no line"
     try:
-        found, covariance = curve_fit(model, position, density, start, bounds=(lowest, highest))
+        parameters, covariance = curve_fit(model, position, density, start, bounds=(lowest, highest))
     except RuntimeError as failure:
         raise ValueError(f"{missing}: {failure}") from failure
-    at_edge = [np.isclose(found[:2], edge[:2], atol=1e-6 * span) for edge in (lowest, highest)]
+    at_edge = [np.isclose(parameters[:2], edge[:2], atol=1e-6 * span) for edge in (lowest, highest)]
     if np.any(at_edge) or not np.isfinite(covariance).all():
-        raise ValueError(f"{missing}: the fit ran to {found[1]:.3g} mm wide at {found[0]:.3g} mm")
+        raise ValueError(f"{missing}: the fit ran to {parameters[1]:.3g} mm wide at {parameters[0]:.3g} mm")
     if np.isfinite(error).all():
-        change = np.linalg.pinv(approx_fprime(found, lambda values: model(position, *values)))
+        change = np.linalg.pinv(approx_fprime(parameters, lambda values: model(position, *values)))
         covariance = (change * error**2) @ change.T
     names = ("centre", "width", "height", "background", "slope", "exponent")
-    values = {"exponent": exponent} | dict(zip(names, found.tolist(), strict=False))
+    values = {"exponent": exponent} | dict(zip(names, parameters.tolist(), strict=False))
     errors = {"exponent": 0.0} | dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=False))
-    fitted = model(position, *found)
+    fitted = model(position, *parameters)
     misfit = (density - fitted) / _errors_of(fitted, density, error)
     return ZoneLine(
         **values,
         **{f"{name}_error": errors[name] for name in names if name != "slope"},
         chi_square=float(misfit @ misfit),
-        degrees_of_freedom=len(position) - len(found),
+        degrees_of_freedom=len(position) - len(parameters),
     )
 
 
@@ -172,62 +170,3 @@ def _errors_of(expected, density, error):
     with np.errstate(divide="ignore", invalid="ignore"):
         hits_per_density = np.where(density > 0, density / error**2, 1 / error)
     return np.sqrt(np.maximum(expected * hits_per_density, 1)) / hits_per_density
-
-
-class ProfileComparison(NamedTuple):
-    """Two profiles of one rectangle, each relative to its own mean."""
-
-    position: np.ndarray
-    """Centres of the bins, shape (bins,)."""
-    difference: np.ndarray
-    """Density of the first less that of the second, in units of its error, shape (bins,)."""
-    chi_square: float
-    """Sum of the squares of the differences."""
-    degrees_of_freedom: int
-    """Bins less one: both have the mean 1."""
-    probability: float
-    """Probability that the noise of counting alone makes a larger chi_square."""
-    relative: float
-    """Root mean square of the difference of the densities beyond what noise explains; 0 if noise explains all."""
-
-
-def compare_profiles(first: Profile, second: Profile) -> ProfileComparison:
-    """Compare two profiles bin by bin, in units of the errors.
-
-    Parameters
-    ----------
-    first, second : Profile
-        Profiles with the same bins and with errors: of hits, or of maps of counts.
-
-    Returns
-    -------
-    ProfileComparison
-
-    Raises
-    ------
-    ValueError
-        If bins differ, or a profile has no errors.
-    """
-    for name, profile in (("first", first), ("second", second)):
-        if not isinstance(profile, Profile):
-            raise ValueError(f"{name} must be a Profile, got {profile!r:.80}")
-        if not np.isfinite(profile.error).any():
-            raise ValueError(f"{name} must have errors, got a profile of densities: count hits instead")
-    if first.position.shape != second.position.shape or not np.allclose(first.position, second.position):
-        raise ValueError(
-            f"the profiles must have the same bins, got {len(first.position)} and {len(second.position)} "
-            f"around {first.position.mean():g} and {second.position.mean():g}"
-        )
-    difference = first.density - second.density
-    error = np.hypot(first.error, second.error)
-    pull = difference / error
-    chi_square, bins = float(np.nansum(pull**2)), int(np.isfinite(pull).sum())
-    beyond = np.nanmean(difference**2) - np.nanmean(error**2)
-    return ProfileComparison(
-        position=first.position,
-        difference=pull,
-        chi_square=chi_square,
-        degrees_of_freedom=bins - 1,
-        probability=float(chi2.sf(chi_square, bins - 1)),
-        relative=float(np.sqrt(max(beyond, 0.0))),
-    )

@@ -203,8 +203,16 @@ def fit_orientation(
     chosen = bool(fits[1][2] < 0.999 * fits[0][2] - 1e-9) if mirror is None else bool(mirror)
     matrix, projection, rms, errors = fits[chosen]
     residuals = np.linalg.norm(projection.places(normals @ matrix.T) - places, axis=1)
-    found = Orientation.from_matrix(host, matrix)
-    return FittedOrientation(found, projection, residuals, rms, *errors, mirrored_rms=fits[not chosen][2])
+    angle_error, scale_error = errors
+    return FittedOrientation(
+        orientation=Orientation.from_matrix(host, matrix),
+        projection=projection,
+        residuals=residuals,
+        rms=rms,
+        angle_error=angle_error,
+        scale_error=scale_error,
+        mirrored_rms=fits[not chosen][2],
+    )
 
 
 def _line(host, first, line):
@@ -230,18 +238,18 @@ def _fit(normals, places, lines, projection, free, mirror):
 
         def misfit(unknowns, rotation=rotation, scale=scale):
             turned = (Rotation.from_rotvec(unknowns[:3]) * rotation).as_matrix()
-            shown = Projection(scale * math.exp(unknowns[3]) if free else scale, projection.centre, mirror)
+            trial = Projection(scale * math.exp(unknowns[3]) if free else scale, projection.centre, mirror)
             # on the sphere, times the scale: finite for any rotation
-            seen, expected = shown.directions(places), normals @ turned.T
-            parts = [_offsets(seen, expected).ravel()]
-            parts += [np.arcsin(shown.directions(points) @ (turned @ zone)) for zone, _, points in lines]
-            return shown.scale * np.concatenate(parts)
+            measured, expected = trial.directions(places), normals @ turned.T
+            parts = [_offsets(measured, expected).ravel()]
+            parts += [np.arcsin(trial.directions(points) @ (turned @ zone)) for zone, _, points in lines]
+            return trial.scale * np.concatenate(parts)
 
         fit = least_squares(misfit, np.zeros(4 if free else 3), x_scale=0.1, xtol=1e-12, ftol=1e-12, gtol=1e-12)
-        found = scale * math.exp(fit.x[3]) if free else scale
-        tries.append((fit.cost, found, rotation, fit))
+        fitted_scale = scale * math.exp(fit.x[3]) if free else scale
+        tries.append((fit.cost, fitted_scale, rotation, fit))
     reach = np.linalg.norm(places - projection.centre, axis=1).max()
-    tries = [each for each in tries if reach <= each[1] * math.pi / 2] or tries
+    tries = [each for each in tries if reach <= Projection(each[1]).rim] or tries
     # two poles may fit exactly in two ways: of equals the one with the smaller angles
     least = min(each[0] for each in tries)
     _, scale, rotation, fit = max(
@@ -258,11 +266,11 @@ def _fit(normals, places, lines, projection, free, mirror):
     return matrix, Projection(scale, projection.centre, mirror), rms, errors
 
 
-def _offsets(seen, expected):
+def _offsets(first, second):
     """Rotation vectors from unit vectors to others, as long as the angle between them, shape (n, 3)."""
-    across = np.cross(seen, expected)
+    across = np.cross(first, second)
     sine = np.linalg.norm(across, axis=1)
-    angle = np.arctan2(sine, np.einsum("ij,ij->i", seen, expected))
+    angle = np.arctan2(sine, np.einsum("ij,ij->i", first, second))
     return across * np.divide(angle, sine, out=np.ones_like(sine), where=sine > 0)[:, None]
 
 
@@ -272,17 +280,17 @@ def _scales(normals, places, projection):
     angles = np.linalg.norm(_offsets(normals[first], normals[second]), axis=1)
     apart = angles > _SAME
     ratio = np.median(np.linalg.norm(places[first] - places[second], axis=1)[apart] / angles[apart])
-    least = np.linalg.norm(places - projection.centre, axis=1).max() / (math.pi / 2)
+    least = np.linalg.norm(places - projection.centre, axis=1).max() / Projection(1.0).rim
     return [max(ratio * factor, least) for factor in (0.7, 1.0, 1.4, 2.5)]
 
 
 def _aligned(normals, places, lines, projection):
     """The rotation that brings poles and lines nearest to where they are seen."""
-    seen, crystal = [projection.directions(places)], [normals]
+    specimen, crystal = [projection.directions(places)], [normals]
     for _, tangent, points in lines:
         there = projection.directions(points)
-        angle = np.arctan2(np.linalg.norm(np.cross(there, seen[0][0]), axis=1), there @ seen[0][0])
-        seen.append(there)
+        angle = np.arctan2(np.linalg.norm(np.cross(there, specimen[0][0]), axis=1), there @ specimen[0][0])
+        specimen.append(there)
         crystal.append(np.cos(angle)[:, None] * normals[0] + np.sin(angle)[:, None] * tangent)
-    seen, crystal = np.concatenate(seen), np.concatenate(crystal)
-    return Rotation.align_vectors(seen, crystal)[0]
+    specimen, crystal = np.concatenate(specimen), np.concatenate(crystal)
+    return Rotation.align_vectors(specimen, crystal)[0]

@@ -77,16 +77,20 @@ def poles(material: Material, families: int = 8) -> Poles:
     if families > _MAX_FAMILIES:
         raise ValueError(f"families must be at most {_MAX_FAMILIES}, got {families}")
     four = material.structure == "hcp"
-    found = []
+    candidates = []
     for h, k, last in product(range(_LARGEST + 1), repeat=3):
         if gcd(h, k, last) != 1 or h > k or (not four and k > last):
             continue
         plane = np.array([h, k, -h - k, last] if four else [h, k, last])
         multiple, spacing = _stacking(material, plane)
         # rounded: of families as far apart as each other the one with the smaller indices is first
-        found.append((-round(spacing / material.a, 9), int(np.abs(plane).sum()), tuple((multiple * plane).tolist())))
-    found.sort()
-    members = [(member, -spacing * material.a) for spacing, _, plane in found[:families] for member in _members(plane)]
+        candidates.append(
+            (-round(spacing / material.a, 9), int(np.abs(plane).sum()), tuple((multiple * plane).tolist()))
+        )
+    candidates.sort()
+    members = [
+        (member, -spacing * material.a) for spacing, _, plane in candidates[:families] for member in _members(plane)
+    ]
     planes = np.array([member for member, _ in members])
     return Poles(
         planes,
@@ -214,18 +218,18 @@ def _members(indices):
     """All that the symmetry of the lattice makes of three indices (m-3m) or four (6/mmm)."""
     if len(indices) == 3:
         signs = product((1, -1), repeat=3)
-        found = {
+        members = {
             tuple(int(s * i) for s, i in zip(sign, p, strict=True)) for sign in signs for p in permutations(indices)
         }
     else:
         *first, last = indices
-        found = {
+        members = {
             (*(sign * int(index) for index in p), other * int(last))
             for p in permutations(first)
             for sign in (1, -1)
             for other in (1, -1)
         }
-    return sorted(found, reverse=True)
+    return sorted(members, reverse=True)
 
 
 def _stacking(material, plane):

@@ -4,7 +4,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import ndimage
-from skimage.morphology import convex_hull_image
 
 from apt_evap._common.types import Booleans, Floats, Integers
 from apt_evap._common.validation import check_array, check_count, check_number, shown
@@ -131,6 +130,12 @@ def bin_edges(
     bins = check_count(bins, "bins", at_least=1, at_most=MAX_BINS)
     if extent is None:
         extent = (x.min(), x.max(), y.min(), y.max())
+        if extent[0] == extent[1] and extent[2] == extent[3]:
+            ions = "the only ion lies" if len(x) == 1 else f"all {len(x):,} ions lie"
+            raise ValueError(
+                f"{ions} at ({x[0]:g}, {y[0]:g}) mm: a map needs ions at different places, select more of them or give "
+                "extent=(x_min, x_max, y_min, y_max) [mm]"
+            )
     low_x, high_x, low_y, high_y = (float(value) for value in check_array(extent, "extent", (4,)))
     longer = max(high_x - low_x, high_y - low_y)
     if high_x < low_x or high_y < low_y or longer == 0:
@@ -232,4 +237,45 @@ def field_of_view(counts: Integers) -> Booleans:
     region &= ndimage.uniform_filter((counts > 0).astype(float), side, mode="constant") > 0
     if min(np.ptp(axis) for axis in np.nonzero(region)) == 0:
         return region
-    return convex_hull_image(region, offset_coordinates=False)
+    return convex_hull(region)
+
+
+def convex_hull(region: Booleans) -> Booleans:
+    """Bins whose centres lie within the convex hull of the centres of a region, or on its border.
+
+    Parameters
+    ----------
+    region : ndarray
+        bool of shape (ny, nx), not all False.
+
+    Returns
+    -------
+    ndarray
+        bool of shape (ny, nx).
+    """
+    nx = region.shape[1]
+    rows = np.flatnonzero(region.any(axis=1))
+    left, right = region[rows].argmax(axis=1), nx - 1 - region[rows, ::-1].argmax(axis=1)
+    inner = np.arange(rows[0], rows[-1] + 1)
+    columns = np.arange(nx)
+    hull = np.zeros_like(region)
+    hull[inner] = (-_upper_hull(rows, -left, inner)[:, None] <= columns) & (
+        columns <= _upper_hull(rows, right, inner)[:, None]
+    )
+    return hull
+
+
+def _upper_hull(x, y, at):
+    """Whole part of the least concave function through or above integer points, at integers, in exact arithmetic."""
+    corners = []
+    for point in zip(x.tolist(), y.tolist(), strict=True):
+        while len(corners) > 1 and not _turns_right(*corners[-2:], point):
+            corners.pop()
+        corners.append(point)
+    x, y = np.array(corners + corners[-1:]).T
+    step = np.minimum(np.searchsorted(x, at, side="right"), len(x) - 1) - 1
+    return y[step] + (y[step + 1] - y[step]) * (at - x[step]) // np.maximum(x[step + 1] - x[step], 1)
+
+
+def _turns_right(a, b, c):
+    return (b[0] - a[0]) * (c[1] - a[1]) < (b[1] - a[1]) * (c[0] - a[0])

@@ -8,9 +8,11 @@ from numpy.typing import NDArray
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_choice, check_number
 from apt_evap.detection.hits import Outcome
+from apt_evap.detection.projection import Projection, along_axis, stereographic, stereographic_stretch
 from apt_evap.units import NM_PER_MM
 
-PROJECTIONS = ("plane", "equidistant")
+PROJECTIONS = {"plane": 1.0, "equidistant": None}
+"""Image compression of each `Projection`; None is the azimuthal equidistant one."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,11 @@ class Detector:
         half = self.width / 2
         return -half, half, -half, half
 
+    @property
+    def seen_from_apex(self) -> Projection:
+        """The projection of the directions in which ions fly, as seen from the apex, onto this detector."""
+        return Projection(self.distance, compression=PROJECTIONS[self.projection])
+
     def directions(self, positions: Floats, velocities: Floats, apex: float) -> tuple[Floats, Floats]:
         """Directions in which ions meet the plane, as seen from the apex.
 
@@ -80,8 +87,7 @@ class Detector:
                 (positions + velocities * np.where(ahead, remaining, 0.0)[:, None]) - (0, 0, apex),
                 velocities,
             )
-            directions = place[:, :2] / (np.linalg.norm(place, axis=1) + place[:, 2])[:, None]
-        return directions, remaining
+            return stereographic(place), remaining
 
     def impacts(self, directions: Floats, times: Floats) -> tuple[Floats, Floats, Floats, NDArray[np.int8]]:
         """Where and when ions meet the detector.
@@ -105,13 +111,10 @@ class Detector:
         s2 = np.einsum("ij,ij->i", directions, directions)
         ahead = s2 < 1.0
         with np.errstate(divide="ignore", invalid="ignore"):
-            if self.projection == "plane":
-                scale = 2.0 / (1.0 - s2)  # tan(theta) / tan(theta / 2)
-            else:
-                s = np.sqrt(s2)
-                scale = np.where(s > 0, 2.0 * np.arctan(s) / s, 2.0)
-                times = np.where(ahead, times * (1.0 - s2) / (1.0 + s2), times)  # cos(theta) of the way to the plane
-            scale = np.where(ahead, self.distance * scale, np.nan)
+            stretch = stereographic_stretch(s2, PROJECTIONS[self.projection])
+            if self.projection == "equidistant":
+                times = np.where(ahead, along_axis(times, s2), times)  # cos(theta) of the way to the plane
+            scale = np.where(ahead, self.distance * stretch, np.nan)
         x, y = directions[:, 0] * scale, directions[:, 1] * scale
         outcome = np.full(len(x), Outcome.MISSED, np.int8)
         outcome[(np.abs(x) <= self.width / 2) & (np.abs(y) <= self.width / 2)] = Outcome.HIT

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from apt_evap._common.types import Floats, Integers
+from apt_evap._common.types import Booleans, Floats, Integers
 from apt_evap._common.validation import check_array, check_kind, check_number, check_seed, check_switch
 from apt_evap.detection.binning import bin_edges, count, field_of_view, find_combs
 
@@ -142,9 +142,9 @@ class DetectorMap:
             mask = _check_mask(mask, counts.shape)
         else:
             mask = field_of_view(counts) if hits.extent is None else _on_detector(x_edges, y_edges, hits.extent)
-        found = None if combs is None else tuple(float(comb.spacing) for comb in combs)
+        spacings = None if combs is None else tuple(float(comb.spacing) for comb in combs)
         ions = int(counts[mask].sum())
-        return cls(counts, x_edges, y_edges, mask, True, ions, quantum=found, source=hits.source, detected=len(x))
+        return cls(counts, x_edges, y_edges, mask, True, ions, quantum=spacings, source=hits.source, detected=len(x))
 
     @classmethod
     def from_array(
@@ -293,10 +293,7 @@ class DetectorMap:
 
     def _blurred(self, sigma):
         width, height = self.bin_size
-        blur = {"sigma": (sigma / height, sigma / width), "mode": "constant"}
-        weight = ndimage.gaussian_filter(self.mask.astype(float), **blur)
-        values = ndimage.gaussian_filter(np.where(self.mask, self.values, 0).astype(float), **blur)
-        return np.divide(values, weight, out=np.zeros_like(values), where=self.mask)
+        return blurred(self.values, self.mask, (sigma / height, sigma / width))
 
     def __repr__(self) -> str:
         ny, nx = self.values.shape
@@ -305,6 +302,32 @@ class DetectorMap:
         smoothing = f", smoothed by {self.smoothing:g} mm" if self.smoothing else ""
         source = f" from {self.source!r}" if self.source else ""
         return f"<DetectorMap: {what}{source}, {nx} x {ny} bins of {width:.4g} x {height:.4g} mm{smoothing}>"
+
+
+def blurred(values: Floats, mask: Booleans, sigmas: ArrayLike) -> Floats:
+    """Smooth maps with a Gaussian that sees only the inside of a mask.
+
+    Parameters
+    ----------
+    values : ndarray
+        One map or several, shape (..., ny, nx).
+    mask : ndarray
+        Whether a bin is inside, bool of shape (ny, nx).
+    sigmas : array_like
+        Standard deviations along y and x [bins], shape (2,).
+
+    Returns
+    -------
+    ndarray
+        The smoothed values over the smoothed mask, 0 outside of the mask, of the shape of `values`.
+    """
+    smooth = gaussian(np.where(mask, values, 0).astype(float), sigmas)
+    return np.divide(smooth, gaussian(mask.astype(float), sigmas), out=np.zeros_like(smooth), where=mask)
+
+
+def gaussian(values: Floats, sigmas: ArrayLike, truncate: float = 4.0) -> Floats:
+    """Gaussian filter of maps of shape (..., ny, nx), with nothing beyond their ends; lengths as for `blurred`."""
+    return ndimage.gaussian_filter(values, sigmas, mode="constant", truncate=truncate, axes=(-2, -1))
 
 
 def _check_edges(edges, name, bins):

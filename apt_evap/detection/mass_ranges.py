@@ -74,11 +74,11 @@ class Ranges:
         first = {}
         for i, key in enumerate(zip(names, low, high, strict=True)):
             first.setdefault(key, i)
-        kept = list(first.values())
+        rows = list(first.values())
         for name, values in (("low", low), ("high", high), ("volume", volume)):
-            object.__setattr__(self, name, values[kept])
+            object.__setattr__(self, name, values[rows])
         for name, values in (("names", names), ("colour", colour), ("composition", composition)):
-            object.__setattr__(self, name, tuple(values[i] for i in kept))
+            object.__setattr__(self, name, tuple(values[i] for i in rows))
         self._warn_of_overlap()
 
     def __len__(self) -> int:

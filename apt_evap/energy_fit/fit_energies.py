@@ -3,20 +3,22 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from apt_evap._common.threads import thread_count
-from apt_evap._common.validation import check_count, check_kind, check_number, check_seed, check_switch
+from apt_evap._common.validation import check_count, check_kind
+from apt_evap.analysis.similarity import WINDOW
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.energies import Thermal
 from apt_evap.emission.perturbations import LateralVelocity, Unperturbed
 from apt_evap.energy_fit.grid import MEANS, RSDS, EnergyGrid, maxima
-from apt_evap.energy_fit.resampling import WINDOW
-from apt_evap.energy_fit.search import EnergySearch, registered, score
-from apt_evap.energy_fit.study import Study, plain
-from apt_evap.registration.register import Registration
+from apt_evap.energy_fit.search import EnergySearch, registered
+from apt_evap.energy_fit.settings import StudySettings
+from apt_evap.energy_fit.study import Score, Study, plain
+from apt_evap.registration.register import DoubtfulRegistration, Registration
 from apt_evap.simulation.run import Run
 
 BINS = 128
@@ -32,8 +34,8 @@ def fit_energies(
     measured: Hits | DetectorMap,
     mechanism: str = "roll-up",
     *,
-    means: Sequence[float] | None = MEANS,
-    rsds: Sequence[float] | None = RSDS,
+    means: Sequence[float] = MEANS,
+    rsds: Sequence[float] = RSDS,
     rollup_fractions: Sequence[float] | None = None,
     registration: Registration | None = None,
     bins: int | None = None,
@@ -129,88 +131,80 @@ def fit_energies(
     without ν, beside which the ceiling stands. Noise of measured densities is not known and stays: their maps look most
     like those with somewhat more contrast than the truth.
     """
-    grid = EnergyGrid(mechanism, means, rsds, rollup_fractions)
+    grid = EnergyGrid(mechanism, means, rsds, rollup_fractions)  # type: ignore[arg-type]
     if check_kind(run, "run", Run, "a Run").responses is None:
         raise ValueError(f"run must have responses for fit_energies, got {run!r}")
-    thermal = LateralVelocity(Thermal(temperature))
     measured = _measured_map(measured, bins)
-    settings = {
-        "smoothing": max(measured.bin_size) * (0.5 if measured.is_counts else 1) if smoothing is None else smoothing,
-        "flattening": flattening,
-        "data_range": check_number(data_range, "data_range", above=0),
-        "allow_noise": check_switch(allow_noise, "allow_noise"),
-        "replicas": _replicas(measured, run) if replicas is None else check_count(replicas, "replicas", at_least=1),
-        "resamples": check_count(resamples, "resamples"),
-        "seed": check_seed(seed),
-    }
-    replicas = settings["replicas"]
-    for name in ("smoothing", "flattening"):
-        if settings[name] is not None:
-            settings[name] = check_number(settings[name], name, at_least=0, unit="mm")
+    settings = StudySettings(
+        smoothing=max(measured.bin_size) * (0.5 if measured.is_counts else 1) if smoothing is None else smoothing,
+        flattening=flattening,
+        data_range=data_range,
+        allow_noise=allow_noise,
+        replicas=_replicas(measured, run) if replicas is None else replicas,
+        resamples=resamples,
+        seed=seed,
+        temperature=temperature,
+    )
+    replicas = settings.replicas
     search = EnergySearch(run, measured, grid, settings, thread_count(n_threads), progress)
     with warnings.catch_warnings():
         # for every energy anew; what it says is in the settings
         warnings.filterwarnings("ignore", message=".*launch above the")
-        rounds = []
+        rounds: list[Any] = []
         if registration is None:
-            warnings.filterwarnings("ignore", message="the registration is doubtful")  # once, of the last
+            warnings.simplefilter("ignore", DoubtfulRegistration)  # once, of the last
             registration, rounds = registered(search)
-        search.place(registration, resamples)
+        search.place(registration, settings.resamples)
         values = search.matrix(replicas, "energies")
         cells = maxima(values)
-        optimum, refined = (
-            search.optimum(index, replicas) for index in (cells, search.refine(values, cells, replicas))
-        )
+        optimum = search.optimum(cells, replicas)
+        refined = search.optimum(search.refine(values, cells, replicas), replicas)
         scores, plain_scores, maps = {}, {}, {}
-        for name, perturbation in (
-            ("unperturbed", Unperturbed()),
-            ("thermal", thermal),
-            ("optimum", optimum.perturbation),
+        for name, perturbation, draws in (
+            ("unperturbed", Unperturbed(), 1),
+            ("thermal", LateralVelocity(Thermal(settings.temperature)), replicas),
+            ("optimum", optimum.perturbation, replicas),
         ):
-            draws = 1 if name == "unperturbed" else replicas
             maps[name], scores[name], plain_scores[name] = search.map_and_scores(perturbation, draws)
         gain = scores.pop("optimum") - scores["unperturbed"]
     registration.warn_if_doubtful()
-    shown = maps["unperturbed"].ions / search.comparison.mask.sum()
-    if shown < FEWEST_IONS:
+    density = maps["unperturbed"].ions / search.comparison.mask.sum()
+    if density < FEWEST_IONS:
         warnings.warn(
-            f"the run has {shown:.2g} ions in a bin that is compared, {FEWEST_IONS:g} or more are needed for a map: "
+            f"the run has {density:.2g} ions in a bin that is compared, {FEWEST_IONS:g} or more are needed for a map: "
             f"give fewer bins than {max(measured.values.shape)}, or simulate more ions",
             stacklevel=2,
         )
     resampled = values[1:]
     wins = np.ravel_multi_index(cells[1:].T, grid.shape)
+    provenance = {
+        "bins": measured.values.shape[::-1],
+        "bin_size": measured.bin_size,
+        "bins_compared": search.comparison.inside.sum(),
+        "measured": repr(measured),
+        "measured_noise": "Poisson" if measured.is_counts else "not known",
+        "registered": rounds or "given",
+        "share_above_energy_limit": grid.share_above(run.response_settings.energy_limit),
+        "run": {"ions": len(run), "provenance": run.provenance, **run.settings},
+    }
     return Study(
         grid=grid,
         ssim=values[0],
-        errors=resampled.std(axis=0, ddof=1) if resamples > 1 else np.full(grid.shape, np.nan),
-        shares=np.bincount(wins, minlength=values[0].size).reshape(grid.shape) / max(resamples, 1),
+        errors=resampled.std(axis=0, ddof=1) if settings.resamples > 1 else np.full(grid.shape, np.nan),
+        shares=np.bincount(wins, minlength=values[0].size).reshape(grid.shape) / max(settings.resamples, 1),
         resampled=resampled,
         optimum=optimum,
         refined=refined,
-        baselines={name: score(each) for name, each in scores.items()},
-        plain={name: score(each) for name, each in plain_scores.items()},
-        gain=score(gain),
-        gain_share=float((gain[1:] > 0).mean()) if resamples else float("nan"),
+        baselines={name: Score.of_resamples(each) for name, each in scores.items()},
+        plain={name: Score.of_resamples(each) for name, each in plain_scores.items()},
+        gain=Score.of_resamples(gain),
+        gain_share=float((gain[1:] > 0).mean()) if settings.resamples else float("nan"),
         ceiling=search.ceiling(),
         registration=registration,
         measured=search.region,
         maps=maps,
-        settings=plain(
-            settings
-            | {
-                "flattening": search.flattening,
-                "temperature": thermal.energy.temperature,
-                "bins": measured.values.shape[::-1],
-                "bin_size": measured.bin_size,
-                "bins_compared": search.comparison.inside.sum(),
-                "measured": repr(measured),
-                "measured_noise": "Poisson" if measured.is_counts else "not known",
-                "registered": rounds or "given",
-                "share_above_energy_limit": grid.share_above(run.response_settings.energy_limit),
-                "run": {"ions": len(run), "provenance": run.provenance, **run.settings},
-            }
-        ),
+        settings=search.comparison.settings,
+        provenance=plain(provenance),
     )
 
 

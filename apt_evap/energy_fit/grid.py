@@ -1,5 +1,6 @@
 """The energies a study tries: a grid of distributions for one mechanism, and the maximum between its points."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -47,9 +48,9 @@ class EnergyGrid:
     """
 
     mechanism: str
-    means: tuple = MEANS
-    rsds: tuple = RSDS
-    rollup_fractions: tuple | None = None
+    means: Sequence[float] = MEANS
+    rsds: Sequence[float] = RSDS
+    rollup_fractions: Sequence[float] = None  # type: ignore[assignment]  # the mechanism sets them
 
     def __post_init__(self):
         check_choice(self.mechanism, "mechanism", MECHANISMS)

@@ -16,8 +16,10 @@ from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.energies import TruncatedNormal
 from apt_evap.emission.perturbations import Perturbation, Unperturbed, to_dict
+from apt_evap.energy_fit.comparison import Comparison
 from apt_evap.energy_fit.grid import EnergyGrid, maxima, spline_maxima
-from apt_evap.energy_fit.resampling import Comparison, Sampler, drawn_hits
+from apt_evap.energy_fit.resampling import Sampler, drawn_hits
+from apt_evap.energy_fit.settings import StudySettings
 from apt_evap.energy_fit.study import Optimum, Score
 from apt_evap.registration.register import Registration, register
 from apt_evap.simulation.run import Run
@@ -34,7 +36,13 @@ class EnergySearch:
     """Similarities of one run with one measured map, in the frame of the registration that `place` gives."""
 
     def __init__(
-        self, run: Run, measured: DetectorMap, grid: EnergyGrid, settings: Any, n_threads: int | None, progress: Any
+        self,
+        run: Run,
+        measured: DetectorMap,
+        grid: EnergyGrid,
+        settings: StudySettings,
+        n_threads: int,
+        progress: bool | None,
     ) -> None:
         self.run, self.measured, self.grid, self.settings = run, measured, grid, settings
         self.n_threads = n_threads
@@ -51,14 +59,12 @@ class EnergySearch:
         self.region = region = replace(
             region, mask=mask, ions=int(region.values[mask].sum()) if region.is_counts else None, detected=None
         )
-        self.flattening = self.settings["flattening"]
-        if self.flattening is None:
-            self.flattening = FLATTENING * float(np.sqrt(mask.sum() * np.prod(region.bin_size)))
-        seed, smoothing, data_range = (self.settings[name] for name in ("seed", "smoothing", "data_range"))
-        self.comparison = Comparison(
-            region, smoothing, self.flattening, data_range, resamples, (seed, 0), self.settings["allow_noise"]
-        )
-        self.sampler = Sampler(self.run, registration, region, self.comparison.box, resamples, (seed, 1))
+        settings = replace(self.settings, resamples=resamples)
+        if settings.flattening is None:
+            area = mask.sum() * np.prod(region.bin_size)
+            settings = replace(settings, flattening=FLATTENING * float(np.sqrt(area)))
+        self.comparison = Comparison(region, settings)
+        self.sampler = Sampler(self.run, registration, region, self.comparison.box, resamples, (settings.seed, 1))
 
     def perturbation(self, index: ArrayLike) -> Perturbation:
         """Perturbation at an index of the grid."""
@@ -67,7 +73,8 @@ class EnergySearch:
     def hits(self, index: ArrayLike) -> Hits:
         """Hits of some draws of all ions at an index of the grid, in the frame of the run."""
         drawn = [drawn_hits(self.run, self.perturbation(index), replica) for replica in range(ROUGH)]
-        return Hits(**{name: np.concatenate([getattr(hits, name) for hits in drawn]) for name in ("x", "y")})
+        x, y = (np.concatenate([getattr(hits, name) for hits in drawn]) for name in ("x", "y"))
+        return Hits(x=x, y=y)
 
     def polished(self, registration: Registration, index: ArrayLike) -> Registration:
         """The transform near a registration that makes the map of a point of the grid most alike.
@@ -77,9 +84,9 @@ class EnergySearch:
         """
         region, hits = self.region, self.hits(index)
         bin_size = max(region.bin_size)
-        smoothing = max(self.settings["smoothing"], bin_size)  # less is too rough a ground to search on
-        others = self.settings["data_range"], 0, 0, self.settings["allow_noise"]
-        comparison = Comparison(region, smoothing, self.flattening, *others)
+        smoothing = max(self.settings.smoothing, bin_size)  # less is too rough a ground to search on
+        settings = replace(self.comparison.settings, smoothing=smoothing, resamples=0, seed=0)
+        comparison = Comparison(region, settings)
 
         def moved(steps):
             turn, stretch, x, y = steps * np.array([0.5, 0.015, bin_size, bin_size])  # degrees, logarithm, mm
@@ -111,9 +118,9 @@ class EnergySearch:
         ):
 
             def scores(perturbation):
-                found = self.scores(perturbation, replicas)
+                similarities = self.scores(perturbation, replicas)
                 bar.update()
-                return found
+                return similarities
 
             values = np.stack(list(pool.map(scores, tried)), axis=1)
         return values.reshape(-1, *map(len, places))
@@ -124,10 +131,10 @@ class EnergySearch:
         They are looked for within a step of the best point; a resample whose best point lies elsewhere keeps that.
         """
         places = self.grid.around(cells[0])
-        found = spline_maxima(places, self.matrix(replicas, "between points", places))
+        refined = spline_maxima(places, self.matrix(replicas, "between points", places))
         low, high = (np.array([along[end] for along in places]) for end in (0, -1))
         near = ((low <= cells) & (cells <= high)).all(axis=1)
-        return np.where(near[:, None], found, cells)
+        return np.where(near[:, None], refined, cells)
 
     def optimum(self, index: Any, replicas: int) -> Optimum:
         """The `Optimum` at an index of the grid, shape (1 + resamples, 3), those of the resamples for its intervals."""
@@ -154,7 +161,7 @@ class EnergySearch:
         return Optimum(
             perturbation=perturbation,
             **best,
-            score=score(self.scores(perturbation, replicas)),
+            score=Score.of_resamples(self.scores(perturbation, replicas)),
             intervals=intervals,
             at_edge=ends,
         )
@@ -176,32 +183,27 @@ class EnergySearch:
             source=source,
             detected=None,
         )
-        return simulated, *(self.comparison.similarities(drawn, noise, plain=plain) for plain in (False, True))
+        similarities = self.comparison.similarities
+        return simulated, similarities(drawn, noise), similarities(drawn, noise, plain=True)
 
-    def ceiling(self) -> Any:
+    def ceiling(self) -> Score | None:
         """Similarity of two halves of the measured ions, None for densities."""
         if not self.measured.is_counts:
             return None
-        halves = self.comparison.ceiling(max(self.settings["resamples"], 20), (self.settings["seed"], 2))
+        halves = self.comparison.ceiling(max(self.settings.resamples, 20), (self.settings.seed, 2))
         return Score(float(halves.mean()), float(halves.std(ddof=1)))
 
 
 def registered(search: EnergySearch) -> tuple[Registration, list[dict[str, Any]]]:
     """Register with the middle of the grid, then with the best point, until that stays; polished, and the rounds."""
-    registration, best, rounds = None, search.middle, []
+    registration: Any = None
+    best, rounds = search.middle, []
     for _ in range(_MAX_ROUNDS):
-        found = register(search.hits(best), search.measured, start=registration)
-        registration = replace(found, method="search")  # of the first round, which the others start from
+        registration = register(search.hits(best), search.measured, start=registration)
+        registration = replace(registration, method="search")  # of the first round, which the others start from
         rounds.append({"perturbation": to_dict(search.perturbation(best)), "registration": registration.to_dict()})
         search.place(registration, 0)
-        likest = tuple(maxima(search.matrix(ROUGH, "registration"))[0])
-        if likest == best:
+        previous, best = best, tuple(maxima(search.matrix(ROUGH, "registration"))[0])
+        if best == previous:
             break
-        best = likest
     return search.polished(registration, best), rounds
-
-
-def score(similarities: Floats) -> Score:
-    """Value of all ions, and the standard deviation over the resamples."""
-    error = similarities[1:].std(ddof=1) if len(similarities) > 2 else np.nan
-    return Score(float(similarities[0]), float(error))

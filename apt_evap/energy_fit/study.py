@@ -7,11 +7,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from apt_evap._common.files import replace_file
-from apt_evap._common.types import AnyPath
+from apt_evap._common.types import AnyPath, Floats
 from apt_evap._version import __version__
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.emission.perturbations import to_dict
 from apt_evap.energy_fit.grid import EnergyGrid
+from apt_evap.energy_fit.settings import StudySettings
 from apt_evap.registration.register import Registration
 
 
@@ -20,6 +21,12 @@ class Score(NamedTuple):
 
     value: float
     error: float
+
+    @classmethod
+    def of_resamples(cls, similarities: Floats) -> "Score":
+        """The first similarity, that of all ions, with the standard deviation over the others, of resamples."""
+        error = similarities[1:].std(ddof=1) if len(similarities) > 2 else np.nan
+        return cls(float(similarities[0]), float(error))
 
     def __str__(self):
         return f"{self.value:z.3f}" + (f" ± {self.error:.3f}" if np.isfinite(self.error) else "")
@@ -106,8 +113,10 @@ class Study:
         The measured map; its mask is the region compared.
     maps : dict of DetectorMap
         Simulated maps in the measured frame: "unperturbed", "thermal", "optimum".
-    settings : dict
-        Everything else the study was made with, in plain types.
+    settings : StudySettings
+        How maps were compared, drawn and resampled.
+    provenance : dict
+        Everything else the study was made with, in plain types: run, measured map, bins, rounds of the registration.
     """
 
     grid: EnergyGrid
@@ -125,22 +134,23 @@ class Study:
     registration: Registration
     measured: DetectorMap
     maps: dict
-    settings: dict
+    settings: StudySettings
+    provenance: dict
 
     def compared(self, map: DetectorMap) -> DetectorMap:
         """Return a map of the measured frame as it is compared: in the common region, flattened and smoothed."""
-        flat = replace(map, mask=self.measured.mask).flattened(self.settings["flattening"])
-        return flat.smoothed(self.settings["smoothing"])
+        flat = replace(map, mask=self.measured.mask).flattened(self.settings.flattening or 0.0)
+        return flat.smoothed(self.settings.smoothing)
 
     def to_dict(self) -> dict[str, Any]:
         """Return results and settings in plain types, NaN as None, dict."""
-        held = {"made_by": f"apt_evap {__version__}", "grid": asdict(self.grid)}
-        held |= {name: getattr(self, name) for name in ("ssim", "errors", "shares", "gain_share")}
-        held |= {name: getattr(self, name).to_dict() for name in ("optimum", "refined", "registration")}
-        held |= {name: getattr(self, name) and getattr(self, name)._asdict() for name in ("gain", "ceiling")}
+        results = {"made_by": f"apt_evap {__version__}", "grid": asdict(self.grid)}
+        results |= {name: getattr(self, name) for name in ("ssim", "errors", "shares", "gain_share")}
+        results |= {name: getattr(self, name).to_dict() for name in ("optimum", "refined", "registration")}
+        results |= {name: getattr(self, name) and getattr(self, name)._asdict() for name in ("gain", "ceiling")}
         for group in ("baselines", "plain"):
-            held[group] = {name: score._asdict() for name, score in getattr(self, group).items()}
-        return plain(held | {"settings": self.settings})
+            results[group] = {name: score._asdict() for name, score in getattr(self, group).items()}
+        return plain(results | {"settings": asdict(self.settings) | self.provenance})
 
     def save(self, path: AnyPath) -> None:
         """Write results and settings to a JSON file, whole or not at all.
@@ -164,14 +174,15 @@ class Study:
         share = f", roll-up fraction {best.rollup_fraction:g}" if combined else ""
         edge = f" (at the end of the grid in {' and '.join(best.at_edge)})" if best.at_edge else ""
         others = [f"{name} {score}" for name, score in self.baselines.items()]
-        noisy = f";\n noise and all {self.plain['optimum']}, " if self.settings["allow_noise"] else ", "
+        noisy = f";\n noise and all {self.plain['optimum']}, " if self.settings.allow_noise else ", "
         others = f"{', '.join(others)}, gain over unperturbed {self.gain}" + (noisy if self.ceiling else "")
         others += f"two halves of the measured ions {self.ceiling}" if self.ceiling else ""
         between = f"{refined.bounded('mean')} eV, sigma/mean {refined.bounded('rsd')}"
         between += f", roll-up fraction {refined.bounded('rollup_fraction')}" if combined else ""
         doubtful = ", registration doubtful" if self.registration.doubtful else ""
-        radius = self.settings["run"]["tip"].get("apex_radius")
-        scale = f" at {self.settings['run']['voltage']:g} V" + (f" and R = {radius:.3g} nm" if radius else "")
+        run = self.provenance["run"]
+        radius = run["tip"].get("apex_radius")
+        scale = f" at {run['voltage']:g} V" + (f" and R = {radius:.3g} nm" if radius else "")
         return (
             f"<Study: {self.grid.mechanism}{doubtful}, best at {best.mean:g} eV, sigma/mean {best.rsd:g}{share}{edge}, "
             f"SSIM {best.score}; {others};\n between points {between}; energies "

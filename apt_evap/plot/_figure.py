@@ -1,8 +1,10 @@
 """Figures and colour bars, the same for every picture."""
 
 import importlib
+import re
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -39,6 +41,12 @@ def add_colorbar(
     extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[below, above]
     figure = images[0].axes.figure
     return figure.colorbar(images[0], ax=ax, label=label, extend=extend, fraction=0.05, pad=0.02)
+
+
+def set_title(ax: Axes, title: str | None, **options: Any) -> None:
+    """Write a title as it is: a file name may hold dollar signs, and bytes that are not text."""
+    if title:
+        ax.set_title(re.sub("[\ud800-\udfff]", "\N{REPLACEMENT CHARACTER}", title), parse_math=False, **options)
 
 
 class _Layout(ConstrainedLayoutEngine):

@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from apt_evap._common.validation import check_count
+from apt_evap.analysis.voltage_history import course, evaporation_voltages
 from apt_evap.detection.hits import Hits
 from apt_evap.plot._figure import new_figure
 from apt_evap.simulation.run import Run
@@ -38,8 +39,7 @@ def history(run: Run | Hits, axes: Sequence[Axes] | None = None, *, points: int 
 
     Notes
     -----
-    Charges and fields are proportional to the voltage. An atom that left at the field F of the run's voltage V would
-    reach its evaporation field at V F_evap / F: the voltage that a measurement at a constant rate would apply.
+    The voltage of a run is that of `evaporation_voltages`.
     """
     points = check_count(points, "points", at_least=1)
     panels = _panels(run)
@@ -49,9 +49,9 @@ def history(run: Run | Hits, axes: Sequence[Axes] | None = None, *, points: int 
     if len(axes) != len(panels):
         raise ValueError(f"axes must be {len(panels)} for {run!r}, got {len(axes)}")
     for ax, (label, values) in zip(axes, panels, strict=True):
-        ions, low, middle, high = _course(values, points)
+        ions, low, median, high = course(values, points)
         ax.fill_between(ions, low, high, color="C0", alpha=0.25, linewidth=0, label="90 % of the ions")
-        ax.plot(ions, middle, color="C0", linewidth=1.3, label="median")
+        ax.plot(ions, median, color="C0", linewidth=1.3, label="median")
         ax.set(ylabel=label, xlim=(0, len(values)))
         ax.grid(alpha=0.3)
     axes[0].legend(loc="best", frameon=False, ncols=2)
@@ -62,21 +62,8 @@ def history(run: Run | Hits, axes: Sequence[Axes] | None = None, *, points: int 
 
 def _panels(run):
     """Label and values of each panel."""
-    if not hasattr(run, "fields"):
+    if isinstance(run, Hits):
         (voltage,) = run.require("voltage")
         return [("voltage [V]", voltage)]
-    tip = run.settings["tip"]
-    described = [tip["material"], *(solute for solute, _ in tip["solutes"])] if "material" in tip else tip["elements"]
-    evaporation_fields = {element["name"]: element["evaporation_field"] for element in described}
-    needed = np.array([evaporation_fields[name] for name in run.elements])[run.species]
-    return [
-        (f"field at {run.voltage:g} V [V/nm]", run.fields),
-        ("voltage of evaporation [V]", run.voltage * needed / run.fields),
-    ]
-
-
-def _course(values, points):
-    """Middle, and the 5, 50 and 95 percentiles, of successive stretches of nearly equal length."""
-    edges = np.linspace(0, len(values), min(points, len(values)) + 1).astype(int)
-    stretches = np.split(values, edges[1:-1])
-    return (edges[:-1] + edges[1:]) / 2, *np.array([np.percentile(part, [5, 50, 95]) for part in stretches]).T
+    voltages = evaporation_voltages(run)
+    return [(f"field at {run.voltage:g} V [V/nm]", run.fields), ("voltage of evaporation [V]", voltages)]

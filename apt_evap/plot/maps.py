@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from apt_evap.detection.detector_map import DetectorMap
-from apt_evap.plot._figure import OUTSIDE, add_colorbar, new_figure
+from apt_evap.plot._figure import OUTSIDE, add_colorbar, new_figure, set_title
 
 
 def detector_map(
@@ -60,7 +60,7 @@ def detector_map(
     ax.set(facecolor=OUTSIDE, aspect="equal", xlabel="x [mm]", ylabel="y [mm]")
     described = _wrap(describe(map), 54)  # what fits above a map of `detector_maps`
     if title:
-        ax.set_title(_wrap(title, 36), pad=10 + 10 * len(described.splitlines()) if caption else 8)
+        set_title(ax, _wrap(title, 36), pad=10 + 10 * len(described.splitlines()) if caption else 8)
     if caption:
         ax.annotate(
             described, (0.5, 1), xytext=(0, 5), xycoords="axes fraction", textcoords="offset points",
@@ -176,6 +176,6 @@ def describe(map: DetectorMap) -> str:
 
 def _wrap(text, width):
     """Break text into lines, at its commas where that will do."""
-    kept = text.replace(" ", "\N{NO-BREAK SPACE}").replace(",\N{NO-BREAK SPACE}", ", ")
-    lines = "\n".join(fill(line, width, break_long_words=False) for line in kept.splitlines())
+    unbroken = text.replace(" ", "\N{NO-BREAK SPACE}").replace(",\N{NO-BREAK SPACE}", ", ")
+    lines = "\n".join(fill(line, width, break_long_words=False) for line in unbroken.splitlines())
     return "\n".join(fill(line.replace("\N{NO-BREAK SPACE}", " "), width) for line in lines.splitlines())

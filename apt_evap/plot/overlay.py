@@ -6,9 +6,9 @@ from matplotlib.lines import Line2D
 
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
-from apt_evap.plot._figure import OUTSIDE, add_colorbar, new_figure
+from apt_evap.plot._figure import OUTSIDE, add_colorbar, new_figure, set_title
 from apt_evap.plot.maps import detector_map
-from apt_evap.registration.alignment import BROAD, View
+from apt_evap.registration.correlation_search import BROAD, View
 from apt_evap.registration.register import Registration
 
 BRIGHT, DARK, RIM = "cyan", "lime", "white"
@@ -60,33 +60,33 @@ def overlay(
     if ax is None:
         ax, beside = new_figure((10.4, 5.2)).subplots(1, 2)
     detector_map(measured, ax, title=title, colormap=colormap, colorbar=colorbar, caption=False)
-    inside, seen = View(simulated), View(measured)
+    view, measured_view = View(simulated), View(measured)
     scale = registration.scale
-    image = inside.flatten(_SMOOTHING * seen.diameter / scale, BROAD * seen.diameter / scale)
+    image = view.flatten(_SMOOTHING * measured_view.diameter / scale, BROAD * measured_view.diameter / scale)
     low_x, high_x, low_y, high_y = measured.extent
     x, y = np.meshgrid(np.linspace(low_x, high_x, 400), np.linspace(low_y, high_y, 400))
     back_x, back_y = registration.inverse.points(x, y)
-    values, shown = image.sample(back_x + 1j * back_y)
-    inner = _on(measured, x, y) & shown  # contours beyond the measured map tell nothing
+    values, covered = image.sample(back_x + 1j * back_y)
+    compared = _on(measured, x, y) & covered  # contours beyond the measured map tell nothing
     legend = []
-    if inner.any() and np.ptp(values[inner]) > 0:
-        field = np.ma.masked_array(values, ~inner)
+    if compared.any() and np.ptp(values[compared]) > 0:
+        field = np.ma.masked_array(values, ~compared)
         for percent, color, label in ((87.5, BRIGHT, "simulated, bright"), (12.5, DARK, "simulated, dark")):
-            level = np.percentile(values[inner], percent)
+            level = np.percentile(values[compared], percent)
             for panel in (ax,) if beside is None else (ax, beside):
                 panel.contour(x, y, field, levels=[level], colors=color, linewidths=0.9, linestyles="solid")
             legend.append(Line2D([], [], color=color, label=label))
     if beside is not None:
         image = beside.imshow(
-            np.where(shown, 1 + values, np.nan), origin="lower", extent=measured.extent, cmap=colormap,
+            np.where(covered, 1 + values, np.nan), origin="lower", extent=measured.extent, cmap=colormap,
             vmin=max(0, 1 + values.min()), vmax=1 + values.max(),
         )  # fmt: skip
         beside.set(facecolor=OUTSIDE, xlabel="x [mm]", ylabel="y [mm]")
         beside.annotate("simulated, flattened, as registered", (0.5, 1), **_ABOVE)
         if colorbar:
             add_colorbar([image], beside, label="hits per area / mean, flattened")
-    if not shown.all():
-        ax.contour(x, y, shown.astype(float), levels=[0.5], colors=RIM, linewidths=1.2, linestyles="dashed")
+    if not covered.all():
+        ax.contour(x, y, covered.astype(float), levels=[0.5], colors=RIM, linewidths=1.2, linestyles="dashed")
         legend.append(Line2D([], [], color="0.4", linestyle="dashed", label="simulated field of view"))
     how = {"handles": legend, "ncols": 3, "fontsize": "small", "frameon": False}
     if beside is None:
@@ -94,8 +94,7 @@ def overlay(
     else:
         ax.figure.legend(loc="outside lower center", **how)
     ax.annotate(_caption(registration), (0.5, 1), **_ABOVE)
-    if title:
-        ax.set_title(title, pad=34)
+    set_title(ax, title, pad=34)
     return ax
 
 

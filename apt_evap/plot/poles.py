@@ -72,18 +72,18 @@ def poles(
         return inside
 
     if zone_families is None or len(zone_families):
-        found = zones(material, zone_families)
-        for axis, family in zip(orientation.directions(found.directions), found.families, strict=True):
+        axes = zones(material, zone_families)
+        for axis, family in zip(orientation.directions(axes.directions), axes.families, strict=True):
             first, second = np.linalg.svd(axis[None])[2][1:]
             circle = np.cos(_AZIMUTHS)[:, None] * first + np.sin(_AZIMUTHS)[:, None] * second
             places = projection.places(circle)
             places[~shown(places)] = np.nan
             ax.plot(*places.T, color=_COLORS[family % len(_COLORS)], linewidth=0.8, alpha=0.9, zorder=2.5)
     if families:
-        found = poles_of(material, families)
-        places = projection.places(orientation.directions(found.normals))
+        crystal_poles = poles_of(material, families)
+        places = projection.places(orientation.directions(crystal_poles.normals))
         chosen = np.flatnonzero(shown(places))
-        areas = 60 * (found.spacings[chosen] / found.spacings.max()) ** 2
+        areas = 60 * (crystal_poles.spacings[chosen] / crystal_poles.spacings.max()) ** 2
         outline = [withStroke(linewidth=2, foreground="black")]
         ax.scatter(*places[chosen].T, s=areas, facecolors="none", edgecolors="white", linewidths=1.2, zorder=3,
                    path_effects=outline)  # fmt: skip
@@ -95,7 +95,7 @@ def poles(
             if all(np.hypot(*(point - other)) > _APART * size / 9 for other in written):
                 written.append(point)
                 at_edge = places[index, 0] > x_limits[1] - 0.07 * (x_limits[1] - x_limits[0])
-                ax.annotate(found.labels[index], places[index], xytext=(-4 if at_edge else 4, 4), size=size,
+                ax.annotate(crystal_poles.labels[index], places[index], xytext=(-4 if at_edge else 4, 4), size=size,
                             textcoords="offset points", ha="right" if at_edge else "left", color="white",
                             path_effects=outline, clip_on=True)  # fmt: skip
     ax.set(xlim=x_limits, ylim=y_limits)

@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 
-from apt_evap.analysis.profiles import Profile, Rectangle
-from apt_evap.analysis.zone_line import ZoneLine, compare_profiles
+from apt_evap.analysis.profiles import Profile, Rectangle, compare_profiles
+from apt_evap.analysis.zone_line import ZoneLine
 from apt_evap.plot._figure import new_figure
 
 
@@ -45,7 +45,7 @@ def profile(
     ValueError
         If there is no profile, or not one label or line for each.
     """
-    profiles = [profiles] if hasattr(profiles, "density") else list(profiles)
+    profiles = [profiles] if isinstance(profiles, Profile) else list(profiles)
     n = len(profiles)
     labels = [None] * n if labels is None else list(labels)
     lines = [None] * n if lines is None else list(lines)
@@ -145,7 +145,7 @@ def rectangles(
     -------
     matplotlib.axes.Axes
     """
-    chosen = [chosen] if hasattr(chosen, "corners") else list(chosen)
+    chosen = [chosen] if isinstance(chosen, Rectangle) else list(chosen)
     colors = [colors] * len(chosen) if isinstance(colors, str) else list(colors)
     for index, (rectangle, color) in enumerate(zip(chosen, colors, strict=True)):
         corners = rectangle.corners

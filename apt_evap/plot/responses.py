@@ -10,7 +10,7 @@ from matplotlib.colors import Normalize
 from numpy.typing import ArrayLike
 
 from apt_evap.analysis.response_tracks import lateral_tracks, rollup_tracks
-from apt_evap.plot._figure import new_figure
+from apt_evap.plot._figure import new_figure, set_title
 from apt_evap.simulation.run import Run
 
 MECHANISMS = ("lateral velocity", "roll-up")
@@ -88,7 +88,8 @@ def response(
         ax = new_figure((5.6, 5.0)).subplots()
     draw(ax, tracks, dots, scale, 1.0)
     _dots(ax, dots, colors, 26)
-    ax.set(aspect="equal", xlabel="x [mm]", ylabel="y [mm]", title=title)
+    ax.set(aspect="equal", xlabel="x [mm]", ylabel="y [mm]")
+    set_title(ax, title)
     ax.autoscale_view()
     ax.set_box_aspect(1)
     ax.set_adjustable("datalim")

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from apt_evap._common.validation import check_array, check_number
 from apt_evap.evaporation.emitter import Emitter
-from apt_evap.plot._figure import add_colorbar, new_figure
+from apt_evap.plot._figure import add_colorbar, new_figure, set_title
 
 COLORED_BY = {"fields": "field [V/nm]", "charges": "charge [e]"}
 
@@ -69,12 +69,12 @@ def specimen(
     else:
         values = check_array(color, "color", (len(emitter),), finite=False)
     right, up, towards = _viewed_from(elevation, azimuth)
-    shown = np.flatnonzero(emitter.normals @ towards > 1e-9)  # the others face away; symmetric ones lie across
-    positions = emitter.positions[shown]
-    shown = shown[np.argsort(positions @ towards, kind="stable")]  # what is drawn last is in front
-    positions, values = emitter.positions[shown], values[shown]
+    facing = np.flatnonzero(emitter.normals @ towards > 1e-9)  # the others face away; symmetric ones lie across
+    positions = emitter.positions[facing]
+    facing = facing[np.argsort(positions @ towards, kind="stable")]  # what is drawn last is in front
+    positions, values = emitter.positions[facing], values[facing]
     if limits is None:
-        counted = values[emitter.tip.evaporable[emitter.atoms[shown]]]
+        counted = values[emitter.tip.evaporable[emitter.atoms[facing]]]
         limits = np.nanpercentile(counted if len(counted) else values, [1, 99.5])
     diameter = emitter.tip.nearest_neighbour_distance
     places = np.column_stack([positions @ right, positions @ up])
@@ -86,7 +86,8 @@ def specimen(
         ax = figure.subplots()
     _discs(ax, places, 2 * diameter, color="0.2")  # what lies below the gaps of the surface, and its outline
     atoms = _discs(ax, places, diameter, array=values, cmap=colormap, clim=tuple(limits))
-    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", title=title)
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+    set_title(ax, title)
     if abs(elevation) == 90 and azimuth == -90:
         ax.set(xlabel="x [nm]", ylabel="y [nm]" if elevation > 0 else "-y [nm]")
     else:

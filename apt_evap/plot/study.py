@@ -81,7 +81,7 @@ def ssim_matrix(study: Study, axes: Sequence[Axes] | None = None, *, colormap: s
     add_colorbar(
         [ax.images[0] for ax in panels],
         list(panels),
-        label="SSIM, noise allowed for" if study.settings["allow_noise"] else "SSIM",
+        label="SSIM, noise allowed for" if study.settings.allow_noise else "SSIM",
     )
     return panels
 
@@ -151,19 +151,19 @@ def side_by_side(
         titles = "measured", "simulated, unperturbed", f"simulated, {mechanism}\n{energies}"
     # percents below 2 may be a dark rim
     low, high = np.percentile(maps[0].density[maps[0].mask], [2, 99.5])
-    seen = {"limits": (low, high) if high > low else (0, 2)}
-    simulated = {"limits": common_limits(maps[1:])}
-    how = {"colormap": colormap, "colorbar": False, "caption": False}
+    measured = (float(low), float(high)) if high > low else (0.0, 2.0)
+    simulated = common_limits(maps[1:])
     figure = new_figure((13.0, 8.4))
     axes = figure.subplots(2, 3)
-    for ax, map, title, scale in zip(axes[0], maps, titles, (seen, simulated, simulated), strict=True):
-        detector_map(map, ax, title=title, **scale, **how)
+    for ax, map, title, limits in zip(axes[0], maps, titles, (measured, simulated, simulated), strict=True):
+        detector_map(map, ax, title=title, limits=limits, colormap=colormap, colorbar=False, caption=False)
         _show_inside(ax, map)
-    for ax, map, title, scale in (
-        (axes[1, 0], maps[0], titles[0], seen),
+    for ax, map, title, limits in (
+        (axes[1, 0], maps[0], titles[0], measured),
         (axes[1, 2], maps[2], "simulated", simulated),
     ):
-        detector_map(map, ax, title=f"{title}, magnified", **scale, **how)
+        title = f"{title}, magnified"
+        detector_map(map, ax, title=title, limits=limits, colormap=colormap, colorbar=False, caption=False)
         ax.images[0].set_clip_path(Circle((x, y), radius, transform=ax.transData))
         ax.set(xlim=(x - radius, x + radius), ylim=(y - radius, y + radius), facecolor="w")
         ax.add_patch(Circle((x, y), radius, fill=False, edgecolor=_MARK, linewidth=3))
@@ -199,10 +199,10 @@ def _default_circle(study):
 
 def _scores(study):
     """The similarities as text."""
-    allowed = study.settings["allow_noise"]
+    allowed = study.settings.allow_noise
     lines = [
         "SSIM with the measured map",
-        f"in {study.settings['bins_compared']:,} bins" + ", noise allowed for" * allowed,
+        f"in {study.provenance['bins_compared']:,} bins" + ", noise allowed for" * allowed,
     ]
     if study.registration.doubtful:
         lines.insert(0, f"THE REGISTRATION IS DOUBTFUL: correlation {study.registration.score:.2f}\n")
@@ -213,5 +213,5 @@ def _scores(study):
         lines += [f"noise and all: {study.plain['optimum']}"] * allowed
         lines.append(f"two halves of the measured ions: {study.ceiling}")
     width, height = study.measured.bin_size
-    lines.append(f"bins {width:.3g} × {height:.3g} mm, smoothed by {study.settings['smoothing']:.3g} mm")
+    lines.append(f"bins {width:.3g} × {height:.3g} mm, smoothed by {study.settings.smoothing:.3g} mm")
     return "\n".join(lines)

@@ -12,7 +12,7 @@ from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_number, check_sequence, check_switch
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
-from apt_evap.registration.alignment import (
+from apt_evap.registration.correlation_search import (
     FINE,
     MEDIUM,
     NARROW,
@@ -24,11 +24,16 @@ from apt_evap.registration.alignment import (
     refine,
     search,
 )
+from apt_evap.registration.transform import SimilarityTransform
 
 DOUBTFUL = 0.5
 """Score times root of the overlap that wrong places reach: up to 0.25 on noise, 0.5 on maps of other poles."""
 _KEPT = 12  # places that are refined: as many as there are symmetric ones of a threefold axis with mirrors, twice
 _BINS = 384  # of a map of simulated hits
+
+
+class DoubtfulRegistration(UserWarning):
+    """Maps that have nothing to do with each other may fit as well as these."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +85,11 @@ class Registration:
         object.__setattr__(self, "mirror", check_switch(self.mirror, "mirror"))
         object.__setattr__(self, "ties", tuple(self.ties))
 
+    @property
+    def transform(self) -> SimilarityTransform:
+        """The transform of complex points, anchored at 0."""
+        return SimilarityTransform(self.rotation, self.scale, self.mirror, place=complex(*self.shift))
+
     def points(self, x: ArrayLike, y: ArrayLike) -> tuple[Floats, Floats]:
         """Move points into the measured frame.
 
@@ -94,7 +104,7 @@ class Registration:
             Measured detector coordinates [mm].
         """
         z = np.asarray(x, float) + 1j * np.asarray(y, float)
-        moved = self._turn * (z.conj() if self.mirror else z) + complex(*self.shift)
+        moved = self.transform.forth(z)
         return moved.real, moved.imag
 
     def hits(self, hits: Hits) -> "Hits":
@@ -116,10 +126,10 @@ class Registration:
     @property
     def inverse(self) -> "Registration":
         """The transform from the measured into the simulated frame, a Registration without score."""
-        rotation = self.rotation if self.mirror else -self.rotation
-        back = Registration(rotation, 1 / self.scale, (0.0, 0.0), self.mirror)
-        x, y = back.points(*self.shift)
-        return replace(back, shift=(-float(x), -float(y)))
+        inverse = self.transform.inverse
+        back = Registration(inverse.rotation, inverse.scale, (0.0, 0.0), inverse.mirror)
+        shift = -back.transform.forth(inverse.anchor)  # with the angle that `back` has, to the last bit
+        return replace(back, shift=(float(shift.real), float(shift.imag)))
 
     @property
     def doubtful(self) -> bool:
@@ -134,12 +144,9 @@ class Registration:
                 f"({self.overlap:.0%} of the measured one), as maps may that have nothing to do with each other; look "
                 "at the overlay of both, make sure that the specimen was simulated along its axis, and give a pole, "
                 "scales or a start where known",
+                DoubtfulRegistration,
                 stacklevel=3,
             )
-
-    @property
-    def _turn(self):
-        return self.scale * np.exp(1j * np.radians(self.rotation))
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as plain types that JSON can hold (dict); NaN becomes None."""
@@ -227,7 +234,7 @@ def register(
 
     Warns
     -----
-    UserWarning
+    DoubtfulRegistration
         If it was searched for everywhere, and has a score that maps reach which have nothing to do with each other.
 
     Notes
@@ -266,24 +273,25 @@ def register(
     mirrors = tuple(dict.fromkeys(check_switch(mirror, "mirrors") for mirror in mirrors))
     if not mirrors:
         raise ValueError("mirrors must hold False, True or both, got none")
-    angles = np.arange(0, 360, ROTATION_STEP) if rotations is None else _steps(*rotations, ROTATION_STEP)
-    fits = search(simulated, measured, angles, np.exp(_steps(*np.log(tried), SCALE_STEP)), mirrors, least, near)
+    angles = np.arange(0, 360, ROTATION_STEP) if rotations is None else _steps(rotations, ROTATION_STEP)
+    fits = search(simulated, measured, angles, np.exp(_steps(np.log(tried), SCALE_STEP)), mirrors, least, near)
     if not fits:
         raise ValueError(
             f"the maps must share {least:.0%} of the measured field of view (overlap), and do not for scales of "
             f"{tried[0]:.3g} to {tried[1]:.3g}"
         )
     bounds = rotations, scales, near
-    fits = [refine(simulated, measured, fit.placement, MEDIUM, least, *bounds) for fit in distinct(fits, _KEPT)]
+    fits = [refine(simulated, measured, fit.transform, MEDIUM, least, *bounds) for fit in distinct(fits, _KEPT)]
     fits = distinct(sorted(fits, key=lambda fit: -fit.rank), _KEPT)
     fits = [fit for fit in fits if fit.rank > fits[0].rank - 2 * _noise(fits[0], MEDIUM)]
     for _ in range(2):  # once more, flattened at the new scale
-        fits = [refine(simulated, measured, fit.placement, FINE, least, *bounds) for fit in fits]
+        fits = [refine(simulated, measured, fit.transform, FINE, least, *bounds) for fit in fits]
     fits = sorted(fits, key=lambda fit: -fit.rank)
     fits = distinct([fit for fit in fits if fit.rank > fits[0].rank - _noise(fits[0], FINE)], _KEPT)
-    fits.sort(key=lambda fit: fit.placement.mirror)  # stable: the best stays first among either kind
-    found = [_registration(fit, "search" if near is None else "start" if pole is None else "pole") for fit in fits]
-    best = replace(found[0], ties=tuple(found[1:]))
+    fits.sort(key=lambda fit: fit.transform.mirror)  # stable: the best stays first among either kind
+    method = "search" if near is None else "start" if pole is None else "pole"
+    best, *ties = (_registration(fit, method) for fit in fits)
+    best = replace(best, ties=tuple(ties))
     best.warn_if_doubtful()
     return best
 
@@ -319,9 +327,9 @@ def register_points(
             raise ValueError(f"{name} must be different points, got {points[0].tolist()} {len(points)} times")
     choices = (False, True) if mirror is None else (check_switch(mirror, "mirror"),)
     source, target = (points[:, 0] + 1j * points[:, 1] for points in (simulated, measured))
-    found = [_least_squares(source, target, choice) for choice in choices]
+    fits = [_least_squares(source, target, choice) for choice in choices]
     # rounding must not decide where both fit exactly
-    best = min(found, key=lambda one: (round(one.residual / np.ptp(target.real + target.imag), 9), one.mirror))
+    best = min(fits, key=lambda one: (round(one.residual / np.ptp(target.real + target.imag), 9), one.mirror))
     if not best.scale > 0:
         raise ValueError("simulated_points and measured_points must be alike but for rotation, scale and shift")
     return best
@@ -369,7 +377,8 @@ def _range(value, name, **limits):
     return low, check_number(high, name, at_least=low)
 
 
-def _steps(low, high, step):
+def _steps(ends, step):
+    low, high = ends
     return np.linspace(low, high, int(np.ceil((high - low) / step)) + 1)
 
 
@@ -380,13 +389,13 @@ def _noise(fit, pixels):
 
 
 def _registration(fit, method):
-    placement = fit.placement
-    shift = complex(placement.forth(0j))
+    transform = fit.transform
+    shift = complex(transform.forth(0j))  # where the origin goes
     return Registration(
-        rotation=float(placement.rotation),
-        scale=float(placement.scale),
+        rotation=float(transform.rotation),
+        scale=float(transform.scale),
         shift=(shift.real, shift.imag),
-        mirror=placement.mirror,
+        mirror=transform.mirror,
         score=fit.score,
         overlap=fit.overlap,
         method=method,

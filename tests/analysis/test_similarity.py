@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
+from skimage import metrics, morphology
 
-from apt_evap.analysis.similarity import half_ceiling, ssim
+from apt_evap.analysis.similarity import half_ceiling, local_moments, local_similarity, ssim
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 
@@ -42,6 +43,28 @@ def test_the_measure_is_that_of_wang():
     expected /= (mean_p**2 + mean_q**2 + c1) * (var_p + var_q + c2)
     assert result.local[row, column] == pytest.approx(expected, rel=1e-10)
     assert float(result) == pytest.approx(np.nanmean(result.local), rel=1e-12)
+
+
+@pytest.mark.parametrize("smoothing, data_range", [(0.0, 2.0), (0.5, 1.0), (1.7, 3.0)])
+def test_local_similarity_is_that_of_scikit_image(smoothing, data_range):
+    a, b = noisy(20, 1), noisy(20, 2)
+    result = ssim(a, b, smoothing=smoothing, data_range=data_range)
+    images = [np.where(INSIDE, m.smoothed(smoothing).density, 1.0) for m in (a, b)]
+    window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    _, local = metrics.structural_similarity(*images, data_range=data_range, full=True, **window)
+    # the same window: a disc of half width 5, from which the common mask is eroded
+    inside = morphology.erosion(np.pad(INSIDE, 1), morphology.disk(5))[1:-1, 1:-1]
+    assert np.array_equal(inside, np.isfinite(result.local))
+    assert result.local[inside] == pytest.approx(local[inside], abs=1e-12)
+    assert float(result) == pytest.approx(local[inside].mean(), abs=1e-12)
+
+
+def test_stacks_are_compared_one_by_one():
+    maps = np.random.default_rng(1).poisson(20 * LINES, (3, *LINES.shape)) / 20
+    stacked = local_similarity(local_moments(maps), local_moments(maps[:1]), 2.0)
+    alone = [local_similarity(local_moments(each), local_moments(maps[0]), 2.0) for each in maps]
+    assert np.array_equal(stacked, alone)
+    assert stacked[0] == pytest.approx(1, abs=1e-12)
 
 
 def test_what_lies_outside_the_common_mask_does_not_matter():

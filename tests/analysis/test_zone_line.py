@@ -4,8 +4,8 @@ from scipy.special import ndtr
 from scipy.stats import chi2
 
 import apt_evap as ae
-from apt_evap.analysis.profiles import Profile, Rectangle, zone_line_profile
-from apt_evap.analysis.zone_line import compare_profiles, fit_zone_line
+from apt_evap.analysis.profiles import Profile, Rectangle, compare_profiles, zone_line_profile
+from apt_evap.analysis.zone_line import fit_zone_line
 
 FULL_WIDTH = 2 * np.sqrt(2 * np.log(2))  # of a Gaussian, in standard deviations
 EDGES = np.linspace(-15, 15, 41)

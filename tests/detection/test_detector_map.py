@@ -3,11 +3,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from skimage.morphology import convex_hull_image
 
 from apt_evap import plot
-from apt_evap.detection.binning import bin_edges, count, field_of_view, find_comb
+from apt_evap.detection.binning import bin_edges, convex_hull, count, field_of_view, find_comb
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.io.formats import read
@@ -170,6 +172,22 @@ def test_few_hits_still_make_a_map(x, y):
     assert map.counts.sum() == len(x) and map.mask.any() and field_of_view(map.counts).any()
 
 
+@given(hnp.arrays(bool, hnp.array_shapes(min_dims=2, max_dims=2, min_side=2, max_side=12), elements=st.booleans()))
+@example(np.eye(2, 12, 3, dtype=bool) | np.eye(2, 12, dtype=bool))
+def test_convex_hull_is_that_of_scikit_image(region):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # bins on one line, of which it makes nothing
+        expected = convex_hull_image(region, offset_coordinates=False)
+    assume(expected.any())
+    assert np.array_equal(convex_hull(region), expected)
+
+
+def test_convex_hull_of_bins_on_one_line():
+    line = np.zeros((5, 9), bool)
+    line[[0, 4], [0, 8]] = True
+    assert np.argwhere(convex_hull(line)).tolist() == [[k, 2 * k] for k in range(5)]
+
+
 def test_density_has_mean_one_inside_and_is_nan_outside():
     x, y = disc(30_000)
     for map in (Hits(x=x, y=y).map(bins=64), Hits(x=x, y=y).map(bins=64).smoothed(0.5)):
@@ -213,7 +231,12 @@ def test_bad_arguments_are_named():
         (lambda: hits.map(extent=(1, 0, 0, 1)), "extent must be"),
         (lambda: hits.map(extent=(50, 60, 50, 60)), "none of 1,000 hits"),
         (lambda: hits.map(mask=np.ones((2, 2), bool)), "mask must have shape"),
-        (lambda: Hits(x=[1.0], y=[1.0]).map(), "not a point"),
+        (
+            lambda: Hits(x=[1.0], y=[2.0]).map(),
+            r"the only ion lies at \(1, 2\) mm: .* select more of them or give ext",
+        ),
+        (lambda: Hits(x=[1.0] * 3, y=[2.0] * 3).map(), r"all 3 ions lie at \(1, 2\) mm"),
+        (lambda: hits.map(extent=(1, 1, 2, 2)), "not a point"),
         (lambda: Hits(x=[np.nan], y=[1.0], source="f").map(), "f has none of 1"),
         (lambda: hits.map().smoothed(-1), "sigma must be"),
         (

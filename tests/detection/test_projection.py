@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from apt_evap import Detector, Projection
+from apt_evap.detection.projection import along_axis, polar_angles, stereographic, stereographic_stretch
 
 PROJECTIONS = st.builds(
     Projection,
@@ -37,6 +38,69 @@ def test_a_compression_of_1_is_a_straight_flight_from_the_apex():
     np.testing.assert_allclose(Projection(90.0, compression=1.0).places(direction)[0], [x[0], y[0]], rtol=1e-12)
     x, y, *_ = curved.impacts(flown, np.zeros(1))
     np.testing.assert_allclose(Projection(90.0).places(direction)[0], [x[0], y[0]], rtol=1e-12)
+
+
+@pytest.mark.parametrize("compression", [None, 0.8, 1.0, 1.6])
+def test_angles_of_places(compression):
+    projection = Projection(40.0, (3.0, -2.0), compression=compression)
+    angles = np.radians([0.0, 5.0, 30.0, 65.0])
+    directions = np.column_stack([np.zeros(4), np.sin(angles), np.cos(angles)])
+    np.testing.assert_allclose(projection.angles(projection.places(directions)), angles, atol=1e-15)
+    assert np.isnan(projection.angles([[np.nan, 0.0]]))
+
+
+@pytest.mark.parametrize("compression", [None, 0.8, 1.0, 1.6])
+def test_stereographic_directions_appear_where_the_others_do(compression):
+    directions = np.random.default_rng(1).normal(size=(500, 3)) * (1, 1, 3)
+    last = math.pi / 2 if compression is None else min(1.0, compression) * math.pi / 2
+    directions = directions[polar_angles(directions) < last - 0.01]
+    flat = stereographic(directions)
+    angle = polar_angles(directions)
+    s2 = (flat**2).sum(axis=1)
+    np.testing.assert_allclose(np.sqrt(s2), np.tan(angle / 2), rtol=1e-12)
+    places = 40.0 * flat * stereographic_stretch(s2, compression)[:, None]
+    np.testing.assert_allclose(places, Projection(40.0, compression=compression).places(directions), rtol=1e-11)
+    np.testing.assert_allclose(along_axis(np.full(len(s2), 3.0), s2), 3.0 * np.cos(angle), rtol=1e-12, atol=1e-15)
+    with np.errstate(invalid="ignore"):
+        assert stereographic_stretch(np.zeros(1), compression) == 2.0
+
+
+def test_the_rim():
+    for compression in (None, 1.2, 1.6):
+        projection = Projection(40.0, compression=compression)
+        edge = math.pi / 2 - 1e-9
+        (place,) = projection.places([[math.sin(edge), 0.0, math.cos(edge)]])
+        assert place[0] == pytest.approx(projection.rim, rel=1e-7)
+    assert Projection(40.0, compression=1.0).rim == Projection(40.0, compression=0.7).rim == math.inf
+
+
+@pytest.mark.parametrize(("name", "own"), [("plane", 1.0), ("equidistant", None)])
+def test_a_detector_sees_a_compressed_specimen(name, own):
+    """Where the specimen has the polar angle 1.4 theta, the detector sees the ion at theta."""
+    seen = Detector(90.0, 300.0, name).seen_from_apex
+    assert seen == Projection(90.0, compression=own)
+    angles = np.radians([3.0, 20.0, 40.0])
+    on_detector = np.column_stack([np.sin(angles), np.zeros(3), np.cos(angles)])
+    on_specimen = np.column_stack([np.sin(1.4 * angles), np.zeros(3), np.cos(1.4 * angles)])
+    np.testing.assert_allclose(seen.compressed(1.4).places(on_specimen), seen.places(on_detector), rtol=1e-12)
+
+
+def test_bits_of_impacts_are_those_of_their_formulae():
+    """Runs depend on the last bits of places and times, so on the order of the operations."""
+    random = np.random.default_rng(3)
+    s = np.concatenate([random.normal(size=(5000, 2)) * 0.6, [[0, 0], [1, 0], [np.nan, 0], [0.6, 0.8]]])
+    times = random.random(len(s)) * 1e3
+    s2 = np.einsum("ij,ij->i", s, s)
+    ahead = s2 < 1
+    with np.errstate(divide="ignore", invalid="ignore"):
+        root = np.sqrt(s2)
+        plane, curved = 2.0 / (1.0 - s2), np.where(root > 0, 2.0 * np.arctan(root) / root, 2.0)
+        shorter = np.where(ahead, times * (1.0 - s2) / (1.0 + s2), times)
+        for name, stretch, expected in (("plane", plane, times), ("equidistant", curved, shorter)):
+            scale = np.where(ahead, 97.3 * stretch, np.nan)
+            x, y, flown, _ = Detector(97.3, 250.0, name).impacts(s, times)
+            assert x.tobytes() == (s[:, 0] * scale).tobytes() and y.tobytes() == (s[:, 1] * scale).tobytes()
+            assert flown.tobytes() == expected.tobytes()
 
 
 def test_near_the_centre_all_compressions_have_the_same_scale():

@@ -1,7 +1,7 @@
 """Searches for emission energies: what is compared is what `ssim` compares, and hidden energies are found again."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -10,9 +10,11 @@ from scipy.stats import truncnorm
 
 import apt_evap as ae
 from apt_evap.emission.perturbations import Combined
+from apt_evap.energy_fit.comparison import Comparison
 from apt_evap.energy_fit.grid import EnergyGrid, maxima, spline_maxima
-from apt_evap.energy_fit.resampling import NOISE, Comparison, Sampler
+from apt_evap.energy_fit.resampling import NOISE, Sampler
 from apt_evap.energy_fit.search import EnergySearch
+from apt_evap.energy_fit.settings import StudySettings
 
 EDGES = np.linspace(-60, 60, 49)
 ROLLUP = ae.RollUp(ae.TruncatedNormal(0.155, 0.155))
@@ -123,7 +125,7 @@ def test_grids_that_are_none(wrong, words):
 def test_what_is_compared_is_what_ssim_compares(run, other, smoothing, flattening):
     x, y = np.meshgrid(EDGES[1:], EDGES[1:])
     measured = replace(seen(other, ROLLUP), mask=(x**2 + y**2 < 50**2) & (x < 30))
-    comparison = Comparison(measured, smoothing, flattening, 2.0, 0, 0)
+    comparison = Comparison(measured, StudySettings(smoothing, flattening, resamples=0))
     sampler = Sampler(run, HERE, measured, comparison.box, 0, 0)
     simulated = replace(seen(run, LATERAL), mask=measured.mask)
     maps, noise = sampler.maps(LATERAL, 1)
@@ -158,7 +160,7 @@ def test_errors_of_measured_maps_are_those_of_new_measurements(run, other):
     for seed in range(200):
         measured = replace(frame, values=random.poisson(3 * truth.values))
         resamples = 300 if seed < 3 else 0
-        comparison = Comparison(measured, 2.5, 0.0, 2.0, resamples, seed)
+        comparison = Comparison(measured, StudySettings(2.5, 0.0, resamples=resamples, seed=seed))
         found = comparison.similarities(np.repeat(counts[None], resamples + 1, axis=0))
         values.append(found[0])
         if resamples:
@@ -199,20 +201,20 @@ def test_replicas_have_less_noise(run, other):
 def test_noise_that_is_allowed_for_is_that_of_the_maps(run, other):
     """What is added to the numerator is the variance that noise adds to windows: of measured counts and of draws."""
     measured, draws = seen(other, ROLLUP), 6
-    comparison = Comparison(measured, 2.5, 15.0, 2.0, 0, 3)
+    comparison = Comparison(measured, StudySettings(2.5, 15.0, resamples=0, seed=3))
     whole = (slice(0, 48), slice(0, 48))
     sampler = Sampler(run, HERE, measured, whole, 0, 0)
     maps, noise = sampler.maps(LATERAL, draws)
-    told = comparison._variance(maps, noise[None])[comparison.inside].mean()
+    variance = comparison.variance_of(noise[None], maps)[comparison.inside].mean()
     # the same ions drawn anew, forty times: their mean is free of noise
     again = [Sampler(replace(run, seed=s), HERE, measured, whole, 0, 0).maps(LATERAL, draws)[0] for s in range(40)]
     again = np.concatenate(again)
-    scatter = comparison._variance(again.mean(axis=0, keepdims=True), (again - again.mean(axis=0)) * np.sqrt(40 / 39))
+    scatter = comparison.variance_of((again - again.mean(axis=0)) * np.sqrt(40 / 39), again.mean(axis=0, keepdims=True))
     # one estimate from about (48 / 6)^2 windows of ten degrees of freedom: 6 %
-    assert told == pytest.approx(scatter[comparison.inside].mean(), rel=0.2)
+    assert variance == pytest.approx(scatter[comparison.inside].mean(), rel=0.2)
     drawn = np.random.default_rng(8).poisson(measured.values, (200, 48, 48)) - measured.values
-    poisson = comparison._variance(measured.values[None].astype(float), drawn)[comparison.inside].mean()
-    assert comparison._noise[comparison.inside].mean() == pytest.approx(poisson, rel=0.05)
+    poisson = comparison.variance_of(drawn, measured.values[None].astype(float))[comparison.inside].mean()
+    assert comparison.measured_noise[comparison.inside].mean() == pytest.approx(poisson, rel=0.05)
 
 
 def test_noise_does_not_draw_to_more_contrast():
@@ -226,7 +228,7 @@ def test_noise_does_not_draw_to_more_contrast():
     for seed in range(20):
         measured = replace(frame, values=random.poisson(20 * (1 + 0.2 * pattern)))
         for allowed, found in alike.items():
-            comparison = Comparison(measured, 2.5, 0.0, 2.0, 0, seed, allowed)
+            comparison = Comparison(measured, StudySettings(2.5, 0.0, allow_noise=allowed, resamples=0, seed=seed))
             found.append([float(comparison.similarities(1 + c * pattern[None])[0]) for c in contrasts])
     allowed, plain = (np.mean(alike[key], axis=0) for key in (True, False))
     assert contrasts[allowed.argmax()] == 0.2 and allowed[2] == pytest.approx(1, abs=0.02)
@@ -285,8 +287,7 @@ def test_hidden_energies_are_found(twin):
 
 def test_a_registration_is_polished(run, other):
     """From 1.5 degrees, 3 % and 1 mm off, back to the frame in which the map was made."""
-    settings = {"smoothing": 0.6, "flattening": None, "data_range": 2.0, "seed": 0, "allow_noise": True}
-    search = EnergySearch(run, measured_map(other, ROLLUP), EnergyGrid("roll-up"), settings, 1, False)
+    search = EnergySearch(run, measured_map(other, ROLLUP), EnergyGrid("roll-up"), StudySettings(0.6), 1, False)
     rough = ae.Registration(1.5, 1.03, (1.0, -0.5), score=0.8, overlap=1.0)
     search.place(rough, 0)
     found = search.polished(rough, (0, 4, 2))
@@ -316,7 +317,7 @@ def test_what_a_study_holds(twin):
     assert float(ae.ssim(study.compared(draws), study.compared(study.measured))) == pytest.approx(
         study.plain["optimum"].value, abs=1e-9
     )
-    assert study.settings["replicas"] == 16
+    assert study.settings.replicas == 16
     assert 0 < study.plain["optimum"].value < study.optimum.score.value < 1.05
     assert 0 < study.ceiling.value < 1
     text = repr(study)
@@ -327,14 +328,35 @@ def test_what_a_study_holds(twin):
 def test_settings_are_recorded(twin, tmp_path):
     study, _, _ = twin
     study.save(tmp_path / "study.json")
-    held = json.loads((tmp_path / "study.json").read_text())
-    assert np.array(held["ssim"]) == pytest.approx(study.ssim)
-    assert held["grid"]["means"] == list(study.grid.means)
-    assert held["optimum"]["perturbation"]["energy"]["mean"] == study.optimum.mean
-    assert held["registration"]["scale"] == 1
-    wanted = {"smoothing", "flattening", "data_range", "temperature", "replicas", "resamples", "seed", "bins", "run"}
-    assert wanted <= set(held["settings"])
-    assert held["settings"]["temperature"] == 50
+    saved = json.loads((tmp_path / "study.json").read_text())
+    assert np.array(saved["ssim"]) == pytest.approx(study.ssim)
+    assert saved["grid"]["means"] == list(study.grid.means)
+    assert saved["optimum"]["perturbation"]["energy"]["mean"] == study.optimum.mean
+    assert saved["registration"]["scale"] == 1
+    # as files of before have them
+    names = "smoothing flattening data_range allow_noise replicas resamples seed temperature"
+    names += " bins bin_size bins_compared measured measured_noise registered share_above_energy_limit run"
+    assert list(saved["settings"]) == names.split()
+    assert saved["settings"] | asdict(study.settings) == saved["settings"]
+    assert study.settings.temperature == 50 and study.settings.flattening > 0
+
+
+def test_study_settings_are_checked():
+    assert StudySettings(1, flattening=0).flattening == 0.0
+    for wrong, words in (
+        ({"smoothing": -1.0}, r"smoothing must be a finite number \[mm\] at least 0, got -1.0"),
+        ({"flattening": -1.0}, "flattening must be"),
+        ({"data_range": 0}, "data_range must be"),
+        ({"allow_noise": "no"}, "allow_noise must be True or False"),
+        ({"replicas": 0}, "replicas must be"),
+        ({"resamples": 1.5}, "resamples must be"),
+        ({"seed": -1}, "seed must be"),
+        ({"temperature": -1}, "temperature must be"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            StudySettings(**{"smoothing": 1.0} | wrong)
+    with pytest.raises(AttributeError):
+        StudySettings(1.0).seed = 3
 
 
 def test_results_do_not_depend_on_threads(run, other):

@@ -13,8 +13,9 @@ from scipy import ndimage
 
 import apt_evap as ae
 from apt_evap import plot
-from apt_evap.registration import alignment
-from apt_evap.registration.register import register, register_points
+from apt_evap.registration import correlation_search
+from apt_evap.registration.register import DoubtfulRegistration, register, register_points
+from apt_evap.registration.transform import SimilarityTransform
 
 NICKEL = Path(__file__).parents[3] / "shared" / "data" / "ni111_map.npz"
 ROLLED = ae.RollUp(ae.TruncatedNormal(0.155, 0.155))
@@ -141,7 +142,7 @@ def test_a_threefold_pole_with_mirrors_has_ties(run20):
 def test_maps_that_have_nothing_in_common(simulated):
     rng = np.random.default_rng(5)
     z = 20 * np.sqrt(rng.random(100_000)) * np.exp(2j * np.pi * rng.random(100_000))
-    with pytest.warns(UserWarning, match="correlate by only 0.[0-3]"):
+    with pytest.warns(DoubtfulRegistration, match="correlate by only 0.[0-3]"):
         found = register(simulated, ae.Hits(x=z.real, y=z.imag))
     assert found.score < 0.35
     with pytest.raises(ValueError, match="must share 50% of the measured field of view"):
@@ -207,6 +208,35 @@ def test_order_of_the_steps():
     assert ae.Registration(90.0, 3.0, (0.5, -1.0), True).points(1.0, 2.0) == pytest.approx((6.5, 2.0))
 
 
+@given(transforms, st.complex_numbers(max_magnitude=100), st.complex_numbers(max_magnitude=100))
+def test_an_anchor_changes_no_transform(registration, place, point):
+    anchored = registration.transform.anchored(place)
+    assert anchored.place == place
+    assert anchored.forth(anchored.anchor) == place
+    assert anchored.forth(point) == pytest.approx(registration.transform.forth(point), abs=1e-6)
+    assert anchored.back(anchored.forth(point)) == pytest.approx(point, abs=1e-6)
+    assert anchored.inverse.forth(place) == anchored.anchor
+    assert anchored.inverse.forth(point) == pytest.approx(anchored.back(point), abs=1e-6)
+
+
+@given(transforms, st.floats(-180, 180), st.floats(0.1, 10))
+def test_turning_and_stretching_leaves_the_anchor_where_it_is(registration, rotation, scale):
+    anchored = registration.transform.anchored(3 - 4j)
+    turned = replace(anchored, rotation=anchored.rotation + rotation, scale=anchored.scale * scale)
+    assert turned.forth(turned.anchor) == 3 - 4j
+    distance = abs(anchored.forth(anchored.anchor + 1) - (3 - 4j))
+    assert abs(turned.forth(turned.anchor + 1) - (3 - 4j)) == pytest.approx(scale * distance)
+
+
+def test_a_registration_moves_points_as_its_formula_says():
+    """With z = x + iy, z' = scale exp(i rotation) conj(z) + shift, to the last bit."""
+    registration = ae.Registration(33.0, 0.7, (4.0, -9.0), True)
+    x, y = np.random.default_rng(1).normal(size=(2, 1000)) * 30
+    moved = 0.7 * np.exp(1j * np.radians(33.0)) * np.conj(x + 1j * y) + (4.0 - 9.0j)
+    assert np.array_equal(registration.points(x, y), [moved.real, moved.imag])
+    assert registration.transform == SimilarityTransform(33.0, 0.7, True, place=4.0 - 9.0j)
+
+
 @given(transforms, st.floats(-100, 100), st.floats(-100, 100))
 def test_there_and_back(transform, x, y):
     assert transform.inverse.points(*transform.points(x, y)) == pytest.approx((x, y), abs=1e-6)
@@ -259,8 +289,8 @@ def test_masked_correlation_against_sums(rng):
     images = [rng.normal(size=shape) for shape in ((9, 7), (8, 10))]
     masks = [rng.random(image.shape) < 0.8 for image in images]
     size = 18
-    spectra = [alignment.spectra(np.where(m, i, 0), m, size) for i, m in zip(images, masks, strict=True)]
-    coefficients, shared = alignment.correlate(*spectra, size)
+    spectra = [correlation_search.spectra(np.where(m, i, 0), m, size) for i, m in zip(images, masks, strict=True)]
+    coefficients, shared = correlation_search.correlate(*spectra, size)
     padded = [np.full((3 * size, 3 * size), np.nan) for _ in images]
     padded[1][size : size + 8, size : size + 10] = np.where(masks[1], images[1], np.nan)
     checked = 0

@@ -1,4 +1,4 @@
-"""Where one map fits best on another: flattened images, masked correlations, a search and its refinement."""
+"""Search for the transform of one map onto another: flattened images, masked correlations, refinement."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,6 +10,7 @@ from scipy import fft, ndimage, optimize
 from apt_evap._common.types import Booleans, Floats
 from apt_evap.detection.binning import field_of_view
 from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.registration.transform import SimilarityTransform
 
 COARSE, MEDIUM, FINE = 40, 60, 100
 """Pixels across the field of view in the search, when its best places are refined, and at the end."""
@@ -23,43 +24,10 @@ ROTATION_STEP, SCALE_STEP = 6.0, 0.1
 """Steps of the search [degrees] and in the logarithm of the scale: some two coarse pixels at the rim."""
 
 
-class Placement(NamedTuple):
-    """A similarity transform of points z (complex [mm]) that moves the centre of a simulated field of view."""
-
-    rotation: float
-    """Anticlockwise [degrees]."""
-    scale: float
-    """Measured over simulated lengths."""
-    mirror: bool
-    """Whether y changes its sign first."""
-    anchor: complex
-    """A simulated point."""
-    place: complex
-    """Where it comes to lie."""
-
-    def forth(self, points: Any) -> Any:
-        """Move simulated points into the measured frame."""
-        away = points - self.anchor
-        return self.place + self._turn * (np.conj(away) if self.mirror else away)
-
-    def back(self, points: Any) -> Any:
-        """Move measured points into the simulated frame."""
-        away = (points - self.place) / self._turn
-        return self.anchor + (np.conj(away) if self.mirror else away)
-
-    def anchored(self, place: complex) -> "Placement":
-        """The same transform with the anchor that comes to lie at `place`."""
-        return self._replace(anchor=self.back(place), place=place)
-
-    @property
-    def _turn(self):
-        return self.scale * np.exp(1j * np.radians(self.rotation))
-
-
 class Fit(NamedTuple):
-    """A placement and how well the images fit there."""
+    """A transform and how well the images fit under it."""
 
-    placement: Placement
+    transform: SimilarityTransform
     score: float
     """Correlation coefficient where both show something."""
     overlap: float
@@ -188,7 +156,7 @@ def search(
     scales: Any,
     mirrors: Any,
     least: float,
-    near: tuple[complex, float] | None = None,
+    near: Near | None = None,
 ) -> list[Fit]:
     """Find the best shift for every rotation, scale and mirror.
 
@@ -211,61 +179,63 @@ def search(
     pixel, broad = measured.diameter / COARSE, BROAD * measured.diameter
     grid = _square(measured.reach, pixel)
     image = measured.flatten(NARROW * pixel, broad)
-    turned = [image.sample(measured.centre + np.exp(1j * np.radians(turn)) * grid) for turn in rotations]
+    # frames about the measured centre that turn with the simulated map
+    frames = [SimilarityTransform(float(rotation), 1.0, place=measured.centre) for rotation in rotations]
+    turned = [image.sample(frame.forth(grid)) for frame in frames]
     fits = []
     for scale in scales:
         image = simulated.flatten(NARROW * pixel / scale, broad / scale)
         points = _square(simulated.reach * scale, pixel)
         size = fft.next_fast_len(len(points) + len(grid) - 1, real=True)
-        # shifts of the simulated centre from the measured one, in the frame that turns with the simulated map
+        # shifts of the simulated centre from the measured one, in these frames
         steps = np.arange(size)
         steps = (np.where(steps < len(grid), steps, steps - size) + len(points) // 2 - len(grid) // 2) * pixel
         shifts = steps + 1j * steps[:, None]
         fixed = [spectra(*values, size) for values in turned]
         for mirror in mirrors:
-            moving = spectra(*image.sample(simulated.centre + (points.conj() if mirror else points) / scale), size)
-            allowed = True
-            for turn, values, (_, inside) in zip(rotations, fixed, turned, strict=True):
+            unshifted = SimilarityTransform(0.0, float(scale), mirror, simulated.centre)
+            moving = spectra(*image.sample(unshifted.back(points)), size)
+            allowed: Any = True
+            for frame, values, (_, inside) in zip(frames, fixed, turned, strict=True):
                 if near is not None:
-                    unmoved = Placement(0.0, scale, mirror, simulated.centre, 0j).forth(near.anchor)
-                    target = (near.place - measured.centre) * np.exp(-1j * np.radians(turn))
-                    allowed = np.abs(unmoved + shifts - target) <= max(near.tolerance, pixel)
+                    target = frame.back(near.place) - unshifted.forth(near.anchor)
+                    allowed = np.abs(shifts - target) <= max(near.tolerance, pixel)
                 score, shared = correlate(moving, values, size)
-                share = np.minimum(shared / np.count_nonzero(inside), 1)
-                best = np.argmax(np.where(allowed & (share >= least), score * np.sqrt(share), -1))
-                if share.flat[best] >= least:
-                    place = measured.centre + np.exp(1j * np.radians(turn)) * shifts.flat[best]
-                    placement = Placement(float(turn), float(scale), mirror, simulated.centre, complex(place))
-                    fits.append(Fit(placement, float(score.flat[best]), float(share.flat[best])))
+                overlap = np.minimum(shared / np.count_nonzero(inside), 1)
+                best = np.argmax(np.where(allowed & (overlap >= least), score * np.sqrt(overlap), -1))
+                if overlap.flat[best] >= least:
+                    place = complex(frame.forth(shifts.flat[best]))
+                    transform = replace(unshifted, rotation=frame.rotation, place=place)
+                    fits.append(Fit(transform, float(score.flat[best]), float(overlap.flat[best])))
     return sorted(fits, key=lambda fit: -fit.rank)
 
 
 def distinct(fits: Sequence[Fit], most: int) -> list[Fit]:
     """The first `most` fits that are no neighbours in rotation and scale of a better one."""
-    kept = []
+    best = []
     for fit in fits:
-        if len(kept) < most and not any(_close(fit.placement, other.placement) for other in kept):
-            kept.append(fit)
-    return kept
+        if len(best) < most and not any(_close(fit.transform, other.transform) for other in best):
+            best.append(fit)
+    return best
 
 
 def refine(
     simulated: View,
     measured: View,
-    placement: Placement,
+    transform: SimilarityTransform,
     pixels: int,
     least: float,
     rotations: tuple[float, ...] | None = None,
     scales: tuple[float, ...] | None = None,
     near: Near | None = None,
 ) -> Fit:
-    """Maximise the correlation near a placement.
+    """Maximise the correlation near a transform.
 
     Parameters
     ----------
     simulated, measured : View
         The maps.
-    placement : Placement
+    transform : SimilarityTransform
         Where to begin.
     pixels : int
         Pixels across the measured field of view.
@@ -284,12 +254,12 @@ def refine(
     points = _square(measured.reach, pixel) + measured.centre
     values, inside = measured.flatten(NARROW * pixel, broad).sample(points)
     points, values = points[inside], values[inside]
-    image = simulated.flatten(NARROW * pixel / placement.scale, broad / placement.scale)
-    start = placement.anchored(measured.centre)
+    image = simulated.flatten(NARROW * pixel / transform.scale, broad / transform.scale)
+    start = transform.anchored(measured.centre)
     if near is not None:
-        away = placement.forth(near.anchor) - near.place
+        away = transform.forth(near.anchor) - near.place
         away = complex(*np.clip((away.real, away.imag), -near.tolerance, near.tolerance))
-        start = placement._replace(anchor=near.anchor, place=near.place + away)
+        start = replace(transform, anchor=near.anchor, place=near.place + away)
     free = [rotations is None or rotations[0] < rotations[1], scales is None or scales[0] < scales[1], True, True]
     units = np.array([ROTATION_STEP / 2, SCALE_STEP / 2, pixel, pixel])
     low, high = np.full(4, -np.inf), np.full(4, np.inf)
@@ -303,15 +273,18 @@ def refine(
 
     def placed(steps):
         turn, stretch, x, y = _spread(steps, free) * units
-        return start._replace(
-            rotation=start.rotation + turn, scale=start.scale * np.exp(stretch), place=start.place + complex(x, y)
+        return replace(
+            start,
+            rotation=start.rotation + turn,
+            scale=start.scale * np.exp(stretch),
+            place=start.place + complex(x, y),
         )
 
     def fit(steps):
-        placement = placed(steps)
-        sampled, shared = image.sample(placement.back(points))
+        transform = placed(steps)
+        sampled, shared = image.sample(transform.back(points))
         overlap = np.count_nonzero(shared) / len(points)
-        return Fit(placement, correlation(sampled[shared], values[shared]) if overlap >= least else -1.0, overlap)
+        return Fit(transform, correlation(sampled[shared], values[shared]) if overlap >= least else -1.0, overlap)
 
     low, high = np.minimum(low, 0)[free], np.maximum(high, 0)[free]  # the start is inside but for rounding
     simplex = np.vstack([np.zeros(len(low)), np.diag(np.where(high >= 1, 1.0, -1.0))])

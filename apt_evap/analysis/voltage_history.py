@@ -1,0 +1,95 @@
+"""Voltage at which the ions of a run evaporate, and the course of a quantity over the ions."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from apt_evap._common.types import Floats
+from apt_evap._common.validation import check_array, check_count, check_kind
+from apt_evap.simulation.run import Run
+
+
+class Course(NamedTuple):
+    """Percentiles of a quantity in successive stretches of the ions, each of shape (k,)."""
+
+    ions: np.ndarray
+    """Middle of each stretch, in ions from the first."""
+    low: np.ndarray
+    """5th percentile, in the unit of the quantity."""
+    median: np.ndarray
+    """50th percentile."""
+    high: np.ndarray
+    """95th percentile."""
+
+
+def evaporation_fields(run: Run) -> Floats:
+    """Evaporation field of the species of each ion.
+
+    Parameters
+    ----------
+    run : Run
+        The ions; the materials are those of its settings.
+
+    Returns
+    -------
+    ndarray
+        [V/nm], shape (n,).
+    """
+    tip = check_kind(run, "run", Run, "a Run").settings["tip"]
+    # in the order of the species; two of them may have the same name
+    materials = [tip["material"], *(solute for solute, _ in tip["solutes"])] if "material" in tip else tip["elements"]
+    return np.array([material["evaporation_field"] for material in materials])[run.species]
+
+
+def evaporation_voltages(run: Run) -> Floats:
+    r"""Voltage at which each ion of a run reaches its evaporation field.
+
+    Parameters
+    ----------
+    run : Run
+        The ions, simulated at one voltage.
+
+    Returns
+    -------
+    ndarray
+        [V], shape (n,).
+
+    Notes
+    -----
+    Charges and fields are proportional to the voltage. An atom that leaves at the field F, simulated at the voltage V,
+    reaches the evaporation field of its species at
+
+    .. math:: V_\mathrm{evap} = V \, F_\mathrm{evap} / F
+
+    which is the voltage that a measurement at a constant rate would apply.
+    """
+    return run.voltage * evaporation_fields(run) / run.fields
+
+
+def course(values: ArrayLike, points: int = 200) -> Course:
+    """Median and 5 and 95 % percentiles of successive stretches of nearly equal length.
+
+    Parameters
+    ----------
+    values : array_like
+        A quantity of each ion, shape (n,), in the order of evaporation.
+    points : int
+        Number of stretches k; n if there are fewer values.
+
+    Returns
+    -------
+    Course
+
+    Raises
+    ------
+    ValueError
+        If there are no values, or points is not an integer >= 1.
+    """
+    values = check_array(values, "values", ("n",), finite=False)
+    points = check_count(points, "points", at_least=1)
+    if not len(values):
+        raise ValueError("values must be one or more, got none")
+    edges = np.linspace(0, len(values), min(points, len(values)) + 1).astype(int)
+    stretches = np.split(values, edges[1:-1])
+    return Course((edges[:-1] + edges[1:]) / 2, *np.array([np.percentile(part, [5, 50, 95]) for part in stretches]).T)

@@ -1,0 +1,61 @@
+"""Settings of a study: how maps are compared, drawn and resampled."""
+
+from dataclasses import dataclass
+
+from apt_evap._common.validation import check_count, check_number, check_seed, check_switch
+from apt_evap.emission.energies import Thermal
+
+
+@dataclass(frozen=True)
+class StudySettings:
+    """How simulated maps are compared with a measured one, drawn and resampled, as `fit_energies` sets it.
+
+    Parameters
+    ----------
+    smoothing : float
+        Standard deviation of the Gaussian that both maps are smoothed with [mm]; 0 for none.
+    flattening : float, optional
+        Standard deviation of the Gaussian that both maps are flattened by [mm]; 0 for none. None until the region is
+        known whose area sets it.
+    data_range : float
+        Range of densities, as for `ssim`.
+    allow_noise : bool
+        Whether noise counts as alike: that of Poisson of measured counts, that of the draws of simulated ions.
+    replicas : int
+        Draws of the energy and direction of every ion, added up.
+    resamples : int
+        Draws of all measured and simulated ions with replacement, for the errors.
+    seed : int
+        Seed of the resamples.
+    temperature : float
+        Temperature of the thermal baseline [K].
+
+    Raises
+    ------
+    ValueError
+        If a value is out of range.
+    """
+
+    smoothing: float
+    flattening: float | None = None
+    data_range: float = 2.0
+    allow_noise: bool = True
+    replicas: int = 4
+    resamples: int = 200
+    seed: int = 0
+    temperature: float = 50.0
+
+    def __post_init__(self):
+        checked = {
+            "smoothing": check_number(self.smoothing, "smoothing", at_least=0, unit="mm"),
+            "data_range": check_number(self.data_range, "data_range", above=0),
+            "allow_noise": check_switch(self.allow_noise, "allow_noise"),
+            "replicas": check_count(self.replicas, "replicas", at_least=1),
+            "resamples": check_count(self.resamples, "resamples"),
+            "seed": check_seed(self.seed),
+            "temperature": Thermal(self.temperature).temperature,
+        }
+        if self.flattening is not None:
+            checked["flattening"] = check_number(self.flattening, "flattening", at_least=0, unit="mm")
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
