@@ -8,9 +8,9 @@ import numpy as np
 
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence
-from apt_evap.detection.binning import MOST_BINS
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
+from apt_evap.detection.limits import MOST_BINS
 
 
 class Profile(NamedTuple):

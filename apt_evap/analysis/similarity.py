@@ -4,9 +4,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy import ndimage
-from skimage.metrics import structural_similarity
-from skimage.morphology import disk
+import scipy
+import skimage
 
 from apt_evap._common.validation import check_kind, check_number, check_seed
 from apt_evap.detection.detector_map import DetectorMap
@@ -95,14 +94,14 @@ def ssim(map_a: DetectorMap, map_b: DetectorMap, *, smoothing: float = 0.0, data
         check_kind(each, name, DetectorMap, "a DetectorMap")
     _check_bins(map_a, map_b)
     common = map_a.mask & map_b.mask
-    inside = ndimage.binary_erosion(common, disk(_WINDOW))
+    inside = scipy.ndimage.binary_erosion(common, skimage.morphology.disk(_WINDOW))
     if not inside.any():
         raise ValueError(
             f"the masks of the two maps must share more than a window of {2 * _WINDOW + 1} bins, they share "
             f"{np.count_nonzero(common)} bins"
         )
     images = [np.where(common, replace(m.smoothed(smoothing), mask=common).density, 1.0) for m in (map_a, map_b)]
-    _, local = structural_similarity(
+    _, local = skimage.metrics.structural_similarity(
         *images,
         data_range=data_range,
         gaussian_weights=True,

@@ -4,9 +4,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.optimize import approx_fprime, curve_fit
-from scipy.stats import chi2
 
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_kind, check_number
@@ -121,14 +120,14 @@ def fit_zone_line(profile: Profile, *, exponent: float = 2.0) -> ZoneLine:
     highest = [position[-1], span, np.inf, np.inf, np.inf, EXPONENTS[1]][: len(start)]
     missing = f"the profile of {len(position)} bins over {span:g} mm shows no line"
     try:
-        found, covariance = curve_fit(model, position, density, start, bounds=(lowest, highest))
+        found, covariance = scipy.optimize.curve_fit(model, position, density, start, bounds=(lowest, highest))
     except RuntimeError as failure:
         raise ValueError(f"{missing}: {failure}") from failure
     at_edge = [np.isclose(found[:2], edge[:2], atol=1e-6 * span) for edge in (lowest, highest)]
     if np.any(at_edge) or not np.isfinite(covariance).all():
         raise ValueError(f"{missing}: the fit ran to {found[1]:.3g} mm wide at {found[0]:.3g} mm")
     if np.isfinite(error).all():
-        change = np.linalg.pinv(approx_fprime(found, lambda values: model(position, *values)))
+        change = np.linalg.pinv(scipy.optimize.approx_fprime(found, lambda values: model(position, *values)))
         covariance = (change * error**2) @ change.T
     names = ("centre", "width", "height", "background", "slope", "exponent")
     values = {"exponent": exponent} | dict(zip(names, found.tolist(), strict=False))
@@ -228,6 +227,6 @@ def compare_profiles(first: Profile, second: Profile) -> ProfileComparison:
         difference=pull,
         chi_square=chi_square,
         degrees_of_freedom=bins - 1,
-        probability=float(chi2.sf(chi_square, bins - 1)),
+        probability=float(scipy.stats.chi2.sf(chi_square, bins - 1)),
         relative=float(np.sqrt(max(beyond, 0.0))),
     )

@@ -7,7 +7,7 @@ from typing import Any
 from apt_evap._common.validation import check_count, check_number, shown
 from apt_evap.config.perturbation_text import read_perturbation, title_of
 from apt_evap.config.tables import check_keys, check_table
-from apt_evap.detection.binning import MOST_BINS
+from apt_evap.detection.limits import MOST_BINS
 from apt_evap.emission.energies import TruncatedNormal
 from apt_evap.emission.perturbations import Perturbation, RollUp, Unperturbed, to_dict
 

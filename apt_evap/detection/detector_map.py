@@ -6,8 +6,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy import ndimage
 
 from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_array, check_kind, check_number, check_seed, check_switch
@@ -294,8 +294,8 @@ class DetectorMap:
     def _blurred(self, sigma):
         width, height = self.bin_size
         blur = {"sigma": (sigma / height, sigma / width), "mode": "constant"}
-        weight = ndimage.gaussian_filter(self.mask.astype(float), **blur)
-        values = ndimage.gaussian_filter(np.where(self.mask, self.values, 0).astype(float), **blur)
+        weight = scipy.ndimage.gaussian_filter(self.mask.astype(float), **blur)
+        values = scipy.ndimage.gaussian_filter(np.where(self.mask, self.values, 0).astype(float), **blur)
         return np.divide(values, weight, out=np.zeros_like(values), where=self.mask)
 
     def __repr__(self) -> str:

@@ -12,7 +12,8 @@ from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.energies import Thermal
 from apt_evap.emission.perturbations import LateralVelocity, Unperturbed
-from apt_evap.energy_fit.grid import MEANS, RSDS, EnergyGrid, maxima
+from apt_evap.energy_fit.defaults import MEANS, RSDS
+from apt_evap.energy_fit.grid import EnergyGrid, maxima
 from apt_evap.energy_fit.resampling import WINDOW
 from apt_evap.energy_fit.search import EnergySearch, registered, score
 from apt_evap.energy_fit.study import Study, plain

@@ -20,8 +20,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy import ndimage, sparse
-from skimage.morphology import disk
+import scipy
+import skimage
 
 from apt_evap._common.types import Floats
 from apt_evap.detection.detector_map import DetectorMap
@@ -73,7 +73,7 @@ class Comparison:
         seed: Any,
         allow_noise: bool = True,
     ) -> None:
-        inside = ndimage.binary_erosion(measured.mask, disk(WINDOW))
+        inside = scipy.ndimage.binary_erosion(measured.mask, skimage.morphology.disk(WINDOW))
         if not inside.any():
             raise ValueError(
                 f"the region that both maps show must hold a window of {2 * WINDOW + 1} bins, it has "
@@ -234,7 +234,7 @@ class Sampler:
         if not self.resamples:
             return np.bincount(cells, minlength=size).reshape(1, *self.shape).astype(float), noise
         ones = np.ones(len(cells), np.float32)
-        table = sparse.coo_array((ones, (cells, self._groups[ions])), (size, len(self._weights))).tocsr()
+        table = scipy.sparse.coo_array((ones, (cells, self._groups[ions])), (size, len(self._weights))).tocsr()
         return (table @ self._weights).T.reshape(-1, *self.shape).astype(float), noise
 
     def _cells(self, perturbation, replica):
@@ -263,7 +263,7 @@ def drawn_hits(run: Run, perturbation: Perturbation, replica: int) -> Hits:
 
 def _filtered(maps, sigmas, truncate=4.0):
     """Gaussian along the last two axes, with nothing beyond the ends."""
-    return ndimage.gaussian_filter(maps, sigmas, mode="constant", truncate=truncate, axes=(-2, -1))
+    return scipy.ndimage.gaussian_filter(maps, sigmas, mode="constant", truncate=truncate, axes=(-2, -1))
 
 
 def _window(maps):
