@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_array, check_kind, check_number, check_seed, check_switch
+from apt_evap._common.warnings import MapWarning
 from apt_evap.detection.binning import bin_edges, count, field_of_view, find_combs
 
 if TYPE_CHECKING:
@@ -127,6 +128,7 @@ class DetectorMap:
                 warnings.warn(
                     "hits on a comb are binned on the edges of another map and may show stripes; dither_seed "
                     "prevents them",
+                    MapWarning,
                     stacklevel=2,
                 )
         else:

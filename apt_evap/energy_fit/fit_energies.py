@@ -8,6 +8,7 @@ import numpy as np
 
 from apt_evap._common.threads import thread_count
 from apt_evap._common.validation import check_count, check_kind, check_number, check_seed, check_switch
+from apt_evap._common.warnings import MapWarning, RegistrationWarning, ResponseWarning
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.energies import Thermal
@@ -151,10 +152,10 @@ def fit_energies(
     search = EnergySearch(run, measured, grid, settings, thread_count(n_threads), progress)
     with warnings.catch_warnings():
         # for every energy anew; what it says is in the settings
-        warnings.filterwarnings("ignore", message=".*launch above the")
+        warnings.simplefilter("ignore", ResponseWarning)
         rounds = []
         if registration is None:
-            warnings.filterwarnings("ignore", message="the registration is doubtful")  # once, of the last
+            warnings.simplefilter("ignore", RegistrationWarning)  # once, of the last
             registration, rounds = registered(search)
         search.place(registration, resamples)
         values = search.matrix(replicas, "energies")
@@ -177,6 +178,7 @@ def fit_energies(
         warnings.warn(
             f"the run has {shown:.2g} ions in a bin that is compared, {FEWEST_IONS:g} or more are needed for a map: "
             f"give fewer bins than {max(measured.values.shape)}, or simulate more ions",
+            MapWarning,
             stacklevel=2,
         )
     resampled = values[1:]

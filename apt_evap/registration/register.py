@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_number, check_sequence, check_switch
+from apt_evap._common.warnings import RegistrationWarning
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.registration.alignment import (
@@ -131,9 +132,10 @@ class Registration:
         if self.doubtful:
             warnings.warn(
                 f"the registration is doubtful: the maps correlate by only {self.score:.2f} where both show something "
-                f"({self.overlap:.0%} of the measured one), as maps may that have nothing to do with each other; look "
-                "at the overlay of both, make sure that the specimen was simulated along its axis, and give a pole, "
-                "scales or a start where known",
+                f"({self.overlap:.0%} of the measured one), as maps may that have nothing to do with each other; lay "
+                "one over the other, make sure that the specimen was simulated along its axis, and give what is known of "
+                "rotation, scale and shift",
+                RegistrationWarning,
                 stacklevel=3,
             )
 

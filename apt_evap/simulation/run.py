@@ -13,6 +13,7 @@ import numpy as np
 from apt_evap._common.files import FileError, check_path
 from apt_evap._common.types import AnyPath, Booleans
 from apt_evap._common.validation import check_kind, check_switch, shown
+from apt_evap._common.warnings import ResponseWarning
 from apt_evap._version import __version__
 from apt_evap.detection.detector import Detector
 from apt_evap.detection.hits import Hits
@@ -175,6 +176,7 @@ class Run:
                 f"{faster:,} of {len(self):,} ions launch above the {settings.energy_limit:g} eV of the responses: "
                 "their places are extrapolated; run with a larger energy_limit, of ResponseSettings or in [responses] "
                 "of a settings file",
+                ResponseWarning,
                 stacklevel=2,
             )
         values = np.empty((len(self), 3))
