@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-import apt_evap.cli as cli
-from apt_evap import __version__, plot
-from apt_evap.cli.main import EXIT_CODES, main
+from apt_evap import __version__, cli, plot
+from apt_evap.cli import run as run_command
+from apt_evap.cli.main import main
+from apt_evap.cli.parser import EXIT_CODES
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.perturbations import Combined, LateralVelocity, RollUp, Unperturbed
 from apt_evap.io.formats import write
@@ -208,7 +209,7 @@ def test_a_second_run_overwrites_the_first_but_nobody_elses_files(folder, capsys
 
 
 def test_what_cannot_be_written_is_said_before_computing(folder, capsys, monkeypatch):
-    monkeypatch.setattr(cli.run, "read_config", checked := Counting(cli.run.read_config))
+    monkeypatch.setattr(run_command, "read_config", checked := Counting(run_command.read_config))
     assert "cannot write 'none/a.h5': No such file or directory" in failed(
         capsys, "run", "small.toml", "-o", "none/a.h5"
     )
@@ -295,7 +296,7 @@ def test_memory_and_interrupts_are_no_tracebacks_but_bugs_are(folder, capsys, mo
 
 
 def test_progress_without_a_terminal_is_plain_lines(folder, capsys, monkeypatch):
-    monkeypatch.setattr(cli.run, "SECONDS_BETWEEN_LINES", 0.0)
+    monkeypatch.setattr(run_command, "SECONDS_BETWEEN_LINES", 0.0)
     assert main(["run", "small.toml", "--ions", "600", "--threads", "1"]) == 0
     line = r"300 of 600 ions \(50%\), [\d.,]+ ions/s, \d+ s left\n"
     assert re.search(line, capsys.readouterr().err)
