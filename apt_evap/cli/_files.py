@@ -124,7 +124,7 @@ def check_output(path: AnyPath, is_ours: Callable[[Path], bool], force: bool) ->
             if not target.is_file():
                 raise OSError(None, "Not a regular file")
             if not force:
-                with open_for_reading(target):
+                with open_for_reading(path):
                     pass  # what cannot be read is not known to be ours, nor anybody else's
                 if not is_ours(target):
                     raise FileError(f"{str(path)!r} exists and was not made by apt-evap: --force overwrites it")

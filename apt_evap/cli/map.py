@@ -77,7 +77,10 @@ def _map_settings(run, options):
     if options.bins is not None:
         # what was a good smoothing for other bins is not for these
         settings = replace(settings, bins=options.bins, smoothing=None)
-    return settings if options.smooth is None else replace(settings, smoothing=options.smooth)
+    if options.smooth is not None:
+        settings = replace(settings, smoothing=options.smooth)
+    settings.check_detector(run.detector)
+    return settings
 
 
 def run_maps(

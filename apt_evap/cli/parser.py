@@ -6,6 +6,7 @@ from math import inf, isfinite
 from typing import Any, NoReturn
 
 from apt_evap._version import __version__
+from apt_evap.cli._output import put
 from apt_evap.detection.limits import MOST_BINS
 from apt_evap.energy_fit.defaults import MEANS, MECHANISMS, ROLLUP_FRACTIONS, RSDS
 
@@ -66,6 +67,9 @@ class _Parser(argparse.ArgumentParser):
         if unknown:
             self.error(f"unrecognized arguments: {' '.join(unknown)}")
         return options, unknown
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        put(message.removesuffix("\n"))  # that of argparse does not tell of a full disk
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is not None and value not in action.choices:

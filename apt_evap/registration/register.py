@@ -133,8 +133,8 @@ class Registration:
             warnings.warn(
                 f"the registration is doubtful: the maps correlate by only {self.score:.2f} where both show something "
                 f"({self.overlap:.0%} of the measured one), as maps may that have nothing to do with each other; lay "
-                "one over the other, make sure that the specimen was simulated along its axis, and give what is known of "
-                "rotation, scale and shift",
+                "one over the other, make sure that the specimen was simulated along its axis, and give what is known "
+                "of rotation, scale and shift",
                 RegistrationWarning,
                 stacklevel=3,
             )
