@@ -2,6 +2,13 @@
 from . import plot as plot
 from ._common.files import FileError as FileError
 from ._common.files import TruncatedFile as TruncatedFile
+from ._common.warnings import AptWarning as AptWarning
+from ._common.warnings import ChargesWarning as ChargesWarning
+from ._common.warnings import DataWarning as DataWarning
+from ._common.warnings import MapWarning as MapWarning
+from ._common.warnings import RegistrationWarning as RegistrationWarning
+from ._common.warnings import ResponseWarning as ResponseWarning
+from ._common.warnings import RunWarning as RunWarning
 from .analysis.apex import field_factor as field_factor
 from .analysis.apex import fit_caps as fit_caps
 from .analysis.apex import image_compression as image_compression

@@ -5,6 +5,7 @@ import warnings
 from pathlib import Path
 
 import matplotlib
+from PIL import Image
 
 import apt_evap
 
@@ -23,7 +24,9 @@ extensions = [
     "numpydoc",
     "sphinx_gallery.gen_gallery",
     "sphinxcontrib.bibtex",
+    "sphinx_design",
 ]
+SECTIONS = ("start", "background", "evidence", "development")  # pages that only list others
 default_role = "py:obj"
 rst_prolog = r".. |v| replace:: \|v\|"  # docstrings write the magnitude of v as |v|
 exclude_patterns = ["_build", "generated/scripts"]
@@ -51,6 +54,30 @@ sphinx_gallery_conf = {
     "write_computation_times": False,
 }
 
+# pictures of the cards on the front page: parts of figures, as left, upper, right and lower fraction
+CARDS = {
+    "first_map": ("ni111.png", (0.555, 0.12, 0.895, 0.86)),
+    "accuracy": ("figure7.png", (0.50, 0.05, 0.985, 0.362)),
+    "results": ("figure6.png", (0.711, 0.10, 0.939, 0.453)),
+    "code": ("figure2.png", (0.064, 0.045, 0.424, 0.30)),
+}
+(GENERATED / "cards").mkdir(parents=True, exist_ok=True)
+for name, (figure, (left, upper, right, lower)) in CARDS.items():
+    picture = Image.open(HERE / figure)
+    width, height = picture.size
+    box = (round(left * width), round(upper * height), round(right * width), round(lower * height))
+    picture.crop(box).save(GENERATED / "cards" / f"{name}.png")
+
 html_theme = "pydata_sphinx_theme"
 html_title = f"apt_evap {version}"
-html_theme_options = {"show_toc_level": 2, "secondary_sidebar_items": ["page-toc"]}
+html_static_path = ["_static"]
+html_css_files = ["pages.css"]
+html_show_sourcelink = False
+# no column that would be empty: the front page has neither, the pages of a section list the section
+html_sidebars = {"index": [], "search": [], "genindex": []}
+html_theme_options = {
+    "show_toc_level": 2,
+    "show_nav_level": 2,
+    "navigation_with_keys": False,
+    "secondary_sidebar_items": {"**": ["page-toc"], "index": [], **{section: [] for section in SECTIONS}},
+}

@@ -1,5 +1,7 @@
 """Whether a specimen fits into the memory."""
 
+from apt_evap._common.wording import argument
+
 # Peaks of building a specimen, charging it and flying 300 ions, of 18 specimens of five lattices with 0.4 to 28 million
 # atoms, whole or a shell: within 15 % of what the first two say. The third is 150 to 215, by 1 to 8 threads.
 _BYTES_PER_ATOM = 81
@@ -45,7 +47,7 @@ def check_copies(surface_atoms: float, n_threads: int) -> None:
     """Refuse more threads than there is memory for, each with a copy of the surface (ValueError)."""
     _check(
         _BYTES_PER_COPIED_ATOM * surface_atoms * n_threads,
-        f"n_threads={n_threads}, each with a copy of {surface_atoms:.2g} surface atoms,",
+        f"{argument('n_threads', n_threads)}, each with a copy of {surface_atoms:.2g} surface atoms,",
         "give fewer",
     )
 

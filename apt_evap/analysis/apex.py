@@ -6,8 +6,8 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.optimize import least_squares
 
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence
@@ -234,7 +234,7 @@ def _sphere(points, centre, radius):
     """Centre and radius of the sphere nearest to points, outliers counted linearly."""
     if math.isnan(radius):
         radius = float(np.median(np.linalg.norm(points - centre, axis=1)))
-    fit = least_squares(
+    fit = scipy.optimize.least_squares(
         lambda unknowns: np.linalg.norm(points - unknowns[:3], axis=1) - unknowns[3],
         np.append(centre, radius),
         jac=lambda unknowns: np.column_stack([_towards(unknowns[:3], points), -np.ones(len(points))]),

@@ -5,13 +5,13 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+import scipy
 
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence
-from apt_evap.detection.binning import MAX_BINS
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
+from apt_evap.detection.limits import MAX_BINS
 
 
 class Profile(NamedTuple):
@@ -260,7 +260,7 @@ def compare_profiles(first: Profile, second: Profile) -> ProfileComparison:
         difference=pull,
         chi_square=chi_square,
         degrees_of_freedom=bins - 1,
-        probability=float(chi2.sf(chi_square, bins - 1)),
+        probability=float(scipy.stats.chi2.sf(chi_square, bins - 1)),
         relative=float(np.sqrt(max(beyond, 0.0))),
     )
 

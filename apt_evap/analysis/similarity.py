@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import ndimage
+import scipy
 
 from apt_evap._common.types import Booleans, Floats
 from apt_evap._common.validation import check_kind, check_number, check_seed
@@ -33,7 +33,7 @@ def window_mean(values: Floats) -> Floats:
 def window_fits(mask: Booleans) -> Booleans:
     """Whether the disc of radius `WINDOW` about a bin lies inside a mask, bool of shape (ny, nx)."""
     step = np.arange(-WINDOW, WINDOW + 1)
-    return ndimage.binary_erosion(mask, step[:, None] ** 2 + step**2 <= WINDOW**2)
+    return scipy.ndimage.binary_erosion(mask, step[:, None] ** 2 + step**2 <= WINDOW**2)
 
 
 def local_moments(density: Floats) -> Moments:

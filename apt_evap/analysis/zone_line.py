@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.optimize import approx_fprime, curve_fit
 
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_kind, check_number
@@ -119,14 +119,14 @@ def fit_zone_line(profile: Profile, *, exponent: float = 2.0) -> ZoneLine:
     highest = [position[-1], span, np.inf, np.inf, np.inf, EXPONENTS[1]][: len(start)]
     missing = f"the profile of {len(position)} bins over {span:g} mm shows no line"
     try:
-        parameters, covariance = curve_fit(model, position, density, start, bounds=(lowest, highest))
+        parameters, covariance = scipy.optimize.curve_fit(model, position, density, start, bounds=(lowest, highest))
     except RuntimeError as failure:
         raise ValueError(f"{missing}: {failure}") from failure
     at_edge = [np.isclose(parameters[:2], edge[:2], atol=1e-6 * span) for edge in (lowest, highest)]
     if np.any(at_edge) or not np.isfinite(covariance).all():
         raise ValueError(f"{missing}: the fit ran to {parameters[1]:.3g} mm wide at {parameters[0]:.3g} mm")
     if np.isfinite(error).all():
-        change = np.linalg.pinv(approx_fprime(parameters, lambda values: model(position, *values)))
+        change = np.linalg.pinv(scipy.optimize.approx_fprime(parameters, lambda values: model(position, *values)))
         covariance = (change * error**2) @ change.T
     names = ("centre", "width", "height", "background", "slope", "exponent")
     values = {"exponent": exponent} | dict(zip(names, parameters.tolist(), strict=False))

@@ -7,8 +7,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from apt_evap import plot
-from apt_evap._common.files import FileError, check_path, replace_file
+from apt_evap._common.files import FileError, check_path, open_for_reading, replace_file
 from apt_evap._common.types import AnyPath
 from apt_evap._version import __version__
 from apt_evap.detection.detector_map import DetectorMap
@@ -18,6 +20,7 @@ from apt_evap.io.rrng import read_ranges
 from apt_evap.simulation.run import Run, load
 
 _MARK = f"apt_evap {__version__}"
+_MARKED = 1 << 16  # bytes: a .png and an .svg begin with the mark, a .pdf ends with it
 _MARK_KEYS = {".png": "Software", ".pdf": "Creator", ".svg": "Creator"}
 
 
@@ -78,6 +81,23 @@ def select(hits: Hits, options: argparse.Namespace) -> Hits:
     return chosen
 
 
+def check_columns(hits: Hits, options: argparse.Namespace) -> None:
+    """Refuse ions without places on the detector (ValueError)."""
+    if hits.x is None or hits.y is None:
+        names = ", ".join(hits.columns)
+        raise ValueError(f"{options.file!r} has no detector coordinates x and y, which a map needs, only {names}")
+
+
+def check_places(chosen: Hits, options: argparse.Namespace) -> None:
+    """Refuse ions that are all at one place on the detector (ValueError): their map has no size."""
+    x, y = (values[chosen.detected] for values in chosen.require("x", "y"))
+    if chosen.extent is None and len(x) and np.ptp(x) == np.ptp(y) == 0:
+        given = [f"--{name}" for name in _SELECTING if getattr(options, name) is not None]
+        left = f"{' '.join(given)} leaves" if given else f"{options.file!r} has"
+        what = "one ion" if len(x) == 1 else f"{len(x):,} ions at one place"
+        raise ValueError(f"{left} {what} on the detector: a map needs more")
+
+
 def picture_path(path: AnyPath) -> Path:
     path = check_path(path)
     if path.suffix.lower() not in _MARK_KEYS:
@@ -100,11 +120,21 @@ def check_output(path: AnyPath, is_ours: Callable[[Path], bool], force: bool) ->
             raise IsADirectoryError(None, "Is a directory")
         with tempfile.TemporaryFile(dir=target.parent):
             pass
-        if target.exists() and not force and not is_ours(target):
-            raise FileError(f"{str(path)!r} exists and was not made by apt-evap: --force overwrites it")
+        if target.exists():
+            if not target.is_file():
+                raise OSError(None, "Not a regular file")
+            if not force:
+                with open_for_reading(path):
+                    pass  # what cannot be read is not known to be ours, nor anybody else's
+                if not is_ours(target):
+                    raise FileError(f"{str(path)!r} exists and was not made by apt-evap: --force overwrites it")
     except OSError as error:
         raise FileError(f"cannot write {str(path)!r}: {error.strerror or error}") from error
 
 
 def is_picture(path: Path) -> bool:
-    return b"apt_evap" in path.read_bytes()
+    """Whether a picture says, near its beginning or its end, that this package made it."""
+    with open_for_reading(path) as file:
+        beginning = file.read(_MARKED)
+        file.seek(max(0, path.stat().st_size - _MARKED))
+        return b"apt_evap" in beginning or b"apt_evap" in file.read(_MARKED)

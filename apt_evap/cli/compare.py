@@ -6,77 +6,26 @@ import json
 import os
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from apt_evap import plot
 from apt_evap._common.files import FileError, check_path, open_for_reading
-from apt_evap.cli._files import check_output, read, select
-from apt_evap.cli._options import SHAPE, add_reading_options, smoothing, whole
+from apt_evap.cli._files import check_columns, check_output, check_places, read, select
+from apt_evap.cli._output import put, say
 from apt_evap.config.perturbation_text import read_perturbation
-from apt_evap.detection.binning import MAX_BINS
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.energy_fit.fit_energies import fit_energies
-from apt_evap.energy_fit.grid import MEANS, MECHANISMS, ROLLUP_FRACTIONS, RSDS
 from apt_evap.registration.register import Registration
 from apt_evap.simulation.run import Run, load
 from apt_evap.simulation.run_hdf5 import is_run
 
 _STUDY = "study.json"
+OVERLAY = "registration.png"
 
 
-def add_parser(commands: Any) -> None:
-    """Describe the command."""
-    command = commands.add_parser(
-        "compare",
-        help="find the emission energies that make a run look most like a measured map",
-        description="Find the emission energies that make a run look most like a measured map: the structural\n"
-        "similarity for a grid of energies, its maximum, its errors, and what no energy and thermal energies give.",
-        epilog="writes to FOLDER:\n"
-        "  study.json        results and every setting\n"
-        "  ssim.csv          similarity, error and share of the resamples for every energy\n"
-        "  ssim.png          the same as a picture\n"
-        "  maps.png          measured, unperturbed and best map side by side, and a part of them magnified\n"
-        "  registration.png  the simulated map laid over the measured one\n\n"
-        "example: apt-evap compare ni111.h5 R5083.epos -o R5083_study --mechanism roll-up",
-        **SHAPE,
-    )
-    command.add_argument("run", metavar="RUN.h5", help="a run with responses")
-    command.add_argument("file", metavar="MEASURED", help="measured ions (.epos, ...), a map (.npz), or a run (.h5)")
-    command.add_argument("-o", "--output", metavar="FOLDER", help="default: MEASURED_study, here")
-    command.add_argument("--mechanism", choices=MECHANISMS, default="roll-up", help="default: roll-up")
-    for name, default, what in (
-        ("means", MEANS, "of the energy [eV]"),
-        ("rsds", RSDS, "standard deviations over the means"),
-        ("rollup-fractions", ROLLUP_FRACTIONS, "for combined"),
-    ):
-        shown = ",".join(f"{value:g}" for value in default)
-        command.add_argument(f"--{name}", type=_numbers, metavar="N,N,...", help=f"{what}; default: {shown}")
-    command.add_argument(
-        "--registration",
-        metavar="R",
-        help="a JSON file (such as study.json) or ROTATION,SCALE,DX,DY[,mirror] in degrees and mm; found by default",
-    )
-    command.add_argument("--bins", type=whole(11, MAX_BINS), metavar="N", help="along the longer side")
-    command.add_argument(
-        "--smooth", type=smoothing, metavar="MM", help="sigma of a Gaussian; default: half a bin, of densities one"
-    )
-    command.add_argument("--flatten", type=smoothing, metavar="MM", help="sigma of a broad Gaussian; 0 for not")
-    command.add_argument("--temperature", type=float, default=50.0, metavar="K", help="of the thermal map; default: 50")
-    command.add_argument("--plain", action="store_true", help="SSIM as it is, without allowance for noise")
-    command.add_argument("--replicas", type=whole(1), metavar="N", help="draws of every ion; default: 4 to 16")
-    command.add_argument("--resamples", type=whole(0), default=200, metavar="N", help="for the errors; default: 200")
-    command.add_argument("--seed", type=whole(0), default=0, metavar="N", help="of the resamples; default: 0")
-    command.add_argument("--threads", type=whole(1), metavar="N", help="default: all processors")
-    command.add_argument("--quiet", action="store_true", help="no progress bar, no summary")
-    command.add_argument("--force", action="store_true", help="overwrite files that apt-evap did not make")
-    reading = add_reading_options(command)
-    reading.add_argument("--perturbation", metavar="P", help="of the ions of MEASURED where it is a run")
-    command.set_defaults(command=_compare)
-
-
-def _compare(options):
+def execute(options: argparse.Namespace) -> int:
+    """Run the command."""
     folder = check_path(options.output or f"{Path(options.file).stem}_study")
     _check_folder(folder, options.force)
     registration = None if options.registration is None else _registration(options.registration)
@@ -102,20 +51,15 @@ def _compare(options):
         **{name: getattr(options, name) for name in ("means", "rsds", "rollup_fractions") if getattr(options, name)},
     )
     _write(study, run, folder)
+    if study.registration.doubtful:
+        say("note", f"look at {folder / OVERLAY}; --registration gives a registration that is known")
     if not options.quiet:
-        print(repr(study).strip("<>"))
-        print(f"wrote {', '.join(FILES)} to {folder}")
+        put(repr(study).strip("<>"))
+        put(f"wrote {', '.join(FILES)} to {folder}")
     return 0
 
 
 # ---- what comes in -------------------------------------------------------------------------------------------------
-
-
-def _numbers(text):
-    try:
-        return tuple(float(part) for part in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"must be numbers with commas between, got {text!r}") from None
 
 
 def _registration(text):
@@ -134,27 +78,26 @@ def _registration(text):
         raise ValueError(f"--registration must be a .json file or ROTATION,SCALE,DX,DY[,mirror], got {text!r}")
     with open_for_reading(text) as file:
         try:
-            held = json.loads(file.read())
-            return Registration.from_dict(dict(held.get("registration", held)))
+            content = json.loads(file.read())
+            return Registration.from_dict(dict(content.get("registration", content)))
         except (ValueError, TypeError, AttributeError, KeyError) as error:
             raise FileError(f"{text!r} does not hold a registration: {error}") from error
 
 
 def _measured(options):
-    held = read(options)
-    if isinstance(held, Run):
+    content = read(options)
+    if isinstance(content, Run):
         if options.perturbation is None:
             raise ValueError(f"{options.file!r} is a run: say by --perturbation how its ions start")
-        return select(held.hits(read_perturbation(options.perturbation)), options)
+        return select(content.hits(read_perturbation(options.perturbation)), options)
     if options.perturbation is not None:
         raise ValueError(f"--perturbation is for a run as MEASURED, {options.file!r} holds measured ions")
-    if isinstance(held, DetectorMap):
-        return held
-    if held.x is None or held.y is None:
-        raise ValueError(
-            f"{options.file!r} has no detector coordinates x and y, which a map needs, only {', '.join(held.columns)}"
-        )
-    return select(held, options)
+    if isinstance(content, DetectorMap):
+        return content
+    check_columns(content, options)
+    chosen = select(content, options)
+    check_places(chosen, options)
+    return chosen
 
 
 # ---- what goes out -------------------------------------------------------------------------------------------------
@@ -212,5 +155,5 @@ FILES = {
     "ssim.csv": _write_table,
     "ssim.png": lambda study, run, path: plot.ssim_matrix(study)[0].figure.savefig(path),
     "maps.png": lambda study, run, path: plot.side_by_side(study)[0].figure.savefig(path),
-    "registration.png": _write_overlay,
+    OVERLAY: _write_overlay,
 }

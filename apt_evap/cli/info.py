@@ -1,46 +1,31 @@
 """`apt-evap info`: say what is in a file."""
 
+import argparse
 import json
-from typing import Any
 
 from apt_evap.analysis.description import UNITS, describe
 from apt_evap.cli._files import read, select, selects
-from apt_evap.cli._options import SHAPE, reading_options
+from apt_evap.cli._output import put
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.simulation.ending import Ending
 from apt_evap.simulation.run import Run
 
 
-def add_parser(commands: Any) -> None:
-    """Describe the command."""
-    command = commands.add_parser(
-        "info",
-        parents=[reading_options()],
-        help="say what is in a file",
-        description="Say what is in a run (of an unfinished one, give the folder), in a file of ions or a map.",
-        epilog="example: apt-evap info ni111.h5\n         apt-evap info R5083.epos --json | jq .columns.voltage",
-        **SHAPE,
-    )
-    command.add_argument(
-        "--json", action="store_true", help="as JSON, for programs; numbers are in the units that the text shows"
-    )
-    command.set_defaults(command=_info)
-
-
-def _info(options):
-    held = read(options)
+def execute(options: argparse.Namespace) -> int:
+    """Run the command."""
+    content = read(options)
     told = {"file": options.file}
-    if selects(options) and not isinstance(held, DetectorMap):
-        ions = held.hits(held.first_perturbation) if isinstance(held, Run) else held
-        told["selected_of"], held = len(ions), select(ions, options)
-    told |= describe(held)
-    if isinstance(held, Run) and held.ended == Ending.UNFINISHED:
-        told["kind"] = f"unfinished run of {len(held):,} ions"
+    if selects(options) and not isinstance(content, DetectorMap):
+        ions = content.hits(content.first_perturbation) if isinstance(content, Run) else content
+        told["selected_of"], content = len(ions), select(ions, options)
+    told |= describe(content)
+    if isinstance(content, Run) and content.ended == Ending.UNFINISHED:
+        told["kind"] = f"unfinished run of {len(content):,} ions"
         told["ended"] = "not yet: the command that began it, with --resume, goes on"
     if options.json:
-        print(json.dumps(told, indent=2, allow_nan=False))
+        put(json.dumps(told, indent=2, allow_nan=False))
     else:
-        print("\n".join(_lines(told)))
+        put("\n".join(_lines(told)))
     return 0
 
 

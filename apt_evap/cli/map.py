@@ -1,5 +1,6 @@
 """`apt-evap map`: draw detector maps of a run or of measured ions."""
 
+import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -7,69 +8,47 @@ from typing import Any
 
 import numpy as np
 
-from apt_evap.cli._files import check_output, is_picture, picture_path, read, save_picture, select, selects
-from apt_evap.cli._options import SHAPE, add_speech, reading_options, smoothing, tell, tell_json, whole
+from apt_evap.cli._files import (
+    check_columns,
+    check_output,
+    check_places,
+    is_picture,
+    picture_path,
+    read,
+    save_picture,
+    select,
+    selects,
+)
+from apt_evap.cli._output import tell, tell_json
 from apt_evap.config.map_panels import MapSettings, Panel, read_maps
 from apt_evap.config.perturbation_text import read_perturbation, title_of
-from apt_evap.detection.binning import MAX_BINS
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.perturbations import Unperturbed
 from apt_evap.simulation.run import Run
 
 
-def add_parser(commands: Any) -> None:
-    """Describe the command."""
-    command = commands.add_parser(
-        "map",
-        parents=[reading_options()],
-        help="draw detector maps of a run or of measured ions",
-        description="Draw detector maps of a run or of measured ions, or a map.",
-        epilog="example:\n"
-        "  apt-evap map R5083.epos --bins 128\n"
-        "  apt-evap map R5083.epos --ranges R5083.rrng --species Si --voltage 4000, --circle 15 -o silicon.png\n"
-        "  apt-evap map ni111.h5 --perturbation Unperturbed --perturbation RollUp:0.3,0.1 -o energies.png\n\n"
-        "a perturbation is NAME, NAME:NUMBERS or a TOML table:\n"
-        "  Unperturbed              RollUp:0.2 (eV, all ions)    RollUp:0.155,0.155 (mean, standard deviation)\n"
-        "  LateralVelocity:0.3,0.1  Combined:0.155,0.155,0.75 (the last number is the share of the roll-up)\n"
-        '  \'{name = "RollUp", energy = {name = "Thermal", temperature = 50}}\'',
-        **SHAPE,
-    )
-    command.add_argument("-o", "--output", metavar="MAP.png", help=".png, .pdf or .svg; default: FILE_map.png, here")
-    command.add_argument(
-        "--bins", type=whole(1, MAX_BINS), metavar="N", help="along the longer side; default: about sqrt(ions)"
-    )
-    command.add_argument("--smooth", type=smoothing, metavar="MM", help="sigma of a Gaussian; default: one bin")
-    command.add_argument(
-        "--perturbation", action="append", metavar="P", help="of the ions of a run; repeat it for maps side by side"
-    )
-    command.add_argument("--force", action="store_true", help="overwrite a file that apt-evap did not make")
-    add_speech(command)
-    command.set_defaults(command=_map)
-
-
-def _map(options):
+def execute(options: argparse.Namespace) -> int:
+    """Run the command."""
     picture = picture_path(options.output or f"{Path(options.file).stem}_map.png")
     check_output(picture, is_picture, options.force)
-    held = read(options)
-    if isinstance(held, Run):
-        maps = run_maps(held, _map_settings(held, options), lambda hits: select(hits, options))
+    content = read(options)
+    if isinstance(content, Run):
+        maps = run_maps(content, _map_settings(content, options), lambda hits: select(hits, options))
     elif options.perturbation:
-        what = "a map" if isinstance(held, DetectorMap) else "measured ions"
+        what = "a map" if isinstance(content, DetectorMap) else "measured ions"
         raise ValueError(f"--perturbation needs a run (.h5), {options.file!r} holds {what}")
-    elif isinstance(held, DetectorMap):
+    elif isinstance(content, DetectorMap):
         if options.bins is not None:
-            raise ValueError(f"--bins is for ions, {options.file!r} is a map: its bins are {_bins_of(held)}")
-        sigma = 0.0 if options.smooth is None and not held.is_counts else options.smooth
-        maps = [_smoothed(held, sigma)], [Path(options.file).name]
-    elif held.x is None or held.y is None:
-        raise ValueError(
-            f"{options.file!r} has no detector coordinates x and y, which a map needs, only {', '.join(held.columns)}"
-        )
+            raise ValueError(f"--bins is for ions, {options.file!r} is a map: its bins are {_bins_of(content)}")
+        sigma = 0.0 if options.smooth is None and not content.is_counts else options.smooth
+        maps = [_smoothed(content, sigma)], [Path(options.file).name]
     else:
-        chosen = select(held, options)
+        check_columns(content, options)
+        chosen = select(content, options)
+        check_places(chosen, options)
         drawn = chosen.map(options.bins or _bins_for(np.count_nonzero(chosen.detected)))
-        part = f", {len(chosen):,} of {len(held):,} ions" if selects(options) else ""
+        part = f", {len(chosen):,} of {len(content):,} ions" if selects(options) else ""
         maps = [_smoothed(drawn, options.smooth)], [f"{Path(options.file).name}{part}"]
     save_picture(picture, *maps)
     tell(options, f"wrote {picture}")
@@ -98,7 +77,10 @@ def _map_settings(run, options):
     if options.bins is not None:
         # what was a good smoothing for other bins is not for these
         settings = replace(settings, bins=options.bins, smoothing=None)
-    return settings if options.smooth is None else replace(settings, smoothing=options.smooth)
+    if options.smooth is not None:
+        settings = replace(settings, smoothing=options.smooth)
+    settings.check_detector(run.detector)
+    return settings
 
 
 def run_maps(

@@ -1,13 +1,13 @@
 """`apt-evap run`: simulate what a TOML file describes."""
 
+import argparse
 import sys
 import time
 from dataclasses import replace
-from typing import Any
 
 from apt_evap._common.files import FileError, check_path
 from apt_evap.cli._files import check_output, is_picture, picture_path, save_picture
-from apt_evap.cli._options import INTERRUPTED, SHAPE, add_speech, minutes, say, tell, tell_json, whole
+from apt_evap.cli._output import INTERRUPTED, say, tell, tell_json
 from apt_evap.cli.map import described, run_maps
 from apt_evap.config.simulation_file import read_config
 from apt_evap.simulation.checkpoint import Checkpoint
@@ -18,37 +18,8 @@ SECONDS_BETWEEN_LINES = 60.0
 _GO_ON = "the same command with --resume goes on"
 
 
-def add_parser(commands: Any) -> None:
-    """Describe the command."""
-    command = commands.add_parser(
-        "run",
-        help="simulate what a TOML file describes",
-        description="Simulate what a TOML file describes, save the run and draw its detector maps.\n"
-        "Ctrl-C or SIGTERM ends the simulation and saves what is done. While it goes on it is kept in\n"
-        "RUN.h5.unfinished; killed, it goes on from there with --resume, and gives the same bits as if it had not.\n"
-        "Behind the bar: charges, how far from settled they are (RMS over their mean); shares of the last ions that\n"
-        "missed, never left, or are marked, as their responses are inexact. Without a terminal: a line a minute.",
-        epilog="example: apt-evap run examples/ni111.toml -o ni.h5 --ions 5000",
-        **SHAPE,
-    )
-    command.add_argument("config", metavar="CONFIG.toml")
-    command.add_argument("-o", "--output", metavar="RUN.h5", help="default: output of the file, or its name with .h5")
-    command.add_argument("--ions", type=whole(1), metavar="N", help="atoms to evaporate, instead of those of the file")
-    command.add_argument("--threads", type=whole(1), metavar="N", help="default: all processors")
-    command.add_argument("--seed", type=whole(0), metavar="N", help="instead of that of the file")
-    command.add_argument("--map", metavar="MAP.png", help="picture of the maps; default: beside the run")
-    command.add_argument("--resume", action="store_true", help="go on with an unfinished run, or make one longer")
-    command.add_argument(
-        "--checkpoint", type=minutes, default=10.0, metavar="MINUTES", help="time between two checkpoints; default: 10"
-    )
-    add_speech(command)
-    command.add_argument(
-        "--force", action="store_true", help="overwrite unfinished and other runs, and files that apt-evap did not make"
-    )
-    command.set_defaults(command=_run)
-
-
-def _run(options):
+def execute(options: argparse.Namespace) -> int:
+    """Run the command."""
     config = read_config(options.config)
     output = check_path(options.output or config.output or f"{config.path.stem}.h5")
     if output.suffix.lower() != ".h5":
@@ -68,24 +39,7 @@ def _run(options):
     done = checkpoint.ions_there() if options.resume else 0
     if 0 < done < n_ions:
         tell(options, f"resumed at {done:,} of {n_ions:,} ions")
-    lines = not options.quiet and not sys.stderr.isatty()
-    try:
-        run = simulation.run(
-            n_ions,
-            config.emissions,
-            responses=config.responses,
-            progress=False if options.quiet else _Lines() if lines else None,
-            checkpoint=checkpoint,
-        )
-    except KeyboardInterrupt:
-        if ions := checkpoint.ions_there():
-            where = checkpoint.folder if checkpoint.folder.exists() else output
-            say("note", f"{ions:,} of {n_ions:,} ions are in {str(where)!r}; {_GO_ON}")
-        raise
-    except RunInterrupted as error:
-        replace(error.run, provenance=error.run.provenance | provenance).save(output)
-        say("note", f"the {len(error.run):,} ions done so far are in {str(output)!r}")
-        raise
+    run = _simulate(options, config, simulation, checkpoint, n_ions, provenance)
     seconds = time.perf_counter() - began
     if done == n_ions and not unfinished:
         tell(options, f"{output} is complete: nothing to do")
@@ -95,6 +49,43 @@ def _run(options):
     run.save(output)
     new = "" if not done else f", {len(run) - done:,} of them new,"
     tell(options, f"{len(run):,} ions{new} in {seconds:.1f} s, {(len(run) - done) / seconds:,.0f} ions/s")
+    _tell_outcomes(options, config, run, output, n_ions)
+    tell(options, f"{'replaced' if replaced and not options.resume else 'wrote'} {output}")
+    try:
+        maps = run_maps(run, config.maps)
+        save_picture(picture, *maps)
+    except ValueError as error:
+        raise ValueError(f"no maps are drawn, the run is in {str(output)!r}: {error}") from error
+    tell(options, f"wrote {picture}")
+    written = {"wrote": str(output), "picture": str(picture), "maps": described(*maps)}
+    tell_json(options, {**written, **_counts(run, seconds)})
+    return INTERRUPTED if run.ended == Ending.INTERRUPTED else 0
+
+
+def _simulate(options, config, simulation, checkpoint, n_ions, provenance):
+    """Run the simulation; say where its ions are if that ends in an interrupt or an error."""
+    lines = not options.quiet and not sys.stderr.isatty()
+    try:
+        return simulation.run(
+            n_ions,
+            config.emissions,
+            responses=config.responses,
+            progress=False if options.quiet else _Lines() if lines else None,
+            checkpoint=checkpoint,
+        )
+    except KeyboardInterrupt:
+        if ions := checkpoint.ions_there():
+            where = checkpoint.folder if checkpoint.folder.exists() else checkpoint.path
+            say("note", f"{ions:,} of {n_ions:,} ions are in {str(where)!r}; {_GO_ON}")
+        raise
+    except RunInterrupted as error:
+        replace(error.run, provenance=error.run.provenance | provenance).save(checkpoint.path)
+        say("note", f"the {len(error.run):,} ions done so far are in {str(checkpoint.path)!r}")
+        raise
+
+
+def _tell_outcomes(options, config, run, output, n_ions):
+    """Say how many ions hit the detector, and what is not as it was planned."""
     most_missed = []
     for panel in config.maps.panels:
         hit, missed, never_left = run.hits(panel.perturbation).counts.values()
@@ -114,16 +105,6 @@ def _run(options):
         say("note", f"interrupted; {len(run):,} of {n_ions:,} ions are in {str(output)!r}; {_GO_ON}")
     elif run.ended:
         say("note", f"the run ended before its time: {run.ended}; the {len(run):,} ions so far are kept")
-    tell(options, f"{'replaced' if replaced and not options.resume else 'wrote'} {output}")
-    try:
-        maps = run_maps(run, config.maps)
-        save_picture(picture, *maps)
-    except ValueError as error:
-        raise ValueError(f"no maps are drawn, the run is in {str(output)!r}: {error}") from error
-    tell(options, f"wrote {picture}")
-    written = {"wrote": str(output), "picture": str(picture), "maps": described(*maps)}
-    tell_json(options, {**written, **_counts(run, seconds)})
-    return INTERRUPTED if run.ended == Ending.INTERRUPTED else 0
 
 
 def _counts(run, seconds):

@@ -4,20 +4,39 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from apt_evap._common.validation import check_count, check_number, shown
+from apt_evap._common.validation import check_count, check_kind, check_number, check_sequence, shown
 from apt_evap.config.perturbation_text import read_perturbation, title_of
 from apt_evap.config.tables import check_keys, check_table
-from apt_evap.detection.binning import MAX_BINS
+from apt_evap.detection.detector import Detector
+from apt_evap.detection.limits import MAX_BINS
 from apt_evap.emission.energies import TruncatedNormal
 from apt_evap.emission.perturbations import Perturbation, RollUp, Unperturbed, to_dict
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One map of a picture: the perturbation of its ions, and the title above it."""
+    """One map of a picture.
+
+    Parameters
+    ----------
+    title : str
+        Title above it.
+    perturbation : perturbation
+        Of its ions.
+
+    Raises
+    ------
+    ValueError
+        If the title is not printable text, or the perturbation is none.
+    """
 
     title: str
     perturbation: Perturbation
+
+    def __post_init__(self):
+        check_kind(self.perturbation, "perturbation", "launch", "a perturbation with a method launch")
+        if not isinstance(self.title, str) or not all(part.isprintable() for part in self.title.split("\n")):
+            raise ValueError(f"title must be printable text, got {shown(self.title)}")
 
 
 @dataclass(frozen=True)
@@ -32,11 +51,34 @@ class MapSettings:
         Bins along the longer side.
     smoothing : float, optional
         Standard deviation of the Gaussian that smooths the maps [mm].
+
+    Raises
+    ------
+    ValueError
+        If there is no panel, or a number is out of its range.
     """
 
-    panels: tuple
+    panels: tuple[Panel, ...]
     bins: int | None = None
     smoothing: float | None = None
+
+    def __post_init__(self):
+        panels = check_sequence(self.panels, "panels", "Panels")
+        if not panels:
+            raise ValueError("panels must hold at least one Panel, got none")
+        for panel in panels:
+            check_kind(panel, "panels", Panel, "Panels")
+        object.__setattr__(self, "panels", panels)
+        if self.bins is not None:
+            object.__setattr__(self, "bins", check_count(self.bins, "bins", at_least=1, at_most=MAX_BINS))
+        if self.smoothing is not None:
+            object.__setattr__(self, "smoothing", check_number(self.smoothing, "smoothing", at_least=0, unit="mm"))
+
+    def check_detector(self, detector: Detector) -> None:
+        """Refuse a smoothing broader than the detector (ValueError), before anything is simulated."""
+        if self.smoothing is not None:
+            why = "the width of the detector"
+            check_number(self.smoothing, "smoothing", at_most=detector.width, unit="mm", why=why)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the settings in plain types, as the table [maps] of a TOML file has them."""
@@ -65,10 +107,6 @@ def read_maps(table: Mapping[str, Any]) -> MapSettings:
     """
     check_keys(table, ("panels", "bins", "smoothing"))
     bins, smoothing = table.get("bins"), table.get("smoothing")
-    if bins is not None:
-        bins = check_count(bins, "bins", at_least=1, at_most=MAX_BINS)
-    if smoothing is not None:
-        smoothing = check_number(smoothing, "smoothing", at_least=0, unit="mm")
     if table.get("panels") is None:
         usual = (Unperturbed(), RollUp(TruncatedNormal(0.155, 0.155)))
         return MapSettings(tuple(Panel(title_of(each), each) for each in usual), bins, smoothing)
@@ -80,10 +118,7 @@ def read_maps(table: Mapping[str, Any]) -> MapSettings:
             check_table(entry, "it")
             check_keys(entry, ("title", "perturbation"), ("perturbation",))
             perturbation = read_perturbation(entry["perturbation"])
-            title = entry.get("title", title_of(perturbation))
-            if not isinstance(title, str):
-                raise ValueError(f"title must be text, got {shown(title)}")
+            panels.append(Panel(entry.get("title", title_of(perturbation)), perturbation))
         except ValueError as error:
             raise ValueError(f"panel {number}: {error}") from error
-        panels.append(Panel(title, perturbation))
     return MapSettings(tuple(panels), bins, smoothing)

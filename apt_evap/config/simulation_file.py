@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 from apt_evap._common.files import FileError, open_for_reading
-from apt_evap._common.validation import check_count, check_number, check_seed, shown
+from apt_evap._common.validation import check_count, check_kind, check_number, check_seed, check_switch, shown
 from apt_evap.config.map_panels import MapSettings, read_maps
 from apt_evap.config.tables import check_keys, check_table
 from apt_evap.detection.detector import Detector
@@ -24,6 +24,16 @@ from apt_evap.simulation.simulation import Simulation
 from apt_evap.specimen.materials import MATERIALS, Material, material
 from apt_evap.specimen.tip import Tip
 
+_KINDS = {
+    "path": Path,
+    "tip": Mapping,
+    "detector": Detector,
+    "charge_settings": ChargeSettings,
+    "flight_settings": FlightSettings,
+    "response_settings": ResponseSettings,
+    "watch_settings": WatchSettings,
+    "maps": MapSettings,
+}
 _LENGTH = re.compile(r"\s*(\S+?)\s*(a|nm)\s*")
 
 
@@ -55,6 +65,11 @@ class Config:
         Maps to draw of the run.
     output : str or None
         Where the run goes.
+
+    Raises
+    ------
+    ValueError
+        If a field is of the wrong kind or out of its range, or the maps do not fit the detector.
     """
 
     path: Path
@@ -70,6 +85,17 @@ class Config:
     watch_settings: WatchSettings
     maps: MapSettings
     output: str | None
+
+    def __post_init__(self):
+        for name, kind in _KINDS.items():
+            check_kind(getattr(self, name), name, kind, f"of type {kind.__name__}")
+        check_count(self.n_ions, "n_ions", at_least=1)
+        check_switch(self.responses, "responses")
+        check_voltage(self.voltage)
+        check_seed(self.seed)
+        if self.output is not None and not (isinstance(self.output, str) and self.output):
+            raise ValueError(f"output must be a file name such as 'run.h5', got {shown(self.output)}")
+        self.maps.check_detector(self.detector)
 
     def __repr__(self) -> str:
         host, radius = self.tip["material"].name, self.tip["apex_radius"]
@@ -184,6 +210,7 @@ def read_config(path: str | Path) -> Config:
             made.append(kind(**document.get(name, {})))
     with _place(path, "maps"):
         maps = read_maps(document.get("maps", {}))
+        maps.check_detector(made[0])  # type: ignore[arg-type]
     return Config(path, tip, n_ions, responses, voltage, seed, *made, maps, output)  # type: ignore[arg-type, call-arg]
 
 

@@ -7,9 +7,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_number, check_sequence, check_switch, shown
@@ -237,7 +236,7 @@ def _fit(normals, places, lines, projection, free, mirror):
         rotation = _aligned(normals, places, lines, start)
 
         def misfit(unknowns, rotation=rotation, scale=scale):
-            turned = (Rotation.from_rotvec(unknowns[:3]) * rotation).as_matrix()
+            turned = (scipy.spatial.transform.Rotation.from_rotvec(unknowns[:3]) * rotation).as_matrix()
             trial = Projection(scale * math.exp(unknowns[3]) if free else scale, projection.centre, mirror)
             # on the sphere, times the scale: finite for any rotation
             measured, expected = trial.directions(places), normals @ turned.T
@@ -245,7 +244,9 @@ def _fit(normals, places, lines, projection, free, mirror):
             parts += [np.arcsin(trial.directions(points) @ (turned @ zone)) for zone, _, points in lines]
             return trial.scale * np.concatenate(parts)
 
-        fit = least_squares(misfit, np.zeros(4 if free else 3), x_scale=0.1, xtol=1e-12, ftol=1e-12, gtol=1e-12)
+        fit = scipy.optimize.least_squares(
+            misfit, np.zeros(4 if free else 3), x_scale=0.1, xtol=1e-12, ftol=1e-12, gtol=1e-12
+        )
         fitted_scale = scale * math.exp(fit.x[3]) if free else scale
         tries.append((fit.cost, fitted_scale, rotation, fit))
     reach = np.linalg.norm(places - projection.centre, axis=1).max()
@@ -255,7 +256,7 @@ def _fit(normals, places, lines, projection, free, mirror):
     _, scale, rotation, fit = max(
         (each for each in tries if each[0] <= 1.001 * least + 1e-12), key=lambda each: each[1]
     )
-    matrix = (Rotation.from_rotvec(fit.x[:3]) * rotation).as_matrix()
+    matrix = (scipy.spatial.transform.Rotation.from_rotvec(fit.x[:3]) * rotation).as_matrix()
     surplus = len(fit.fun) - len(fit.x) - len(places)  # of the three offsets of a pole two are independent
     errors = [math.nan, math.nan]
     if surplus > 0:
@@ -293,4 +294,4 @@ def _aligned(normals, places, lines, projection):
         specimen.append(there)
         crystal.append(np.cos(angle)[:, None] * normals[0] + np.sin(angle)[:, None] * tangent)
     specimen, crystal = np.concatenate(specimen), np.concatenate(crystal)
-    return Rotation.align_vectors(specimen, crystal)[0]
+    return scipy.spatial.transform.Rotation.align_vectors(specimen, crystal)[0]

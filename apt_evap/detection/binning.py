@@ -3,15 +3,14 @@
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import ndimage
+import scipy
 
 from apt_evap._common.types import Booleans, Floats, Integers
 from apt_evap._common.validation import check_array, check_count, check_number, shown
+from apt_evap.detection.limits import MAX_BINS
 
 _CHUNK = 1 << 16
 
-
-MAX_BINS = 16384  # along a side: 2 GB of counts
 MAX_BY_CHANCE = 32  # so few different values may lie on a comb by chance: eight of a normal distribution did
 
 
@@ -229,12 +228,12 @@ def field_of_view(counts: Integers) -> Booleans:
     share = len(occupied) / counts.size
     side = int(np.ceil(np.sqrt(20 / (occupied.mean() * max(share, 0.2)))))
     side = min(side | 1, max(1, min(counts.shape) // 8 | 1))
-    smooth = ndimage.uniform_filter(counts.astype(float), side, mode="constant")
+    smooth = scipy.ndimage.uniform_filter(counts.astype(float), side, mode="constant")
     region = smooth > 0.1 * np.median(smooth[smooth > 0])
-    labels, number = ndimage.label(region)
+    labels, number = scipy.ndimage.label(region)
     if number > 1:
-        region = labels == 1 + np.argmax(ndimage.sum_labels(counts, labels, np.arange(1, number + 1)))
-    region &= ndimage.uniform_filter((counts > 0).astype(float), side, mode="constant") > 0
+        region = labels == 1 + np.argmax(scipy.ndimage.sum_labels(counts, labels, np.arange(1, number + 1)))
+    region &= scipy.ndimage.uniform_filter((counts > 0).astype(float), side, mode="constant") > 0
     if min(np.ptp(axis) for axis in np.nonzero(region)) == 0:
         return region
     return convex_hull(region)

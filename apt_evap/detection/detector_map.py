@@ -6,11 +6,12 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy import ndimage
 
 from apt_evap._common.types import Booleans, Floats, Integers
 from apt_evap._common.validation import check_array, check_kind, check_number, check_seed, check_switch
+from apt_evap._common.warnings import MapWarning
 from apt_evap.detection.binning import bin_edges, count, field_of_view, find_combs
 
 if TYPE_CHECKING:
@@ -127,6 +128,7 @@ class DetectorMap:
                 warnings.warn(
                     "hits on a comb are binned on the edges of another map and may show stripes; dither_seed "
                     "prevents them",
+                    MapWarning,
                     stacklevel=2,
                 )
         else:
@@ -327,7 +329,7 @@ def blurred(values: Floats, mask: Booleans, sigmas: ArrayLike) -> Floats:
 
 def gaussian(values: Floats, sigmas: ArrayLike, truncate: float = 4.0) -> Floats:
     """Gaussian filter of maps of shape (..., ny, nx), with nothing beyond their ends; lengths as for `blurred`."""
-    return ndimage.gaussian_filter(values, sigmas, mode="constant", truncate=truncate, axes=(-2, -1))
+    return scipy.ndimage.gaussian_filter(values, sigmas, mode="constant", truncate=truncate, axes=(-2, -1))
 
 
 def _check_edges(edges, name, bins):

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from apt_evap._common.types import Integers
 from apt_evap._common.validation import check_array, check_kind, check_sequence, did_you_mean, shown
+from apt_evap._common.warnings import DataWarning
 from apt_evap.detection.hits import Hits
 
 
@@ -175,6 +176,7 @@ class Ranges:
             warnings.warn(
                 f"{self.source or 'Ranges'}: {len(pairs)} ranges overlap another, the first in the file wins: "
                 f"{self._text(first)} over {self._text(second)}" + (", ..." if len(pairs) > 1 else ""),
+                DataWarning,
                 stacklevel=4,
             )
 

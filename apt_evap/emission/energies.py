@@ -6,8 +6,8 @@ from numbers import Real
 from typing import Any, Protocol
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.special import log_ndtr, ndtr, ndtri
 
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_number, shown
@@ -54,9 +54,11 @@ class TruncatedNormal:
         """Energy [eV] below which the fraction `u` (in (0, 1), any shape) of the distribution lies."""
         u = np.asarray(u, dtype=np.float64)
         ratio = self.mean / self.standard_deviation
-        lower = ndtr(-ratio) + u * ndtr(ratio)
+        special = scipy.special
+        lower = special.ndtr(-ratio) + u * special.ndtr(ratio)
         # the tail that is the smaller one keeps all its digits
-        deviate = np.where(lower < 0.5, ndtri(np.minimum(lower, 0.5)), -ndtri((1 - u) * ndtr(ratio)))
+        upper = -special.ndtri((1 - u) * special.ndtr(ratio))
+        deviate = np.where(lower < 0.5, special.ndtri(np.minimum(lower, 0.5)), upper)
         return np.maximum(self.mean + self.standard_deviation * deviate, np.finfo(np.float64).tiny)
 
     @property
@@ -73,7 +75,7 @@ class TruncatedNormal:
 
     def _hazard(self):
         ratio = self.mean / self.standard_deviation
-        return math.exp(-0.5 * ratio * ratio - log_ndtr(ratio)) / math.sqrt(2 * math.pi)
+        return math.exp(-0.5 * ratio * ratio - scipy.special.log_ndtr(ratio)) / math.sqrt(2 * math.pi)
 
 
 @dataclass(frozen=True)

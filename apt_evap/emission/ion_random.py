@@ -1,8 +1,8 @@
 """Random numbers keyed by seed and ion: the same for an ion whatever the batch or the threads."""
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.special import ndtri
 
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_count, check_seed
@@ -62,4 +62,4 @@ class IonRandom:
 
     def normal(self, columns: int = 1) -> Floats:
         """Return the next normal numbers of mean 0 and variance 1, shape (n, columns)."""
-        return ndtri(self.uniform(columns))
+        return scipy.special.ndtri(self.uniform(columns))

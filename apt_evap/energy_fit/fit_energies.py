@@ -9,16 +9,18 @@ import numpy as np
 
 from apt_evap._common.threads import thread_count
 from apt_evap._common.validation import check_count, check_kind
+from apt_evap._common.warnings import MapWarning, RegistrationWarning, ResponseWarning
 from apt_evap.analysis.similarity import WINDOW
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.energies import Thermal
 from apt_evap.emission.perturbations import LateralVelocity, Unperturbed
-from apt_evap.energy_fit.grid import MEANS, RSDS, EnergyGrid, maxima
+from apt_evap.energy_fit.defaults import MEANS, RSDS
+from apt_evap.energy_fit.grid import EnergyGrid, maxima
 from apt_evap.energy_fit.search import EnergySearch, registered
 from apt_evap.energy_fit.settings import StudySettings
 from apt_evap.energy_fit.study import Score, Study, plain
-from apt_evap.registration.register import DoubtfulRegistration, Registration
+from apt_evap.registration.register import Registration
 from apt_evap.simulation.run import Run
 
 BINS = 128
@@ -149,10 +151,10 @@ def fit_energies(
     search = EnergySearch(run, measured, grid, settings, thread_count(n_threads), progress)
     with warnings.catch_warnings():
         # for every energy anew; what it says is in the settings
-        warnings.filterwarnings("ignore", message=".*launch above the")
+        warnings.simplefilter("ignore", ResponseWarning)
         rounds: list[Any] = []
         if registration is None:
-            warnings.simplefilter("ignore", DoubtfulRegistration)  # once, of the last
+            warnings.simplefilter("ignore", RegistrationWarning)  # once, of the last
             registration, rounds = registered(search)
         search.place(registration, settings.resamples)
         values = search.matrix(replicas, "energies")
@@ -173,6 +175,7 @@ def fit_energies(
         warnings.warn(
             f"the run has {density:.2g} ions in a bin that is compared, {FEWEST_IONS:g} or more are needed for a map: "
             f"give fewer bins than {max(measured.values.shape)}, or simulate more ions",
+            MapWarning,
             stacklevel=2,
         )
     resampled = values[1:]

@@ -5,23 +5,15 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.interpolate import make_interp_spline
-from scipy.special import ndtr
 
 from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_array, check_choice
 from apt_evap.emission.energies import TruncatedNormal
 from apt_evap.emission.perturbations import Combined, LateralVelocity, Perturbation, RollUp
+from apt_evap.energy_fit.defaults import MEANS, MECHANISMS, ROLLUP_FRACTIONS, RSDS
 
-MEANS = (0.01, 0.0825, 0.155, 0.2275, 0.3, 0.3725)
-"""Means of the paper's grid [eV]: from 0.01 to 0.3725 in even steps."""
-RSDS = (0.01, 0.0316, 0.1, 0.316, 1.0, 3.16)
-"""Relative standard deviations of the paper's grid: from 0.01 to 3.16, two per decade."""
-ROLLUP_FRACTIONS = (0.0, 0.25, 0.5, 0.75, 1.0)
-"""Shares of the roll-up in the energy, of the paper's grid."""
-
-MECHANISMS = ("roll-up", "lateral", "combined")
 _HALVES = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
 _FINE = np.linspace(-1.0, 1.0, 41)
 
@@ -113,7 +105,7 @@ class EnergyGrid:
     def share_above(self, energy: float) -> Floats:
         """Share of the ions with more than an energy [eV] at every point of the grid, shape `shape`."""
         means, rsds = np.array(self.means), np.array(self.rsds)[:, None]
-        share = ndtr((means - energy) / (rsds * means)) / ndtr(1 / rsds)
+        share = scipy.special.ndtr((means - energy) / (rsds * means)) / scipy.special.ndtr(1 / rsds)
         return np.broadcast_to(share, self.shape)
 
     def around(self, cell: tuple[int, ...]) -> list[Floats]:
@@ -155,7 +147,7 @@ def spline_maxima(places: list[Floats], values: Floats) -> Floats:
     ndarray
         Places of the k maxima, shape (k, 3).
     """
-    spline, fine = make_interp_spline(_HALVES, np.eye(5))(_FINE), []
+    spline, fine = scipy.interpolate.make_interp_spline(_HALVES, np.eye(5))(_FINE), []
     for axis, along in enumerate(places):
         fine.append(along if len(along) == 1 else along[2] + _FINE)
         if len(along) > 1:

@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy import sparse
+import scipy
 
 from apt_evap._common.types import Floats
 from apt_evap.detection.detector_map import DetectorMap
@@ -97,7 +97,7 @@ class Sampler:
         if not self.resamples:
             return np.bincount(cells, minlength=size).reshape(1, *self.shape).astype(float), noise
         ones = np.ones(len(cells), np.float32)
-        table = sparse.coo_array((ones, (cells, self._groups[ions])), (size, len(self._weights))).tocsr()
+        table = scipy.sparse.coo_array((ones, (cells, self._groups[ions])), (size, len(self._weights))).tocsr()
         return (table @ self._weights).T.reshape(-1, *self.shape).astype(float), noise
 
     def _cells(self, perturbation, replica):

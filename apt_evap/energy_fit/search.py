@@ -6,10 +6,10 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy import optimize
-from tqdm.auto import tqdm
 
+from apt_evap._common.progress import progress_bar
 from apt_evap._common.types import Floats
 from apt_evap.detection.binning import field_of_view
 from apt_evap.detection.detector_map import DetectorMap
@@ -100,8 +100,8 @@ class EnergySearch:
 
         simplex = np.vstack([np.zeros(4), np.eye(4)])
         options = {"initial_simplex": simplex, "xatol": 0.01, "fatol": 1e-5, "maxfev": 200}
-        bounds = optimize.Bounds(np.full(4, -4.0), np.full(4, 4.0))
-        best = optimize.minimize(unlike, simplex[0], method="Nelder-Mead", bounds=bounds, options=options)
+        bounds = scipy.optimize.Bounds(np.full(4, -4.0), np.full(4, 4.0))
+        best = scipy.optimize.minimize(unlike, simplex[0], method="Nelder-Mead", bounds=bounds, options=options)
         return moved(best.x)
 
     def scores(self, perturbation: Any, replicas: int) -> Floats:
@@ -114,7 +114,7 @@ class EnergySearch:
         tried = [self.perturbation(index) for index in product(*places)]
         with (
             ThreadPoolExecutor(self.n_threads) as pool,
-            tqdm(total=len(tried), unit=" maps", desc=note, disable=self.disable) as bar,
+            progress_bar(total=len(tried), unit=" maps", desc=note, disable=self.disable) as bar,
         ):
 
             def scores(perturbation):

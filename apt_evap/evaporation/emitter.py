@@ -13,6 +13,7 @@ from apt_evap._common.describe import describe
 from apt_evap._common.threads import thread_count
 from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_array, check_count, check_kind, check_number
+from apt_evap._common.warnings import ChargesWarning
 from apt_evap._core.evaporation import DONE, EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, Evaporation, Start
 from apt_evap._core.journal import Journal
 from apt_evap._core.neighbourhood import Neighbourhood
@@ -189,7 +190,7 @@ class Emitter:
     @property
     def bonds(self) -> Integers:
         """Nearest neighbours of the surface atoms that are still there, shape (n,)."""
-        return self._core.atoms.bond_counts[self.atoms]
+        return self._core.atoms.bond_counts[self.atoms].astype(np.int64)
 
     def to_atoms(self) -> Any:
         """Return the surface as ase.Atoms [Angstrom]; needs ASE.
@@ -270,8 +271,9 @@ class Emitter:
         self._recorded = RECORD
         if not outcome[1] < tolerance:
             warnings.warn(
-                f"the charges had not settled after {outcome[0]} sweeps: the last one changed one by {outcome[1]:.1g} "
-                f"of the mean charge, expected {tolerance:.1g}",
+                f"charges did not converge in {outcome[0]} sweeps: largest relative change {outcome[1]:.1g} "
+                f"(tolerance {tolerance:.1g})",
+                ChargesWarning,
                 stacklevel=3,
             )
         return outcome

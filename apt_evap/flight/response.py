@@ -238,7 +238,8 @@ class ResponseModel:
             coefficients.append(fitted)
             # a small change of the stereographic direction is half as large on a plane at unit distance
             residuals.append(2.0 * self.detector.distance * residual)
-        return Responses(*coefficients, np.stack(residuals, axis=1).astype(np.float32))
+        site, rolled = coefficients
+        return Responses(site, rolled, np.stack(residuals, axis=1).astype(np.float32))
 
     def evaluate(
         self, responses: Responses, rolled: Booleans, first: Floats, second: Floats, masses: Floats

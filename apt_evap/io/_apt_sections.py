@@ -10,6 +10,8 @@ import numpy as np
 
 from apt_evap._common.files import FileError, TruncatedFile
 from apt_evap._common.types import AnyPath
+from apt_evap._common.warnings import DataWarning
+from apt_evap._common.wording import argument
 
 SIGNATURE = b"APT\0"
 _SECTION = b"SEC\0"
@@ -70,7 +72,7 @@ def read_sections(file: BinaryIO, path: AnyPath, partial: bool) -> tuple[int, li
     if header_size < _HEADER_SIZE:
         raise FileError(f"{str(path)!r} has a header size of {header_size}, expected at least {_HEADER_SIZE}")
     if version != 2:
-        warnings.warn(f"{str(path)!r} is of version {version} of .apt, read as version 2", stacklevel=6)
+        warnings.warn(f"{str(path)!r} is of version {version} of .apt, read as version 2", DataWarning, stacklevel=6)
     if n == 0:
         raise FileError(f"{str(path)!r} says that it holds 0 ions, expected at least 1")
 
@@ -88,8 +90,10 @@ def read_sections(file: BinaryIO, path: AnyPath, partial: bool) -> tuple[int, li
             problem = f"{str(path)!r} ends in its section {name!r}, which begins at byte {at}: {size} bytes"
             problem += f" of {end}" if name else ""
             if not partial:
-                raise TruncatedFile(f"{problem}; partial=True reads the {len(sections)} whole sections before it")
-            warnings.warn(f"{problem}; only the {len(sections)} sections before it are read", stacklevel=6)
+                raise TruncatedFile(
+                    f"{problem}; {argument('partial', True)} reads the {len(sections)} whole sections before it"
+                )
+            warnings.warn(f"{problem}; only the {len(sections)} sections before it are read", DataWarning, stacklevel=6)
             break
         if section:
             sections.append(section)
@@ -126,7 +130,7 @@ def _section(head, at, n, size, path):
     else:
         dtype, values = np.dtype(f"<{_KINDS[kind]}{bits // 8}"), record_size // (bits // 8)
     if problem:
-        warnings.warn(f"{where} left out, it has {problem}", stacklevel=7)
+        warnings.warn(f"{where} left out, it has {problem}", DataWarning, stacklevel=7)
         return None, end
     if records != n:
         raise FileError(f"{where} holds {records} records, expected one for each of the {n} ions")
@@ -160,7 +164,9 @@ def _distinct(sections, path):
             count += 1
             name = f"{section.name} ({count})"
         if count > 1:
-            warnings.warn(f"{str(path)!r}: a further section {section.name!r} is called {name!r}", stacklevel=7)
+            warnings.warn(
+                f"{str(path)!r}: a further section {section.name!r} is called {name!r}", DataWarning, stacklevel=7
+            )
         seen.add(name)
         distinct.append(replace(section, name=name))
     return distinct

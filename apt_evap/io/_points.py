@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apt_evap._common.types import AnyPath, Booleans, Floats
+from apt_evap._common.warnings import DataWarning
 from apt_evap.detection.hits import Hits
 
 _NAMES = {"x": "detector_x", "y": "detector_y"}
@@ -44,7 +45,7 @@ def points_and_data(path: AnyPath, hits: Hits) -> tuple[Booleans | slice, Floats
     if left == len(hits):
         raise ValueError(f"nothing to write to {str(path)!r}: {reason}")
     if left:
-        warnings.warn(f"{str(path)!r} leaves out what has no place: {reason}", stacklevel=4)
+        warnings.warn(f"{str(path)!r} leaves out what has no place: {reason}", DataWarning, stacklevel=4)
     chosen = finite if left else slice(None)
     data = {_NAMES.get(name, name): getattr(hits, name) for name in hits.columns if name != "positions"}
     for name, values in hits.extra.items():

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from apt_evap._common.files import FileError, TruncatedFile, open_for_reading, replace_file
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_choice, check_switch, shown
+from apt_evap._common.warnings import DataWarning
+from apt_evap._common.wording import argument
 from apt_evap.detection.hits import Hits, Outcome
 
 _CHUNK = 1 << 14
@@ -271,7 +273,9 @@ def choose(path: AnyPath, hits: Hits, columns: Any) -> Any:
         raise ValueError(f"nothing to write to {str(path)!r}: of {len(hits):,} ions {reasons}")
     if missed + broken == 0:
         return slice(None)
-    warnings.warn(f"{str(path)!r} leaves out {missed + broken:,} of {len(hits):,} ions: {reasons}", stacklevel=4)
+    warnings.warn(
+        f"{str(path)!r} leaves out {missed + broken:,} of {len(hits):,} ions: {reasons}", DataWarning, stacklevel=4
+    )
     return hit & finite
 
 
@@ -307,11 +311,13 @@ def write_words(path: AnyPath, columns: Any, row_size: int, chosen: Any) -> None
 
 def _wrong_size(path, size, row_size, kind, rival):
     n, tail = divmod(size, row_size)
-    advice = "partial=True reads the whole ones"
+    advice = f"{argument('partial', True)} reads the whole ones"
     if rival and size % rival[1] == 0:
         # a copy cut at a block of the disk has a size that fits a .pos, too
         kind_too = rival[0].split()[-1]
-        advice += f"; or it is probably {rival[0]}, whose {rival[1]} bytes fit (format={kind_too!r} reads it so)"
+        advice += (
+            f"; or it is probably {rival[0]}, whose {rival[1]} bytes fit ({argument('format', kind_too)} reads it so)"
+        )
     return TruncatedFile(
         f"{str(path)!r} ends in the middle of an ion: {n} whole ions of {row_size} bytes as in {kind} and "
         f"{tail} bytes more; {advice}"
@@ -325,7 +331,7 @@ def _check_byte_order(path, words, order):
         raise FileError(
             f"{str(path)!r} looks {other}-endian (as {order}-endian its first row is "
             f"{words.view(_ORDERS[order] + 'f4')[0].tolist()}), expected {order}-endian; "
-            f"byte_order={other!r} reads it, byte_order={order!r} reads it as it stands"
+            f"{argument('byte_order', other)} reads it, {argument('byte_order', order)} reads it as it stands"
         )
 
 

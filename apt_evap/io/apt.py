@@ -15,6 +15,7 @@ import numpy as np
 
 from apt_evap._common.files import TruncatedFile, open_for_reading
 from apt_evap._common.types import AnyPath
+from apt_evap._common.warnings import DataWarning
 from apt_evap.detection.hits import Hits
 from apt_evap.io._apt_sections import read_sections
 from apt_evap.io._pulses import PulseCheck, first_from_every, pulses_from_first, whole_pulses
@@ -170,6 +171,7 @@ def _assign(sections, path):
         if problem:
             warnings.warn(
                 f"{str(path)!r}: section {section.name!r} has {problem}, so it is in extra and not {columns[0][0]}",
+                DataWarning,
                 stacklevel=5,
             )
         if problem or not columns or taken & {target for target, _, _ in columns}:
@@ -203,6 +205,7 @@ def _ions(file, path, grouping, n):
         warnings.warn(
             f"{str(path)!r} does not tell which ions share a pulse, so its Multiplicity is in extra: "
             f"neither every ion nor the first one of each pulse holds the number of ions in it ({problem})",
+            DataWarning,
             stacklevel=4,
         )
     return ions

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from apt_evap._common.types import AnyPath
+from apt_evap._common.warnings import DataWarning
 from apt_evap.detection.hits import Hits
 from apt_evap.io._pulses import PulseCheck, first_from_equal, pulses_from_first, whole_pulses
 from apt_evap.io._records import check_any, choose, choose_fields, open_words, write_words
@@ -167,6 +168,7 @@ class _Survey:
                 warnings.warn(
                     f"{str(path)!r} does not tell which ions share a pulse, so pulse_id and multiplicity are None: "
                     f"the ions-per-pulse column is not consistent, {problem}",
+                    DataWarning,
                     stacklevel=5,
                 )
 

@@ -11,6 +11,7 @@ from typing import Any
 from apt_evap._common.files import FileError, TruncatedFile, check_path, open_for_reading
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_count, check_kind, shown
+from apt_evap._common.wording import argument
 from apt_evap.detection.hits import Hits
 from apt_evap.io._apt_sections import SIGNATURE
 from apt_evap.io.apt import chunk_apt, read_apt
@@ -216,7 +217,5 @@ def _by_suffix(path, format, doing):
     for candidate in FORMATS:
         if candidate.suffix == suffix.lower():
             return candidate
-    raise FileError(
-        f"the format of {str(path)!r} is not known from "
-        f"{f'its suffix {suffix!r}' if format is None else f'format={format!r}'}, expected one of {_suffixes(doing)}"
-    )
+    told = f"its suffix {suffix!r}" if format is None else argument("format", format)
+    raise FileError(f"the format of {str(path)!r} is not known from {told}, expected one of {_suffixes(doing)}")

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from apt_evap._common.types import AnyPath
+from apt_evap._common.warnings import DataWarning
 from apt_evap.detection.hits import Hits
 from apt_evap.io._pulses import first_from_equal, pulses_from_first
 from apt_evap.io._records import check_any, choose_fields, open_words
@@ -129,7 +130,9 @@ def _grouped(blocks, path):
         problem = f"only neighbours of equal pulse number are grouped: the number falls at {falls} rows"
     else:
         return True
-    warnings.warn(f"{str(path)!r} does not tell for certain which ions share a pulse, so {problem}", stacklevel=4)
+    warnings.warn(
+        f"{str(path)!r} does not tell for certain which ions share a pulse, so {problem}", DataWarning, stacklevel=4
+    )
     return bool(found)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from apt_evap._common.files import FileError, open_for_reading
 from apt_evap._common.types import AnyPath
+from apt_evap._common.warnings import DataWarning
 from apt_evap.detection.mass_ranges import Ranges
 
 _MOST = 1 << 22
@@ -57,7 +58,9 @@ def read_ranges(path: AnyPath) -> Ranges:
         raise FileError(f"{str(path)!r} has no lines Range1=... in a section [Ranges], expected at least one")
     announced = [value for section, _, key, value in lines if section == "ranges" and key == "number"]
     if announced and announced[0] != str(len(parts)):
-        warnings.warn(f"{str(path)!r} announces {announced[0]:.20} ranges and holds {len(parts)}", stacklevel=2)
+        warnings.warn(
+            f"{str(path)!r} announces {announced[0]:.20} ranges and holds {len(parts)}", DataWarning, stacklevel=2
+        )
     names, low, high, volume, colour, composition = zip(*parts, strict=True)
     return Ranges(names, np.array(low), np.array(high), np.array(volume), colour, composition, source=str(path))
 

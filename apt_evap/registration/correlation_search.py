@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import fft, ndimage, optimize
+import scipy
 
 from apt_evap._common.types import Booleans, Floats
 from apt_evap.detection.binning import field_of_view
@@ -63,8 +63,8 @@ class Image:
         """Values at points, 0 outside, and whether points are inside; both of the shape of `points`."""
         place = points - self.origin
         index = np.stack([place.imag / self.bin_size[1], place.real / self.bin_size[0]])
-        inside = ndimage.map_coordinates(self.mask, index, order=0, mode="constant") > 0
-        return np.where(inside, ndimage.map_coordinates(self.values, index, order=1, mode="nearest"), 0.0), inside
+        inside = scipy.ndimage.map_coordinates(self.mask, index, order=0, mode="constant") > 0
+        return np.where(inside, scipy.ndimage.map_coordinates(self.values, index, order=1, mode="nearest"), 0.0), inside
 
 
 class View:
@@ -82,7 +82,7 @@ class View:
         mask = np.pad(map.mask & field_of_view(np.where(map.mask, values, 0)), 1)
         width, height = map.bin_size
         rim = RIM * 2 * np.sqrt(np.count_nonzero(mask) * width * height / np.pi)
-        self.mask = (ndimage.distance_transform_edt(mask, sampling=(height, width)) > rim)[1:-1, 1:-1]
+        self.mask = (scipy.ndimage.distance_transform_edt(mask, sampling=(height, width)) > rim)[1:-1, 1:-1]
         self.map = replace(map, mask=self.mask)
         x, y = np.meshgrid(*map.centres)
         points = (x + 1j * y)[self.mask]
@@ -115,7 +115,7 @@ def correlation(a: Floats, b: Floats) -> float:
 
 def spectra(values: Any, inside: Any, size: int) -> Any:
     """Fourier transforms of a mask, an image that is 0 outside of it and its square, padded to (size, size)."""
-    return fft.rfft2(np.stack([inside, values, values**2]).astype(np.float32), (size, size))
+    return scipy.fft.rfft2(np.stack([inside, values, values**2]).astype(np.float32), (size, size))
 
 
 def correlate(moving: Any, fixed: Any, size: int) -> tuple[Floats, Floats]:
@@ -140,7 +140,7 @@ def correlate(moving: Any, fixed: Any, size: int) -> tuple[Floats, Floats]:
     """
     pairs = ((0, 0), (1, 0), (0, 1), (1, 1), (2, 0), (0, 2))
     products = np.stack([np.conj(moving[i]) * fixed[j] for i, j in pairs])
-    shared, a, b, ab, aa, bb = fft.irfft2(products, (size, size))
+    shared, a, b, ab, aa, bb = scipy.fft.irfft2(products, (size, size))
     shared = np.rint(shared)
     number = np.maximum(shared, 1)
     spread = np.maximum(aa - a * a / number, 0) * np.maximum(bb - b * b / number, 0)
@@ -186,7 +186,7 @@ def search(
     for scale in scales:
         image = simulated.flatten(NARROW * pixel / scale, broad / scale)
         points = _square(simulated.reach * scale, pixel)
-        size = fft.next_fast_len(len(points) + len(grid) - 1, real=True)
+        size = scipy.fft.next_fast_len(len(points) + len(grid) - 1, real=True)
         # shifts of the simulated centre from the measured one, in these frames
         steps = np.arange(size)
         steps = (np.where(steps < len(grid), steps, steps - size) + len(points) // 2 - len(grid) // 2) * pixel
@@ -289,8 +289,10 @@ def refine(
     low, high = np.minimum(low, 0)[free], np.maximum(high, 0)[free]  # the start is inside but for rounding
     simplex = np.vstack([np.zeros(len(low)), np.diag(np.where(high >= 1, 1.0, -1.0))])
     options = {"initial_simplex": np.clip(simplex, low, high), "xatol": 2e-3, "fatol": 1e-6, "maxiter": 400}
-    bounds = optimize.Bounds(low, high)
-    result = optimize.minimize(lambda s: -fit(s).rank, simplex[0], method="Nelder-Mead", bounds=bounds, options=options)
+    bounds = scipy.optimize.Bounds(low, high)
+    result = scipy.optimize.minimize(
+        lambda s: -fit(s).rank, simplex[0], method="Nelder-Mead", bounds=bounds, options=options
+    )
     return fit(result.x)
 
 

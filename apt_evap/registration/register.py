@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_number, check_sequence, check_switch
+from apt_evap._common.warnings import RegistrationWarning
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.registration.correlation_search import (
@@ -30,10 +31,6 @@ DOUBTFUL = 0.5
 """Score times root of the overlap that wrong places reach: up to 0.25 on noise, 0.5 on maps of other poles."""
 _KEPT = 12  # places that are refined: as many as there are symmetric ones of a threefold axis with mirrors, twice
 _BINS = 384  # of a map of simulated hits
-
-
-class DoubtfulRegistration(UserWarning):
-    """Maps that have nothing to do with each other may fit as well as these."""
 
 
 @dataclass(frozen=True)
@@ -141,10 +138,10 @@ class Registration:
         if self.doubtful:
             warnings.warn(
                 f"the registration is doubtful: the maps correlate by only {self.score:.2f} where both show something "
-                f"({self.overlap:.0%} of the measured one), as maps may that have nothing to do with each other; look "
-                "at the overlay of both, make sure that the specimen was simulated along its axis, and give a pole, "
-                "scales or a start where known",
-                DoubtfulRegistration,
+                f"({self.overlap:.0%} of the measured one), as maps may that have nothing to do with each other; lay "
+                "one over the other, make sure that the specimen was simulated along its axis, and give what is known "
+                "of rotation, scale and shift",
+                RegistrationWarning,
                 stacklevel=3,
             )
 
@@ -234,7 +231,7 @@ def register(
 
     Warns
     -----
-    DoubtfulRegistration
+    RegistrationWarning
         If it was searched for everywhere, and has a score that maps reach which have nothing to do with each other.
 
     Notes

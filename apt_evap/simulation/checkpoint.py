@@ -22,6 +22,7 @@ import numpy as np
 from apt_evap._common.files import FileError, check_path, flush_folder
 from apt_evap._common.interrupts import uninterrupted
 from apt_evap._common.validation import check_count, check_number, check_switch
+from apt_evap._common.wording import argument
 from apt_evap.evaporation.state import EmitterState
 from apt_evap.simulation.ending import Ending
 from apt_evap.simulation.run import PART_NAME, Run, load, part_paths
@@ -229,7 +230,9 @@ class Keeper:
         if not np.array_equal(done.emissions.ions, done.emissions.ions[0] + np.arange(len(done))):
             raise FileError(f"the run in {name!r} cannot be resumed: some of its ions are missing")
         if len(done) > n_ions:
-            raise FileError(f"n_ions must be at least the {len(done):,} that are done already, got {n_ions:,}")
+            raise FileError(
+                f"{argument('n_ions')} must be at least the {len(done):,} that are done already, got {n_ions:,}"
+            )
         if not parts and done.state is None:
             raise FileError(f"the run in {name!r} cannot be resumed: the file holds no state")
         self.done, self._in_file, self._written_to = done, not parts, len(done)
@@ -239,7 +242,8 @@ class Keeper:
 
     def _refuse_a_loss(self, parts, n_ions):
         """Refuse to begin anew over what this run would not give again."""
-        name, anew = str(self._checkpoint.path), "resume=True goes on with it, overwrite=True begins anew"
+        name, replaces = str(self._checkpoint.path), f"{argument('overwrite', True)} replaces it"
+        anew = f"{argument('resume', True)} goes on with it, {argument('overwrite', True)} begins anew"
         if parts:
             ions = sum(map(count_ions, parts))
             raise FileError(
@@ -248,19 +252,18 @@ class Keeper:
         if not self._target.exists():
             return
         if not is_run(self._target):
-            raise FileError(f"{name!r} exists and is no run: overwrite=True replaces it")
+            raise FileError(f"{name!r} exists and is no run: {replaces}")
         try:
             done = load(self._target)
         except FileError as error:
-            raise FileError(f"{error}; overwrite=True replaces it") from error
+            raise FileError(f"{error}; {replaces}") from error
         if differing := self._differing(done):
-            raise FileError(f"{name!r} holds a run with other settings ({differing}): overwrite=True replaces it")
+            raise FileError(f"{name!r} holds a run with other settings ({differing}): {replaces}")
         if done.ended not in (Ending.COMPLETE, Ending.EXHAUSTED):
             raise FileError(f"{name!r} holds a run of {len(done):,} ions that is not complete ({done.ended}): {anew}")
         if len(done) > n_ions:
             raise FileError(
-                f"{name!r} holds a run of {len(done):,} ions, more than the {n_ions:,} asked for: overwrite=True "
-                "replaces it"
+                f"{name!r} holds a run of {len(done):,} ions, more than the {n_ions:,} asked for: {replaces}"
             )
 
     def _with_state(self, run):

@@ -15,6 +15,7 @@ import numpy as np
 
 from apt_evap._common.files import FileError, check_path, open_for_reading, replace_file
 from apt_evap._common.types import AnyPath
+from apt_evap._common.wording import argument
 from apt_evap.detection.detector import Detector
 from apt_evap.emission.emissions import Emissions
 from apt_evap.emission.perturbations import from_dict, to_dict
@@ -205,7 +206,7 @@ def write_state(path: AnyPath, state: Any, first_event: int) -> None:
 
 def read_run(path: AnyPath, partial: bool = False) -> dict[str, Any]:
     """What a file says of a Run, as the arguments of one; FileError if it is missing, damaged or not a run."""
-    hint = "" if partial else "; partial=True reads the ions that are whole"
+    hint = "" if partial else f"; {argument('partial', True)} reads the ions that are whole"
     with _reading(path, hint) as file:
         return _read(file, partial)
 

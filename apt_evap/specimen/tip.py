@@ -5,8 +5,8 @@ from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.spatial import cKDTree
 
 from apt_evap._common.memory import check_memory
 from apt_evap._common.types import Floats
@@ -205,7 +205,7 @@ class Tip:
                 f"species must be indices from 0 to {len(elements) - 1}, got {tip.species.min()} to {tip.species.max()}"
             )
         sample = tip.positions[:: max(1, n // _SAMPLE)]
-        neighbours = cKDTree(tip.positions)
+        neighbours = scipy.spatial.cKDTree(tip.positions)
         distances = neighbours.query(sample, k=2)[0][:, 1]
         if not distances.min() > 0 or neighbours.query_pairs(1e-3 * float(np.median(distances))):
             raise ValueError("positions must be distinct, got two atoms at the same place")

@@ -4,6 +4,7 @@ import re
 import signal
 import subprocess
 import sys
+import tempfile
 import termios
 import time
 from pathlib import Path
@@ -13,9 +14,10 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-import apt_evap.cli as cli
-from apt_evap import __version__, plot
-from apt_evap.cli.main import EXIT_CODES, main
+from apt_evap import __version__, cli, plot
+from apt_evap.cli import run as run_command
+from apt_evap.cli.main import main
+from apt_evap.cli.parser import EXIT_CODES
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.perturbations import Combined, LateralVelocity, RollUp, Unperturbed
 from apt_evap.io.formats import write
@@ -208,7 +210,7 @@ def test_a_second_run_overwrites_the_first_but_nobody_elses_files(folder, capsys
 
 
 def test_what_cannot_be_written_is_said_before_computing(folder, capsys, monkeypatch):
-    monkeypatch.setattr(cli.run, "read_config", checked := Counting(cli.run.read_config))
+    monkeypatch.setattr(run_command, "read_config", checked := Counting(run_command.read_config))
     assert "cannot write 'none/a.h5': No such file or directory" in failed(
         capsys, "run", "small.toml", "-o", "none/a.h5"
     )
@@ -295,7 +297,7 @@ def test_memory_and_interrupts_are_no_tracebacks_but_bugs_are(folder, capsys, mo
 
 
 def test_progress_without_a_terminal_is_plain_lines(folder, capsys, monkeypatch):
-    monkeypatch.setattr(cli.run, "SECONDS_BETWEEN_LINES", 0.0)
+    monkeypatch.setattr(run_command, "SECONDS_BETWEEN_LINES", 0.0)
     assert main(["run", "small.toml", "--ions", "600", "--threads", "1"]) == 0
     line = r"300 of 600 ions \(50%\), [\d.,]+ ions/s, \d+ s left\n"
     assert re.search(line, capsys.readouterr().err)
@@ -655,3 +657,51 @@ def test_a_reader_of_the_output_may_leave(made):
     )
     os.close(write_end)
     assert done.returncode == 1 and done.stderr == b""
+
+
+# ---- told before anything is computed --------------------------------------------------------------------------------
+
+
+def test_maps_that_cannot_be_drawn_are_told_before_the_simulation(folder, capsys):
+    (folder / "broad.toml").write_text(SMALL + "[maps]\nsmoothing = 500.0\n")
+    assert "'broad.toml', [maps]: smoothing must be a finite number [mm] at most 300 (the width of the detector)" in (
+        failed(capsys, "run", "broad.toml")
+    )
+
+
+def test_a_smoothing_broader_than_the_detector(made, folder, capsys):
+    assert "smoothing must be a finite number [mm] at most 300 (the width of the detector), got 400.0" in failed(
+        capsys, "map", made, "--smooth", "400"
+    )
+
+
+def test_a_selection_too_small_for_a_map_names_the_option(mixed, capsys):
+    assert "--ions leaves one ion on the detector: a map needs more" in failed(
+        capsys, "map", "mixed.epos", "--ions", "3,4"
+    )
+    write("one.epos", Hits(x=np.ones(3), y=np.ones(3), pulse_id=np.arange(3)))
+    assert "'one.epos' has 3 ions at one place on the detector" in failed(capsys, "map", "one.epos")
+
+
+def test_files_that_cannot_be_read_are_not_said_to_be_somebody_elses(capsys, monkeypatch):
+    """Of a run that another user may not read, --force would not be the advice."""
+    with tempfile.TemporaryDirectory() as name:  # not pytest's, which nobody else may enter
+        monkeypatch.chdir(name)
+        os.chmod(name, 0o777)
+        Path("small.toml").write_text(SMALL)
+        Path("q.h5").write_bytes(b"a run")
+        os.chmod("q.h5", 0)
+        user = os.geteuid()
+        if user == 0:
+            os.seteuid(65534)  # root may read everything
+        try:
+            assert "cannot read 'q.h5': Permission denied" in failed(capsys, "run", "small.toml", "-o", "q.h5")
+        finally:
+            os.seteuid(user)
+
+
+@pytest.mark.parametrize("name", ["pipe.h5", "pipe.png"])
+def test_an_output_that_is_no_regular_file_is_refused(folder, capsys, name):
+    os.mkfifo(name)
+    option = "-o" if name.endswith(".h5") else "--map"
+    assert f"cannot write '{name}': Not a regular file" in failed(capsys, "run", "small.toml", option, name)

@@ -1,6 +1,7 @@
 import copy
 import math
-from dataclasses import fields
+import re
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from apt_evap._common.files import FileError
-from apt_evap.config.map_panels import read_maps
+from apt_evap.config.map_panels import MapSettings, Panel, read_maps
 from apt_evap.config.perturbation_text import read_perturbation, title_of
 from apt_evap.config.simulation_file import read_config
 from apt_evap.detection.detector import Detector
@@ -245,7 +246,24 @@ def test_an_unknown_table_and_a_missing_one(tmp_path):
         ("maps", "panels", [], "panels must be a list of tables such as [[maps.panels]], got []"),
         ("maps", "panels", [{"title": "x"}], "panel 1: perturbation is missing"),
         ("maps", "panels", [{"perturbation": "Rollup"}], "panel 1: perturbation 'Rollup': no perturbation"),
-        ("maps", "panels", [{"perturbation": "Unperturbed", "title": 1}], "panel 1: title must be text, got 1"),
+        (
+            "maps",
+            "panels",
+            [{"perturbation": "Unperturbed", "title": 1}],
+            "panel 1: title must be printable text, got 1",
+        ),
+        (
+            "maps",
+            "panels",
+            [{"perturbation": "Unperturbed", "title": "\u200b"}],
+            "panel 1: title must be printable text",
+        ),
+        (
+            "maps",
+            "smoothing",
+            80.1,
+            "smoothing must be a finite number [mm] at most 80 (the width of the detector), got 80.1",
+        ),
         ("maps", "panels", [{"perturbation": {"energy": 1}}], "must have a name"),
         ("maps", "panels", [{"perturbation": {"name": "Fixed", "energy": 1}}], "such as Unperturbed or RollUp"),
     ],
@@ -319,6 +337,41 @@ def test_a_perturbation_that_is_none_is_named(text):
 def test_titles_tell_perturbations_apart():
     titles = {title_of(each) for each in PERTURBATIONS.values()}
     assert len(titles) == len(PERTURBATIONS) and "roll-up, 50 K" in titles
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"maps": None}, "maps must be of type MapSettings, got None"),
+        ({"n_ions": 0}, "n_ions must be a whole number of at least 1, got 0"),
+        ({"voltage": -1.0}, "voltage must be"),
+        ({"seed": 0.5}, "seed must be"),
+        ({"responses": "no"}, "responses must be True or False, got 'no'"),
+        ({"detector": 100.0}, "detector must be of type Detector, got 100.0"),
+        ({"detector": Detector(width=1.0)}, "smoothing must be a finite number [mm] at most 1 (the width of"),
+        ({"output": ""}, "output must be a file name"),
+    ],
+)
+def test_a_config_made_in_python_is_checked(change, sentence):
+    with pytest.raises(ValueError, match=re.escape(sentence)):
+        replace(read_config(EXAMPLE), **change)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ({"panels": ()}, "panels must hold at least one Panel, got none"),
+        ({"panels": ("RollUp:0.1",)}, "panels must be Panels, got 'RollUp:0.1'"),
+        ({"panels": None}, "panels must be a sequence of Panels, got None"),
+        ({"bins": 0}, "bins must be a whole number"),
+        ({"smoothing": math.nan}, "smoothing must be a finite number [mm] at least 0, got nan"),
+    ],
+)
+def test_map_settings_made_in_python_are_checked(arguments, sentence):
+    with pytest.raises(ValueError, match=re.escape(sentence)):
+        MapSettings(**{"panels": (Panel("none", Unperturbed()),)} | arguments)
+    with pytest.raises(ValueError, match="perturbation must be a perturbation with a method launch"):
+        Panel("none", "Unperturbed")
 
 
 def test_maps_round_trip():

@@ -13,8 +13,9 @@ from scipy import ndimage
 
 import apt_evap as ae
 from apt_evap import plot
+from apt_evap._common.warnings import RegistrationWarning
 from apt_evap.registration import correlation_search
-from apt_evap.registration.register import DoubtfulRegistration, register, register_points
+from apt_evap.registration.register import register, register_points
 from apt_evap.registration.transform import SimilarityTransform
 
 NICKEL = Path(__file__).parents[3] / "shared" / "data" / "ni111_map.npz"
@@ -142,7 +143,7 @@ def test_a_threefold_pole_with_mirrors_has_ties(run20):
 def test_maps_that_have_nothing_in_common(simulated):
     rng = np.random.default_rng(5)
     z = 20 * np.sqrt(rng.random(100_000)) * np.exp(2j * np.pi * rng.random(100_000))
-    with pytest.warns(DoubtfulRegistration, match="correlate by only 0.[0-3]"):
+    with pytest.warns(RegistrationWarning, match="correlate by only 0.[0-3]"):
         found = register(simulated, ae.Hits(x=z.real, y=z.imag))
     assert found.score < 0.35
     with pytest.raises(ValueError, match="must share 50% of the measured field of view"):

@@ -130,7 +130,7 @@ def test_charges_that_are_let_go_are_noticed(small_tip):
     """A bound that is not too wide: patches too small to carry the change of charge run past it."""
     loose = ae.ChargeSettings(patch_radius=1.5, update_radius=1.5, sweep_interval=400, tolerance=0.5)
     (message,) = warned(small_tip, n=900, charge_settings=loose)
-    assert "from settled ones" in message
+    assert "residuals of the charges" in message
 
 
 def test_the_progress_line_shows_it(small_tip, capsys):

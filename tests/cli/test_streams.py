@@ -1,0 +1,82 @@
+"""What the shell does to a program: closed and full streams, encodings, Ctrl-C while it is being loaded."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from apt_evap import cli
+from apt_evap.detection.hits import Hits
+from apt_evap.io.formats import write
+
+HERE = str(Path(cli.__file__).parents[2])  # the package under test, installed or not
+PROGRAM = "import sys; from apt_evap.cli.main import main; sys.exit(main())"
+SMALL = '[tip]\nmaterial = "Ni"\napex_radius = "4 a"\nshank_length = "4 a"\n[simulation]\nions = 3\nresponses = false\n'
+FULL = pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+
+
+@pytest.fixture
+def folder(tmp_path):
+    random = np.random.default_rng(1)
+    x, y = random.uniform(-20, 20, (2, 50))
+    write(tmp_path / "ions.epos", Hits(x=x, y=y, mass_to_charge=np.full(50, 58.0), pulse_id=np.arange(50)))
+    (tmp_path / "small.toml").write_text(SMALL)
+    return tmp_path
+
+
+def shell(folder, redirection, *arguments, **environment):
+    """Run the program with its streams redirected as a shell writes it; its code, stdout and stderr."""
+    done = subprocess.run(
+        ["sh", "-c", f'exec "$@" {redirection}', "sh", sys.executable, "-c", PROGRAM, *arguments],
+        cwd=folder,
+        capture_output=True,
+        env=os.environ | {"PYTHONPATH": HERE} | environment,
+        timeout=120,
+    )
+    return done.returncode, done.stdout.decode(), done.stderr.decode()
+
+
+def test_a_run_without_stderr(folder):
+    code, out, _ = shell(folder, "2>&-", "run", "small.toml")
+    assert code == 0 and out.endswith("wrote small.h5\nwrote small.png\n")
+    assert sorted(os.listdir(folder)) == ["ions.epos", "small.h5", "small.png", "small.toml"]
+
+
+@pytest.mark.parametrize("arguments", [("info", "ions.epos"), ("map", "ions.epos"), ("--version",)], ids=" ".join)
+def test_commands_without_stdout(folder, arguments):
+    assert shell(folder, ">&-", *arguments) == (0, "", "")
+    assert shell(folder, "<&- >&- 2>&-", *arguments) == (0, "", "")
+    assert (folder / "ions_map.png").exists() == (arguments[0] == "map")
+
+
+def test_an_error_does_not_go_to_stdout_for_want_of_stderr(folder):
+    assert shell(folder, "2>&-", "info", "none.epos") == (2, "", "")
+
+
+@FULL
+@pytest.mark.parametrize("arguments", [("--help",), ("--version",), ("info", "ions.epos")], ids=" ".join)
+def test_a_full_stdout_is_an_error(folder, arguments):
+    sentence = "apt-evap: error: cannot write to the standard output: No space left on device\n"
+    assert shell(folder, ">/dev/full", *arguments) == (2, "", sentence)
+
+
+@FULL
+def test_a_full_stderr_is_no_error(folder):
+    assert shell(folder, "2>/dev/full", "info", "none.epos") == (2, "", "")
+
+
+def test_a_terminal_that_knows_ascii_alone(folder):
+    os.rename(folder / "ions.epos", folder / "Å.epos")
+    code, out, err = shell(folder, "", "map", "Å.epos", PYTHONIOENCODING="ascii", PYTHONUTF8="1")
+    assert (code, out, err) == (0, "wrote \\xc5_map.png\n", "")
+
+
+def test_ctrl_c_while_libraries_are_loaded(folder):
+    """A library in place of h5py presses it as it is imported."""
+    (folder / "h5py.py").write_text("import os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\ntime.sleep(60)\n")
+    path = os.pathsep.join([str(folder), HERE])
+    found = shell(folder, "", "run", "small.toml", PYTHONPATH=path)
+    assert found == (130, "", "apt-evap: interrupted\n")

@@ -1,0 +1,53 @@
+"""What is not loaded until it is used: help, and the first line of a script, must come at once."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import apt_evap as ae
+
+ROOT = Path(ae.__file__).parents[1]
+DRAWING = ("matplotlib", "PIL")
+NUMBERS = ("numpy", "h5py", "scipy", "skimage", "tqdm", "apt_evap.simulation", "apt_evap._core")
+# these have parts that take longer to load than the whole of this package
+PARTS = tuple(f"scipy.{part}" for part in ("fft", "interpolate", "linalg", "ndimage", "optimize", "spatial", "special"))
+PARTS += tuple(f"skimage.{part}" for part in ("filters", "measure", "metrics", "morphology"))
+HELP = "from apt_evap.cli.main import main; assert main({}) == 0"
+
+
+def loaded(code):
+    """Names of the modules that a new Python has loaded after some code."""
+    code = f"import sys, os\nbefore = os.dup(1); os.dup2(2, 1)\n{code}\nsys.stdout.flush(); os.dup2(before, 1)\n"
+    done = subprocess.run(
+        [sys.executable, "-c", code + "print(*sys.modules)"],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        check=True,
+    )
+    return set(done.stdout.split())
+
+
+@pytest.mark.parametrize(
+    ("code", "unwanted"),
+    [
+        ("import apt_evap", DRAWING + NUMBERS),
+        (HELP.format("['--help']"), DRAWING + NUMBERS),
+        (HELP.format("['run', '--help']"), DRAWING + NUMBERS),
+        (HELP.format("['compare', '--help']"), DRAWING + NUMBERS),
+        ("import apt_evap as ae\nae.Tip, ae.Simulation, ae.RollUp, ae.load, ae.read, ae.plot", DRAWING + PARTS),
+        ("import apt_evap as ae\n[getattr(ae, name) for name in ae.__all__]", DRAWING + PARTS),
+    ],
+    ids=["package", "help", "run", "compare", "first use", "every name"],
+)
+def test_what_is_loaded(code, unwanted):
+    found = loaded(code)
+    assert "apt_evap" in found and "lazy_loader" in found
+    assert found.intersection(unwanted) == set()
+
+
+def test_the_test_sees_what_is_loaded():
+    assert {"matplotlib", "scipy.optimize"} <= loaded("import matplotlib, scipy.optimize")
