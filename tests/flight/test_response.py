@@ -172,9 +172,9 @@ def test_higher_degree_is_better(tip12):
     assert errors[2] < errors[1] / 2
 
 
-def test_bad_fits_are_marked(run):
+def test_bad_fits_are_flagged(run):
     assert not run.flagged.any()
     bad = run.responses.residuals.copy()
     bad[3, 0], bad[5, 1], bad[7, 0] = 0.3, 0.3, np.nan
-    marked = replace(run, responses=Responses(run.responses.site, run.responses.rolled, bad)).marked
-    assert np.flatnonzero(marked).tolist() == [3, 5, 7]
+    flagged = replace(run, responses=Responses(run.responses.site, run.responses.rolled, bad)).flagged
+    assert np.flatnonzero(flagged).tolist() == [3, 5, 7]
