@@ -120,11 +120,11 @@ def fit_energies(
     Notes
     -----
     The method is that of Shaikh et al., arXiv 2509.13744, with errors added. A resample draws every measured bin from
-    a Poisson distribution and weighs the ions of the run at random (see `resample`); all energies and baselines see the
+    a Poisson distribution and weighs the ions of the run at random (see `Sampler`); all energies and baselines see the
     same draws. The registration is held fixed.
 
     Noise is variance, too, and would be taken for contrast: the energies whose map has most contrast would seem best.
-    So the similarity of a window of densities x and y is
+    So the similarity of a window of densities x and y is (`local_similarity`)
 
     .. math:: \frac{2 μ_x μ_y + C_1}{μ_x^2 + μ_y^2 + C_1} \; \frac{2 σ_{xy} + ν_x + ν_y + C_2}{σ_x^2 + σ_y^2 + C_2}
 

@@ -1,8 +1,8 @@
 """Maps of one run, drawn again and again as the noise of its ions would have it.
 
-Maps with all their noise once more on top would again be drawn to other energies. So resamples have a tenth of it, and
-their deviations count tenfold: the first order in the noise (the infinitesimal jackknife of B. Efron, J. R. Statist.
-Soc. B 54, 83 (1992)).
+Resamples with all the noise once more would have twice that of the maps, and favour other energies. So they have a
+tenth of it, and their deviations count tenfold: the first order in the noise (the infinitesimal jackknife of B. Efron,
+J. R. Statist. Soc. B 54, 83 (1992)).
 """
 
 from dataclasses import replace

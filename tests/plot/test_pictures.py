@@ -69,7 +69,7 @@ def test_titles_are_broken_at_commas():
         assert plot.detector_map(map, title=title).get_title().splitlines() == lines
 
 
-def test_titles_are_names_of_files(run, emitter, tmp_path):
+def test_titles_are_names_of_files(run, emitter):
     """Dollar signs are no formula, and a byte that is not text is a mark of its own."""
     map = ae.DetectorMap.from_array(np.random.default_rng(0).random((40, 40)), np.arange(41.0), np.arange(41.0))
     here = ae.Registration(0.0, 1.0, (0.0, 0.0))
@@ -85,7 +85,7 @@ def test_titles_are_names_of_files(run, emitter, tmp_path):
             plot.response(run, [3], title=title),
         ):
             assert ax.get_title() == written
-            ax.figure.savefig(tmp_path / "a.png")
+            ax.title.get_window_extent()  # its letters are laid out
 
 
 @pytest.mark.parametrize("n, shape", [(1, (1, 1)), (3, (1, 3)), (4, (2, 2)), (5, (2, 3)), (7, (3, 3))])
