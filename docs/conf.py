@@ -51,6 +51,7 @@ sphinx_gallery_conf = {
     "within_subsection_order": "ExampleTitleSortKey",
     "download_all_examples": False,
     "show_memory": False,
+    "remove_config_comments": True,
     "write_computation_times": False,
 }
 
@@ -59,6 +60,7 @@ CARDS = {
     "first_map": ("ni111.png", (0.555, 0.12, 0.895, 0.86)),
     "accuracy": ("figure7.png", (0.50, 0.05, 0.985, 0.362)),
     "results": ("figure6.png", (0.711, 0.10, 0.939, 0.453)),
+    "physics": ("figure2.png", (0.555, 0.048, 0.895, 0.26)),
     "code": ("figure2.png", (0.064, 0.045, 0.424, 0.30)),
 }
 (GENERATED / "cards").mkdir(parents=True, exist_ok=True)

@@ -8,6 +8,8 @@ Redraws figure 2 of Shaikh et al., arXiv 2509.13744: lateral velocities of Al[01
 figure2.png and figure2.json. Tips have R = 20 a; `--full` makes them as large as the paper's, R = 80 a.
 """
 
+# sphinx_gallery_thumbnail_path = 'figure2.png'
+
 import argparse
 import json
 from dataclasses import dataclass

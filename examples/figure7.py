@@ -9,6 +9,8 @@ runs. Tips have R = 20 a and 30 a; `--full` makes them as large as the paper's, 
 widths.
 """
 
+# sphinx_gallery_thumbnail_path = 'figure7.png'
+
 import argparse
 import json
 from dataclasses import asdict

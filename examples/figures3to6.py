@@ -18,6 +18,8 @@ Writes figure3.png to figure6.png, figures3to6.json and the runs. Tips have R = 
 makes them as large as the paper's, R = 80 a, with 400,000 ions each.
 """
 
+# sphinx_gallery_thumbnail_path = 'figure6.png'
+
 import argparse
 import json
 from pathlib import Path

@@ -13,6 +13,8 @@ By default the tip is small, R = 20 a, and takes a minute; with ``--full`` it ha
 of an hour on two cores. Writes the run, and for every mechanism the matrix, the maps side by side and a JSON file.
 """
 
+# sphinx_gallery_thumbnail_path = 'figure3.png'
+
 import argparse
 from pathlib import Path
 

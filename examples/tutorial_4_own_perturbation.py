@@ -6,6 +6,8 @@ A perturbation is any object with a method over a batch of emissions. Here one t
 ions that have a neighbour to roll onto only a share rolls up.
 """
 
+# sphinx_gallery_thumbnail_path = 'figure2.png'
+
 import sys
 from dataclasses import dataclass, replace
 

@@ -7,6 +7,8 @@ What a tip of real size needs: memory for its outer skin only, and a run that on
 ``python tutorial_5_large_tip.py 2000 80`` evaporates 2,000 atoms of a tip of R = 80 a; by default 1,000 of one of 40 a.
 """
 
+# sphinx_gallery_thumbnail_path = 'soak.png'
+
 import sys
 import time
 
