@@ -1,11 +1,19 @@
-"""Small specimens, made once for all tests."""
+"""Small specimens, made once for all tests, and runs, made once for all processes that test."""
 
+import fcntl
+import os
 import signal
 import sys
 from pathlib import Path
 
+if "PYTEST_XDIST_WORKER" in os.environ:  # before NumPy is imported: every processor has a worker already
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, settings
+from matplotlib.figure import Figure
 
 sys.path.append(str(Path(__file__).parent))  # for twins.py, whatever the import mode
 
@@ -13,6 +21,30 @@ import apt_evap as ae
 
 # a shell that has put the tests into the background lets them ignore Ctrl-C, which some of them press
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# examples are not timed: the machine may be slow or busy
+untimed = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow, HealthCheck.function_scoped_fixture]}
+settings.register_profile("quick", max_examples=25, derandomize=True, **untimed)
+settings.register_profile("thorough", max_examples=300, **untimed)
+settings.load_profile("quick")
+
+
+@pytest.fixture(scope="session")
+def made_once(tmp_path_factory):
+    """Function of a name and of a function that makes a run: one process makes and saves it, all load it."""
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent  # of all workers
+
+    def load(name, make):
+        path = folder / f"{name}.h5"
+        with open(path.with_suffix(".lock"), "w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # until the file is closed
+            if not path.exists():
+                make().save(path)
+        return ae.load(path)
+
+    return load
 
 
 @pytest.fixture(scope="session")
@@ -46,11 +78,23 @@ def tip20(nickel):
 
 
 @pytest.fixture(scope="session")
-def run20(tip20):
-    """15,000 ions of `tip20`, each flown at rest and rolled up (some 10 s)."""
-    simulation = ae.Simulation(tip20, voltage=1000.0, seed=1, detector=ae.Detector(distance=100.0, width=300.0))
+def run20(tip20, made_once):
+    """15,000 ions of `tip20`, each flown at rest and rolled up."""
+    detector = ae.Detector(distance=100.0, width=300.0)
     flown = (ae.Unperturbed(), ae.RollUp(ae.TruncatedNormal(0.155, 0.155)))
-    return simulation.run(15_000, flown, responses=False, progress=False)
+
+    def make():
+        simulation = ae.Simulation(tip20, voltage=1000.0, seed=1, detector=detector)
+        return simulation.run(15_000, flown, responses=False, progress=False)
+
+    return made_once("run20", make)
+
+
+@pytest.fixture
+def blank_pictures(monkeypatch):
+    """Pictures are files of their kind with nothing on them: for tests of all but pictures, which take a second each."""
+    save = Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *args, **options: save(Figure((1, 1)), *args, **options))
 
 
 @pytest.fixture
