@@ -92,7 +92,7 @@ def run20(tip20, made_once):
 
 @pytest.fixture
 def blank_pictures(monkeypatch):
-    """Pictures are files of their kind with nothing on them: for tests of all but pictures, which take a second each."""
+    """Pictures are written with nothing on them: for tests of all but pictures, which take a second each."""
     save = Figure.savefig
     monkeypatch.setattr(Figure, "savefig", lambda figure, *args, **options: save(Figure((1, 1)), *args, **options))
 

@@ -88,7 +88,7 @@ def test_sweep_is_the_field_of_all_others(surface12, double):
     # float32 carries 6e-8 per term, about a group's middle; its sums of 8,000 terms stay at 1e-6
     assert rms(field[some] - expected, expected) < (1e-13 if double else 2e-6)
     InteractionLists(tree, DEFAULT_ANGLE).sweep(field, double_precision=double)
-    assert 1e-5 < rms(field[some] - expected, expected) < 1e-3  # the accuracy asked of the default; and cells were in use
+    assert 1e-5 < rms(field[some] - expected, expected) < 1e-3  # as asked of the default; and cells were in use
 
 
 def test_sweep_over_a_cell_leaves_the_octupole(rng):

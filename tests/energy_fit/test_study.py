@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from rough import ROUGH
 from scipy.stats import truncnorm
 
 import apt_evap as ae
@@ -20,16 +21,20 @@ LATERAL = ae.LateralVelocity(ae.TruncatedNormal(0.3, 0.316 * 0.3))
 
 
 @pytest.fixture(scope="module")
-def run(tip20):
+def run(tip20, made_once):
     """15,000 ions of Ni[111], R = 20 a, with responses."""
-    return ae.Simulation(tip20, voltage=1000.0, seed=1).run(15_000, progress=False)
+    return made_once("run", lambda: ae.Simulation(tip20, seed=1, **ROUGH).run(15_000, progress=False))
 
 
 @pytest.fixture(scope="module")
-def other(nickel):
+def other(nickel, made_once):
     """Of a tip with another origin of the lattice, and with other random numbers: no ion is one of `run`."""
-    tip = ae.Tip(nickel, apex_radius=20 * nickel.a, axis=(1, 1, 1), shank_length=20 * nickel.a, offset_seed=5)
-    return ae.Simulation(tip, voltage=1000.0, seed=2).run(15_000, progress=False)
+
+    def make():
+        tip = ae.Tip(nickel, apex_radius=20 * nickel.a, axis=(1, 1, 1), shank_length=20 * nickel.a, offset_seed=5)
+        return ae.Simulation(tip, seed=2, **ROUGH).run(15_000, progress=False)
+
+    return made_once("other", make)
 
 
 HERE = ae.Registration(0.0, 1.0, (0.0, 0.0))

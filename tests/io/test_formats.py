@@ -163,6 +163,7 @@ def hits_of(values, **columns):
 
 finite = st.floats(-1000, 1000, width=32).filter(lambda value: value == 0 or abs(value) > 1e-6)
 
+
 @given(values=arrays("f4", st.tuples(st.integers(1, 12), st.just(7)), elements=finite), data=st.data())
 def test_epos_round_trip(tmp_path, values, data):
     values[:, 4:6] += 2000  # no column of zeros, which would come back as None
