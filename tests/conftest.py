@@ -29,6 +29,15 @@ settings.register_profile("thorough", max_examples=300, **untimed)
 settings.load_profile("quick")
 
 
+def read_only(thing):
+    """The same object, whose arrays, one level down too, nobody can change: all tests share it."""
+    for value in (*vars(thing).values(), *getattr(thing, "flown", ()), getattr(thing, "responses", None) or ()):
+        for array in (value, *getattr(value, "__dict__", {}).values()):
+            if isinstance(array, np.ndarray):
+                array.flags.writeable = False
+    return thing
+
+
 @pytest.fixture(scope="session")
 def made_once(tmp_path_factory):
     """Function of a name and of a function that makes a run: one process makes and saves it, all load it."""
@@ -42,7 +51,7 @@ def made_once(tmp_path_factory):
             fcntl.flock(lock, fcntl.LOCK_EX)  # until the file is closed
             if not path.exists():
                 make().save(path)
-        return ae.load(path)
+        return read_only(ae.load(path))
 
     return load
 
@@ -55,26 +64,33 @@ def nickel():
 @pytest.fixture(scope="session")
 def small_tip(nickel):
     """Ni[111], R = 6 a: 10,000 atoms, 2,100 at the surface."""
-    return ae.Tip(nickel, apex_radius=6 * nickel.a, axis=(1, 1, 1), shank_length=6 * nickel.a)
+    return read_only(ae.Tip(nickel, apex_radius=6 * nickel.a, axis=(1, 1, 1), shank_length=6 * nickel.a))
 
 
 @pytest.fixture(scope="session")
 def tip12(nickel):
     """Ni[111], R = 12 a, of a random origin: no two charges are equal."""
-    return ae.Tip(nickel, apex_radius=12 * nickel.a, axis=(1, 1, 1), shank_length=12 * nickel.a, offset_seed=3)
+    return read_only(
+        ae.Tip(nickel, apex_radius=12 * nickel.a, axis=(1, 1, 1), shank_length=12 * nickel.a, offset_seed=3)
+    )
 
 
 @pytest.fixture(scope="session")
 def surface12(tip12):
     """Positions, normals and charges of the surface atoms of `tip12`, solved to 1e-8."""
     emitter = ae.Emitter(tip12, 1000.0)
-    return emitter.positions, emitter.normals, emitter.charges
+    arrays = emitter.positions, emitter.normals, emitter.charges
+    for array in arrays:
+        array.flags.writeable = False
+    return arrays
 
 
 @pytest.fixture(scope="session")
 def tip20(nickel):
     """Ni[111], R = 20 a, centred on an atom: as symmetric as the crystal."""
-    return ae.Tip(nickel, apex_radius=20 * nickel.a, axis=(1, 1, 1), shank_angle=1.5, shank_length=20 * nickel.a)
+    return read_only(
+        ae.Tip(nickel, apex_radius=20 * nickel.a, axis=(1, 1, 1), shank_angle=1.5, shank_length=20 * nickel.a)
+    )
 
 
 @pytest.fixture(scope="session")
@@ -84,7 +100,8 @@ def run20(tip20, made_once):
     flown = (ae.Unperturbed(), ae.RollUp(ae.TruncatedNormal(0.155, 0.155)))
 
     def make():
-        simulation = ae.Simulation(tip20, voltage=1000.0, seed=1, detector=detector)
+        flight = ae.FlightSettings(opening_angle=0.6, tolerance=1e-2)  # to 0.1 mm: patterns of many mm are looked at
+        simulation = ae.Simulation(tip20, voltage=1000.0, seed=1, detector=detector, flight_settings=flight)
         return simulation.run(15_000, flown, responses=False, progress=False)
 
     return made_once("run20", make)

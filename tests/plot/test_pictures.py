@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -41,10 +42,16 @@ def discs_of(ax):
 # ---- maps ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("height", [0.6, 1.0, 1.1])
-@pytest.mark.parametrize("title", [None, "0.75 roll-up + 0.25 lateral velocity, 0.155 ± 0.155 eV"])
-@pytest.mark.parametrize("half", [100, 150, 1500])
-def test_nothing_of_a_map_is_cut_off(half, height, title):
+TITLES = (None, "0.75 roll-up + 0.25 lateral velocity, 0.155 ± 0.155 eV")
+PICTURES = list(product((100, 150, 1500), TITLES, (0.6, 1.0, 1.1)))
+
+
+@pytest.mark.parametrize(
+    "half, title, height",
+    # every other one: each half with each height, each with and without a title
+    [*PICTURES[::2], *(pytest.param(*picture, marks=pytest.mark.slow) for picture in PICTURES[1::2])],
+)
+def test_nothing_of_a_map_is_cut_off(half, title, height):
     random = np.random.default_rng(0)
     edges = np.linspace(-half, half, 21)
     map = ae.DetectorMap.from_array(random.random((20, 20)), edges, height * edges)

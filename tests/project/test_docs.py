@@ -95,13 +95,10 @@ def test_what_the_readme_makes(folder, monkeypatch):
     assert not np.array_equal(flown.x, page.run.hits(ae.Unperturbed()).x)
 
 
-SLOW = {"tutorial_3_fit_energies.py"}
-TUTORIALS = [
-    pytest.param(path.name, marks=[pytest.mark.slow] if path.name in SLOW else [])
-    for path in sorted((ROOT / "examples").glob("tutorial_*.py"))
-]
+TUTORIALS = sorted(path.name for path in (ROOT / "examples").glob("tutorial_*.py"))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*leaves out:UserWarning")
 @pytest.mark.parametrize("name", TUTORIALS)
 def test_examples_run(name, folder, monkeypatch, capsys):
@@ -140,8 +137,9 @@ def run_figure(name, monkeypatch, *arguments):
     runpy.run_path(str(ROOT / "examples" / name), run_name="__main__")
 
 
+@pytest.mark.slow
 def test_figure_2_of_a_small_tip(folder, monkeypatch, capsys):
-    run_figure("figure2.py", monkeypatch, "--radius", "8", "-o", "out")
+    run_figure("figure2.py", monkeypatch, "--radius", "12", "-o", "out")
     assert (folder / "out" / "figure2.png").stat().st_size > 100_000
     results = json.loads((folder / "out" / "figure2.json").read_text())["results"]
     assert set(results) == {"Al[012]", "Ni[111]"}
