@@ -1,11 +1,19 @@
-"""Small specimens, made once for all tests."""
+"""Small specimens, made once for all tests, and runs, made once for all processes that test."""
 
+import fcntl
+import os
 import signal
 import sys
 from pathlib import Path
 
+if "PYTEST_XDIST_WORKER" in os.environ:  # before NumPy is imported: every processor has a worker already
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, settings
+from matplotlib.figure import Figure
 
 sys.path.append(str(Path(__file__).parent))  # for twins.py, whatever the import mode
 
@@ -13,6 +21,39 @@ import apt_evap as ae
 
 # a shell that has put the tests into the background lets them ignore Ctrl-C, which some of them press
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# examples are not timed: the machine may be slow or busy
+untimed = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow, HealthCheck.function_scoped_fixture]}
+settings.register_profile("quick", max_examples=25, derandomize=True, **untimed)
+settings.register_profile("thorough", max_examples=300, **untimed)
+settings.load_profile("quick")
+
+
+def read_only(thing):
+    """The same object, whose arrays, one level down too, nobody can change: all tests share it."""
+    for value in (*vars(thing).values(), *getattr(thing, "flown", ()), getattr(thing, "responses", None) or ()):
+        for array in (value, *getattr(value, "__dict__", {}).values()):
+            if isinstance(array, np.ndarray):
+                array.flags.writeable = False
+    return thing
+
+
+@pytest.fixture(scope="session")
+def made_once(tmp_path_factory):
+    """Function of a name and of a function that makes a run: one process makes and saves it, all load it."""
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent  # of all workers
+
+    def load(name, make):
+        path = folder / f"{name}.h5"
+        with open(path.with_suffix(".lock"), "w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # until the file is closed
+            if not path.exists():
+                make().save(path)
+        return read_only(ae.load(path))
+
+    return load
 
 
 @pytest.fixture(scope="session")
@@ -23,34 +64,54 @@ def nickel():
 @pytest.fixture(scope="session")
 def small_tip(nickel):
     """Ni[111], R = 6 a: 10,000 atoms, 2,100 at the surface."""
-    return ae.Tip(nickel, apex_radius=6 * nickel.a, axis=(1, 1, 1), shank_length=6 * nickel.a)
+    return read_only(ae.Tip(nickel, apex_radius=6 * nickel.a, axis=(1, 1, 1), shank_length=6 * nickel.a))
 
 
 @pytest.fixture(scope="session")
 def tip12(nickel):
     """Ni[111], R = 12 a, of a random origin: no two charges are equal."""
-    return ae.Tip(nickel, apex_radius=12 * nickel.a, axis=(1, 1, 1), shank_length=12 * nickel.a, offset_seed=3)
+    return read_only(
+        ae.Tip(nickel, apex_radius=12 * nickel.a, axis=(1, 1, 1), shank_length=12 * nickel.a, offset_seed=3)
+    )
 
 
 @pytest.fixture(scope="session")
 def surface12(tip12):
     """Positions, normals and charges of the surface atoms of `tip12`, solved to 1e-8."""
     emitter = ae.Emitter(tip12, 1000.0)
-    return emitter.positions, emitter.normals, emitter.charges
+    arrays = emitter.positions, emitter.normals, emitter.charges
+    for array in arrays:
+        array.flags.writeable = False
+    return arrays
 
 
 @pytest.fixture(scope="session")
 def tip20(nickel):
     """Ni[111], R = 20 a, centred on an atom: as symmetric as the crystal."""
-    return ae.Tip(nickel, apex_radius=20 * nickel.a, axis=(1, 1, 1), shank_angle=1.5, shank_length=20 * nickel.a)
+    return read_only(
+        ae.Tip(nickel, apex_radius=20 * nickel.a, axis=(1, 1, 1), shank_angle=1.5, shank_length=20 * nickel.a)
+    )
 
 
 @pytest.fixture(scope="session")
-def run20(tip20):
-    """15,000 ions of `tip20`, each flown at rest and rolled up (some 10 s)."""
-    simulation = ae.Simulation(tip20, voltage=1000.0, seed=1, detector=ae.Detector(distance=100.0, width=300.0))
+def run20(tip20, made_once):
+    """15,000 ions of `tip20`, each flown at rest and rolled up."""
+    detector = ae.Detector(distance=100.0, width=300.0)
     flown = (ae.Unperturbed(), ae.RollUp(ae.TruncatedNormal(0.155, 0.155)))
-    return simulation.run(15_000, flown, responses=False, progress=False)
+
+    def make():
+        flight = ae.FlightSettings(opening_angle=0.6, tolerance=1e-2)  # to 0.1 mm: patterns of many mm are looked at
+        simulation = ae.Simulation(tip20, voltage=1000.0, seed=1, detector=detector, flight_settings=flight)
+        return simulation.run(15_000, flown, responses=False, progress=False)
+
+    return made_once("run20", make)
+
+
+@pytest.fixture
+def blank_pictures(monkeypatch):
+    """Pictures are written with nothing on them: for tests of all but pictures, which take a second each."""
+    save = Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *args, **options: save(Figure((1, 1)), *args, **options))
 
 
 @pytest.fixture

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 import twins
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import apt_evap as ae
@@ -82,13 +82,13 @@ def test_a_cell_leaves_the_octupole(rng):
 def test_sweep_is_the_field_of_all_others(surface12, double):
     positions, _, charges = surface12
     tree = Octree(positions, charges)
-    field = np.empty((len(positions), 3))
-    expected = twins.field(tree.positions, tree.positions, tree.charges)
+    field, some = np.empty((len(positions), 3)), slice(None, None, 8)
+    expected = twins.field(tree.positions[some], tree.positions, tree.charges)
     InteractionLists(tree, 0.0).sweep(field, double_precision=double)
     # float32 carries 6e-8 per term, about a group's middle; its sums of 8,000 terms stay at 1e-6
-    assert rms(field - expected, expected) < (1e-13 if double else 2e-6)
+    assert rms(field[some] - expected, expected) < (1e-13 if double else 2e-6)
     InteractionLists(tree, DEFAULT_ANGLE).sweep(field, double_precision=double)
-    assert 1e-5 < rms(field - expected, expected) < 1e-3  # the accuracy asked of the default; and cells were in use
+    assert 1e-5 < rms(field[some] - expected, expected) < 1e-3  # as asked of the default; and cells were in use
 
 
 def test_sweep_over_a_cell_leaves_the_octupole(rng):
@@ -109,12 +109,13 @@ def test_sweep_over_a_cell_leaves_the_octupole(rng):
 def test_sweep_better_with_smaller_angle(surface12):
     positions, _, charges = surface12
     tree = Octree(positions, charges)
-    expected = twins.field(tree.positions, tree.positions, tree.charges)
+    some = slice(None, None, 8)
+    expected = twins.field(tree.positions[some], tree.positions, tree.charges)
     errors = []
     for angle in (0.8, 0.6, 0.4, 0.2):
         field = np.empty((len(positions), 3))
         InteractionLists(tree, angle).sweep(field, double_precision=True)
-        errors.append(rms(field - expected, expected))
+        errors.append(rms(field[some] - expected, expected))
     assert errors == sorted(errors, reverse=True)
 
 
@@ -170,12 +171,12 @@ def test_order_is_that_of_the_keys(crowd, n_threads):
     assert np.array_equal(keys, expected[order])
 
 
-@pytest.mark.parametrize("n_threads", [1, 2, 3])
 @pytest.mark.parametrize("leaf_size", [1, 16, 5000])
-def test_nodes_are_those_of_a_plain_recursion(crowd, leaf_size, n_threads):
+def test_nodes_are_those_of_a_plain_recursion(crowd, leaf_size):
     _, keys = morton_order(crowd)
     expected = np.array(twins.flat(twins.split(keys, leaf_size)))
-    assert np.array_equal(np.stack(split(keys, leaf_size, n_threads), axis=1), expected)
+    for n_threads in (1, 2, 3):
+        assert np.array_equal(np.stack(split(keys, leaf_size, n_threads), axis=1), expected)
 
 
 # ---- copies, threads -----------------------------------------------------------------------------------------------
@@ -251,7 +252,6 @@ def test_odd_arrangements(name, rng):
         assert rms(swept - expected, expected) < 1e-3
 
 
-@settings(max_examples=40, deadline=None)
 @given(n=st.integers(1, 200), leaf=st.integers(1, 32), seed=st.integers(0, 2**32 - 1), grid=st.booleans())
 def test_any_arrangement(n, leaf, seed, grid):
     generator = np.random.default_rng(seed)

@@ -76,6 +76,6 @@ def test_bad_arguments_are_named(run, call, message):
         call(run)
 
 
-def test_a_run_without_responses_has_no_tracks(run20):
+def test_a_run_without_responses_has_no_tracks(run):
     with pytest.raises(ValueError, match="has none: run it with responses=True"):
-        ae.rollup_tracks(run20, [0], [0.1])
+        ae.rollup_tracks(replace(run, responses=None), [0], [0.1])

@@ -24,6 +24,7 @@ from apt_evap.io.formats import write
 from apt_evap.simulation.run import load
 
 HERE = str(Path(cli.__file__).parents[2])  # the package under test, installed or not
+NO_PICTURES = pytest.mark.usefixtures("blank_pictures")
 PROGRAM = "import sys; from apt_evap.cli.main import main; sys.exit(main())"
 SMALL = """
 [tip]
@@ -93,6 +94,7 @@ def test_run_writes_run_and_picture_and_says_so(folder, capsys):
     assert sorted(os.listdir()) == ["small.h5", "small.png", "small.toml"]
 
 
+@NO_PICTURES
 def test_options_go_before_the_file(folder, capsys):
     arguments = ["run", "small.toml", "-o", "other.h5", "--ions", "20", "--seed", "5", "--map", "other.svg", "--quiet"]
     assert main(arguments) == 0
@@ -102,12 +104,14 @@ def test_options_go_before_the_file(folder, capsys):
     assert sorted(os.listdir()) == ["other.h5", "other.svg", "small.toml"]
 
 
+@NO_PICTURES
 def test_the_output_of_the_file_is_the_default(folder):
     (folder / "small.toml").write_text('output = "named.h5"\n' + SMALL)
     assert main(["run", "small.toml", "--ions", "5", "--quiet"]) == 0
     assert (folder / "named.h5").exists() and (folder / "named.png").exists()
 
 
+@NO_PICTURES
 def test_the_run_is_that_of_python_whatever_the_threads(folder, made):
     assert main(["run", "small.toml", "--threads", "2", "--quiet"]) == 0
     one, two = load(made), load("small.h5")
@@ -115,6 +119,7 @@ def test_the_run_is_that_of_python_whatever_the_threads(folder, made):
         assert np.array_equal(one.hits(perturbation).x, two.hits(perturbation).x)
 
 
+@NO_PICTURES
 def test_without_responses_the_perturbations_of_the_maps_are_flown(folder, capsys):
     (folder / "small.toml").write_text(SMALL + 'responses = false\n[[maps.panels]]\nperturbation = "RollUp:0.2"\n')
     assert main(["run", "small.toml"]) == 0
@@ -131,6 +136,7 @@ def datasets(path):
     return found
 
 
+@NO_PICTURES
 def test_a_run_is_made_longer_by_resume(folder, made, capsys):
     assert main(["run", "small.toml", "--ions", "25", "--quiet"]) == 0
     assert main(["run", "small.toml", "--resume", "--checkpoint", "0"]) == 0
@@ -155,6 +161,7 @@ def test_a_run_is_made_longer_by_resume(folder, made, capsys):
     )
 
 
+@NO_PICTURES
 def test_an_unfinished_run_is_resumed_or_begun_anew_as_asked(folder, made, capsys):
     assert main(["run", "small.toml", "--ions", "25", "--quiet"]) == 0
     (folder / "small.h5.unfinished").mkdir()
@@ -176,6 +183,7 @@ def test_an_unfinished_run_is_resumed_or_begun_anew_as_asked(folder, made, capsy
     assert sorted(os.listdir()) == ["small.h5", "small.png", "small.toml"]
 
 
+@NO_PICTURES
 def test_a_second_run_overwrites_the_first_but_nobody_elses_files(folder, capsys):
     quick = ["run", "small.toml", "--ions", "5", "--quiet"]
     assert main(quick) == 0
@@ -257,6 +265,7 @@ def test_wrong_configs_are_one_sentence(folder, made, capsys):
     assert f"'{made}' is a run: see apt-evap info" in failed(capsys, "run", made)
 
 
+@NO_PICTURES
 def test_a_run_that_ends_early_says_why(folder, capsys):
     (folder / "small.toml").write_text(SMALL.replace("6 a", "3 a") + "responses = false\n")
     assert main(["run", "small.toml", "--ions", "100000"]) == 0
@@ -296,8 +305,10 @@ def test_memory_and_interrupts_are_no_tracebacks_but_bugs_are(folder, capsys, mo
     assert os.listdir() == ["small.toml"]
 
 
+@NO_PICTURES
 def test_progress_without_a_terminal_is_plain_lines(folder, capsys, monkeypatch):
     monkeypatch.setattr(run_command, "SECONDS_BETWEEN_LINES", 0.0)
+    (folder / "small.toml").write_text(SMALL + "responses = false\n")
     assert main(["run", "small.toml", "--ions", "600", "--threads", "1"]) == 0
     line = r"300 of 600 ions \(50%\), [\d.,]+ ions/s, \d+ s left\n"
     assert re.search(line, capsys.readouterr().err)
@@ -305,6 +316,7 @@ def test_progress_without_a_terminal_is_plain_lines(folder, capsys, monkeypatch)
     assert capsys.readouterr().err == ""
 
 
+@NO_PICTURES
 def test_a_run_that_misses_the_detector_says_so(folder, capsys):
     (folder / "small.toml").write_text(SMALL + "[detector]\nwidth = 40\n")
     assert main(["run", "small.toml"]) == 0
@@ -318,7 +330,7 @@ def test_a_run_that_misses_the_detector_says_so(folder, capsys):
 def test_ctrl_c_and_sigterm_keep_what_is_done(folder, sent, code):
     terminal, end = os.openpty()
     termios.tcsetwinsize(end, (24, 100))
-    (folder / "small.toml").write_text(SMALL.replace("6 a", "10 a"))
+    (folder / "small.toml").write_text(SMALL.replace("6 a", "8 a"))
     process = subprocess.Popen(
         [sys.executable, "-c", PROGRAM, "run", "small.toml", "--ions", "5000", "--threads", "1"],
         cwd=folder,
@@ -383,6 +395,7 @@ def test_map_of_a_run_shows_the_whole_detector(folder, made, monkeypatch, capsys
         assert each.values.shape == (32, 32) and each.smoothing == 300 / 32
 
 
+@NO_PICTURES
 def test_map_of_a_run_under_any_perturbation(folder, made, monkeypatch):
     wanted = ["--perturbation", "LateralVelocity:0.3", "--perturbation", "Combined:0.3,0.1,0.75"]
     maps, titles = drawn_by(monkeypatch, "map", made, *wanted, "--bins", "16", "--smooth", "0", "-o", "a.pdf")
@@ -407,6 +420,7 @@ def test_a_run_is_drawn_with_the_maps_of_its_config(folder, monkeypatch):
     assert maps[0].values.shape == (30, 30) and maps[0].smoothing == 10
 
 
+@NO_PICTURES
 def test_map_of_measured_ions_keeps_to_their_comb(measured, monkeypatch):
     (only,), titles = drawn_by(monkeypatch, "map", measured)
     assert titles == ["ions.epos"] and only.quantum == pytest.approx((0.5, 0.5))
@@ -414,6 +428,7 @@ def test_map_of_measured_ions_keeps_to_their_comb(measured, monkeypatch):
     assert only.bin_size == pytest.approx((0.5, 0.5)) and only.smoothing == pytest.approx(0.5)
 
 
+@NO_PICTURES
 def test_what_was_written_is_told_as_json_or_not_at_all(folder, capsys):
     assert main(["run", "small.toml", "--json", "--map", "small.svg"]) == 0
     out, err = capsys.readouterr()
@@ -433,6 +448,7 @@ def test_what_was_written_is_told_as_json_or_not_at_all(folder, capsys):
     assert "not allowed with argument" in failed(capsys, "map", "small.h5", "--quiet", "--json")
 
 
+@NO_PICTURES
 def test_map_errors(measured, made, capsys):
     write("ions.pos", Hits(positions=np.zeros((3, 3)), mass_to_charge=np.ones(3)))
     assert (
@@ -521,6 +537,7 @@ def test_warnings_of_readers_are_one_line(measured, capsys):
 # ---- maps in .npz files ----------------------------------------------------------------------------------------------
 
 
+@NO_PICTURES
 def test_map_and_info_of_a_map(folder, monkeypatch, capsys):
     edges = np.linspace(-20, 20, 41)
     values = np.random.default_rng(1).poisson(5.0, (40, 40))
@@ -559,6 +576,7 @@ def mixed(folder):
     return x.astype(np.float32), y.astype(np.float32)
 
 
+@NO_PICTURES
 def test_ions_are_selected(mixed, monkeypatch, capsys):
     x, y = mixed
 
@@ -580,6 +598,7 @@ def test_ions_are_selected(mixed, monkeypatch, capsys):
     assert only.ions <= 25 and titles == ["mixed.epos, 25 of 1,000 ions"]
 
 
+@NO_PICTURES
 def test_ions_of_a_run_are_selected(folder, made, monkeypatch, capsys):
     run = load(made)
     maps, _ = drawn_by(monkeypatch, "map", made, "--ions", "20,", "--perturbation", "Unperturbed")

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import assume, example, given, settings
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from skimage.morphology import convex_hull_image
@@ -37,7 +37,6 @@ def modulation(map):
     return [totals.std() / np.sqrt(totals.mean()) for totals in (middle.sum(0), middle.sum(1))]
 
 
-@settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2**32), st.integers(1, 40), st.integers(1, 300))
 def test_counts_are_those_of_numpy(seed, bins, n):
     x, y = np.random.default_rng(seed).normal(size=(2, n))
@@ -89,7 +88,6 @@ def test_irregular_comb_is_found():
     assert find_comb(random.choice(teeth, 50_000)).spacing == pytest.approx(0.03, rel=1e-4)
 
 
-@settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32), st.sampled_from(["f4", "f8"]), st.sampled_from([10, 1000, 150_000]), st.booleans())
 def test_continuous_coordinates_have_no_comb(seed, dtype, n, repeated):
     random = np.random.default_rng(seed)

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from apt_evap._common.files import FileError
@@ -139,7 +139,6 @@ def test_where_ranges_overlap_the_first_wins_and_a_warning_says_so(save):
         Ranges(list("ab"), [1, 2], [2, 3])  # adjoining ranges do not overlap
 
 
-@settings(max_examples=50, deadline=None)
 @given(
     bounds=st.lists(st.tuples(st.integers(0, 20), st.integers(1, 8)), min_size=1, max_size=8),
     masses=st.lists(st.floats(-2, 32, width=32), min_size=1, max_size=30),

@@ -5,7 +5,7 @@ import warnings
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from ion_files import apt, apt_section, epos, ions_of, pos, raw, usual_apt
 
@@ -13,8 +13,6 @@ import apt_evap.io._pulses as pulses_module
 import apt_evap.io._records as records_module
 from apt_evap._common.files import FileError, TruncatedFile
 from apt_evap.io.formats import chunks, read
-
-quick = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @pytest.fixture(autouse=True)
@@ -47,7 +45,6 @@ def assert_joined(parts, whole):
         np.testing.assert_array_equal(np.concatenate([part.extra[name] for part in parts]), whole.extra[name])
 
 
-@quick
 @given(
     suffix=st.sampled_from([".epos", ".raw", ".apt", ".pos"]),
     sizes=st.lists(st.integers(1, 4), min_size=1, max_size=15),
@@ -71,7 +68,6 @@ def test_chunks_joined_are_the_whole(tmp_path, suffix, sizes, more):
             assert part.multiplicity.tolist() == count[inverse].tolist()
 
 
-@quick
 @given(suffix=st.sampled_from([".epos", ".raw", ".apt", ".pos"]), data=st.data())
 def test_some_columns_are_those_of_the_whole(tmp_path, suffix, data):
     path = tmp_path / f"a{suffix}"
@@ -86,7 +82,6 @@ def test_some_columns_are_those_of_the_whole(tmp_path, suffix, data):
     assert_joined(chunks(path, 3, columns=names), some)
 
 
-@settings(quick, max_examples=300)
 @example(ions=[0, 0, 0, 1])  # a block without a first ion
 @given(ions=st.lists(st.integers(0, 3), min_size=1, max_size=12))
 def test_the_last_column_is_consistent_where_a_plain_reading_says_so(tmp_path, ions):

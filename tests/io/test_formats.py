@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -162,10 +162,8 @@ def hits_of(values, **columns):
 
 
 finite = st.floats(-1000, 1000, width=32).filter(lambda value: value == 0 or abs(value) > 1e-6)
-quick = settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
-@quick
 @given(values=arrays("f4", st.tuples(st.integers(1, 12), st.just(7)), elements=finite), data=st.data())
 def test_epos_round_trip(tmp_path, values, data):
     values[:, 4:6] += 2000  # no column of zeros, which would come back as None

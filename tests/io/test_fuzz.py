@@ -9,7 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from ion_files import epos, ions_of, pos, raw, usual_apt
 
@@ -25,10 +25,6 @@ SILICON = Path(__file__).parents[3] / "shared" / "data" / "Si.epos"
 READ = tuple(entry.suffix for entry in FORMATS if entry.read and entry.suffix != ".npz")  # maps: test_npz.py
 RANGES = b"[Ions]\nNumber=2\nIon1=Si\nIon2=O\n[Ranges]\nNumber=2\nRange1=13,5 14.2 Vol:0.02 Si:1 Color:CCCCCC\n"
 RANGES += b"Range2 = 15.8 16.5 Name:oxide Si:1 O:2\n"
-
-fuzz = settings(
-    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
-)
 
 
 def samples():
@@ -100,13 +96,11 @@ def test_cut_anywhere(tmp_path, suffix, partial):
         check(save(tmp_path, data[:size], suffix), **options)
 
 
-@fuzz
 @given(suffix=st.sampled_from([*READ, ".rrng"]), data=st.binary(max_size=400))
 def test_random_bytes(tmp_path, suffix, data):
     check(save(tmp_path, data, suffix))
 
 
-@fuzz
 @given(suffix=st.sampled_from([*READ, ".rrng"]), of=st.sampled_from(sorted(SAMPLES)), swapped=st.booleans())
 def test_renamed_and_swapped(tmp_path, suffix, of, swapped):
     data = SAMPLES[of]
@@ -116,7 +110,6 @@ def test_renamed_and_swapped(tmp_path, suffix, of, swapped):
     check(save(tmp_path, data, suffix))
 
 
-@fuzz
 @given(
     suffix=st.sampled_from([".epos", ".pos", ".raw", ".apt", ".rrng"]),
     changes=st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), min_size=1, max_size=8),
@@ -129,7 +122,6 @@ def test_changed_bytes(tmp_path, suffix, changes, partial):
     check(save(tmp_path, data, suffix), **({"partial": partial} if suffix != ".rrng" else {}))
 
 
-@fuzz
 @given(
     field=st.sampled_from([4, 8, 80, 84, 88, 92, 96, 132, 140]),
     section=st.integers(0, 5),
@@ -146,7 +138,6 @@ def test_changed_headers_of_apt_sections(tmp_path, field, section, value):
     check(save(tmp_path, data, ".apt"))
 
 
-@fuzz
 @given(
     lines=st.lists(
         st.text(st.sampled_from("Range12=:., \t[]VolSiONameColor#\u00b2\u0660;eE+-_\x00\x85"), max_size=40), max_size=6
@@ -207,7 +198,6 @@ def test_damaged_runs_are_read_or_refused(tmp_path, small_tip):
 
 
 @pytest.mark.skipif(not SILICON.exists(), reason="the measured Si.epos is not there")
-@fuzz
 @given(
     start=st.integers(0, 1999),
     size=st.integers(0, 400),
@@ -231,7 +221,6 @@ def test_a_measured_file_changed(tmp_path, start, size, what):
     assert hits is None or len(hits) == (start + len(changed[what])) // 44
 
 
-@fuzz
 @given(data=st.binary(min_size=1, max_size=500), partial=st.booleans(), order=st.sampled_from(["big", "little"]))
 def test_any_bytes_in_an_order_that_is_said(tmp_path, data, partial, order):
     for suffix, row in ((".epos", 44), (".pos", 16), (".raw", 32)):

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import apt_evap as ae
@@ -76,7 +76,6 @@ def test_files_that_are_none(tmp_path):
         ae.read_map(tmp_path / "none.npz")
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(place=st.integers(0, 10_000), byte=st.integers(0, 255), length=st.integers(0, 10_000), cut=st.booleans())
 def test_damaged_files_are_refused_or_hold_a_map(tmp_path, place, byte, length, cut):
     path = tmp_path / "damaged.npz"

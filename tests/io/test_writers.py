@@ -6,7 +6,7 @@ import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -14,8 +14,6 @@ from apt_evap._common.files import FileError
 from apt_evap.detection.hits import Hits, Outcome
 from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.io.formats import read, write
-
-quick = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def full():
@@ -124,7 +122,6 @@ def test_vtp_holds_every_column(tmp_path):
     assert {name for _, name in parts} == {"a_b", "a_b_2"}
 
 
-@quick
 @given(positions=arrays("f4", st.tuples(st.integers(1, 9), st.just(3)), elements=st.floats(-1e4, 1e4, width=32)))
 def test_positions_come_back(tmp_path, positions):
     hits = Hits(positions=positions, x=positions[:, 0], y=positions[:, 1].astype(float))

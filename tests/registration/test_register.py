@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rough import ROUGH
 from scipy import ndimage
 
 import apt_evap as ae
@@ -24,11 +25,15 @@ FASTER = ae.RollUp(ae.TruncatedNormal(0.3, 0.1))
 
 
 @pytest.fixture(scope="module")
-def low():
-    """Ni[124], an axis without any symmetry: 16,000 ions (some 15 s on two cores)."""
+def low(made_once):
+    """Ni[124], an axis without any symmetry: 16,000 ions."""
     nickel = ae.material("Ni")
-    tip = ae.Tip(nickel, apex_radius=16 * nickel.a, axis=(1, 2, 4), shank_length=16 * nickel.a)
-    return ae.Simulation(tip, voltage=1000.0, seed=1).run(16_000, progress=False)
+
+    def make():
+        tip = ae.Tip(nickel, apex_radius=16 * nickel.a, axis=(1, 2, 4), shank_length=16 * nickel.a)
+        return ae.Simulation(tip, voltage=1000.0, seed=1, **ROUGH).run(16_000, progress=False)
+
+    return made_once("low", make)
 
 
 @pytest.fixture(scope="module")
@@ -78,15 +83,20 @@ def off(found, true, radius):
 
 
 @pytest.mark.parametrize(
-    "scale, mirror, radius, shift, seed",
-    [(0.2, False, 15, (6.0, -3.0), 1), (0.45, True, 30, (8.0, 3.0), 2), (1.5, False, 110, (20.0, -30.0), 3)],
+    "scale, mirror, radius, shift, seed, scales",
+    [
+        (0.45, True, 30, (8.0, 3.0), 2, (0.3, 0.7)),
+        pytest.param(0.2, False, 15, (6.0, -3.0), 1, None, marks=pytest.mark.slow),
+        pytest.param(0.45, True, 30, (8.0, 3.0), 2, None, marks=pytest.mark.slow),
+        pytest.param(1.5, False, 110, (20.0, -30.0), 3, None, marks=pytest.mark.slow),
+    ],
 )
-def test_a_known_transform(low, simulated, scale, mirror, radius, shift, seed):
+def test_a_known_transform(low, simulated, scale, mirror, radius, shift, seed, scales):
     """Other energies, a gradient, an off-centre circle, 1e5 ions: within 1 degree and 1 %, as asked for."""
     true = ae.Registration(17.0, scale, shift, mirror)
     map = measured(draws(low, FASTER, seed), true, radius, seed)
     assert map.ions > 85_000  # of 100,000 some are too thinly spread to be in the mask
-    found = register(simulated, map)
+    found = register(simulated, map, scales=scales)
     assert found.mirror == mirror and found.method == "search"
     rotation, stretch, distance = off(found, true, radius)
     assert rotation < 1 and stretch < 0.01 and distance < 0.01
@@ -98,7 +108,7 @@ def test_layers_of_their_own(low):
     early = together(*(replace(low, seed=seed).hits(ROLLED)[:8000] for seed in range(1, 7)))
     true = ae.Registration(17.0, 0.45, (8.0, 3.0), True)
     map = measured(draws(low, FASTER, 2, slice(8000, None)), true, 30, 2)
-    found = register(early, map)
+    found = register(early, map, scales=(0.3, 0.7))
     rotation, stretch, distance = off(found, true, 30)
     assert found.mirror and rotation < 1 and stretch < 0.03 and distance < 0.02
 
@@ -125,6 +135,7 @@ def test_what_is_known_is_kept(low, simulated):
     assert not plain.mirror and plain.score < found.score - 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the registration is doubtful")
 def test_a_threefold_pole_with_mirrors_has_ties(run20):
     """fcc [111]: turned by 120 degrees it is the same, and mirrored and turned by 60; unmirrored is preferred."""
@@ -144,7 +155,7 @@ def test_maps_that_have_nothing_in_common(simulated):
     rng = np.random.default_rng(5)
     z = 20 * np.sqrt(rng.random(100_000)) * np.exp(2j * np.pi * rng.random(100_000))
     with pytest.warns(RegistrationWarning, match="correlate by only 0.[0-3]"):
-        found = register(simulated, ae.Hits(x=z.real, y=z.imag))
+        found = register(simulated, ae.Hits(x=z.real, y=z.imag), scales=(0.2, 0.4))
     assert found.score < 0.35
     with pytest.raises(ValueError, match="must share 50% of the measured field of view"):
         register(simulated, ae.Hits(x=z.real, y=z.imag), scales=0.01)

@@ -1,5 +1,6 @@
 """Runs that are killed, interrupted, out of disk or damaged, and go on with the same bits."""
 
+import json
 import os
 import resource
 import signal
@@ -7,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+import traceback
 import warnings
 from pathlib import Path
 
@@ -24,12 +26,34 @@ HERE = str(Path(ae.__file__).parents[1])  # the package under test, installed or
 KILLABLE = pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
 
 
-def start(function, *arguments):
-    """Begin a function of this file in a process of its own, once that has imported all it needs."""
-    command = [sys.executable, "-P", __file__, function.__name__, *map(str, arguments)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, env=os.environ | {"PYTHONPATH": HERE})
-    process.stdout.readline()
-    return process
+class Processes:
+    """Functions of this file in processes of their own, forked from one that has imported all they need."""
+
+    def __init__(self):
+        self._parent = subprocess.Popen(
+            [sys.executable, "-P", __file__],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=os.environ | {"PYTHONPATH": HERE},
+        )
+
+    def run(self, function, *arguments, kill_after=None):
+        """Exit code of a function in a new process, which is killed if it takes longer [s]."""
+        line = json.dumps([function.__name__, kill_after, *map(str, arguments)])
+        self._parent.stdin.write(line.encode() + b"\n")
+        self._parent.stdin.flush()
+        return int(self._parent.stdout.readline())
+
+    def close(self):
+        self._parent.stdin.close()
+        self._parent.wait()
+
+
+@pytest.fixture(scope="module")
+def processes():
+    processes = Processes()
+    yield processes
+    processes.close()
 
 
 def simulation(**options):
@@ -72,7 +96,7 @@ def differing(path, other):
 
 # ---- killed --------------------------------------------------------------------------------------------------------
 
-N_IONS, KILLS = 300, 20
+N_IONS = 300
 
 
 def work(path):
@@ -87,33 +111,30 @@ def work(path):
 
 
 @KILLABLE
-def test_killed_at_random_moments_and_resumed_it_has_the_same_bits(tmp_path):
-    """SIGKILL at 20 random moments; whenever the run comes to its end before, another one begins."""
+@pytest.mark.parametrize("n_kills", [5, pytest.param(20, marks=pytest.mark.slow)])
+def test_killed_at_random_moments_and_resumed_it_has_the_same_bits(tmp_path, processes, n_kills):
+    """SIGKILL at random moments; whenever the run comes to its end before, another one begins."""
     simulation().run(N_IONS, [ae.RollUp(ENERGY)], progress=False).save(tmp_path / "uninterrupted.h5")
     random = np.random.default_rng(3)
     kills, whole, shortest, over = [], 0, None, False
-    while len(kills) < KILLS or whole < 3 or over or any("unfinished" in name for name in os.listdir(tmp_path)):
+    while len(kills) < n_kills or whole < 3 or over or any("unfinished" in name for name in os.listdir(tmp_path)):
         path = tmp_path / f"{whole}.h5"
         folder = Path(f"{path}.unfinished")
-        spared = shortest is None or over or (len(kills) >= KILLS and folder.exists())
-        process = start(work, path)
+        spared = shortest is None or over or (len(kills) >= n_kills and folder.exists())
         began = time.monotonic()
-        try:
-            process.wait(None if spared else random.uniform(0, 0.4 * shortest))
-        except subprocess.TimeoutExpired:
-            process.kill()
-        if process.wait() == -signal.SIGKILL:
+        code = processes.run(work, path, kill_after=None if spared else random.uniform(0, 0.4 * shortest))
+        if code == -signal.SIGKILL:
             kills.append(len(list(folder.glob("ions-*.h5"))))
             over = path.exists() and not folder.exists()  # hit after its end: another one begins
             continue
-        assert process.returncode == 0
+        assert code == 0
         shortest = time.monotonic() - began if shortest is None else shortest
         assert differing(path, tmp_path / "uninterrupted.h5") == []
         assert not folder.exists()
         whole, over = whole + 1, False
     print(f"checkpoints there at each of {len(kills)} kills: {kills}; {whole} runs to the end, alone {shortest:.1f} s")
     assert whole >= 3  # the first, which is not killed, and two that were
-    assert max(kills) > 3  # they hit runs that had come some way
+    assert max(kills) > n_kills // 6  # they hit runs that had come some way
     leftover = [name for name in os.listdir(tmp_path) if "unfinished" in name]
     assert leftover == []
 
@@ -139,11 +160,13 @@ def crash(path, number, late):
 
 @KILLABLE
 @pytest.mark.parametrize("late", [False, True])
-def test_killed_at_every_rename(tmp_path, late):
+def test_killed_at_every_rename(tmp_path, processes, late):
     run_small(tmp_path / "uninterrupted.h5")
     for number in range(20):
         path = tmp_path / f"{number}.h5"
-        left = start(crash, path, number, int(late)).wait() == 9
+        code = processes.run(crash, path, number, int(late))
+        assert code in (0, 9)
+        left = code == 9
         run_small(path, resume=True)
         assert differing(path, tmp_path / "uninterrupted.h5") == []
         if not left:
@@ -455,7 +478,26 @@ def test_other_versions_are_told(tmp_path):
         ae.load(tmp_path / "run.h5")
 
 
+def serve():
+    """Run every function asked for in a child, and say how it ended."""
+    small(), simulation()  # names are loaded when they are first used
+    for line in sys.stdin:
+        name, kill_after, path, *numbers = json.loads(line)
+        child = os.fork()
+        if child == 0:
+            try:
+                {"work": work, "crash": crash}[name](Path(path), *map(int, numbers))
+            except BaseException:
+                traceback.print_exc()
+                os._exit(1)
+            os._exit(0)
+        began = time.monotonic()
+        while (ended := os.waitpid(child, os.WNOHANG)) == (0, 0):
+            if kill_after is not None and time.monotonic() - began > kill_after:
+                os.kill(child, signal.SIGKILL)
+            time.sleep(0.0005)
+        print(os.waitstatus_to_exitcode(ended[1]), flush=True)
+
+
 if __name__ == "__main__":
-    print("ready", flush=True)
-    name, path, *numbers = sys.argv[1:]
-    {"work": work, "crash": crash}[name](Path(path), *map(int, numbers))
+    serve()

@@ -192,7 +192,7 @@ def test_a_shell_gives_the_ions_of_the_whole_specimen(nickel):
     shape = {"apex_radius": 10 * nickel.a, "axis": (1, 1, 1)}
     shell, whole = ae.Tip(nickel, **shape, depth=5.2 * nickel.a), ae.Tip(nickel, **shape)
     assert len(shell) < 0.9 * len(whole)
-    held = ae.Simulation(shell).run(1200, responses=False, progress=False)
+    held = ae.Simulation(shell).run(500, responses=False, progress=False)
     full = ae.Simulation(whole).run(len(held), responses=False, progress=False)
     assert len(held) > 300
     assert np.array_equal(held.emissions.positions, full.emissions.positions)

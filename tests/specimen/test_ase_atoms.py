@@ -36,7 +36,7 @@ class TestAse:
         assert len(atoms) == len(alloy)
         assert atoms.get_chemical_symbols()[:50] == [alloy.elements[k].name for k in alloy.species[:50]]
         # nearest neighbours of nickel are 2.49 Angstrom apart
-        assert atoms.get_all_distances()[0, 1:].min() == pytest.approx(3.52 / 2**0.5, rel=1e-9)
+        assert atoms.get_distances(0, range(1, len(atoms))).min() == pytest.approx(3.52 / 2**0.5, rel=1e-9)
         tip = ae.Tip.from_atoms(atoms)
         np.testing.assert_allclose(tip.positions, alloy.positions, rtol=0, atol=EXACT)
         np.testing.assert_array_equal(tip.evaporable, alloy.evaporable)

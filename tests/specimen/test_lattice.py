@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
@@ -47,7 +47,6 @@ def points_in_ball(structure, radius, axis=(0, 0, 1), origin=(0, 0, 0), **option
 
 @pytest.mark.parametrize("structure", BASES)
 @given(axis=axes, site=st.integers(0, 7), shift=st.tuples(*[st.floats(-1, 1)] * 3))
-@settings(max_examples=15, deadline=None)
 def test_shells_of_neighbours_of_every_site(structure, axis, site, shift):
     shells = SHELLS[structure]
     reach = A * (math.sqrt(shells[-1][1]) + 0.01)
@@ -88,7 +87,6 @@ def test_density_times_volume_is_the_number_of_points(structure):
 
 
 @given(axis=axes, rotation=st.floats(-400, 400), structure=st.sampled_from([*BASES]))
-@settings(max_examples=60, deadline=None)
 def test_rotation_brings_the_axis_onto_z(axis, rotation, structure):
     matrix = rotation_to_axis(structure, axis, rotation)
     np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-14)
@@ -123,7 +121,6 @@ def test_documented_direction_along_x(axis, across):
     length=st.floats(0.01, 100),
     structure=st.sampled_from([*BASES]),
 )
-@settings(max_examples=60, deadline=None)
 def test_any_axis_comes_onto_z_whatever_its_length(axis, length, structure):
     matrix = rotation_to_axis(structure, axis)
     np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-14)
@@ -186,7 +183,6 @@ def test_bad_directions_are_refused(structure, axis, message):
     blocks=st.tuples(st.integers(1, 5), st.integers(6, 12)),
     depth=st.one_of(st.none(), st.floats(0.3, 2.0)),
 )
-@settings(max_examples=25, deadline=None)
 def test_points_and_their_order_do_not_depend_on_the_blocks(structure, axis, blocks, depth):
     small, large = (
         points_in_ball(structure, 5 * A, axis, depth=depth and uniform(depth), block=block) for block in blocks

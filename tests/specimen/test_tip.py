@@ -3,7 +3,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
@@ -34,7 +34,6 @@ def small(**changes):
     z=st.floats(-8, 3),
     azimuth=st.floats(0, 6.3),
 )
-@settings(max_examples=300, deadline=None)
 def test_signed_distance_is_that_of_the_hull_of_two_balls(angle, length, rho, z, azimuth):
     # brute force over the balls of growing radius along the axis, whose union the hull is (outside), and over
     # its supporting planes (inside); both are within 1e-6 of their optimum at this fineness
@@ -51,7 +50,6 @@ def test_signed_distance_is_that_of_the_hull_of_two_balls(angle, length, rho, z,
 
 
 @given(angle=st.floats(0, 44), length=st.floats(0.2, 4.0), base=st.sampled_from(["rounded", "flat"]))
-@settings(max_examples=40, deadline=None)
 def test_signed_distance_never_changes_faster_than_the_points(angle, length, base):
     shape = TaperedCap(1.0, length, angle, base)
     generator = np.random.default_rng(5)
