@@ -7,6 +7,26 @@ from apt_evap._common.wording import argument
 
 MAX_THREADS = 1024  # each has a copy of the surface; more is a slip of the keyboard
 
+_state = {"several": False, "forked": False}  # whether several threads were asked for, and that in the parent process
+
+
+def _after_fork() -> None:
+    _state["forked"] = _state["several"]
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
+
+
+def usable_threads(n_threads: int) -> int:
+    """Return how many of `n_threads` OpenMP can serve: 1 in a child that was forked after its parent used several.
+
+    The threads of the parent do not exist in the child, and GCC's OpenMP waits for them for ever. The results do not
+    depend on the number of threads.
+    """
+    _state["several"] |= n_threads > 1
+    return 1 if _state["forked"] else n_threads
+
 
 def thread_count(n_threads: int | None = None) -> int:
     """Return the number of threads to use.

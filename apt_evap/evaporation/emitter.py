@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from apt_evap._common.describe import describe
-from apt_evap._common.threads import thread_count
+from apt_evap._common.threads import thread_count, usable_threads
 from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_array, check_count, check_kind, check_number
 from apt_evap._common.warnings import ChargesWarning
@@ -148,12 +148,15 @@ class Emitter:
             tip.surface_threshold,
             tip.support.view(np.int8),
             tip.bond_length,
-            self.n_threads,
+            usable_threads(self.n_threads),
             before,
         )
 
     def __len__(self) -> int:
         return len(self._core.slots)
+
+    def __reduce__(self):
+        raise TypeError("an Emitter cannot be pickled or copied: make one of the same tip and restore its `state()`")
 
     def __repr__(self) -> str:
         return f"<Emitter: {len(self):,} surface atoms of {len(self.tip.positions):,} at {self.voltage:g} V>"
@@ -230,12 +233,12 @@ class Emitter:
             Field [V/nm].
         """
         points, opening_angle = check_array(points, "points", ("m", 3)), check_angle(opening_angle)
-        return COULOMB * self._core.tree.fields(points, opening_angle, self.n_threads)
+        return COULOMB * self._core.tree.fields(points, opening_angle, usable_threads(self.n_threads))
 
     def potential_at(self, points: ArrayLike, opening_angle: float = 0.3) -> Floats:
         """Electric potential of the surface charges [V], shape (m,); parameters as in `field_at`."""
         points, opening_angle = check_array(points, "points", ("m", 3)), check_angle(opening_angle)
-        return COULOMB * self._core.tree.potentials(points, opening_angle, self.n_threads)
+        return COULOMB * self._core.tree.potentials(points, opening_angle, usable_threads(self.n_threads))
 
     def relax(self, tolerance: float | None = None) -> tuple[int, float]:
         """Bring the whole surface to equilibrium at the applied voltage.
@@ -265,7 +268,7 @@ class Emitter:
             tolerance=tolerance,
             opening_angle=angle,
             double_precision=tolerance < 1e-6,  # below it the rounding of float32 keeps charges moving
-            n_threads=self.n_threads,
+            n_threads=usable_threads(self.n_threads),
             start=start,
         )
         self._recorded = RECORD

@@ -103,7 +103,8 @@ class Design:
         misfit = np.einsum("mc,nkc->nmk", matrix, coefficients[:, :2]) - values[:, :, :2]
         freedom = max(1, len(matrix) - matrix.shape[1])
         residual = np.sqrt(np.einsum("nmk,nmk->n", misfit, misfit) / freedom)
-        for ion in np.flatnonzero(~np.isfinite(residual)):
+        # a time may be infinite where the place is not: a launch that never meets the plane of the detector
+        for ion in np.flatnonzero(~(np.isfinite(residual) & np.isfinite(values).all(axis=(1, 2)))):
             good = np.isfinite(values[ion]).all(axis=1)
             if good.any():
                 coefficients[ion] = np.linalg.lstsq(matrix[good], values[ion, good], rcond=None)[0].T

@@ -5,6 +5,7 @@ the surface that replay the events one by one, so each ion flies in exactly the 
 whatever the number of threads and the size of a batch.
 """
 
+import threading
 import warnings
 from collections.abc import Callable, Iterable
 
@@ -105,6 +106,7 @@ class Simulation:
         check_copies(len(self.emitter), self.n_threads)
         self.settings = self._settings_of(tip)
         self.n_evaporated = 0
+        self._running = threading.Lock()
         self._crew = FlightCrew(tip, self.flight_settings, self.n_threads)
 
     @property
@@ -184,7 +186,20 @@ class Simulation:
         with Keeper(checkpoint, self.settings, emissions, responses, n_ions) as keeper:
             return self._run(n_ions, emissions, responses, progress, batch_size, keeper)
 
+    def __reduce__(self):
+        raise TypeError("a Simulation cannot be pickled or copied: save its run, and make one with the same arguments")
+
     def _run(self, n_ions, emissions, responses, progress, batch_size, keeper):
+        if not self._running.acquire(blocking=False):
+            raise ValueError(
+                "a run of this simulation is under way in another thread: wait for it, or make another one"
+            )
+        try:
+            return self._run_alone(n_ions, emissions, responses, progress, batch_size, keeper)
+        finally:
+            self._running.release()
+
+    def _run_alone(self, n_ions, emissions, responses, progress, batch_size, keeper):
         self._catch_up(keeper.done if keeper else None)
         self.emitter.hand_out_tree()  # somebody may have let atoms evaporate without flights
         backlog = BACKLOG if self.n_threads > 1 else 0

@@ -21,6 +21,7 @@ from apt_evap.specimen.surface_criterion import SurfaceCriterion
 _ROUNDING = 1e-6  # nearest neighbour distances: sites on the surface stay together whatever their rounding
 _LAYER = 0.74  # thickness of the layer of surface atoms [d_nn]: 0.48 a^2 of the surface for each one of fcc
 _WIDEST = 10  # neighbourhood [d_nn]: 6,000 atoms each, more do not fit into the memory
+_MAX_CELLS = 5e8  # neighbourhoods in the box of all atoms: 2 GB of the grid that finds neighbours
 _SAMPLE = 10_000  # atoms asked for their nearest neighbour
 
 
@@ -220,6 +221,12 @@ class Tip:
             )
             tip.criterion = replace(tip.criterion, surface_threshold=threshold)
         low, high = tip.positions.min(axis=0), tip.positions.max(axis=0)
+        span = high - low
+        if np.prod(span / tip.neighbour_radius + 1) > _MAX_CELLS:
+            raise ValueError(
+                f"positions must lie together, got {n:,} atoms that span {span[0]:.4g} x {span[1]:.4g} x "
+                f"{span[2]:.4g} nm: is one of them far away?"
+            )
         tip.apex = float(high[2])
         if evaporable is None:
             evaporable = tip.positions[:, 2] >= (low[2] + high[2]) / 2

@@ -178,3 +178,16 @@ def test_bad_fits_are_flagged(run):
     bad[3, 0], bad[5, 1], bad[7, 0] = 0.3, 0.3, np.nan
     flagged = replace(run, responses=Responses(run.responses.site, run.responses.rolled, bad)).flagged
     assert np.flatnonzero(flagged).tolist() == [3, 5, 7]
+
+
+def test_a_launch_that_never_meets_the_plane_leaves_no_infinite_time():
+    """Ions at a wide angle meet an equidistant detector though one of their launches flies away from its plane."""
+    design = ae.Design(1, ((0.0, 1), (1.0, 4)))
+    values = np.zeros((2, 5, 3))
+    values[:, :, 0] = design.velocities[:, 0]
+    values[:, :, 2] = 100.0
+    values[1, 2, 2] = np.inf
+    coefficients, residual = design.fit(values)
+    assert np.isfinite(coefficients).all()
+    assert residual[0] < 1e-12 and np.isinf(residual[1])  # which flags the ion
+    assert coefficients[1, 2] == pytest.approx([100.0, 0.0, 0.0], abs=1e-4)

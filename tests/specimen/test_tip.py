@@ -284,3 +284,9 @@ def test_an_axis_of_floats_near_a_lattice_direction_gives_nearly_the_same_tip():
     distances = cKDTree(near.positions).query(whole.positions)[0]
     assert len(whole) == len(near)
     assert distances.max() < 1e-9 * 3 * 8 * NICKEL.a  # the angle times the height of the tip
+
+
+def test_an_atom_far_from_all_others_is_refused(small_tip):
+    positions = np.vstack([small_tip.positions, [[1e6, 1e6, 1e6]]])
+    with pytest.raises(ValueError, match=r"positions must lie together, got .* atoms that span 1e\+06"):
+        Tip.from_positions(positions, np.zeros(len(positions), int), ["Ni"])

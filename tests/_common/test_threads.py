@@ -1,0 +1,57 @@
+"""Threads and processes: a forked child, two threads on one simulation."""
+
+import multiprocessing
+import pickle
+import threading
+
+import numpy as np
+import pytest
+
+import apt_evap as ae
+
+
+def charges(tip, queue):
+    queue.put(ae.Emitter(tip, n_threads=2).charges.sum())
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork here")
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_child_forked_after_threads_were_used_does_not_hang(small_tip):
+    parent = ae.Emitter(small_tip, n_threads=2)
+    context = multiprocessing.get_context("fork")
+    queue = context.Queue()
+    child = context.Process(target=charges, args=(small_tip, queue), daemon=True)
+    child.start()
+    try:
+        assert queue.get(timeout=120) == parent.charges.sum()
+    finally:
+        child.kill()
+
+
+def test_two_threads_do_not_run_one_simulation(small_tip):
+    simulation = ae.Simulation(small_tip, n_threads=1)
+    begun, go_on = threading.Event(), threading.Event()
+
+    def wait(done, n_ions):
+        begun.set()
+        assert go_on.wait(60)
+
+    runs = []
+    thread = threading.Thread(target=lambda: runs.append(simulation.run(20, responses=False, progress=wait)))
+    thread.start()
+    try:
+        assert begun.wait(60)
+        with pytest.raises(ValueError, match="under way in another thread"):
+            simulation.run(5, responses=False, progress=False)
+    finally:
+        go_on.set()
+        thread.join()
+    more = simulation.run(5, responses=False, progress=False)
+    alone = ae.Simulation(small_tip, n_threads=1).run(25, responses=False, progress=False)
+    assert np.array_equal(np.concatenate([runs[0].site, more.site]), alone.site)
+
+
+@pytest.mark.parametrize("make", [ae.Simulation, ae.Emitter])
+def test_what_cannot_be_pickled_says_what_to_do(small_tip, make):
+    with pytest.raises(TypeError, match="cannot be pickled or copied: .*make one"):
+        pickle.dumps(make(small_tip))
