@@ -112,7 +112,7 @@ def solutions(radii=(20, 40, 80), shank=2.0, n_threads=2):
             for tolerance in (1e-3, 1e-6, 1e-10):
                 core.tree.charges = np.ones(core.tree.n_slots)
                 start = time.perf_counter()
-                sweeps, residual = Robin(window=window).iterate(
+                sweeps, residual = Robin(1e-5, window).iterate(
                     core.tree,
                     core.slot_normals,
                     lists,
@@ -279,7 +279,7 @@ def place_errors(radius=40, shank=1.0, events=5000, ions=200, n_threads=2):
         emitter = simulation.emitter
         tree = Octree(np.ascontiguousarray(emitter.positions), emitter.charges.copy())
         normals = np.ascontiguousarray(emitter.normals[tree.atoms])
-        Robin().iterate(
+        Robin(1e-5, 8).iterate(
             tree,
             normals,
             InteractionLists(tree, 0.3, n_threads),

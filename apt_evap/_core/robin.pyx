@@ -9,7 +9,7 @@ from libc.math cimport M_PI, fabsf
 
 import numpy as np
 
-from apt_evap._core.interactions import direct_field
+from apt_evap._core import interactions
 
 from apt_evap._core.octree cimport Octree
 from apt_evap._core.rule cimport FieldRule, Patch
@@ -23,44 +23,15 @@ cdef extern from "kernels.h":
 
 
 cdef class Robin(FieldRule):
-    """Robin's iteration.
+    """Robin's iteration; its parameters are those of `apt_evap.Robin`."""
 
-    The charge of an atom on a conductor is what the field of all the others along its normal induces. The iteration
-    leaves the total charge free; a point inside the specimen is brought to the potential, and moves down the axis as the
-    surface comes close to it.
-
-    Parameters
-    ----------
-    tolerance : float
-        Largest change of a charge in the last iteration of a patch, relative to the mean charge.
-    window : int
-        Sweeps before the last that are mixed into the next charges; 0 is Robin's plain iteration.
-    """
-
-    def __init__(self, double tolerance=1e-5, int window=8):
-        if not 0.0 < tolerance <= 1.0:
-            raise ValueError(f"tolerance of Robin must be above 0 and at most 1, got {tolerance!r}")
-        if not 0 <= window <= 32:
-            raise ValueError(f"window of Robin must be 0 to 32 sweeps, got {window}")
+    def __init__(self, double tolerance, int window):
         self.tolerance = tolerance
         self.window = window
         self.area = 1.0
         self.clearance = 0.0
         self.point = np.zeros((1, 3))
         self.grow(512)
-
-    def __repr__(self):
-        return f"Robin(tolerance={self.tolerance!r}, window={self.window})"
-
-    def __eq__(self, other):
-        return type(other) is type(self) and other.settings() == self.settings()
-
-    def __hash__(self):
-        return hash((self.tolerance, self.window))
-
-    def settings(self):
-        """Parameters of the rule, dict."""
-        return {"tolerance": self.tolerance, "window": self.window}
 
     def begin(self, point):
         """Take the point inside the specimen [nm], shape (3,), that is to have the potential."""
@@ -114,7 +85,7 @@ cdef class Robin(FieldRule):
         relaxation (Rolland et al., Microsc. Microanal. 21, 1649, 2015). Each sweep of Robin's iteration about halves the
         error, so that it is about as large as the residual.
         """
-        field = direct_field(positions[chosen], positions, charges)
+        field = interactions.direct_field(positions[chosen], positions, charges)
         settled = self.area / (2 * np.pi) * np.einsum("ij,ij->i", field, normals[chosen])
         return (settled - charges[chosen]) / charges.mean()
 

@@ -67,14 +67,6 @@ cdef class ChargingRule:
     def state(self, values):
         pass
 
-    def settings(self):
-        """Parameters of the rule in plain types (dict): ``type(rule)(**rule.settings())`` is the same rule."""
-        return {}
-
-    def fresh(self):
-        """Return a rule of the same settings that has seen no surface."""
-        return type(self)(**self.settings())
-
     def field_unit(self, double coulomb):
         """Field just outside a slot of strength 1 [V/nm]: 4 pi k_e / area for a charge on its area of the surface."""
         return 4.0 * M_PI * coulomb / self.area
@@ -197,10 +189,6 @@ cdef class PythonRule(FieldRule):
     def __init__(self, rule):
         self.rule = rule
         self.area = 1.0
-
-    def settings(self):
-        """The rule itself: it has no others."""
-        return {"rule": self.rule}
 
     def solve(self, Octree tree, double[:, ::1] normals, InteractionLists lists, *, double potential, double tolerance,
               int max_sweeps=200, bint double_precision=False, int n_threads=1):

@@ -27,7 +27,7 @@ UNITS = {
     "field_before_leaving": "V/nm",
     "energy_limit": "eV",
     "median_residual": "mm",
-    "marked_above": "mm",
+    "flagged_above": "mm",
     "apex_radius": "nm",
     "shank_length": "nm",
     "shank_angle": "degrees",
@@ -75,7 +75,7 @@ def _of_map(map):
         "x": [_plain(x_min), _plain(x_max)],
         "y": [_plain(y_min), _plain(y_max)],
         "values": _extent(map.values[map.mask]),
-        "share_inside_mask": _plain(np.mean(map.mask)),
+        "fraction_inside_mask": _plain(np.mean(map.mask)),
     }
 
 
@@ -87,7 +87,7 @@ def _of_run(run):
         responses = {
             "energy_limit": settings.energy_limit,
             "median_residual": _plain(np.median(residuals)) if len(residuals) else None,
-            "marked_above": settings.bound,
+            "flagged_above": settings.bound,
             "flagged": summary["flagged"],
         }
     return {

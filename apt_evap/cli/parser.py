@@ -95,7 +95,7 @@ def _add_run(commands: Any) -> None:
         "Ctrl-C or SIGTERM ends the simulation and saves what is done. While it goes on it is kept in\n"
         "RUN.h5.unfinished; killed, it goes on from there with --resume, and gives the same bits as if it had not.\n"
         "Behind the bar: charges, how far from settled they are (RMS over their mean); shares of the last ions that\n"
-        "missed, never left, or are marked, as their responses are inexact. Without a terminal: a line a minute.",
+        "missed, never left, or are flagged, as their responses are inexact. Without a terminal: a line a minute.",
         epilog="example: apt-evap run examples/ni111.toml -o ni.h5 --ions 5000",
         **_SHAPE,
     )

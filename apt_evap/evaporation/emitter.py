@@ -18,9 +18,8 @@ from apt_evap._core.evaporation import DONE, EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, 
 from apt_evap._core.journal import Journal
 from apt_evap._core.neighbourhood import Neighbourhood
 from apt_evap._core.octree import Octree
-from apt_evap._core.rule import ChargingRule
+from apt_evap.evaporation import rule as rules
 from apt_evap.evaporation.law import Extremal, Law, check_law, kernel_of
-from apt_evap.evaporation.rule import Rule, rule_for
 from apt_evap.evaporation.settings import ChargeSettings, check_angle
 from apt_evap.evaporation.state import EmitterState
 from apt_evap.evaporation.voltage import check_voltage
@@ -109,7 +108,7 @@ class Emitter:
         law: Law | None = None,
         settings: ChargeSettings | None = None,
         n_threads: int | None = None,
-        rule: ChargingRule | Rule | None = None,
+        rule: rules.Rule | rules.CompiledRule | None = None,
     ) -> None:
         self.tip = check_kind(tip, "tip", Tip, "a Tip")
         self.voltage = check_voltage(voltage)
@@ -117,13 +116,13 @@ class Emitter:
         check_law(self.law)
         self.settings = ChargeSettings() if settings is None else settings
         check_kind(self.settings, "settings", ChargeSettings, "ChargeSettings")
-        self.rule = rule_for(rule)
-        self.rule.begin(tip.potential_point)
+        self.rule = rules.Robin() if rule is None else rule
+        rules.check_rule(self.rule)
         self.n_threads = thread_count(n_threads)
         distance = tip.nearest_neighbour_distance
         self._core = Evaporation(
             self._neighbourhood_of(tip),
-            self.rule,
+            rules.kernel_of(self.rule, tip),
             kernel_of(self.law, tip),
             self.voltage / COULOMB,
             COULOMB,
@@ -181,6 +180,21 @@ class Emitter:
         """Charges of the surface atoms [e], shape (n,)."""
         return self._core.tree.charges[self._core.slots]
 
+    def charge_residuals(self, chosen: Integers) -> Floats:
+        """How far charges are from the equation of the charging rule, by direct sums over all others.
+
+        Parameters
+        ----------
+        chosen : ndarray of int, shape (m,)
+            Which of the surface atoms.
+
+        Returns
+        -------
+        ndarray, shape (m,)
+            Residuals over the mean charge; NaN for a rule that cannot say.
+        """
+        return self._core.rule.residuals(self.positions, self.normals, self.charges, chosen)
+
     @property
     def fields(self) -> Floats:
         """Fields just outside the surface atoms [V/nm], shape (n,).
@@ -209,7 +223,7 @@ class Emitter:
     @property
     def area_per_atom(self) -> float:
         """Area s of the surface per atom, as of the last relaxation [nm^2]."""
-        return self.rule.area
+        return self._core.rule.area
 
     @property
     def counts(self) -> dict[str, int]:

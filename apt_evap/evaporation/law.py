@@ -1,5 +1,6 @@
 """Evaporation laws: which atom leaves next."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -57,7 +58,7 @@ class Extremal:
 
 def check_law(law: object) -> None:
     """Refuse what is not a law (ValueError)."""
-    if not any(callable(getattr(law, name, None)) for name in ("kernel", "keys")):
+    if isinstance(law, type | Mapping) or not any(callable(getattr(law, name, None)) for name in ("kernel", "keys")):
         raise ValueError(f"law must be an evaporation law with a method keys, such as Extremal(), got {law!r:.80}")
 
 

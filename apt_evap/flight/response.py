@@ -141,7 +141,7 @@ class ResponseSettings:
         Launches from the site and from the rolled-up position. Measured on Ni[111], R = 80 a, 300 ions, against flights
         at random energies up to 1.5 eV: median 0.008 mm and 0.0016 mm on a detector at 100 mm.
     bound : float
-        Residual of a fit, on the detector, above which an ion is marked [mm].
+        Residual of a fit, on the detector, above which an ion is flagged [mm].
     """
 
     energy_limit: float = 1.5

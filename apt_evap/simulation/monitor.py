@@ -67,11 +67,10 @@ def charge_residuals(emitter: Emitter, sample: int, seed: int) -> Floats:
     ndarray, shape (sample,)
         Residuals over the mean charge of the surface; NaN for a rule that cannot say.
     """
-    positions, normals, charges = emitter.positions, emitter.normals, emitter.charges
     chosen = np.flatnonzero(emitter.tip.evaporable[emitter.atoms])
     if len(chosen) > sample:
         chosen = np.sort(np.random.default_rng(seed).choice(chosen, sample, replace=False))
-    return emitter.rule.residuals(positions, normals, charges, chosen)
+    return emitter.charge_residuals(chosen)
 
 
 class Monitor:

@@ -18,14 +18,13 @@ from apt_evap._common.threads import thread_count
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_count, check_kind, check_seed, check_sequence, check_switch
 from apt_evap._common.warnings import RunWarning
-from apt_evap._core.rule import ChargingRule
 from apt_evap.detection.detector import Detector
 from apt_evap.emission.emissions import Emissions, check_launches
 from apt_evap.emission.ion_random import IonRandom
 from apt_evap.emission.perturbations import Perturbation, Unperturbed
 from apt_evap.evaporation.emitter import BATCH, Emitter
 from apt_evap.evaporation.law import Extremal, Law
-from apt_evap.evaporation.rule import Rule
+from apt_evap.evaporation.rule import CompiledRule, Rule
 from apt_evap.evaporation.settings import ChargeSettings
 from apt_evap.evaporation.voltage import check_voltage
 from apt_evap.flight.crew import FlightCrew, FlightSettings, check_reach
@@ -85,7 +84,7 @@ class Simulation:
         flight_settings: FlightSettings | None = None,
         response_settings: ResponseSettings | None = None,
         n_threads: int | None = None,
-        rule: ChargingRule | Rule | None = None,
+        rule: Rule | CompiledRule | None = None,
         watch_settings: WatchSettings | None = None,
     ) -> None:
         self.voltage = check_voltage(voltage)

@@ -155,6 +155,7 @@ CASES = [
             "relaxation_angle": [*NUMBER, -0.1, 3.0],
         },
     ),
+    (ae.Robin, {}, {"tolerance": [*POSITIVE, 2.0], "window": [*COUNT, 100]}),
     (
         ae.FlightSettings,
         {},
@@ -393,7 +394,7 @@ NEEDS_A_RUN = [
     ("emitter.field_at", {"points": [[0.0, 0, 9]]}, {"points": VECTOR, "opening_angle": [*NUMBER, -1.0, 3.0]}),
     ("emitter.potential_at", {"points": [[0.0, 0, 9]]}, {"points": VECTOR, "opening_angle": [*NUMBER, -1.0, 3.0]}),
     ("emitter.relax", {}, {"tolerance": [value for value in POSITIVE if value is not None]}),
-    ("emitter.evaporate", {}, {"most": [*COUNT, 0]}),
+    ("emitter.evaporate", {}, {"max_events": [*COUNT, 0]}),
     ("run.hits", {"perturbation": ae.Unperturbed()}, {"perturbation": [*OBJECT, None], "by_response": SWITCH}),
     ("simulation.run", {"n_ions": 1, "progress": False}, {"checkpoint": [True, 3, NAN, [], "a\0b", "a.txt"]}),
     (ae.fit_caps, {"windows": 1}, {"run": [*OBJECT, None]}),
@@ -486,6 +487,7 @@ def test_every_public_name_with_arguments_is_in_the_table():
     tried = {getattr(function, "__self__", function) for function, _, _ in (*CASES, *NEEDS_A_RUN)}
     tried |= {ae.Run, ae.Simulation}
     taken = {"Unperturbed", "Extremal"}  # no arguments
+    taken |= {"Ending", "RunInterrupted", "RunNotSaved"}  # made by the package
     taken |= {"FileError", "TruncatedFile", "Outcome", "Run", "plot", "__version__"}  # made by the package
     taken |= {"chunks", "Study", "ZoneLine", "History", "Batch"}  # in test_chunks; made by the package
     taken |= {name for name in ae.__all__ if name.endswith("Warning")}
@@ -598,7 +600,7 @@ def test_everything_says_in_one_line_what_it_holds(ready, tmp_path):
         (simulation, ["Simulation", "1000 V", "seed 0", "atoms of Ni [0 0 1]", "300 mm at 100 mm"]),
         (shell, ["Tip", f"{len(shell):,} atoms of Ni [0 0 1]", "1.5 nm", "to a depth of 1.2 nm"]),
         (emitter, ["Emitter", f"{len(emitter):,} surface atoms", "1000 V"]),
-        (run, ["Run", "12 ions of Ni", "1000 V", "marked"]),
+        (run, ["Run", "12 ions of Ni", "1000 V", "flagged"]),
         (run.hits(ae.Unperturbed()), ["Hits", "12 ions", "detected", "Unperturbed()", "time_of_flight"]),
         (run.emissions, ["Emissions", "12 atoms", "neighbour"]),
         (launches, ["Launches", "12 ions", "0 of them rolled up"]),

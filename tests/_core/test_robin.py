@@ -15,7 +15,7 @@ def solved(positions, normals, opening_angle=0.0, tolerance=1e-10, start=None, *
     """Charges in the order given, the tree, area per atom, sweeps and residual."""
     start = np.ones(len(positions)) if start is None else start
     tree = Octree(np.ascontiguousarray(positions), start)
-    rule = Robin()
+    rule = Robin(tolerance=1e-5, window=8)
     sweeps, residual = rule.iterate(
         tree,
         np.ascontiguousarray(normals[tree.atoms]),

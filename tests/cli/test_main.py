@@ -486,7 +486,7 @@ def test_info_of_a_run(made, capsys):
     assert told["ions"] == told["species"]["Ni"] == 60 and told["seed"] == 1 and told["voltage"] == 1000
     assert [told["outcomes"][key] for key in ("hit", "missed", "never_left")] == list(counts.values())
     assert told["tip"]["axis"] == [1, 1, 1] and told["tip"]["material"]["name"] == "Ni"
-    assert told["responses"]["marked"] == run.flagged.sum() and told["perturbations_flown"] == []
+    assert told["responses"]["flagged"] == run.flagged.sum() and told["perturbations_flown"] == []
     low, high = told["field_before_leaving"]
     # six digits are kept
     assert low == pytest.approx(run.fields.min(), rel=1e-5) and high == pytest.approx(run.fields.max(), rel=1e-5)

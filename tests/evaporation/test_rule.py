@@ -45,7 +45,7 @@ def by_atom(emitter):
 def test_a_rule_in_python_is_the_twin_of_robin(tip12):
     compiled = ae.Emitter(tip12, settings=ae.ChargeSettings(start_tolerance=1e-6))
     slow = ae.Emitter(tip12, settings=ae.ChargeSettings(start_tolerance=1e-6), rule=SlowRobin())
-    assert isinstance(slow.rule, PythonRule)
+    assert isinstance(slow._core.rule, PythonRule)
     for events in (0, 12):
         first = np.concatenate([np.empty(0, int), *(batch.site for batch in compiled.advance(events))])
         second = np.concatenate([np.empty(0, int), *(batch.site for batch in slow.advance(events))])
@@ -61,14 +61,14 @@ def test_a_rule_without_residuals_is_not_warned_of(small_tip):
     run = ae.Simulation(small_tip, rule=SlowRobin(), watch_settings=ae.WatchSettings(interval=10)).run(
         30, responses=False, progress=False
     )
-    assert run.settings["rule"] == {"name": "PythonRule", "rule": {"name": "SlowRobin", "sweeps": 200}}
+    assert run.settings["rule"] == {"name": "SlowRobin", "sweeps": 200}
     assert len(run) == 30
 
 
 def test_two_emitters_may_share_a_rule(small_tip):
     rule = ae.Robin(tolerance=1e-4)
     first, second = ae.Emitter(small_tip, rule=rule), ae.Emitter(small_tip, 500.0, rule=rule)
-    assert first.rule is not rule and first.rule == rule == second.rule
+    assert first.rule is rule is second.rule
     alone = ae.Emitter(small_tip, rule=ae.Robin(tolerance=1e-4))
     for emitter in (first, second, alone):
         assert len(list(emitter.advance(50))) > 0
@@ -102,5 +102,5 @@ def test_bad_rules_are_refused(small_tip, rule, message):
 
 @pytest.mark.parametrize("bad", [{"tolerance": 0.0}, {"tolerance": 2.0}, {"window": -1}, {"window": 100}])
 def test_bad_parameters_of_robin_are_refused(bad):
-    with pytest.raises(ValueError, match="of Robin must be"):
+    with pytest.raises(ValueError, match=rf"^{next(iter(bad))} must be .* got"):
         ae.Robin(**bad)
