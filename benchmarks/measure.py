@@ -1,6 +1,7 @@
-"""Speed and accuracy of apt_evap: prints a table and writes JSON. `python benchmarks/measure.py --help`.
+"""Speed and accuracy of apt_evap; prints tables and writes a JSON file. See `python benchmarks/measure.py --help`.
 
-Every speed stands beside its accuracy and, where there is something to compare with, as a ratio taken in the same run.
+Speeds are given together with the accuracy. Where a reference exists, they are also given as a ratio to the reference,
+measured in the same run.
 """
 
 import argparse
@@ -27,13 +28,13 @@ A = NICKEL.a
 
 
 def nickel_tip(radius, shank, depth=8.0):
-    """Ni[111] of a radius, with a shank of so many radii; large ones as a shell. Lengths in lattice constants."""
+    """Ni[111] tip; radius and depth in lattice constants, shank in radii. Large tips are shells."""
     depth = depth * A if radius > 40 else None
     return ae.Tip(NICKEL, radius * A, axis=(1, 1, 1), shank_length=shank * radius * A, depth=depth)
 
 
 def best(function, repeats=3):
-    """Shortest of some times [s], and the last result."""
+    """Shortest time of several calls [s], and the last result."""
     times = []
     for _ in range(repeats):
         start = time.perf_counter()
@@ -43,7 +44,7 @@ def best(function, repeats=3):
 
 
 def peak_memory():
-    """Peak memory of this process so far [GB]."""
+    """Peak memory of this process [GB]."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
 
 
@@ -60,13 +61,13 @@ def processor():
 
 
 def fields(radius=80, shank=3.0, targets=2000, angles=(0.5, 0.6, 0.7, 0.75, 0.8), threads=(1, 2)):
-    """Field on all surface atoms by lists, as a fraction of the time of a direct float64 sum measured beside it."""
+    """Field at all surface atoms from interaction lists; times relative to a direct float64 sum in the same run."""
     emitter = Emitter(nickel_tip(radius, shank, depth=5.0), n_threads=max(threads))
     positions, n = np.ascontiguousarray(emitter.positions), len(emitter)
     charges = np.random.default_rng(1).uniform(0.5, 1.5, n)
     tree = Octree(positions, charges)
-    chosen = np.random.default_rng(2).choice(n, targets, replace=False)
-    points = np.ascontiguousarray(tree.positions[chosen])
+    sample = np.random.default_rng(2).choice(n, targets, replace=False)
+    points = np.ascontiguousarray(tree.positions[sample])
     seconds, exact = best(lambda: direct_field(points, tree.positions, tree.charges.copy()))
     direct = seconds * n / targets
     scale = np.sqrt((exact**2).sum(axis=1).mean())
@@ -76,7 +77,7 @@ def fields(radius=80, shank=3.0, targets=2000, angles=(0.5, 0.6, 0.7, 0.75, 0.8)
             walk, lists = best(lambda angle=angle, n_threads=n_threads: InteractionLists(tree, angle, n_threads))
             field = np.empty((n, 3))
             sweep, _ = best(lambda lists=lists, field=field, n=n_threads: lists.sweep(field, False, n))
-            error = np.linalg.norm(field[chosen] - exact, axis=1) / scale
+            error = np.linalg.norm(field[sample] - exact, axis=1) / scale
             rows.append(
                 {
                     "opening angle": angle,
@@ -92,7 +93,7 @@ def fields(radius=80, shank=3.0, targets=2000, angles=(0.5, 0.6, 0.7, 0.75, 0.8)
                 }
             )
     return {
-        "title": f"field on all {n:,} surface atoms, Ni[111], R = {radius} a, shank {shank} R; a direct float64 sum, "
+        "title": f"field at all {n:,} surface atoms, Ni[111], R = {radius} a, shank {shank} R; direct float64 sum, "
         f"one thread: {n / direct * n / 1e9:.2f} Gpair/s, {direct:.1f} s (from {targets:,} targets)",
         "rows": rows,
     }
@@ -102,7 +103,7 @@ def fields(radius=80, shank=3.0, targets=2000, angles=(0.5, 0.6, 0.7, 0.75, 0.8)
 
 
 def solutions(radii=(20, 40, 80), shank=2.0, n_threads=2):
-    """Sweeps and seconds from equal charges, plain and mixed."""
+    """Number of sweeps and time from equal start charges, with and without mixing."""
     rows = []
     for radius in radii:
         emitter = Emitter(nickel_tip(radius, shank, depth=5.0), n_threads=n_threads)
@@ -138,7 +139,7 @@ def solutions(radii=(20, 40, 80), shank=2.0, n_threads=2):
 
 
 def evaporate(emitter, events):
-    """Evaporate atoms without flights; return the seconds of events and of relaxations."""
+    """Evaporate atoms without flights; return the times of events and of relaxations [s]."""
     relaxations = 0.0
 
     @contextmanager
@@ -155,13 +156,13 @@ def evaporate(emitter, events):
 
 
 def rates(radii=(20, 40, 80, 120), shank=2.0, ions=5000, threads=(1, 2), depth=8.0):
-    """Microseconds an event, ions per second with one flight and with both responses, peak memory."""
+    """Time of an event, ions per second with one flight and with both responses, peak memory."""
     rows = []
     for radius in radii:
         for n_threads in threads:
             start = time.perf_counter()
             simulation = ae.Simulation(nickel_tip(radius, shank, depth), seed=1, n_threads=n_threads)
-            begun = time.perf_counter() - start
+            set_up = time.perf_counter() - start
             events, relaxations = evaporate(simulation.emitter, ions)
             speeds = []
             for responses in (False, True):
@@ -173,7 +174,7 @@ def rates(radii=(20, 40, 80, 120), shank=2.0, ions=5000, threads=(1, 2), depth=8
                     "R [a]": radius,
                     "surface atoms": len(simulation.emitter),
                     "threads": n_threads,
-                    "start [s]": begun,
+                    "start [s]": set_up,
                     "event [us]": events / ions * 1e6,
                     "relaxation, per event [us]": relaxations / ions * 1e6,
                     "ions/s, one flight": speeds[0],
@@ -188,7 +189,7 @@ def rates(radii=(20, 40, 80, 120), shank=2.0, ions=5000, threads=(1, 2), depth=8
 
 
 def charge_errors(radius=40, shank=1.0, events=5000, n_threads=2):
-    """Charges after events against a converged solution of the same surface, just after and just before relaxations."""
+    """Charges after events, just after and just before a relaxation, against a converged solution."""
     rows = []
     emitter = Emitter(nickel_tip(radius, shank), n_threads=n_threads)
     interval = emitter.sweep_interval
@@ -196,10 +197,10 @@ def charge_errors(radius=40, shank=1.0, events=5000, n_threads=2):
         evaporate(emitter, count)
         atoms, charges, since = emitter.atoms, emitter.charges.copy(), emitter._core.since_relaxation
         emitter.relax(1e-10)
-        solved = np.zeros(len(emitter.tip))
-        solved[emitter.atoms] = emitter.charges
-        solved = solved[atoms]
-        error = (charges * (solved.sum() / charges.sum()) - solved) / solved.mean()
+        solution = np.zeros(len(emitter.tip))
+        solution[emitter.atoms] = emitter.charges
+        solution = solution[atoms]
+        error = (charges * (solution.sum() / charges.sum()) - solution) / solution.mean()
         rows.append(
             {
                 "events": emitter._core.n_removed,
@@ -210,13 +211,13 @@ def charge_errors(radius=40, shank=1.0, events=5000, n_threads=2):
             }
         )
     return {
-        "title": f"error of charges over the mean charge, Ni[111], R = {radius} a, {len(emitter):,} atoms",
+        "title": f"error of charges relative to the mean charge, Ni[111], R = {radius} a, {len(emitter):,} atoms",
         "rows": rows,
     }
 
 
 def flights(radii=(20, 40, 80, 120), shank=2.0, ions=256, group=17):
-    """Microseconds and evaluations of a flight, alone and in a group that shares its walks; one thread."""
+    """Time and evaluations of a flight, alone and in a group with common walks through the octree; one thread."""
     rows = []
     for radius in radii:
         emitter = Emitter(nickel_tip(radius, shank))
@@ -232,22 +233,22 @@ def flights(radii=(20, 40, 80, 120), shank=2.0, ions=256, group=17):
             start = time.perf_counter()
             fly(flier, batch.journal, np.arange(len(batch)), launches, positions, velocities)
             seconds = time.perf_counter() - start
-            flown = len(batch) * launches
+            n_flights = len(batch) * launches
             rows.append(
                 {
                     "R [a]": radius,
-                    "launches a group": launches,
-                    "us a flight": seconds / flown * 1e6,
+                    "launches per group": launches,
+                    "time per flight [us]": seconds / n_flights * 1e6,
                     "steps": flier.n_steps / len(batch),
-                    "evaluations a flight": flier.n_evaluations / flown,
-                    "atoms and cells an evaluation": flier.n_pairs / flier.n_evaluations,
+                    "evaluations per flight": flier.n_evaluations / n_flights,
+                    "atoms and cells per evaluation": flier.n_pairs / flier.n_evaluations,
                 }
             )
-    return {"title": "flights, one thread, replay of the events included", "rows": rows}
+    return {"title": "flights, one thread, including the replay of the events", "rows": rows}
 
 
 def flier_over(tree, tip, settings):
-    """Flights over a tree, as `Simulation` makes them."""
+    """Flights in the field of a tree, with the settings of `Simulation`."""
     return Flights(
         tree,
         coulomb=COULOMB,
@@ -261,7 +262,7 @@ def flier_over(tree, tip, settings):
 
 
 def fly(flier, journal, events, launches, positions, velocities):
-    """Fly groups of so many launches; return ends (m, 7) and outcomes (m,)."""
+    """Fly groups of launches; return ends (m, 7) and outcomes (m,)."""
     end, outcome = np.empty((len(positions), 7)), np.empty(len(positions), np.int8)
     start = np.arange(0, len(positions) + 1, launches)
     counter, halt = np.zeros((2, 1), np.int64)
@@ -270,7 +271,7 @@ def fly(flier, journal, events, launches, positions, velocities):
 
 
 def place_errors(radius=40, shank=1.0, events=5000, ions=200, n_threads=2):
-    """Places of ions of a run against exact flights in the exact field: converged charges, sums over all atoms."""
+    """Hit positions of a run against exact flights in the exact field: converged charges, sums over all atoms."""
     simulation = ae.Simulation(nickel_tip(radius, shank), seed=1, n_threads=n_threads)
     detector, tip, errors = simulation.detector, simulation.tip, []
     for _ in range(ions):
@@ -297,17 +298,17 @@ def place_errors(radius=40, shank=1.0, events=5000, ions=200, n_threads=2):
     rows = [
         {
             "ions": ions,
-            "of events": events,
+            "events": events,
             "median [mm]": float(np.median(errors)),
             "99 % [mm]": float(np.quantile(errors, 0.99)),
             "largest [mm]": float(np.max(errors)),
         }
     ]
-    return {"title": f"places against exact flights in the exact field, Ni[111], R = {radius} a", "rows": rows}
+    return {"title": f"hit positions against exact flights in the exact field, Ni[111], R = {radius} a", "rows": rows}
 
 
 def response_errors(radii=(20, 80), shank=2.0, events=5000, ions=200, n_threads=2):
-    """Places by responses against flights at energies to 1.5 eV that no design used."""
+    """Hit positions from responses against flights, for energies up to 1.5 eV that are not in the design."""
     rows = []
     energies = [ae.Fixed(energy) for energy in (0.05, 0.2, 0.5, 0.8, 1.1, 1.5)]
     for radius in radii:
@@ -318,9 +319,9 @@ def response_errors(radii=(20, 80), shank=2.0, events=5000, ions=200, n_threads=
         for kind in (ae.LateralVelocity, ae.RollUp):
             errors = []
             for energy in energies:
-                flown, fitted = run.hits(kind(energy)), run.hits(kind(energy), by_response=True)
-                both = flown.detected & fitted.detected
-                errors.append(np.hypot(flown.x - fitted.x, flown.y - fitted.y)[both])
+                direct, fit = run.hits(kind(energy)), run.hits(kind(energy), by_response=True)
+                both = direct.detected & fit.detected
+                errors.append(np.hypot(direct.x - fit.x, direct.y - fit.y)[both])
             errors = np.concatenate(errors)
             rows.append(
                 {
@@ -330,14 +331,14 @@ def response_errors(radii=(20, 80), shank=2.0, events=5000, ions=200, n_threads=
                     "median [mm]": float(np.median(errors)),
                     "95 % [mm]": float(np.quantile(errors, 0.95)),
                     "largest [mm]": float(errors.max()),
-                    "ions marked [%]": 100 * float(run.flagged.mean()),
+                    "flagged ions [%]": 100 * float(run.flagged.mean()),
                 }
             )
-    return {"title": f"responses against flights, energies to 1.5 eV, {ions} ions", "rows": rows}
+    return {"title": f"responses against flights, energies up to 1.5 eV, {ions} ions", "rows": rows}
 
 
 def hits_of_a_million(ions=1_000_000, n_threads=2):
-    """Seconds of Run.hits for a million ions: a small run, joined with itself."""
+    """Time of `Run.hits` for a million ions, from copies of a small run."""
     run = ae.Simulation(nickel_tip(12, 1.0), seed=1, n_threads=n_threads).run(2000, progress=False)
     run = ae.Run.join([run] * (ions // len(run)))
     energy = ae.TruncatedNormal(0.155, 0.155)
@@ -345,14 +346,14 @@ def hits_of_a_million(ions=1_000_000, n_threads=2):
     for perturbation in (ae.Unperturbed(), ae.LateralVelocity(energy), ae.RollUp(energy), ae.Combined(energy, 0.75)):
         seconds, hits = best(lambda perturbation=perturbation: run.hits(perturbation))
         rows.append({"perturbation": type(perturbation).__name__, "ions": len(hits), "seconds": seconds})
-    return {"title": "Run.hits by responses", "rows": rows}
+    return {"title": "Run.hits from responses", "rows": rows}
 
 
 # ---- the base --------------------------------------------------------------------------------------------------------
 
 
 def bases(radius=20, shanks=(0.5, 1.0, 2.0, 3.0, 5.0, 8.0), ions=200, n_threads=2):
-    """What the foot does to the cap: fields over their mean, and places, against the longest shank."""
+    """Influence of the foot on fields and hit positions of the cap, relative to the longest shank."""
     cases = [(base, shank) for shank in shanks for base in ("rounded", "flat")]
     results = {}
     for base, shank in cases:
@@ -361,36 +362,39 @@ def bases(radius=20, shanks=(0.5, 1.0, 2.0, 3.0, 5.0, 8.0), ions=200, n_threads=
         emitter = simulation.emitter
         emitter.relax(1e-8)
         cap = emitter.positions[:, 2] > 0.5 * radius * A
-        # atoms of both caps in one order, to rounding
+        # atoms of all caps in the same order, up to rounding
         order = np.lexsort(np.round(emitter.positions[cap], 6).T)
         fields = emitter.fields[cap][order]
         sites = (emitter.positions + 0.25 * emitter.normals)[cap][order]
         rim = emitter.fields[emitter.positions[:, 2] < -0.5 * shank * radius * A].max()
-        # the same launches for all: from the first atoms, one flight each, nobody leaving in between
+        # the same launches for all specimens: one flight from each site, before the first event
         batch = emitter.evaporate(1)
-        chosen = np.ascontiguousarray(sites[:: max(1, len(sites) // ions)])
+        starts = np.ascontiguousarray(sites[:: max(1, len(sites) // ions)])
         flier = flier_over(batch.tree, tip, ae.FlightSettings())
-        end, _ = fly(flier, batch.journal, np.full(len(chosen), -1), 1, chosen, np.zeros_like(chosen))
+        end, _ = fly(flier, batch.journal, np.full(len(starts), -1), 1, starts, np.zeros_like(starts))
         directions, remaining = simulation.detector.directions(end[:, :3], end[:, 3:6], tip.apex)
         results[base, shank] = fields, rim, np.stack(simulation.detector.impacts(directions, remaining)[:2], axis=1)
     reference = results["rounded", shanks[-1]]
     rows = []
-    for (base, shank), (fields, rim, places) in results.items():
+    for (base, shank), (fields, rim, hits) in results.items():
         relative = fields / fields.mean() / (reference[0] / reference[0].mean()) - 1
-        radial = np.hypot(*places.T) / np.hypot(*reference[2].T)
+        radial = np.hypot(*hits.T) / np.hypot(*reference[2].T)
         rows.append(
             {
                 "base": base,
                 "shank [R]": shank,
                 "V/(R mean cap field)": 1000.0 / (radius * A * fields.mean()),
                 "cap field / mean, RMS change": float(np.sqrt((relative**2).mean())),
-                "largest": float(np.abs(relative).max()),
-                "place, magnification": float(np.nanmedian(radial)),
-                "its spread": float(np.nanstd(radial)),
+                "largest change": float(np.abs(relative).max()),
+                "magnification": float(np.nanmedian(radial)),
+                "standard deviation": float(np.nanstd(radial)),
                 "largest field of the foot / of the cap": rim / fields.max(),
             }
         )
-    return {"title": f"the foot, Ni[111], R = {radius} a; against a rounded base at {shanks[-1]:g} R", "rows": rows}
+    return {
+        "title": f"influence of the foot, Ni[111], R = {radius} a; relative to a rounded base at {shanks[-1]:g} R",
+        "rows": rows,
+    }
 
 
 # ---- printing --------------------------------------------------------------------------------------------------------
@@ -423,14 +427,14 @@ def _text(value):
 
 
 def main():
-    """Measure the parts named, or all but the largest."""
+    """Run the given benchmarks, or all except the largest one."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("parts", nargs="*", help=f"of {', '.join(PARTS)}; all but large if none is named")
-    parser.add_argument("-o", "--output", default="measure.json", help="JSON file [%(default)s]")
+    parser.add_argument("parts", nargs="*", help=f"{', '.join(PARTS)}; default: all except large")
+    parser.add_argument("-o", "--output", default="measure.json", help="JSON file (default: %(default)s)")
     arguments = parser.parse_args()
     for name in arguments.parts:
         if name not in PARTS:
-            parser.error(f"no part {name!r}; known are {', '.join(PARTS)}")
+            parser.error(f"unknown benchmark {name!r}, must be one of {', '.join(PARTS)}")
     results = {"processor": processor(), "version": ae.__version__, "python": platform.python_version()}
     print(f"{results['processor']}, apt_evap {ae.__version__}\n")
     for name in arguments.parts or [name for name in PARTS if name != "large"]:

@@ -1,10 +1,10 @@
-"""A long run under watch: does its memory grow by more than its results?
+"""Memory of a long run: checks that it does not grow by more than the results.
 
     python benchmarks/soak.py                       # 100,000 ions of Ni[111], R = 20 a, one flight each
     python benchmarks/soak.py --ions 20000 --radius 40 --output soak.png
 
-Records the resident memory while the run goes on, with checkpoints, draws it over the ions, and fails (exit code 1) if
-it grows, after the first fifth of the run, by more than the results take and the bound below.
+Records the resident memory during a run with checkpoints, and draws it against the number of ions. Fails (exit code 1)
+if the memory grows, after the first fifth of the run, by more than the size of the results and the bound SLACK.
 """
 
 import argparse
@@ -19,8 +19,8 @@ from matplotlib.figure import Figure
 
 import apt_evap as ae
 
-# what the sizes of the surface and of the trees' copies vary by, and what allocators keep: a leak of 1 kB an ion, a
-# sixth of the journal of an event, is 100 MB in a run of 100,000 ions
+# [bytes] variation of the sizes of the surface and of the copies of the tree, and memory that allocators do not return.
+# A leak of 1 kB per ion, a sixth of the journal of an event, would be 100 MB in a run of 100,000 ions.
 SLACK = 30e6
 
 
@@ -29,7 +29,7 @@ def resident():
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith("VmRSS:"):
             return 1024 * int(line.split()[1])
-    raise OSError("/proc/self/status holds no VmRSS")
+    raise OSError("/proc/self/status has no VmRSS")
 
 
 def bytes_of(run):
@@ -42,7 +42,7 @@ def bytes_of(run):
 
 
 def soak(radius, n_ions, responses, n_threads):
-    """Run, and sample the memory twice a second; returns the run, the ions and the memory [bytes] of each sample."""
+    """Run, and sample the memory twice per second; return the run, and the ions and memory [bytes] of each sample."""
     nickel = ae.material("Ni")
     tip = ae.Tip(nickel, apex_radius=radius * nickel.a, axis=(1, 1, 1), shank_length=2 * radius * nickel.a)
     simulation = ae.Simulation(tip, seed=1, n_threads=n_threads)
@@ -56,38 +56,40 @@ def soak(radius, n_ions, responses, n_threads):
     sampler = threading.Thread(target=sample)
     with tempfile.TemporaryDirectory() as folder:
         sampler.start()
-        began = time.perf_counter()
+        start = time.perf_counter()
         try:
             checkpoint = ae.Checkpoint(Path(folder, "soak.h5"), minutes=1.0)
             run = simulation.run(n_ions, responses=responses, checkpoint=checkpoint)
         finally:
             done.set()
             sampler.join()
-    print(f"{len(run):,} ions, {len(run) / (time.perf_counter() - began):.0f} ions/s; {run.ended or 'not ended early'}")
+    print(f"{len(run):,} ions, {len(run) / (time.perf_counter() - start):.0f} ions/s; {run.ended or 'complete'}")
     ions, memory = np.array(samples).T
-    under_way = ions < len(run)  # at the end the parts are joined: for a moment they are there twice
-    return run, ions[under_way], memory[under_way]
+    during = ions < len(run)  # at the end the parts are joined and are twice in memory for a moment
+    return run, ions[during], memory[during]
 
 
 def draw(path, ions, memory, expected):
-    """Draw the memory over the ions."""
+    """Draw the memory against the number of ions."""
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     axes = figure.subplots()
     axes.plot(ions / 1e3, memory / 1e6, label="resident memory")
-    axes.plot(ions / 1e3, expected / 1e6, "--", label="at a fifth of the run, and the results since")
+    axes.plot(ions / 1e3, expected / 1e6, "--", label="memory after a fifth of the run, plus later results")
     axes.set(xlabel="ions evaporated / 1000", ylabel="memory / MB", ylim=(0, 1.1e-6 * memory.max()), xlim=(0, None))
     axes.legend(loc="lower right")
     figure.savefig(path, dpi=150)
 
 
 def main():
-    """Run the soak and judge it."""
+    """Run, draw and check the memory."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--radius", type=float, default=20.0, help="apex radius in lattice constants")
     parser.add_argument("--ions", type=int, default=100_000)
-    parser.add_argument("--responses", action="store_true", help="fly the responses instead of one flight an ion")
+    parser.add_argument("--responses", action="store_true", help="compute responses instead of one flight per ion")
     parser.add_argument("--threads", type=int, help="default: all processors")
-    parser.add_argument("--output", default="soak.png", help="picture; the samples go beside it as .csv")
+    parser.add_argument(
+        "--output", default="soak.png", help="figure; the samples are written to a .csv file with the same name"
+    )
     options = parser.parse_args()
     run, ions, memory = soak(options.radius, options.ions, options.responses, options.threads)
     path = Path(options.output)
@@ -99,11 +101,11 @@ def main():
     over = float((memory - expected)[fifth:].max())
     print(
         f"memory {memory[fifth] / 1e6:.0f} MB at {ions[fifth]:,} ions, {memory[-1] / 1e6:.0f} MB at {ions[-1]:,}; "
-        f"results {per_ion:.0f} B an ion, {per_ion * (ions[-1] - ions[fifth]) / 1e6:.0f} MB since; "
-        f"at most {over / 1e6:.0f} MB beyond them"
+        f"results {per_ion:.0f} B per ion, {per_ion * (ions[-1] - ions[fifth]) / 1e6:.0f} MB of the increase; "
+        f"largest excess {over / 1e6:.0f} MB"
     )
     if over > SLACK:
-        print(f"memory grows: expected at most {SLACK / 1e6:.0f} MB beyond the results", file=sys.stderr)
+        print(f"memory grows: the excess over the results must be <= {SLACK / 1e6:.0f} MB", file=sys.stderr)
         return 1
     return 0
 

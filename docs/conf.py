@@ -26,7 +26,7 @@ extensions = [
     "sphinxcontrib.bibtex",
     "sphinx_design",
 ]
-SECTIONS = ("start", "background", "evidence", "development")  # pages that only list others
+SECTIONS = ("start", "background", "evidence", "development")  # pages that only list other pages
 default_role = "py:obj"
 rst_prolog = r".. |v| replace:: \|v\|"  # docstrings write the magnitude of v as |v|
 exclude_patterns = ["_build", "generated/scripts"]
@@ -40,14 +40,14 @@ numpydoc_show_class_members = False
 bibtex_bibfiles = ["references.bib"]
 bibtex_default_style = "alpha"
 
-# examples write where they are run: not into the folder they are kept in
+# examples write files to the folder where they run: run copies, not the originals
 shutil.copytree(HERE.parent / "examples", GENERATED / "scripts", dirs_exist_ok=True)
 matplotlib.use("agg")
 warnings.filterwarnings("ignore", message=".*non-interactive.*")
 sphinx_gallery_conf = {
     "examples_dirs": str(GENERATED / "scripts"),
     "gallery_dirs": str(GENERATED / "gallery"),
-    "filename_pattern": r"/tutorial_",  # the figures of the paper take minutes: shown, not run
+    "filename_pattern": r"/tutorial_",  # the figures of the paper take minutes and are not run
     "within_subsection_order": "ExampleTitleSortKey",
     "download_all_examples": False,
     "show_memory": False,
@@ -55,7 +55,7 @@ sphinx_gallery_conf = {
     "write_computation_times": False,
 }
 
-# pictures of the cards on the front page: parts of figures, as left, upper, right and lower fraction
+# pictures of the cards on the front page: parts of figures, given by left, upper, right and lower fractions
 CARDS = {
     "first_map": ("ni111.png", (0.555, 0.12, 0.895, 0.86)),
     "accuracy": ("figure7.png", (0.50, 0.05, 0.985, 0.362)),
@@ -75,7 +75,7 @@ html_title = f"apt_evap {version}"
 html_static_path = ["_static"]
 html_css_files = ["pages.css"]
 html_show_sourcelink = False
-# no column that would be empty: the front page has neither, the pages of a section list the section
+# no empty columns: the front page has no sidebars, and pages that only list other pages have no table of contents
 html_sidebars = {"index": [], "search": [], "genindex": []}
 html_theme_options = {
     "show_toc_level": 2,

@@ -2,10 +2,10 @@
 1. First map
 ============
 
-A nickel tip along [111], evaporated once and seen under four perturbations.
+Simulate a nickel tip along [111] once, and draw its detector map for four perturbations.
 
-``python tutorial_1_first_map.py 500`` evaporates 500 atoms instead of 15,000, which take some fifteen seconds. Writes
-ni111_perturbations.h5 and .png, and ni111_rollup.epos, into the current folder.
+The script evaporates 15,000 atoms in about fifteen seconds. ``python tutorial_1_first_map.py 500`` evaporates 500
+atoms. The script writes ni111_perturbations.h5 and .png, and ni111_rollup.epos, to the current folder.
 """
 
 import sys
@@ -15,8 +15,8 @@ import apt_evap as ae
 n_ions = int(sys.argv[1]) if len(sys.argv) > 1 else 15_000
 
 # %%
-# A material is a few numbers, each with its source. The tip is a crystal cut to a spherical cap on a shank: here
-# small, R = 20 a = 7 nm, and with the [111] direction along its axis.
+# A material is a small set of numbers, each with its source. The tip is a crystal, cut to the shape of a spherical cap
+# on a conical shank. This tip is small, R = 20 a = 7 nm, with the [111] direction along its axis.
 
 nickel = ae.material("Ni")
 print(nickel)
@@ -24,8 +24,9 @@ tip = ae.Tip(nickel, apex_radius=20 * nickel.a, axis=(1, 1, 1), shank_length=20 
 print(tip)
 
 # %%
-# A simulation charges the surface when it is made. Its run evaporates atoms, one by one, and flies every ion with the
-# 30 launches that fix its response: how its hit depends on its velocity along the surface.
+# When the simulation is created, it solves the charges of the surface. The run evaporates atoms one by one. Every ion
+# is flown with 30 launches. They determine its response, that is, how its hit depends on its velocity along the
+# surface.
 
 simulation = ae.Simulation(tip, voltage=1000.0, seed=1, detector=ae.Detector(distance=100.0, width=300.0))
 run = simulation.run(n_ions)
@@ -33,8 +34,9 @@ run.save("ni111_perturbations.h5")
 print(run)
 
 # %%
-# So the perturbation of the emission is chosen afterwards. These energies are those that :cite:t:`Shaikh` find for
-# nickel. Without perturbation the zone lines through the (111) pole are dark; ions that rolled up make them bright.
+# The perturbation of the emission can therefore be chosen after the simulation. These are the energies of
+# :cite:t:`Shaikh` for nickel. Without perturbation, the zone lines through the (111) pole are dark. If the ions roll
+# up, they are bright.
 
 energy = ae.TruncatedNormal(mean=0.155, standard_deviation=0.155)
 perturbations = {
@@ -47,19 +49,21 @@ maps = []
 for name, perturbation in perturbations.items():
     hits = run.hits(perturbation)
     print(f"{name}: {hits}")
-    maps.append(hits.map(bins=160).smoothed(2.0))  # of the whole detector
+    maps.append(hits.map(bins=160).smoothed(2.0))  # map of the whole detector
 axes = ae.plot.detector_maps(maps, list(perturbations))
 axes[0].figure.savefig("ni111_perturbations.png")
 
 # %%
-# Simulated ions can be written as a measurement is. The ions that missed the detector are left out, with a warning.
+# Simulated ions can be saved in the format of a measurement. Ions that missed the detector are left out, with a
+# warning.
 
 ae.write("ni111_rollup.epos", run.hits(ae.RollUp(energy)))
 print(ae.read("ni111_rollup.epos"))
 
 # %%
-# The charged surface as it is after the last ion has left. Its fields may be far from the 35 V/nm at which nickel
-# evaporates: the voltage scales all of them alike, and only their ratios say which atom leaves next.
+# The emitter is the charged surface after the last evaporation. Its fields can differ strongly from the 35 V/nm at
+# which nickel evaporates. The voltage scales all fields by the same factor, and only their ratios determine which atom
+# evaporates next.
 
 emitter = simulation.emitter
-print(f"{len(emitter):,} surface atoms left, fields {emitter.fields.min():.1f} to {emitter.fields.max():.1f} V/nm")
+print(f"{len(emitter):,} surface atoms, fields {emitter.fields.min():.1f} to {emitter.fields.max():.1f} V/nm")

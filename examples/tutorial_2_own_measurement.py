@@ -1,12 +1,12 @@
 """
-2. Your own .epos
-=================
+2. Your own measurement
+=======================
 
-Read a LEAP export, look at it, select ions, and draw its map without the stripes of the detector's comb.
+Read a LEAP export, select ions, and draw a detector map without quantisation stripes.
 
-``python tutorial_2_own_measurement.py R5083.epos`` takes a file of yours (.epos, .apt or .raw). Without one, a file is
-made here first: ions on a comb of 0.027 mm, as a delay line detector gives them, a dark pole and dark zone lines among
-them.
+``python tutorial_2_own_measurement.py R5083.epos`` reads your file (.epos, .apt or .raw). Without an argument, the
+script creates an example file. Its coordinates have a quantisation step of 0.027 mm, like those of a delay line
+detector, and its map has a dark pole and dark zone lines.
 """
 
 import sys
@@ -22,34 +22,34 @@ if path is None:
     n = 400_000
     radius, azimuth = 18.0 * np.sqrt(random.random(n)), 2 * np.pi * random.random(n)
     dark = 0.5 * np.exp(-((radius / 1.5) ** 2)) + 0.3 * np.exp(-((radius * np.sin(1.5 * azimuth) / 0.8) ** 2))
-    kept = random.random(n) > dark
-    comb = 0.02725, 0.02602
-    x, y = (np.rint(radius * part(azimuth) / step) * step for part, step in zip((np.cos, np.sin), comb, strict=True))
-    made = ae.Hits(
-        x=x[kept],
-        y=y[kept],
-        positions=random.normal(size=(n, 3))[kept],
-        mass_to_charge=random.choice([58.0, 60.0, 29.0], n, p=[0.6, 0.3, 0.1])[kept],
-        time_of_flight=random.normal(600.0, 5.0, n)[kept],
-        voltage=np.linspace(4000.0, 5000.0, n)[kept],
-        pulse_id=np.cumsum(random.random(n) > 0.04)[kept],
+    mask = random.random(n) > dark
+    steps = 0.02725, 0.02602  # quantisation steps in x and y [mm]
+    x, y = (np.rint(radius * part(azimuth) / step) * step for part, step in zip((np.cos, np.sin), steps, strict=True))
+    example = ae.Hits(
+        x=x[mask],
+        y=y[mask],
+        positions=random.normal(size=(n, 3))[mask],
+        mass_to_charge=random.choice([58.0, 60.0, 29.0], n, p=[0.6, 0.3, 0.1])[mask],
+        time_of_flight=random.normal(600.0, 5.0, n)[mask],
+        voltage=np.linspace(4000.0, 5000.0, n)[mask],
+        pulse_id=np.cumsum(random.random(n) > 0.04)[mask],
     )
-    ae.write(path, made)
+    ae.write(path, example)
 
 # %%
-# Whatever the format, the same columns come back, in the same units; what a file does not hold is None. Multi-hits
-# are grouped when the file is read, before anything is selected.
+# All formats give the same columns in the same units. Columns that the file does not contain are None. Multiple hits
+# are grouped when the file is read, before any selection.
 
 measured = ae.read(path)
 print(measured)
 print("columns:", ", ".join(measured.columns))
 
 # %%
-# Ions are selected by masks, by windows of a column, or by a circle on the detector. With an .rrng file, ranges name
-# the species: ``ae.read_ranges("R5083.rrng")``.
+# Ions are selected by masks, by windows of a column, or by a circle on the detector. An .rrng file assigns species to
+# mass ranges: ``ae.read_ranges("R5083.rrng")``.
 
-centre = [(column.min() + column.max()) / 2 for column in (measured.x, measured.y)]  # not at 0 in every file
-late = measured.window(ion=(len(measured) // 2, None))  # measured ions are counted by their rows
+centre = [(column.min() + column.max()) / 2 for column in (measured.x, measured.y)]  # not (0, 0) in every file
+late = measured.window(ion=(len(measured) // 2, None))  # measured ions are numbered by row
 inner = late.within_circle(10.0, centre=centre)
 print(f"{len(late):,} ions in the second half, {len(inner):,} of them within 10 mm of {np.round(centre, 1)} mm")
 if measured.mass_to_charge is not None:
@@ -62,17 +62,19 @@ if measured.multiplicity is not None:
     print(f"{len(measured[measured.multiplicity == 1]):,} ions alone in a pulse")
 
 # %%
-# Bins that are no multiple of the comb's spacing hold now one tooth more, now one less, and show stripes (left). By
-# default the spacing is found in the data and bins are multiples of it (right).
+# Measured coordinates are quantised. Bins that are not multiples of the quantisation step alias into stripes (left). By
+# default, the step is determined from the data, and the bins are multiples of it (right).
 
-naive = measured.map(bins=256, quantum=None)
-aware = measured.map(bins=256)
-print(f"spacing of the comb: {aware.quantum} mm, bins of {aware.bin_size} mm")
-ae.plot.detector_maps([naive, aware], ["bins of any size", "bins on the comb"])[0].figure.savefig("measured.png")
+arbitrary = measured.map(bins=256, quantum=None)
+aligned = measured.map(bins=256)
+print(f"quantisation step: {aligned.quantum} mm, bin size: {aligned.bin_size} mm")
+axes = ae.plot.detector_maps([arbitrary, aligned], ["arbitrary bins", "multiples of the step"])
+axes[0].figure.savefig("measured.png")
 
 # %%
-# How noisy is this map? Two random halves of the measurement are compared: 1 would be no noise at all. It is a scale to
-# judge a simulation by, not its limit: a simulation has more ions than a half, and can come out higher.
+# To estimate the noise of the map, two random halves of the measurement are compared. Without noise, their similarity
+# would be 1. This value is a reference for the comparison with a simulation, but not an upper limit: a simulation can
+# have more ions than one half, and therefore a higher similarity.
 
 for smoothing in (0.0, 0.5, 1.0):
     print(f"smoothed by {smoothing} mm:", ae.half_ceiling(measured, bins=128, smoothing=smoothing))

@@ -2,11 +2,12 @@
 3. Fit the energies
 ===================
 
-From a measured map to the energies of the emission: bring a simulated map onto it, compare for many energies, and read
-off the best ones with their errors.
+Determine emission energies from a measured map: register a simulated map, compare maps for many energies, and find the
+best energies with their errors.
 
-``python tutorial_3_fit_energies.py 2000`` evaporates 2,000 atoms of each of two smaller tips instead of 15,000. A
-measurement of yours takes the place of the one made here: ``measured = ae.read("R5083.epos")``.
+The script evaporates 15,000 atoms of each of two tips. ``python tutorial_3_fit_energies.py 2000`` evaporates 2,000
+atoms of two smaller tips. To use your own measurement, replace the simulated one by ``measured =
+ae.read("R5083.epos")``.
 """
 
 import sys
@@ -15,12 +16,12 @@ import apt_evap as ae
 
 n_ions = int(sys.argv[1]) if len(sys.argv) > 1 else 15_000
 size, bins = (20, 48) if n_ions >= 5_000 else (10, 24)  # radius in lattice constants; bins across the measured map
-n_ions = max(n_ions, 1_500)  # fewer show no pattern to register
+n_ions = max(n_ions, 1_500)  # with fewer ions, there is no pattern to register
 nickel = ae.material("Ni")
 
 
 def evaporate(offset_seed, seed):
-    """A run of a tip along [111], the origin of the lattice and the ties of the events as the seeds say."""
+    """Run of a tip along [111]; the seeds set the origin of the lattice and the random numbers of the perturbations."""
     tip = ae.Tip(
         nickel,
         apex_radius=size * nickel.a,
@@ -33,42 +34,42 @@ def evaporate(offset_seed, seed):
 
 
 # %%
-# A measurement whose energies are known shows what the fit can find. It is another specimen, of which no ion is one of
-# the run that is fitted: rolled up with a hidden energy, turned by 17 degrees, shrunk to the detector of an instrument,
-# off its centre, and cut off by the circle of the field of view.
+# A simulated measurement with known energies shows what the fit can determine. It is another specimen, with no ions in
+# common with the fitted run. Its ions roll up with a hidden energy. Its map is rotated by 17 degrees, scaled to the
+# detector of an instrument, shifted from its centre, and limited to a circular field of view.
 
-hidden = ae.RollUp(ae.TruncatedNormal(mean=0.155, standard_deviation=0.155))
+truth = ae.RollUp(ae.TruncatedNormal(mean=0.155, standard_deviation=0.155))
 instrument = ae.Registration(rotation=17.0, scale=0.3, shift=(2.0, -1.0))
-measured = instrument.hits(evaporate(offset_seed=5, seed=2).hits(hidden)).within_circle(18.0)
+measured = instrument.hits(evaporate(offset_seed=5, seed=2).hits(truth)).within_circle(18.0)
 print(measured)
 
 # %%
-# One run serves all energies, since its responses give the hits of every ion for any of them.
+# One run is sufficient for all energies, because the responses give the hits of every ion for any energy.
 
 run = evaporate(offset_seed=1, seed=1)
 print(run)
 
 # %%
-# Registration: where the simulated map lies on the measured one. Any energy of the right order does. A [111] axis has
-# three such places, and three mirrored ones, alike but for noise: what fits as well is in ``ties``. Always look at the
-# overlay.
+# Registration finds the rotation, scale and shift between the simulated and the measured map. An approximate energy is
+# sufficient for this step. For a [111] axis, there are three equivalent registrations, and three mirrored ones, which
+# differ only by noise. Equally good registrations are in ``ties``. Always check the overlay.
 
 guess = run.hits(ae.RollUp(0.1)).map(bins=2 * bins, quantum=None)
-seen = measured.map(bins=bins, quantum=None)
-registration = ae.register(guess, seen)
+measured_map = measured.map(bins=bins, quantum=None)
+registration = ae.register(guess, measured_map)
 print(f"{registration}, correlation {registration.score:.2f}, {len(registration.ties)} ties")
-ae.plot.overlay(guess, seen.smoothed(0.6), registration).figure.savefig("overlay.png")
+ae.plot.overlay(guess, measured_map.smoothed(0.6), registration).figure.savefig("overlay.png")
 
 # %%
-# What is compared: both maps on the same bins, where both show something; each divided by itself, smoothed broadly, so
-# that gradients across the detector do not count, and smoothed by half a bin. Their structural similarity (SSIM) is 1
-# for equal maps and 0 for maps that have nothing in common. The noise of both is known and allowed for: the true
-# energies have about 1, give or take the error, although no two noisy maps are equal. Here a part of the grid of
-# energies will do; without ``means`` and ``rsds`` it is that of :cite:t:`Shaikh`.
+# Both maps are compared on the same bins, in the region that both cover. Each map is divided by a strongly smoothed
+# copy of itself, which removes gradients across the detector, and smoothed by half a bin. The structural similarity
+# (SSIM) is 1 for equal maps and 0 for unrelated maps. The SSIM is corrected for the noise of both maps, which is known.
+# For the true energies, it is therefore about 1 within the error, although two noisy maps are never equal. In this
+# example, a small grid of energies is sufficient. Without ``means`` and ``rsds``, the grid is that of :cite:t:`Shaikh`.
 
 study = ae.fit_energies(
     run,
-    seen,
+    measured_map,
     mechanism="roll-up",
     means=(0.01, 0.0825, 0.155, 0.2275, 0.3),
     rsds=(0.0316, 0.1, 0.316, 1.0, 3.16),
@@ -78,28 +79,29 @@ study = ae.fit_energies(
 print(study)
 
 # %%
-# The framed energies are the best on the grid, the circle is the best place between its points.
+# The frame shows the best energies on the grid, and the circle shows the interpolated optimum.
 
 ae.plot.ssim_matrix(study)[0].figure.savefig("ssim.png")
 
 # %%
-# What the errors mean. All ions, measured and simulated, are drawn anew, with replacement, 100 times, and everything is
-# computed again: ± is the standard deviation, the bars hold 95 % of the best places. So they say what another
-# measurement of as many ions would have given. They do not hold what is wrong in the model: the shape of the specimen,
-# the registration, a mechanism that is not that of the metal. Whether to believe the optimum, two numbers tell: by how
-# much it is better than the unperturbed map, and how far it stays below 1. With the noise, which ``plain`` has, a good
-# model reaches more than two random halves of the measured ions do, since each of them has the noise of half the ions.
+# The errors come from 100 resamples of all measured and simulated ions, for which the analysis is repeated. The value
+# after ± is the standard deviation, and the bars contain 95 % of the optima. The errors show how much the result of
+# another measurement with the same number of ions would differ. They do not include errors of the model: the shape of
+# the specimen, the registration, or a mechanism that does not apply to the metal. Two numbers show whether the optimum
+# is credible: its gain over the unperturbed map, and its difference from 1. The uncorrected SSIM is in ``plain``. For a
+# good model, it is higher than the SSIM of two random halves of the measured ions, because each half has the noise of
+# half the ions.
 #
-# A mean and a width of the distribution make up for each other. The mean of the energies that ions really have, those
-# above 0, is found better than either.
+# The mean and the width of the distribution can compensate each other. The true mean, that is, the mean of the energies
+# after truncation at 0, is determined better than both.
 
-found = study.refined
-print(f"mean of the energies {found.bounded('true_mean')} eV, hidden {hidden.energy.true_mean:.3g} eV")
+optimum = study.refined
+print(f"mean of the energies {optimum.bounded('true_mean')} eV, hidden {truth.energy.true_mean:.3g} eV")
 print(f"better than unperturbed by {study.gain}, in {study.gain_share:.0%} of the resamples")
-print(f"SSIM {study.optimum.score}; noise and all {study.plain['optimum']}, two halves {study.ceiling}")
+print(f"SSIM {study.optimum.score}; uncorrected {study.plain['optimum']}, two halves {study.ceiling}")
 
 # %%
-# The maps, as they are compared, and their middle magnified.
+# The compared maps, and their central part magnified.
 
 ae.plot.side_by_side(study)[0].figure.savefig("maps.png")
 study.save("study.json")

@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# Source archive -> wheel -> tests in a fresh environment: what a user gets from the package index.
+# Build the source archive and the wheel, and run the tests in a new environment, as installed by a user.
 #
-#   tools/check_dist.sh [arguments of pytest]      all tests; a file or two is quicker
+#   tools/check_dist.sh [arguments of pytest]      default: all tests; one or two files are faster
 #
-# APT_EVAP_SERIAL=1 before it builds the core without OpenMP, and tests that.
+# With APT_EVAP_SERIAL=1, the core is built and tested without OpenMP.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 work=$(mktemp -d)
@@ -46,9 +46,9 @@ mkdir "$work/source"
 tar -xzf "$archive" -C "$work/source" --strip-components=1
 cd "$work/source"
 "$work/fresh/bin/python" -P - <<'PYTHON'
-import os, apt_evap, apt_evap._core.interactions as sweep
+import os, apt_evap, apt_evap._core.interactions as interactions
 assert "site-packages" in apt_evap.__file__, apt_evap.__file__
-needs_openmp = b"GOMP_" in open(sweep.__file__, "rb").read()
+needs_openmp = b"GOMP_" in open(interactions.__file__, "rb").read()
 print("the core was built", "with" if needs_openmp else "without", "OpenMP")
 assert not (needs_openmp and os.environ.get("APT_EVAP_SERIAL"))
 PYTHON

@@ -1,7 +1,7 @@
-"""Reads the logs of a checker, prints the findings that have to do with the compiled core, and fails if there are any.
+"""Read the logs of a checker, print the findings in the compiled core, and fail if there are any.
 
-Python, NumPy and SciPy leave some memory behind when they end; a leak is the core's if a function of the core is among
-the callers, the loading of its modules excepted.
+Python, NumPy and SciPy do not free all memory at exit. A leak is attributed to the core if a function of the core is
+among the callers, except for the loading of its modules.
 """
 
 import re
@@ -19,13 +19,13 @@ FRAME = re.compile(r"^\s*(?:#\d+|at|by)\b")
 
 
 def paragraphs(text):
-    """Paragraphs of a log, without the process numbers that valgrind puts in front of its lines."""
+    """Paragraphs of a log, without the process numbers at the start of valgrind's lines."""
     text = re.sub(r"^(?:==|--)\d+(?:==|--) ?", "", text, flags=re.MULTILINE)
     return [part for part in re.split(r"\n\s*\n", text) if part.strip()]
 
 
 def concerns_the_core(paragraph):
-    """Whether a finding is one, and of the core."""
+    """Whether a paragraph is a finding in the core."""
     frames = "\n".join(line for line in paragraph.splitlines() if FRAME.match(line))
     if LEAK.search(paragraph):
         return bool(CORE.search(frames)) and not LOADING.search(frames)
@@ -33,17 +33,17 @@ def concerns_the_core(paragraph):
 
 
 def main():
-    """Print what concerns the core."""
-    read = found = 0
+    """Print the findings in the core."""
+    n_findings = n_core = 0
     for path in map(Path, sys.argv[1:]):
         if path.is_file():
             for paragraph in paragraphs(path.read_text(errors="replace")):
-                read += bool(LEAK.search(paragraph) or ERROR.search(paragraph))
+                n_findings += bool(LEAK.search(paragraph) or ERROR.search(paragraph))
                 if concerns_the_core(paragraph):
-                    found += 1
+                    n_core += 1
                     print(paragraph, end="\n\n")
-    print(f"{read} findings in the logs, {found} of the core")
-    return 1 if found else 0
+    print(f"{n_findings} findings in the logs, {n_core} in the core")
+    return 1 if n_core else 0
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
-"""Whether two commits give the same bits: installs both, makes three runs with each, compares every dataset.
+"""Compare two commits bit by bit: install both, make three runs with each, and compare every dataset.
 
     python tools/same_bits.py BASE [HEAD]        two commits; HEAD is the working tree if not given
     python tools/same_bits.py BASE --times 5     the same, and pairs of timed runs
 
-The runs: Ni[111], R = 20 a, with responses; a random alloy with a perturbation of a user's own; a shell of R = 60 a
-that deepens. Prints a hash for each dataset that differs, and exits with 1 if one does.
+The runs: Ni[111], R = 20 a, with responses; a random alloy with a user-defined perturbation; a shell with R = 60 a
+that is deepened. Prints the hashes of each dataset that differs. The exit code is 1 if a dataset differs.
 """
 
 import argparse
@@ -55,24 +55,24 @@ def simulation(name):
 
 
 for name in sys.argv[2:]:
-    made, ions, emissions = simulation(name)
-    started = time.perf_counter()
-    run = made.run(ions, emissions, progress=False)
-    print(name, time.perf_counter() - started, len(made.tip.positions), flush=True)
+    case, ions, emissions = simulation(name)
+    start = time.perf_counter()
+    run = case.run(ions, emissions, progress=False)
+    print(name, time.perf_counter() - start, len(case.tip.positions), flush=True)
     run.save(f"{sys.argv[1]}/{name}.h5")
 """
 
 
 def install(commit, folder):
-    """Install a commit, or the working tree, into an environment of its own; return its Python."""
+    """Install a commit, or the working tree, into a new environment; return its Python executable."""
     source = folder / "source"
     if commit:
         subprocess.run(["git", "clone", "-q", str(ROOT), str(source)], check=True)
         subprocess.run(["git", "checkout", "-q", commit], cwd=source, check=True)
     else:
         command = ["git", "ls-files", "-co", "--exclude-standard"]
-        listed = subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
-        for name in listed.stdout.decode().split():
+        listing = subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+        for name in listing.stdout.decode().split():
             if (ROOT / name).exists():
                 (source / name).parent.mkdir(parents=True, exist_ok=True)
                 (source / name).write_bytes((ROOT / name).read_bytes())
@@ -83,7 +83,7 @@ def install(commit, folder):
 
 
 def run_cases(python, folder, cases):
-    """Make the runs; return seconds by name."""
+    """Make the runs; return their times [s] by name."""
     outcome = subprocess.run(
         [python, folder / "cases.py", folder, *cases], check=True, cwd=folder, capture_output=True, text=True
     )
@@ -92,26 +92,26 @@ def run_cases(python, folder, cases):
 
 def datasets(path):
     """Hash of every dataset of a run file, by name."""
-    import h5py  # of the environment this tool runs in
+    import h5py  # from the environment of this tool
 
-    found = {}
+    hashes = {}
 
     def visit(name, item):
         if isinstance(item, h5py.Dataset):
             values = item[()]
-            found[name] = hashlib.sha256(str(values.dtype).encode() + str(values.shape).encode() + values.tobytes())
+            hashes[name] = hashlib.sha256(str(values.dtype).encode() + str(values.shape).encode() + values.tobytes())
 
     with h5py.File(path) as file:
         file.visititems(visit)
-    return {name: digest.hexdigest()[:16] for name, digest in found.items()}
+    return {name: digest.hexdigest()[:16] for name, digest in hashes.items()}
 
 
 def main():
-    """Install, run, compare."""
+    """Install both commits, make the runs and compare them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("base")
     parser.add_argument("head", nargs="?")
-    parser.add_argument("--times", type=int, default=0, help="pairs of timed runs")
+    parser.add_argument("--times", type=int, default=0, help="number of pairs of timed runs")
     options = parser.parse_args()
     cases = ("nickel", "alloy", "shell")
     with tempfile.TemporaryDirectory() as folder:
@@ -121,12 +121,12 @@ def main():
             path.mkdir()
             sides[side] = install(commit, path), path
             run_cases(*sides[side], cases)
-        differing = 0
+        differences = 0
         for case in cases:
             base, head = (datasets(path / f"{case}.h5") for _, path in sides.values())
             for name in sorted(base | head):
                 if base.get(name) != head.get(name):
-                    differing += 1
+                    differences += 1
                     print(f"{case}: {name} {base.get(name)} -> {head.get(name)}")
             print(f"{case}: {sum(base[name] == head.get(name) for name in base)} of {len(base)} datasets equal")
         ratios = {case: [] for case in cases}
@@ -137,7 +137,7 @@ def main():
         for case, values in ratios.items():
             if values:
                 print(f"{case}: head / base {statistics.median(values):.3f} ({min(values):.3f} to {max(values):.3f})")
-    return bool(differing)
+    return bool(differences)
 
 
 if __name__ == "__main__":

@@ -1,36 +1,36 @@
 #!/usr/bin/env bash
-# The compiled core under a checker; what is built goes to build/KIND and the package in the source tree stays as it is.
+# Run the compiled core with a checker. The build goes to build/KIND; the package in the source tree is not changed.
 #
-#   tools/sanitize.sh address    reads and writes outside of memory, undefined behaviour, leaks of the core (GCC)
-#   tools/sanitize.sh bounds     every index of every typed memoryview against its length
-#   tools/sanitize.sh thread     races (needs clang, its OpenMP runtime and Archer: clang-19 libomp-19-dev of Debian)
-#   tools/sanitize.sh valgrind   reads of memory that was never written, leaks of the core (needs valgrind; slow)
+#   tools/sanitize.sh address    invalid reads and writes, undefined behaviour, memory leaks of the core (GCC)
+#   tools/sanitize.sh bounds     bounds checks of every index of every typed memoryview
+#   tools/sanitize.sh thread     data races (needs clang, its OpenMP runtime and Archer: clang-19 libomp-19-dev on Debian)
+#   tools/sanitize.sh valgrind   reads of uninitialised memory, memory leaks of the core (needs valgrind; slow)
 #
-# More words are given to pytest in place of the tests named here. It needs what '.[test]' installs, and says at the
-# end "sanitize KIND: nothing found"; its exit code is not 0 if something was.
+# Further arguments are passed to pytest instead of the default tests. The script needs the packages of '.[test]'. At the
+# end it prints "sanitize KIND: nothing found"; otherwise its exit code is not 0.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-kind=${1:?"say which: address, bounds, thread or valgrind"}
+kind=${1:?"must be address, bounds, thread or valgrind"}
 shift
 tests=("$@")
 core=(tests/_core tests/flight)
 build=$PWD/build/$kind
-log=$build/found
+log=$build/findings
 mkdir -p "$build"
 rm -f "$log"*
 
-build_core() { # with the environment it is given, into a folder of its own
+build_core() { # with the given environment variables, into a separate folder
     env "$@" python setup.py -q build --build-base "$build" --build-lib "$build/lib" --force
 }
-run() { # a command that imports the package from there
+run() { # run a command that imports the package from this folder
     env PYTHONSAFEPATH=1 PYTHONPATH="$build/lib" "$@"
 }
-preload() { # so that the checker is there before Python is
+preload() { # load the checker before Python starts
     echo "LD_PRELOAD=$1"
 }
 finish() {
     if [ "$1" -ne 0 ]; then
-        echo "sanitize $kind: FOUND SOMETHING (or the tests failed), see above and $log*"
+        echo "sanitize $kind: ERRORS FOUND, or tests failed; see above and $log*"
         exit 1
     fi
     echo "sanitize $kind: nothing found"
@@ -41,7 +41,7 @@ case $kind in
 address)
     flags="-fsanitize=address,undefined -fno-sanitize-recover=undefined -fno-omit-frame-pointer -g"
     build_core CC=gcc CFLAGS="$flags"
-    # PYTHONMALLOC: arrays of Python and NumPy then lie between guarded bytes
+    # PYTHONMALLOC: guard bytes around arrays of Python and NumPy
     run "$(preload "$(gcc -print-file-name=libasan.so) $(gcc -print-file-name=libubsan.so)")" PYTHONMALLOC=malloc \
         ASAN_OPTIONS="log_path=$log:exitcode=0:detect_leaks=1:malloc_context_size=12" UBSAN_OPTIONS=print_stacktrace=1 \
         LSAN_OPTIONS="exitcode=0:fast_unwind_on_malloc=0:max_leaks=0" \
@@ -50,7 +50,7 @@ address)
     ;;
 bounds)
     build_core APT_EVAP_BOUNDS=1
-    # an index out of range in a function that cannot raise is printed by Python, and pytest warns of it
+    # if a function cannot raise an exception, Python prints an index error, and pytest issues a warning
     run python -m pytest -q -p no:cacheprovider -W error::pytest.PytestUnraisableExceptionWarning \
         "${tests[@]:-${core[@]}}" || status=1
     ;;
@@ -59,7 +59,7 @@ thread)
     runtime=$("${CLANG:-clang-19}" -print-file-name=libclang_rt.tsan-x86_64.so)
     build_core CC="${CLANG:-clang-19}" CFLAGS="-fsanitize=thread -g -fno-omit-frame-pointer" \
         LDSHARED="${CLANG:-clang-19} -shared -shared-libsan"
-    # Archer tells the checker what OpenMP's barriers and locks order; libomp itself is not instrumented
+    # Archer informs the checker about the barriers and locks of OpenMP; libomp itself is not instrumented
     printf 'called_from_lib:libomp.so\n' >"$build/suppressions"
     run "$(preload "$runtime")" OMP_TOOL_LIBRARIES="$llvm/lib/libarcher.so" OPENBLAS_NUM_THREADS=1 \
         TSAN_OPTIONS="log_path=$log:exitcode=0:history_size=4:suppressions=$build/suppressions" \
@@ -73,7 +73,7 @@ valgrind)
     python tools/findings.py "$log"* || status=1
     ;;
 *)
-    echo "no checker is called '$kind': address, bounds, thread or valgrind"
+    echo "unknown checker '$kind': must be address, bounds, thread or valgrind"
     exit 2
     ;;
 esac

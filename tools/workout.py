@@ -1,4 +1,4 @@
-"""A little of everything that the compiled core does, on several threads: for checkers that slow it a hundred times.
+"""Short run of all parts of the compiled core, on several threads, for checkers that slow it down by a factor of 100.
 
 python tools/workout.py [ions] [threads]
 """
@@ -15,7 +15,7 @@ ions = int(sys.argv[1]) if len(sys.argv) > 1 else 40
 n_threads = int(sys.argv[2]) if len(sys.argv) > 2 else 3
 tip = ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1), shank_length=2.5, offset_seed=1, depth=1.2)
 
-# events and flights side by side; the shell deepens when the emitter comes upon its inner side
+# events and flights in parallel; the shell is deepened when evaporation reaches its innermost atoms
 settings = ae.ChargeSettings(sweep_interval=max(2, ions // 4))
 simulation = ae.Simulation(tip, seed=1, n_threads=n_threads, charge_settings=settings)
 run = simulation.run(ions, (ae.RollUp(ae.TruncatedNormal(0.155, 0.155)),), progress=False, batch_size=max(2, ions // 3))
@@ -24,7 +24,7 @@ emitter.deepen()
 emitter.relax(tolerance=1e-7)  # in double precision
 batch = emitter.evaporate(3)
 
-# sums by the tree and over all atoms, on threads
+# sums with the octree and over all atoms, on several threads
 points = emitter.positions + 0.5 * emitter.normals
 field, potential = emitter.field_at(points), emitter.potential_at(points)
 exact = emitter.field_at(points[:50], opening_angle=0)
@@ -36,5 +36,5 @@ for double_precision in (False, True):
     lists.sweep(sums, double_precision, n_threads)
 assert np.isfinite(sums).all() and np.isfinite(potential).all() and np.isfinite(batch.charges).all()
 worst = np.linalg.norm(field[:50] - exact, axis=1).max() / np.linalg.norm(exact, axis=1).max()
-assert worst < 0.01, worst  # the tree at its usual angle against the sum over all atoms
-print(f"{run}\nthe tree differs from the direct sum by {worst:.1e} of the largest field")
+assert worst < 0.01, worst  # octree with the default opening angle against the sum over all atoms
+print(f"{run}\nlargest difference between octree and direct sum: {worst:.1e} of the largest field")
