@@ -58,7 +58,7 @@ extensions = [
     Extension(
         f"apt_evap._core.{name}",
         [f"apt_evap/_core/{name}.pyx"],
-        depends=["apt_evap/_core/kernels.h", "apt_evap/_core/kernels_group.h"],
+        depends=[f"apt_evap/_core/{header}.h" for header in ("kernels", "kernels_group", "elementary")],
         include_dirs=["apt_evap/_core"],
         libraries=[] if platform.system() == "Windows" else ["m"],
     )

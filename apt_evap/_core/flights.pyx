@@ -9,7 +9,7 @@ The scheme is the Runge-Kutta-Nystrom pair of orders 8 and 6 of Dormand, El-Mikk
 423, 1987), nine stages a step.
 """
 
-from libc.math cimport INFINITY, pow, sqrt
+from libc.math cimport INFINITY, sqrt
 from libc.stdlib cimport free, malloc
 
 import numpy as np
@@ -17,6 +17,10 @@ import numpy as np
 from apt_evap._core.journal cimport Journal
 from apt_evap._core.octree cimport Octree
 from apt_evap._core.sources cimport Sources, sources_field, sources_free, sources_init
+
+cdef extern from "elementary.h":
+    double inverse_seventh_root(double) noexcept nogil
+
 
 cdef extern from *:
     """
@@ -246,7 +250,7 @@ cdef class Flights:
             if not largest < 1e30:   # a stage ran into an atom
                 dt *= 0.1
             else:
-                dt *= min(4.0, max(0.2, 0.9 * pow(max(largest, 1e-12), -1.0 / 7.0)))
+                dt *= min(4.0, max(0.2, 0.9 * inverse_seventh_root(max(largest, 1e-12))))
         for i in range(m):
             if outcome[i] == ION_NEVER_LEFT:
                 for axis in range(3):

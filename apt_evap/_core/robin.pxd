@@ -11,5 +11,6 @@ cdef class Robin(FieldRule):
     cdef double clearance               # of this point from the surface at first [nm]
     cdef float[::1] matrix, residual
 
+    cdef normal_field(self, const double[:, ::1] normals, long n)
     cdef int grow(self, long stride) except -1 nogil
     cdef int patch_charges(self, Octree tree, double[:, ::1] normals, Patch* patch) except -1 nogil

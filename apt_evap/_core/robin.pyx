@@ -22,6 +22,38 @@ cdef extern from "kernels.h":
     float patch_dot(long, const float*, const float*) noexcept nogil
 
 
+cdef double dot(const double[::1] first, const double[::1] second) noexcept nogil:
+    # Scalar product; eight sums, so that it vectorises, in an order that no processor chooses.
+    cdef double sums[8]
+    cdef long i, n = first.shape[0]
+    cdef int lane
+    for lane in range(8):
+        sums[lane] = 0.0
+    for i in range(0, n - 7, 8):
+        for lane in range(8):
+            sums[lane] += first[i + lane] * second[i + lane]
+    for i in range(n - n % 8, n):
+        sums[0] += first[i] * second[i]
+    return ((sums[0] + sums[1]) + (sums[2] + sums[3])) + ((sums[4] + sums[5]) + (sums[6] + sums[7]))
+
+
+cdef eliminate(double[:, ::1] matrix, double[::1] right):
+    # Solution of a few symmetric positive equations by Gaussian elimination, in place of `right`; LAPACK's bits depend on
+    # the processor.
+    cdef long i, j, k, n = right.shape[0]
+    cdef double factor
+    for k in range(n):
+        for i in range(k + 1, n):
+            factor = matrix[i, k] / matrix[k, k]
+            for j in range(k, n):
+                matrix[i, j] -= factor * matrix[k, j]
+            right[i] -= factor * right[k]
+    for k in range(n - 1, -1, -1):
+        for j in range(k + 1, n):
+            right[k] -= matrix[k, j] * right[j]
+        right[k] /= matrix[k, k]
+
+
 cdef class Robin(FieldRule):
     """Robin's iteration; its parameters are those of `apt_evap.Robin`."""
 
@@ -86,7 +118,7 @@ cdef class Robin(FieldRule):
         error, so that it is about as large as the residual.
         """
         field = interactions.direct_field(positions[chosen], positions, charges)
-        settled = self.area / (2 * np.pi) * np.einsum("ij,ij->i", field, normals[chosen])
+        settled = self.area / (2 * np.pi) * (field * normals[chosen]).sum(axis=1)
         return (settled - charges[chosen]) / charges.mean()
 
     @cython.wraparound(True)
@@ -121,15 +153,13 @@ cdef class Robin(FieldRule):
         cdef long n = tree.n_slots
         cdef int sweeps = 0
         cdef double residual = np.inf
-        normal = np.asarray(normals)[:n]
         self.field = np.zeros((tree.x.shape[0], 3))
-        field = np.asarray(self.field)[:n]
         charges = tree.charges
         total = charges.sum()
         maps, steps = [], []   # of the last sweeps: what Robin's iteration made of the charges, and by how much
         for sweeps in range(1, max_sweeps + 1):
             lists.sweep(self.field, double_precision, n_threads)
-            flux = np.maximum(np.einsum("ij,ij->i", field, normal), 0.0)   # a site deep in a notch stays without charge
+            flux = np.maximum(self.normal_field(normals, n), 0.0)   # a site deep in a notch stays without charge
             if not flux.sum() > 0.0:
                 raise ValueError(f"{n} surface atoms hold no charge together: expected normals that point outwards")
             self.area = 2.0 * M_PI * total / flux.sum()
@@ -145,23 +175,36 @@ cdef class Robin(FieldRule):
             tree.charges = mixed
         return sweeps, residual
 
+    cdef normal_field(self, const double[:, ::1] normals, long n):
+        # Field of all the others along the normal of each slot [e/nm^2].
+        cdef double[::1] along = np.empty(n)
+        cdef long i
+        for i in range(n):
+            along[i] = (self.field[i, 0] * normals[i, 0] + self.field[i, 1] * normals[i, 1]
+                        + self.field[i, 2] * normals[i, 2])
+        return np.asarray(along)
+
     @cython.wraparound(True)
     def mixed(self, maps, steps):
         """Next charges by Anderson's mixing of the last sweeps (J. ACM 12, 547, 1965).
 
         The combination of the last maps whose combined step is the smallest; a sum of charges that all maps share is
-        kept. einsum, not BLAS, makes the products: their bits do not depend on threads.
+        kept.
         """
+        cdef int i, j
         del maps[:-self.window - 1], steps[:-self.window - 1]
         if len(steps) == 1:
             return maps[-1]
         step_changes = [steps[-1] - step for step in steps[:-1]]
-        gram = np.array([[np.einsum("i,i", a, b) for b in step_changes] for a in step_changes])
-        right = np.array([np.einsum("i,i", a, steps[-1]) for a in step_changes])
+        gram = np.empty((len(step_changes), len(step_changes)))
+        for i in range(len(step_changes)):
+            for j in range(i + 1):
+                gram[i, j] = gram[j, i] = dot(step_changes[i], step_changes[j])
+        right = np.array([dot(change, steps[-1]) for change in step_changes])
         gram += 1e-12 * np.trace(gram) * np.eye(len(gram))   # equal steps: any fractions will do
-        fractions = np.linalg.solve(gram, right)
+        eliminate(gram, right)
         charges = maps[-1].copy()
-        for fraction, other in zip(fractions, maps[:-1]):
+        for fraction, other in zip(right, maps[:-1]):
             charges -= fraction * (maps[-1] - other)
         return charges
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from apt_evap._common.small_matrices import squared_lengths
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_choice, check_number
 from apt_evap.detection.hits import Outcome
@@ -108,7 +109,7 @@ class Detector:
         outcome : ndarray of int8, shape (n,)
             An `Outcome` each.
         """
-        s2 = np.einsum("ij,ij->i", directions, directions)
+        s2 = squared_lengths(directions)
         ahead = s2 < 1.0
         with np.errstate(divide="ignore", invalid="ignore"):
             stretch = stereographic_stretch(s2, PROJECTIONS[self.projection])

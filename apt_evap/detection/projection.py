@@ -18,8 +18,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from apt_evap._common.small_matrices import lengths
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_number, check_switch
+from apt_evap._core.elementary import arctangent
 
 
 def polar_angles(directions: Floats) -> Floats:
@@ -29,7 +31,7 @@ def polar_angles(directions: Floats) -> Floats:
 
 def stereographic(directions: Floats) -> Floats:
     """Stereographic directions, shape (n, 2), of directions of any length, shape (n, 3)."""
-    return directions[:, :2] / (np.linalg.norm(directions, axis=1) + directions[:, 2])[:, None]
+    return directions[:, :2] / (lengths(directions) + directions[:, 2])[:, None]
 
 
 def stereographic_stretch(s2: Floats, compression: float | None) -> Floats:
@@ -50,7 +52,7 @@ def stereographic_stretch(s2: Floats, compression: float | None) -> Floats:
     if compression == 1.0:
         return 2.0 / (1.0 - s2)  # tan(theta) / tan(theta / 2)
     s = np.sqrt(s2)
-    return np.where(s > 0, radius_of(2.0 * np.arctan(s), compression) / s, 2.0)
+    return np.where(s > 0, radius_of(2.0 * arctangent(s), compression) / s, 2.0)
 
 
 def along_axis(lengths: Floats, s2: Floats) -> Floats:

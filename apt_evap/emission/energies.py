@@ -2,6 +2,8 @@
 
 import math
 from dataclasses import dataclass
+from decimal import Decimal, localcontext
+from functools import lru_cache
 from numbers import Real
 from typing import Any, Protocol
 
@@ -11,9 +13,13 @@ from numpy.typing import ArrayLike
 
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_number, shown
+from apt_evap._core.elementary import logarithm, normal_quantile
 from apt_evap.units import BOLTZMANN
 
 HIGHEST_ENERGY = 100.0  # [eV]: more is a slip of the unit, 155 (meV), or ten times any bond
+
+
+_PI = Decimal("3.14159265358979323846264338327950288419716939937510582097494459230781640628620899862803482534")
 
 
 class Distribution(Protocol):
@@ -22,6 +28,27 @@ class Distribution(Protocol):
     def quantile(self, u: Floats) -> Floats:
         """Energy [eV] below which the fraction `u` (in (0, 1), any shape) of the distribution lies."""
         ...
+
+
+@lru_cache(maxsize=1024)
+def normal_probability(x: float) -> float:
+    """Probability below `x` of the standard normal distribution, correctly rounded; 0 below -12 and 1 above 12.
+
+    Decimal numbers have the same digits on every machine, which the error function of the C library has not.
+    """
+    if abs(x) > 12.0:  # 2e-33
+        return float(x > 0.0)
+    with localcontext() as context:
+        context.prec = 90  # the sum cancels to 33 digits
+        exact = Decimal(x)
+        term = total = exact
+        order = 1
+        while abs(term) > Decimal("1e-60"):  # x + x^3 / 3 + x^5 / (3 * 5) + ...
+            order += 2
+            term *= exact * exact / order
+            total += term
+        density = (-exact * exact / 2).exp() / (2 * _PI).sqrt()
+        return float(Decimal("0.5") + density * total)
 
 
 @dataclass(frozen=True)
@@ -54,11 +81,11 @@ class TruncatedNormal:
         """Energy [eV] below which the fraction `u` (in (0, 1), any shape) of the distribution lies."""
         u = np.asarray(u, dtype=np.float64)
         ratio = self.mean / self.standard_deviation
-        special = scipy.special
-        lower = special.ndtr(-ratio) + u * special.ndtr(ratio)
+        lower = normal_probability(-ratio) + u * normal_probability(ratio)
         # the tail that is the smaller one keeps all its digits
-        upper = -special.ndtri((1 - u) * special.ndtr(ratio))
-        deviate = np.where(lower < 0.5, special.ndtri(np.minimum(lower, 0.5)), upper)
+        upper = (1 - u) * normal_probability(ratio)
+        deviate = normal_quantile(np.minimum(lower, upper))
+        deviate = np.where(lower < 0.5, deviate, -deviate)
         return np.maximum(self.mean + self.standard_deviation * deviate, np.finfo(np.float64).tiny)
 
     @property
@@ -132,7 +159,7 @@ class Thermal:
 
     def quantile(self, u: ArrayLike) -> Floats:
         """Energy [eV] below which the fraction `u` (in (0, 1), any shape) of the distribution lies."""
-        return -BOLTZMANN * self.temperature * np.log1p(-np.asarray(u, dtype=np.float64))
+        return -BOLTZMANN * self.temperature * logarithm(1.0 - np.asarray(u, dtype=np.float64))
 
 
 DISTRIBUTIONS = {kind.__name__: kind for kind in (TruncatedNormal, Fixed, Thermal)}

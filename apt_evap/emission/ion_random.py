@@ -1,11 +1,11 @@
 """Random numbers keyed by seed and ion: the same for an ion whatever the batch or the threads."""
 
 import numpy as np
-import scipy
 from numpy.typing import ArrayLike
 
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_count, check_seed
+from apt_evap._core.elementary import normal_quantile
 
 _GAMMA = np.uint64(0x9E3779B97F4A7C15)
 _FIRST = np.uint64(0xBF58476D1CE4E5B9)
@@ -62,4 +62,4 @@ class IonRandom:
 
     def normal(self, columns: int = 1) -> Floats:
         """Return the next normal numbers of mean 0 and variance 1, shape (n, columns)."""
-        return scipy.special.ndtri(self.uniform(columns))
+        return normal_quantile(self.uniform(columns))

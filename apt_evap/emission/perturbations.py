@@ -13,6 +13,7 @@ import numpy as np
 
 from apt_evap._common.types import Booleans, Floats
 from apt_evap._common.validation import check_kind, check_number, did_you_mean, shown
+from apt_evap._core.elementary import sine_and_cosine
 from apt_evap.emission.emissions import Emissions, Launches
 from apt_evap.emission.energies import (
     DISTRIBUTIONS,
@@ -117,7 +118,8 @@ class LateralVelocity(_Tangential):
         """Nobody rolls; velocities along t1 and t2 [nm/ns]: see `Combined.tangential`."""
         energy, azimuth = self._drawn(emissions, random)
         speed = speed_from_energy(energy, emissions.masses)
-        return np.zeros(len(emissions), dtype=bool), speed * np.cos(azimuth), speed * np.sin(azimuth)
+        sine, cosine = sine_and_cosine(azimuth)
+        return np.zeros(len(emissions), dtype=bool), speed * cosine, speed * sine
 
 
 @dataclass(frozen=True)
@@ -188,11 +190,8 @@ class Combined(_Tangential):
         rolled, first, second = rollup_direction(emissions)
         rolling = speed_from_energy(self.rollup_fraction * energy, emissions.masses)
         lateral = speed_from_energy((1 - self.rollup_fraction) * energy, emissions.masses)
-        return (
-            rolled,
-            rolling * first + lateral * np.cos(azimuth),
-            rolling * second + lateral * np.sin(azimuth),
-        )
+        sine, cosine = sine_and_cosine(azimuth)
+        return rolled, rolling * first + lateral * cosine, rolling * second + lateral * sine
 
 
 PERTURBATIONS = {kind.__name__: kind for kind in (Unperturbed, LateralVelocity, RollUp, Combined)}

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
+from apt_evap._common.small_matrices import products
 from apt_evap._common.types import Booleans, Floats
 from apt_evap._common.validation import check_array
 from apt_evap.emission.emissions import Emissions, Launches
@@ -55,8 +56,8 @@ def rollup_direction(emissions: Emissions) -> tuple[Booleans, Floats, Floats]:
     rolled = np.isfinite(emissions.neighbours).all(axis=1)
     step = np.where(rolled[:, None], emissions.neighbours - emissions.positions, 0.0)
     # the lift d n of the rolled-up position is along the normal and drops out
-    along = [np.einsum("ij,ij->i", step, tangent) for tangent in tangent_frame(emissions.normals)]
-    length = np.hypot(*along)
+    along = [products(step, tangent) for tangent in tangent_frame(emissions.normals)]
+    length = np.sqrt(along[0] * along[0] + along[1] * along[1])
     straight = length < 1e-9 * emissions.nearest_neighbour_distance
     scale = np.where(straight, 0.0, 1 / np.where(straight, 1.0, length))
     return rolled, along[0] * scale, along[1] * scale

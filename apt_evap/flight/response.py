@@ -11,14 +11,18 @@ polar angle: smoother than the place itself, which grows without bound for ions 
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from apt_evap._common.small_matrices import pseudo_inverse, squared_lengths
 from apt_evap._common.types import Booleans, Floats
 from apt_evap._common.validation import check_count, check_kind, check_number, check_sequence, shown
 from apt_evap._common.warnings import ResponseWarning
+from apt_evap._core import polynomials
+from apt_evap._core.elementary import sine_and_cosine
 from apt_evap.detection.detector import Detector
 from apt_evap.emission.emissions import Emissions
 from apt_evap.emission.energies import HIGHEST_ENERGY
@@ -26,7 +30,6 @@ from apt_evap.emission.surface_frame import along_surface, rolled_positions
 from apt_evap.flight.landing import Ends, land
 from apt_evap.units import FLIGHT_TIME
 
-_HIGHEST_DEGREE = 12  # 91 coefficients: no response needs more
 _MAX_LAUNCHES = 1000
 CHUNK = 1 << 16  # ions evaluated at once: their monomials stay below 10 MB
 
@@ -53,7 +56,7 @@ class Design:
     rings: tuple
 
     def __post_init__(self):
-        check_count(self.degree, "degree", at_most=_HIGHEST_DEGREE)
+        check_count(self.degree, "degree", at_most=polynomials.HIGHEST_DEGREE)
         rings = [_ring(ring) for ring in check_sequence(self.rings, "rings", "(radius, launches)")]
         if not rings:
             raise ValueError("rings must hold at least one (radius, launches), got none")
@@ -70,17 +73,13 @@ class Design:
         rings = []
         for index, (radius, count) in enumerate(self.rings):
             angles = 2 * np.pi * (np.arange(count) + 0.5 * (index % 2)) / count
-            rings.append(radius * np.stack([np.cos(angles), np.sin(angles)], axis=1))
+            sine, cosine = sine_and_cosine(angles)
+            rings.append(radius * np.stack([cosine, sine], axis=1))
         return np.concatenate(rings)
 
     def monomials(self, velocities: ArrayLike) -> Floats:
         """Monomials u^i v^j, i + j <= degree, of velocities (u, v) of shape (n, 2); shape (n, coefficients)."""
-        u, v = np.asarray(velocities).T
-        powers = [(np.ones_like(u), np.ones_like(v))]
-        for _ in range(self.degree):
-            powers.append((powers[-1][0] * u, powers[-1][1] * v))
-        columns = [powers[total - j][0] * powers[j][1] for total in range(self.degree + 1) for j in range(total + 1)]
-        return np.stack(columns, axis=1)
+        return polynomials.monomials(self.degree, np.ascontiguousarray(velocities, np.float64))
 
     def fit(self, values: Floats) -> tuple[NDArray[np.float32], Floats]:
         """Least squares fit.
@@ -98,26 +97,31 @@ class Design:
             Root mean square over the launches of the misfit of the first two, per degree of freedom. Infinite where
             some launches are NaN: the polynomial is the smallest through the others; NaN where all are.
         """
-        matrix = self.monomials(self.velocities)
-        coefficients = np.einsum("cm,nmk->nkc", np.linalg.pinv(matrix), values)
-        misfit = np.einsum("mc,nkc->nmk", matrix, coefficients[:, :2]) - values[:, :, :2]
+        matrix, inverse = _matrices(self)
+        values = np.ascontiguousarray(values, np.float64)
+        coefficients = polynomials.fit(inverse, values)
         freedom = max(1, len(matrix) - matrix.shape[1])
-        residual = np.sqrt(np.einsum("nmk,nmk->n", misfit, misfit) / freedom)
+        residual = np.sqrt(polynomials.misfits(matrix, coefficients, values) / freedom)
         # a time may be infinite where the place is not: a launch that never meets the plane of the detector
         for ion in np.flatnonzero(~(np.isfinite(residual) & np.isfinite(values).all(axis=(1, 2)))):
             good = np.isfinite(values[ion]).all(axis=1)
             if good.any():
-                coefficients[ion] = np.linalg.lstsq(matrix[good], values[ion, good], rcond=None)[0].T
+                coefficients[ion] = polynomials.fit(pseudo_inverse(matrix[good]), values[ion, good][None])[0]
                 residual[ion] = np.inf
         return np.ascontiguousarray(coefficients, np.float32), residual
 
     def evaluate(self, coefficients: NDArray[np.float32], velocities: Floats) -> Floats:
         """Values of the polynomials of n ions, each at a velocity of its own; shape (n, 3)."""
-        values = np.empty((len(velocities), 3))
-        for begin in range(0, len(velocities), CHUNK):
-            chunk = slice(begin, begin + CHUNK)
-            values[chunk] = np.einsum("nkc,nc->nk", coefficients[chunk], self.monomials(velocities[chunk]))
-        return values
+        return polynomials.evaluate(
+            self.degree, np.ascontiguousarray(coefficients, np.float32), np.ascontiguousarray(velocities, np.float64)
+        )
+
+
+@lru_cache
+def _matrices(design):
+    """Monomials of the launches of a design, and their pseudo-inverse."""
+    matrix = design.monomials(design.velocities)
+    return matrix, pseudo_inverse(matrix)
 
 
 def _ring(ring):
@@ -271,7 +275,7 @@ class ResponseModel:
             If ions launch above the energy limit: their places are extrapolated.
         """
         velocities = self.settings.reduced(np.column_stack([first, second]), masses)
-        faster = int(np.count_nonzero(np.einsum("ij,ij->i", velocities, velocities) > 1.0001))
+        faster = int(np.count_nonzero(squared_lengths(velocities) > 1.0001))
         if faster:
             warnings.warn(
                 f"{faster:,} of {len(velocities):,} ions launch above the {self.settings.energy_limit:g} eV of the "
@@ -297,13 +301,13 @@ class ResponseModel:
 
 def flattened(directions: Floats, times: Floats) -> Floats:
     """The three quantities that are fitted, shape (n, 3), from directions (n, 2) and times of flight (n,)."""
-    s2 = np.einsum("ij,ij->i", directions, directions)
+    s2 = squared_lengths(directions)
     return np.column_stack([directions, times * (1.0 - s2) / (1.0 + s2)])
 
 
 def unflattened(values: Floats) -> tuple[Floats, Floats]:
     """Directions (n, 2) and times of flight (n,) from the three quantities, the inverse of `flattened`."""
     directions = values[:, :2]
-    s2 = np.einsum("ij,ij->i", directions, directions)
+    s2 = squared_lengths(directions)
     with np.errstate(divide="ignore", invalid="ignore"):
         return directions, np.where(s2 < 1.0, values[:, 2] * (1.0 + s2) / (1.0 - s2), np.inf)

@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from apt_evap._common.small_matrices import lengths, matrix_product, products
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_choice, check_number, shown
+from apt_evap._core.elementary import sine_and_cosine
 
 _HALF = ((0, 0, 0), (0, 1 / 2, 1 / 2), (1 / 2, 0, 1 / 2), (1 / 2, 1 / 2, 0))
 
@@ -144,12 +146,12 @@ def _perpendicular(structure, indices, vectors):
     sure = [(u - 2 * v, 2 * u - v, 0)] if structure == "hcp" else [(v, -u, 0), (w, 0, -u), (0, w, -v)]
     small = np.indices((7, 7, 7)).reshape(3, -1).T - 3
     candidates = np.concatenate([small, sure])
-    cartesian = candidates @ vectors
-    lengths = np.linalg.norm(cartesian, axis=1)
-    axis = indices @ vectors
-    across = np.abs(cartesian @ axis) < 1e-9 * lengths * np.linalg.norm(axis)
-    candidates, lengths = candidates[across & (lengths > 0)], lengths[across & (lengths > 0)]
-    shortest = candidates[lengths < lengths.min() * (1 + 1e-9)]
+    cartesian = matrix_product(candidates, vectors)
+    long = lengths(cartesian)
+    axis = matrix_product(indices, vectors)
+    across = np.abs(products(cartesian, axis)) < 1e-9 * long * lengths(axis)
+    candidates, long = candidates[across & (long > 0)], long[across & (long > 0)]
+    shortest = candidates[long < long.min() * (1 + 1e-9)]
     return max(map(tuple, shortest.tolist()))
 
 
@@ -187,18 +189,18 @@ def rotation_to_axis(material: Any, axis: Sequence[int], rotation: float = 0.0) 
     angle = math.radians(check_number(rotation, "rotation", unit="degrees"))
     vectors = direction_vectors(structure, a, c)
     indices = np.array(check_axis(structure, axis))
-    z = indices @ vectors
+    z = matrix_product(indices, vectors)
     if np.issubdtype(indices.dtype, np.integer):
-        x = np.array(_perpendicular(structure, indices, vectors)) @ vectors
-        z = z / np.linalg.norm(z)
+        x = matrix_product(np.array(_perpendicular(structure, indices, vectors)), vectors)
+        z = z / lengths(z)
     else:
-        z = z / np.linalg.norm(z)
+        z = z / lengths(z)
         # rounded: directions that differ by their length only have the same x
         edge = int(np.argmin(np.round(np.abs(z), 9)))
         x = np.eye(3)[edge] - z[edge] * z
-    x = x / np.linalg.norm(x)
+    x = x / lengths(x)
     y = np.cross(z, x)
-    cos, sin = math.cos(angle), math.sin(angle)
+    sin, cos = sine_and_cosine(angle)
     return np.array([cos * x - sin * y, sin * x + cos * y, z])
 
 
@@ -256,16 +258,16 @@ def lattice_points_in(
     ndarray
         Positions [nm], shape (n, 3).
     """
-    lengths = cell_lengths(structure, a, c)
+    edges = cell_lengths(structure, a, c)
     orientation = check_array(orientation, "orientation", (3, 3))
     origin = check_array(origin, "origin", (3,))
     bounds = check_array(bounds, "bounds", (2, 3))
     basis = np.array(BASES[structure], dtype=np.float64)
     corners = np.array([[x, y, z] for x in bounds[:, 0] for y in bounds[:, 1] for z in bounds[:, 2]])
-    corners = (corners - origin) @ orientation / lengths
+    corners = matrix_product(corners - origin, orientation) / edges
     first = np.floor((corners.min(axis=0) - 1) / block).astype(np.int64)
     count = np.ceil((corners.max(axis=0) + 1) / block).astype(np.int64) - first
-    reach = 0.5 * block * float(np.linalg.norm(lengths)) + tolerance
+    reach = 0.5 * block * float(lengths(edges)) + tolerance
     cells = np.indices((block,) * 3).reshape(3, -1)
 
     def inside(points, margin):
@@ -280,11 +282,11 @@ def lattice_points_in(
         rows = np.indices((1, count[1], count[2])).reshape(3, -1)
         rows[0] = layer
         low = (rows + first[:, None]) * block
-        low = low[:, inside(_to_specimen((low + 0.5 * block) * lengths[:, None], orientation, origin), reach)]
+        low = low[:, inside(_to_specimen((low + 0.5 * block) * edges[:, None], orientation, origin), reach)]
         for start in range(0, low.shape[1], step):
             cell = (low[:, start : start + step, None] + cells[:, None, :]).reshape(3, -1)
             for site, fraction in enumerate(basis):
-                points = _to_specimen((cell + fraction[:, None]) * lengths[:, None], orientation, origin)
+                points = _to_specimen((cell + fraction[:, None]) * edges[:, None], orientation, origin)
                 kept = inside(points, tolerance)
                 i, j, k = cell[:, kept] - (first * block)[:, None]
                 yield ((i * count[1] * block + j) * count[2] * block + k) * len(basis) + site, points[kept]

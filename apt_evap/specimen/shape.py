@@ -7,6 +7,7 @@ import numpy as np
 
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_choice, check_number
+from apt_evap._core.elementary import sine_and_cosine
 
 _LONGEST = 1e7  # [nm]: a centimetre is no tip, and volumes keep their digits
 
@@ -51,8 +52,8 @@ class TaperedCap:
 
     @property
     def _flank(self):
-        angle = math.radians(self.shank_angle)
-        return math.sin(angle), math.cos(angle), self.apex_radius + self.shank_length * math.sin(angle)
+        sin, cos = (float(value) for value in sine_and_cosine(math.radians(self.shank_angle)))
+        return sin, cos, self.apex_radius + self.shank_length * sin
 
     @property
     def bounds(self) -> Floats:

@@ -9,6 +9,7 @@ import scipy
 from numpy.typing import ArrayLike
 
 from apt_evap._common.memory import check_memory
+from apt_evap._common.small_matrices import lengths, matrix_product
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_kind, check_number, check_seed, check_sequence, digest, shown
 from apt_evap.specimen import ase_atoms, lattice
@@ -119,7 +120,7 @@ class Tip:
         shift = origin
         if offset_seed is not None:
             part = np.random.default_rng(check_seed(offset_seed, "offset_seed")).random(3)
-            shift = origin + orientation @ (part * lattice.cell_lengths(host.structure, host.a, host.c))
+            shift = origin + matrix_product(orientation, part * lattice.cell_lengths(host.structure, host.a, host.c))
         self.positions = lattice.lattice_points_in(
             host.structure,
             host.a,
@@ -207,7 +208,8 @@ class Tip:
             )
         sample = tip.positions[:: max(1, n // _SAMPLE)]
         neighbours = scipy.spatial.cKDTree(tip.positions)
-        distances = neighbours.query(sample, k=2)[0][:, 1]
+        nearest = neighbours.query(sample, k=2)[1]
+        distances = lengths(tip.positions[nearest[:, 1]] - tip.positions[nearest[:, 0]])
         if not distances.min() > 0 or neighbours.query_pairs(1e-3 * float(np.median(distances))):
             raise ValueError("positions must be distinct, got two atoms at the same place")
         distance = float(np.median(distances))

@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from apt_evap import Detector, Projection
+from apt_evap._core.elementary import arctangent
 from apt_evap.detection.projection import along_axis, polar_angles, stereographic, stereographic_stretch
 
 PROJECTIONS = st.builds(
@@ -94,7 +95,7 @@ def test_bits_of_impacts_are_those_of_their_formulae():
     ahead = s2 < 1
     with np.errstate(divide="ignore", invalid="ignore"):
         root = np.sqrt(s2)
-        plane, curved = 2.0 / (1.0 - s2), np.where(root > 0, 2.0 * np.arctan(root) / root, 2.0)
+        plane, curved = 2.0 / (1.0 - s2), np.where(root > 0, 2.0 * arctangent(root) / root, 2.0)
         shorter = np.where(ahead, times * (1.0 - s2) / (1.0 + s2), times)
         for name, stretch, expected in (("plane", plane, times), ("equidistant", curved, shorter)):
             scale = np.where(ahead, 97.3 * stretch, np.nan)

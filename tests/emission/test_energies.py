@@ -2,10 +2,10 @@ import math
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import special, stats
 from scipy.integrate import quad
 
-from apt_evap.emission.energies import Fixed, Thermal, TruncatedNormal
+from apt_evap.emission.energies import Fixed, Thermal, TruncatedNormal, normal_probability
 from apt_evap.emission.ion_random import IonRandom
 from apt_evap.units import BOLTZMANN
 
@@ -79,3 +79,10 @@ def test_thermal_energy_is_that_of_two_normal_velocities():
 def test_bad_parameters_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_probability_of_the_normal_distribution():
+    for x in np.concatenate([np.linspace(-11.9, 11.9, 240), [0.0, 1e-300, -1e-9]]):
+        # SciPy's own logarithm has an error of up to 1e-14 of its value here
+        assert normal_probability(float(x)) == pytest.approx(np.exp(special.log_ndtr(x)), rel=3e-14)
+    assert normal_probability(-12.1) == 0 and normal_probability(12.1) == 1

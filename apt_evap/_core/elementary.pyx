@@ -1,0 +1,70 @@
+"""Elementary functions with the same bits on every processor, with every C library and every version of NumPy."""
+
+import numpy as np
+
+
+cdef extern from "elementary.h":
+    void sine_cosine(double, double*, double*) noexcept nogil
+    double arc_tangent(double) noexcept nogil
+    double natural_logarithm(double) noexcept nogil
+    double inverse_seventh_root(double) noexcept nogil
+    double quantile_of_normal(double) noexcept nogil
+
+
+def sine_and_cosine(angles):
+    """Sine and cosine of angles [rad] up to 1e5, of any shape; errors below 3e-16."""
+    cdef long i
+    shape = np.shape(angles)
+    cdef const double[::1] values = np.ascontiguousarray(angles, np.float64).reshape(-1)
+    cdef double[::1] sine = np.empty(values.shape[0]), cosine = np.empty(values.shape[0])
+    with nogil:
+        for i in range(values.shape[0]):
+            sine_cosine(values[i], &sine[i], &cosine[i])
+    return np.asarray(sine).reshape(shape)[()], np.asarray(cosine).reshape(shape)[()]
+
+
+def arctangent(numbers):
+    """Arcus tangens [rad] of numbers of any shape; relative errors below 1e-15."""
+    cdef long i
+    cdef const double[::1] values = np.ascontiguousarray(numbers, np.float64).reshape(-1)
+    cdef double[::1] angles = np.empty(values.shape[0])
+    with nogil:
+        for i in range(values.shape[0]):
+            angles[i] = arc_tangent(values[i])
+    return np.asarray(angles).reshape(np.shape(numbers))[()]
+
+
+def logarithm(numbers):
+    """Natural logarithm of positive numbers of any shape; relative errors below 5e-16."""
+    cdef long i
+    cdef const double[::1] values = np.ascontiguousarray(numbers, np.float64).reshape(-1)
+    cdef double[::1] logarithms = np.empty(values.shape[0])
+    with nogil:
+        for i in range(values.shape[0]):
+            logarithms[i] = natural_logarithm(values[i])
+    return np.asarray(logarithms).reshape(np.shape(numbers))[()]
+
+
+def seventh_root_of_reciprocal(numbers):
+    """x^(-1/7) of positive numbers of any shape, for the steps of flights; relative errors below 2e-15."""
+    cdef long i
+    cdef const double[::1] values = np.ascontiguousarray(numbers, np.float64).reshape(-1)
+    cdef double[::1] roots = np.empty(values.shape[0])
+    with nogil:
+        for i in range(values.shape[0]):
+            roots[i] = inverse_seventh_root(values[i])
+    return np.asarray(roots).reshape(np.shape(numbers))[()]
+
+
+def normal_quantile(probabilities):
+    """Quantile of the standard normal distribution for numbers of any shape; -inf at 0, inf at 1.
+
+    Relative errors are below 2e-15 (Wichura, Applied Statistics 37, 477, 1988, algorithm AS 241).
+    """
+    cdef long i
+    cdef const double[::1] values = np.ascontiguousarray(probabilities, np.float64).reshape(-1)
+    cdef double[::1] quantiles = np.empty(values.shape[0])
+    with nogil:
+        for i in range(values.shape[0]):
+            quantiles[i] = quantile_of_normal(values[i])
+    return np.asarray(quantiles).reshape(np.shape(probabilities))[()]

@@ -1,0 +1,13 @@
+import numpy as np
+from numpy.typing import NDArray
+
+HIGHEST_DEGREE: int
+
+def monomials(degree: int, velocities: NDArray[np.float64]) -> NDArray[np.float64]: ...
+def fit(inverse: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]: ...
+def misfits(
+    matrix: NDArray[np.float64], coefficients: NDArray[np.float64], values: NDArray[np.float64]
+) -> NDArray[np.float64]: ...
+def evaluate(
+    degree: int, coefficients: NDArray[np.float32], velocities: NDArray[np.float64]
+) -> NDArray[np.float64]: ...

@@ -1,0 +1,50 @@
+"""Elementary functions of our own against those of NumPy and SciPy, whose bits depend on the processor."""
+
+import math
+
+import numpy as np
+import pytest
+import scipy
+
+from apt_evap._core.elementary import (
+    arctangent,
+    logarithm,
+    normal_quantile,
+    seventh_root_of_reciprocal,
+    sine_and_cosine,
+)
+
+
+def test_sine_and_cosine(rng):
+    angles = np.concatenate(
+        [rng.uniform(-7, 7, 20_000), rng.uniform(-1e5, 1e5, 20_000), np.arange(-8, 9) * math.pi / 4]
+    )
+    sine, cosine = sine_and_cosine(angles)
+    assert np.abs(sine - np.sin(angles)).max() < 3e-16
+    assert np.abs(cosine - np.cos(angles)).max() < 3e-16
+    assert sine_and_cosine(0.0) == (0.0, 1.0)
+    assert sine_and_cosine(angles.reshape(-1, 1))[0].shape == (len(angles), 1)
+
+
+def test_arctangent(rng):
+    numbers = np.concatenate([10 ** rng.uniform(-12, 12, 20_000), -(10 ** rng.uniform(-12, 12, 20_000))])
+    assert arctangent(numbers) == pytest.approx(np.arctan(numbers), rel=1e-15, abs=0)
+    assert arctangent(0.0) == 0.0 and arctangent(np.inf) == math.pi / 2 and np.isnan(arctangent(np.nan))
+
+
+def test_logarithm(rng):
+    numbers = np.concatenate([rng.uniform(0, 2, 20_000), 10 ** rng.uniform(-300, 300, 20_000), [5e-324]])
+    assert logarithm(numbers) == pytest.approx(np.log(numbers), rel=6e-16, abs=0)
+    assert logarithm(1.0) == 0.0
+
+
+def test_seventh_root_of_the_reciprocal(rng):
+    numbers = np.concatenate([10 ** rng.uniform(-12, 30, 20_000), 2.0 ** np.arange(-40, 90)])
+    assert seventh_root_of_reciprocal(numbers) == pytest.approx(numbers ** (-1 / 7), rel=2e-15)
+
+
+def test_quantile_of_the_normal_distribution(rng):
+    p = np.concatenate([rng.uniform(0, 1, 20_000), 10 ** rng.uniform(-300, -1, 20_000), [1 - 2**-53]])
+    assert normal_quantile(p) == pytest.approx(scipy.special.ndtri(p), rel=3e-15, abs=0)
+    assert normal_quantile([0.0, 0.5, 1.0]).tolist() == [-np.inf, 0.0, np.inf]
+    assert np.isnan(normal_quantile([np.nan, -0.1, 1.1])).all()

@@ -1,0 +1,38 @@
+"""Polynomials of responses against sums spelled out in NumPy."""
+
+import numpy as np
+import pytest
+
+from apt_evap._core import polynomials
+
+
+@pytest.mark.parametrize("degree", [0, 1, 4, polynomials.HIGHEST_DEGREE])
+def test_monomials_and_values(degree, rng):
+    velocities = rng.normal(size=(7, 2))
+    u, v = velocities.T
+    columns = [u ** (total - j) * v**j for total in range(degree + 1) for j in range(total + 1)]
+    expected = np.stack(columns, axis=1)
+    assert polynomials.monomials(degree, velocities) == pytest.approx(expected, rel=1e-14)
+    coefficients = rng.normal(size=(7, 3, expected.shape[1])).astype(np.float32)
+    values = polynomials.evaluate(degree, coefficients, velocities)
+    scale = np.abs(coefficients[:, :, None] * expected[:, None, None]).sum(axis=(2, 3))
+    assert np.abs(values - np.einsum("nkc,nc->nk", coefficients, expected)).max() <= 1e-14 * scale.max()
+
+
+def test_fits_and_misfits(rng):
+    matrix = polynomials.monomials(2, rng.normal(size=(11, 2)))
+    values = rng.normal(size=(5, 11, 3))
+    inverse = np.ascontiguousarray(np.linalg.pinv(matrix))
+    coefficients = polynomials.fit(inverse, values)
+    exact = np.stack([np.linalg.lstsq(matrix, each, rcond=None)[0].T for each in values])
+    assert coefficients == pytest.approx(exact, abs=1e-13)
+    squares = ((np.einsum("mc,nkc->nmk", matrix, exact) - values)[..., :2] ** 2).sum(axis=(1, 2))
+    assert polynomials.misfits(matrix, coefficients, values) == pytest.approx(squares, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("degree", "shape"), [(1, (2, 3, 4)), (1, (3, 3, 3)), (1, (2, 2, 3)), (13, (2, 3, 105)), (-1, (2, 3, 0))]
+)
+def test_shapes_that_do_not_fit_are_refused(degree, shape):
+    with pytest.raises(ValueError, match="must have shape"):
+        polynomials.evaluate(degree, np.zeros(shape, np.float32), np.zeros((2, 2)))
