@@ -7,6 +7,7 @@ from ._common.warnings import ChargesWarning as ChargesWarning
 from ._common.warnings import DataWarning as DataWarning
 from ._common.warnings import MapWarning as MapWarning
 from ._common.warnings import RegistrationWarning as RegistrationWarning
+from ._common.warnings import ReproducibilityWarning as ReproducibilityWarning
 from ._common.warnings import ResponseWarning as ResponseWarning
 from ._common.warnings import RunWarning as RunWarning
 from .analysis.apex import field_factor as field_factor

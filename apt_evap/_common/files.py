@@ -224,6 +224,21 @@ def _remove_if_abandoned(path):
         os.close(descriptor)
 
 
+def move_file(written: Path, target: Path) -> None:
+    """Give a complete file the name of another, whose mode it takes over if that one is there.
+
+    Raises
+    ------
+    OSError
+        If it cannot be done, or the other one is not a regular file.
+    """
+    mode = _mode_of(target)
+    if mode is not None:
+        os.chmod(written, mode)
+    os.replace(written, target)
+    flush_folder(target.parent)
+
+
 def flush_folder(folder: AnyPath) -> None:
     """Make sure that the names of new files are on the disk too, where the system can do that."""
     with suppress(OSError):

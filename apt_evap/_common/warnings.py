@@ -27,3 +27,7 @@ class RegistrationWarning(AptWarning):
 
 class RunWarning(AptWarning):
     """A run that ends early, or that cannot be kept on disk as asked."""
+
+
+class ReproducibilityWarning(AptWarning):
+    """Results that may not have the bits of others of the same settings: another kind of processor or library."""

@@ -103,9 +103,7 @@ def _range(text, elements, where):
         else:
             raise FileError(f"{where}: expected a number of atoms such as {key}:1, got {part!r:.60}")
     if len(bounds) != 2 or not bounds[0] < bounds[1]:
-        raise FileError(
-            f"{where}: expected two bounds [Da], the lower one first, got {str(bounds):.60} in {text!r:.60}"
-        )
+        raise FileError(f"{where}: expected two bounds [Da], the lower one first, got {bounds!s:.60} in {text!r:.60}")
     composition = {element: count for element, count in composition.items() if count}
     formula = "".join(element + (str(count) if count > 1 else "") for element, count in composition.items())
     if not (name or formula):

@@ -1,6 +1,5 @@
 """A run: the sequence of atoms that left, and where their ions land under any perturbation; saved in HDF5."""
 
-import datetime
 import json
 import warnings
 from collections.abc import Sequence
@@ -13,7 +12,7 @@ import numpy as np
 from apt_evap._common.files import FileError, check_path
 from apt_evap._common.types import AnyPath, Booleans
 from apt_evap._common.validation import check_kind, check_switch, shown
-from apt_evap._version import __version__
+from apt_evap._common.warnings import DataWarning
 from apt_evap.detection.detector import Detector
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.emissions import Emissions
@@ -23,6 +22,7 @@ from apt_evap.evaporation.state import EmitterState
 from apt_evap.flight.response import ResponseModel, Responses, ResponseSettings
 from apt_evap.simulation.ending import Ending
 from apt_evap.simulation.history import History
+from apt_evap.simulation.provenance import joined, provenance_now
 from apt_evap.simulation.run_hdf5 import described, read_run, write_run
 
 
@@ -80,7 +80,7 @@ class Run:
     ended : str
         Why the run ended before its time; "" if it did not.
     provenance : dict
-        Version and time.
+        Version, time, and under "systems" the processors and libraries that it was computed with.
     """
 
     emissions: Emissions
@@ -101,12 +101,7 @@ class Run:
     state: EmitterState | None = None
     first_event: int = 0
     ended: str = ""
-    provenance: dict = field(
-        default_factory=lambda: {
-            "version": __version__,
-            "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        }
-    )
+    provenance: dict = field(default_factory=provenance_now)
 
     def __len__(self) -> int:
         return len(self.site)
@@ -228,7 +223,7 @@ class Run:
         """Join the parts of one run, in their order, into one."""
         first = runs[0]
         emissions = Emissions.join([run.emissions for run in runs])
-        columns = {
+        columns: dict[str, Any] = {
             name: np.concatenate([getattr(run, name) for run in runs])
             for name in ("site", "species", "charges", "fields")
         }
@@ -245,6 +240,7 @@ class Run:
                 *(np.concatenate(parts) for parts in zip(*(run.responses for run in runs), strict=True))
             )
         history = History.join([run.history for run in runs])
+        columns["provenance"] = joined([run.provenance for run in runs])
         return replace(first, emissions=emissions, flown=flown, responses=responses, history=history, **columns)  # type: ignore[arg-type]
 
     def ended_by(self, reason: str) -> "Run":
@@ -300,19 +296,33 @@ def _load_file(path, partial=False):
 
 
 def _load_parts(folder, partial):
-    parts = []
+    parts, names = [], []
     for path in part_paths(folder):
         try:
             part = _load_file(path, partial)
         except FileError as error:
             if not partial:
                 raise
-            warnings.warn(f"{error}: its ions are lost", stacklevel=3)
+            warnings.warn(f"{error}: its ions are lost", DataWarning, stacklevel=3)
             continue
+        if parts and (name := _difference(parts[0], part)):
+            raise FileError(f"{str(path)!r} is of another run than {names[0]!r}: its {name} differ")
         parts.append(part)
+        names.append(path.name)
     if not parts:
         raise FileError(f"{str(folder)!r} holds no run: expected files {PART_NAME.format(0)!r} and so on")
     return Run.join(parts).ended_by(Ending.UNFINISHED)
+
+
+def _difference(one, other):
+    """What two parts of one run differ in, though they should not; "" if in nothing."""
+    pairs = {
+        "settings": (one.settings, other.settings),
+        "elements": (one.elements, other.elements),
+        "perturbations": tuple([described(each) for each in run.perturbations] for run in (one, other)),
+        "responses": (one.responses is None, other.responses is None),
+    }
+    return next((name for name, (first, second) in pairs.items() if first != second), "")
 
 
 PART_NAME = "ions-{:012d}.h5"
