@@ -159,22 +159,27 @@ class Keeper:
             try:
                 self._take(lock)
                 if os.path.samestat(os.fstat(lock.fileno()), os.lstat(self._folder / LOCK_NAME)):
+                    self._sign(lock)
                     self._lock = lock
-                    break
+                    return
             except FileNotFoundError:
                 pass
+            except OSError as error:
+                raise self._error(error) from error
             finally:
                 if self._lock is None:
                     lock.close()
-        else:
-            raise FileError(f"cannot write {str(self._folder)!r}: other processes take it away")
-        self._lock.seek(0)
-        if (written := self._lock.read(100)) and not written.startswith(_OWNER):
-            raise FileError(f"{str(self._folder / LOCK_NAME)!r} is not a lock of a run: it reads {written:.40!r}")
-        self._lock.seek(0)
-        self._lock.truncate()
-        self._lock.write(f"{_OWNER}{os.getpid()} on {socket.gethostname()}")
-        self._lock.flush()
+        raise FileError(f"cannot write {str(self._folder)!r}: other processes take it away")
+
+    def _sign(self, lock):
+        """Write into a lock whose it is, over what another process has written."""
+        lock.seek(0)
+        if (written := lock.read(100)) and not written.startswith(_OWNER):
+            raise FileError(f"{str(self._folder / LOCK_NAME)!r} is not a lock of a run: it reads {written!r:.40}")
+        lock.seek(0)
+        lock.truncate()
+        lock.write(f"{_OWNER}{os.getpid()} on {socket.gethostname()}")
+        lock.flush()
 
     def _make_folder(self):
         try:
