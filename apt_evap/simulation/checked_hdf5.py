@@ -107,13 +107,22 @@ def write_checked(path: AnyPath, rows: int) -> Iterator[h5py.File]:
         finally:
             if sink.error is not None:
                 raise sink.error
-        size = target.seek(0, os.SEEK_END)
-        outside, blocks["crc"] = _sums(target, size, blocks)
-        table, sizes = blocks.tobytes(), _TAIL.pack(b"", size, len(blocks), _MARK)[32:]
-        for part in (table, sizes):
-            outside.update(part)
-        target.seek(size)
-        target.write(table + outside.digest() + sizes)
+        _append_sums(target, blocks)
+
+
+def _append_sums(file, blocks):
+    """Append the checksums of an HDF5 file whose rows lie in some blocks."""
+    size = file.seek(0, os.SEEK_END)
+    outside, blocks["crc"] = _sums(file, size, blocks)
+    table, sizes = blocks.tobytes(), _sizes(size, len(blocks))
+    outside.update(table + sizes)
+    file.seek(size)
+    file.write(table + outside.digest() + sizes)
+
+
+def _sizes(size, n):
+    """What follows the SHA-256 at the end of a file."""
+    return _TAIL.pack(b"", size, n, _MARK)[hashlib.sha256().digest_size :]
 
 
 def _blocks_of(file, rows):
@@ -191,11 +200,16 @@ def open_checked(path: AnyPath, *, with_data: bool = True, partial: bool = False
     try:
         opened = h5py.File(name, "r", locking=False)
     except (OSError, RuntimeError, ValueError) as error:
-        raise FileError(f"cannot read {name!r} as HDF5: {str(error).splitlines()[0]}") from error
+        raise FileError(f"cannot read {name!r} as HDF5: {first_line(error)}") from error
     with opened:
         if damaged is None and _NAME in opened.attrs:
             raise _without_checksums(name)
         yield CheckedFile(opened, size, damaged)
+
+
+def first_line(error: Exception) -> str:
+    """What an error of HDF5 says, without the lines of its stack."""
+    return (str(error) or type(error).__name__).splitlines()[0]
 
 
 class DamagedRows(FileError):
@@ -236,7 +250,7 @@ def _compare(file, size, name, with_data):
     if n and not ((begins <= ends).all() and (ends[:-1] <= begins[1:]).all() and ends[-1] <= inner):
         raise wrong
     outside, crcs = _sums(file, inner, blocks, with_data)
-    outside.update(table + _TAIL.pack(b"", inner, n, _MARK)[32:])
+    outside.update(table + _sizes(inner, n))
     if outside.digest() != digest:
         raise wrong
     bad = crcs != blocks["crc"] if with_data else np.zeros(n, bool)

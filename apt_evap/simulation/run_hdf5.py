@@ -22,7 +22,14 @@ from apt_evap.emission.perturbations import from_dict, to_dict
 from apt_evap.evaporation.state import EmitterState
 from apt_evap.evaporation.voltage import check_voltage
 from apt_evap.flight.response import Design, Responses, ResponseSettings
-from apt_evap.simulation.checked_hdf5 import CheckedFile, DamagedRows, has_checksums, open_checked, write_checked
+from apt_evap.simulation.checked_hdf5 import (
+    CheckedFile,
+    DamagedRows,
+    first_line,
+    has_checksums,
+    open_checked,
+    write_checked,
+)
 from apt_evap.simulation.history import History
 from apt_evap.simulation.old_settings import upgraded
 
@@ -215,7 +222,7 @@ def _reading(path, hint="", with_data=True, partial=False):
     except FileError:
         raise
     except _READ_ERRORS as error:
-        raise FileError(f"cannot read {name!r} as a run: {str(error).splitlines()[0]}{hint}") from error
+        raise FileError(f"cannot read {name!r} as a run: {first_line(error)}{hint}") from error
 
 
 def _read(file, partial):

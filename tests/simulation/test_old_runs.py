@@ -1,5 +1,6 @@
 """Runs of earlier versions load, compare and are resumed."""
 
+import multiprocessing
 import warnings
 from dataclasses import asdict
 
@@ -10,7 +11,7 @@ from old_files import make_old, old_settings
 
 import apt_evap as ae
 from apt_evap.simulation.old_settings import upgraded
-from apt_evap.simulation.run_hdf5 import is_run, plain
+from apt_evap.simulation.run_hdf5 import is_run, plain, read_state, write_state
 
 
 def simulation():
@@ -124,3 +125,26 @@ def test_an_old_index_that_lost_a_chunk_is_noticed(saved, tmp_path):
         file.create_dataset(place, shape, dtype, chunks=shape, fletcher32=True)
     with pytest.raises(ae.FileError, match=r"run\.h5' as a run: entry1/simulation/neighbours is not whole"):
         ae.load(tmp_path / "run.h5")
+
+
+def read_all_with_zeros(path, step):
+    whole = path.read_bytes()
+    expected = read_state(path)[0]
+    for place in range(0, len(whole), step):
+        path.write_bytes(whole[:place] + bytes(47) + whole[place + 47 :])
+        try:
+            state, _ = read_state(path)
+        except ae.FileError:
+            continue
+        assert len(state.lonely) == len(expected.lonely) and state.charges.shape == expected.charges.shape
+
+
+def test_damaged_indices_of_old_states_crash_nothing(tmp_path):
+    """HDF5 reads beyond its memory at some of these places, were it asked for the values at once."""
+    state = simulation().run(60, responses=False, progress=False).state
+    write_state(tmp_path / "state.h5", state, 0)
+    make_old(tmp_path / "state.h5")
+    child = multiprocessing.get_context("fork").Process(target=read_all_with_zeros, args=(tmp_path / "state.h5", 8))
+    child.start()
+    child.join()
+    assert child.exitcode == 0
