@@ -1,12 +1,24 @@
 """What every reader and writer shares: errors in one sentence, whole files or none."""
 
 import os
+import re
+import secrets
+import socket
+import stat
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from apt_evap._common.types import AnyPath
+
+try:
+    import fcntl
+except ImportError:  # not on this system: unfinished files of killed processes stay
+    fcntl = None  # type: ignore[assignment]
+
+_ABANDONED_AFTER = 60.0  # seconds: a file that was made just now may not be locked yet
 
 
 class FileError(ValueError):
@@ -47,19 +59,52 @@ def open_for_reading(path: AnyPath) -> Iterator[BinaryIO]:
     Raises
     ------
     FileError
-        If it is missing, unreadable or a directory.
+        If it is missing, unreadable or not a regular file: a pipe would be waited for.
     """
     path = check_path(path)
     try:
-        with open(path, "rb", buffering=0) as file:
+        with open(path, "rb", buffering=0, opener=_open_regular) as file:
             yield file
     except OSError as error:
         raise FileError(f"cannot read {str(path)!r}: {_reason(error)}") from error
 
 
+def read_small_file(path: AnyPath, at_most: int, what: str) -> bytes:
+    """Read a whole file that is not meant to be large.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file.
+    at_most : int
+        Bytes that it may have.
+    what : str
+        What was expected, for the message.
+
+    Returns
+    -------
+    bytes
+
+    Raises
+    ------
+    FileError
+        If it is larger, or cannot be read.
+    """
+    data = b""
+    with open_for_reading(path) as file:
+        while len(data) <= at_most and (more := file.read(1 << 20)):
+            data += more
+    if len(data) > at_most:
+        raise FileError(f"{str(path)!r} has more than {at_most} bytes, expected {what}")
+    return data
+
+
 @contextmanager
 def replace_file(path: AnyPath) -> Iterator[BinaryIO]:
-    """Write a file aside, in the same folder, and put it in its place only once it is complete.
+    """Write a file under another name in the same folder, and rename it once it is complete.
+
+    A file that is overwritten keeps its mode. The other name is random and never that of a file or link which is there
+    already; what a killed process has left of the same file is removed.
 
     Parameters
     ----------
@@ -69,29 +114,129 @@ def replace_file(path: AnyPath) -> Iterator[BinaryIO]:
     Yields
     ------
     file
-        Open for writing bytes.
+        Open for writing and reading bytes.
 
     Raises
     ------
     FileError
-        If the file cannot be written; nothing is left behind then.
+        If the file cannot be written, or is not a regular file; nothing is left behind then.
     """
     path = check_path(path)
-    target = Path(os.path.realpath(path))
-    aside = target.with_name(f".{target.name}.{os.getpid()}.part")
+    aside = None
     try:
-        if target.is_dir():
-            raise IsADirectoryError(None, "Is a directory")
-        with open(aside, "wb") as file:
+        target = Path(os.path.realpath(path))
+        mode = _mode_of(target)
+        _remove_abandoned(target)
+        name = target.with_name(f".{_stem(target)}.{_host()}.{secrets.token_hex(8)}.part")
+        descriptor = os.open(name, _NEW_FILE, 0o666 if mode is None else 0o600)
+        aside = name
+        with open(descriptor, "w+b") as file:
+            if mode is not None:
+                os.fchmod(descriptor, mode)
+            with suppress(OSError):
+                _lock(descriptor)
             yield file
             file.flush()
-            os.fsync(file.fileno())  # a name must not come before the bytes, should the power fail
-        os.replace(aside, target)
+            os.fsync(descriptor)  # a name must not come before the bytes, should the power fail
+            os.replace(name, target)
+            aside = None
         flush_folder(target.parent)
     except OSError as error:
         raise FileError(f"cannot write {str(path)!r}: {_reason(error)}") from error
     finally:
-        aside.unlink(missing_ok=True)
+        if aside is not None:
+            with suppress(OSError):
+                aside.unlink()
+
+
+_NEW_FILE = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
+_WAIT_FOR_NOBODY = getattr(os, "O_NONBLOCK", 0)
+_UNFINISHED = re.compile(r"\..*\.[\w-]*\.[0-9a-f]{16}\.part")
+
+
+def is_unfinished(name: str) -> bool:
+    """Whether a file has the name of one that `replace_file` has not completed."""
+    return _UNFINISHED.fullmatch(name) is not None
+
+
+def _open_regular(path, flags):
+    descriptor = os.open(path, flags | _WAIT_FOR_NOBODY)
+    try:
+        check_regular(os.fstat(descriptor))
+    except OSError:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def check_regular(status: os.stat_result) -> None:
+    """Refuse folders, pipes and devices (OSError)."""
+    if stat.S_ISDIR(status.st_mode):
+        raise IsADirectoryError(None, "Is a directory")
+    if not stat.S_ISREG(status.st_mode):
+        raise OSError(None, "Not a regular file")
+
+
+def _mode_of(target):
+    """Mode of a file that is there, None if it is not; OSError if it is not a regular one."""
+    try:
+        status = os.stat(target)
+    except FileNotFoundError:
+        return None
+    check_regular(status)
+    return stat.S_IMODE(status.st_mode) & 0o777
+
+
+def _stem(target):
+    return target.name[:40]  # with all the rest no name is longer than a file system takes
+
+
+def _host():
+    return re.sub(r"[^\w-]", "-", socket.gethostname(), flags=re.ASCII)[:40]
+
+
+def _lock(descriptor):
+    """Lock a file until it is closed; OSError if another process has locked it."""
+    if fcntl is not None:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def _remove_abandoned(target):
+    """Remove what killed processes have left of a file: files of this user that nobody has locked."""
+    if fcntl is None:
+        return
+    with suppress(OSError):
+        for entry in os.scandir(target.parent):
+            if entry.name.startswith(f".{_stem(target)}.") and is_unfinished(entry.name):
+                with suppress(OSError):
+                    _remove_if_abandoned(target.with_name(entry.name))
+
+
+def _remove_if_abandoned(path):
+    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | _WAIT_FOR_NOBODY)
+    try:
+        status = os.fstat(descriptor)
+        check_regular(status)
+        if status.st_uid == os.geteuid() and time.time() - status.st_mtime > _ABANDONED_AFTER:
+            _lock(descriptor)
+            path.unlink()
+    finally:
+        os.close(descriptor)
+
+
+def move_file(written: Path, target: Path) -> None:
+    """Give a complete file the name of another, whose mode it takes over if that one is there.
+
+    Raises
+    ------
+    OSError
+        If it cannot be done, or the other one is not a regular file.
+    """
+    mode = _mode_of(target)
+    if mode is not None:
+        os.chmod(written, mode)
+    os.replace(written, target)
+    flush_folder(target.parent)
 
 
 def flush_folder(folder: AnyPath) -> None:

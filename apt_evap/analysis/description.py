@@ -95,6 +95,7 @@ def _of_run(run):
         "version": run.provenance.get("version"),
         "created": run.provenance.get("created"),
         "config": run.provenance.get("config"),
+        "fingerprint": run.fingerprint(),
         "ended": run.ended or "as planned",
         "voltage": run.voltage,
         "seed": run.seed,

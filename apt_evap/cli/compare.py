@@ -3,14 +3,14 @@
 import argparse
 import csv
 import json
-import os
+import shutil
 import tempfile
 from pathlib import Path
 
 import numpy as np
 
 from apt_evap import plot
-from apt_evap._common.files import FileError, check_path, open_for_reading
+from apt_evap._common.files import FileError, check_path, read_small_file, replace_file
 from apt_evap.cli._files import check_columns, check_output, check_places, read, select
 from apt_evap.cli._output import put, say
 from apt_evap.config.perturbation_text import read_perturbation
@@ -21,6 +21,7 @@ from apt_evap.simulation.run import Run, load
 from apt_evap.simulation.run_hdf5 import is_run
 
 _STUDY = "study.json"
+_MOST = 1 << 28  # bytes: a study holds three numbers for each cell of its grid
 OVERLAY = "registration.png"
 
 
@@ -76,12 +77,12 @@ def _registration(text):
         return Registration(*numbers)
     if Path(text).suffix.lower() != ".json":
         raise ValueError(f"--registration must be a .json file or ROTATION,SCALE,DX,DY[,mirror], got {text!r}")
-    with open_for_reading(text) as file:
-        try:
-            content = json.loads(file.read())
-            return Registration.from_dict(dict(content.get("registration", content)))
-        except (ValueError, TypeError, AttributeError, KeyError) as error:
-            raise FileError(f"{text!r} does not hold a registration: {error}") from error
+    written = read_small_file(text, _MOST, "a registration or a study")
+    try:
+        content = json.loads(written)
+        return Registration.from_dict(dict(content.get("registration", content)))
+    except (ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:
+        raise FileError(f"{text!r} does not hold a registration: {error}") from error
 
 
 def _measured(options):
@@ -117,8 +118,8 @@ def _check_folder(folder, force):
 
 def _is_study(path):
     try:
-        return str(json.loads(path.read_bytes()).get("made_by", "")).startswith("apt_evap")
-    except (OSError, ValueError, AttributeError):
+        return str(json.loads(read_small_file(path, _MOST, "a study")).get("made_by", "")).startswith("apt_evap")
+    except (ValueError, AttributeError, RecursionError):
         return False
 
 
@@ -130,7 +131,8 @@ def _write(study, run, folder):
                 write(study, run, Path(aside) / name)
             folder.mkdir(exist_ok=True)
             for name in FILES:
-                os.replace(Path(aside) / name, folder / name)
+                with replace_file(folder / name) as file, open(Path(aside) / name, "rb") as written:
+                    shutil.copyfileobj(written, file)
     except OSError as error:
         raise FileError(f"cannot write to {str(folder)!r}: {error.strerror or error}") from error
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from apt_evap._common.files import FileError, open_for_reading
+from apt_evap._common.files import FileError, check_path, read_small_file
 from apt_evap._common.validation import check_count, check_kind, check_number, check_seed, check_switch, shown
 from apt_evap.config.map_panels import MapSettings, read_maps
 from apt_evap.config.tables import check_keys, check_table
@@ -34,6 +34,7 @@ _KINDS = {
     "watch_settings": WatchSettings,
     "maps": MapSettings,
 }
+_MOST = 1 << 22  # bytes
 _LENGTH = re.compile(r"\s*(\S+?)\s*(a|nm)\s*")
 
 
@@ -168,14 +169,15 @@ def read_config(path: str | Path) -> Config:
     FileError
         If the file cannot be read or is not TOML, or a table, key or value is wrong; the message names it.
     """
-    with open_for_reading(path) as file:
-        content = file.read()
+    check_path(path)
+    if is_run(path):
+        raise FileError(f"{str(path)!r} is a run: see apt-evap info")
+    content = read_small_file(path, _MOST, "a TOML file")
     path = Path(path)
     try:
         document = tomllib.loads(content.decode())
     except UnicodeDecodeError as error:
-        what = "a run: see apt-evap info" if is_run(path) else "not a TOML file: it is not text in UTF-8"
-        raise FileError(f"{str(path)!r} is {what}") from error
+        raise FileError(f"{str(path)!r} is not a TOML file: it is not text in UTF-8") from error
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise FileError(f"{str(path)!r} is not a TOML file: {error}") from error
     with _place(path):

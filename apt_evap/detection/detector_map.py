@@ -17,6 +17,8 @@ from apt_evap.detection.binning import bin_edges, count, field_of_view, find_com
 if TYPE_CHECKING:
     from apt_evap.detection.hits import Hits
 
+_MOST_IONS = 2**53  # whole numbers up to here are exact as floats, which sums and densities are made of
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DetectorMap:
@@ -182,7 +184,7 @@ class DetectorMap:
         Raises
         ------
         ValueError
-            If shapes do not fit, edges are not even, values are negative or the mask is empty.
+            If shapes do not fit, edges are not even, values are negative or too many, or the mask is empty.
         """
         is_counts = check_switch(is_counts, "is_counts")
         check_kind(source, "source", str, "text")
@@ -199,6 +201,8 @@ class DetectorMap:
         values = np.where(finite, values, 0.0)
         ions = None
         if is_counts:
+            if (total := values.sum()) > _MOST_IONS:
+                raise ValueError(f"values that are counts must add up to at most {_MOST_IONS}, got {total:g}")
             values = check_array(values, "values", ("ny", "nx"), dtype=np.int64)
             ions = int(values[mask].sum())
         return cls(values, x_edges, y_edges, mask, is_counts, ions, source=source)

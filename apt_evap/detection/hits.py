@@ -121,6 +121,8 @@ class Hits:
         for name in ("extra", "units"):
             given = {} if getattr(self, name) is None else getattr(self, name)
             check_kind(given, name, Mapping, "a mapping by name of the column")
+            for key in given:
+                check_kind(key, f"a name in {name}", str, "text")
             object.__setattr__(self, name, dict(given))
         self.extra.update({name: _extra(name, value) for name, value in self.extra.items()})
         check_kind(self.source, "source", str, "text")

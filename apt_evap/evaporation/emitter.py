@@ -340,6 +340,8 @@ class Emitter:
             self._hold_more()
             done = event
         self._core.atoms.remove_atoms(state.sites[done:])
+        if not np.isin(state.lonely, self._core.atoms.surface).all() or len(state.lonely) != len(state.lonely_normals):
+            raise ValueError("lonely must be surface atoms, each with a normal: the state is of another specimen")
         self._left, self._deepened = [state.sites], list(state.deepened)
         self._core.n_clipped, self._core.n_unsettled = state.clipped, state.unsettled
         start = Start(len(state.sites), state.charges, state.lonely, state.lonely_normals, state.rule_state)

@@ -17,7 +17,8 @@ SIGNATURE = b"APT\0"
 _SECTION = b"SEC\0"
 _HEADER_SIZE = 540
 _SECTION_SIZE = 148
-_PADDING = 4096
+_PADDING = 1 << 16
+_MOST_PADDING = 1 << 24  # sections begin at whole pages of 4 kB: far more zeros than that are not padding
 _KINDS = {1: "i", 2: "u", 3: "f"}
 _BITS = {"i": (8, 16, 32, 64), "u": (8, 16, 32, 64), "f": (16, 32, 64)}
 
@@ -143,6 +144,8 @@ def _skip_padding(file, path, at, size):
     """Where the next section begins; the size of the file if there is none."""
     start = at
     while at < size:
+        if at - start > _MOST_PADDING:
+            raise FileError(f"{str(path)!r}: expected a section ({_SECTION!r}) at byte {start}, got only zeros")
         block = _at(file, at, _PADDING)
         rest = block.lstrip(b"\0")
         at += len(block) - len(rest)

@@ -9,7 +9,7 @@ import warnings
 
 import numpy as np
 
-from apt_evap._common.files import FileError, open_for_reading
+from apt_evap._common.files import FileError, read_small_file
 from apt_evap._common.types import AnyPath
 from apt_evap._common.warnings import DataWarning
 from apt_evap.detection.mass_ranges import Ranges
@@ -35,14 +35,9 @@ def read_ranges(path: AnyPath) -> Ranges:
     FileError
         If the file is missing or unreadable, has no ranges, or a line cannot be understood.
     """
-    with open_for_reading(path) as file:
-        data = b""
-        while len(data) <= _MOST and (more := file.read(1 << 20)):
-            data += more
+    data = read_small_file(path, _MOST, "the text of an .rrng file")
     if not data:
         raise FileError(f"{str(path)!r} is empty (0 bytes), expected the text of an .rrng file")
-    if len(data) > _MOST:
-        raise FileError(f"{str(path)!r} has more than {_MOST} bytes, expected the text of an .rrng file")
     lines = _lines(data)
     elements = {}
     for section, _, key, value in lines:
@@ -75,8 +70,8 @@ def _lines(data):
     found = []
     for number, line in enumerate(text.splitlines(), 1):
         line = line.strip()
-        if match := re.match(r"\[\s*(.*?)\s*\]", line):
-            section = match[1].casefold()
+        if line.startswith("[") and "]" in line:
+            section = line[1 : line.index("]")].strip().casefold()
         elif "=" in line and not line.startswith((";", "#")):
             key, _, value = line.partition("=")
             found.append((section, number, key.strip().casefold(), value.strip()))
@@ -87,8 +82,10 @@ def _range(text, elements, where):
     """Read "13.8745 14.2410 Vol:0.02003 Si:1 Color:CCCCCC"."""
     bounds = []
     name, volume, colour, composition = "", np.nan, "", {}
-    # "Vol : 0.02" is "Vol:0.02", but the value may also be missing
-    for part in re.sub(r":\s+(?=[^\s:]+(\s|$))", ":", re.sub(r"\s+:", ":", text)).split():
+    # "Vol : 0.02" is "Vol:0.02", but the value may also be missing; a pattern for the first space of many before a
+    # colon would look at all of them again from each
+    joined = ":".join([part.rstrip() for part in text.split(":")])
+    for part in re.sub(r":\s+(?=[^\s:]+(\s|$))", ":", joined).split():
         key, colon, value = part.partition(":")
         word = key.casefold()
         if not colon:
@@ -106,7 +103,7 @@ def _range(text, elements, where):
         else:
             raise FileError(f"{where}: expected a number of atoms such as {key}:1, got {part!r:.60}")
     if len(bounds) != 2 or not bounds[0] < bounds[1]:
-        raise FileError(f"{where}: expected two bounds [Da], the lower one first, got {bounds} in {text!r:.60}")
+        raise FileError(f"{where}: expected two bounds [Da], the lower one first, got {bounds!s:.60} in {text!r:.60}")
     composition = {element: count for element, count in composition.items() if count}
     formula = "".join(element + (str(count) if count > 1 else "") for element, count in composition.items())
     if not (name or formula):

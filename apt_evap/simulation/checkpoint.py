@@ -9,8 +9,11 @@ the folder goes: renamed first, so that no half of it is taken for an unfinished
 import contextlib
 import errno
 import os
+import re
+import secrets
 import shutil
 import socket
+import stat
 import time
 import warnings
 from dataclasses import dataclass, replace
@@ -19,9 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from apt_evap._common.files import FileError, check_path, flush_folder
+from apt_evap._common.files import FileError, check_path, check_regular, is_unfinished, move_file
 from apt_evap._common.interrupts import uninterrupted
 from apt_evap._common.validation import check_count, check_number, check_switch
+from apt_evap._common.warnings import DataWarning, RunWarning
 from apt_evap._common.wording import argument
 from apt_evap.evaporation.state import EmitterState
 from apt_evap.simulation.ending import Ending
@@ -34,7 +38,10 @@ except ImportError:  # not on this system: two processes on one file are not not
     fcntl = None
 
 
-STATE_NAME, WHOLE_NAME = "state.h5", "whole.h5"
+STATE_NAME, WHOLE_NAME, LOCK_NAME = "state.h5", "whole.h5", "lock"
+_OWNER = "process "  # what a lock begins with
+_OPEN_LOCK = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+_TRIES = 1000  # times that other processes may take the folder away while this one locks it
 
 
 @dataclass(frozen=True)
@@ -113,7 +120,7 @@ class Keeper:
     ) -> None:
         self._checkpoint, self._folder = checkpoint, checkpoint.folder
         self._target = Path(os.path.realpath(checkpoint.path))
-        self._lock = None
+        self._lock, self._is_ours = None, False
         self._written_at, self._written_to = time.monotonic(), 0
         self.done = None  # what is there already
         self._in_file = False  # whether that is in the file only, and not yet in the folder
@@ -138,10 +145,10 @@ class Keeper:
 
     def _open(self):
         # The lock may be on a folder that its last owner has just taken away: then once more.
-        while self._lock is None:
+        for _ in range(_TRIES):
             try:
-                self._folder.mkdir(exist_ok=True)
-                lock = open(self._folder / "lock", "a+", encoding="utf-8")
+                self._make_folder()
+                lock = open(self._folder / LOCK_NAME, "r+", encoding="utf-8", errors="replace", opener=_open_lock)
             except FileNotFoundError as error:
                 if self._folder.parent.is_dir():
                     continue
@@ -150,16 +157,37 @@ class Keeper:
                 raise self._error(error) from error
             try:
                 self._take(lock)
-                if os.path.samestat(os.fstat(lock.fileno()), os.stat(self._folder / "lock")):
+                if os.path.samestat(os.fstat(lock.fileno()), os.lstat(self._folder / LOCK_NAME)):
+                    self._sign(lock)
                     self._lock = lock
+                    return
             except FileNotFoundError:
                 pass
+            except OSError as error:
+                raise self._error(error) from error
             finally:
                 if self._lock is None:
                     lock.close()
-        self._lock.truncate(0)
-        self._lock.write(f"process {os.getpid()} on {socket.gethostname()}")
-        self._lock.flush()
+        raise FileError(f"cannot write {str(self._folder)!r}: other processes take it away")
+
+    def _sign(self, lock):
+        """Write into a lock whose it is, over what another process has written."""
+        lock.seek(0)
+        if (written := lock.read(100)) and not written.startswith(_OWNER):
+            raise FileError(f"{str(self._folder / LOCK_NAME)!r} is not a lock of a run: it reads {written!r:.40}")
+        lock.seek(0)
+        lock.truncate()
+        lock.write(f"{_OWNER}{os.getpid()} on {socket.gethostname()}")
+        lock.flush()
+
+    def _make_folder(self):
+        try:
+            self._folder.mkdir()
+            self._is_ours = True
+        except FileExistsError:
+            if not stat.S_ISDIR(os.lstat(self._folder).st_mode):
+                raise OSError(None, "Not a folder") from None
+            self._is_ours = self._is_ours or bool(os.listdir(self._folder))
 
     def _take(self, lock):
         if fcntl is None:
@@ -174,16 +202,18 @@ class Keeper:
                     f"{str(self._checkpoint.path)!r} is being written by {owner}; wait for it or choose another file"
                 ) from None
             warnings.warn(
-                f"no lock on {str(self._folder)!r} ({error.strerror}): see to it that no other process writes there",
+                f"no lock on {str(self._folder)!r} ({error.strerror}): make sure that no other process writes there",
+                RunWarning,
                 stacklevel=6,
             )
 
     @uninterrupted()
     def close(self) -> None:
-        """Let go of the files; a folder without ions goes."""
+        """Let go of the files; a folder without ions is removed if this run has made it."""
         with contextlib.suppress(OSError):
             if self._lock is None:
-                self._folder.rmdir()  # made, and not locked yet; one that somebody else has locked is not empty
+                if self._is_ours:
+                    self._folder.rmdir()  # made, and not locked yet; one that somebody else has locked is not empty
             elif self._folder.is_dir() and not part_paths(self._folder):
                 self._remove_folder()
         if self._lock is not None:
@@ -191,10 +221,17 @@ class Keeper:
             self._lock = None
 
     def _remove_folder(self):
-        # renamed first: a folder with some of its files gone is no unfinished run
-        gone = self._folder.with_name(f".{self._folder.name}.{os.getpid()}.gone")
-        os.replace(self._folder, gone)
-        shutil.rmtree(gone, ignore_errors=True)
+        names = os.listdir(self._folder)
+        if self._is_ours and all(map(_is_known, names)):
+            # renamed first: a folder with some of its files gone is not an unfinished run
+            gone = self._folder.with_name(f".{self._folder.name}.{secrets.token_hex(8)}.gone")
+            os.replace(self._folder, gone)
+            shutil.rmtree(gone, ignore_errors=True)
+            return
+        # somebody else's folder or files stay; the last part goes first, as what is left of a run is then a run
+        parts = [path.name for path in part_paths(self._folder)]
+        for name in (WHOLE_NAME, STATE_NAME, *filter(is_unfinished, names), *reversed(parts), LOCK_NAME):
+            (self._folder / name).unlink(missing_ok=True)
 
     def _error(self, error):
         return FileError(f"cannot write {str(self._folder)!r}: {error.strerror or error}")
@@ -204,12 +241,14 @@ class Keeper:
     def _prepare(self, n_ions):
         checkpoint, folder = self._checkpoint, self._folder
         try:
-            for rest in (
-                *folder.glob(".*.part"),
-                *folder.glob(WHOLE_NAME),
-                *self._target.parent.glob(f".{folder.name}.*.gone"),
-            ):
-                shutil.rmtree(rest) if rest.is_dir() else rest.unlink()
+            if self._target.exists():
+                check_regular(os.stat(self._target))
+            for rest in (*folder.glob(".*.part"), *folder.glob(WHOLE_NAME)):
+                rest.unlink()
+            gone = re.compile(rf"\.{re.escape(folder.name)}\.[0-9a-f]+\.gone")
+            for entry in os.scandir(folder.parent):
+                if gone.fullmatch(entry.name) and entry.is_dir(follow_symlinks=False):
+                    shutil.rmtree(entry.path, ignore_errors=True)
         except OSError as error:
             raise self._error(error) from error
         parts = part_paths(folder)
@@ -276,7 +315,7 @@ class Keeper:
                 last = load(part_paths(self._folder)[-1])
                 state, first_event = last.state, last.first_event
         except FileError as error:
-            warnings.warn(f"{error}: all events are computed again", stacklevel=7)
+            warnings.warn(f"{error}: all events are computed again", DataWarning, stacklevel=7)
             state, first_event = None, 0
         return replace(run, state=state, first_event=first_event)
 
@@ -327,7 +366,7 @@ class Keeper:
             if len(state.sites) <= first_event + self._written_to:  # else its ions are not on the disk yet
                 write_state(self._folder / STATE_NAME, state, first_event)
         except FileError as error:
-            warnings.warn(f"no checkpoint: {error}; the run goes on and tries again", stacklevel=4)
+            warnings.warn(f"no checkpoint: {error}; the run goes on and tries again", RunWarning, stacklevel=4)
         return written
 
     def _write_part(self, part):
@@ -339,11 +378,31 @@ class Keeper:
         whole = self._folder / WHOLE_NAME
         run.save(whole)
         try:
-            os.replace(whole, self._target)
-            flush_folder(self._target.parent)
+            move_file(whole, self._target)
             self._remove_folder()
         except OSError as error:
             raise FileError(f"cannot write {str(self._checkpoint.path)!r}: {error.strerror or error}") from error
+
+
+def _open_lock(path, flags):
+    descriptor = os.open(path, _OPEN_LOCK, 0o666)
+    try:
+        status = os.fstat(descriptor)
+        check_regular(status)
+        if status.st_nlink > 1:
+            raise OSError(None, f"its {LOCK_NAME} is another file, too")
+    except OSError:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def _is_known(name):
+    """Whether a file of a folder is one that this module has written."""
+    return name in (STATE_NAME, WHOLE_NAME, LOCK_NAME) or _PART.fullmatch(name) is not None or is_unfinished(name)
+
+
+_PART = re.compile(r"ions-[0-9]{12,}\.h5")
 
 
 def _flat(settings, before=""):

@@ -15,9 +15,9 @@ class History(NamedTuple):
         Ions that had left by then.
     residual_rms, residual_max : ndarray, shape (k,)
         Of the residuals of the sampled charges, relative to the mean charge; see `charge_residuals`.
-    missed, never_left, marked : ndarray, shape (k,)
-        Shares of the ions since the look before that missed the detector or never left, under the first perturbation of
-        the run, and that the responses mark.
+    missed, never_left, flagged : ndarray, shape (k,)
+        Fractions of the ions since the look before that missed the detector or never left, under the first perturbation
+        of the run, and whose responses are flagged as inexact.
     field : ndarray, shape (k,)
         Mean field at which these ions left [V/nm].
     """
@@ -27,7 +27,7 @@ class History(NamedTuple):
     residual_max: np.ndarray
     missed: np.ndarray
     never_left: np.ndarray
-    marked: np.ndarray
+    flagged: np.ndarray
     field: np.ndarray
 
     @classmethod

@@ -1,6 +1,6 @@
 """A run: the sequence of atoms that left, and where their ions land under any perturbation; saved in HDF5."""
 
-import datetime
+import hashlib
 import json
 import warnings
 from collections.abc import Sequence
@@ -13,16 +13,17 @@ import numpy as np
 from apt_evap._common.files import FileError, check_path
 from apt_evap._common.types import AnyPath, Booleans
 from apt_evap._common.validation import check_kind, check_switch, shown
-from apt_evap._version import __version__
+from apt_evap._common.warnings import DataWarning
 from apt_evap.detection.detector import Detector
 from apt_evap.detection.hits import Hits
-from apt_evap.emission.emissions import Emissions
+from apt_evap.emission.emissions import COLUMNS, Emissions
 from apt_evap.emission.ion_random import IonRandom
 from apt_evap.emission.perturbations import Perturbation, Unperturbed
 from apt_evap.evaporation.state import EmitterState
 from apt_evap.flight.response import ResponseModel, Responses, ResponseSettings
 from apt_evap.simulation.ending import Ending
 from apt_evap.simulation.history import History
+from apt_evap.simulation.provenance import joined, provenance_now
 from apt_evap.simulation.run_hdf5 import described, read_run, write_run
 
 
@@ -80,7 +81,7 @@ class Run:
     ended : str
         Why the run ended before its time; "" if it did not.
     provenance : dict
-        Version and time.
+        Version, time, and under "systems" the processors and libraries that it was computed with.
     """
 
     emissions: Emissions
@@ -101,12 +102,7 @@ class Run:
     state: EmitterState | None = None
     first_event: int = 0
     ended: str = ""
-    provenance: dict = field(
-        default_factory=lambda: {
-            "version": __version__,
-            "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        }
-    )
+    provenance: dict = field(default_factory=provenance_now)
 
     def __len__(self) -> int:
         return len(self.site)
@@ -133,6 +129,31 @@ class Run:
     def first_perturbation(self) -> Any:
         """The first one flown in the run; `Unperturbed` where there are only responses."""
         return self.perturbations[0] if self.flown else Unperturbed()
+
+    def fingerprint(self) -> str:
+        """Hash of all results, by which runs can be compared.
+
+        Returns
+        -------
+        str
+            SHA-256 over the names, types and values of the columns: emissions, sites, species, charges, fields, flown
+            perturbations and responses. The same settings give the same on every machine.
+        """
+        columns = {name: getattr(self, name) for name in ("site", "species", "charges", "fields")}
+        columns |= {f"emissions/{name}": getattr(self.emissions, name) for name in COLUMNS}
+        for number, flown in enumerate(self.flown):
+            columns |= {f"flown/{number}/directions": flown.directions, f"flown/{number}/times": flown.times}
+        if self.responses is not None:
+            columns |= {f"responses/{name}": values for name, values in self.responses._asdict().items()}
+        hashed = hashlib.sha256()
+        for name in sorted(columns):
+            values = np.array(columns[name], order="C")
+            if values.dtype.kind == "f":
+                values[np.isnan(values)] = np.nan  # NaN has many bits, which depend on the processor
+            values = values.astype(values.dtype.newbyteorder("<"), copy=False)
+            hashed.update(f"{name} {values.dtype.str} {values.shape}\n".encode())
+            hashed.update(values.tobytes())
+        return hashed.hexdigest()
 
     def hits(self, perturbation: Perturbation, *, by_response: bool = False) -> Hits:
         """Where the ions land under a perturbation.
@@ -228,7 +249,7 @@ class Run:
         """Join the parts of one run, in their order, into one."""
         first = runs[0]
         emissions = Emissions.join([run.emissions for run in runs])
-        columns = {
+        columns: dict[str, Any] = {
             name: np.concatenate([getattr(run, name) for run in runs])
             for name in ("site", "species", "charges", "fields")
         }
@@ -245,6 +266,7 @@ class Run:
                 *(np.concatenate(parts) for parts in zip(*(run.responses for run in runs), strict=True))
             )
         history = History.join([run.history for run in runs])
+        columns["provenance"] = joined([run.provenance for run in runs])
         return replace(first, emissions=emissions, flown=flown, responses=responses, history=history, **columns)  # type: ignore[arg-type]
 
     def ended_by(self, reason: str) -> "Run":
@@ -300,19 +322,33 @@ def _load_file(path, partial=False):
 
 
 def _load_parts(folder, partial):
-    parts = []
+    parts, names = [], []
     for path in part_paths(folder):
         try:
             part = _load_file(path, partial)
         except FileError as error:
             if not partial:
                 raise
-            warnings.warn(f"{error}: its ions are lost", stacklevel=3)
+            warnings.warn(f"{error}: its ions are lost", DataWarning, stacklevel=3)
             continue
+        if parts and (name := _difference(parts[0], part)):
+            raise FileError(f"{str(path)!r} is of another run than {names[0]!r}: its {name} differ")
         parts.append(part)
+        names.append(path.name)
     if not parts:
         raise FileError(f"{str(folder)!r} holds no run: expected files {PART_NAME.format(0)!r} and so on")
     return Run.join(parts).ended_by(Ending.UNFINISHED)
+
+
+def _difference(one, other):
+    """What two parts of one run differ in, though they should not; "" if in nothing."""
+    pairs = {
+        "settings": (one.settings, other.settings),
+        "elements": (one.elements, other.elements),
+        "perturbations": tuple([described(each) for each in run.perturbations] for run in (one, other)),
+        "responses": (one.responses is None, other.responses is None),
+    }
+    return next((name for name, (first, second) in pairs.items() if first != second), "")
 
 
 PART_NAME = "ions-{:012d}.h5"

@@ -3,30 +3,40 @@
 Groups and fields have the names of NeXus NXapm where it has one; see docs/formats.rst.
 """
 
-import io
 import json
 import warnings
 from contextlib import contextmanager, suppress
-from dataclasses import fields
 from typing import Any
 
 import h5py
 import numpy as np
 
-from apt_evap._common.files import FileError, check_path, open_for_reading, replace_file
+from apt_evap._common.files import FileError, check_path
 from apt_evap._common.types import AnyPath
+from apt_evap._common.validation import check_count, check_number, check_seed
+from apt_evap._common.warnings import DataWarning
 from apt_evap._common.wording import argument
 from apt_evap.detection.detector import Detector
 from apt_evap.emission.emissions import Emissions
 from apt_evap.emission.perturbations import from_dict, to_dict
 from apt_evap.evaporation.state import EmitterState
+from apt_evap.evaporation.voltage import check_voltage
 from apt_evap.flight.response import Design, Responses, ResponseSettings
+from apt_evap.simulation.checked_hdf5 import (
+    CheckedFile,
+    DamagedRows,
+    first_line,
+    has_checksums,
+    open_checked,
+    write_checked,
+)
 from apt_evap.simulation.history import History
+from apt_evap.simulation.old_settings import upgraded
 
 FORMAT = "apt_evap run 2"
 _KIND = "apt_evap run "
 _LONGEST_TEXT = 60_000  # bytes: HDF5 takes 64 kB in an attribute
-ROWS = 4096  # ions of a chunk of every dataset: each has a checksum, and damage costs the ions of its chunks
+ROWS = 4096  # ions whose part of a dataset has a checksum of its own: damage costs these ions
 
 _ENTRY = "entry1"
 _ATOM_PROBE, _SIMULATION = f"{_ENTRY}/atom_probe", f"{_ENTRY}/simulation"
@@ -43,7 +53,27 @@ _UNITS = {
     "residuals": "mm",
     "field": "V/nm",
 }
-_READ_ERRORS = (OSError, KeyError, RuntimeError, TypeError, ValueError, AttributeError)
+_IONS = f"{_ATOM_PROBE}/evaporation_id"
+_KINDS = {  # datasets of a row for each ion: name, type, shape of a row
+    "ions": (_IONS, np.int64, ()),
+    "positions": (f"{_SIMULATION}/positions", np.float64, (3,)),
+    "normals": (f"{_SIMULATION}/normals", np.float64, (3,)),
+    "neighbours": (f"{_SIMULATION}/neighbours", np.float64, (3,)),
+    "charge_states": (f"{_SIMULATION}/charge_states", np.int32, ()),
+    "masses": (f"{_SIMULATION}/masses", np.float64, ()),
+    "site": (f"{_SIMULATION}/site", np.int64, ()),
+    "species": (f"{_SIMULATION}/species", np.int32, ()),
+    "charges": (f"{_SIMULATION}/charges", np.float64, ()),
+    "fields": (f"{_SIMULATION}/fields", np.float64, ()),
+}
+_STATE_ARRAYS = {
+    "sites": (np.int64, (None,)),
+    "charges": (np.float64, (None,)),
+    "lonely": (np.int64, (None,)),
+    "lonely_normals": (np.float64, (None, 3)),
+}
+_HISTORY = {"flagged": "marked"}  # names of columns in files that differ
+_READ_ERRORS = (OSError, KeyError, IndexError, RuntimeError, TypeError, ValueError, AttributeError, OverflowError)
 
 
 def plain(settings: Any) -> Any:
@@ -69,57 +99,9 @@ def described(perturbation: Any) -> dict[str, Any]:
 
 def write_run(path: AnyPath, run: Any) -> None:
     """Write a Run to a file, whole or not at all; FileError if it cannot be written."""
-    with _writing(path) as file:
+    with write_checked(path, ROWS) as file:
+        _put_text(file, "format", FORMAT)
         _write(file, run)
-
-
-class _Sink(io.RawIOBase):
-    """A file for HDF5, which crashes where writing fails: the first error is kept, to be raised when it is done."""
-
-    def __init__(self, file: Any) -> None:
-        self._file, self._place, self._end, self.error = file, 0, 0, None
-
-    def _do(self, method, *arguments):
-        if self.error is None:
-            try:
-                getattr(self._file, method)(*arguments)
-            except OSError as error:
-                self.error = error
-
-    def seek(self, offset: int, whence: int = 0) -> int:
-        self._place = offset + (0, self._place, self._end)[whence]
-        self._do("seek", self._place)
-        return self._place
-
-    def tell(self) -> int:
-        return self._place
-
-    def write(self, data: Any) -> int:
-        self._do("write", data)
-        self._place += len(data)
-        self._end = max(self._end, self._place)
-        return len(data)
-
-    def truncate(self, size: int | None) -> int:
-        self._do("truncate", size)
-        self._end = size
-        return size
-
-    def flush(self) -> None:
-        self._do("flush")
-
-
-@contextmanager
-def _writing(path):
-    with replace_file(path) as target:
-        sink = _Sink(target)
-        try:
-            with h5py.File(sink, "w") as file:
-                _put_text(file, "format", FORMAT)
-                yield file
-        finally:
-            if sink.error is not None:
-                raise sink.error
 
 
 def _put_text(item, name, text):
@@ -134,16 +116,9 @@ def _put_text(item, name, text):
         item.attrs.create(name, content, dtype=h5py.string_dtype("utf-8", max(1, len(content))))
 
 
-def _text(item, name):
-    value = item.attrs.get(name)
-    return value.decode() if isinstance(value, bytes) else value
-
-
 def _put(group, name, values, units=None):
-    """A dataset in chunks of rows with checksums."""
     values = np.asarray(values)
-    chunks = (min(len(values), ROWS), *values.shape[1:]) if values.size else None
-    dataset = group.create_dataset(name, data=values, chunks=chunks, fletcher32=chunks is not None)
+    dataset = group.create_dataset(name, data=values)
     if units := units or _UNITS.get(name):
         dataset.attrs["units"] = units
     return dataset
@@ -176,28 +151,26 @@ def _write(file, run):
         for name, values in run.responses._asdict().items():
             _put(simulation, f"responses/{name}", values, _UNITS.get(name))
     for name, values in run.history._asdict().items():
-        _put(simulation, f"history/{name}", values, _UNITS.get(name))
+        _put(simulation, f"history/{_HISTORY.get(name, name)}", values, _UNITS.get(name))
     if run.state is not None:
         _put_state(simulation.create_group("state"), run.state, run.first_event)
 
 
 def _put_state(group, state, first_event):
-    for name, value in (vars(state) | state.rule_state).items():
-        if name == "rule_state":
-            continue
-        if name in state.rule_state:
-            group.attrs[name] = value
-            continue
-        if isinstance(value, np.ndarray):
+    for name, value in vars(state).items():
+        if name in _STATE_ARRAYS:
             _put(group, name, value)
-        else:
+        elif name != "rule_state":
             group.attrs[name] = value
+    for name, value in state.rule_state.items():
+        group.attrs[name] = value
     group.attrs["first_event"] = first_event
 
 
 def write_state(path: AnyPath, state: Any, first_event: int) -> None:
     """Write an EmitterState to a file of its own, whole or not at all."""
-    with _writing(path) as file:
+    with write_checked(path, ROWS) as file:
+        _put_text(file, "format", FORMAT)
         _put_state(file, state, first_event)
 
 
@@ -207,128 +180,157 @@ def write_state(path: AnyPath, state: Any, first_event: int) -> None:
 def read_run(path: AnyPath, partial: bool = False) -> dict[str, Any]:
     """What a file says of a Run, as the arguments of one; FileError if it is missing, damaged or not a run."""
     hint = "" if partial else f"; {argument('partial', True)} reads the ions that are whole"
-    with _reading(path, hint) as file:
+    with _reading(path, hint, partial=partial) as file:
         return _read(file, partial)
 
 
-def read_state(path: AnyPath) -> tuple[Any, int]:
+def read_state(path: AnyPath) -> tuple[EmitterState, int]:
     """The EmitterState in a file of its own, and how many atoms had left before the first ion of its run."""
     with _reading(path) as file:
-        return _read_state(file)
+        return _read_state(file, "")
 
 
 def count_ions(path: AnyPath) -> int:
     """Ions of the run in a file; FileError as `read_run`."""
-    with _reading(path) as file:
-        return len(file[f"{_ATOM_PROBE}/evaporation_id"])
+    with _reading(path, with_data=False) as file:
+        return len(file.dataset(_IONS, np.int64, (None,)))
 
 
 def is_run(path: AnyPath) -> bool:
-    """Whether a file is a run, in this format or another one."""
-    with suppress(OSError, RuntimeError), h5py.File(path, "r") as file:
-        return str(_text(file, "format")).startswith(_KIND)
+    """Whether a file is a run, damaged or not, in this format or another one."""
+    with suppress(OSError, RuntimeError, ValueError, KeyError):
+        if has_checksums(path):
+            return True
+        with h5py.File(path, "r", locking=False) as file:
+            return CheckedFile(file, 0, None).text("format").startswith(_KIND)
     return False
 
 
 @contextmanager
-def _reading(path, hint=""):
-    with open_for_reading(path):
-        pass  # says why it cannot be opened better than HDF5 does
+def _reading(path, hint="", with_data=True, partial=False):
     name = str(check_path(path))
     try:
-        with h5py.File(name, "r") as file:
-            kind = str(_text(file, "format"))
+        with open_checked(path, with_data=with_data, partial=partial) as file:
+            kind = file.text("format") if "format" in file.attributes() else "another file"
             if not kind.startswith(_KIND):
                 raise FileError(f"{name!r} is not a run: expected {FORMAT!r}, got {kind!r}")
             if kind != FORMAT:
                 raise FileError(f"{name!r} is a run in another format, {kind!r}; this version reads {FORMAT!r}")
             yield file
+    except DamagedRows as error:
+        raise FileError(f"{error}{hint}") from error
     except FileError:
         raise
     except _READ_ERRORS as error:
-        raise FileError(f"cannot read {name!r} as a run: {str(error).splitlines()[0]}{hint}") from error
+        raise FileError(f"cannot read {name!r} as a run: {first_line(error)}{hint}") from error
 
 
 def _read(file, partial):
-    settings = json.loads(_text(file, "settings"))
-    simulation = file[_SIMULATION]
-    perturbations, paths = [], {"ions": f"{_ATOM_PROBE}/evaporation_id"}
-    paths |= {name: f"{_SIMULATION}/{name}" for name in (*_EMISSIONS, *_COLUMNS)}
-    for index in range(len(simulation.get("flown", ()))):
-        perturbations.append(_known(json.loads(_text(simulation[f"flown/{index}"], "perturbation"))))
-        paths |= {f"{index} {name}": f"{_SIMULATION}/flown/{index}/{name}" for name in ("directions", "times")}
-    if "responses" in simulation:
-        paths |= {f"responses {name}": f"{_SIMULATION}/responses/{name}" for name in Responses._fields}
-    columns, lost = _columns(file, paths, partial)
+    settings = upgraded(json.loads(file.text("settings")))
+    elements = tuple(json.loads(file.text("elements")))
+    designs = settings["responses"]
+    response_settings = ResponseSettings(
+        energy_limit=designs["energy_limit"],
+        bound=designs["bound"],
+        site=Design(**designs["site"]),
+        rolled=Design(**designs["rolled"]),
+    )
+    perturbations, kinds = [], dict(_KINDS)
+    while (group := f"{_SIMULATION}/flown/{len(perturbations)}") in file:
+        kinds[f"{len(perturbations)} directions"] = f"{group}/directions", np.float64, (2,)
+        kinds[f"{len(perturbations)} times"] = f"{group}/times", np.float64, ()
+        perturbations.append(_known(json.loads(file.text("perturbation", group))))
+    group = f"{_SIMULATION}/responses"
+    has_responses = group in file
+    if has_responses:
+        for name, design in (("site", response_settings.site), ("rolled", response_settings.rolled)):
+            n_coefficients = design.monomials(np.zeros((1, 2))).shape[1]
+            kinds[f"responses {name}"] = f"{group}/{name}", np.float32, (3, n_coefficients)
+        kinds["responses residuals"] = f"{group}/residuals", np.float32, (2,)
+    columns, lost = _columns(file, kinds, partial)
+    if len(columns["ions"]) and not 0 <= columns["species"].min() <= columns["species"].max() < len(elements):
+        raise ValueError(f"species must be 0 to {len(elements) - 1}, as there are {len(elements)} elements")
     history, state, first_event = History.empty(), None, 0
     try:
-        history = History(*(simulation["history"][name][()] for name in History._fields))
-        if "state" in simulation and not lost:
-            state, first_event = _read_state(simulation["state"])
+        history = _read_history(file)
+        if f"{_SIMULATION}/state" in file and not lost:
+            state, first_event = _read_state(file, f"{_SIMULATION}/state")
     except _READ_ERRORS:
         if not partial:
             raise
-    designs = settings["responses"]
     return {
         "emissions": Emissions(
             **{name: columns[name] for name in ("ions", *_EMISSIONS)},
-            nearest_neighbour_distance=float(file.attrs["nearest_neighbour_distance"]),
+            nearest_neighbour_distance=float(file.attributes()["nearest_neighbour_distance"]),
         ),
         **{name: columns[name] for name in _COLUMNS},
         "perturbations": tuple(perturbations),
         "flown": tuple((columns[f"{k} directions"], columns[f"{k} times"]) for k in range(len(perturbations))),
         "responses": Responses(*(columns[f"responses {name}"] for name in Responses._fields))
-        if "responses" in simulation
+        if has_responses
         else None,
-        "seed": settings["seed"],
-        "voltage": settings["voltage"],
+        "seed": check_seed(settings["seed"]),
+        "voltage": check_voltage(settings["voltage"]),
         "detector": Detector(**settings["detector"]),
-        "response_settings": ResponseSettings(
-            energy_limit=designs["energy_limit"],
-            bound=designs["bound"],
-            site=Design(**designs["site"]),
-            rolled=Design(**designs["rolled"]),
-        ),
-        "elements": tuple(json.loads(_text(file, "elements"))),
+        "response_settings": response_settings,
+        "elements": elements,
         "settings": settings,
         "history": history,
         "state": state,
         "first_event": first_event,
-        "ended": f"damaged: {lost:,} ions are lost" if lost else _text(file, "ended"),
-        "provenance": json.loads(_text(file, "provenance")),
+        "ended": f"damaged: {lost:,} ions are lost" if lost else file.text("ended"),
+        "provenance": dict(json.loads(file.text("provenance"))),
     }
 
 
-def _columns(file, paths, partial):
-    """Columns of the ions by name; in a damaged file, only the ions whose chunks are whole in all of them."""
-    if not partial:
-        return {name: file[path][()] for name, path in paths.items()}, 0
-    datasets = {name: file[path] for name, path in paths.items()}
-    n = min(len(dataset) for dataset in datasets.values())
-    blocks, lost = [{name: dataset[:0] for name, dataset in datasets.items()}], 0
-    for begin in range(0, n, ROWS):
-        end = min(begin + ROWS, n)
+def _columns(file, kinds, partial):
+    """Columns of the ions by name; of a damaged file, only the ions whose rows are whole in all of them."""
+    n = len(file.dataset(_IONS, np.int64, (None,)))
+    datasets = {name: file.dataset(path, dtype, (n, *shape)) for name, (path, dtype, shape) in kinds.items()}
+    blocks, lost = [], 0
+    step = ROWS if partial else max(n, 1)
+    for begin in range(0, n, step):
+        end = min(begin + step, n)
         try:
-            blocks.append({name: dataset[begin:end] for name, dataset in datasets.items()})
+            blocks.append([file.rows(dataset, begin, end) for dataset in datasets.values()])
         except _READ_ERRORS:
+            if not partial:
+                raise
             lost += end - begin
-    if lost:
-        warnings.warn(f"{file.filename!r} is damaged: {lost:,} of {n:,} ions are lost", stacklevel=5)
-    return {name: np.concatenate([block[name] for block in blocks]) for name in datasets}, lost
+    if lost or file.is_damaged:
+        warnings.warn(f"{file.name!r} is damaged: {lost:,} of {n:,} ions are lost", DataWarning, stacklevel=5)
+    if len(blocks) == 1:
+        return dict(zip(datasets, blocks[0], strict=True)), lost
+    empty = [dataset[:0] for dataset in datasets.values()]
+    joined = [np.concatenate(parts) for parts in zip(empty, *blocks, strict=True)]
+    return dict(zip(datasets, joined, strict=True)), lost
 
 
-def _read_state(group):
-    values = {name: group[name][()] for name in group} | dict(group.attrs)
-    values.pop("format", None)  # of a file of its own
-    first_event = int(values.pop("first_event"))
-    values["deepened"] = tuple(values["deepened"].tolist())
-    for name in ("clipped", "unsettled"):
-        values[name] = int(values[name])
-    for name in ("tolerance", "opening_angle"):
-        values[name] = float(values[name])
-    own = {item.name for item in fields(EmitterState)}
-    rule_state = {name: value for name, value in values.items() if name not in own}
-    return EmitterState(**{name: values[name] for name in own & set(values)}, rule_state=rule_state), first_event
+def _read_history(file):
+    group = f"{_SIMULATION}/history"
+    ions = file.read(f"{group}/ions", np.int64, (None,))
+    others = [file.read(f"{group}/{_HISTORY.get(name, name)}", float, (len(ions),)) for name in History._fields[1:]]
+    return History(ions, *others)
+
+
+def _read_state(file, group):
+    before = f"{group}/" if group else ""
+    arrays = {name: file.read(before + name, dtype, shape) for name, (dtype, shape) in _STATE_ARRAYS.items()}
+    numbers = dict(file.attributes(group))
+    for name in ("format", "checksums"):  # of a file of its own
+        numbers.pop(name, None)
+    own = {name: numbers.pop(name) for name in ("deepened", "tolerance", "opening_angle", "clipped", "unsettled")}
+    first_event = check_count(int(numbers.pop("first_event")), "first_event")
+    state = EmitterState(
+        **arrays,
+        deepened=tuple(int(event) for event in np.ravel(own["deepened"])),
+        tolerance=check_number(float(own["tolerance"]), "tolerance", above=0),
+        opening_angle=check_number(float(own["opening_angle"]), "opening_angle", at_least=0),
+        clipped=check_count(int(own["clipped"]), "clipped"),
+        unsettled=check_count(int(own["unsettled"]), "unsettled"),
+        rule_state=numbers,
+    )
+    return state, first_event
 
 
 def _known(description):

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from apt_evap._common.describe import describe
+from apt_evap._common.files import FileError
 from apt_evap._common.interrupts import interruptible
 from apt_evap._common.memory import check_copies
 from apt_evap._common.threads import thread_count
@@ -226,7 +227,10 @@ class Simulation:
         if left := emitter.counts["events"]:
             raise ValueError(f"a run is resumed by a new Simulation, got one that {left:,} atoms left")
         if done.state is not None:
-            emitter.restore(done.state)
+            try:
+                emitter.restore(done.state)
+            except (ValueError, KeyError) as error:
+                raise FileError(f"the run cannot be resumed, its state does not fit: {error}") from error
         ions = emitter.counts["events"] - done.first_event  # ions of the run that have left; those before it count down
         same = ions <= len(done)
         for batch in emitter.advance(max(len(done) - ions, 0)):

@@ -56,6 +56,25 @@ def failed(capsys, *arguments):
     return err
 
 
+@NO_PICTURES
+def test_files_that_are_overwritten_keep_their_modes(folder):
+    arguments = ["compare", "run.h5", "map.npz", "-o", "study", *QUICK, *HERE, "--quiet"]
+    assert main(arguments) == 0
+    for name in FILES:
+        (folder / "study" / name).chmod(0o640)
+    assert main(arguments) == 0
+    assert {path.stat().st_mode & 0o777 for path in (folder / "study").iterdir()} == {0o640}
+
+
+def test_a_pipe_is_no_registration_and_no_study(folder, capsys):
+    os.mkfifo("pipe.json")
+    err = failed(capsys, "run.h5", "map.npz", *QUICK, "--registration", "pipe.json")
+    assert "cannot read 'pipe.json': Not a regular file" in err
+    Path("study").mkdir()
+    os.mkfifo("study/study.json")
+    assert "Not a regular file" in failed(capsys, "run.h5", "map.npz", "-o", "study", *QUICK, *HERE)
+
+
 def test_everything_is_written(folder, capsys):
     assert main(["compare", "run.h5", "map.npz", "-o", "study", *QUICK, *HERE]) == 0
     out, _ = capsys.readouterr()

@@ -517,7 +517,7 @@ def test_info_of_what_cannot_be_read(measured, made, capsys):
     assert main(["info", "ions.epos", "--partial", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["ions"] == 3999
     Path("cut.h5").write_bytes(made.read_bytes()[:5000])
-    assert "cannot read 'cut.h5' as a run" in failed(capsys, "info", "cut.h5")
+    assert "'cut.h5' is damaged" in failed(capsys, "info", "cut.h5")
     Path("empty.epos").write_bytes(b"")
     assert "'empty.epos' is empty" in failed(capsys, "info", "empty.epos")
     assert "cannot read 'none.h5'" in failed(capsys, "info", "none.h5")

@@ -1,5 +1,6 @@
 import copy
 import math
+import os
 import re
 from dataclasses import fields, replace
 from pathlib import Path
@@ -302,6 +303,16 @@ def test_what_is_not_toml_is_called_so(tmp_path, content):
     path.write_bytes(content)
     with pytest.raises(FileError, match=r"a\.toml' is not a TOML file: "):
         read_config(path)
+
+
+def test_what_is_too_large_or_a_pipe_is_not_read(tmp_path):
+    with open(tmp_path / "large.toml", "wb") as file:
+        file.truncate(6 << 30)
+    with pytest.raises(FileError, match=r"large\.toml' has more than \d+ bytes, expected a TOML file"):
+        read_config(tmp_path / "large.toml")
+    os.mkfifo(tmp_path / "pipe.toml")
+    with pytest.raises(FileError, match=r"cannot read .*pipe\.toml': Not a regular file"):
+        read_config(tmp_path / "pipe.toml")
 
 
 def test_a_missing_file(tmp_path):

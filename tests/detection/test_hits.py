@@ -59,6 +59,12 @@ def test_selection_by_anything_else_is_an_error(selection):
         simulated()[selection]
 
 
+@pytest.mark.parametrize("name", ["extra", "units"])
+def test_further_columns_have_names(name):
+    with pytest.raises(ValueError, match=f"a name in {name} must be text, got 1"):
+        Hits(x=[1.0], **{name: {1: [1.0]}})
+
+
 def test_missing_column_names_column_and_source():
     with pytest.raises(ValueError, match=r"a test has no column 'voltage'"):
         simulated().require("x", "voltage")

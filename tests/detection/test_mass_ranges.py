@@ -1,3 +1,4 @@
+import time
 import warnings
 from pathlib import Path
 
@@ -102,6 +103,26 @@ def test_an_untidy_file_says_the_same(save):
 def test_lines_that_cannot_be_understood(save, line, problem):
     with pytest.raises(FileError, match=rf"a\.rrng.*{problem}"):
         read_ranges(save(f"[Ranges]\n{line}\n"))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"[{' ' * 4_000}x\n[Ranges]\nRange1=27 29 Si:1\n",
+        f"[Ranges]\nRange1=27 29{' ' * 200_000}Si{' ' * 200_000}:{' ' * 200_000}1\n",
+        f"[Ranges]\nRange1=27 29 Si:1 {': ' * 200_000}\n",
+        f"[Ranges]\n{'[' * 200_000}\nRange1=27 29 Si:1 {'x:' * 200_000}\n",
+        f"[{' x' * 200_000}]\n[Ranges]\nrange{' ' * 200_000}1=27 29 Si:1\n",
+    ],
+)
+def test_many_spaces_take_no_longer_than_other_text(save, text):
+    """A pattern that looks at them once from each of them takes a minute for these, or hours."""
+    began = time.process_time()
+    try:
+        assert read_ranges(save(text)).names == ("Si",)
+    except FileError as error:
+        assert len(str(error)) < 500
+    assert time.process_time() - began < 5
 
 
 def test_what_is_no_rrng(save, tmp_path):

@@ -50,6 +50,15 @@ def test_any_order_padding_and_header_size(tmp_path):
     assert hits.mass_to_charge.tolist() == [1.5, 2.5, 3.5] and hits.time_of_flight.tolist() == [150, 250, 350]
 
 
+def test_zeros_without_end_are_not_read_to_their_end(tmp_path):
+    path = tmp_path / "a.apt"
+    path.write_bytes(apt_header(3) + apt_section("Mass", THREE, "Da"))
+    with open(path, "r+b") as file:
+        file.truncate(300 << 30)
+    with pytest.raises(FileError, match=r"a\.apt'.*expected a section .* got only zeros"):
+        read(path)
+
+
 def test_detector_coordinates_have_a_stride_of_two(save):
     pairs = np.arange(6.0, dtype="f4").reshape(3, 2)
     hits = strict(save(apt_section("Detector Coordinates", pairs, "mm")))

@@ -1,5 +1,6 @@
 """Maps in .npz files."""
 
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -58,12 +59,36 @@ def test_names_and_unit_can_be_given(tmp_path):
         ({"counts": COUNTS, "x_edges_mm": X[:-1], "y_edges_mm": Y}, r"x_edges must have shape \(21,\), got \(20,\)"),
         ({"counts": -COUNTS, "x_edges_mm": X, "y_edges_mm": Y}, "must be at least 0, got -"),
         ({"counts": np.array([None]), "x_edges_mm": X}, "as an .npz file: Object arrays"),
+        ({"counts": COUNTS, "x_edges_mm": X.astype("U9"), "y_edges_mm": Y}, "x_edges_mm must hold numbers, got <U9"),
+        ({"counts": COUNTS, "x_edges_mm": X, "y_edges_mm": Y > 0}, "y_edges_mm must hold numbers, got bool"),
+        (
+            {"counts": COUNTS + np.int64(2**62), "x_edges_mm": X, "y_edges_mm": Y},
+            "add up to at most 9007199254740992, got 9.2",
+        ),
     ],
 )
 def test_arrays_that_are_no_map(tmp_path, arrays, words):
     np.savez(tmp_path / "map.npz", **arrays)
     with pytest.raises(ae.FileError, match=rf"map\.npz.*{words}"):
         ae.read_map(tmp_path / "map.npz")
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2, zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED])
+def test_damage_in_every_kind_of_compression(tmp_path, method):
+    path = tmp_path / "map.npz"
+    with zipfile.ZipFile(path, "w", method) as archive:
+        for name, values in {"counts": COUNTS, "x_edges_mm": X, "y_edges_mm": Y}.items():
+            with archive.open(f"{name}.npy", "w") as member:
+                np.save(member, values)
+    assert np.array_equal(ae.read_map(path).counts, COUNTS)
+    whole, refused = path.read_bytes(), 0
+    for place in range(0, len(whole), 7):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 0xFF]) + whole[place + 1 :])
+        try:
+            ae.read_map(path)
+        except ae.FileError:
+            refused += 1
+    assert refused > len(whole) // 7 // 2
 
 
 def test_files_that_are_none(tmp_path):

@@ -10,6 +10,7 @@ import threading
 import time
 import traceback
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -122,7 +123,7 @@ def test_killed_at_random_moments_and_resumed_it_has_the_same_bits(tmp_path, pro
         folder = Path(f"{path}.unfinished")
         spared = shortest is None or over or (len(kills) >= n_kills and folder.exists())
         began = time.monotonic()
-        code = processes.run(work, path, kill_after=None if spared else random.uniform(0, 0.4 * shortest))
+        code = processes.run(work, path, kill_after=None if spared else random.uniform(0, 0.6 * shortest))
         if code == -signal.SIGKILL:
             kills.append(len(list(folder.glob("ions-*.h5"))))
             over = path.exists() and not folder.exists()  # hit after its end: another one begins
@@ -250,7 +251,7 @@ def test_an_error_keeps_what_is_done(tmp_path):
 def test_a_full_disk_loses_nothing(tmp_path):
     """A limit on the size of files, as they meet a full disk: writing fails part of the way."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (12_000, before[1]))
     try:
         with (
             pytest.warns(UserWarning, match=r"no checkpoint: cannot write .*File too large; the run goes on"),
@@ -409,27 +410,154 @@ def test_settings_that_are_refused(options, message):
         ae.Checkpoint(**options)
 
 
+# ---- files and folders of others -----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def planted(tmp_path):
+    """A folder where that of an unfinished run goes, and a file to be destroyed."""
+    (tmp_path / "victim.txt").write_text("precious")
+    (tmp_path / "run.h5.unfinished").mkdir()
+    return tmp_path / "run.h5.unfinished" / "lock"
+
+
+@pytest.mark.parametrize(
+    ("plant", "reason"),
+    [
+        (lambda lock: lock.symlink_to(lock.parents[1] / "victim.txt"), "Too many levels of symbolic links"),
+        (lambda lock: lock.symlink_to("/nonexistent/x"), "Too many levels of symbolic links"),
+        (lambda lock: os.link(lock.parents[1] / "victim.txt", lock), "its lock is another file, too"),
+        (lambda lock: lock.write_text("precious"), "is not a lock of a run: it reads 'precious'"),
+        (lambda lock: lock.mkdir(), "Is a directory"),
+        (os.mkfifo, "Not a regular file"),
+    ],
+)
+def test_a_lock_is_a_file_of_this_program(tmp_path, planted, plant, reason):
+    plant(planted)
+    with pytest.raises(ae.FileError, match=rf"run\.h5\.unfinished.*{reason}"):
+        run_small(tmp_path / "run.h5")
+    assert (tmp_path / "victim.txt").read_text() == "precious"
+    assert planted.is_symlink() or planted.exists()
+
+
+@pytest.mark.parametrize("kind", ["file", "link"])
+def test_what_is_not_a_folder_is_refused(tmp_path, kind):
+    folder = tmp_path / "run.h5.unfinished"
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "ions-000000000000.h5").write_text("precious")
+    folder.write_text("precious") if kind == "file" else folder.symlink_to("other")
+    with pytest.raises(ae.FileError, match=r"cannot write .*run\.h5\.unfinished': Not a folder"):
+        small().run(30, responses=False, checkpoint=ae.Checkpoint(tmp_path / "run.h5", overwrite=True))
+    assert (tmp_path / "other" / "ions-000000000000.h5").read_text() == "precious"
+
+
+def test_an_output_that_is_a_pipe_is_refused_before_the_run(tmp_path):
+    os.mkfifo(tmp_path / "run.h5")
+    with pytest.raises(ae.FileError, match="Not a regular file"):
+        run_small(tmp_path / "run.h5")
+    assert [item.name for item in tmp_path.iterdir()] == ["run.h5"]
+
+
+@pytest.mark.parametrize("names", [(), ("notes.txt",), ("notes.txt", "folder")])
+def test_folders_and_files_of_others_stay(tmp_path, names):
+    folder = tmp_path / "run.h5.unfinished"
+    folder.mkdir()
+    for name in names:
+        (folder / name).touch() if "." in name else (folder / name).mkdir()
+    run_small(tmp_path / "run.h5")
+    assert len(ae.load(tmp_path / "run.h5")) == 90
+    assert sorted(item.name for item in folder.iterdir()) == sorted(names)
+    with pytest.raises(ae.FileError, match="more than the 30 asked for"):
+        run_small(tmp_path / "run.h5", 30)
+    assert sorted(item.name for item in folder.iterdir()) == sorted(names)
+
+
+def test_a_run_that_is_overwritten_keeps_its_mode(tmp_path):
+    run_small(tmp_path / "run.h5")
+    (tmp_path / "run.h5").chmod(0o640)
+    run_small(tmp_path / "run.h5")
+    assert (tmp_path / "run.h5").stat().st_mode & 0o777 == 0o640
+
+
+def test_names_may_hold_signs_of_patterns(tmp_path):
+    path = tmp_path / "run[1]*.h5"
+    (tmp_path / f".{path.name}.unfinished.123.gone").mkdir()
+    run_small(path)
+    assert [item.name for item in tmp_path.iterdir()] == [path.name]
+
+
+# ---- what does not belong together ---------------------------------------------------------------------------------
+
+
+def test_parts_of_two_runs_are_not_joined(unfinished, tmp_path):
+    folder = Path(f"{unfinished}.unfinished")
+    for options, flown, what in (
+        ({"seed": 6}, [Interrupting()], "settings"),
+        ({}, [ae.RollUp(0.2)], "perturbations"),
+    ):
+        simulation = ae.Simulation(small().tip, n_threads=1, **{"seed": 5} | options)
+        simulation.run(60, responses=False, progress=False)
+        part = simulation.run(30, flown, responses=False, progress=False)
+        part.save(folder / "ions-000000000060.h5")
+        for action in (lambda: ae.load(folder), lambda: interrupted(unfinished, (), resume=True)):
+            with pytest.raises(
+                ae.FileError, match=rf"060\.h5' is of another run than 'ions-0+\.h5': its {what} differ"
+            ):
+                action()
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"lonely": np.array([10**9]), "lonely_normals": np.eye(3)[:1]}, "lonely must be surface atoms"),
+        ({"lonely": np.array([-1]), "lonely_normals": np.eye(3)[:1]}, "lonely must be surface atoms"),
+        ({"sites": np.array([10**9])}, "atoms to take away must be there"),
+        ({"charges": np.ones(3)}, "start must have the charges of"),
+        ({"rule_state": {}}, "potential_point"),
+        ({"rule_state": {"potential_point": np.zeros(4)}}, "reshape"),
+    ],
+)
+def test_a_state_that_does_not_fit_is_refused(tmp_path, change, reason):
+    run = run_small(tmp_path / "run.h5", 60)
+    replace(run, state=replace(run.state, **change)).save(tmp_path / "run.h5")
+    with pytest.raises(ae.FileError, match=rf"cannot be resumed, its state does not fit: .*{reason}"):
+        run_small(tmp_path / "run.h5", 90, resume=True)
+
+
+def test_a_run_knows_all_systems_it_was_computed_on(tmp_path):
+    run = run_small(tmp_path / "run.h5", 60)
+    (system,) = run.provenance["systems"]
+    assert {"processor", "machine", "numpy", "scipy", "h5py", "hdf5"} <= set(system)
+    other = dict(system, processor="of another machine")
+    replace(run, provenance=run.provenance | {"systems": [other]}).save(tmp_path / "run.h5")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        run_small(tmp_path / "run.h5", 90, resume=True)
+    assert ae.load(tmp_path / "run.h5").provenance["systems"] == [other, system]
+
+
 # ---- damaged files -------------------------------------------------------------------------------------------------
 
 
-def damage(path, name, chunk=0):
-    """Turn the bits of a byte inside of a chunk."""
+def damage(path, name, row=0):
+    """Turn the bits of a byte in a row of a dataset."""
     with h5py.File(path) as file:
-        info = file[name].id.get_chunk_info(chunk)
+        dataset = file[name]
+        place = dataset.id.get_offset() + row * (dataset.nbytes // len(dataset))
     with open(path, "r+b") as file:
-        file.seek(info.byte_offset + info.size // 2)
+        file.seek(place)
         byte = file.read(1)[0]
-        file.seek(-1, os.SEEK_CUR)
+        file.seek(place)
         file.write(bytes([byte ^ 0xFF]))
 
 
-def test_a_damaged_chunk_costs_its_ions_only(tmp_path, monkeypatch):
+def test_damaged_rows_cost_their_ions_only(tmp_path, monkeypatch):
     monkeypatch.setattr(run_hdf5, "ROWS", 32)
     run = run_small(tmp_path / "run.h5")
-    damage(tmp_path / "run.h5", "entry1/simulation/fields", 1)
-    with pytest.raises(ae.FileError, match=r"cannot read .*run\.h5' as a run: .*partial=True reads"):
+    damage(tmp_path / "run.h5", "entry1/simulation/fields", 40)
+    with pytest.raises(ae.FileError, match=r"run\.h5' is damaged: its checksum does not match; partial=True reads"):
         ae.load(tmp_path / "run.h5")
-    with pytest.warns(UserWarning, match="run.h5' is damaged: 32 of 90 ions are lost"):
+    with pytest.warns(ae.DataWarning, match="run.h5' is damaged: 32 of 90 ions are lost"):
         whole = ae.load(tmp_path / "run.h5", partial=True)
     kept = np.r_[0:32, 64:90]
     assert np.array_equal(whole.emissions.ions, kept)
@@ -470,10 +598,31 @@ def test_a_damaged_state_is_made_again(unfinished):
     assert differing(unfinished, unfinished.with_name("whole.h5")) == []
 
 
+@KILLABLE
+def test_a_state_that_would_crash_hdf5_is_made_again(unfinished):
+    """Zeros in the index of a dataset: HDF5 reads beyond its memory there, were it to look."""
+    path = Path(f"{unfinished}.unfinished") / "state.h5"
+    content = path.read_bytes()
+    whole = bytearray(content)
+    for place in range(0, len(content) - 47, 173):
+        if not any(content[place : place + 47]):
+            continue
+        path.write_bytes(content[:place] + bytes(47) + content[place + 47 :])
+        with pytest.raises(ae.FileError, match="is damaged"):
+            run_hdf5.read_state(path)
+    whole[0x6EB : 0x6EB + 47] = bytes(47)
+    path.write_bytes(whole)
+    with pytest.warns(ae.DataWarning, match=r"state\.h5' is damaged.*all events are computed again"):
+        interrupted(unfinished, (), resume=True)
+    interrupted(unfinished.with_name("whole.h5"), ())
+    assert differing(unfinished, unfinished.with_name("whole.h5")) == []
+
+
 def test_other_versions_are_told(tmp_path):
     run_small(tmp_path / "run.h5")
     with h5py.File(tmp_path / "run.h5", "a") as file:
         file.attrs["format"] = "apt_evap run 1"
+        del file.attrs["checksums"]  # which changing it has cut off
     with pytest.raises(ae.FileError, match=r"is a run in another format, 'apt_evap run 1'; this version reads"):
         ae.load(tmp_path / "run.h5")
 

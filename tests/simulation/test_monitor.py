@@ -76,7 +76,7 @@ def test_the_history_is_that_of_the_ions(small_tip, tmp_path):
         since = slice(end - 100, end)
         assert history.missed[row] == np.mean(outcome[since] == ae.Outcome.MISSED)
         assert history.never_left[row] == 0
-        assert history.marked[row] == np.mean(run.flagged[since])
+        assert history.flagged[row] == np.mean(run.flagged[since])
         assert history.field[row] == pytest.approx(run.fields[since].mean(), rel=1e-14)
     assert 0 < history.missed.max() < 1
     run.save(tmp_path / "run.h5")

@@ -1,0 +1,59 @@
+"""Where a run was computed: version, time, libraries and the kind of processor.
+
+None of it is a setting: a run may be resumed elsewhere, with the same bits. The record is there to find the reason if they
+should ever differ.
+"""
+
+import datetime
+import functools
+import platform
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import h5py
+import numpy as np
+import scipy
+
+from apt_evap._version import __version__
+
+
+def provenance_now() -> dict[str, Any]:
+    """Provenance of a run that is computed here and now, in the plain types of JSON."""
+    created = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    return {"version": __version__, "created": created, "systems": [dict(system())]}
+
+
+@functools.cache
+def system() -> Mapping[str, str]:
+    """Processor and libraries of this process."""
+    return {
+        "processor": _processor(),
+        "machine": platform.machine(),
+        "libc": " ".join(platform.libc_ver()),
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+        "h5py": h5py.version.version,
+        "hdf5": h5py.version.hdf5_version,
+    }
+
+
+def joined(parts: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """Provenance of a run whose parts have these: that of the first, with the systems of all."""
+    first, *others = parts
+    systems = list(first.get("systems", ()))
+    for part in others:
+        systems += [each for each in part.get("systems", ()) if each not in systems]
+    return {**first, "systems": systems} if systems else dict(first)
+
+
+def _processor():
+    """Name of the processor, as the system tells it."""
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as file:
+            for line in file:
+                if line.startswith("model name"):
+                    return line.partition(":")[2].strip()
+    except OSError:
+        pass  # not on this system
+    return platform.processor()

@@ -1,0 +1,52 @@
+"""Runs as earlier versions saved them: chunks with checksums of HDF5, names of settings that were changed since."""
+
+import json
+
+import h5py
+import numpy as np
+
+
+def old_settings(settings):
+    """Settings under the names that they had."""
+    old = json.loads(json.dumps(settings))
+    old["flights"]["most_steps"] = old["flights"].pop("max_steps")
+    old["watch"]["share_bound"] = old["watch"].pop("fraction_bound")
+    assert old["rule"] == {"name": "Robin", "tolerance": 1e-5, "window": 8}
+    old["rule"] = "Robin"
+    assert old["law"] == {"name": "Extremal"}
+    old["law"] = {"name": "Extremal", "repr": "Extremal()"}
+    return old
+
+
+def make_old(path, rows=4096):
+    """Rewrite the file of a run, or of a state, as an earlier version would have written it."""
+    items = {}
+
+    def note(name, item):
+        items[name] = (item[()] if isinstance(item, h5py.Dataset) else None, list(texts_and_numbers(item)))
+
+    with h5py.File(path, "r") as file:
+        note("/", file)
+        file.visititems(note)
+    with h5py.File(path, "w") as file:
+        for name, (values, attributes) in items.items():
+            if values is None:
+                item = file.require_group(name)
+            else:
+                chunks = (min(len(values), rows), *values.shape[1:]) if values.size else None
+                item = file.create_dataset(name, data=values, chunks=chunks, fletcher32=chunks is not None)
+            for key, value in attributes:
+                if key == "settings":
+                    value = json.dumps(old_settings(json.loads(value))).encode()
+                if key == "provenance":
+                    value = json.dumps({k: v for k, v in json.loads(value).items() if k != "systems"}).encode()
+                if isinstance(value, bytes):
+                    item.attrs.create(key, value, dtype=h5py.string_dtype("utf-8", max(1, len(value))))
+                else:
+                    item.attrs[key] = value
+
+
+def texts_and_numbers(item):
+    for key, value in item.attrs.items():
+        if key != "checksums":
+            yield key, bytes(value) if isinstance(value, np.bytes_) else value

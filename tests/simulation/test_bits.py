@@ -1,0 +1,67 @@
+"""A run has the same bits on every processor, with every BLAS, and with every choice that NumPy and the C library make.
+
+The fingerprint below is that of the machine it was first computed on. It changes when the model changes, never otherwise.
+"""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import apt_evap as ae
+
+FINGERPRINT = "a5954cb09c169c5a20ec43b766af4c93e432459674bc02dc815433a8100670eb"
+PROGRAM = """
+import warnings
+
+import apt_evap as ae
+
+warnings.simplefilter("ignore")
+nickel = ae.material("Ni")
+tip = ae.Tip(
+    nickel, 5 * nickel.a, (1, 2, 3), solutes={"Al": 0.1}, seed=3, offset_seed=4, shank_angle=2.3, rotation=17.0
+)
+flown = ae.LateralVelocity(ae.TruncatedNormal(0.3, 0.2)), ae.Combined(ae.Thermal(300.0), 0.4)
+simulation = ae.Simulation(tip, seed=2, detector=ae.Detector(100.0, 300.0, "equidistant"))
+print(simulation.run(80, emissions=flown, progress=False).fingerprint())
+"""
+
+
+def numpy_dispatch():
+    """Features of this processor that NumPy chooses functions by."""
+    from numpy._core._multiarray_umath import __cpu_dispatch__, __cpu_features__
+
+    return " ".join(name for name in __cpu_dispatch__ if __cpu_features__.get(name))
+
+
+@pytest.mark.parametrize(
+    "variant",
+    [
+        {},
+        {"OPENBLAS_CORETYPE": "Nehalem"},
+        {"OPENBLAS_CORETYPE": "Haswell"},
+        {"NPY_DISABLE_CPU_FEATURES": "all"},
+        {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX,-AVX2,-FMA,-FMA4,-AVX512F"},
+    ],
+    ids=lambda variant: "".join(variant) or "as it is",
+)
+def test_a_run_has_the_same_bits_everywhere(variant):
+    if "NPY_DISABLE_CPU_FEATURES" in variant:
+        if np.lib.NumpyVersion(np.__version__) < "2.0.0":
+            pytest.skip("needs NumPy 2")
+        variant = {"NPY_DISABLE_CPU_FEATURES": numpy_dispatch()}
+    environment = os.environ | variant | {"PYTHONPATH": str(Path(ae.__file__).parents[1])}
+    done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True, env=environment)
+    assert done.stdout.strip() == FINGERPRINT
+
+
+def test_fingerprints_tell_runs_apart(small_tip, tmp_path):
+    run = ae.Simulation(small_tip, seed=1).run(20, progress=False)
+    run.save(tmp_path / "a.h5")
+    assert ae.load(tmp_path / "a.h5").fingerprint() == run.fingerprint()
+    assert ae.Simulation(small_tip, seed=1).run(19, progress=False).fingerprint() != run.fingerprint()
+    run.charges[3] = np.nextafter(run.charges[3], 2.0)
+    assert run.fingerprint() != ae.load(tmp_path / "a.h5").fingerprint()

@@ -1,0 +1,193 @@
+"""Damage run and state files at random, load each, and compare what comes back value by value.
+
+python tools/fuzz_runs.py [--mutants 20000] [--seed 1] [--processes 2] [--run RUN.h5] [--state STATE.h5]
+
+Each mutant is loaded in a child process. It must come back as the original or be refused by a FileError. Those whose
+checksums were made again after the damage are told apart: nothing can notice their damage for certain, but it should
+end in a FileError or in other values, and in no crash. Files of your own, such as those of an earlier version without
+checksums, take the place of the two that are made here. Exit code 1 if a mutant with the checksums of the original is
+silently wrong, hangs, or ends in a crash or in another error.
+"""
+
+import argparse
+import hashlib
+import io
+import json
+import multiprocessing
+import os
+import resource
+import signal
+import sys
+import tempfile
+import time
+from collections import Counter
+from dataclasses import fields, is_dataclass
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+
+import apt_evap as ae
+from apt_evap.simulation import checked_hdf5
+from apt_evap.simulation.run_hdf5 import count_ions, is_run, read_state, write_state
+
+KINDS = ("flipped bits", "zeroed range", "random range", "truncation", "insertion", "deletion")
+GOOD = ("as the original", "FileError")
+SECONDS, MEMORY = 20, 6 << 30  # of one mutant
+
+
+def make_files(folder):
+    """A run with all that a file may hold, and the state it ends in."""
+    tip = ae.Tip("Ni", apex_radius=1.8, axis=(1, 1, 1), shank_length=1.8, depth=1.2, solutes={"Al": 0.1}, seed=1)
+    settings, watch = ae.ChargeSettings(sweep_interval=20), ae.WatchSettings(interval=20)
+    simulation = ae.Simulation(tip, seed=1, n_threads=1, charge_settings=settings, watch_settings=watch)
+    run = simulation.run(60, [ae.RollUp(0.2), ae.Unperturbed()], progress=False)
+    run.save(folder / "run.h5")
+    write_state(folder / "state.h5", run.state, run.first_event)
+    return folder / "run.h5", folder / "state.h5"
+
+
+def values_of(thing):
+    """All values of an object, as nested lists of what can be compared."""
+    if isinstance(thing, np.ndarray):
+        return [thing.dtype.str, thing.shape, hashlib.sha256(np.ascontiguousarray(thing).tobytes()).hexdigest()]
+    if is_dataclass(thing) and not isinstance(thing, type):
+        return [type(thing).__name__, *(values_of(getattr(thing, item.name)) for item in fields(thing))]
+    if isinstance(thing, dict):
+        return [[key, values_of(value)] for key, value in sorted(thing.items())]
+    if isinstance(thing, list | tuple):
+        return [values_of(each) for each in thing]
+    return repr(thing)
+
+
+def load_run(path):
+    """Read a run in every way that there is."""
+    is_run(path), count_ions(path)
+    return ae.load(path)
+
+
+def mutant(content, random):
+    """Damaged content, and the kind of the damage."""
+    kind = KINDS[int(random.integers(len(KINDS)))]
+    n = len(content)
+    place = int(random.integers(n))
+    length = int(random.integers(1, 2 ** int(random.integers(1, 11))))
+    damaged, after = bytearray(content), content[place + length :]
+    if kind == "flipped bits":
+        for at in (place, *random.integers(n, size=int(random.integers(3)))):
+            damaged[at] ^= 1 << int(random.integers(8))
+    elif kind == "zeroed range":
+        damaged[place : place + length] = bytes(n - place - len(after))
+    elif kind == "random range":
+        damaged[place : place + length] = random.bytes(n - place - len(after))
+    elif kind == "truncation":
+        del damaged[place:]
+    elif kind == "insertion":
+        damaged[place:place] = random.bytes(length)
+    else:
+        del damaged[place : place + length]
+    return bytes(damaged), kind
+
+
+def sealed(content, blocks):
+    """An HDF5 file with checksums that fit it."""
+    end = blocks["begin"] + blocks["size"]
+    file = io.BytesIO(content)
+    checked_hdf5._append_sums(file, blocks[end <= len(content)].copy())
+    return file.getvalue()
+
+
+def split(content):
+    """An HDF5 file without its checksums, and the blocks that these are of; none of a file of an earlier version."""
+    if (tail := checked_hdf5._tail(io.BytesIO(content), len(content))) is None:
+        return content, np.empty(0, checked_hdf5._BLOCK)
+    _, size, n = tail
+    return content[:size], np.frombuffer(content[size:], checked_hdf5._BLOCK, n)
+
+
+def outcome_of(path, load, original):
+    """How reading a mutant ends."""
+    try:
+        return GOOD[0] if values_of(load(path)) == original else "silently other values"
+    except ae.FileError:
+        return GOOD[1]
+    except Exception as error:
+        return f"{type(error).__name__}: {error!s:.60}"
+
+
+def try_some(numbers, seed, content, load, original, seal, folder):
+    """Outcomes of some mutants; a child that dies takes one with it, and another child goes on behind that."""
+    inner, blocks = split(content)
+    path, done = Path(folder) / f"{os.getpid()}.h5", []
+    while len(done) < len(numbers):
+        reader, writer = os.pipe()
+        child = os.fork()
+        if child == 0:
+            resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+            signal.signal(signal.SIGALRM, signal.SIG_DFL)
+            with os.fdopen(writer, "w") as told:
+                for number in numbers[len(done) :]:
+                    signal.alarm(SECONDS)
+                    damaged, kind = mutant(inner if seal else content, np.random.default_rng([seed, number]))
+                    path.write_bytes(sealed(damaged, blocks) if seal else damaged)
+                    print(json.dumps([kind, None]), file=told, flush=True)
+                    print(json.dumps([kind, outcome_of(path, load, original)]), file=told, flush=True)
+            os._exit(0)
+        os.close(writer)
+        with os.fdopen(reader) as told:
+            lines = [json.loads(line) for line in told if line.endswith("\n")]
+        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        done += [(kind, outcome) for kind, outcome in lines if outcome is not None]
+        if status and len(done) < len(numbers):
+            how = "hangs" if status == -signal.SIGALRM else f"crash ({signal.Signals(-status).name})"
+            done.append((lines[-1][0] if lines else "?", how))
+    return list(zip(numbers, done, strict=True))
+
+
+def fuzz(name, path, load, options, seal, folder):
+    """Try all mutants of a file; return whether all ended well."""
+    original = values_of(load(path))
+    content, began = path.read_bytes(), time.perf_counter()
+    numbers = [list(range(k, options.mutants, 50 * options.processes)) for k in range(50 * options.processes)]
+    same = (options.seed, content, load, original, seal, folder)
+    context = multiprocessing.get_context("fork")
+    with context.Pool(options.processes) as pool:
+        parts = pool.starmap(try_some, [(part, *same) for part in numbers if part], chunksize=1)
+    counts, firsts = Counter(), {}
+    for number, (kind, outcome) in sorted(chain.from_iterable(parts)):
+        counts[kind, outcome] += 1
+        firsts.setdefault(outcome, number)
+    seconds = time.perf_counter() - began
+    how = "checksums made again" if seal else "as damaged"
+    print(f"{name} ({len(content):,} bytes), {how}: {options.mutants:,} mutants in {seconds:.0f} s")
+    for outcome in sorted(firsts):
+        by_kind = ", ".join(f"{kind} {counts[kind, outcome]:,}" for kind in KINDS if counts[kind, outcome])
+        total = sum(counts[kind, outcome] for kind in (*KINDS, "?"))
+        first = "" if outcome in GOOD else f"; the first is number {firsts[outcome]}"
+        print(f"  {outcome}: {total:,} ({by_kind}){first}")
+    return set(firsts) <= set(GOOD)
+
+
+def main():
+    """Damage the files as often as the command line says."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--mutants", type=int, default=1000, help="of each file, and as many with new checksums")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--run", type=Path, help="a run file instead of the one that is made here")
+    parser.add_argument("--state", type=Path, help="a state file instead of the one that is made here")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        run, state = make_files(Path(folder))
+        files = ("run file", options.run or run, load_run), ("state file", options.state or state, read_state)
+        well = True
+        for name, path, load in files:
+            well &= fuzz(name, path, load, options, False, folder)
+            if checked_hdf5.has_checksums(path):
+                fuzz(name, path, load, options, True, folder)
+    sys.exit(not well)
+
+
+if __name__ == "__main__":
+    main()
