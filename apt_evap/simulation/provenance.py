@@ -1,7 +1,7 @@
 """Where a run was computed: version, time, libraries and the kind of processor.
 
-None of it is a setting: a run may be resumed elsewhere, with the same bits. The record is there to find the reason if they
-should ever differ.
+None of it is a setting: a run may be resumed elsewhere, with the same bits. The record helps to find the reason if
+they should ever differ.
 """
 
 import datetime

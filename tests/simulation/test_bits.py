@@ -1,6 +1,6 @@
 """A run has the same bits on every processor, with every BLAS, and with every choice that NumPy and the C library make.
 
-The fingerprint below is that of the machine it was first computed on. It changes when the model changes, never otherwise.
+The fingerprint below was first computed on one machine. It changes when the model changes, never otherwise.
 """
 
 import os
