@@ -118,7 +118,7 @@ for name, number in (("Al lateral", 5), ("Ni roll-up", 6)):
     )
     ae.plot.side_by_side(study, titles=titles)[0].figure.savefig(options.output / f"figure{number}.png")
 
-print("\n| study | best | between points, 95 % | SSIM | unperturbed | thermal | SSIM, noise and all | two halves |")
+print("\n| study | best | between points, 95 % | SSIM | unperturbed | thermal | uncorrected SSIM | two halves |")
 print("|---|---|---|---|---|---|---|---|")
 for name, study in studies.items():
     best, refined = study.optimum, study.refined

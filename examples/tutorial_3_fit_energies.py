@@ -96,7 +96,7 @@ ae.plot.ssim_matrix(study)[0].figure.savefig("ssim.png")
 found = study.refined
 print(f"mean of the energies {found.bounded('true_mean')} eV, hidden {hidden.energy.true_mean:.3g} eV")
 print(f"better than unperturbed by {study.gain}, in {study.gain_share:.0%} of the resamples")
-print(f"SSIM {study.optimum.score}; noise and all {study.plain['optimum']}, two halves {study.ceiling}")
+print(f"SSIM {study.optimum.score}; uncorrected {study.plain['optimum']}, two halves {study.ceiling}")
 
 # %%
 # The maps, as they are compared, and their middle magnified.

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from apt_evap._common.validation import check_count, check_kind, check_number, check_sequence, shown
+from apt_evap._common.validation import check_count, check_kind, check_number, check_sequence, short_text
 from apt_evap.config.perturbation_text import read_perturbation, title_of
 from apt_evap.config.tables import check_keys, check_table
 from apt_evap.detection.detector import Detector
@@ -36,7 +36,7 @@ class Panel:
     def __post_init__(self):
         check_kind(self.perturbation, "perturbation", "launch", "a perturbation with a method launch")
         if not isinstance(self.title, str) or not all(part.isprintable() for part in self.title.split("\n")):
-            raise ValueError(f"title must be printable text, got {shown(self.title)}")
+            raise ValueError(f"title must be printable text, got {short_text(self.title)}")
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def read_maps(table: Mapping[str, Any]) -> MapSettings:
         usual = (Unperturbed(), RollUp(TruncatedNormal(0.155, 0.155)))
         return MapSettings(tuple(Panel(title_of(each), each) for each in usual), bins, smoothing)
     if not isinstance(table["panels"], list) or not table["panels"]:
-        raise ValueError(f"panels must be a list of tables such as [[maps.panels]], got {shown(table['panels'])}")
+        raise ValueError(f"panels must be a list of tables such as [[maps.panels]], got {short_text(table['panels'])}")
     panels = []
     for number, entry in enumerate(table["panels"], start=1):
         try:

@@ -4,7 +4,7 @@ import tomllib
 from collections.abc import Mapping
 from typing import Any
 
-from apt_evap._common.validation import shown
+from apt_evap._common.validation import short_text
 from apt_evap.config.tables import check_table
 from apt_evap.emission.energies import Fixed, Thermal, TruncatedNormal
 from apt_evap.emission.perturbations import Perturbation, from_dict
@@ -38,10 +38,10 @@ def read_perturbation(settings: str | Mapping[str, Any]) -> Perturbation:
     check_table(settings, "perturbation")
     for table in (settings, *settings.values()):
         if isinstance(table, Mapping) and not isinstance(table.get("name"), str):
-            raise ValueError(f"a perturbation or distribution must have a name, got {shown(dict(table))}")
+            raise ValueError(f"a perturbation or distribution must have a name, got {short_text(dict(table))}")
     perturbation = from_dict(settings)
     if not callable(getattr(perturbation, "launch", None)):
-        raise ValueError(f"perturbation must be one, such as Unperturbed or RollUp, got {shown(dict(settings))}")
+        raise ValueError(f"perturbation must be one, such as Unperturbed or RollUp, got {short_text(dict(settings))}")
     return perturbation
 
 

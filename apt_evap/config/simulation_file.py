@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 from apt_evap._common.files import FileError, open_for_reading
-from apt_evap._common.validation import check_count, check_kind, check_number, check_seed, check_switch, shown
+from apt_evap._common.validation import check_count, check_kind, check_number, check_seed, check_switch, short_text
 from apt_evap.config.map_panels import MapSettings, read_maps
 from apt_evap.config.tables import check_keys, check_table
 from apt_evap.detection.detector import Detector
@@ -94,7 +94,7 @@ class Config:
         check_voltage(self.voltage)
         check_seed(self.seed)
         if self.output is not None and not (isinstance(self.output, str) and self.output):
-            raise ValueError(f"output must be a file name such as 'run.h5', got {shown(self.output)}")
+            raise ValueError(f"output must be a file name such as 'run.h5', got {short_text(self.output)}")
         self.maps.check_detector(self.detector)
 
     def __repr__(self) -> str:
@@ -185,7 +185,7 @@ def read_config(path: str | Path) -> Config:
             check_table(document.get(name, {}), f"[{name}]")
         output = document.get("output")
         if output is not None and not (isinstance(output, str) and output):
-            raise ValueError(f"output must be a file name such as 'run.h5', got {shown(output)}")
+            raise ValueError(f"output must be a file name such as 'run.h5', got {short_text(output)}")
     with _place(path, "tip"):
         tip = _tip(document["tip"])
     with _place(path, "simulation"):
@@ -196,7 +196,7 @@ def read_config(path: str | Path) -> Config:
         seed = check_seed(simulation.get("seed", 0))
         responses = simulation.get("responses", True)
         if not isinstance(responses, bool):
-            raise ValueError(f"responses must be true or false, got {shown(responses)}")
+            raise ValueError(f"responses must be true or false, got {short_text(responses)}")
     made = []
     for name, kind, known in (
         ("detector", Detector, _field_names(Detector)),
@@ -230,7 +230,7 @@ def _tip(table):
     elif isinstance(host, str):
         host = material(host)
     else:
-        raise ValueError(f"material must be a name such as 'Ni' or a table, got {shown(host)}")
+        raise ValueError(f"material must be a name such as 'Ni' or a table, got {short_text(host)}")
     settings = dict(table, material=host)
     for name in ("apex_radius", "shank_length", "depth"):
         if name in settings:
@@ -250,7 +250,9 @@ def _length(value, name, a):
     try:
         return float(found[1]) * (a if found[2] == "a" else 1.0)
     except (TypeError, ValueError):
-        raise ValueError(f"{name} must be a number [nm] or text such as '20 a' or '7 nm', got {shown(value)}") from None
+        raise ValueError(
+            f"{name} must be a number [nm] or text such as '20 a' or '7 nm', got {short_text(value)}"
+        ) from None
 
 
 def _field_names(kind):

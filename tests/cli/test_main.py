@@ -257,8 +257,8 @@ def test_wrong_configs_are_one_sentence(folder, made, capsys):
         return failed(capsys, "run", "wrong.toml")
 
     assert "'wrong.toml', [tip]: no key is named 'apex' (did you mean 'apex_radius'?)" in wrong("apex_radius", "apex")
-    assert "'wrong.toml', [tip]: apex_radius must be a finite number [nm] at least" in wrong("6 a", "1 a")
-    assert "'wrong.toml', [simulation]: ions must be a whole number of at least 1, got 'many'" in wrong("60", '"many"')
+    assert "'wrong.toml', [tip]: apex_radius must be a finite number [nm] >=" in wrong("6 a", "1 a")
+    assert "'wrong.toml', [simulation]: ions must be an integer >= 1, got 'many'" in wrong("60", '"many"')
     assert "GB are free; give a depth" in wrong("6 a", "90000 a")
     assert "'wrong.toml' is not a TOML file" in wrong("=", ":")
     assert "cannot read 'none.toml'" in failed(capsys, "run", "none.toml")
@@ -462,9 +462,7 @@ def test_map_errors(measured, made, capsys):
     assert "RollUp needs energy, got no parameters; an example is RollUp:0.155,0.155" in failed(
         capsys, "map", made, "--perturbation", "RollUp"
     )
-    assert "argument --bins: must be a whole number from 1 to 16384, got '0'" in failed(
-        capsys, "map", made, "--bins", "0"
-    )
+    assert "argument --bins: must be an integer from 1 to 16384, got '0'" in failed(capsys, "map", made, "--bins", "0")
     assert "argument --smooth: must be a number [mm] of at least 0, got 'nan'" in failed(
         capsys, "map", made, "--smooth", "nan"
     )
@@ -640,8 +638,8 @@ def test_a_selection_by_a_missing_column_is_refused(folder, capsys):
         (["fly"], "invalid choice: 'fly'"),
         (["mpa"], "invalid choice: 'mpa' (did you mean 'map'?)"),
         (["run"], "the following arguments are required: CONFIG.toml (see apt-evap run --help)"),
-        (["run", "small.toml", "--ions", "0"], "argument --ions: must be a whole number of at least 1, got '0'"),
-        (["run", "small.toml", "--threads", "x"], "argument --threads: must be a whole number of at least 1, got 'x'"),
+        (["run", "small.toml", "--ions", "0"], "argument --ions: must be an integer >= 1, got '0'"),
+        (["run", "small.toml", "--threads", "x"], "argument --threads: must be an integer >= 1, got 'x'"),
         (["run", "small.toml", "--colour"], "unrecognized arguments: --colour (see apt-evap run --help)"),
         (["info", "a.epos", "--byte-order", "up"], "argument --byte-order: invalid choice: 'up'"),
     ],
@@ -683,13 +681,13 @@ def test_a_reader_of_the_output_may_leave(made):
 
 def test_maps_that_cannot_be_drawn_are_told_before_the_simulation(folder, capsys):
     (folder / "broad.toml").write_text(SMALL + "[maps]\nsmoothing = 500.0\n")
-    assert "'broad.toml', [maps]: smoothing must be a finite number [mm] at most 300 (the width of the detector)" in (
+    assert "'broad.toml', [maps]: smoothing must be a finite number [mm] <= 300 (the width of the detector)" in (
         failed(capsys, "run", "broad.toml")
     )
 
 
 def test_a_smoothing_broader_than_the_detector(made, folder, capsys):
-    assert "smoothing must be a finite number [mm] at most 300 (the width of the detector), got 400.0" in failed(
+    assert "smoothing must be a finite number [mm] <= 300 (the width of the detector), got 400.0" in failed(
         capsys, "map", made, "--smooth", "400"
     )
 
