@@ -1,4 +1,4 @@
-"""Tables of a TOML file: their keys are checked."""
+"""Validation of tables of a TOML file."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -7,13 +7,13 @@ from apt_evap._common.validation import did_you_mean, short_text
 
 
 def check_table(value: Any, name: str) -> None:
-    """Refuse what is not a table (ValueError)."""
+    """Raise a ValueError if `value` is not a table."""
     if not isinstance(value, Mapping):
         raise ValueError(f"{name} must be a table, got {short_text(value)}")
 
 
 def check_keys(table: Mapping[str, Any], known: tuple[str, ...], needed: tuple[str, ...] = ()) -> None:
-    """Refuse unknown keys, and tables that lack a needed one (ValueError)."""
+    """Raise a ValueError for an unknown or missing key."""
     for key in table:
         if key not in known:
             raise ValueError(
@@ -21,4 +21,4 @@ def check_keys(table: Mapping[str, Any], known: tuple[str, ...], needed: tuple[s
             )
     for key in needed:
         if key not in table:
-            raise ValueError(f"{key} is missing; needed are {', '.join(needed)}")
+            raise ValueError(f"{key} is missing; required are {', '.join(needed)}")

@@ -128,5 +128,5 @@ def test_maps_that_cannot_be_compared():
         half_ceiling(small)
     with pytest.raises(ValueError, match="data_range"):
         ssim(a, a, data_range=0)
-    with pytest.raises(ValueError, match="takes no bins"):
+    with pytest.raises(ValueError, match="options bins are for hits"):
         half_ceiling(a, bins=5)

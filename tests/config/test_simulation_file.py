@@ -359,7 +359,7 @@ def test_a_config_made_in_python_is_checked(change, sentence):
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        ({"panels": ()}, "panels must hold at least one Panel, got none"),
+        ({"panels": ()}, "panels must contain at least one Panel, got none"),
         ({"panels": ("RollUp:0.1",)}, "panels must be Panels, got 'RollUp:0.1'"),
         ({"panels": None}, "panels must be a sequence of Panels, got None"),
         ({"bins": 0}, "bins must be an integer"),

@@ -235,7 +235,7 @@ def test_bad_arguments_are_named():
         ),
         (lambda: Hits(x=[1.0] * 3, y=[2.0] * 3).map(), r"all 3 ions lie at \(1, 2\) mm"),
         (lambda: hits.map(extent=(1, 1, 2, 2)), "with a non-zero size"),
-        (lambda: Hits(x=[np.nan], y=[1.0], source="f").map(), "f has none of 1"),
+        (lambda: Hits(x=[np.nan], y=[1.0], source="f").map(), "got none of 1 in f"),
         (lambda: hits.map().smoothed(-1), "sigma must be"),
         (
             lambda: DetectorMap.from_array(np.ones((3, 3)), even, uneven),
@@ -243,7 +243,7 @@ def test_bad_arguments_are_named():
         ),
         (lambda: DetectorMap.from_array(np.ones((3, 2)), even, even), "x_edges must have shape"),
         (lambda: DetectorMap.from_array(-np.ones((3, 3)), even, even), "values of a map must be >= 0, got -1"),
-        (lambda: DetectorMap.from_array(np.full((3, 3), np.nan), even, even), "mask must leave"),
+        (lambda: DetectorMap.from_array(np.full((3, 3), np.nan), even, even), "mask must contain"),
     ]
     for call, message in cases:
         with pytest.raises(ValueError, match=message):
@@ -260,7 +260,7 @@ def test_pictures_share_a_scale_and_state_what_they_show(tmp_path):
     assert len({ax.images[0].get_clim() for ax in axes}) == 1
     low, high = plot.color_limits(map)
     assert low < 1 < high and "smoothed by 1 mm" in plot.describe(map.smoothed(1.0))
-    with pytest.raises(ValueError, match="a title for each"):
+    with pytest.raises(ValueError, match="one title per map"):
         plot.detector_maps([map], ["a", "b"])
 
 
