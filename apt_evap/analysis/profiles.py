@@ -163,8 +163,7 @@ def zone_line_profile(
         Hits, which should fill the complete rectangle; for a map, only bins inside the detector count.
     rectangles : Rectangle or sequence of Rectangle
         Position and direction of the line. The profiles of several rectangles, along symmetry-equivalent lines, are
-        added;
-         they must have the same width.
+        added; they must have the same width.
     bins : int
         Number of strips of equal width along the line. For a map they should be wider than its bins.
 

@@ -131,8 +131,7 @@ def ssim(map_a: DetectorMap, map_b: DetectorMap, *, smoothing: float = 0.0, data
         Standard deviation of a Gaussian [mm]; noise reduces the similarity of unsmoothed maps.
     data_range : float
         Range of densities, relative to their mean, in the constants of the similarity. It is fixed, not taken from the
-        data, so
-         that values of different pairs can be compared.
+        data, so that values of different pairs can be compared.
 
     Returns
     -------

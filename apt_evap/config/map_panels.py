@@ -93,9 +93,8 @@ def read_maps(table: Mapping[str, Any]) -> MapSettings:
     ----------
     table : mapping
         bins, smoothing [mm] and panels (a list of tables with a perturbation and a title), all optional. The default
-        panels are
-         one without perturbation, and one of a roll-up with the energies of Shaikh et al. (arXiv 2509.13744) for
-         nickel, 0.155 eV and 0.155 eV.
+        panels are one without perturbation, and one of a roll-up with the energies of Shaikh et al. (arXiv 2509.13744)
+        for nickel, 0.155 eV and 0.155 eV.
 
     Returns
     -------

@@ -69,8 +69,7 @@ def fit_energies(
         Mechanism of emission: `RollUp`, `LateralVelocity` or `Combined`.
     means, rsds : sequence of float
         Means of the truncated normal distributions [eV], and standard deviations relative to the means; by default
-        those of the
-         paper.
+        those of the paper.
     rollup_fractions : sequence of float, optional
         Roll-up fractions for "combined"; by default those of the paper.
     registration : Registration, optional

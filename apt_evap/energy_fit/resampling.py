@@ -84,8 +84,7 @@ class Sampler:
             Shape (1 + resamples, ny, nx).
         noise : ndarray or None
             Sum of the draws with weights of sum 0 and mean square 1: it has the same noise as the sum of the draws, but
-            no signal;
-             shape (ny, nx). None for a single draw.
+            no signal; shape (ny, nx). None for a single draw.
         """
         size = int(np.prod(self.shape))
         draws = [self._cells(perturbation, replica) for replica in range(replicas)]

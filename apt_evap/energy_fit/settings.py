@@ -16,14 +16,12 @@ class StudySettings:
         Standard deviation of the Gaussian that smooths both maps [mm]; 0 for none.
     flattening : float, optional
         Standard deviation of the Gaussian that flattens both maps [mm]; 0 for none. None until it follows from the area
-        of the
-         compared region.
+        of the compared region.
     data_range : float
         Range of densities, as for `ssim`.
     allow_noise : bool
         Whether the similarity is corrected for noise: the Poisson noise of measured counts, and the noise of the random
-        draws
-         of simulated ions.
+        draws of simulated ions.
     replicas : int
         Number of draws of energy and direction per ion, which are summed.
     resamples : int

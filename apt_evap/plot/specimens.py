@@ -39,14 +39,12 @@ def specimen(
         Where to draw; a new figure by default.
     elevation, azimuth : float
         Position of the viewer [degrees]: above the x-y plane, and around z from x towards y. By default above the apex,
-        with x
-         to the right and y upwards; 25 and -60 give a side view.
+        with x to the right and y upwards; 25 and -60 give a side view.
     label : str, optional
         Quantity of the colours, with its unit, if `color` is an array.
     limits : tuple of float, optional
         Values at the ends of the colour scale; by default the 1 and 99.5 percentiles of the visible evaporable atoms,
-        without the
-         rim of the base.
+        without the rim of the base.
     colormap : str
         Name of a colour map of matplotlib.
     colorbar : bool

@@ -20,8 +20,7 @@ def ssim_matrix(study: Study, axes: Sequence[Axes] | None = None, *, colormap: s
     """Draw the similarity with the measured map against mean and relative standard deviation of the energy.
 
     A frame marks the best point of the grid. A circle marks the maximum between points, with the interval of 95 % of
-    the
-     resamples. A new figure has a legend.
+    the resamples. A new figure has a legend.
 
     Parameters
     ----------

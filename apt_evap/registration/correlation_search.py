@@ -132,8 +132,7 @@ def correlate(moving: Any, fixed: Any, size: int) -> tuple[Floats, Floats]:
     -------
     coefficients, shared : ndarray, shape (size, size)
         For every shift of the first image in y and x, the correlation coefficient and the number of common pixels;
-        negative
-         shifts count from the end.
+        negative shifts count from the end.
 
     Notes
     -----

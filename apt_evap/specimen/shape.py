@@ -15,9 +15,9 @@ _LONGEST = 1e7  # [nm]: 1 cm is larger than any tip, and volumes keep their prec
 class TaperedCap:
     """A spherical cap on a shank that widens downwards.
 
-    The convex hull of two spheres, tangent everywhere: the cap of radius R around the origin, its apex at
-    z = R, and the foot of radius R + L sin(alpha) around z = -L. Between them is the cone
-    rho cos(alpha) + z sin(alpha) = R. With ``base="flat"`` this cone continues to z = -L and is cut there.
+    The convex hull of two spheres, tangent everywhere: the cap of radius R around the origin, its apex at z = R, and
+    the foot of radius R + L sin(alpha) around z = -L. Between them is the cone rho cos(alpha) + z sin(alpha) = R. With
+    ``base="flat"`` this cone continues to z = -L and is cut there.
 
     Parameters
     ----------
