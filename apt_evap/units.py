@@ -25,7 +25,7 @@ SPEED = math.sqrt(2 * ELEMENTARY_CHARGE / DALTON)
 """Speed [nm/ns] of 1 Da at 1 eV: v = SPEED * sqrt(energy / mass), 13891 nm/ns."""
 
 FLIGHT_TIME = math.sqrt(2.0) / SPEED
-"""[ns sqrt(V) / nm / sqrt(Da)]: turns the reduced time of a flight (m = charge state = e = 1) into ns."""
+"""[ns sqrt(V) / nm / sqrt(Da)]: converts the reduced time of a flight (m = charge state = e = 1) to ns."""
 
 
 def speed_from_energy(energy: Floats | float, mass: Floats | float) -> Floats:

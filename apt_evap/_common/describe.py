@@ -1,4 +1,4 @@
-"""What a file says of a law, a rule or a perturbation: its name and parameters in plain types."""
+"""Description of a law, a rule or a perturbation in a file: its name and parameters in plain types."""
 
 from dataclasses import fields, is_dataclass
 from typing import Any
@@ -12,13 +12,13 @@ def describe(thing: Any) -> dict[str, Any]:
     Parameters
     ----------
     thing : object
-        Its parameters are what its method ``settings`` returns, the fields of a dataclass, or else its attributes
+        Its parameters are the result of its method ``settings``, the fields of a dataclass, or else its attributes
         without a leading underscore.
 
     Returns
     -------
     dict
-        "name", the name of its class, and its parameters.
+        The name of its class under "name", and its parameters.
     """
     return {"name": type(thing).__name__, **{name: _plain(value) for name, value in _parameters(thing).items()}}
 
@@ -42,6 +42,6 @@ def _plain(value):
         return {str(key): _plain(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(each) for each in value]
-    if callable(value) and hasattr(value, "__qualname__"):  # a function has no parameters that could be kept
+    if callable(value) and hasattr(value, "__qualname__"):  # a function has no parameters to store
         return f"{value.__module__}.{value.__qualname__}"
     return describe(value)

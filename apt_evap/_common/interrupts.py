@@ -1,4 +1,4 @@
-"""What Ctrl-C does to the main thread."""
+"""Handling of Ctrl-C in the main thread."""
 
 import signal
 import threading
@@ -8,36 +8,36 @@ from contextlib import contextmanager
 
 @contextmanager
 def interruptible() -> Iterator[threading.Event]:
-    """Turn the first Ctrl-C into a flag, so that the batch under way is kept; the second one interrupts."""
+    """Set a flag at the first Ctrl-C, so that the current batch is completed; the second one interrupts."""
     flag = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield flag
         return
 
-    def note(number, frame):
+    def set_flag(number, frame):
         flag.set()
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, previous)
 
-    before = signal.signal(signal.SIGINT, note)
+    previous = signal.signal(signal.SIGINT, set_flag)
     try:
         yield flag
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, previous)
 
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Let Ctrl-C wait until what is under way, such as putting files in order, is done."""
+    """Delay Ctrl-C until the block, such as the replacement of a file, is complete."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    came = []
-    before = signal.signal(signal.SIGINT, lambda *arguments: came.append(arguments))
+    calls = []
+    previous = signal.signal(signal.SIGINT, lambda *arguments: calls.append(arguments))
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
-        for arguments in came:
-            handler = signal.getsignal(signal.SIGINT)  # the first one may have changed it
+        signal.signal(signal.SIGINT, previous)
+        for arguments in calls:
+            handler = signal.getsignal(signal.SIGINT)  # the first call may have changed it
             if callable(handler):
                 handler(*arguments)

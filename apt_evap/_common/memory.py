@@ -1,16 +1,17 @@
-"""Whether a specimen fits into the memory."""
+"""Memory that a specimen needs."""
 
 from apt_evap._common.wording import argument
 
-# Peaks of building a specimen, charging it and flying 300 ions, of 18 specimens of five lattices with 0.4 to 28 million
-# atoms, whole or a shell: within 15 % of what the first two say. The third is 150 to 215, by 1 to 8 threads.
+# Measured: the peak memory to build and charge a specimen and fly 300 ions agrees within 15 % with the first two
+# numbers, for 18 specimens (five lattices, 0.4 to 28 million atoms, complete or a shell). The third number is 150 to
+# 215 for 1 to 8 threads.
 _BYTES_PER_ATOM = 81
 _BYTES_PER_SURFACE_ATOM = 577
 _BYTES_PER_COPIED_ATOM = 180
 
 
 def _available_memory():
-    """Free memory [bytes], or None where the system does not say (other than Linux)."""
+    """Free memory [bytes], or None if the system does not report it (other than Linux)."""
     try:
         with open("/proc/meminfo") as lines:
             return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable"))
@@ -19,36 +20,36 @@ def _available_memory():
 
 
 def needed_memory(atoms: float, surface_atoms: float) -> float:
-    """Most memory [bytes] that a specimen and its charges take, from how many atoms it has and has on the surface."""
+    """Peak memory [bytes] of a specimen and its charges, from its numbers of atoms and of surface atoms."""
     return _BYTES_PER_ATOM * atoms + _BYTES_PER_SURFACE_ATOM * surface_atoms
 
 
 def check_memory(atoms: float, surface_atoms: float) -> None:
-    """Refuse a specimen that, with its charges, does not fit into the memory that is free.
+    """Check that a specimen and its charges fit into the free memory.
 
     Parameters
     ----------
     atoms, surface_atoms : float
-        Atoms to hold, and how many of them are on the surface, approximately.
+        Approximate number of atoms, and of surface atoms among them.
 
     Raises
     ------
     ValueError
-        Naming what is needed and what is free.
+        If they do not fit; the message names the needed and the free memory.
     """
     _check(
         needed_memory(atoms, surface_atoms),
         f"a tip of {atoms:.2g} atoms",
-        "give a depth, to hold only the atoms near the surface, a smaller apex_radius or a shorter shank_length",
+        "give a depth (keeps only the atoms near the surface), a smaller apex_radius or a shorter shank_length",
     )
 
 
 def check_copies(surface_atoms: float, n_threads: int) -> None:
-    """Refuse more threads than there is memory for, each with a copy of the surface (ValueError)."""
+    """Check that the copies of the surface, one per thread, fit into the free memory (ValueError)."""
     _check(
         _BYTES_PER_COPIED_ATOM * surface_atoms * n_threads,
         f"{argument('n_threads', n_threads)}, each with a copy of {surface_atoms:.2g} surface atoms,",
-        "give fewer",
+        "use fewer threads",
     )
 
 

@@ -1,18 +1,18 @@
-"""Packages that need not be installed."""
+"""Optional packages."""
 
 from importlib import import_module
 from typing import Any
 
 
 def optional_import(name: str, what: str) -> Any:
-    """Import a package that need not be installed.
+    """Import an optional package.
 
     Parameters
     ----------
     name : str
         Name of the module.
     what : str
-        What needs it, for the message.
+        Name of the feature that needs it, for the message.
 
     Returns
     -------

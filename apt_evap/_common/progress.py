@@ -4,7 +4,7 @@ from typing import Any
 
 
 def progress_bar(**options: Any) -> Any:
-    """Return a progress bar of tqdm, which is loaded with the first one.
+    """Return a progress bar of tqdm, which is imported at the first call.
 
     Parameters
     ----------

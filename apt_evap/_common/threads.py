@@ -1,13 +1,13 @@
-"""How many threads to use."""
+"""Number of threads to use."""
 
 import os
 
 from apt_evap._common.validation import check_count
 from apt_evap._common.wording import argument
 
-MAX_THREADS = 1024  # each has a copy of the surface; more is a slip of the keyboard
+MAX_THREADS = 1024  # each has a copy of the surface; more is a typing error
 
-_state = {"several": False, "forked": False}  # whether several threads were asked for, and that in the parent process
+_state = {"several": False, "forked": False}  # whether several threads were used here, and in the parent process
 
 
 def _after_fork() -> None:
@@ -19,10 +19,10 @@ if hasattr(os, "register_at_fork"):
 
 
 def usable_threads(n_threads: int) -> int:
-    """Return how many of `n_threads` OpenMP can serve: 1 in a child that was forked after its parent used several.
+    """Return the number of threads that OpenMP can use: 1 in a process that was forked after its parent used several.
 
-    The threads of the parent do not exist in the child, and GCC's OpenMP waits for them for ever. The results do not
-    depend on the number of threads.
+    The threads of the parent do not exist in the child, and OpenMP of GCC would wait for them for ever. The results
+    do not depend on the number of threads.
     """
     _state["several"] |= n_threads > 1
     return 1 if _state["forked"] else n_threads
@@ -34,7 +34,7 @@ def thread_count(n_threads: int | None = None) -> int:
     Parameters
     ----------
     n_threads : int, optional
-        What the user asked for; by default the processors this process may use.
+        Number requested by the user; by default the number of processors that this process may use.
 
     Returns
     -------
@@ -43,11 +43,11 @@ def thread_count(n_threads: int | None = None) -> int:
     Raises
     ------
     ValueError
-        If it is not a whole number of at least 1.
+        If it is not an integer >= 1.
     """
     if n_threads is not None:
         n_threads = check_count(n_threads, "n_threads", at_least=1)
         if n_threads > MAX_THREADS:
-            raise ValueError(f"{argument('n_threads')} must be at most {MAX_THREADS}, got {n_threads}")
+            raise ValueError(f"{argument('n_threads')} must be <= {MAX_THREADS}, got {n_threads}")
         return n_threads
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,4 +1,4 @@
-"""Names for the arrays and files in signatures."""
+"""Types of arrays and paths in signatures."""
 
 import os
 

@@ -1,4 +1,4 @@
-"""Classes of warnings, by what they concern: filter by class, as texts may change."""
+"""Classes of warnings, by subject. Filter them by class: the texts may change."""
 
 
 class AptWarning(UserWarning):
@@ -6,19 +6,19 @@ class AptWarning(UserWarning):
 
 
 class DataWarning(AptWarning):
-    """Ions, ranges or a file are incomplete or ambiguous: what was lost, left out or assumed."""
+    """Incomplete or ambiguous ions, ranges or files: the text says what was lost, skipped or assumed."""
 
 
 class ChargesWarning(AptWarning):
-    """Charges did not converge, or have drifted from converged ones."""
+    """Charges that did not converge, or that drifted from the converged ones."""
 
 
 class ResponseWarning(AptWarning):
-    """Hits follow from responses outside the range that these were fitted to, or where the fit is poor."""
+    """Hits from responses outside the fitted range, or where the fit is poor."""
 
 
 class MapWarning(AptWarning):
-    """A map that may mislead: stripes of the detector's comb, or too few ions for its bins."""
+    """A map that may mislead: stripes from the detector quantisation step, or too few ions for its bins."""
 
 
 class RegistrationWarning(AptWarning):
@@ -26,4 +26,4 @@ class RegistrationWarning(AptWarning):
 
 
 class RunWarning(AptWarning):
-    """A run that ends early, or that cannot be kept on disk as asked."""
+    """A run that ends early, or that cannot be saved as requested."""

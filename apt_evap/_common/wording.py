@@ -1,4 +1,4 @@
-"""Arguments named in messages: as Python writes them, or as a shell does."""
+"""Names of arguments in messages, in the syntax of Python or of the shell."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -8,19 +8,19 @@ _options: ContextVar[Mapping[str, str] | None] = ContextVar("options", default=N
 
 
 def argument(name: str, value: object = None) -> str:
-    """Return an argument as the user of a message writes it.
+    """Return an argument in the syntax that the user writes.
 
     Parameters
     ----------
     name : str
         Name of the argument.
     value : object, optional
-        Its value; None leaves it out.
+        Its value; omitted if None.
 
     Returns
     -------
     str
-        ``name=value`` in Python; the option, and its value unless that is True, within `options_of_a_shell`.
+        ``name=value`` in Python; within `options_of_a_shell` the option and, unless it is True, its value.
     """
     options = _options.get()
     if options is None or name not in options:
@@ -30,7 +30,7 @@ def argument(name: str, value: object = None) -> str:
 
 @contextmanager
 def options_of_a_shell(options: Mapping[str, str]) -> Iterator[None]:
-    """Let messages name options of a shell, given by argument, in place of arguments of Python."""
+    """Let messages name the options of the shell, a mapping by argument, instead of the arguments of Python."""
     token = _options.set(options)
     try:
         yield

@@ -1,1 +1,1 @@
-"""The compiled core: arrays in, arrays out; it knows positions, species and charges, no lattice and no material."""
+"""Compiled core: arrays in, arrays out; it uses positions and charges, without lattices or materials."""

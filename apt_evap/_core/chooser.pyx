@@ -1,4 +1,4 @@
-"""Choosers: which slot of the tree evaporates next, from the keys that a law gives to the slots."""
+"""Choosers: the slot of the tree that evaporates next, from the keys of a law."""
 
 import numpy as np
 
@@ -9,31 +9,32 @@ cdef class Chooser:
     """Interface of a chooser over the keys of the slots of a tree."""
 
     cdef void update(self, const int* slots, long n) noexcept nogil:
-        # The keys of these slots have changed.
+        # To be called when the keys of these slots have changed.
         pass
 
     cdef int choose(self, double u) noexcept nogil:
-        # The slot that evaporates next, by a random number u in (0, 1) where chance decides; -1: none may leave.
+        # The slot that evaporates next; a stochastic chooser uses the random number u in (0, 1). -1: none can
+        # evaporate.
         return -1
 
     cdef double total(self) noexcept nogil:
-        # Sum of the keys where they are rates [1/s]; else 0.
+        # Sum of the keys if they are rates [1/s]; otherwise 0.
         return 0.0
 
     def chosen(self, double u=0.5):
-        """The slot that evaporates next (int); -1 if none may leave."""
+        """The slot that evaporates next (int); -1 if none can evaporate."""
         return self.choose(u)
 
 
 cdef class Largest(Chooser):
-    """Chooses the slot of the largest key, by a tournament; equal keys go by the number of the atom.
+    """Chooser of the slot with the largest key, by a tournament; equal keys are ordered by the index of the atom.
 
     Parameters
     ----------
     tree : Octree
-        Whose slots take part.
+        Tree of the slots.
     key : ndarray, shape (capacity,)
-        Key of each slot; not above 0 where no atom may leave.
+        Key of each slot; <= 0 if it cannot evaporate.
     """
 
     def __init__(self, Octree tree, double[::1] key):
@@ -65,7 +66,7 @@ cdef class Largest(Chooser):
         self.winner[node] = b if self.better(b, a) else a
 
     cdef void update(self, const int* slots, long n) noexcept nogil:
-        # Carry changed keys up, level by level: slots that are neighbours soon share their matches.
+        # Update the matches of changed keys level by level: neighbouring slots soon have common matches.
         cdef long i, left
         cdef int node
         for i in range(n):

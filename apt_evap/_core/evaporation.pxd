@@ -14,18 +14,18 @@ cdef class Evaporation:
     cdef readonly ChargingRule rule
     cdef readonly LawKernel law
     cdef readonly double potential, coulomb, field_unit, patch_radius, update_radius, bond_length, opening_angle
-    cdef readonly object start          # what the last relaxation started from
+    cdef readonly object start          # start values of the last relaxation
     cdef readonly long n_removed, since_relaxation
-    cdef public long n_clipped          # charges that came out negative and were set to 0
-    cdef public long n_unsettled        # patches whose charges were still changing after the last iteration
+    cdef public long n_clipped          # negative charges that were set to 0
+    cdef public long n_unsettled        # patches that did not converge
     cdef bint has_support
-    cdef int[::1] slot_of               # (n_atoms,) -1 away from the surface
+    cdef int[::1] slot_of               # (n_atoms,) -1 for atoms not at the surface
     cdef double[:, ::1] normals         # (capacity, 3) by slot
-    cdef Chooser chooser                # of the slot that evaporates next
-    cdef Hole hole                      # what is around an atom that leaves; its memory follows
+    cdef Chooser chooser                # selects the slot that evaporates next
+    cdef Hole hole                      # surroundings of an evaporating atom; its memory follows
     cdef int[::1] hole_slot
     cdef float[:, ::1] hole_float       # (3, room)
-    cdef Patch patch                    # those whose charges are solved; its memory follows
+    cdef Patch patch                    # slots whose charges are solved; its memory follows
     cdef int[::1] patch_slot
     cdef double[::1] patch_charge
     cdef float[:, ::1] patch_float      # (4, room)

@@ -1,9 +1,9 @@
-"""The sequence of events: which atom leaves, and what its leaving does to the charges around the hole.
+"""Sequence of events: selection of the evaporating atom, and change of the charges around the hole.
 
-An event takes the atom that the chooser names by the keys of the law, exposes what lay under it, and lets the charging
-rule solve a patch around the hole while all other charges are held: the change falls off as the cube of the distance.
-What is left over is smooth, and `relax` (a solution for the whole surface every so many events) carries it. The cost of
-an event does not depend on the size of the specimen.
+An event removes the atom that the chooser selects by the keys of the law, and exposes the atoms below it. The charging
+rule then solves a patch around the hole with all other charges fixed: the change decreases with the cube of the
+distance. The remaining error is smooth; `relax`, a solution for the whole surface after many events, removes it. The
+cost of an event does not depend on the size of the specimen.
 """
 
 from cython.parallel cimport prange
@@ -21,9 +21,9 @@ cdef extern from "kernels.h":
 
 
 cdef enum:
-    NOT_RELAXED = 1 << 30   # events since the last relaxation, while there is none
-    FEW = 16384             # surface atoms up to which one thread builds: others cost more than they save
-    ROOM = 4096             # slots at first within the update radius; 18 d_nn of fcc hold about 1,000
+    NOT_RELAXED = 1 << 30   # number of events since the last relaxation before the first one
+    FEW = 16384             # number of surface atoms up to which one thread is faster than several
+    ROOM = 4096             # initial number of slots within the update radius; 18 d_nn of fcc contain about 1,000
     STATUS_DONE = 0
     STATUS_SWEEP_DUE = 1
     STATUS_EXHAUSTED = 2
@@ -33,10 +33,11 @@ DONE, SWEEP_DUE, EXHAUSTED, TOO_SHALLOW = STATUS_DONE, STATUS_SWEEP_DUE, STATUS_
 
 
 cdef class Start:
-    """What a relaxation starts from; with the atoms that are left it makes the same charges again, bit by bit.
+    """Start values of a relaxation, from which the same charges are recomputed bit by bit.
 
-    Events so far, charges of the surface atoms in the order of their numbers (n,) [e], atoms that keep the normal they
-    had since no neighbour pulls (m,), these normals (m, 3), and the state of the charging rule (dict of arrays).
+    Number of events so far, charges of the surface atoms in the order of their indices (n,) [e], atoms without
+    neighbours that keep their last normal (m,), these normals (m, 3), and the state of the charging rule (dict of
+    arrays).
     """
 
     cdef readonly long n_removed
@@ -48,24 +49,25 @@ cdef class Start:
 
 
 cdef class Evaporation:
-    """A charged surface from which atoms leave one by one.
+    """A charged surface whose atoms evaporate one by one.
 
     Parameters
     ----------
     atoms : Neighbourhood
         The atoms and their surface.
     rule : ChargingRule
-        How charge distributes over the surface.
+        Distribution of the charge over the surface.
     law : LawKernel
-        Which atom leaves next.
+        Selects the next atom to evaporate.
     potential : float
-        Potential of the specimen over the Coulomb constant [e/nm].
+        Potential of the specimen divided by the Coulomb constant [e/nm].
     coulomb : float
         Coulomb constant [V nm/e].
     patch_radius, update_radius : float
-        Within the first the charges are solved after an event, within the second the fields are kept up to date [nm].
+        Distances from the hole within which charges are solved, and within which fields are updated, after an event
+        [nm].
     opening_angle : float
-        Of relaxations and of fields on newly exposed atoms [rad].
+        Opening angle of relaxations, and of fields at newly exposed atoms [rad].
     """
 
     def __init__(self, Neighbourhood atoms, ChargingRule rule, LawKernel law, double potential, double coulomb,
@@ -80,7 +82,7 @@ cdef class Evaporation:
         self.make_room(ROOM)
 
     cdef void make_room(self, long room):
-        # Buffers for so many slots around a hole, and the atoms that come to the surface.
+        # Buffers for this number of slots around a hole, and for the newly exposed atoms.
         self.hole_slot = np.empty(room + MAX_NEAR, np.int32)
         self.hole_float = np.empty((3, room + MAX_NEAR + GROUP), np.float32)
         self.hole.slot = &self.hole_slot[0]
@@ -96,7 +98,7 @@ cdef class Evaporation:
         self.key_atom, self.key_bonds = np.empty(room + MAX_NEAR, np.int64), np.empty(room + MAX_NEAR, np.int32)
 
     def take_over(self, Neighbourhood atoms, LawKernel law):
-        """Continue with more atoms: the first of them are those held so far. Call `relax` next."""
+        """Continue with additional atoms; the first ones are the previous atoms. Call `relax` next."""
         cdef int[::1] slot_of = np.full(atoms.n_atoms, -1, np.int32)
         np.asarray(slot_of)[:self.atoms.n_atoms] = self.slot_of
         self.since_relaxation = NOT_RELAXED
@@ -112,24 +114,24 @@ cdef class Evaporation:
         tolerance : float
             Largest change of a charge in a sweep, relative to the mean charge, at which to stop.
         max_sweeps : int
-            Sweeps after which to stop in any case.
+            Maximum number of sweeps.
         double_precision : bool
             Sums in float64; needed for tolerances below 1e-6.
         extra : int
-            Room for atoms that come to the surface before the next relaxation; by default an eighth of the surface.
+            Space for atoms exposed before the next relaxation; by default 1/8 of the number of surface atoms.
         opening_angle : float
-            Of the sweeps [rad]; by default that of the events.
+            Opening angle of the sweeps [rad]; by default that of the events.
         n_threads : int
-            Threads.
+            Number of threads.
         start : Start, optional
-            What to start from; by default the surface as it is, or equal charges.
+            Start values; by default the current surface, or equal charges.
 
         Returns
         -------
         sweeps : int
-            Sweeps done.
+            Number of sweeps.
         residual : float
-            Largest change of a charge in the last one, relative to the mean charge.
+            Largest change of a charge in the last sweep, relative to the mean charge.
         """
         cdef long n, slot
         cdef int builders
@@ -139,7 +141,7 @@ cdef class Evaporation:
         if len(surface) == 0:
             raise ValueError("the specimen has no surface atoms")
         builders = n_threads if len(surface) > FEW else 1
-        self.since_relaxation = NOT_RELAXED   # an interruption below leaves a surface that no atom may leave
+        self.since_relaxation = NOT_RELAXED   # after an interruption below no atom can evaporate
         if start is None:
             start = self.start_here(surface, builders)
         elif len(start.charges) != len(surface):
@@ -147,7 +149,7 @@ cdef class Evaporation:
         self.start, self.n_removed, self.rule.state = start, start.n_removed, start.rule_state
         tree = Octree(self.atoms.positions_of(surface, builders), start.charges, surface,
                       extra=extra or len(surface) // 8 + MAX_NEAR, n_threads=builders)
-        surface = tree.atoms   # in the order of the slots from here on
+        surface = tree.atoms   # from here on in the order of the slots
         n, capacity = tree.n_slots, tree.capacity
         normals = np.zeros((capacity, 3))
         normals[:n] = self.atoms.normals_of(surface, builders)
@@ -170,7 +172,7 @@ cdef class Evaporation:
         return outcome
 
     def start_here(self, const long long[::1] surface, int n_threads=1):
-        """What a relaxation of the surface as it is starts from; equal charges if it has none yet."""
+        """Start values of a relaxation of the current surface; equal charges if it has none yet."""
         cdef double[::1] charges = np.ones(len(surface))
         cdef char[::1] alone = np.zeros(len(surface), np.int8)
         cdef long i, slot
@@ -187,7 +189,7 @@ cdef class Evaporation:
     # ---- one event -------------------------------------------------------------------------------------------------
 
     cdef long strongest_neighbour(self, long atom) noexcept nogil:
-        # The surface nearest neighbour with the highest charge; -1: there is none.
+        # The surface nearest neighbour with the highest charge; -1 if there is none.
         cdef int[MAX_NEAR] others
         cdef int n = self.atoms.near(atom, others), i
         cdef long best = -1, other
@@ -205,7 +207,7 @@ cdef class Evaporation:
         return best
 
     cdef void join(self, int slot, double dx, double dy, double dz) noexcept nogil:
-        # One more slot in the patch, at (dx, dy, dz) from the hole; its normal may have changed.
+        # Add a slot at (dx, dy, dz) from the hole to the patch; its normal may have changed.
         cdef long n = self.patch.n
         self.patch.slot[n] = slot
         self.patch.x[n], self.patch.y[n], self.patch.z[n] = <float>dx, <float>dy, <float>dz
@@ -213,7 +215,7 @@ cdef class Evaporation:
         self.patch.n = n + 1
 
     cdef int judge(self, const int* slots, long n) except -1 nogil:
-        # New keys of some slots whose fields or bonds have changed.
+        # New keys of slots whose fields or bonds have changed.
         cdef long i
         if n == 0:
             return 0
@@ -245,7 +247,7 @@ cdef class Evaporation:
         self.chooser.update(&gone, 1)
         n_fresh = self.atoms.remove(atom, fresh)
 
-        # the slots around the hole, without the charge that left
+        # the slots around the hole, without the evaporated charge
         room = self.hole_slot.shape[0] - MAX_NEAR - PATCH_LANES
         hole.n = self.tree.within(hole.x, hole.y, hole.z, self.update_radius, hole.slot, room)
         if hole.n > room:
@@ -264,7 +266,7 @@ cdef class Evaporation:
         self.rule.removed(self.tree, hole)
         self.expose(fresh, n_fresh, gone, journal)
 
-        # new charges of the patch, and what they change in the fields around it
+        # new charges of the patch, and changes of the fields around it
         patch.stride = (patch.n + PATCH_LANES - 1) // PATCH_LANES * PATCH_LANES
         for i in range(patch.n, patch.stride):
             patch.x[i] = patch.y[i] = patch.z[i] = 1e6
@@ -289,7 +291,7 @@ cdef class Evaporation:
         return 0
 
     cdef int expose(self, const int* fresh, int n_fresh, int gone, Journal journal) except -1 nogil:
-        # The atoms that came to the surface join the leaf of the slot nearest to them, without charge at first.
+        # The exposed atoms are added to the leaf of their nearest slot, without charge.
         cdef double px, py, pz, s, nearest
         cdef Hole* hole = &self.hole
         cdef int slot, best
@@ -323,25 +325,25 @@ cdef class Evaporation:
 
     def evaporate(self, Journal journal, long max_events, long sweep_interval, long long[::1] atom,
                   double[::1] charge, double[::1] field, double[:, ::1] normal, long long[::1] neighbour):
-        """Evaporate atoms until `max_events` are in the journal, or something has to be done first.
+        """Evaporate up to `max_events` atoms; stops early if a relaxation or deepening is needed, or no atom is left.
 
         Parameters
         ----------
         journal : Journal
-            Filled; must be new.
+            A new journal; it is filled.
         max_events : int
-            Events at most.
+            Maximum number of events.
         sweep_interval : int
             Events after which a relaxation is due.
         atom, charge, field, normal, neighbour : ndarray, shapes (m,), (m,), (m,), (m, 3), (m,)
-            Filled, for each of `max_events` events, with the atom that left, its charge [e], the field just outside
-            before it left [V/nm], its normal, and its surface nearest neighbour of the highest charge (-1: none).
+            Filled, for each event, with the evaporated atom, its charge [e], the field just outside before evaporation
+            [V/nm], its normal, and its surface nearest neighbour with the highest charge (-1: none).
 
         Returns
         -------
         int
-            DONE; SWEEP_DUE (call `relax`); EXHAUSTED (no atom may leave); TOO_SHALLOW (the next event would reach
-            atoms that are held as support).
+            DONE; SWEEP_DUE (call `relax`); EXHAUSTED (no atom can evaporate); TOO_SHALLOW (the next event would reach
+            support atoms).
         """
         cdef long n, leaving
         cdef int status = STATUS_DONE, best, axis
@@ -372,12 +374,12 @@ cdef class Evaporation:
 
     @property
     def next_slot(self):
-        """Slot of the atom that would leave next (int); -1 if none may."""
+        """Slot of the next atom to evaporate (int); -1 if none can evaporate."""
         return self.chooser.choose(0.5)
 
     @property
     def slots(self):
-        """Slots that hold an atom now, shape (n,)."""
+        """Slots that contain an atom, shape (n,)."""
         return np.flatnonzero(self.tree.atoms >= 0)
 
     @property
@@ -387,5 +389,5 @@ cdef class Evaporation:
 
     @property
     def slot_fields(self):
-        """Field just outside by slot [V/nm], shape (n_slots,)."""
+        """Field just outside each slot [V/nm], shape (n_slots,)."""
         return self.field_unit * self.rule.strengths(self.tree)

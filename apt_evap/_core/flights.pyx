@@ -1,12 +1,12 @@
-"""Flights of ions from the surface to where the field has died away.
+"""Flights of ions from the surface to the end of the field.
 
-Flights are in reduced units: charge and mass of the ion are 1, so velocities are in sqrt(V) and times in nm/sqrt(V); the
-path of an ion depends on its energy per charge alone. Flights that start together (one ion under many perturbations)
-share their steps, and each step shares one walk through the tree: what acts on a ball around all of them is collected
+Flights are in reduced units: charge and mass of the ion are 1, so velocities are in sqrt(V) and times in nm/sqrt(V);
+the path of an ion depends only on its energy per charge. Flights that start together (one ion with many perturbations)
+have common steps, with one walk through the tree per step: the sources for a ball around all flights are collected
 once, then summed for every stage and flight.
 
 The scheme is the Runge-Kutta-Nystrom pair of orders 8 and 6 of Dormand, El-Mikkawy and Prince (IMA J. Numer. Anal. 7,
-423, 1987), nine stages a step.
+423, 1987), nine stages per step.
 """
 
 from libc.math cimport INFINITY, sqrt
@@ -34,7 +34,7 @@ cdef extern from *:
 cdef enum:
     STAGES = 9
     ION_LEFT = 0
-    ION_NEVER_LEFT = 1   # and what it counts as while it flies
+    ION_NEVER_LEFT = 1   # also the value during the flight
 
 LEFT, NEVER_LEFT = ION_LEFT, ION_NEVER_LEFT
 
@@ -67,26 +67,26 @@ cdef double[9] VELOCITY_ERROR = [
 
 
 cdef class Flights:
-    """Flies ions over one copy of the charged surface.
+    """Flights of ions over one copy of the charged surface.
 
     Parameters
     ----------
     tree : Octree
-        The surface; this object keeps a copy of its own and replays the events on it.
+        The surface; this object keeps a copy and replays the events on it.
     coulomb : float
         Coulomb constant [V nm/e].
     length : float
-        A length of the atomic scale, for the first step [nm].
+        Length on the atomic scale, for the first step [nm].
     centre : ndarray, shape (3,)
         The apex, from which `reach` is measured [nm].
     reach : float
-        Distance at which a flight ends; beyond it the ion goes straight on [nm].
+        Distance at which a flight ends; the ion then continues in a straight line [nm].
     opening_angle : float
-        Full angle under which a cell is taken as a whole [rad]; 0 sums over all atoms.
+        Largest full angle of a cell that replaces its atoms [rad]; 0 sums over all atoms.
     tolerance : float
-        Of the position relative to the path and of the velocity, in a step.
+        Error of a step, of the position relative to the path and of the velocity.
     max_steps : int
-        Steps after which an ion counts as one that never left.
+        Number of steps after which an ion counts as not escaped.
     """
 
     cdef Octree tree
@@ -117,12 +117,12 @@ cdef class Flights:
         free(self.work)
 
     def begin(self, Octree tree):
-        """Take a copy of the surface as it stands before the first event of a journal."""
+        """Copy the surface before the first event of a journal."""
         self.tree = tree.copy()
         self.n_replayed = 0
 
     def follow(self, Journal journal):
-        """Let the events of a journal happen that have not, and be ready for the journal after it."""
+        """Replay the remaining events of a journal, before the next journal."""
         with nogil:
             while self.n_replayed < journal.n_events:
                 journal.replay(self.n_replayed, self.tree)
@@ -132,19 +132,19 @@ cdef class Flights:
     def fly(self, Journal journal, const long long[::1] event, const long long[::1] start,
             const double[:, ::1] positions, const double[:, ::1] velocities, double[:, ::1] end,
             signed char[::1] outcome, long long[::1] counter, long long[::1] halt):
-        """Fly groups of launches, each in the field that its event left behind.
+        """Fly groups of launches, each in the field after its event.
 
-        Several objects may share the work in threads of their own: `counter` hands out the groups. Call `follow` before
-        another journal.
+        Several objects can work in parallel threads: `counter` distributes the groups. Call `follow` before another
+        journal.
 
         Parameters
         ----------
         journal : Journal
-            The events after those followed so far.
+            The next events.
         event : ndarray, shape (g,)
-            Event of each group, not falling.
+            Event of each group, not decreasing.
         start : ndarray, shape (g + 1,)
-            Where the launches of each group begin.
+            Begin of the launches of each group.
         positions, velocities : ndarray, shape (m, 3)
             Launches [nm], [sqrt(V)].
         end : ndarray, shape (m, 7)
@@ -152,9 +152,9 @@ cdef class Flights:
         outcome : ndarray, shape (m,)
             Filled with LEFT or NEVER_LEFT.
         counter : ndarray, shape (1,)
-            The next group.
+            Number of the next group.
         halt : ndarray, shape (1,)
-            Not 0: stop before the next group.
+            If not 0, stop before the next group.
         """
         cdef long group, k, n_groups = event.shape[0]
         with nogil:
@@ -168,7 +168,7 @@ cdef class Flights:
                 if start[group + 1] > start[group]:
                     self.fly_group(start[group + 1] - start[group], &positions[start[group], 0],
                                    &velocities[start[group], 0], &end[start[group], 0], &outcome[start[group]])
-                if start[group + 1] > start[group] + 1:   # one that runs into an atom stops its whole group
+                if start[group + 1] > start[group] + 1:   # a launch that hits an atom stops its whole group
                     for k in range(start[group], start[group + 1]):
                         if outcome[k] == ION_NEVER_LEFT:
                             self.fly_group(1, &positions[k, 0], &velocities[k, 0], &end[k, 0], &outcome[k])
@@ -247,7 +247,7 @@ cdef class Flights:
                         end[7 * i + 6] = time
                 if flying == 0:
                     return 0
-            if not largest < 1e30:   # a stage ran into an atom
+            if not largest < 1e30:   # a stage hit an atom
                 dt *= 0.1
             else:
                 dt *= min(4.0, max(0.2, 0.9 * inverse_seventh_root(max(largest, 1e-12))))
@@ -260,8 +260,8 @@ cdef class Flights:
         return 0
 
     cdef double time_to_reach(self, long m, const double* x, const double* v, const signed char* outcome) noexcept nogil:
-        # Time in which the slowest of those about to cross `reach` has crossed it on a straight line, so that no flight
-        # ends far beyond it; flights that need more than the largest step do not count.
+        # Time in which the slowest flight close to `reach` crosses it in a straight line, so that no flight ends far
+        # beyond; flights that need more than the largest step are ignored.
         cdef double rr, rv, vv, dx, longest = 0.0
         cdef long i
         cdef int axis
@@ -280,7 +280,7 @@ cdef class Flights:
 
     cdef double step_error(self, long i, long m, double dt, const double* a, const double* v, const double* origin,
                            const double* trial) noexcept nogil:
-        # Largest error of the step over what the tolerance allows.
+        # Largest error of the step, relative to the tolerance.
         cdef double dx, dv, ex = 0.0, ev = 0.0, path = 0.0, speed = 0.0, new
         cdef int axis, k
         for axis in range(3):
@@ -300,7 +300,7 @@ cdef class Flights:
 
     cdef int gather(self, long m, const double* x, const double* v, const double* a, const signed char* outcome,
                     double dt) except -1 nogil:
-        # Collects what acts on a ball that holds all flights from here to the end of the step.
+        # Collects the sources for a ball that contains all flights until the end of the step.
         cdef double cx = 0.0, cy = 0.0, cz = 0.0, radius = 0.0, dx, dy, dz
         cdef long i, n = 0
         for i in range(m):
@@ -324,7 +324,7 @@ cdef class Flights:
         return 0
 
     cdef void evaluate(self, long m, const double* x, double* a, const signed char* outcome) noexcept nogil:
-        # Accelerations [V/nm] of the flights still under way.
+        # Accelerations [V/nm] of the unfinished flights.
         cdef long i
         cdef int axis
         for i in range(m):

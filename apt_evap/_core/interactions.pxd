@@ -7,10 +7,10 @@ cdef class InteractionLists:
     cdef readonly Octree tree
     cdef long n_groups
     cdef int[:, ::1] members     # (n_groups, 32) slots of each group
-    cdef double[:, ::1] ball     # (n_groups, 4) middle and radius of each group
-    cdef int[::1] cells          # accepted nodes of all groups, one after the other
-    cdef int[::1] ranges         # slots [begin, end) of the leaves that stay atoms
-    cdef long[:, ::1] starts     # (n_groups + 1, 3) where each group's cells and ranges begin, and its atoms so far
+    cdef double[:, ::1] ball     # (n_groups, 4) centre and radius of each group
+    cdef int[::1] cells          # accepted nodes of all groups in sequence
+    cdef int[::1] ranges         # slots [begin, end) of the leaves whose atoms are summed one by one
+    cdef long[:, ::1] starts     # (n_groups + 1, 3) begin of cells and ranges of each group, atoms so far
 
     cdef void split(self, Octree tree, int* slots, long n, long group) noexcept nogil
     cdef void walk(self, Octree tree, long group, double opening_angle, int* cells, int* ranges,

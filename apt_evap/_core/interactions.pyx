@@ -1,9 +1,9 @@
-"""Sweeps: the field of all atoms on each of them, by lists shared by groups of 32 neighbours.
+"""Sweeps: the field of all atoms at each atom, by common interaction lists of groups of 32 neighbouring atoms.
 
-The walk collects, the kernel sums: 32 neighbouring atoms share one list of the cells and atoms that act on them. Lists
-depend on places alone, so they serve every sweep until an atom comes or goes. The groups come from median splits inside
-nodes of the octree: at the same error a sweep over R = 80 a takes 0.7 of the time it takes with 32 atoms in a row of the
-Morton order, whose jumps make wide groups.
+The walk collects, the kernel sums: the 32 atoms of a group have one list of the cells and atoms that act on them. Lists
+depend only on positions, so they are valid for all sweeps until an atom is added or removed. The groups are made by
+median splits within nodes of the octree. Measured: at equal error, a sweep over R = 80 a takes 0.7 of the time for
+groups of 32 successive atoms in Morton order, which are wider because of the jumps of this order.
 """
 
 from cython.parallel cimport prange
@@ -27,7 +27,7 @@ cdef extern from "kernels.h":
 
 
 cdef enum:
-    CHUNK = 1024    # atoms of a node that is cut into groups by median splits
+    CHUNK = 1024    # largest number of atoms of a node that is split into groups
 
 
 ctypedef fused real:
@@ -36,7 +36,7 @@ ctypedef fused real:
 
 
 cdef void group_field(InteractionLists lists, Octree tree, long group, double[:, ::1] field, real* work) noexcept nogil:
-    # Field on one group; `work` has room for the 32 targets and their sums, relative to the middle of the group.
+    # Field at one group; `work` has space for the 32 targets and their sums, relative to the centre of the group.
     cdef long first = lists.starts[group, 0], n_cells = lists.starts[group + 1, 0] - first
     cdef long range_first = lists.starts[group, 1], n_ranges = lists.starts[group + 1, 1] - range_first, k, l
     cdef const double* ball = &lists.ball[group, 0]
@@ -55,7 +55,7 @@ cdef void group_field(InteractionLists lists, Octree tree, long group, double[:,
         group_cells_double(n_cells, &lists.cells[0] + first, &tree.cells[0, 0], ball, work, sums)
         group_atoms_double(n_ranges, &lists.ranges[0] + 2 * range_first, &tree.x[0], &tree.y[0], &tree.z[0],
                            &tree.q[0], ball, work, sums)
-    for l in range(GROUP):   # the atoms that fill up a group are members of it: the same values once more
+    for l in range(GROUP):   # atoms that pad a group are members of it and get the same values again
         k = lists.members[group, l]
         field[k, 0] = sums[l]
         field[k, 1] = sums[GROUP + l]
@@ -68,11 +68,11 @@ cdef class InteractionLists:
     Parameters
     ----------
     tree : Octree
-        With no atoms put in since it was built. Its charges may change later, its atoms may not.
+        A tree without atoms added after its build. Its charges may change later, but not its atoms.
     opening_angle : float
-        A cell stands for its atoms where its ball is seen under less than this full angle [rad].
+        A cell replaces its atoms if the full angle of its ball is smaller than this angle [rad].
     n_threads : int
-        Threads.
+        Number of threads.
     """
 
     def __init__(self, Octree tree, double opening_angle, int n_threads=1):
@@ -110,7 +110,8 @@ cdef class InteractionLists:
                       &self.ranges[0] + 2 * self.starts[group, 1], NULL)
 
     cdef void split(self, Octree tree, int* slots, long n, long group) noexcept nogil:
-        # Cuts n slots across their longest side into halves of whole groups, down to groups numbered from `group` on.
+        # Splits n slots across their longest side into halves of complete groups, down to groups numbered from `group`
+        # on.
         cdef double[3] low, high
         cdef double middle, far = 0.0, s
         cdef const double* c
@@ -127,13 +128,13 @@ cdef class InteractionLists:
             ball = &self.ball[group, 0]
             for axis in range(3):
                 ball[axis] = 0.5 * (low[axis] + high[axis])
-            for k in range(GROUP):   # a group that is not full is filled up with its last atom
+            for k in range(GROUP):   # an incomplete group is padded with its last atom
                 self.members[group, k] = slots[min(k, n - 1)]
             for k in range(n):
                 s = ((tree.x[slots[k]] - ball[0]) ** 2 + (tree.y[slots[k]] - ball[1]) ** 2
                      + (tree.z[slots[k]] - ball[2]) ** 2)
                 far = max(far, s)
-            ball[3] = sqrt(far) * 1.0001   # no atom on the rim may take itself for a cell of one atom
+            ball[3] = sqrt(far) * 1.0001   # an atom on the rim must not act on itself as a cell of one atom
             return
         for k in range(1, 3):
             if high[k] - low[k] > high[axis] - low[axis]:
@@ -165,8 +166,8 @@ cdef class InteractionLists:
         self.split(tree, slots + half, n - half, group + left)
 
     cdef void walk(self, Octree tree, long group, double opening_angle, int* cells, int* ranges, long* counts) noexcept nogil:
-        # Lists of one group: accepted cells, and slots [begin, end) of the leaves that stay atoms, neighbours merged.
-        # Without lists it only counts: cells, ranges, atoms.
+        # Lists of one group: accepted cells, and slots [begin, end) of the leaves whose atoms are summed one by one,
+        # adjacent ranges merged. Without lists it only counts cells, ranges and atoms.
         cdef const double* ball = &self.ball[group, 0]
         cdef long node = 0, n_cells = 0, n_ranges = 0, n_atoms = 0, open_end = -1
         cdef double dx, dy, dz, reach, factor = 2.0 / opening_angle if opening_angle > 0.0 else 1e30
@@ -194,16 +195,16 @@ cdef class InteractionLists:
             counts[0], counts[1], counts[2] = n_cells, n_ranges, n_atoms
 
     def sweep(self, double[:, ::1] field, bint double_precision=False, int n_threads=1):
-        """Field of all the others on each atom of the tree, from the charges it has now.
+        """Field of all other atoms at each atom of the tree, from its current charges.
 
         Parameters
         ----------
         field : ndarray, shape (n, 3) or longer
             Filled with the field [e/nm^2], in the order of the slots.
         double_precision : bool
-            Vector lanes of float64; else of float32 (relative error near 1e-6).
+            Sums in float64; otherwise in float32 (relative error about 1e-6).
         n_threads : int
-            Threads.
+            Number of threads.
         """
         cdef Octree tree = self.tree
         cdef long group
@@ -234,14 +235,14 @@ cdef class InteractionLists:
 
 
 def direct_field(const double[:, ::1] points, const double[:, ::1] positions, const double[::1] charges):
-    """Field at points by sums over all charges in float64, one thread: the yardstick of speed and accuracy.
+    """Field at points by sums over all charges in float64, one thread: the reference of speed and accuracy.
 
     Parameters
     ----------
     points : ndarray, shape (m, 3)
-        Points [nm]; a charge at the very place of a point does not act on it.
+        Points [nm]; a charge at the position of a point does not act on it.
     positions : ndarray, shape (n, 3)
-        Of the charges [nm].
+        Positions of the charges [nm].
     charges : ndarray, shape (n,)
         Charges [e].
 

@@ -5,12 +5,12 @@ from apt_evap._core.octree cimport Octree
 
 cdef class Journal:
     cdef readonly long n_events
-    cdef long[::1] start                # (max_events + 1,) where each event's changes begin
-    cdef int[::1] slot                  # changed slots; the first of each event is the one taken out
+    cdef long[::1] start                # (max_events + 1,) begin of the changes of each event
+    cdef int[::1] slot                  # changed slots; the first of each event is the removed one
     cdef double[::1] charge             # new charges [e]
     cdef long[::1] fresh_start          # (max_events + 1,)
-    cdef int[::1] fresh_atom            # atoms put in
-    cdef int[::1] fresh_leaf            # and the leaf each joined
+    cdef int[::1] fresh_atom            # added atoms
+    cdef int[::1] fresh_leaf            # and their leaves
     cdef const double[:, ::1] positions # (n_atoms, 3) nm
 
     cdef int room(self, long changes, long fresh) except -1 nogil

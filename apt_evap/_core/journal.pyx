@@ -1,7 +1,7 @@
-"""The journal of events: what each changed in the tree, to make it happen again in a copy.
+"""Journal of events: the changes of the tree by each event, to replay them on a copy.
 
-Flights follow the events on copies of the tree; since a replay makes the same calls in the same order, and moments are
-always made anew from charges, a copy has the same bits as the tree had then.
+Flights follow the events on copies of the tree. A replay makes the same calls in the same order, and moments are always
+recomputed from charges, so a copy has the same bits as the original tree.
 """
 
 import numpy as np
@@ -10,7 +10,7 @@ from apt_evap._core.octree cimport Octree
 
 
 cdef class Journal:
-    """What each event of a batch changed in the tree, to be replayed on a copy of it bit by bit."""
+    """Changes of the tree by each event of a batch, to be replayed on a copy bit by bit."""
 
     def __init__(self, const double[:, ::1] positions, long max_events):
         self.n_events = 0
@@ -23,7 +23,7 @@ cdef class Journal:
         self.fresh_leaf = np.empty(max_events * 8, np.int32)
 
     cdef int room(self, long changes, long fresh) except -1 nogil:
-        # Space for one more event.
+        # Make space for one more event.
         if self.start[self.n_events] + changes > self.slot.shape[0]:
             with gil:
                 self.slot = np.resize(np.asarray(self.slot), 2 * self.slot.shape[0] + changes)
@@ -35,7 +35,7 @@ cdef class Journal:
         return 0
 
     cdef void replay(self, long event, Octree tree) noexcept nogil:
-        # The same calls in the same order as the event made them.
+        # The same calls in the same order as in the event.
         cdef long k
         cdef int atom
         tree.take_out(self.slot[self.start[event]])
@@ -48,7 +48,7 @@ cdef class Journal:
         tree.refresh()
 
     def replay_on(self, Octree tree, long event):
-        """Make event number `event` of this journal happen in a copy of the tree."""
+        """Replay event number `event` of this journal on a copy of the tree."""
         if not 0 <= event < self.n_events:
             raise IndexError(f"event must be from 0 to {self.n_events - 1}, got {event}")
         self.replay(event, tree)

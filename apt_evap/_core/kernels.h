@@ -1,7 +1,7 @@
 /* The hot sums: fields of point charges and of quadrupole cells; lengths in nm, charges in e, fields q r/r^3 in e/nm^2.
  *
- * Two ways round: `group_*` puts 32 targets into the vector lanes and goes through the sources one by one (a sweep),
- * `point_*` puts the sources into 8 lanes for one target (a flight). The lanes are fixed and nothing is contracted or
+ * Two layouts: `group_*` has 32 targets in the vector lanes and loops over the sources (a sweep),
+ * `point_*` has the sources in 8 lanes for one target (a flight). The lanes are fixed and nothing is contracted or
  * reassociated (-ffp-contract=off), so the bits are the same for SSE2, AVX2 and AVX-512.
  */
 #ifndef APT_EVAP_PAIR_H
@@ -10,7 +10,7 @@
 #include <math.h>
 #include <string.h>
 
-/* musl and macOS have no ifunc, and GCC before 12 does not know these levels: there the baseline of the build serves. */
+/* musl and macOS have no ifunc, and GCC before 12 does not know these levels: then the baseline of the build applies. */
 #if defined(__GNUC__) && !defined(__clang__) && __GNUC__ >= 12 && defined(__x86_64__) && defined(__GLIBC__)
 #define APT_CLONES __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default"), unused))
 #elif defined(__GNUC__)
@@ -19,7 +19,7 @@
 #define APT_CLONES
 #endif
 
-#define GROUP 32          /* targets of one group: two or four AVX-512 registers a coordinate */
+#define GROUP 32          /* targets of one group: two or four AVX-512 registers per coordinate */
 #define CELL 10           /* numbers of one cell: centre x y z, charge, quadrupole xx xy xz yy yz zz */
 #define LANES 8           /* sources of one point sum: an AVX-512 register of doubles */
 #define SAME_PLACE 1e-12  /* [nm^2] below this a source is the target itself; atoms are 0.2 nm apart */
@@ -71,7 +71,7 @@ APT_CLONES static void point_atoms(long n, const double *restrict x, const doubl
 }
 
 /* Adds the field of n cells at (px, py, pz) to field[3]; c holds CELL rows of `stride` numbers, n a multiple of LANES
- * (the caller fills up with cells of no charge). */
+ * (padded by the caller with cells without charge). */
 APT_CLONES static void point_cells(long n, long stride, const double *restrict c, double px, double py, double pz,
                                    double *restrict field)
 {
@@ -102,9 +102,9 @@ APT_CLONES static void point_cells(long n, long stride, const double *restrict c
     }
 }
 
-/* The sums of a patch of some 300 atoms are in single precision, its coordinates relative to the hole. Rows have a
- * length that is a multiple of PATCH_LANES, filled up with atoms of no charge: four registers wide, or the additions of
- * a dot product wait for one another. */
+/* The sums of a patch of about 300 atoms are in single precision, with coordinates relative to the hole. The length of
+ * the rows is a multiple of PATCH_LANES, padded with atoms without charge: with fewer than four registers the additions
+ * of a dot product wait for each other. */
 #define PATCH_LANES 64
 
 /* One row of the Robin matrix: row[k] = n . (p - r_k)/|p - r_k|^3 for the atom at p with normal n. */
@@ -136,9 +136,10 @@ APT_CLONES static float patch_dot(long n, const float *restrict a, const float *
          + (((s[1] + s[9]) + (s[5] + s[13])) + ((s[3] + s[11]) + (s[7] + s[15])));
 }
 
-/* Adds the field of the patch's n charges q on m targets, all relative to the hole; m is a multiple of GROUP. Targets are
- * in the lanes: with the sources there, the sum over the lanes takes longer than the terms. The start of the sums is
- * read and each source has names of its own, or GCC 12 turns the lanes into scalars (16 times slower). */
+/* Adds the field of the n charges q of the patch at m targets, all relative to the hole; m is a multiple of GROUP.
+ * Targets are in the lanes: with the sources in the lanes, the sum over the lanes takes longer than the terms. The sums
+ * start from the values in memory and each source has its own variables; otherwise GCC 12 replaces the lanes by scalars
+ * (16 times slower). */
 APT_CLONES static void patch_field(long m, const float *restrict targets_x, const float *restrict targets_y,
                                    const float *restrict targets_z, long n, const float *restrict x,
                                    const float *restrict y, const float *restrict z, const float *restrict q,

@@ -1,7 +1,7 @@
-/* Included by pair.h once for float and once for double: 32 targets in the vector lanes, the sources one by one.
+/* Included by kernels.h, once for float and once for double: 32 targets in the vector lanes, a loop over the sources.
  *
- * Source coordinates are taken relative to `origin` (the middle of the group) before they are rounded to REAL, so
- * that single precision loses nothing by cancellation. targets and field hold x[32], y[32], z[32]; field is added to.
+ * Source coordinates are relative to `origin` (the centre of the group) before they are rounded to REAL, so that single
+ * precision has no loss by cancellation. targets and field contain x[32], y[32], z[32]; values are added to field.
  */
 
 /* Atoms in n_ranges ranges [ranges[2 k], ranges[2 k + 1]). */
@@ -36,8 +36,8 @@ APT_CLONES static void GROUP_NAME(group_atoms)(long n_ranges, const int *ranges,
     memcpy(field + 2 * GROUP, ez, sizeof ez);
 }
 
-/* Cells by their numbers. The lanes are gone through in halves, with a start that GCC 12 cannot see through: it would
- * turn all 32 into scalars (12 times slower). */
+/* Cells by their indices. The loop over the lanes is in two halves, with a start that GCC 12 cannot analyse; otherwise
+ * it replaces all 32 lanes by scalars (12 times slower). */
 APT_CLONES static void GROUP_NAME(group_cells)(long n, const int *list, const double *cells, const double *origin,
                                                const REAL *restrict targets, REAL *restrict field)
 {

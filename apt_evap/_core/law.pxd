@@ -1,4 +1,4 @@
-"""The contract of a law, for the sequence of events: the key by which an atom is chosen."""
+"""Interface of a law for the sequence of events: the key of an atom."""
 
 from apt_evap._core.chooser cimport Chooser
 from apt_evap._core.octree cimport Octree

@@ -1,4 +1,4 @@
-"""Laws: the key of an atom from its field, its number and its bonds, and the chooser that goes with the keys."""
+"""Laws: the key of an atom from its field, index and bonds, and the chooser for these keys."""
 
 import numpy as np
 
@@ -9,32 +9,32 @@ from apt_evap._core.octree cimport Octree
 cdef class LawKernel:
     """Interface of an evaporation law in the compiled core.
 
-    After every event the keys of the atoms around the hole are computed again, since their fields or bonds have changed.
+    After every event the keys of the atoms around the hole are recomputed, because their fields or bonds have changed.
     A compiled law implements `key`, and `begin` if it needs the field in V/nm.
     """
 
     def begin(self, double field_unit):
-        """Take the field of strength 1 [V/nm], after each relaxation."""
+        """Set the field of strength 1 [V/nm], after each relaxation."""
 
     cdef double key(self, double strength, long long atom, int bonds) noexcept nogil:
-        # Key of one atom from the field just outside (in the unit that `begin` took), its number in the specimen and
-        # its bonds to nearest neighbours; not above 0 for an atom that may not leave.
+        # Key of one atom from the field just outside (in the unit set by `begin`), its index in the specimen and its
+        # number of nearest neighbours; <= 0 for an atom that cannot evaporate.
         return 0.0
 
     cdef int keys(self, long n, const double* strength, const long long* atom, const int* bonds,
                   double* key) except -1 nogil:
-        # The keys of several atoms.
+        # Keys of several atoms.
         cdef long i
         for i in range(n):
             key[i] = self.key(strength[i], atom[i], bonds[i])
         return 0
 
     cdef Chooser chooser(self, Octree tree, double[::1] key):
-        # The chooser that goes with these keys.
+        # The chooser for these keys.
         return Largest(tree, key)
 
     def evaluate(self, const double[::1] strength, const long long[::1] atom, const int[::1] bonds):
-        """Keys of some atoms, shape (n,), as the sequence of events computes them."""
+        """Keys of atoms as in the sequence of events, shape (n,)."""
         cdef double[::1] key = np.empty(strength.shape[0])
         if strength.shape[0]:
             self.keys(strength.shape[0], &strength[0], &atom[0], &bonds[0], &key[0])
@@ -42,29 +42,29 @@ cdef class LawKernel:
 
 
 cdef class WeightedField(LawKernel):
-    """The key is the field times a weight of the atom: the atom of the largest product leaves.
+    """Law with the key field times weight of the atom: the atom with the largest product evaporates next.
 
     Parameters
     ----------
     weight : ndarray, shape (n_atoms,)
-        One over the evaporation field [nm/V], say; 0 for atoms that may not leave.
+        Weight, such as 1 / evaporation field [nm/V]; 0 for atoms that cannot evaporate.
     """
 
     def __init__(self, const double[::1] weight):
         self.weight = weight
 
     cdef double key(self, double strength, long long atom, int bonds) noexcept nogil:
-        # all strengths share one unit: it does not change the order
+        # all strengths have the same unit, which does not change the order
         return strength * self.weight[atom]
 
 
 cdef class PythonLaw(LawKernel):
-    """A law written in Python, behind the contract of the compiled ones; the atom of the largest key leaves.
+    """Wrapper of a law written in Python; the atom with the largest key evaporates next.
 
     Parameters
     ----------
     law : object
-        With a method ``keys(tip, atoms, fields, bonds)``, see `apt_evap.evaporation.law.Law`.
+        Object with a method ``keys(tip, atoms, fields, bonds)``, see `apt_evap.evaporation.law.Law`.
     tip : Tip
         The specimen.
     """
@@ -74,7 +74,7 @@ cdef class PythonLaw(LawKernel):
         self.field_unit = 1.0
 
     def begin(self, double field_unit):
-        """Take the field of strength 1 [V/nm]."""
+        """Set the field of strength 1 [V/nm]."""
         self.field_unit = field_unit
 
     cdef int keys(self, long n, const double* strength, const long long* atom, const int* bonds,

@@ -1,6 +1,6 @@
-"""The shape of an octree: atoms in Morton order, and the nodes as ranges of them.
+"""Structure of an octree: atoms in Morton order, and the nodes as ranges of them.
 
-Every step is shared by threads, and its outcome does not depend on how: keys and ranges are whole numbers.
+All steps are parallel, and the results do not depend on the threads: keys and ranges are integers.
 """
 
 from cython.parallel cimport prange
@@ -11,11 +11,11 @@ import numpy as np
 
 
 cdef enum:
-    BITS = 21            # of a coordinate in the key
-    BLOCK = 16384        # keys that one thread counts or moves at a time
-    DIGIT = 11           # bits of the key that one pass of the sort goes by
+    BITS = 21            # bits of a coordinate in the key
+    BLOCK = 16384        # keys that one thread counts or moves in one step
+    DIGIT = 11           # bits of the key per pass of the sort
     BUCKETS = 1 << DIGIT
-    SUBTREE = 4096       # atoms of a subtree that one thread makes; few enough to keep many threads busy
+    SUBTREE = 4096       # atoms of a subtree that one thread builds; small enough for many threads
     STACK = 8 * (BITS + 2)
 
 
@@ -27,11 +27,11 @@ cdef struct Node:
     int last
     int parent
     int skip        # the next node outside the subtree
-    int level       # lowest bit of the octants its children are told apart by, or would be
+    int level       # lowest bit of the octants of its (possible) children
 
 
 cdef inline Key spread(Key n) noexcept nogil:
-    # The bits of a coordinate, two zeros between each and the next.
+    # The bits of a coordinate, separated by two zeros each.
     n = (n | n << 32) & 0x1F00000000FFFFULL
     n = (n | n << 16) & 0x1F0000FF0000FFULL
     n = (n | n << 8) & 0x100F00F00F00F00FULL
@@ -47,14 +47,14 @@ def morton_order(const double[:, ::1] positions, int n_threads=1):
     positions : ndarray, shape (n, 3)
         Positions [nm].
     n_threads : int
-        Threads.
+        Number of threads.
 
     Returns
     -------
     order : ndarray of int64, shape (n,)
-        Numbers of the positions along the curve; those with the same key in their own order.
+        Indices of the positions along the curve; equal keys stay in the order of the indices.
     keys : ndarray of uint64, shape (n,)
-        Their keys in that order: the bits of x, y and z in turn, from the highest.
+        Keys in this order: interleaved bits of x, y and z, from the highest.
     """
     cdef long n = positions.shape[0], n_blocks = (n + BLOCK - 1) // BLOCK, block, i
     cdef double scale
@@ -74,7 +74,7 @@ def morton_order(const double[:, ::1] positions, int n_threads=1):
 
 
 cdef void enclose(const double[:, ::1] positions, long begin, long end, double* low, double* high) noexcept nogil:
-    # Bounding box of some positions.
+    # Bounding box of positions.
     cdef long i
     cdef int axis
     for axis in range(3):
@@ -84,12 +84,12 @@ cdef void enclose(const double[:, ::1] positions, long begin, long end, double* 
 
 
 cdef sort(Key[::1] keys, int n_threads):
-    # Order and sorted keys, by one stable pass after the other from the lowest digit to the highest.
+    # Order and sorted keys, by stable passes from the lowest digit to the highest.
     cdef long n = keys.shape[0], n_blocks = (n + BLOCK - 1) // BLOCK, block, bucket, total, count
     cdef int shift
     cdef Key[::1] other_keys = np.empty(n, np.uint64)
     cdef long long[::1] order = np.arange(n, dtype=np.int64), other_order = np.empty(n, np.int64)
-    cdef int[:, ::1] place = np.empty((n_blocks, BUCKETS), np.int32)   # at first how many, then where the next one goes
+    cdef int[:, ::1] place = np.empty((n_blocks, BUCKETS), np.int32)   # counts, then next positions
     for shift in range(0, 3 * BITS, DIGIT):
         for block in prange(n_blocks, nogil=True, schedule="dynamic", num_threads=n_threads):
             count_digits(keys, block * BLOCK, min(n, (block + 1) * BLOCK), shift, &place[block, 0])
@@ -132,11 +132,11 @@ def split(const Key[::1] keys, int leaf_size, int n_threads=1):
     Parameters
     ----------
     keys : ndarray of uint64, shape (n,)
-        Sorted.
+        Sorted keys.
     leaf_size : int
-        Most atoms of a node that is not cut into octants; more only where keys are equal.
+        Largest number of atoms of a node that is not split into octants; more only for equal keys.
     n_threads : int
-        Threads.
+        Number of threads.
 
     Returns
     -------
@@ -144,7 +144,7 @@ def split(const Key[::1] keys, int leaf_size, int n_threads=1):
         Slots [first, last), the node above (-1 for the root), and the next node outside the subtree.
     """
     cdef long n = keys.shape[0], n_top, t, begin
-    # a node that is cut has two children at least, so m atoms make less than 2 m nodes: subtrees do not meet
+    # a split node has at least two children, so m atoms have less than 2 m nodes: subtrees do not overlap
     cdef Node* top = <Node*>malloc(2 * n * sizeof(Node))
     cdef Node* below = <Node*>malloc(2 * n * sizeof(Node))
     cdef long[::1] start
@@ -186,8 +186,8 @@ cdef void copy(const Node* nodes, long n, long begin, int* first, int* last, int
 
 
 cdef long grow(const Key[::1] keys, long begin, long end, int level, int leaf_size, Node* nodes) noexcept nogil:
-    # Nodes over the slots [begin, end), numbered from 0; returns how many. Preorder with an explicit stack; a range
-    # whose atoms share the octant goes one level down without a node.
+    # Nodes over the slots [begin, end), numbered from 0; returns their number. Preorder with an explicit stack; a range
+    # with all atoms in one octant goes one level down without a node.
     cdef Node[STACK] stack
     cdef Node* node
     cdef long[9] cut

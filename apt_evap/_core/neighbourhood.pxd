@@ -1,24 +1,24 @@
 """The atoms and their neighbourhoods, for the other compiled modules."""
 
 cdef enum:
-    MAX_NEAR = 1024    # atoms within the radius of one; a dense metal has 54
+    MAX_NEAR = 1024    # largest number of atoms within the radius of an atom; a dense metal has 54
 
 
 cdef class Neighbourhood:
     cdef readonly long n_atoms
-    cdef readonly double radius         # of the neighbourhood, and edge of a cell of the grid [nm]
+    cdef readonly double radius         # of the neighbourhood; also the edge of a cell of the grid [nm]
     cdef readonly double threshold
     cdef readonly double bond_length    # [nm]
-    cdef const double[:, ::1] positions # (n, 3) nm, the caller's own array
+    cdef const double[:, ::1] positions # (n, 3) nm, array of the caller
     cdef signed char[::1] alive                # (n,)
     cdef const signed char[::1] support              # (n,) atoms that never become surface atoms
     cdef signed char[::1] exposed              # (n,) surface atoms
     cdef int[::1] count                 # (n,) neighbours within the radius
-    cdef signed char[::1] bonds         # (n,) nearest neighbours: those closer than `bond_length`
+    cdef signed char[::1] bonds         # (n,) number of nearest neighbours, closer than `bond_length`
     cdef double[:, ::1] offset          # (n, 3) sum of (neighbour - atom) over the neighbours [nm]
     cdef double[::1] low                # (3,) corner of the grid of cells [nm]
     cdef long[::1] shape                # (3,) cells along each axis
-    cdef int[::1] start                 # (cells + 1,) where each cell's atoms begin in `order`
+    cdef int[::1] start                 # (cells + 1,) begin of the atoms of each cell in `order`
     cdef int[::1] order                 # (n,) atoms cell by cell
 
     cdef int near(self, long atom, int* others) noexcept nogil

@@ -1,8 +1,8 @@
-"""Which atoms are at the surface, and their normals: from the centre of mass of each atom's neighbourhood.
+"""Surface atoms and their normals, from the mean position of the neighbourhood of each atom.
 
 For atom i at p_i with the mean c_i of all other atoms within a radius, d_i = |p_i - c_i|: a surface atom has d_i above
-a threshold, its outward normal is (p_i - c_i)/d_i (Rolland et al., Microsc. Microanal. 21, 1649, 2015). An atom once
-exposed stays exposed until it leaves.
+a threshold, its outward normal is (p_i - c_i)/d_i (Rolland et al., Microsc. Microanal. 21, 1649, 2015). An exposed atom
+stays exposed until it evaporates.
 """
 
 from cython.parallel cimport prange
@@ -12,24 +12,24 @@ import numpy as np
 
 
 cdef class Neighbourhood:
-    """Atoms, their neighbours within a radius, and the surface that follows.
+    """Atoms, their neighbours within a radius, and the resulting surface.
 
     Parameters
     ----------
     positions : ndarray, shape (n, 3)
-        All atoms held [nm].
+        All atoms [nm].
     radius : float
         Radius of the neighbourhood [nm].
     threshold : float
-        Offset of the centre of mass above which an atom is at the surface [nm].
+        Distance from the mean position of the neighbourhood above which an atom is a surface atom [nm].
     support : ndarray of int8, shape (n,)
-        1 for atoms that complete the neighbourhoods of others but are never surface atoms themselves.
+        1 for atoms that complete the neighbourhoods of others but are never surface atoms.
     bond_length : float
-        Atoms closer than this are nearest neighbours [nm]; at most the radius.
+        Atoms closer than this are nearest neighbours [nm]; not larger than the radius.
     n_threads : int
-        Threads.
+        Number of threads.
     before : Neighbourhood, optional
-        Of the first of these atoms: what has left it and what was exposed in it stays so.
+        Neighbourhood of the first of these atoms: its removed and exposed atoms stay removed and exposed.
     """
 
     def __init__(self, const double[:, ::1] positions, double radius, double threshold, const signed char[::1] support,
@@ -55,7 +55,7 @@ cdef class Neighbourhood:
         shape = np.floor((where.max(axis=0) - low) / radius).astype(np.int64) + 1
         self.shape = shape
         flat = np.zeros(n, np.int64)
-        for axis in range(3):   # one axis at a time: whole arrays of temporaries would be the peak of the memory
+        for axis in range(3):   # one axis at a time: complete temporary arrays would dominate the peak memory
             flat *= shape[axis]
             flat += np.floor((where[:, axis] - low[axis]) / radius).astype(np.int64)
         self.order = np.argsort(flat, kind="stable").astype(np.int32)
@@ -72,7 +72,7 @@ cdef class Neighbourhood:
             raise ValueError(f"radius must hold at most {MAX_NEAR} atoms around each atom, got {radius!r} nm")
 
     cdef int near(self, long atom, int* others) noexcept nogil:
-        # The atoms still there within the radius of one atom, in the order of the cells; -1: more than MAX_NEAR.
+        # The remaining atoms within the radius of an atom, in the order of the cells; -1: more than MAX_NEAR.
         cdef double px = self.positions[atom, 0], py = self.positions[atom, 1], pz = self.positions[atom, 2]
         cdef double dx, dy, dz, reach = self.radius * self.radius
         cdef long ci = <long>floor((px - self.low[0]) / self.radius), cj = <long>floor((py - self.low[1]) / self.radius)
@@ -94,7 +94,7 @@ cdef class Neighbourhood:
         return n
 
     cdef void gather(self, long atom) noexcept nogil:
-        # Count, bonds and sum of offsets of the neighbours; a count of -1 says there were too many.
+        # Count, bonds and sum of offsets of the neighbours; a count of -1 means too many.
         cdef int[MAX_NEAR] others
         cdef int n = self.near(atom, others), i
         cdef double step, s, bond = self.bond_length * self.bond_length
@@ -109,21 +109,21 @@ cdef class Neighbourhood:
             self.bonds[atom] += s <= bond
 
     cdef bint judge(self, long atom) noexcept nogil:
-        # Whether the atom is at the surface by its neighbours; one alone in space is.
+        # Whether the atom is a surface atom by its neighbours; an isolated atom is.
         cdef double sx = self.offset[atom, 0], sy = self.offset[atom, 1], sz = self.offset[atom, 2]
         if self.support[atom]:
             return False
         return self.count[atom] == 0 or sqrt(sx * sx + sy * sy + sz * sz) > self.threshold * self.count[atom]
 
     cdef void normal(self, long atom, double* normal) noexcept nogil:
-        # Outward unit normal; an atom whose neighbours pull nowhere keeps the one it had.
+        # Outward unit normal; an atom with zero offset keeps its last normal.
         cdef double sx = self.offset[atom, 0], sy = self.offset[atom, 1], sz = self.offset[atom, 2]
         cdef double length = sqrt(sx * sx + sy * sy + sz * sz)
         if self.count[atom] > 0 and length > 1e-9:
             normal[0], normal[1], normal[2] = -sx / length, -sy / length, -sz / length
 
     cdef int remove(self, long atom, int* fresh) noexcept nogil:
-        # Takes an atom away, renews the normals around it; lists the atoms that came to the surface, returns how many.
+        # Removes an atom and updates the normals around it; lists the newly exposed atoms and returns their number.
         cdef int[MAX_NEAR] others
         cdef int n = self.near(atom, others), i, other, n_fresh = 0
         cdef double step, s, bond = self.bond_length * self.bond_length
@@ -146,7 +146,7 @@ cdef class Neighbourhood:
         return n_fresh
 
     cdef bint reaches_support(self, long atom) noexcept nogil:
-        # Whether taking this atom away could expose atoms that are only held as support.
+        # Whether the removal of this atom could expose support atoms.
         cdef int[MAX_NEAR] others
         cdef int n = self.near(atom, others), i
         for i in range(n):
@@ -155,12 +155,12 @@ cdef class Neighbourhood:
         return False
 
     def remove_atom(self, long atom):
-        """Take one atom away; return the atoms that came to the surface by it, shape (m,)."""
+        """Remove an atom; return the newly exposed atoms, shape (m,)."""
         cdef int[::1] fresh = np.empty(MAX_NEAR, np.int32)
         return np.asarray(fresh)[:self.remove(atom, &fresh[0])].copy()
 
     def remove_atoms(self, const long long[::1] atoms):
-        """Take atoms away one after the other, as events do; ValueError for one that is not there."""
+        """Remove atoms one by one, as events do; ValueError for an atom that was already removed."""
         cdef int[::1] fresh = np.empty(MAX_NEAR, np.int32)
         cdef long i
         for i in range(atoms.shape[0]):
@@ -172,11 +172,11 @@ cdef class Neighbourhood:
 
     @property
     def surface(self):
-        """Atoms at the surface, shape (m,), in the caller's numbering."""
+        """Indices of the surface atoms, shape (m,)."""
         return np.flatnonzero(np.asarray(self.exposed).view(bool))   # as bool: seven times faster
 
     def positions_of(self, const long long[::1] atoms, int n_threads=1):
-        """Positions of some atoms [nm], shape (m, 3): gathered from all over the memory, which takes time."""
+        """Positions of atoms [nm], shape (m, 3); slow, because they are scattered in memory."""
         cdef double[:, ::1] positions = np.empty((len(atoms), 3))
         cdef long i
         for i in prange(atoms.shape[0], nogil=True, schedule="static", num_threads=n_threads):
@@ -186,7 +186,7 @@ cdef class Neighbourhood:
         return np.asarray(positions)
 
     def normals_of(self, atoms, int n_threads=1):
-        """Outward unit normals of some atoms, shape (m, 3); (0, 0, 1) where the neighbours pull nowhere."""
+        """Outward unit normals of atoms, shape (m, 3); (0, 0, 1) for zero offset of the neighbours."""
         cdef long long[::1] chosen = np.ascontiguousarray(atoms, np.int64)
         cdef double[:, ::1] normals = np.tile([0.0, 0.0, 1.0], (len(chosen), 1))
         cdef long i
@@ -206,5 +206,5 @@ cdef class Neighbourhood:
 
     @property
     def offsets(self):
-        """Distance of each atom from the centre of mass of its neighbours [nm], shape (n,)."""
+        """Distance of each atom from the mean position of its neighbours [nm], shape (n,)."""
         return np.linalg.norm(np.asarray(self.offset), axis=1) / np.maximum(np.asarray(self.count), 1)

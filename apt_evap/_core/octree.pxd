@@ -4,15 +4,15 @@ from apt_evap._core.sources cimport Sources
 
 
 cdef class Octree:
-    cdef readonly long n_slots          # atoms in the tree's arrays, those taken out included (their charge is 0)
-    cdef readonly long n_sorted         # of these, the ones that stand in the order of the leaves
+    cdef readonly long n_slots          # atoms in the arrays of the tree, including removed ones (with charge 0)
+    cdef readonly long n_sorted         # number of these in the order of the leaves
     cdef readonly long n_nodes
     cdef readonly int leaf_size
-    cdef int n_threads                  # of what is done to the whole tree
+    cdef int n_threads                  # for operations on the whole tree
     cdef double[::1] x, y, z, q         # (capacity,) nm, e
-    cdef long long[::1] atom            # (capacity,) the caller's index; -1 for one taken out
+    cdef long long[::1] atom            # (capacity,) index of the caller; -1 for a removed atom
     cdef int[::1] leaf                  # (capacity,) node of each slot
-    cdef int[::1] next_extra            # (capacity,) chain of the slots put into a leaf after the build
+    cdef int[::1] next_extra            # (capacity,) chain of the slots added to a leaf after the build
     cdef int[::1] first, last, skip, parent, extra   # (n_nodes,) slots [first, last), next node outside, ...
     cdef double[:, ::1] ball            # (n_nodes, 4) centre and radius [nm], fixed while charges change
     cdef double[:, ::1] cells           # (n_nodes, CELL) moments about the centre of charge

@@ -1,9 +1,9 @@
 """Octree over charged atoms: fields by cells with quadrupoles (Barnes and Hut, Nature 324, 446, 1986).
 
 The tree is flat: nodes in preorder with two integers each (`skip`, the next node outside the subtree, and the slots
-[first, last)), so a walk is a loop. A cell carries charge and traceless quadrupole about its centre of charge; whether
-it may stand for its atoms is decided on its fixed ball, so the lists do not depend on the charges. Charges must not be
-negative: a cell has its centre of charge for origin.
+[first, last)), so a walk is a loop. A cell has a charge and a traceless quadrupole about its centre of charge. Whether
+it replaces its atoms depends on its fixed ball, so the lists do not depend on the charges. Charges must not be
+negative, because the origin of a cell is its centre of charge.
 """
 
 from cython.parallel cimport prange
@@ -26,15 +26,16 @@ cdef class Octree:
     positions : ndarray, shape (n, 3)
         Positions of the atoms [nm].
     charges : ndarray, shape (n,)
-        Charges, none negative [e].
+        Charges [e], >= 0.
     atoms : ndarray of int64, shape (n,), optional
-        The caller's index of each atom; by default 0 ... n - 1.
+        Index of each atom for the caller; by default 0 ... n - 1.
     leaf_size : int
-        Most atoms of a leaf. 8, 16 and 24 are within a tenth in the time and the error of lists and sweep (R = 80 a).
+        Largest number of atoms of a leaf. Measured: 8, 16 and 24 differ by less than 10 % in time and error of lists
+        and sweep (R = 80 a).
     extra : int
-        How many atoms may be put in before the tree is built anew.
+        Number of atoms that can be added before the tree is rebuilt.
     n_threads : int
-        Threads.
+        Number of threads.
     """
 
     def __init__(self, const double[:, ::1] positions, const double[::1] charges, atoms=None, int leaf_size=16,
@@ -66,7 +67,7 @@ cdef class Octree:
         self.refresh_all()
 
     cdef enclose(self, int n_threads):
-        # Leaf of every slot, and ball of every node: middle of its bounding box, and distance to its farthest atom.
+        # Leaf of every slot, and ball of every node: centre of its bounding box, and distance of its farthest atom.
         cdef long node
         cdef int up, axis
         cdef double[:, ::1] low = np.full((self.n_nodes, 3), np.inf), high = np.full((self.n_nodes, 3), -np.inf)
@@ -103,7 +104,7 @@ cdef class Octree:
         ball[3] = sqrt(far)
 
     cdef inline long following(self, long node, long slot) noexcept nogil:
-        # The slot of a leaf after this one: those in order, then those put in later; -1 after the last.
+        # The next slot of a leaf: first those in order, then those added later; -1 after the last.
         if slot + 1 < self.last[node]:
             return slot + 1
         return self.extra[node] if slot < self.last[node] else self.next_extra[slot]
@@ -171,7 +172,7 @@ cdef class Octree:
         cell[4], cell[5], cell[6], cell[7], cell[8], cell[9] = xx, xy, xz, yy, yz, zz
 
     def refresh_all(self):
-        """Moments of every node from the charges."""
+        """Recompute the moments of every node from the charges."""
         cdef long node
         for node in prange(self.n_nodes, nogil=True, schedule="dynamic", chunksize=256, num_threads=self.n_threads):
             if self.skip[node] == node + 1:
@@ -189,17 +190,17 @@ cdef class Octree:
             node = self.parent[node]
 
     cdef void set_charge(self, long slot, double charge) noexcept nogil:
-        # The moments follow at the next refresh().
+        # The moments are updated at the next refresh().
         self.q[slot] = charge
         self.mark(self.leaf[slot])
 
     cdef void take_out(self, long slot) noexcept nogil:
-        # The slot stays, without charge and without an atom.
+        # The slot remains, without charge and without an atom.
         self.atom[slot] = -1
         self.set_charge(slot, 0.0)
 
     cdef long put_in(self, long long atom, double px, double py, double pz, int leaf) noexcept nogil:
-        # A new atom joins a leaf that has an atom beside it; the balls above grow to hold it. -1: no room left.
+        # Adds an atom to the leaf of a neighbouring atom; the balls above grow to contain it. -1: no space left.
         cdef long slot = self.n_slots, node = leaf
         cdef double far
         if slot >= self.x.shape[0]:
@@ -220,7 +221,7 @@ cdef class Octree:
         return slot
 
     cdef void refresh(self) noexcept nogil:
-        # Moments of the nodes above changed charges, children before parents: preorder numbers from high to low.
+        # Recomputes moments of the nodes above changed charges, children before parents: descending preorder numbers.
         cdef long i, j
         cdef int node
         for i in range(1, self.n_dirty):
@@ -239,8 +240,8 @@ cdef class Octree:
 
     cdef int collect(self, double cx, double cy, double cz, double radius, double opening_angle,
                      Sources* sources) except -1 nogil:
-        # Everything that acts on the targets in a ball: a cell where its ball is seen under less than the opening
-        # angle from all of the targets' ball, atoms elsewhere.
+        # Collects all sources for the targets in a ball: a cell if its ball appears under less than the opening angle
+        # from every point of the ball of the targets, otherwise its atoms.
         cdef long node = 0, k, stride, m
         cdef double dx, dy, dz, distance, factor = 2.0 / opening_angle if opening_angle > 0.0 else 1e30
         sources.n_atoms = sources.n_cells = 0
@@ -270,7 +271,7 @@ cdef class Octree:
         while sources.n_cells % LANES:
             for m in range(CELL):
                 sources.cells[m * stride + sources.n_cells] = 0.0
-            sources.cells[sources.n_cells] = cx + 1e6   # an empty cell, away from every target
+            sources.cells[sources.n_cells] = cx + 1e6   # an empty cell, distant from every target
             sources.n_cells += 1
         return 0
 
@@ -283,7 +284,8 @@ cdef class Octree:
         sources.n_atoms = m + 1
 
     cdef long within(self, double px, double py, double pz, double radius, int* slots, long most) noexcept nogil:
-        # Slots of the atoms within a radius, in the order of the tree; lists at most `most`, returns how many there are.
+        # Slots of the atoms within a radius, in the order of the tree; lists up to `most` of them, returns their
+        # number.
         cdef long node = 0, k, n = 0
         cdef double dx, dy, dz, reach
         while node < self.n_nodes:
@@ -312,11 +314,11 @@ cdef class Octree:
         Parameters
         ----------
         points : ndarray, shape (m, 3)
-            Points [nm]; an atom of the tree at the very place of a point does not act on it.
+            Points [nm]; an atom of the tree at the position of a point does not act on it.
         opening_angle : float
-            Full angle under which a cell is taken as a whole [rad]; 0 sums over all atoms.
+            Largest full angle of a cell that replaces its atoms [rad]; 0 sums over all atoms.
         n_threads : int
-            Threads.
+            Number of threads.
 
         Returns
         -------
@@ -354,7 +356,7 @@ cdef class Octree:
         sources_free(&sources)
         return total
 
-    # ---- for the callers' eyes -------------------------------------------------------------------------------------
+    # ---- read access -----------------------------------------------------------------------------------------------
 
     @property
     def positions(self):
@@ -363,7 +365,7 @@ cdef class Octree:
 
     @property
     def charges(self):
-        """Charges of the slots [e], shape (n_slots,); 0 where an atom was taken out."""
+        """Charges of the slots [e], shape (n_slots,); 0 where an atom was removed."""
         return np.asarray(self.q)[:self.n_slots]
 
     @charges.setter
@@ -373,12 +375,12 @@ cdef class Octree:
 
     @property
     def atoms(self):
-        """The caller's index of the atom in each slot, shape (n_slots,); -1 where an atom was taken out."""
+        """Index of the atom in each slot, shape (n_slots,); -1 where an atom was removed."""
         return np.asarray(self.atom)[:self.n_slots]
 
     @property
     def capacity(self):
-        """Slots there is room for."""
+        """Largest number of slots."""
         return self.x.shape[0]
 
     @property

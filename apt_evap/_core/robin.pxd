@@ -1,4 +1,4 @@
-"""Robin's rule, for those that build on it."""
+"""Robin's rule, for derived rules."""
 
 from apt_evap._core.octree cimport Octree
 from apt_evap._core.rule cimport FieldRule, Patch
@@ -7,8 +7,8 @@ from apt_evap._core.rule cimport FieldRule, Patch
 cdef class Robin(FieldRule):
     cdef readonly double tolerance
     cdef readonly int window
-    cdef readonly object point          # (1, 3) the point inside that has the potential [nm]
-    cdef double clearance               # of this point from the surface at first [nm]
+    cdef readonly object point          # (1, 3) the point inside with the given potential [nm]
+    cdef double clearance               # initial distance of this point from the surface [nm]
     cdef float[::1] matrix, residual
 
     cdef normal_field(self, const double[:, ::1] normals, long n)

@@ -1,7 +1,7 @@
 """Charges of the surface atoms: Robin's iteration, for the whole surface and for a patch of it.
 
-q_i <- (s/2 pi) sum_{k != i} q_k n_i . (r_i - r_k)/|r_i - r_k|^3, with s, the area per atom, set anew in every sweep so
-that the total charge is kept (Robin, 1886; Rolland et al., Microsc. Microanal. 21, 1649, 2015).
+q_i <- (s/2 pi) sum_{k != i} q_k n_i . (r_i - r_k)/|r_i - r_k|^3, with s, the area per atom, chosen in every sweep so
+that the total charge is conserved (Robin, 1886; Rolland et al., Microsc. Microanal. 21, 1649, 2015).
 """
 
 cimport cython
@@ -66,12 +66,12 @@ cdef class Robin(FieldRule):
         self.grow(512)
 
     def begin(self, point):
-        """Take the point inside the specimen [nm], shape (3,), that is to have the potential."""
+        """Set the point inside the specimen where the potential is given [nm], shape (3,)."""
         self.point = np.array(point, dtype=np.float64).reshape(1, 3)
 
     @property
     def state(self):
-        """The point that has the potential [nm], as "potential_point"."""
+        """The point with the given potential [nm], as "potential_point"."""
         return {"potential_point": self.point.ravel()}
 
     @state.setter
@@ -87,12 +87,12 @@ cdef class Robin(FieldRule):
         return outcome
 
     def scale(self, Octree tree, double factor):
-        """Multiply all charges, and the fields they make, by a factor."""
+        """Multiply all charges and their fields by a factor."""
         tree.charges = np.asarray(tree.charges) * factor
         np.asarray(self.field)[:] *= factor
 
     def keep_inside(self, Octree tree):
-        """Distances of the surface from the point of the potential [nm]; it moves down where the surface comes close."""
+        """Distances of the surface from the point of the potential [nm]; moves the point down if one is small."""
         away = self.distances(tree)
         if self.clearance == 0.0:
             self.clearance = away.min()
@@ -109,13 +109,13 @@ cdef class Robin(FieldRule):
         return np.sqrt(sum((column[:tree.n_slots] - at) ** 2 for column, at in zip(columns, self.point[0])))
 
     def residuals(self, positions, normals, charges, chosen):
-        """How far charges are from Robin's equation: see `ChargingRule.residuals`.
+        """Residuals of Robin's equation: see `ChargingRule.residuals`.
 
         Notes
         -----
         (s/2 pi) sum_k q_k n_i . r_ik / r_ik^3 - q_i, with r_ik = r_i - r_k and the area per atom s of the last
-        relaxation (Rolland et al., Microsc. Microanal. 21, 1649, 2015). Each sweep of Robin's iteration about halves the
-        error, so that it is about as large as the residual.
+        relaxation (Rolland et al., Microsc. Microanal. 21, 1649, 2015). Each sweep of Robin's iteration reduces the
+        error to about one half, so the error is about as large as the residual.
         """
         field = interactions.direct_field(positions[chosen], positions, charges)
         settled = self.area / (2 * np.pi) * (field * normals[chosen]).sum(axis=1)
@@ -124,31 +124,31 @@ cdef class Robin(FieldRule):
     @cython.wraparound(True)
     def iterate(self, Octree tree, const double[:, ::1] normals, InteractionLists lists, *, double tolerance=1e-6,
                 int max_sweeps=200, bint double_precision=False, int n_threads=1):
-        """Iterate over the whole surface from the charges the tree has.
+        """Iterate over the whole surface from the charges in the tree.
 
         Parameters
         ----------
         tree : Octree
-            Its charges are the start, and are replaced; their sum is kept.
+            Its charges are the start values, and are replaced; their sum is conserved.
         normals : ndarray, shape (n, 3)
             Outward unit normals in the order of the slots.
         lists : InteractionLists
-            Of this tree.
+            Interaction lists of this tree.
         tolerance : float
             Largest change of a charge in a sweep, relative to the mean charge, at which to stop.
         max_sweeps : int
-            Sweeps after which to stop in any case.
+            Maximum number of sweeps.
         double_precision : bool
             Needed for tolerances below 1e-6.
         n_threads : int
-            Threads.
+            Number of threads.
 
         Returns
         -------
         sweeps : int
-            Sweeps done.
+            Number of sweeps.
         residual : float
-            Largest change of a charge in the last one, relative to the mean charge.
+            Largest change of a charge in the last sweep, relative to the mean charge.
         """
         cdef long n = tree.n_slots
         cdef int sweeps = 0
@@ -156,10 +156,10 @@ cdef class Robin(FieldRule):
         self.field = np.zeros((tree.x.shape[0], 3))
         charges = tree.charges
         total = charges.sum()
-        maps, steps = [], []   # of the last sweeps: what Robin's iteration made of the charges, and by how much
+        maps, steps = [], []   # of the last sweeps: results of Robin's iteration, and their changes
         for sweeps in range(1, max_sweeps + 1):
             lists.sweep(self.field, double_precision, n_threads)
-            flux = np.maximum(self.normal_field(normals, n), 0.0)   # a site deep in a notch stays without charge
+            flux = np.maximum(self.normal_field(normals, n), 0.0)   # a site deep in a notch has no charge
             if not flux.sum() > 0.0:
                 raise ValueError(f"{n} surface atoms hold no charge together: expected normals that point outwards")
             self.area = 2.0 * M_PI * total / flux.sum()
@@ -186,10 +186,10 @@ cdef class Robin(FieldRule):
 
     @cython.wraparound(True)
     def mixed(self, maps, steps):
-        """Next charges by Anderson's mixing of the last sweeps (J. ACM 12, 547, 1965).
+        """Next charges by Anderson mixing of the last sweeps (J. ACM 12, 547, 1965).
 
-        The combination of the last maps whose combined step is the smallest; a sum of charges that all maps share is
-        kept.
+        The linear combination of the last maps with the smallest combined step; the common total charge of all maps is
+        conserved.
         """
         cdef int i, j
         del maps[:-self.window - 1], steps[:-self.window - 1]
@@ -201,7 +201,7 @@ cdef class Robin(FieldRule):
             for j in range(i + 1):
                 gram[i, j] = gram[j, i] = dot(step_changes[i], step_changes[j])
         right = np.array([dot(change, steps[-1]) for change in step_changes])
-        gram += 1e-12 * np.trace(gram) * np.eye(len(gram))   # equal steps: any fractions will do
+        gram += 1e-12 * np.trace(gram) * np.eye(len(gram))   # regular also for equal steps
         eliminate(gram, right)
         charges = maps[-1].copy()
         for fraction, other in zip(right, maps[:-1]):
@@ -216,7 +216,8 @@ cdef class Robin(FieldRule):
         return 0
 
     cdef int patch_charges(self, Octree tree, double[:, ::1] normals, Patch* patch) except -1 nogil:
-        # Gauss-Seidel on the changes: x_i = r_i + (s/2 pi) sum_k K_ik x_k with the residual r_i of the old charges.
+        # Gauss-Seidel iteration of the changes: x_i = r_i + (s/2 pi) sum_k K_ik x_k with the residual r_i of the old
+        # charges.
         cdef double c = self.area / (2.0 * M_PI), mean = 0.0
         cdef float new, largest
         cdef long i, slot

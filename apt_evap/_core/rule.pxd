@@ -1,8 +1,8 @@
-"""The contract of a charging rule: all that the events, the monitor and the chooser need of an electrostatics.
+"""Interface of a charging rule: all that the events, the monitor and the chooser need of the electrostatics.
 
-A rule keeps, for every slot of the tree, what it needs to know of the charges of all others: a field or a potential. The
-calls come in this order: `solve` over a new tree; then for every event `removed`, `exposed` for each atom that comes to
-the surface, and `solve_patch`, which solves the charges around the hole and spreads their change over its surroundings.
+A rule stores, for every slot of the tree, the effect of all other charges: a field or a potential. The order of the
+calls is: `solve` for a new tree; then for every event `removed`, `exposed` for each newly exposed atom, and
+`solve_patch`, which solves the charges around the hole and updates the fields of its surroundings.
 """
 
 from apt_evap._core.octree cimport Octree
@@ -10,12 +10,12 @@ from apt_evap._core.sources cimport Sources
 
 
 cdef struct Hole:
-    # The surroundings of an atom that left: slots whose fields are kept up to date. Places are relative to the hole; their
-    # arrays are filled up to a multiple of GROUP with places far away.
-    double x                # of the atom that left [nm]
+    # The surroundings of an evaporated atom: slots whose fields are updated. Positions are relative to the hole; the
+    # arrays are padded to a multiple of GROUP with distant positions.
+    double x                # position of the evaporated atom [nm]
     double y
     double z
-    double charge           # it took along [e]
+    double charge           # its charge [e]
     long n
     int* slot
     float* near_x           # [nm]
@@ -25,21 +25,21 @@ cdef struct Hole:
 
 cdef struct Patch:
     # The slots around a hole whose charges are solved. x, y, z and change have `stride` elements, a multiple of
-    # PATCH_LANES; those from n on have no charge and are far away.
+    # PATCH_LANES; elements from n on have no charge and are distant.
     long n
     long stride
     int* slot
-    double* charge          # solved [e]
-    float* change           # solved, relative to the charges in the tree [e]
+    double* charge          # new charges [e]
+    float* change           # new charges minus the charges in the tree [e]
     float* x                # relative to the hole [nm]
     float* y
     float* z
-    long n_clipped          # charges that came out negative and were set to 0
-    bint unsettled          # whether the charges were still changing after the last iteration
+    long n_clipped          # negative charges that were set to 0
+    bint unsettled          # whether the iteration did not converge
 
 
 cdef class ChargingRule:
-    cdef readonly double area           # surface per atom [nm^2], as of the last relaxation
+    cdef readonly double area           # area per surface atom at the last relaxation [nm^2]
 
     cdef void removed(self, Octree tree, const Hole* hole) noexcept nogil
     cdef int exposed(self, Octree tree, long slot, double opening_angle) except -1 nogil
@@ -48,8 +48,8 @@ cdef class ChargingRule:
 
 
 cdef class FieldRule(ChargingRule):
-    cdef double[:, ::1] field           # (capacity, 3) field of all the others on each slot [e/nm^2]
-    cdef float[:, ::1] spread           # (3, room) what a patch changes in it
+    cdef double[:, ::1] field           # (capacity, 3) field of all other atoms at each slot [e/nm^2]
+    cdef float[:, ::1] spread           # (3, room) change of this field by a patch
     cdef Sources sources
 
     cdef int patch_charges(self, Octree tree, double[:, ::1] normals, Patch* patch) except -1 nogil

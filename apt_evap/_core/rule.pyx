@@ -1,4 +1,4 @@
-"""Charging rules: the contract, what rules share that keep the field on every slot, and rules written in Python."""
+"""Charging rules: the interface, the base of rules that store a field per slot, and rules written in Python."""
 
 from libc.math cimport M_PI, sqrt
 
@@ -16,51 +16,50 @@ cdef extern from "kernels.h":
 
 
 cdef class ChargingRule:
-    """Interface of a charging rule: how charge distributes over the surface atoms.
+    """Interface of a charging rule: the distribution of the charge over the surface atoms.
 
     Compiled rules implement the five methods below `solve` in Cython (``rule.pxd``); a rule in Python is wrapped by
-    `PythonRule`. The strength of a slot is the field just outside of it in a unit that `field_unit` gives: the charge,
-    unless a rule says otherwise.
+    `PythonRule`. The strength of a slot is the field just outside it in the unit `field_unit`: by default the charge.
     """
 
     def solve(self, Octree tree, double[:, ::1] normals, InteractionLists lists, *, double potential, double tolerance,
               int max_sweeps=200, bint double_precision=False, int n_threads=1):
-        """Solve the charges of the whole surface and bring it to its potential.
+        """Solve the charges of the whole surface at its potential.
 
         Parameters
         ----------
         tree : Octree
-            Its charges are the start, and are replaced.
+            Its charges are the start values, and are replaced.
         normals : ndarray, shape (n, 3)
             Outward unit normals in the order of the slots.
         lists : InteractionLists
-            Of this tree.
+            Interaction lists of this tree.
         potential : float
-            Potential of the specimen over the Coulomb constant [e/nm].
+            Potential of the specimen divided by the Coulomb constant [e/nm].
         tolerance : float
-            Largest relative change of a charge in a sweep at which to stop.
+            Largest change of a charge in a sweep, relative to the mean charge, at which to stop.
         max_sweeps : int
-            Sweeps after which to stop in any case.
+            Maximum number of sweeps.
         double_precision : bool
             Sums in float64; needed for tolerances below 1e-6.
         n_threads : int
-            Threads.
+            Number of threads.
 
         Returns
         -------
         sweeps : int
-            Sweeps done.
+            Number of sweeps.
         residual : float
-            Largest change of a charge in the last one, relative to the mean charge.
+            Largest change of a charge in the last sweep, relative to the mean charge.
         """
         raise NotImplementedError(f"{type(self).__name__} has no solve")
 
     def begin(self, point):
-        """Take a point well inside the specimen [nm], shape (3,), before the first relaxation."""
+        """Set a point well inside the specimen [nm], shape (3,), before the first relaxation."""
 
     @property
     def state(self):
-        """What a relaxation starts from besides the charges, dict of arrays by name; kept in files."""
+        """Further input of a relaxation besides the charges, dict of arrays by name; stored in files."""
         return {}
 
     @state.setter
@@ -68,7 +67,7 @@ cdef class ChargingRule:
         pass
 
     def field_unit(self, double coulomb):
-        """Field just outside a slot of strength 1 [V/nm]: 4 pi k_e / area for a charge on its area of the surface."""
+        """Field just outside a slot of strength 1 [V/nm]: 4 pi k_e / area for a charge on its surface area."""
         return 4.0 * M_PI * coulomb / self.area
 
     def strengths(self, Octree tree):
@@ -81,7 +80,7 @@ cdef class ChargingRule:
         return np.asarray(values)
 
     def residuals(self, positions, normals, charges, chosen):
-        """How far charges are from the rule's own equation, by direct sums over all others.
+        """Residuals of the equation of the rule, by direct sums over all other atoms.
 
         Parameters
         ----------
@@ -90,25 +89,25 @@ cdef class ChargingRule:
         charges : ndarray, shape (n,)
             Charges [e].
         chosen : ndarray of int, shape (m,)
-            Atoms to check.
+            Indices of the atoms.
 
         Returns
         -------
         ndarray, shape (m,)
-            Residuals over the mean charge; NaN for a rule that cannot say.
+            Residuals relative to the mean charge; NaN for a rule that does not define them.
         """
         return np.full(len(chosen), np.nan)
 
     cdef void removed(self, Octree tree, const Hole* hole) noexcept nogil:
-        # An atom has left, with its charge: the tree does not hold it any more.
+        # An atom has evaporated, with its charge: the tree does not contain it any more.
         pass
 
     cdef int exposed(self, Octree tree, long slot, double opening_angle) except -1 nogil:
-        # An atom without charge has come to the surface, in this slot of the tree.
+        # An atom without charge was exposed, in this slot of the tree.
         return 0
 
     cdef int solve_patch(self, Octree tree, double[:, ::1] normals, const Hole* hole, Patch* patch) except -1 nogil:
-        # Solve the charges of the patch while all others are held, and spread the change over the slots of the hole.
+        # Solve the charges of the patch with all others fixed, and update the fields of the slots around the hole.
         with gil:
             raise NotImplementedError(f"{type(self).__name__} has no solve_patch")
 
@@ -118,7 +117,7 @@ cdef class ChargingRule:
 
 
 cdef class FieldRule(ChargingRule):
-    """A rule that keeps the field of all the others on every slot, and whose charges are never negative."""
+    """Base of rules that store the field of all other atoms at every slot, with charges >= 0."""
 
     def __cinit__(self, *args, **kwargs):
         sources_init(&self.sources)
@@ -152,7 +151,7 @@ cdef class FieldRule(ChargingRule):
         cdef float *field_z
         self.patch_charges(tree, normals, patch)
         for i in range(patch.n):
-            if patch.charge[i] < 0.0:   # a cell's moments stand on its centre of charge: none may be negative
+            if patch.charge[i] < 0.0:   # moments of cells are about the centre of charge: no negative charges
                 patch.change[i] = <float>-tree.q[patch.slot[i]]
                 patch.charge[i] = 0.0
                 patch.n_clipped += 1
@@ -172,18 +171,18 @@ cdef class FieldRule(ChargingRule):
         return 0
 
     cdef int patch_charges(self, Octree tree, double[:, ::1] normals, Patch* patch) except -1 nogil:
-        # New charges of a patch and their changes, from the fields on its slots and the charges in the tree.
+        # New charges of a patch and their changes, from the fields at its slots and the charges in the tree.
         with gil:
             raise NotImplementedError(f"{type(self).__name__} has no patch_charges")
 
 
 cdef class PythonRule(FieldRule):
-    """A charging rule written in Python, behind the contract of the compiled ones.
+    """Wrapper of a charging rule written in Python.
 
     Parameters
     ----------
     rule : object
-        With the methods of `apt_evap.evaporation.rule.Rule`.
+        Object with the methods of `apt_evap.evaporation.rule.Rule`.
     """
 
     def __init__(self, rule):
@@ -214,10 +213,10 @@ cdef class PythonRule(FieldRule):
         before = tree.charges.copy()
         field_of(charges)
         change = float(np.abs(charges - before).max() / charges.mean())
-        return 1, min(change, 0.5 * tolerance)   # the rule has judged for itself when to stop
+        return 1, min(change, 0.5 * tolerance)   # the rule itself decides when to stop
 
     def residuals(self, positions, normals, charges, chosen):
-        """What the rule says itself, if it has a method of this name: see `ChargingRule.residuals`."""
+        """Residuals of the wrapped rule, if it has a method of this name: see `ChargingRule.residuals`."""
         own = getattr(self.rule, "residuals", None)
         return np.full(len(chosen), np.nan) if own is None else own(positions, normals, charges, chosen)
 

@@ -1,4 +1,4 @@
-"""What a walk through the octree collects, for those who walk."""
+"""Sources that a walk through the octree collects."""
 
 cdef extern from "kernels.h":
     const int CELL
@@ -9,7 +9,7 @@ cdef extern from "kernels.h":
 
 
 cdef struct Sources:
-    # What one walk collects for a ball of targets: atoms and cells, ready for the kernels.
+    # Sources for a ball of targets: atoms and cells in the layout of the kernels.
     long n_atoms
     long n_cells
     long capacity        # of each column

@@ -1,1 +1,1 @@
-"""Compiled modules alone use it."""
+"""Used only by compiled modules."""

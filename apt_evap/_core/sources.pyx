@@ -1,4 +1,4 @@
-"""What acts on a ball of targets: atoms and cells in columns, and their field and potential at a point."""
+"""Sources for a ball of targets: atoms and cells in columns, and their field and potential at a point."""
 
 from libc.math cimport sqrt
 from libc.stdlib cimport free, malloc, realloc
@@ -22,7 +22,7 @@ cdef void sources_free(Sources* sources) noexcept nogil:
 
 
 cdef int sources_grow(Sources* sources) except -1 nogil:
-    # Columns keep their stride: the old ones are spread out over the new, wider ones, last column first.
+    # The stride of the columns changes: they are moved to the new memory layout, the last column first.
     cdef long old = sources.capacity, column, k
     sources.capacity = 2 * old
     sources.atoms = <double*>realloc(sources.atoms, 8 * old * sizeof(double))
@@ -40,7 +40,7 @@ cdef int sources_grow(Sources* sources) except -1 nogil:
 
 
 cdef void sources_field(const Sources* sources, double px, double py, double pz, double* field) noexcept nogil:
-    # Field [e/nm^2] of everything collected, at one point.
+    # Field [e/nm^2] of all collected sources at one point.
     cdef const double* a = sources.atoms
     cdef long stride = sources.capacity
     field[0] = field[1] = field[2] = 0.0
@@ -49,7 +49,7 @@ cdef void sources_field(const Sources* sources, double px, double py, double pz,
 
 
 cdef double sources_potential(const Sources* sources, double px, double py, double pz) noexcept nogil:
-    # Potential [e/nm] of everything collected, at one point.
+    # Potential [e/nm] of all collected sources at one point.
     cdef const double* a = sources.atoms
     cdef const double* c
     cdef double total = 0.0, dx, dy, dz, s, w2

@@ -1,1 +1,1 @@
-"""What maps and runs say: profiles, widths of zone lines, similarity, the apex, tracks of single ions."""
+"""Analysis of maps and runs: profiles, widths of zone lines, similarity, the apex, tracks of single ions."""

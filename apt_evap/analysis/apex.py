@@ -1,4 +1,4 @@
-"""What the ions of a run say about the shape of the cap and the way to the detector."""
+"""Shape of the cap, image compression and field factor, from the ions of a run."""
 
 import math
 from collections.abc import Sequence
@@ -15,58 +15,58 @@ from apt_evap.detection.projection import Projection, polar_angles
 from apt_evap.emission.perturbations import Unperturbed
 from apt_evap.simulation.run import Run
 
-_CAP = math.radians(45)  # launch sites nearer to the axis than this make the sphere: the shank is far
-_NEAR = math.radians(20)  # about the apex, for its field
+_CAP = math.radians(45)  # sites within this angle of the axis define the sphere: far from the shank
+_NEAR = math.radians(20)  # angle around the apex for its field
 _BIN = 2.0  # degrees
-_LEAST_IONS = 30  # for the median of a bin
-_INNER = 15.0  # degrees: nearer to the axis a pole there pushes its ions outwards
-_TOLERANCE = 0.05  # share by which the median of a bin may differ from the fit
+_LEAST_IONS = 30  # fewest ions for the median of a bin
+_INNER = 15.0  # [degrees]: inside this angle a pole on the axis deflects its ions outwards
+_TOLERANCE = 0.05  # largest relative deviation of the median of a bin from the fit
 
 
 class Cap(NamedTuple):
-    """Sphere through the launch sites of some ions in a row."""
+    """Sphere fitted to the sites of successive ions."""
 
     first: int
-    """The first of the ions."""
+    """Index of the first ion."""
     last: int
-    """One beyond the last of them."""
+    """Index of the last ion, plus one."""
     centre: np.ndarray
-    """Its centre [nm], shape (3,)."""
+    """Centre [nm], shape (3,)."""
     radius: float
-    """Its radius [nm]."""
+    """Radius [nm]."""
 
 
 class ImageCompression(NamedTuple):
-    """Angle on the specimen over the angle on the detector, and where this is one number."""
+    """Ratio of the angle on the specimen to the angle on the detector, and the range where it is constant."""
 
     compression: float
     """Median over all ions between 15 degrees and `valid_to`."""
     scatter: float
-    """Half the width of the middle 68 % of the single ions."""
+    """Half the width of the central 68 % of the distribution over single ions."""
     valid_from: float
-    """Smallest angle from which on the medians of the bins are within 5 % of `compression` [degrees]."""
+    """Smallest angle of the range in which the medians of the bins are within 5 % of `compression` [degrees]."""
     valid_to: float
-    """Largest angle up to which they are [degrees]."""
+    """Largest angle of this range [degrees]."""
     angles: np.ndarray
     """Centres of bins of the angle on the specimen [degrees], shape (n,)."""
     detector_angles: np.ndarray
     """Median of the angle on the detector in each bin [degrees], shape (n,)."""
     projection: Projection
-    """The projection of the run onto its detector, for overlays of poles."""
+    """Projection of the run onto its detector, for overlays of poles."""
 
 
 def fit_caps(run: Run, windows: int | None = None) -> tuple[Cap, ...]:
-    """Fit a sphere to the launch sites of each of several windows of a run.
+    """Fit a sphere to the sites of the ions, in successive windows of a run.
 
-    The cap recedes and changes its radius as it evaporates; angles on the specimen make sense only about the centre
-    that it has at that time.
+    The cap recedes and changes its radius during evaporation. Angles on the specimen are therefore defined about the
+    current centre of the cap.
 
     Parameters
     ----------
     run : Run
         The ions.
     windows : int, optional
-        Into how many windows the ions are cut; by default ten, but less if they would have less than 500 ions each.
+        Number of windows; by default ten, or fewer if a window would have less than 500 ions.
 
     Returns
     -------
@@ -75,7 +75,7 @@ def fit_caps(run: Run, windows: int | None = None) -> tuple[Cap, ...]:
     Raises
     ------
     ValueError
-        If a window has too few ions near the axis (50).
+        If a window has fewer than 50 ions near the axis.
     """
     n = len(check_kind(run, "run", "hits", "a Run"))
     windows = min(10, max(1, n // 500)) if windows is None else check_count(windows, "windows", at_least=1)
@@ -84,25 +84,25 @@ def fit_caps(run: Run, windows: int | None = None) -> tuple[Cap, ...]:
     for first, last in pairwise(edges):
         sites = run.emissions.positions[first:last]
         centre, radius = np.zeros(3), float("nan")
-        for _ in range(3):  # the sites on the cap change with its centre
+        for _ in range(3):  # the selection of sites depends on the centre
             from_centre = sites - centre
             near = polar_angles(from_centre) < _CAP
             if np.count_nonzero(near) < 50:
-                raise ValueError(f"a window of ions must have 50 near the axis, got {np.count_nonzero(near)}")
+                raise ValueError(f"a window must have at least 50 ions near the axis, got {np.count_nonzero(near)}")
             centre, radius = _sphere(sites[near], centre, radius)
         caps.append(Cap(int(first), int(last), centre, radius))
     return tuple(caps)
 
 
 def image_compression(run: Run, caps: Sequence[Cap] | None = None) -> ImageCompression:
-    """Read the image compression of a run from its unperturbed hits.
+    """Determine the image compression of a run from its unperturbed hits.
 
     Parameters
     ----------
     run : Run
-        The ions; unperturbed hits must have been flown or follow from its responses.
+        A run with unperturbed flights or with responses.
     caps : sequence of Cap, optional
-        Spheres about whose centres the angles on the specimen are; by default those of `fit_caps`.
+        Spheres that define the centres of the angles on the specimen; by default those of `fit_caps`.
 
     Returns
     -------
@@ -116,37 +116,37 @@ def image_compression(run: Run, caps: Sequence[Cap] | None = None) -> ImageCompr
     Notes
     -----
     theta_detector = theta_crystal / compression (Gault et al., Atom Probe Microscopy, ch. 7). The median over all
-    azimuths stands against what poles and zone lines do to their surroundings; within some 15 degrees of a pole on the
-    axis all ions are pushed outwards, so that these do not count.
+    azimuths reduces the influence of poles and zone lines on their surroundings. Within about 15 degrees of a pole on
+    the axis all ions are deflected outwards; these are excluded.
     """
     hits = check_kind(run, "run", "hits", "a Run").hits(Unperturbed())
     crystal = np.empty(len(run))
     for cap in _caps_of(run, caps):
         from_centre = run.emissions.positions[cap.first : cap.last] - cap.centre
         crystal[cap.first : cap.last] = np.degrees(polar_angles(from_centre))
-    # to the corners the square detector shows only some azimuths
+    # in the corners the square detector covers only some azimuths
     inside = hits.detected & (np.hypot(hits.x, hits.y) <= run.detector.width / 2)
     onto_detector = run.detector.seen_from_apex
     detector = np.degrees(onto_detector.angles(np.column_stack([hits.x, hits.y])))
     number = np.floor(crystal / _BIN).astype(int)
-    # at the rim of the detector only the ions that come in below the average are left
-    whole = [np.mean(inside[number == index]) > 0.99 for index in range(int(90 / _BIN)) if (number == index).any()]
-    last = len(whole) if all(whole) else whole.index(False)
+    # at the rim of the detector only ions with smaller angles than the average remain
+    complete = [np.mean(inside[number == index]) > 0.99 for index in range(int(90 / _BIN)) if (number == index).any()]
+    last = len(complete) if all(complete) else complete.index(False)
     bins = [index for index in range(last) if np.count_nonzero(inside & (number == index)) >= _LEAST_IONS]
     angles = (np.array(bins) + 0.5) * _BIN
     medians = np.array([np.median(detector[inside & (number == index)]) for index in bins])
     outer = angles > _INNER
     if np.count_nonzero(outer) < 3:
         raise ValueError(
-            f"an image compression needs {_LEAST_IONS} ions in each of 3 bins of {_BIN:g} degrees beyond {_INNER:g}, "
-            f"there are {np.count_nonzero(outer)} such bins"
+            f"an image compression needs at least {_LEAST_IONS} ions in each of 3 bins of {_BIN:g} degrees beyond "
+            f"{_INNER:g} degrees, got {np.count_nonzero(outer)} such bins"
         )
     compression = float(np.median(angles[outer] / medians[outer]))
-    for _ in range(5):  # the range of validity and the median over its ions depend on each other
-        good = np.abs(angles / medians / compression - 1) <= _TOLERANCE
-        low, high = _stretch(angles, good)
-        chosen = inside & (crystal >= max(low, _INNER)) & (crystal < high)
-        ratio = crystal[chosen] / detector[chosen]
+    for _ in range(5):  # iteration: the range of validity depends on the median over its ions
+        valid = np.abs(angles / medians / compression - 1) <= _TOLERANCE
+        low, high = _longest_range(angles, valid)
+        selection = inside & (crystal >= max(low, _INNER)) & (crystal < high)
+        ratio = crystal[selection] / detector[selection]
         compression = float(np.median(ratio))
     scatter = float(np.diff(np.percentile(ratio, [16, 84]))[0] / 2)
     projection = onto_detector.compressed(compression)
@@ -161,19 +161,19 @@ def field_factor(voltage: ArrayLike, field: ArrayLike, radius: ArrayLike) -> Any
     voltage : float or array_like
         Applied voltage [V].
     field : float or array_like
-        Field at the apex [V/nm]; of a measurement the evaporation field of the material.
+        Field at the apex [V/nm]; for a measurement the evaporation field of the material.
     radius : float or array_like
         Radius of the apex [nm].
 
     Returns
     -------
     float or ndarray
-        1 for a free sphere; 2 to 8 are found for specimens on a shank in front of an electrode.
+        1 for a free sphere; 2 to 8 for specimens with a shank in front of an electrode.
 
     Raises
     ------
     ValueError
-        If a value is not above 0.
+        If a value is not positive.
 
     Notes
     -----
@@ -184,54 +184,54 @@ def field_factor(voltage: ArrayLike, field: ArrayLike, radius: ArrayLike) -> Any
         shape = tuple(f"n{axis}" for axis in range(np.ndim(value)))
         values.append(check_array(value, name, shape) if shape else np.float64(check_number(value, name, above=0)))
         if np.size(value) and values[-1].min() <= 0:
-            raise ValueError(f"{name} must be above 0, got {values[-1].min():g}")
+            raise ValueError(f"{name} must be > 0, got {values[-1].min():g}")
     factor = values[0] / (values[1] * values[2])
     return float(factor) if factor.ndim == 0 else factor
 
 
 def run_field_factor(run: Run, caps: Sequence[Cap] | None = None) -> Floats:
-    """Read the field factor of a run from the fields at which its ions left.
+    """Determine the field factor of a run from the fields at evaporation.
 
     Parameters
     ----------
     run : Run
         The ions.
     caps : sequence of Cap, optional
-        Spheres whose radii are those of the apex; by default those of `fit_caps`.
+        Spheres with the radii of the apex; by default those of `fit_caps`.
 
     Returns
     -------
     ndarray
-        The factor of each of the caps, shape (n,): V over the radius and the median field of the atoms within 20
-        degrees of the axis just before they left. These sit at the edges of terraces, where the field is higher than
-        the mean over the cap, so that the factor is smaller than one from the mean field.
+        Field factor of each cap, shape (n,): V / (R F) with the median field F just before evaporation of the atoms
+        within 20 degrees of the axis. These atoms are at the edges of terraces, where the field is higher than the mean
+        over the cap. So the factor is smaller than a factor from the mean field.
 
     Raises
     ------
     ValueError
-        If no ion of a cap left near the axis.
+        If a cap has no ion near the axis.
     """
     factors = []
     for cap in _caps_of(run, caps):
         from_centre = run.emissions.positions[cap.first : cap.last] - cap.centre
         near = polar_angles(from_centre) < _NEAR
         if not near.any():
-            raise ValueError(f"no ion from {cap.first} to {cap.last} left within 20 degrees of the axis")
+            raise ValueError(f"none of the ions {cap.first} to {cap.last} is within 20 degrees of the axis")
         factors.append(field_factor(run.voltage, np.median(run.fields[cap.first : cap.last][near]), cap.radius))
     return np.array(factors)
 
 
 def _caps_of(run, caps):
-    """The caps given, or those of `fit_caps`."""
+    """Validated caps of the user, or those of `fit_caps`."""
     if caps is None:
         return fit_caps(run)
     check_kind(run, "run", "hits", "a Run")
-    caps = check_sequence(caps, "caps", "Cap, as fit_caps gives them")
-    return [check_kind(cap, "caps", Cap, "a sequence of Cap, as fit_caps gives them") for cap in caps]
+    caps = check_sequence(caps, "caps", "Cap, as returned by fit_caps")
+    return [check_kind(cap, "caps", Cap, "a sequence of Cap, as returned by fit_caps") for cap in caps]
 
 
 def _sphere(points, centre, radius):
-    """Centre and radius of the sphere nearest to points, outliers counted linearly."""
+    """Centre and radius of the best sphere through points, with linear weight of outliers."""
     if math.isnan(radius):
         radius = float(np.median(np.linalg.norm(points - centre, axis=1)))
     fit = scipy.optimize.least_squares(
@@ -251,8 +251,8 @@ def _towards(centre, points):
     return step / np.linalg.norm(step, axis=1)[:, None]
 
 
-def _stretch(angles, good):
-    """Ends of the longest stretch of good bins [degrees]."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(int), [0]])))
+def _longest_range(angles, valid):
+    """Ends of the longest range of valid bins [degrees]."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], valid.astype(int), [0]])))
     first, last = max(zip(edges[::2], edges[1::2], strict=True), key=lambda pair: pair[1] - pair[0])
     return float(angles[first] - _BIN / 2), float(angles[last - 1] + _BIN / 2)

@@ -1,10 +1,10 @@
-"""What a run, a file of ions or a map holds, in plain types."""
+"""Summary of a run, a file of ions or a map, in plain types."""
 
 from typing import Any
 
 import numpy as np
 
-from apt_evap.detection.binning import find_combs
+from apt_evap.detection.binning import find_quantisations
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.simulation.run import Run
@@ -41,24 +41,24 @@ UNITS = {
     "mass": "Da",
     "polarizability": "F m^2",
 }
-"""Units of what `describe` gives, by key."""
+"""Units in the result of `describe`, by key."""
 
 
 _MEASURED = ("x", "y", "time_of_flight", "voltage", "pulse_voltage", "mass_to_charge", "positions", "pulse_id")
 
 
 def describe(data: Run | Hits | DetectorMap) -> dict[str, Any]:
-    """Contents of a run, of ions or of a map.
+    """Summarise a run, ions or a map.
 
     Parameters
     ----------
     data : Run or Hits or DetectorMap
-        What `apt_evap.read` gives.
+        Result of `apt_evap.read`.
 
     Returns
     -------
     dict
-        Plain types, what `apt-evap info` prints; a pair is the least and the greatest value. Units are in `UNITS`.
+        Plain types, as printed by `apt-evap info`; a pair is the smallest and the largest value. Units are in `UNITS`.
     """
     if isinstance(data, DetectorMap):
         return _of_map(data)
@@ -112,7 +112,7 @@ def _of_run(run):
 
 
 def _tip(settings):
-    """Settings of a tip that are given, without the sources of the materials."""
+    """Settings of a tip without empty ones, and without the sources of the materials."""
     contents = {key: value for key, value in settings.items() if value not in (None, [], {})}
     if "material" in contents:
         host = contents["material"].items()
@@ -143,8 +143,10 @@ def _of_hits(hits):
     if hits.x is not None and hits.y is not None and detected.any():
         x, y = hits.x[detected], hits.y[detected]
         contents["detector_extent"] = [_plain(np.ptp(x)), _plain(np.ptp(y))]
-        combs = find_combs(x, y)
-        contents["detector_quantum"] = None if combs is None else [_plain(comb.spacing) for comb in combs]
+        quantisations = find_quantisations(x, y)
+        contents["detector_quantum"] = (
+            None if quantisations is None else [_plain(quantisation.spacing) for quantisation in quantisations]
+        )
     if hits.multiplicity is not None:
         contents["multi_hit_share"] = _plain(np.mean(hits.multiplicity > 1))
         contents["largest_multi_hit"] = int(hits.multiplicity.max())
@@ -152,11 +154,11 @@ def _of_hits(hits):
 
 
 def _extent(values):
-    """Least and greatest of the finite values, None if there are none."""
+    """Smallest and largest finite value, None if there is none."""
     finite = values[np.isfinite(values)]
     return [_plain(finite.min()), _plain(finite.max())] if len(finite) else None
 
 
 def _plain(value):
-    """A number for people: whole ones as they are, others with six digits."""
+    """Number with six digits; integers unchanged."""
     return int(value) if isinstance(value, np.integer) else float(f"{value:.6g}")

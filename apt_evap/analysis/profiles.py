@@ -1,4 +1,4 @@
-"""Density of hits along a circle, a radius or across a zone line, with counting errors; two profiles compared."""
+"""Density of hits along a circle, a radius or across a zone line, with counting errors; comparison of two profiles."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,34 +15,34 @@ from apt_evap.detection.limits import MAX_BINS
 
 
 class Profile(NamedTuple):
-    """Density of hits against azimuth, radius, or the distance from a line."""
+    """Density of hits against azimuth, radius, or distance from a line."""
 
     position: np.ndarray
     """Centres of the bins: azimuth [degrees], radius or distance [mm], shape (bins,)."""
     density: np.ndarray
-    """Hits per area relative to that of all bins together, NaN where no area is, shape (bins,)."""
+    """Hits per area relative to the mean over all bins, NaN for bins without area, shape (bins,)."""
     error: np.ndarray
     """Poisson error of the density (one standard deviation), NaN for maps of densities, shape (bins,)."""
 
 
 @dataclass(frozen=True)
 class Rectangle:
-    """A rectangle on the detector, laid along a zone line.
+    """Rectangle on the detector along a zone line.
 
     Parameters
     ----------
     centre : tuple of float
-        Its centre x, y [mm].
+        Centre x, y [mm].
     angle : float
-        Direction of the line, from x towards y [degrees]. Distances from the line grow to its left: along y
-        for an angle of 0, along x for -90.
+        Direction of the line, from x towards y [degrees]. Distances are positive to the left of the line: along y for
+        an angle of 0, along x for -90.
     length, width : float
-        Along the line and across it [mm].
+        Size along the line and across it [mm].
 
     Raises
     ------
     ValueError
-        If a number is not finite, or a length not above 0.
+        If a number is not finite, or a length is not positive.
     """
 
     centre: tuple
@@ -57,20 +57,20 @@ class Rectangle:
             object.__setattr__(self, name, check_number(getattr(self, name), name, above=0, unit="mm"))
 
     def along_and_across(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-        """Distances from the centre along the line and across it [mm], shape (n,) each, of places x, y [mm]."""
+        """Distances from the centre along the line and across it [mm], shape (n,) each, of positions x, y [mm]."""
         cosine, sine = np.cos(np.radians(self.angle)), np.sin(np.radians(self.angle))
         x, y = np.asarray(x, float) - self.centre[0], np.asarray(y, float) - self.centre[1]
         return x * cosine + y * sine, y * cosine - x * sine
 
     def turned(self, angle: float) -> "Rectangle":
-        """The rectangle turned about the middle of the detector by an angle from x towards y [degrees]."""
+        """Return the rectangle rotated about the centre of the detector by an angle from x towards y [degrees]."""
         cosine, sine = np.cos(np.radians(angle)), np.sin(np.radians(angle))
         x, y = self.centre
         return replace(self, centre=(x * cosine - y * sine, x * sine + y * cosine), angle=self.angle + angle)
 
     @property
     def corners(self) -> Floats:
-        """Corners in turn, counterclockwise [mm], shape (4, 2)."""
+        """Corners, counterclockwise [mm], shape (4, 2)."""
         cosine, sine = np.cos(np.radians(self.angle)), np.sin(np.radians(self.angle))
         half = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [self.length / 2, self.width / 2]
         return half @ [[cosine, sine], [-sine, cosine]] + self.centre
@@ -84,23 +84,23 @@ def azimuthal_profile(
     Parameters
     ----------
     hits : Hits or DetectorMap
-        Hits, which should fill the whole ring; of a map, only the inside of the detector counts.
+        Hits, which should fill the complete ring; for a map, only the inside of the detector counts.
     centre : tuple of float
         Centre of the ring [mm].
     inner, outer : float
         Radii of the ring [mm].
     bins : int
-        Number of sectors; the first begins at the x axis, azimuths grow from x to y.
+        Number of sectors; the first begins at the x axis, azimuths increase from x to y.
 
     Returns
     -------
     Profile
-        position is the azimuth [degrees], 0 to 360.
+        `position` is the azimuth [degrees], 0 to 360.
 
     Raises
     ------
     ValueError
-        If the ring is not one or holds no hits.
+        If the radii are invalid, or the ring contains no hits.
     """
     inner, outer, bins = _check_ring(inner, outer, bins)
     places = _Places(hits)
@@ -124,23 +124,23 @@ def radial_profile(
     Parameters
     ----------
     hits : Hits or DetectorMap
-        Hits, which should fill the whole disc; of a map, only the inside of the detector counts.
+        Hits, which should fill the complete disc; for a map, only the inside of the detector counts.
     centre : tuple of float
         Centre of the rings [mm].
     outer, inner : float
-        Where the profile ends and begins [mm].
+        Largest and smallest radius of the profile [mm].
     bins : int
-        Number of rings, all of one width.
+        Number of rings of equal width.
 
     Returns
     -------
     Profile
-        position is the radius [mm].
+        `position` is the radius [mm].
 
     Raises
     ------
     ValueError
-        If outer is not larger than inner or there are no hits between them.
+        If `outer` is not larger than `inner`, or there are no hits between them.
     """
     inner, outer, bins = _check_ring(inner, outer, bins)
     places = _Places(hits)
@@ -160,29 +160,29 @@ def zone_line_profile(
     Parameters
     ----------
     hits : Hits or DetectorMap
-        Hits, which should fill the whole rectangle; of a map, only the inside of the detector counts, bin by bin.
+        Hits, which should fill the complete rectangle; for a map, only bins inside the detector count.
     rectangles : Rectangle or sequence of Rectangle
-        Where, and along which direction the line runs. Several, along lines that symmetry makes equal, are laid over
-        each other; they must be of one width.
+        Position and direction of the line. The profiles of several rectangles, along symmetry-equivalent lines, are
+        added; they must have the same width.
     bins : int
-        Number of strips along the line, all of one width. Those of a map should be wider than its bins.
+        Number of strips of equal width along the line. For a map they should be wider than its bins.
 
     Returns
     -------
     Profile
-        position is the distance from the middle of the rectangle [mm], growing to the left of the line.
+        `position` is the distance from the centre of the rectangle [mm], positive to the left of the line.
 
     Raises
     ------
     ValueError
-        If the rectangles hold no hits, or differ in width.
+        If the rectangles contain no hits, or differ in width.
 
     Notes
     -----
     The normalized hit density p(X) of Shaikh et al., arXiv 2509.13744, figure 7, is the density divided by the width
-    of the rectangle. Measured hits that lie on a comb show stripes across a line that runs along x or y: make a map
-    of them first, whose bins fit the comb. Simulated ions leave layer by layer and spread more evenly than chance, so
-    that Poisson errors are somewhat too large for them.
+    of the rectangle. The quantisation of measured hits causes stripes across a line along x or y: make a map first,
+    with bins that are multiples of the quantisation step. Simulated ions evaporate layer by layer and scatter less than
+    random ions, so Poisson errors are slightly too large for them.
     """
     if isinstance(rectangles, Rectangle):
         rectangles = [rectangles]
@@ -192,36 +192,36 @@ def zone_line_profile(
     bins = check_count(bins, "bins", at_least=1, at_most=MAX_BINS)
     widths = {rectangle.width for rectangle in rectangles}
     if len(widths) != 1:
-        raise ValueError(f"rectangles must be at least one, all of one width, got widths {sorted(widths)} mm")
+        raise ValueError(f"rectangles must contain at least one, all of equal width, got widths {sorted(widths)} mm")
     (width,) = widths
     places = _Places(hits)
-    strips, chosen = [], []
+    strips, selections = [], []
     for rectangle in rectangles:
         along, across = rectangle.along_and_across(places.x, places.y)
         inside = np.flatnonzero((np.abs(along) < rectangle.length / 2) & (np.abs(across) < width / 2))
         strips.append(np.clip(np.floor((across[inside] / width + 0.5) * bins), 0, bins - 1).astype(np.intp))
-        chosen.append(inside)
+        selections.append(inside)
     centres = width * ((np.arange(bins) + 0.5) / bins - 0.5)
     exact = np.full(bins, width / bins * sum(rectangle.length for rectangle in rectangles))
     where = "in " + ", ".join(map(str, rectangles))
-    return _profile(centres, np.concatenate(strips), np.concatenate(chosen), places, exact, where)
+    return _profile(centres, np.concatenate(strips), np.concatenate(selections), places, exact, where)
 
 
 class ProfileComparison(NamedTuple):
-    """Two profiles of one rectangle, each relative to its own mean."""
+    """Comparison of two profiles of the same rectangle, each relative to its own mean."""
 
     position: np.ndarray
     """Centres of the bins, shape (bins,)."""
     difference: np.ndarray
-    """Density of the first less that of the second, in units of its error, shape (bins,)."""
+    """Density of the first minus that of the second, in units of the error, shape (bins,)."""
     chi_square: float
     """Sum of the squares of the differences."""
     degrees_of_freedom: int
-    """Bins less one: both have the mean 1."""
+    """Number of bins minus one: both profiles have the mean 1."""
     probability: float
-    """Probability that the noise of counting alone makes a larger chi_square."""
+    """Probability that counting noise alone gives a larger chi_square."""
     relative: float
-    """Root mean square of the difference of the densities beyond what noise explains; 0 if noise explains all."""
+    """Root mean square difference of the densities after subtraction of the noise; 0 if noise explains all of it."""
 
 
 def compare_profiles(first: Profile, second: Profile) -> ProfileComparison:
@@ -230,7 +230,7 @@ def compare_profiles(first: Profile, second: Profile) -> ProfileComparison:
     Parameters
     ----------
     first, second : Profile
-        Profiles with the same bins and with errors: of hits, or of maps of counts.
+        Profiles with the same bins and with errors, from hits or from maps of counts.
 
     Returns
     -------
@@ -244,10 +244,10 @@ def compare_profiles(first: Profile, second: Profile) -> ProfileComparison:
     for name, profile in (("first", first), ("second", second)):
         check_kind(profile, name, Profile, "a Profile")
         if not np.isfinite(profile.error).any():
-            raise ValueError(f"{name} must have errors, got a profile of densities: count hits instead")
+            raise ValueError(f"{name} must have errors, got a profile of densities: use hits or a map of counts")
     if first.position.shape != second.position.shape or not np.allclose(first.position, second.position):
         raise ValueError(
-            f"the profiles must have the same bins, got {len(first.position)} and {len(second.position)} "
+            f"the profiles must have equal bins, got {len(first.position)} and {len(second.position)} "
             f"around {first.position.mean():g} and {second.position.mean():g}"
         )
     difference = first.density - second.density
@@ -266,7 +266,7 @@ def compare_profiles(first: Profile, second: Profile) -> ProfileComparison:
 
 
 class _Places:
-    """Where hits are: those of ions, each one hit; or the bins of a map, each with its value and its area."""
+    """Positions of single hits, or of the bins of a map with their values and their area."""
 
     x: Floats
     y: Floats
@@ -301,14 +301,14 @@ def _polar(places, centre):
 
 
 def _profile(position, index, inside, places, areas, where):
-    """Add up hits and area over the bins of a profile; hits that are no map fill `areas`."""
+    """Sum hits and areas over the bins of a profile; single hits use the given `areas`."""
     if places.values is None:
         number = np.bincount(index, minlength=len(position)).astype(float)
     else:
         number = np.bincount(index, weights=places.values[inside], minlength=len(position))
         areas = places.area * np.bincount(index, minlength=len(position))
     if not number.any():
-        raise ValueError(f"a profile needs hits, there are none {where}")
+        raise ValueError(f"a profile needs hits, got none {where}")
     # an empty bin gets the error of one hit
     spread = np.sqrt(np.maximum(number, 1)) if places.counted else np.full(len(position), np.nan)
     scale = np.where(areas > 0, areas, np.nan) * (number.sum() / areas.sum())

@@ -1,4 +1,4 @@
-"""Where chosen ions of a run land as their launch energy and direction change."""
+"""Tracks on the detector of selected ions of a run, for varying launch energy and direction."""
 
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ from apt_evap.units import speed_from_energy
 
 
 class Tracks(NamedTuple):
-    """Places on the detector of n chosen ions at m energies, and at k directions where there are any."""
+    """Positions on the detector of n ions at m energies, and for lateral tracks at k directions."""
 
     x: np.ndarray
     """[mm], shape (n, m) or (n, m, k); NaN for an ion that flies away from the detector."""
@@ -24,28 +24,28 @@ class Tracks(NamedTuple):
 
 
 def lateral_tracks(run: Run, ions: ArrayLike, energies: ArrayLike, azimuths: ArrayLike | None = None) -> Tracks:
-    """Places of chosen ions that start from their sites, for every energy and every direction along the surface.
+    """Positions of ions launched from their sites, for every energy and every direction along the surface.
 
     Parameters
     ----------
     run : Run
         A run with responses.
     ions : array_like of int
-        Which ions of the run, by their place in it, shape (n,).
+        Indices of ions of the run, shape (n,).
     energies : array_like
-        Launch energies [eV], shape (m,), at most the `energy_limit` of the responses.
+        Launch energies [eV], shape (m,), up to the `energy_limit` of the responses.
     azimuths : array_like, optional
-        Directions, from t1 to t2 of `tangent_frame` [degrees], shape (k,); by default 72 even ones.
+        Directions, from t1 to t2 of `tangent_frame` [degrees], shape (k,); by default 72 evenly spaced ones.
 
     Returns
     -------
     Tracks
-        Of shape (n, m, k).
+        Shape (n, m, k).
 
     Raises
     ------
     ValueError
-        If the run has no responses, or ions or energies are out of range.
+        If the run has no responses, or if ions or energies are outside their range.
     """
     ions, energies = _check(run, ions, energies)
     azimuths = np.arange(0, 360, 5) if azimuths is None else check_array(azimuths, "azimuths", ("k",))
@@ -56,33 +56,33 @@ def lateral_tracks(run: Run, ions: ArrayLike, energies: ArrayLike, azimuths: Arr
 
 
 def rollup_tracks(run: Run, ions: ArrayLike, energies: ArrayLike) -> Tracks:
-    """Places of chosen ions that roll up, for every energy; NaN for an ion without a neighbour.
+    """Positions of ions that roll up, for every energy; NaN for an ion without a neighbour.
 
     Parameters
     ----------
     run : Run
         A run with responses.
     ions : array_like of int
-        Which ions of the run, by their place in it, shape (n,).
+        Indices of ions of the run, shape (n,).
     energies : array_like
-        Launch energies [eV], shape (m,), at most the `energy_limit` of the responses.
+        Launch energies [eV], shape (m,), up to the `energy_limit` of the responses.
 
     Returns
     -------
     Tracks
-        Of shape (n, m).
+        Shape (n, m).
 
     Raises
     ------
     ValueError
-        If the run has no responses, or ions or energies are out of range.
+        If the run has no responses, or if ions or energies are outside their range.
     """
     ions, energies = _check(run, ions, energies)
-    rolls, first, second = rollup_direction(run.emissions[ions])
+    can_roll, first, second = rollup_direction(run.emissions[ions])
     speeds = speed_from_energy(energies, run.emissions.masses[ions][:, None])
     velocities = np.stack([speeds * first[:, None], speeds * second[:, None]], axis=-1)
     x, y = _places(run, ions, velocities, rolled=True)
-    x[~rolls] = y[~rolls] = np.nan
+    x[~can_roll] = y[~can_roll] = np.nan
     return Tracks(x, y, energies)
 
 
@@ -91,21 +91,21 @@ def _check(run, ions, energies):
         raise ValueError(f"tracks need the responses of the ions, {run!r} has none: run it with responses=True")
     ions = check_array(ions, "ions", ("n",), dtype=np.int64)
     if len(ions) == 0 or ions.min() < 0 or ions.max() >= len(run):
-        raise ValueError(f"ions must be places in the run, 0 to {len(run) - 1}, got {ions}")
+        raise ValueError(f"ions must be indices from 0 to {len(run) - 1}, got {ions}")
     energies = check_array(energies, "energies", ("m",))
     limit = run.response_settings.energy_limit
     if len(energies) == 0 or energies.min() < 0 or energies.max() > limit:
-        raise ValueError(f"energies must be 0 to {limit:g} eV, the limit of the responses, got {energies}")
+        raise ValueError(f"energies must be from 0 to {limit:g} eV, the limit of the responses, got {energies}")
     return ions, energies
 
 
 def _places(run, ions, velocities, rolled):
-    """Places on the detector [mm], shape (...), of launches along the surface [nm/ns] of shape (..., 2)."""
+    """Positions on the detector [mm], shape (...), of launches along the surface [nm/ns] of shape (..., 2)."""
     shape = velocities.shape[:-1]
-    every = np.repeat(ions, int(np.prod(shape[1:])))
-    responses = Responses(*(part[every] for part in run.responses))
+    repeats = np.repeat(ions, int(np.prod(shape[1:])))
+    responses = Responses(*(part[repeats] for part in run.responses))
     first, second = velocities.reshape(-1, 2).T
-    starts = np.full(len(every), rolled)
-    landed = run.response_model.evaluate(responses, starts, first, second, run.emissions.masses[every])
-    x, y, *_ = run.detector.impacts(*landed)
+    starts = np.full(len(repeats), rolled)
+    ends = run.response_model.evaluate(responses, starts, first, second, run.emissions.masses[repeats])
+    x, y, *_ = run.detector.impacts(*ends)
     return x.reshape(shape), y.reshape(shape)

@@ -1,4 +1,4 @@
-"""Structural similarity of two detector maps, and of two halves of one, which its noise limits."""
+"""Structural similarity of two detector maps, and of two halves of one map, which is limited by its noise."""
 
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -12,13 +12,13 @@ from apt_evap.detection.detector_map import DetectorMap, gaussian
 from apt_evap.detection.hits import Hits
 
 SIGMA, TRUNCATE = 1.5, 3.5
-"""Standard deviation of the Gaussian window [bins], and where it is cut off, in standard deviations."""
+"""Standard deviation of the Gaussian window [bins], and its cutoff in standard deviations."""
 WINDOW = int(SIGMA * TRUNCATE + 0.5)
 """Half width of the window [bins]."""
 
 
 class Moments(NamedTuple):
-    """Densities with their mean and variance in the window about every bin, all of shape (..., ny, nx)."""
+    """Densities, with mean and variance in the window around every bin, all of shape (..., ny, nx)."""
 
     density: np.ndarray
     mean: np.ndarray
@@ -26,38 +26,38 @@ class Moments(NamedTuple):
 
 
 def window_mean(values: Floats) -> Floats:
-    """Mean in the window about every bin, of maps of shape (..., ny, nx)."""
+    """Mean in the window around every bin, for maps of shape (..., ny, nx)."""
     return gaussian(values, SIGMA, TRUNCATE)
 
 
 def window_fits(mask: Booleans) -> Booleans:
-    """Whether the disc of radius `WINDOW` about a bin lies inside a mask, bool of shape (ny, nx)."""
+    """Whether the disc of radius `WINDOW` around each bin is inside a mask, bool of shape (ny, nx)."""
     step = np.arange(-WINDOW, WINDOW + 1)
     return scipy.ndimage.binary_erosion(mask, step[:, None] ** 2 + step**2 <= WINDOW**2)
 
 
 def local_moments(density: Floats) -> Moments:
-    """The `Moments` of densities, shape (..., ny, nx)."""
+    """`Moments` of densities, shape (..., ny, nx)."""
     mean = window_mean(density)
     return Moments(density, mean, window_mean(density**2) - mean**2)
 
 
 def local_similarity(first: Moments, second: Moments, data_range: float, noise: float | Floats = 0.0) -> Floats:
-    r"""Structural similarity in the window about every bin.
+    r"""Structural similarity in the window around every bin.
 
     Parameters
     ----------
     first, second : Moments
-        Those of two maps, or of two stacks of maps, one by one.
+        Moments of two maps, or of two stacks of maps, compared in pairs.
     data_range : float
         Range L of the densities.
     noise : float or ndarray
-        Sum of the variances of the noise of both maps, which counts as alike, shape (ny, nx); none by default.
+        Sum of the noise variances of both maps, which counts as common structure, shape (ny, nx); 0 by default.
 
     Returns
     -------
     ndarray
-        Shape (..., ny, nx); it means something where `window_fits`.
+        Shape (..., ny, nx); meaningful where `window_fits` is True.
 
     Notes
     -----
@@ -77,24 +77,24 @@ def local_similarity(first: Moments, second: Moments, data_range: float, noise: 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Similarity:
-    """Structural similarity of two maps with everything it depends on; ``float(similarity)`` is its value.
+    """Structural similarity of two maps, with its parameters; ``float(similarity)`` is its value.
 
     Parameters
     ----------
     value : float
-        Mean of the local similarity where a window fits into the common mask, 1 for equal maps.
+        Mean of the local similarity over all windows within the common mask; 1 for equal maps.
     local : ndarray
-        Local similarity, NaN where no window fits, shape (ny, nx).
+        Local similarity, NaN where the window is not within the common mask, shape (ny, nx).
     bins : tuple of int
         Number of bins in x and y.
     bin_size : tuple of float
         Width and height of a bin [mm].
     smoothing : float
-        Standard deviation of the Gaussian both maps were smoothed with first [mm].
+        Standard deviation of the Gaussian smoothing of both maps [mm].
     data_range : float
         Range L of densities (relative to their mean) in the constants (0.01 L)^2 and (0.03 L)^2.
     inside : int
-        Number of bins where a window fits into the common mask.
+        Number of bins with a window within the common mask.
     """
 
     value: float
@@ -119,20 +119,19 @@ class Similarity:
 def ssim(map_a: DetectorMap, map_b: DetectorMap, *, smoothing: float = 0.0, data_range: float = 2.0) -> Similarity:
     """Structural similarity of two maps on the same bins.
 
-    Both maps are smoothed, brought to densities relative to their mean in the common mask and compared
-    wherever a window fits into it. A window over the rim would see an edge between a dark rim and whatever
-    fills the outside, the same in both maps: that raised the similarity of two noisy halves of a measured map
-    from 0.05 to 0.10.
+    Both maps are smoothed, normalised to densities relative to their mean in the common mask, and compared in all
+    windows within the mask. Windows across the rim would contain the same edge in both maps: measured, this raised the
+    similarity of two noisy halves of a measured map from 0.05 to 0.10.
 
     Parameters
     ----------
     map_a, map_b : DetectorMap
-        Maps with equal edges (``like=`` of `DetectorMap.from_hits` makes one on the bins of the other).
+        Maps with equal edges (``like=`` of `DetectorMap.from_hits` uses the bins of another map).
     smoothing : float
-        Standard deviation of a Gaussian [mm]; noise lowers the similarity of maps that are not smoothed.
+        Standard deviation of a Gaussian [mm]; noise reduces the similarity of unsmoothed maps.
     data_range : float
-        Range of densities, relative to their mean, that the constants of the measure refer to. It is fixed
-        rather than taken from the data, so that values of many pairs can be compared.
+        Range of densities, relative to their mean, in the constants of the similarity. It is fixed, not taken from the
+        data, so that values of different pairs can be compared.
 
     Returns
     -------
@@ -141,7 +140,7 @@ def ssim(map_a: DetectorMap, map_b: DetectorMap, *, smoothing: float = 0.0, data
     Raises
     ------
     ValueError
-        If the bins differ, are fewer than 11 along a side, or the masks share too little.
+        If the bins differ, if there are fewer than 11 along a side, or if the common mask is too small.
 
     Notes
     -----
@@ -157,8 +156,8 @@ def ssim(map_a: DetectorMap, map_b: DetectorMap, *, smoothing: float = 0.0, data
     inside = window_fits(common)
     if not inside.any():
         raise ValueError(
-            f"the masks of the two maps must share more than a window of {2 * WINDOW + 1} bins, they share "
-            f"{np.count_nonzero(common)} bins"
+            f"the common mask of the two maps must contain a window of {2 * WINDOW + 1} bins, got "
+            f"{np.count_nonzero(common)} common bins"
         )
     first, second = (
         local_moments(np.where(common, replace(each.smoothed(smoothing), mask=common).density, 1.0))
@@ -179,10 +178,11 @@ def ssim(map_a: DetectorMap, map_b: DetectorMap, *, smoothing: float = 0.0, data
 def half_ceiling(
     hits: Hits | DetectorMap, *, smoothing: float = 0.0, data_range: float = 2.0, seed: int = 0, **options: Any
 ) -> Similarity:
-    """Structural similarity of two random halves of one measurement: a scale for how noisy it is.
+    """Structural similarity of two random halves of a measurement: a measure of its noise.
 
-    Each ion falls to either half with equal chance. The halves are noisier than the whole, so that a good simulation,
-    which may have more ions besides, can come out higher against the whole.
+    Each ion belongs to either half with equal probability. The halves are noisier than the complete measurement. So a
+    good simulation, which may also have more ions, can be more similar to the complete measurement than the halves to
+    each other.
 
     Parameters
     ----------
@@ -191,7 +191,7 @@ def half_ceiling(
     smoothing, data_range : float
         As for `ssim`.
     seed : int
-        Seed of the division.
+        Seed of the random halves.
     **options
         Passed to `DetectorMap.from_hits`, such as ``bins``, ``extent`` or ``like``.
 
@@ -202,21 +202,21 @@ def half_ceiling(
     Raises
     ------
     ValueError
-        If the map is one of densities, or what `ssim` and `DetectorMap.from_hits` raise.
+        If the map is one of densities, or as in `ssim` and `DetectorMap.from_hits`.
     """
     seed = check_seed(seed)
     if isinstance(hits, DetectorMap):
         if options:
-            raise ValueError(f"a map is already binned and takes no {', '.join(options)}")
-        whole = hits
+            raise ValueError(f"options {', '.join(options)} are for hits, got a map, which has bins already")
+        complete = hits
     else:
         check_kind(hits, "hits", Hits, "Hits or a DetectorMap")
-        whole = DetectorMap.from_hits(hits, **options)
-    # dividing every bin binomially is the same as dividing the ions one by one
-    half = np.random.default_rng(seed).binomial(whole.counts, 0.5)
+        complete = DetectorMap.from_hits(hits, **options)
+    # a binomial division of every bin is equivalent to a division of the single ions
+    half = np.random.default_rng(seed).binomial(complete.counts, 0.5)
     halves = [
-        replace(whole, values=part, ions=int(part[whole.mask].sum()), detected=None)
-        for part in (half, whole.counts - half)
+        replace(complete, values=part, ions=int(part[complete.mask].sum()), detected=None)
+        for part in (half, complete.counts - half)
     ]
     return ssim(*halves, smoothing=smoothing, data_range=data_range)
 
@@ -226,7 +226,7 @@ def _check_bins(map_a, map_b):
         a, b = getattr(map_a, name), getattr(map_b, name)
         if a.shape != b.shape or not np.allclose(a, b, rtol=0, atol=0.01 * (a[1] - a[0])):
             raise ValueError(
-                f"the two maps must have the same bins, got {map_a!r} and {map_b!r} with {name} from "
+                f"the two maps must have equal bins, got {map_a!r} and {map_b!r} with {name} from "
                 f"{a[0]:g} to {a[-1]:g} and {b[0]:g} to {b[-1]:g} mm"
             )
         if len(a) - 1 < 2 * WINDOW + 1:

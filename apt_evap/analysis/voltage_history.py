@@ -1,4 +1,4 @@
-"""Voltage at which the ions of a run evaporate, and the course of a quantity over the ions."""
+"""Evaporation voltage of the ions of a run, and the course of a quantity over the ions."""
 
 from typing import NamedTuple
 
@@ -11,10 +11,10 @@ from apt_evap.simulation.run import Run
 
 
 class Course(NamedTuple):
-    """Percentiles of a quantity in successive stretches of the ions, each of shape (k,)."""
+    """Percentiles of a quantity in successive sections of the ions, each of shape (k,)."""
 
     ions: np.ndarray
-    """Middle of each stretch, in ions from the first."""
+    """Middle of each section, in ions from the first."""
     low: np.ndarray
     """5th percentile, in the unit of the quantity."""
     median: np.ndarray
@@ -29,7 +29,7 @@ def evaporation_fields(run: Run) -> Floats:
     Parameters
     ----------
     run : Run
-        The ions; the materials are those of its settings.
+        The ions; the materials are in its settings.
 
     Returns
     -------
@@ -57,8 +57,8 @@ def evaporation_voltages(run: Run) -> Floats:
 
     Notes
     -----
-    Charges and fields are proportional to the voltage. An atom that leaves at the field F, simulated at the voltage V,
-    reaches the evaporation field of its species at
+    Charges and fields are proportional to the voltage. An atom that evaporates at the field F, simulated at the voltage
+    V, reaches the evaporation field of its species at
 
     .. math:: V_\mathrm{evap} = V \, F_\mathrm{evap} / F
 
@@ -68,14 +68,14 @@ def evaporation_voltages(run: Run) -> Floats:
 
 
 def course(values: ArrayLike, points: int = 200) -> Course:
-    """Median and 5 and 95 % percentiles of successive stretches of nearly equal length.
+    """Median and 5 and 95 % percentiles of successive sections of nearly equal length.
 
     Parameters
     ----------
     values : array_like
         A quantity of each ion, shape (n,), in the order of evaporation.
     points : int
-        Number of stretches k; n if there are fewer values.
+        Number of sections k; n if there are fewer values.
 
     Returns
     -------
@@ -89,7 +89,7 @@ def course(values: ArrayLike, points: int = 200) -> Course:
     values = check_array(values, "values", ("n",), finite=False)
     points = check_count(points, "points", at_least=1)
     if not len(values):
-        raise ValueError("values must be one or more, got none")
+        raise ValueError("values must contain at least one, got none")
     edges = np.linspace(0, len(values), min(points, len(values)) + 1).astype(int)
-    stretches = np.split(values, edges[1:-1])
-    return Course((edges[:-1] + edges[1:]) / 2, *np.array([np.percentile(part, [5, 50, 95]) for part in stretches]).T)
+    sections = np.split(values, edges[1:-1])
+    return Course((edges[:-1] + edges[1:]) / 2, *np.array([np.percentile(part, [5, 50, 95]) for part in sections]).T)

@@ -1,1 +1,1 @@
-"""The command line `apt-evap`: one module for each command, what all of them take in `parser`."""
+"""The command line `apt-evap`: one module per command; all arguments are defined in `parser`."""

@@ -1,4 +1,4 @@
-"""Files of the commands: read by their options, and written only where nobody else's is lost."""
+"""Files of the commands: reading by the options; writing that never replaces files of other programs."""
 
 import argparse
 import os
@@ -20,18 +20,18 @@ from apt_evap.io.rrng import read_ranges
 from apt_evap.simulation.run import Run, load
 
 _MARK = f"apt_evap {__version__}"
-_MARKED = 1 << 16  # bytes: a .png and an .svg begin with the mark, a .pdf ends with it
+_MARKED = 1 << 16  # bytes: the mark is at the beginning of a .png or .svg, and at the end of a .pdf
 _MARK_KEYS = {".png": "Software", ".pdf": "Creator", ".svg": "Creator"}
 
 
 def read(options: argparse.Namespace) -> Hits | Run | DetectorMap:
-    """What is in the FILE of a command."""
-    wanted = {"partial": options.partial, "byte_order": options.byte_order, "unit": options.unit}
+    """Read the FILE of a command."""
+    parameters = {"partial": options.partial, "byte_order": options.byte_order, "unit": options.unit}
     if options.arrays is not None:
         names = options.arrays.split(",")
         if len(names) not in (3, 4):
             raise ValueError(f"--arrays must name values, edges in x and y, and perhaps a mask, got {options.arrays!r}")
-        wanted |= dict(zip(("values", "x_edges", "y_edges", "mask"), names, strict=False))
+        parameters |= dict(zip(("values", "x_edges", "y_edges", "mask"), names, strict=False))
     path = Path(options.file)
     is_map = (options.format or path.suffix).lower().lstrip(".") == "npz"
     for name in _SELECTING if is_map else ("arrays", "unit"):
@@ -41,8 +41,8 @@ def read(options: argparse.Namespace) -> Hits | Run | DetectorMap:
     if path.is_dir():
         return load(path, partial=bool(options.partial))  # an unfinished run
     try:
-        given = {key: value for key, value in wanted.items() if value is not None}
-        return read_file(options.file, format=options.format, **given)
+        parameters = {key: value for key, value in parameters.items() if value is not None}
+        return read_file(options.file, format=options.format, **parameters)
     except FileError as error:
         unfinished = Path(f"{path}.unfinished")
         if unfinished.is_dir() and not path.exists():
@@ -59,43 +59,43 @@ def selects(options: argparse.Namespace) -> bool:
 
 
 def select(hits: Hits, options: argparse.Namespace) -> Hits:
-    """The ions that the options select; ValueError if a column is missing, or none is left."""
+    """Select ions by the options; ValueError if a column is missing, or no ion remains."""
     if (options.ranges is None) != (options.species is None):
-        raise ValueError("--ranges and --species go together: a file of ranges, and which of its species")
+        raise ValueError("--ranges and --species must be used together: a file of ranges, and names of its species")
     steps: dict[str, Callable[[Hits, Any], Hits]] = {
-        "ions": lambda hits, bounds: hits.window(ion=bounds),  # first: it counts the ions of the file
+        "ions": lambda hits, bounds: hits.window(ion=bounds),  # first: numbers of the ions in the file
         "mass": lambda hits, bounds: hits.window(mass_to_charge=bounds),
         "voltage": lambda hits, bounds: hits.window(voltage=bounds),
         "circle": lambda hits, circle: hits.within_circle(*circle),
         "species": lambda hits, names: read_ranges(options.ranges).select(hits, *names.split(",")),
     }
-    chosen = hits
+    selection = hits
     for name, step in steps.items():
         if (value := getattr(options, name)) is not None:
             try:
-                chosen = step(chosen, value)
+                selection = step(selection, value)
             except ValueError as error:
                 raise ValueError(f"--{name}: {error}") from error
-    if selects(options) and len(chosen) == 0:
-        raise ValueError(f"no ion is selected of the {len(hits):,} of {options.file!r}")
-    return chosen
+    if selects(options) and len(selection) == 0:
+        raise ValueError(f"the options select none of the {len(hits):,} ions of {options.file!r}")
+    return selection
 
 
 def check_columns(hits: Hits, options: argparse.Namespace) -> None:
-    """Refuse ions without places on the detector (ValueError)."""
+    """Raise a ValueError for ions without detector coordinates."""
     if hits.x is None or hits.y is None:
         names = ", ".join(hits.columns)
         raise ValueError(f"{options.file!r} has no detector coordinates x and y, which a map needs, only {names}")
 
 
-def check_places(chosen: Hits, options: argparse.Namespace) -> None:
-    """Refuse ions that are all at one place on the detector (ValueError): their map has no size."""
-    x, y = (values[chosen.detected] for values in chosen.require("x", "y"))
-    if chosen.extent is None and len(x) and np.ptp(x) == np.ptp(y) == 0:
-        given = [f"--{name}" for name in _SELECTING if getattr(options, name) is not None]
-        left = f"{' '.join(given)} leaves" if given else f"{options.file!r} has"
+def check_places(selection: Hits, options: argparse.Namespace) -> None:
+    """Raise a ValueError if all ions are at one place on the detector: their map has no size."""
+    x, y = (values[selection.detected] for values in selection.require("x", "y"))
+    if selection.extent is None and len(x) and np.ptp(x) == np.ptp(y) == 0:
+        names = [f"--{name}" for name in _SELECTING if getattr(options, name) is not None]
+        source = f"{' '.join(names)} leaves" if names else f"{options.file!r} has"
         what = "one ion" if len(x) == 1 else f"{len(x):,} ions at one place"
-        raise ValueError(f"{left} {what} on the detector: a map needs more")
+        raise ValueError(f"{source} {what} on the detector: a map needs more")
 
 
 def picture_path(path: AnyPath) -> Path:
@@ -113,7 +113,7 @@ def save_picture(path: Path, maps: Sequence[DetectorMap], titles: Sequence[str])
 
 
 def check_output(path: AnyPath, is_ours: Callable[[Path], bool], force: bool) -> None:
-    """Make sure that a file can be written, and that nobody else's is overwritten."""
+    """Check that a file can be written, and that no file of another program would be overwritten."""
     target = Path(os.path.realpath(path))
     try:
         if target.is_dir():
@@ -125,7 +125,7 @@ def check_output(path: AnyPath, is_ours: Callable[[Path], bool], force: bool) ->
                 raise OSError(None, "Not a regular file")
             if not force:
                 with open_for_reading(path):
-                    pass  # what cannot be read is not known to be ours, nor anybody else's
+                    pass  # the origin of an unreadable file is not known
                 if not is_ours(target):
                     raise FileError(f"{str(path)!r} exists and was not made by apt-evap: --force overwrites it")
     except OSError as error:
@@ -133,7 +133,7 @@ def check_output(path: AnyPath, is_ours: Callable[[Path], bool], force: bool) ->
 
 
 def is_picture(path: Path) -> bool:
-    """Whether a picture says, near its beginning or its end, that this package made it."""
+    """Whether a picture has the mark of this package, near its beginning or its end."""
     with open_for_reading(path) as file:
         beginning = file.read(_MARKED)
         file.seek(max(0, path.stat().st_size - _MARKED))

@@ -1,4 +1,4 @@
-"""How the commands speak: lines and JSON on stdout, notes and errors on stderr."""
+"""Output of the commands: lines and JSON on stdout, notes and errors on stderr."""
 
 import argparse
 import contextlib
@@ -8,14 +8,14 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
-INTERRUPTED, TERMINATED = 130, 143  # 128 + SIGINT and SIGTERM, as shells count
+INTERRUPTED, TERMINATED = 130, 143  # 128 + number of SIGINT and SIGTERM, as in shells
 
 
 def open_missing_streams() -> None:
-    """Give the process the streams that its caller has closed, and stdout an answer to characters it cannot encode."""
+    """Open streams that the caller has closed, and let stdout escape characters that it cannot encode."""
     for name in ("stdin", "stdout", "stderr"):
         if getattr(sys, name) is None:
-            # a number below 3 that is free would go to the next file, and stray output into it
+            # otherwise the next file would get a free number below 3, and output for a stream would go into it
             while (number := os.open(os.devnull, os.O_RDWR)) < 3:
                 pass
             setattr(sys, name, open(number, "r" if name == "stdin" else "w"))
@@ -24,14 +24,14 @@ def open_missing_streams() -> None:
 
 
 def discard_stdout() -> None:
-    """Drop what is buffered for stdout, so that it does not complain at exit."""
-    with contextlib.suppress(OSError, ValueError, AttributeError):  # no file behind it
+    """Discard the buffer of stdout, to avoid an error message at exit."""
+    with contextlib.suppress(OSError, ValueError, AttributeError):  # stdout is not a file
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 @contextlib.contextmanager
 def _to_stdout() -> Iterator[None]:
-    """Say of what goes wrong that it was the output, and not a file."""
+    """Let messages of errors name the standard output."""
     try:
         yield
     except BrokenPipeError:
@@ -42,36 +42,36 @@ def _to_stdout() -> Iterator[None]:
 
 
 def put(text: str) -> None:
-    """Print on stdout at once.
+    """Print on stdout without delay.
 
     Raises
     ------
     OSError
-        If it takes no more; BrokenPipeError if its reader has left.
+        If it cannot be written; BrokenPipeError if the reader has closed the pipe.
     """
     with _to_stdout():
         print(text, flush=True)
 
 
 def flush() -> None:
-    """Print what others have left in the buffer of stdout; raises as `put`."""
+    """Write the buffer of stdout; errors as in `put`."""
     with _to_stdout():
         sys.stdout.flush()
 
 
 def say(kind: str, message: object) -> None:
     """Print one line on stderr: an error, a warning or a note."""
-    with contextlib.suppress(OSError):  # nobody is left to tell
+    with contextlib.suppress(OSError):  # stderr is closed
         print(f"apt-evap: {kind}:", *str(message).split(), file=sys.stderr, flush=True)
 
 
 def tell(options: argparse.Namespace, line: str) -> None:
-    """Print a line for people, where neither --quiet nor --json is given."""
+    """Print a line for readers, unless --quiet or --json is given."""
     if not (options.quiet or options.json):
         put(line)
 
 
 def tell_json(options: argparse.Namespace, content: dict[str, Any]) -> None:
-    """Print a dict as one line for programs, where --json is given."""
+    """Print a dict as one line for programs, if --json is given."""
     if options.json:
         put(json.dumps(content, allow_nan=False))

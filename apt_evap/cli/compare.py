@@ -1,4 +1,4 @@
-"""`apt-evap compare`: find the emission energies that make a run look most like a measured map."""
+"""`apt-evap compare`: fit the emission energies of a run to a measured map."""
 
 import argparse
 import csv
@@ -33,7 +33,7 @@ def execute(options: argparse.Namespace) -> int:
     measured = _measured(options)
     run = load(options.run)
     if run.responses is None:
-        raise ValueError(f"{options.run!r} has no responses: run again with responses = true in [simulation]")
+        raise ValueError(f"{options.run!r} has no responses: repeat the run with responses = true in [simulation]")
     study = fit_energies(
         run,
         measured,
@@ -53,18 +53,18 @@ def execute(options: argparse.Namespace) -> int:
     )
     _write(study, run, folder)
     if study.registration.doubtful:
-        say("note", f"look at {folder / OVERLAY}; --registration gives a registration that is known")
+        say("note", f"look at {folder / OVERLAY}; --registration sets a known registration")
     if not options.quiet:
         put(repr(study).strip("<>"))
         put(f"wrote {', '.join(FILES)} to {folder}")
     return 0
 
 
-# ---- what comes in -------------------------------------------------------------------------------------------------
+# ---- input ---------------------------------------------------------------------------------------------------------
 
 
 def _registration(text):
-    """A registration from a file, its own or that of a study, or from numbers."""
+    """Registration from a file (of a registration or a study), or from numbers."""
     parts = text.split(",")
     try:
         mirror = parts[4:] == ["mirror"]
@@ -82,36 +82,36 @@ def _registration(text):
         content = json.loads(written)
         return Registration.from_dict(dict(content.get("registration", content)))
     except (ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:
-        raise FileError(f"{text!r} does not hold a registration: {error}") from error
+        raise FileError(f"{text!r} does not contain a registration: {error}") from error
 
 
 def _measured(options):
     content = read(options)
     if isinstance(content, Run):
         if options.perturbation is None:
-            raise ValueError(f"{options.file!r} is a run: say by --perturbation how its ions start")
+            raise ValueError(f"{options.file!r} is a run: its ions need --perturbation")
         return select(content.hits(read_perturbation(options.perturbation)), options)
     if options.perturbation is not None:
-        raise ValueError(f"--perturbation is for a run as MEASURED, {options.file!r} holds measured ions")
+        raise ValueError(f"--perturbation is only for a run as MEASURED, {options.file!r} contains measured ions")
     if isinstance(content, DetectorMap):
         return content
     check_columns(content, options)
-    chosen = select(content, options)
-    check_places(chosen, options)
-    return chosen
+    selection = select(content, options)
+    check_places(selection, options)
+    return selection
 
 
-# ---- what goes out -------------------------------------------------------------------------------------------------
+# ---- output --------------------------------------------------------------------------------------------------------
 
 
 def _check_folder(folder, force):
-    """Make sure that the files can be written, and that nobody else's are overwritten."""
+    """Check that the files can be written, and that no files of other programs would be overwritten."""
     if folder.is_dir():
         ours = _is_study(folder / _STUDY)
         for name in FILES:
             check_output(folder / name, lambda path: ours, force)
     else:
-        check_output(folder, is_run, False)  # a file of that name, of whatever kind, is no folder
+        check_output(folder, is_run, False)  # a file of this name, of any kind, is not a folder
         if folder.exists():
             raise FileError(f"cannot write to {str(folder)!r}: it is not a folder")
 
@@ -124,14 +124,14 @@ def _is_study(path):
 
 
 def _write(study, run, folder):
-    """Write all files aside, and put them into the folder once they are complete."""
+    """Write all files to a temporary folder, and move them when they are complete."""
     try:
-        with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as aside:
+        with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as temporary:
             for name, write in FILES.items():
-                write(study, run, Path(aside) / name)
+                write(study, run, Path(temporary) / name)
             folder.mkdir(exist_ok=True)
             for name in FILES:
-                with replace_file(folder / name) as file, open(Path(aside) / name, "rb") as written:
+                with replace_file(folder / name) as file, open(Path(temporary) / name, "rb") as written:
                     shutil.copyfileobj(written, file)
     except OSError as error:
         raise FileError(f"cannot write to {str(folder)!r}: {error.strerror or error}") from error

@@ -1,4 +1,4 @@
-"""`apt-evap info`: say what is in a file."""
+"""`apt-evap info`: summarise a file."""
 
 import argparse
 import json
@@ -14,25 +14,27 @@ from apt_evap.simulation.run import Run
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
     content = read(options)
-    told = {"file": options.file}
+    summary = {"file": options.file}
     if selects(options) and not isinstance(content, DetectorMap):
         ions = content.hits(content.first_perturbation) if isinstance(content, Run) else content
-        told["selected_of"], content = len(ions), select(ions, options)
-    told |= describe(content)
+        summary["selected_of"], content = len(ions), select(ions, options)
+    summary |= describe(content)
     if isinstance(content, Run) and content.ended == Ending.UNFINISHED:
-        told["kind"] = f"unfinished run of {len(content):,} ions"
-        told["ended"] = "not yet: the command that began it, with --resume, goes on"
+        summary["kind"] = f"unfinished run of {len(content):,} ions"
+        summary["ended"] = "not yet: continue with the same command and --resume"
     if options.json:
-        put(json.dumps(told, indent=2, allow_nan=False))
+        put(json.dumps(summary, indent=2, allow_nan=False))
     else:
-        put("\n".join(_lines(told)))
+        put("\n".join(_lines(summary)))
     return 0
 
 
-def _lines(told, indent=0, of_columns=False):
-    labels = {key: f"{key.replace('_', ' ')} [{UNITS[key]}]" if key in UNITS else key.replace("_", " ") for key in told}
+def _lines(summary, indent=0, of_columns=False):
+    labels = {
+        key: f"{key.replace('_', ' ')} [{UNITS[key]}]" if key in UNITS else key.replace("_", " ") for key in summary
+    }
     width = max(map(len, labels.values()), default=0)
-    for key, value in told.items():
+    for key, value in summary.items():
         if isinstance(value, dict) and value:
             yield f"{'':{indent}}{labels[key]}"
             yield from _lines(value, indent + 2, key == "columns")
@@ -40,7 +42,7 @@ def _lines(told, indent=0, of_columns=False):
             between = " to " if of_columns or key in _EXTENTS else " x " if key in _SIZES else "   "
             text = _text(value, between)
             if key == "field_before_leaving":
-                text += f" at {told['voltage']:g} V (only its ratio to the evaporation field matters)"
+                text += f" at {summary['voltage']:g} V (only its ratio to the evaporation field matters)"
             yield f"{'':{indent}}{labels[key]:{width}}  {text}"
 
 

@@ -1,4 +1,4 @@
-"""The entry point of `apt-evap`: what signals, warnings and errors do, exit codes."""
+"""Entry point of `apt-evap`: signals, warnings, errors and exit codes."""
 
 import signal
 import sys
@@ -41,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit code, as `apt_evap.cli.parser.EXIT_CODES` says.
+        Exit code, see `apt_evap.cli.parser.EXIT_CODES`.
     """
     open_missing_streams()
     with warnings.catch_warnings(), options_of_a_shell(_OPTIONS), _terminated_like_interrupted() as terminated:
@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except KeyboardInterrupt:
             print("apt-evap: interrupted", file=sys.stderr)
             return TERMINATED if terminated else INTERRUPTED
-        except BrokenPipeError:  # whoever read the output has left
+        except BrokenPipeError:  # the reader of the output has closed the pipe
             discard_stdout()
             return 1
         except MemoryError as error:
@@ -70,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _execute(arguments):
-    """Run a command. Its module, and what that computes with, is imported here, where Ctrl-C is minded."""
+    """Run a command. Its module and all it needs are imported here, where Ctrl-C is handled."""
     parser = import_module("apt_evap.cli.parser").make_parser()
     try:
         options = parser.parse_args(arguments)
@@ -81,19 +81,19 @@ def _execute(arguments):
 
 @contextmanager
 def _terminated_like_interrupted() -> Iterator[list[int]]:
-    """Let SIGTERM do what Ctrl-C does; yields a list that holds the signal once it has come."""
-    came: list[int] = []
+    """Handle SIGTERM like Ctrl-C; yields a list that contains the signal after its arrival."""
+    signals: list[int] = []
     if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
-        yield came
+        yield signals
         return
 
-    def note(number: int, frame: Any) -> None:
-        came.append(number)
-        like = signal.getsignal(signal.SIGINT)
-        (like if callable(like) else signal.default_int_handler)(signal.SIGINT, frame)
+    def interrupt(number: int, frame: Any) -> None:
+        signals.append(number)
+        handler = signal.getsignal(signal.SIGINT)
+        (handler if callable(handler) else signal.default_int_handler)(signal.SIGINT, frame)
 
-    signal.signal(signal.SIGTERM, note)
+    signal.signal(signal.SIGTERM, interrupt)
     try:
-        yield came
+        yield signals
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)

@@ -37,27 +37,27 @@ def execute(options: argparse.Namespace) -> int:
         maps = run_maps(content, _map_settings(content, options), lambda hits: select(hits, options))
     elif options.perturbation:
         what = "a map" if isinstance(content, DetectorMap) else "measured ions"
-        raise ValueError(f"--perturbation needs a run (.h5), {options.file!r} holds {what}")
+        raise ValueError(f"--perturbation needs a run (.h5), {options.file!r} contains {what}")
     elif isinstance(content, DetectorMap):
         if options.bins is not None:
-            raise ValueError(f"--bins is for ions, {options.file!r} is a map: its bins are {_bins_of(content)}")
+            raise ValueError(f"--bins is only for ions, {options.file!r} is a map: its bins are {_bins_of(content)}")
         sigma = 0.0 if options.smooth is None and not content.is_counts else options.smooth
-        maps = [_smoothed(content, sigma)], [Path(options.file).name]
+        maps = [_smooth(content, sigma)], [Path(options.file).name]
     else:
         check_columns(content, options)
-        chosen = select(content, options)
-        check_places(chosen, options)
-        drawn = chosen.map(options.bins or _bins_for(np.count_nonzero(chosen.detected)))
-        part = f", {len(chosen):,} of {len(content):,} ions" if selects(options) else ""
-        maps = [_smoothed(drawn, options.smooth)], [f"{Path(options.file).name}{part}"]
+        selection = select(content, options)
+        check_places(selection, options)
+        map = selection.map(options.bins or _bins_for(np.count_nonzero(selection.detected)))
+        part = f", {len(selection):,} of {len(content):,} ions" if selects(options) else ""
+        maps = [_smooth(map, options.smooth)], [f"{Path(options.file).name}{part}"]
     save_picture(picture, *maps)
     tell(options, f"wrote {picture}")
-    tell_json(options, {"wrote": str(picture), "file": options.file, "maps": described(*maps)})
+    tell_json(options, {"wrote": str(picture), "file": options.file, "maps": summaries(*maps)})
     return 0
 
 
-def described(maps: Any, titles: Sequence[str]) -> list[dict[str, Any]]:
-    """What each map of a picture shows, in plain types: title, ions on it if known, bins, and the smoothing [mm]."""
+def summaries(maps: Any, titles: Sequence[str]) -> list[dict[str, Any]]:
+    """Summary of each map of a picture in plain types: title, number of ions if known, bins, and smoothing [mm]."""
     return [
         {"title": title, "ions": each.ions, "bins": list(each.values.shape[::-1]), "smoothing": each.smoothing}
         for each, title in zip(maps, titles, strict=True)
@@ -65,17 +65,17 @@ def described(maps: Any, titles: Sequence[str]) -> list[dict[str, Any]]:
 
 
 def _map_settings(run, options):
-    """Settings of the maps of a run: those given, else those it was made with, else the usual ones."""
+    """Settings of the maps of a run: from the options, else those of the run, else the defaults."""
     settings = read_maps(run.provenance.get("maps", {}))
     if options.perturbation:
-        chosen = [read_perturbation(text) for text in options.perturbation]
-        panels = tuple(Panel(title_of(perturbation), perturbation) for perturbation in chosen)
+        perturbations = [read_perturbation(text) for text in options.perturbation]
+        panels = tuple(Panel(title_of(perturbation), perturbation) for perturbation in perturbations)
         settings = replace(settings, panels=panels)
     elif "maps" not in run.provenance and run.responses is None:
-        flown = tuple(perturbation for perturbation in run.perturbations if not isinstance(perturbation, dict))
-        settings = MapSettings(tuple(Panel(title_of(each), each) for each in flown or (Unperturbed(),)))
+        perturbations = tuple(perturbation for perturbation in run.perturbations if not isinstance(perturbation, dict))
+        settings = MapSettings(tuple(Panel(title_of(each), each) for each in perturbations or (Unperturbed(),)))
     if options.bins is not None:
-        # what was a good smoothing for other bins is not for these
+        # the smoothing of the settings is for other bins
         settings = replace(settings, bins=options.bins, smoothing=None)
     if options.smooth is not None:
         settings = replace(settings, smoothing=options.smooth)
@@ -86,7 +86,7 @@ def _map_settings(run, options):
 def run_maps(
     run: Run, settings: MapSettings, choose: Callable[[Hits], Hits] = lambda hits: hits
 ) -> tuple[list[DetectorMap], list[str]]:
-    """Maps of the whole detector, of all ions or those that are chosen, and their titles."""
+    """Maps of the complete detector, for all ions or a selection, and their titles."""
     half = run.detector.width / 2
     bins = settings.bins or _bins_for(len(run))
     maps = [
@@ -94,15 +94,15 @@ def run_maps(
             bins,
             extent=(-half, half, -half, half),
             quantum=None,
-            mask=np.broadcast_to(True, (bins, bins)),  # the whole detector is simulated, no outline is to be found
+            mask=np.broadcast_to(True, (bins, bins)),  # the complete detector, without an outline
         )
         for panel in settings.panels
     ]
-    return [_smoothed(each, settings.smoothing) for each in maps], [panel.title for panel in settings.panels]
+    return [_smooth(each, settings.smoothing) for each in maps], [panel.title for panel in settings.panels]
 
 
-def _bins_of(drawn):
-    return " x ".join(map(str, drawn.values.shape[::-1]))
+def _bins_of(detector_map):
+    return " x ".join(map(str, detector_map.values.shape[::-1]))
 
 
 def _bins_for(ions):
@@ -110,5 +110,5 @@ def _bins_for(ions):
     return int(2 ** np.clip(np.rint(np.log2(max(ions, 1)) / 2), 5, 8))
 
 
-def _smoothed(drawn, sigma):
-    return drawn.smoothed(max(drawn.bin_size) if sigma is None else sigma)
+def _smooth(detector_map, sigma):
+    return detector_map.smoothed(max(detector_map.bin_size) if sigma is None else sigma)

@@ -1,4 +1,4 @@
-"""What the commands take on the command line; nothing that computes is imported, so that help comes at once."""
+"""Arguments of the commands; no numerical module is imported, so that help is fast."""
 
 import argparse
 from collections.abc import Callable, Iterable
@@ -12,24 +12,25 @@ from apt_evap.energy_fit.defaults import MEANS, MECHANISMS, ROLLUP_FRACTIONS, RS
 
 EXIT_CODES = """\
 exit codes:
-  0    done; what was written is said on stdout, warnings on stderr
-  1    whoever read the output has left (a closed pipe)
-  2    an error, explained in one sentence on stderr; nothing half-written is left behind
-  130  interrupted by Ctrl-C; `run` has saved the ions done so far
-  143  the same by SIGTERM, as batch systems send it
+  0    success; names of written files on stdout, warnings on stderr
+  1    the reader of the output has closed the pipe
+  2    error, explained in one sentence on stderr; no incomplete file remains
+  130  interrupted by Ctrl-C; `run` has saved the ions so far
+  143  the same by SIGTERM, as sent by batch systems
 """
-"""What the exit codes mean, for the help."""
+"""Meaning of the exit codes, for the help."""
 
 _PATH = """\
-from nothing to a map, and to the energies behind a measured one (the first line writes what the others read):
-  apt-evap run examples/ni111.toml                   simulate; writes ni111.h5 and maps of it, ni111.png
-  apt-evap info ni111.h5                             what the run holds: specimen, ions, outcomes
+from a simulation to its map, and to the emission energies of a measured map (the first command writes the input of the
+others):
+  apt-evap run examples/ni111.toml                   simulate; write ni111.h5 and its maps ni111.png
+  apt-evap info ni111.h5                             contents of the run: specimen, ions, outcomes
   apt-evap map ni111.h5 --perturbation RollUp:0.3 -o rolled.png
-                                                     the same ions, all rolled up with 0.3 eV, in a second
-  apt-evap info R5083.epos --json | jq .ions         measured files too; --json for programs
-  apt-evap map R5083.epos --bins 128                 a measured map beside them
-  apt-evap compare ni111.h5 R5083.epos -o study      the energies for which the run looks most like the measured map
-  apt-evap COMMAND --help                            everything a command takes, with examples
+                                                     map of the same ions, with roll-up at 0.3 eV; takes about 1 s
+  apt-evap info R5083.epos --json | jq .ions         also for measured files; --json for programs
+  apt-evap map R5083.epos --bins 128                 map of measured ions
+  apt-evap compare ni111.h5 R5083.epos -o study      fit the emission energies to the measured map
+  apt-evap COMMAND --help                            all arguments of a command, with examples
 """
 
 _SHAPE: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
@@ -41,12 +42,12 @@ def make_parser() -> argparse.ArgumentParser:
     Returns
     -------
     argparse.ArgumentParser
-        Its errors are ValueErrors. The options it returns have the name of the command as `command`.
+        Its errors are ValueErrors. The parsed options contain the name of the command as `command`.
     """
     parser = _Parser(
         prog="apt-evap",
-        description="Field evaporation in atom probe tomography: simulate a specimen that evaporates atom by atom,\n"
-        "and draw where its ions land under any perturbation of their emission, beside measured ions.",
+        description="Field evaporation in atom probe tomography: simulate the evaporation of a specimen atom by atom,\n"
+        "draw detector maps for any perturbation of the emission, and compare them with measured ions.",
         epilog=f"{_PATH}\n{EXIT_CODES}",
         **_SHAPE,
     )
@@ -62,14 +63,14 @@ class _Parser(argparse.ArgumentParser):
         raise ValueError(f"{message} (see {self.prog} --help)")
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        # a command's own parser would leave it to the one above to say so, with the wrong help
+        # checked in the parser of the command, so that the message names its help
         options, unknown = super().parse_known_args(args, namespace)
         if unknown:
             self.error(f"unrecognized arguments: {' '.join(unknown)}")
         return options, unknown
 
     def _print_message(self, message: str, file: Any = None) -> None:
-        put(message.removesuffix("\n"))  # that of argparse does not tell of a full disk
+        put(message.removesuffix("\n"))  # argparse ignores write errors, such as a full disk
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is not None and value not in action.choices:
@@ -90,22 +91,25 @@ def _did_you_mean(word: str, known: Iterable[str]) -> str:
 def _add_run(commands: Any) -> None:
     command = commands.add_parser(
         "run",
-        help="simulate what a TOML file describes",
-        description="Simulate what a TOML file describes, save the run and draw its detector maps.\n"
-        "Ctrl-C or SIGTERM ends the simulation and saves what is done. While it goes on it is kept in\n"
-        "RUN.h5.unfinished; killed, it goes on from there with --resume, and gives the same bits as if it had not.\n"
-        "Behind the bar: charges, how far from settled they are (RMS over their mean); shares of the last ions that\n"
-        "missed, never left, or are flagged, as their responses are inexact. Without a terminal: a line a minute.",
+        help="run the simulation of a TOML file",
+        description="Run the simulation of a TOML file, save the run and draw its detector maps.\n"
+        "Ctrl-C or SIGTERM ends the simulation and saves the ions so far. During the simulation checkpoints are\n"
+        "stored in RUN.h5.unfinished. After a crash --resume continues from there, with the same bits as an\n"
+        "uninterrupted run. The progress bar shows: charges (RMS residual relative to the mean charge); fractions\n"
+        "of the last ions that missed, never left the tip, or are flagged (inexact responses). Without a terminal:\n"
+        "one line per minute.",
         epilog="example: apt-evap run examples/ni111.toml -o ni.h5 --ions 5000",
         **_SHAPE,
     )
     command.add_argument("config", metavar="CONFIG.toml")
-    command.add_argument("-o", "--output", metavar="RUN.h5", help="default: output of the file, or its name with .h5")
-    command.add_argument("--ions", type=_whole(1), metavar="N", help="atoms to evaporate, instead of those of the file")
-    command.add_argument("--threads", type=_whole(1), metavar="N", help="default: all processors")
-    command.add_argument("--seed", type=_whole(0), metavar="N", help="instead of that of the file")
+    command.add_argument("-o", "--output", metavar="RUN.h5", help="default: output in the file, or its name with .h5")
+    command.add_argument(
+        "--ions", type=_integer(1), metavar="N", help="number of atoms to evaporate; default: ions in the file"
+    )
+    command.add_argument("--threads", type=_integer(1), metavar="N", help="default: all processors")
+    command.add_argument("--seed", type=_integer(0), metavar="N", help="default: seed in the file")
     command.add_argument("--map", metavar="MAP.png", help="picture of the maps; default: beside the run")
-    command.add_argument("--resume", action="store_true", help="go on with an unfinished run, or make one longer")
+    command.add_argument("--resume", action="store_true", help="continue an unfinished run, or extend a run")
     command.add_argument(
         "--checkpoint",
         type=_number("min"),
@@ -115,7 +119,7 @@ def _add_run(commands: Any) -> None:
     )
     _add_speech(command)
     command.add_argument(
-        "--force", action="store_true", help="overwrite unfinished and other runs, and files that apt-evap did not make"
+        "--force", action="store_true", help="overwrite unfinished and other runs, and files not made by apt-evap"
     )
 
 
@@ -130,140 +134,153 @@ def _add_map(commands: Any) -> None:
         "  apt-evap map ni111.h5 --perturbation Unperturbed --perturbation RollUp:0.3,0.1 -o energies.png\n\n"
         "a perturbation is NAME, NAME:NUMBERS or a TOML table:\n"
         "  Unperturbed              RollUp:0.2 (eV, all ions)    RollUp:0.155,0.155 (mean, standard deviation)\n"
-        "  LateralVelocity:0.3,0.1  Combined:0.155,0.155,0.75 (the last number is the share of the roll-up)\n"
+        "  LateralVelocity:0.3,0.1  Combined:0.155,0.155,0.75 (the last number is the roll-up fraction)\n"
         '  \'{name = "RollUp", energy = {name = "Thermal", temperature = 50}}\'',
         **_SHAPE,
     )
     command.add_argument("file", metavar="FILE", help=_FILE_HELP)
     _add_reading(command)
-    command.add_argument("-o", "--output", metavar="MAP.png", help=".png, .pdf or .svg; default: FILE_map.png, here")
     command.add_argument(
-        "--bins", type=_whole(1, MAX_BINS), metavar="N", help="along the longer side; default: about sqrt(ions)"
+        "-o", "--output", metavar="MAP.png", help=".png, .pdf or .svg; default: FILE_map.png in this folder"
+    )
+    command.add_argument(
+        "--bins", type=_integer(1, MAX_BINS), metavar="N", help="bins along the longer side; default: about sqrt(ions)"
     )
     command.add_argument("--smooth", type=_number("mm"), metavar="MM", help="sigma of a Gaussian; default: one bin")
     command.add_argument(
-        "--perturbation", action="append", metavar="P", help="of the ions of a run; repeat it for maps side by side"
+        "--perturbation",
+        action="append",
+        metavar="P",
+        help="perturbation of the ions of a run; repeat it for maps side by side",
     )
-    command.add_argument("--force", action="store_true", help="overwrite a file that apt-evap did not make")
+    command.add_argument("--force", action="store_true", help="overwrite a file not made by apt-evap")
     _add_speech(command)
 
 
 def _add_info(commands: Any) -> None:
     command = commands.add_parser(
         "info",
-        help="say what is in a file",
-        description="Say what is in a run (of an unfinished one, give the folder), in a file of ions or a map.",
+        help="summarise a file",
+        description="Summarise a run (for an unfinished run, give the folder), a file of ions or a map.",
         epilog="example: apt-evap info ni111.h5\n         apt-evap info R5083.epos --json | jq .columns.voltage",
         **_SHAPE,
     )
     command.add_argument("file", metavar="FILE", help=_FILE_HELP)
     _add_reading(command)
-    command.add_argument(
-        "--json", action="store_true", help="as JSON, for programs; numbers are in the units that the text shows"
-    )
+    command.add_argument("--json", action="store_true", help="as JSON, for programs; units as in the text output")
 
 
 def _add_compare(commands: Any) -> None:
     command = commands.add_parser(
         "compare",
-        help="find the emission energies that make a run look most like a measured map",
-        description="Find the emission energies that make a run look most like a measured map: the structural\n"
-        "similarity for a grid of energies, its maximum, its errors, and what no energy and thermal energies give.",
+        help="fit the emission energies of a run to a measured map",
+        description="Fit the emission energies of a run to a measured map: structural similarity for a grid of\n"
+        "energies, its maximum and errors, and for comparison the similarities without energy and with thermal\n"
+        "energies.",
         epilog="writes to FOLDER:\n"
-        "  study.json        results and every setting\n"
-        "  ssim.csv          similarity, error and share of the resamples for every energy\n"
-        "  ssim.png          the same as a picture\n"
-        "  maps.png          measured, unperturbed and best map side by side, and a part of them magnified\n"
-        "  registration.png  the simulated map laid over the measured one\n\n"
+        "  study.json        results and all settings\n"
+        "  ssim.csv          similarity, error and fraction of the resamples for every energy\n"
+        "  ssim.png          plot of the similarities\n"
+        "  maps.png          measured, unperturbed and best map side by side, and an enlarged part\n"
+        "  registration.png  overlay of the simulated map on the measured one\n\n"
         "example: apt-evap compare ni111.h5 R5083.epos -o R5083_study --mechanism roll-up",
         **_SHAPE,
     )
     command.add_argument("run", metavar="RUN.h5", help="a run with responses")
     command.add_argument("file", metavar="MEASURED", help="measured ions (.epos, ...), a map (.npz), or a run (.h5)")
-    command.add_argument("-o", "--output", metavar="FOLDER", help="default: MEASURED_study, here")
+    command.add_argument("-o", "--output", metavar="FOLDER", help="default: MEASURED_study in this folder")
     command.add_argument("--mechanism", choices=MECHANISMS, default="roll-up", help="default: roll-up")
     for name, default, what in (
-        ("means", MEANS, "of the energy [eV]"),
-        ("rsds", RSDS, "standard deviations over the means"),
-        ("rollup-fractions", ROLLUP_FRACTIONS, "for combined"),
+        ("means", MEANS, "means of the energy [eV]"),
+        ("rsds", RSDS, "standard deviations relative to the means"),
+        ("rollup-fractions", ROLLUP_FRACTIONS, "roll-up fractions for the mechanism combined"),
     ):
         numbers = ",".join(f"{value:g}" for value in default)
         command.add_argument(f"--{name}", type=_numbers, metavar="N,N,...", help=f"{what}; default: {numbers}")
     command.add_argument(
         "--registration",
         metavar="R",
-        help="a JSON file (such as study.json) or ROTATION,SCALE,DX,DY[,mirror] in degrees and mm; found by default",
+        help="a JSON file (such as study.json) or ROTATION,SCALE,DX,DY[,mirror] in degrees and mm; default: automatic",
     )
-    command.add_argument("--bins", type=_whole(11, MAX_BINS), metavar="N", help="along the longer side")
+    command.add_argument("--bins", type=_integer(11, MAX_BINS), metavar="N", help="bins along the longer side")
     command.add_argument(
-        "--smooth", type=_number("mm"), metavar="MM", help="sigma of a Gaussian; default: half a bin, of densities one"
+        "--smooth",
+        type=_number("mm"),
+        metavar="MM",
+        help="sigma of a Gaussian; default: half a bin, for densities one bin",
     )
-    command.add_argument("--flatten", type=_number("mm"), metavar="MM", help="sigma of a broad Gaussian; 0 for not")
-    command.add_argument("--temperature", type=float, default=50.0, metavar="K", help="of the thermal map; default: 50")
-    command.add_argument("--plain", action="store_true", help="SSIM as it is, without allowance for noise")
-    command.add_argument("--replicas", type=_whole(1), metavar="N", help="draws of every ion; default: 4 to 16")
-    command.add_argument("--resamples", type=_whole(0), default=200, metavar="N", help="for the errors; default: 200")
-    command.add_argument("--seed", type=_whole(0), default=0, metavar="N", help="of the resamples; default: 0")
-    command.add_argument("--threads", type=_whole(1), metavar="N", help="default: all processors")
+    command.add_argument(
+        "--flatten", type=_number("mm"), metavar="MM", help="sigma of the Gaussian for flattening; 0 for none"
+    )
+    command.add_argument(
+        "--temperature", type=float, default=50.0, metavar="K", help="temperature of the thermal map; default: 50"
+    )
+    command.add_argument("--plain", action="store_true", help="SSIM without noise correction")
+    command.add_argument("--replicas", type=_integer(1), metavar="N", help="draws per ion; default: 4 to 16")
+    command.add_argument(
+        "--resamples", type=_integer(0), default=200, metavar="N", help="number, for the errors; default: 200"
+    )
+    command.add_argument("--seed", type=_integer(0), default=0, metavar="N", help="seed of the resamples; default: 0")
+    command.add_argument("--threads", type=_integer(1), metavar="N", help="default: all processors")
     command.add_argument("--quiet", action="store_true", help="no progress bar, no summary")
-    command.add_argument("--force", action="store_true", help="overwrite files that apt-evap did not make")
+    command.add_argument("--force", action="store_true", help="overwrite files not made by apt-evap")
     reading = _add_reading(command)
-    reading.add_argument("--perturbation", metavar="P", help="of the ions of MEASURED where it is a run")
+    reading.add_argument("--perturbation", metavar="P", help="perturbation of the ions of MEASURED if it is a run")
 
 
-# ---- what several commands take --------------------------------------------------------------------------------------
+# ---- arguments of several commands -----------------------------------------------------------------------------------
 
 _FILE_HELP = "a run (.h5), measured ions (.epos, ...) or a map (.npz)"
 
 
 def _add_reading(parser: argparse.ArgumentParser) -> Any:
-    """Add options that say how the file of ions is read, and which ions; return the group of the first."""
+    """Add options for reading a file and selecting ions; return the first group."""
     group = parser.add_argument_group("reading of files")
-    group.add_argument("--format", metavar="SUFFIX", help="read ions as this format, such as .pos")
-    group.add_argument("--partial", action="store_true", default=None, help="read the whole ions of a truncated file")
-    group.add_argument("--byte-order", choices=("big", "little"), help="of .pos and .epos files")
+    group.add_argument("--format", metavar="SUFFIX", help="read ions in this format, such as .pos")
+    group.add_argument("--partial", action="store_true", default=None, help="read a truncated file to its last ion")
+    group.add_argument("--byte-order", choices=("big", "little"), help="byte order of .pos and .epos files")
     group.add_argument("--arrays", metavar="V,X,Y[,MASK]", help="names in an .npz: values, edges in x and y, mask")
-    group.add_argument("--unit", metavar="UNIT", help="of the edges in an .npz: mm, cm, m or um")
-    chosen = parser.add_argument_group("selection of ions", "LOW <= value < HIGH; LOW or HIGH may be left out: 27,")
-    chosen.add_argument("--mass", type=_bounds, metavar="LOW,HIGH", help="mass over charge state [Da]")
-    chosen.add_argument("--voltage", type=_bounds, metavar="LOW,HIGH", help="standing voltage [V]")
-    chosen.add_argument(
+    group.add_argument("--unit", metavar="UNIT", help="unit of the edges in an .npz: mm, cm, m or um")
+    selection = parser.add_argument_group("selection of ions", "LOW <= value < HIGH; LOW or HIGH may be omitted: 27,")
+    selection.add_argument("--mass", type=_bounds, metavar="LOW,HIGH", help="mass-to-charge ratio [Da]")
+    selection.add_argument("--voltage", type=_bounds, metavar="LOW,HIGH", help="DC voltage [V]")
+    selection.add_argument(
         "--ions", type=_bounds, metavar="FIRST,LAST", help="in the order of the file, from 0; LAST is not included"
     )
-    chosen.add_argument("--circle", type=_circle, metavar="R[,X,Y]", help="on the detector: radius, and centre [mm]")
-    chosen.add_argument("--ranges", metavar="FILE.rrng", help="ranges of mass, for --species")
-    chosen.add_argument("--species", metavar="NAME[,NAME]", help="ions in the ranges of this name, such as Si")
+    selection.add_argument("--circle", type=_circle, metavar="R[,X,Y]", help="radius, and centre, on the detector [mm]")
+    selection.add_argument("--ranges", metavar="FILE.rrng", help="ranges of mass, for --species")
+    selection.add_argument("--species", metavar="NAME[,NAME]", help="ions in the ranges of these names, such as Si")
     return group
 
 
 def _add_speech(command: argparse.ArgumentParser) -> None:
-    """Add options of a command that tells what it has done: in sentences, as JSON or not at all."""
+    """Add options for the messages of a command: text, JSON or none."""
     speech = command.add_mutually_exclusive_group()
-    speech.add_argument("--quiet", action="store_true", help="say nothing but warnings and errors")
-    speech.add_argument("--json", action="store_true", help="say in one line of JSON what was written")
+    speech.add_argument("--quiet", action="store_true", help="only warnings and errors")
+    speech.add_argument("--json", action="store_true", help="one line of JSON that names the written files")
 
 
-# ---- kinds of arguments ----------------------------------------------------------------------------------------------
+# ---- types of arguments ----------------------------------------------------------------------------------------------
 
 
-def _whole(least: int, most: int | None = None) -> Callable[[str], int]:
-    """A whole number within bounds."""
+def _integer(least: int, largest: int | None = None) -> Callable[[str], int]:
+    """Integer within bounds."""
 
-    def whole(text):
+    def integer(text):
         try:
             number = int(text)
         except ValueError:
             number = least - 1
-        if number < least or (most is not None and number > most):
-            bounds = f"of at least {least}" if most is None else f"from {least} to {most}"
-            raise argparse.ArgumentTypeError(f"must be a whole number {bounds}, got {text!r}")
+        if number < least or (largest is not None and number > largest):
+            bounds = f">= {least}" if largest is None else f"from {least} to {largest}"
+            raise argparse.ArgumentTypeError(f"must be an integer {bounds}, got {text!r}")
         return number
 
-    return whole
+    return integer
 
 
 def _number(unit: str) -> Callable[[str], float]:
-    """A finite number of at least 0."""
+    """Finite number >= 0."""
 
     def number(text):
         try:
@@ -271,29 +288,29 @@ def _number(unit: str) -> Callable[[str], float]:
         except ValueError:
             value = -1.0
         if not 0 <= value < inf:
-            raise argparse.ArgumentTypeError(f"must be a number [{unit}] of at least 0, got {text!r}")
+            raise argparse.ArgumentTypeError(f"must be a number [{unit}] >= 0, got {text!r}")
         return value
 
     return number
 
 
 def _numbers(text: str) -> tuple[float, ...]:
-    """Numbers with commas between."""
+    """Numbers separated by commas."""
     try:
         return tuple(float(part) for part in text.split(","))
     except ValueError:
-        raise argparse.ArgumentTypeError(f"must be numbers with commas between, got {text!r}") from None
+        raise argparse.ArgumentTypeError(f"must be numbers separated by commas, got {text!r}") from None
 
 
 def _bounds(text: str) -> tuple[float | None, float | None]:
-    """Two bounds, None where one is left out."""
+    """Two bounds, None for an omitted one."""
     try:
         low, high = (float(part) if part.strip() else None for part in text.split(","))
         ordered = low is None or high is None or low <= high
         if not ordered or not all(bound is None or isfinite(bound) for bound in (low, high)):
             raise ValueError
     except ValueError:
-        raise argparse.ArgumentTypeError(f"must be two numbers in order, such as 27,29.5, got {text!r}") from None
+        raise argparse.ArgumentTypeError(f"must be two increasing numbers, such as 27,29.5, got {text!r}") from None
     return low, high
 
 

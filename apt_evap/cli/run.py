@@ -1,4 +1,4 @@
-"""`apt-evap run`: simulate what a TOML file describes."""
+"""`apt-evap run`: run the simulation of a TOML file."""
 
 import argparse
 import sys
@@ -8,14 +8,14 @@ from dataclasses import replace
 from apt_evap._common.files import FileError, check_path
 from apt_evap.cli._files import check_output, is_picture, picture_path, save_picture
 from apt_evap.cli._output import INTERRUPTED, say, tell, tell_json
-from apt_evap.cli.map import described, run_maps
+from apt_evap.cli.map import run_maps, summaries
 from apt_evap.config.simulation_file import read_config
 from apt_evap.simulation.checkpoint import Checkpoint
 from apt_evap.simulation.ending import Ending, RunInterrupted
 from apt_evap.simulation.run_hdf5 import is_run
 
 SECONDS_BETWEEN_LINES = 60.0
-_GO_ON = "the same command with --resume goes on"
+_CONTINUE = "the same command with --resume continues"
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -23,9 +23,9 @@ def execute(options: argparse.Namespace) -> int:
     config = read_config(options.config)
     output = check_path(options.output or config.output or f"{config.path.stem}.h5")
     if output.suffix.lower() != ".h5":
-        raise FileError(f"a run is saved in an HDF5 file whose name ends in .h5, got {str(output)!r}")
+        raise FileError(f"a run is saved in an HDF5 file with the suffix .h5, got {str(output)!r}")
     picture = picture_path(options.map or output.with_suffix(".png"))
-    # before the hours of computing, not after
+    # before the long computation
     check_output(output, is_run, options.force)
     check_output(picture, is_picture, options.force)
 
@@ -57,13 +57,13 @@ def execute(options: argparse.Namespace) -> int:
     except ValueError as error:
         raise ValueError(f"no maps are drawn, the run is in {str(output)!r}: {error}") from error
     tell(options, f"wrote {picture}")
-    written = {"wrote": str(output), "picture": str(picture), "maps": described(*maps)}
-    tell_json(options, {**written, **_counts(run, seconds)})
+    files = {"wrote": str(output), "picture": str(picture), "maps": summaries(*maps)}
+    tell_json(options, {**files, **_counts(run, seconds)})
     return INTERRUPTED if run.ended == Ending.INTERRUPTED else 0
 
 
 def _simulate(options, config, simulation, checkpoint, n_ions, provenance):
-    """Run the simulation; say where its ions are if that ends in an interrupt or an error."""
+    """Run the simulation; after an interrupt or an error a note names the file of its ions."""
     lines = not options.quiet and not sys.stderr.isatty()
     try:
         return simulation.run(
@@ -76,35 +76,35 @@ def _simulate(options, config, simulation, checkpoint, n_ions, provenance):
     except KeyboardInterrupt:
         if ions := checkpoint.ions_there():
             where = checkpoint.folder if checkpoint.folder.exists() else checkpoint.path
-            say("note", f"{ions:,} of {n_ions:,} ions are in {str(where)!r}; {_GO_ON}")
+            say("note", f"{ions:,} of {n_ions:,} ions are in {str(where)!r}; {_CONTINUE}")
         raise
     except RunInterrupted as error:
         replace(error.run, provenance=error.run.provenance | provenance).save(checkpoint.path)
-        say("note", f"the {len(error.run):,} ions done so far are in {str(checkpoint.path)!r}")
+        say("note", f"the {len(error.run):,} ions so far are in {str(checkpoint.path)!r}")
         raise
 
 
 def _tell_outcomes(options, config, run, output, n_ions):
-    """Say how many ions hit the detector, and what is not as it was planned."""
-    most_missed = []
+    """Print the numbers of hits, and notes about problems."""
+    frequent_misses = []
     for panel in config.maps.panels:
         hit, missed, never_left = run.hits(panel.perturbation).counts.values()
-        most_missed += [missed] if 2 * missed > len(run) else []
+        frequent_misses += [missed] if 2 * missed > len(run) else []
         tell(
             options, f"{panel.title}: {hit:,} hit the detector, {missed:,} missed it, {never_left:,} never left the tip"
         )
     if run.responses is not None:
         tell(options, f"responses: {run.flagged.sum():,} ions flagged as inexact")
-    if most_missed:
+    if frequent_misses:
         say(
             "note",
-            f"{max(most_missed):,} of {len(run):,} ions miss the detector, which is {run.detector.width:g} mm wide at "
-            f"{run.detector.distance:g} mm: a larger width or a smaller distance in [detector] catches more of them",
+            f"{max(frequent_misses):,} of {len(run):,} ions miss the detector, which is {run.detector.width:g} mm "
+            f"wide at {run.detector.distance:g} mm: use a larger width or a smaller distance in [detector]",
         )
     if run.ended == Ending.INTERRUPTED:
-        say("note", f"interrupted; {len(run):,} of {n_ions:,} ions are in {str(output)!r}; {_GO_ON}")
+        say("note", f"interrupted; {len(run):,} of {n_ions:,} ions are in {str(output)!r}; {_CONTINUE}")
     elif run.ended:
-        say("note", f"the run ended before its time: {run.ended}; the {len(run):,} ions so far are kept")
+        say("note", f"the run ended early: {run.ended}; its {len(run):,} ions are saved")
 
 
 def _counts(run, seconds):
@@ -112,25 +112,25 @@ def _counts(run, seconds):
 
 
 class _Lines:
-    """Says on stderr how far a run is, at most once a minute and not in the first one."""
+    """Progress of a run on stderr: one line per minute, after the first minute."""
 
     def __init__(self) -> None:
-        self._began = self._told = self._first = 0.0
+        self._began = self._printed = self._first = 0.0
 
     def __call__(self, done: int, n_ions: int) -> None:
         now = time.monotonic()
         if not self._began:
-            self._began, self._told, self._first = now, now, done
-        elif now - self._told >= SECONDS_BETWEEN_LINES and done > self._first:
-            self._told = now
+            self._began, self._printed, self._first = now, now, done
+        elif now - self._printed >= SECONDS_BETWEEN_LINES and done > self._first:
+            self._printed = now
             rate = (done - self._first) / (now - self._began)
-            left, speed = _duration((n_ions - done) / rate), f"{rate:,.0f}" if rate >= 10 else f"{rate:.2g}"
-            line = f"{done:,} of {n_ions:,} ions ({done / n_ions:.0%}), {speed} ions/s, {left} left"
+            remaining, speed = _duration((n_ions - done) / rate), f"{rate:,.0f}" if rate >= 10 else f"{rate:.2g}"
+            line = f"{done:,} of {n_ions:,} ions ({done / n_ions:.0%}), {speed} ions/s, {remaining} left"
             print(line, file=sys.stderr, flush=True)
 
 
 def _duration(seconds):
-    """A time in the unit that suits it."""
+    """Text of a time in a suitable unit."""
     for unit, length in (("h", 3600), ("min", 60)):
         if seconds >= 2 * length:
             return f"{seconds / length:.1f} {unit}"

@@ -1,1 +1,1 @@
-"""Settings files of simulations, map panels and perturbations written as text."""
+"""Settings files of simulations, map panels, and perturbations as text."""

@@ -4,22 +4,22 @@ import tomllib
 from collections.abc import Mapping
 from typing import Any
 
-from apt_evap._common.validation import shown
+from apt_evap._common.validation import short_text
 from apt_evap.config.tables import check_table
 from apt_evap.emission.energies import Fixed, Thermal, TruncatedNormal
 from apt_evap.emission.perturbations import Perturbation, from_dict
 
 
 def read_perturbation(settings: str | Mapping[str, Any]) -> Perturbation:
-    """Make a perturbation from a table with its name and parameters, or from text.
+    """Make a perturbation from a table with name and parameters, or from text.
 
     Parameters
     ----------
     settings : str or mapping
-        ``{"name": "RollUp", "energy": {"name": "TruncatedNormal", "mean": 0.3, "standard_deviation": 0.1}}``, where a
-        number as energy is the same for every ion [eV]; as text the name alone, ``"RollUp:0.2"`` for the same energy,
-        ``"RollUp:0.3,0.1"`` for a mean and a standard deviation [eV], ``"Combined:0.3,0.1,0.75"`` with the
-        rollup_fraction last, or the table as TOML writes it.
+        ``{"name": "RollUp", "energy": {"name": "TruncatedNormal", "mean": 0.3, "standard_deviation": 0.1}}``, a number
+        as energy is the same for every ion [eV]. As text: the name alone, ``"RollUp:0.2"`` for equal energies,
+        ``"RollUp:0.3,0.1"`` for mean and standard deviation [eV], ``"Combined:0.3,0.1,0.75"`` with the rollup_fraction
+        at the end, or the table in TOML syntax.
 
     Returns
     -------
@@ -28,7 +28,7 @@ def read_perturbation(settings: str | Mapping[str, Any]) -> Perturbation:
     Raises
     ------
     ValueError
-        If a name is unknown, or a parameter is unknown, missing or out of its range.
+        If a name is unknown, or a parameter is unknown, missing or outside its range.
     """
     if isinstance(settings, str):
         try:
@@ -38,15 +38,15 @@ def read_perturbation(settings: str | Mapping[str, Any]) -> Perturbation:
     check_table(settings, "perturbation")
     for table in (settings, *settings.values()):
         if isinstance(table, Mapping) and not isinstance(table.get("name"), str):
-            raise ValueError(f"a perturbation or distribution must have a name, got {shown(dict(table))}")
+            raise ValueError(f"a perturbation or distribution must have a name, got {short_text(dict(table))}")
     perturbation = from_dict(settings)
     if not callable(getattr(perturbation, "launch", None)):
-        raise ValueError(f"perturbation must be one, such as Unperturbed or RollUp, got {shown(dict(settings))}")
+        raise ValueError(f"perturbation must be one such as Unperturbed or RollUp, got {short_text(dict(settings))}")
     return perturbation
 
 
 def _perturbation_table(text):
-    """Table of a perturbation that is given as text."""
+    """Table of a perturbation from text."""
     if text.lstrip().startswith("{"):
         return tomllib.loads(f"perturbation = {text}")["perturbation"]
     name, colon, numbers = text.partition(":")
@@ -55,17 +55,17 @@ def _perturbation_table(text):
     try:
         values = [float(number) for number in numbers.split(",")]
     except ValueError:
-        raise ValueError(f"expected numbers with commas between them after the colon, got {numbers!r}") from None
-    share = {"rollup_fraction": values.pop()} if name == "Combined" else {}
+        raise ValueError(f"expected numbers separated by commas after the colon, got {numbers!r}") from None
+    fraction = {"rollup_fraction": values.pop()} if name == "Combined" else {}
     if len(values) not in (1, 2):
         expected = "1 or 2 numbers (an energy, or mean and standard deviation)"
-        raise ValueError(f"{name} takes {expected}{' and its share of roll-up' if share else ''}, got {numbers!r}")
+        raise ValueError(f"{name} takes {expected}{' and the roll-up fraction' if fraction else ''}, got {numbers!r}")
     normal = dict(zip(("name", "mean", "standard_deviation"), ("TruncatedNormal", *values), strict=False))
-    return {"name": name, "energy": values[0] if len(values) == 1 else normal, **share}
+    return {"name": name, "energy": values[0] if len(values) == 1 else normal, **fraction}
 
 
 def title_of(perturbation: Any) -> str:
-    """Title of a map of the ions of a perturbation (str), such as "roll-up, 0.155 ± 0.155 eV"."""
+    """Title of a map for a perturbation (str), such as "roll-up, 0.155 ± 0.155 eV"."""
     name = type(perturbation).__name__
     words = {"Unperturbed": "unperturbed", "LateralVelocity": "lateral velocity", "RollUp": "roll-up"}
     title = words.get(name, name)

@@ -1,4 +1,4 @@
-"""Simulations from TOML files: every table and key is checked, and a wrong one is named with what was expected."""
+"""Simulations from TOML files, with validation of every table and key."""
 
 import inspect
 import re
@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 from apt_evap._common.files import FileError, check_path, read_small_file
-from apt_evap._common.validation import check_count, check_kind, check_number, check_seed, check_switch, shown
+from apt_evap._common.validation import check_count, check_kind, check_number, check_seed, check_switch, short_text
 from apt_evap.config.map_panels import MapSettings, read_maps
 from apt_evap.config.tables import check_keys, check_table
 from apt_evap.detection.detector import Detector
@@ -40,7 +40,7 @@ _LENGTH = re.compile(r"\s*(\S+?)\s*(a|nm)\s*")
 
 @dataclass(frozen=True, repr=False)
 class Config:
-    """What a TOML file says about a simulation; made by `read_config`.
+    """Settings of a simulation from a TOML file; made by `read_config`.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class Config:
     n_ions : int
         Number of atoms to evaporate.
     responses : bool
-        Whether responses are flown; if not, the perturbations of the maps are flown instead.
+        Whether to compute responses; if not, the perturbations of the maps are flown instead.
     voltage : float
         Applied voltage [V].
     seed : int
@@ -59,18 +59,18 @@ class Config:
     detector : Detector
         The detector.
     charge_settings, flight_settings, response_settings : ChargeSettings, FlightSettings, ResponseSettings
-        How finely everything is computed.
+        Accuracy of the computation.
     watch_settings : WatchSettings
-        How the run is watched.
+        Monitoring of the run.
     maps : MapSettings
-        Maps to draw of the run.
+        Maps of the run.
     output : str or None
-        Where the run goes.
+        File name of the run.
 
     Raises
     ------
     ValueError
-        If a field is of the wrong kind or out of its range, or the maps do not fit the detector.
+        If a field has the wrong type or is outside its range, or the maps do not fit the detector.
     """
 
     path: Path
@@ -95,7 +95,7 @@ class Config:
         check_voltage(self.voltage)
         check_seed(self.seed)
         if self.output is not None and not (isinstance(self.output, str) and self.output):
-            raise ValueError(f"output must be a file name such as 'run.h5', got {shown(self.output)}")
+            raise ValueError(f"output must be a file name such as 'run.h5', got {short_text(self.output)}")
         self.maps.check_detector(self.detector)
 
     def __repr__(self) -> str:
@@ -107,7 +107,7 @@ class Config:
 
     @property
     def emissions(self) -> tuple[Perturbation, ...]:
-        """Perturbations to fly beside the responses: none, or without responses those of the maps."""
+        """Perturbations with their own flights: none, or without responses those of the maps."""
         return () if self.responses else tuple(dict.fromkeys(panel.perturbation for panel in self.maps.panels))
 
     def simulation(self, *, seed: int | None = None, n_threads: int | None = None) -> Simulation:
@@ -116,9 +116,9 @@ class Config:
         Parameters
         ----------
         seed : int, optional
-            Instead of that of the file.
+            Replaces the seed of the file.
         n_threads : int, optional
-            Threads; by default the processors this process may use.
+            Number of threads; by default the number of processors that this process may use.
 
         Returns
         -------
@@ -127,11 +127,11 @@ class Config:
         Raises
         ------
         FileError
-            If the specimen is impossible, or the flights do not fit it; the message names the file.
+            If the specimen is impossible, or the flights do not fit the specimen; the message names the file.
         """
-        with _place(self.path, "tip"):
+        with _located(self.path, "tip"):
             tip = Tip(**self.tip)
-        with _place(self.path):  # flights against tip or detector: no single table
+        with _located(self.path):  # flights and tip or detector: no single table
             return Simulation(
                 tip,
                 voltage=self.voltage,
@@ -152,8 +152,8 @@ def read_config(path: str | Path) -> Config:
     ``[simulation]`` (ions, voltage, seed, responses), ``[detector]``, ``[charges]``, ``[flights]``, ``[responses]``,
     ``[watch]`` (fields of `Detector`, `ChargeSettings`, `FlightSettings`, `ResponseSettings`, `WatchSettings`) and
     ``[maps]`` (bins, smoothing and panels, each with a title and a perturbation as in
-    `apt_evap.perturbation.from_dict`). Only ``[tip]`` with a material and an apex_radius, and the ions of
-    ``[simulation]``, have to be there.
+    `apt_evap.perturbation.from_dict`). Only ``[tip]`` with a material and an apex_radius, and the ions in
+    ``[simulation]``, are required.
 
     Parameters
     ----------
@@ -180,17 +180,17 @@ def read_config(path: str | Path) -> Config:
         raise FileError(f"{str(path)!r} is not a TOML file: it is not text in UTF-8") from error
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise FileError(f"{str(path)!r} is not a TOML file: {error}") from error
-    with _place(path):
+    with _located(path):
         tables = ("tip", "simulation", "detector", "charges", "flights", "responses", "watch", "maps")
         check_keys(document, ("output", *tables), ("tip", "simulation"))
         for name in tables:
             check_table(document.get(name, {}), f"[{name}]")
         output = document.get("output")
         if output is not None and not (isinstance(output, str) and output):
-            raise ValueError(f"output must be a file name such as 'run.h5', got {shown(output)}")
-    with _place(path, "tip"):
+            raise ValueError(f"output must be a file name such as 'run.h5', got {short_text(output)}")
+    with _located(path, "tip"):
         tip = _tip(document["tip"])
-    with _place(path, "simulation"):
+    with _located(path, "simulation"):
         simulation = document["simulation"]
         check_keys(simulation, ("ions", "voltage", "seed", "responses"), ("ions",))
         n_ions = check_count(simulation["ions"], "ions", at_least=1)
@@ -198,8 +198,8 @@ def read_config(path: str | Path) -> Config:
         seed = check_seed(simulation.get("seed", 0))
         responses = simulation.get("responses", True)
         if not isinstance(responses, bool):
-            raise ValueError(f"responses must be true or false, got {shown(responses)}")
-    made = []
+            raise ValueError(f"responses must be true or false, got {short_text(responses)}")
+    sections = []
     for name, kind, known in (
         ("detector", Detector, _field_names(Detector)),
         ("charges", ChargeSettings, _field_names(ChargeSettings)),
@@ -207,13 +207,13 @@ def read_config(path: str | Path) -> Config:
         ("responses", ResponseSettings, ("energy_limit", "bound")),
         ("watch", WatchSettings, _field_names(WatchSettings)),
     ):
-        with _place(path, name):
+        with _located(path, name):
             check_keys(document.get(name, {}), known)
-            made.append(kind(**document.get(name, {})))
-    with _place(path, "maps"):
+            sections.append(kind(**document.get(name, {})))
+    with _located(path, "maps"):
         maps = read_maps(document.get("maps", {}))
-        maps.check_detector(made[0])  # type: ignore[arg-type]
-    return Config(path, tip, n_ions, responses, voltage, seed, *made, maps, output)  # type: ignore[arg-type, call-arg]
+        maps.check_detector(sections[0])  # type: ignore[arg-type]
+    return Config(path, tip, n_ions, responses, voltage, seed, *sections, maps, output)  # type: ignore[arg-type, call-arg]
 
 
 def _tip(table):
@@ -232,7 +232,7 @@ def _tip(table):
     elif isinstance(host, str):
         host = material(host)
     else:
-        raise ValueError(f"material must be a name such as 'Ni' or a table, got {shown(host)}")
+        raise ValueError(f"material must be a name such as 'Ni' or a table, got {short_text(host)}")
     settings = dict(table, material=host)
     for name in ("apex_radius", "shank_length", "depth"):
         if name in settings:
@@ -245,14 +245,16 @@ def _tip(table):
 
 
 def _length(value, name, a):
-    """Length [nm] of a number [nm] or a text such as "20 a"; `Tip` checks its range."""
+    """Length [nm] from a number [nm] or text such as "20 a"; `Tip` checks its range."""
     if not isinstance(value, str):
         return check_number(value, name, unit="nm")
-    found = _LENGTH.fullmatch(value)
+    match = _LENGTH.fullmatch(value)
     try:
-        return float(found[1]) * (a if found[2] == "a" else 1.0)
+        return float(match[1]) * (a if match[2] == "a" else 1.0)
     except (TypeError, ValueError):
-        raise ValueError(f"{name} must be a number [nm] or text such as '20 a' or '7 nm', got {shown(value)}") from None
+        raise ValueError(
+            f"{name} must be a number [nm] or text such as '20 a' or '7 nm', got {short_text(value)}"
+        ) from None
 
 
 def _field_names(kind):
@@ -260,8 +262,8 @@ def _field_names(kind):
 
 
 @contextmanager
-def _place(path, table=None):
-    """Say in front of an error in which file and table it is."""
+def _located(path, table=None):
+    """Add the file and table to the message of an error."""
     try:
         yield
     except ValueError as error:

@@ -1,22 +1,24 @@
-"""Tables of a TOML file: their keys are checked."""
+"""Validation of tables of a TOML file."""
 
 from collections.abc import Mapping
 from typing import Any
 
-from apt_evap._common.validation import did_you_mean, shown
+from apt_evap._common.validation import did_you_mean, short_text
 
 
 def check_table(value: Any, name: str) -> None:
-    """Refuse what is not a table (ValueError)."""
+    """Raise a ValueError if `value` is not a table."""
     if not isinstance(value, Mapping):
-        raise ValueError(f"{name} must be a table, got {shown(value)}")
+        raise ValueError(f"{name} must be a table, got {short_text(value)}")
 
 
 def check_keys(table: Mapping[str, Any], known: tuple[str, ...], needed: tuple[str, ...] = ()) -> None:
-    """Refuse unknown keys, and tables that lack a needed one (ValueError)."""
+    """Raise a ValueError for an unknown or missing key."""
     for key in table:
         if key not in known:
-            raise ValueError(f"no key is named {shown(key)}{did_you_mean(key, known)}; known are {', '.join(known)}")
+            raise ValueError(
+                f"no key is named {short_text(key)}{did_you_mean(key, known)}; known are {', '.join(known)}"
+            )
     for key in needed:
         if key not in table:
-            raise ValueError(f"{key} is missing; needed are {', '.join(needed)}")
+            raise ValueError(f"{key} is missing; required are {', '.join(needed)}")

@@ -1,4 +1,4 @@
-"""Poles and zone axes of a crystal: the lattice planes that show on a map, their directions and their names."""
+"""Poles and zone axes of a crystal: the lattice planes visible on a map, their directions and labels."""
 
 from collections.abc import Iterable, Sequence
 from itertools import permutations, product
@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_array, check_count, shown
+from apt_evap._common.validation import check_array, check_count, short_text
 from apt_evap.specimen import lattice
 from apt_evap.specimen.materials import Material
 
-_LARGEST = 9  # indices looked through: of all lattices the 50 families of the widest spacing are among them
+_LARGEST = 9  # largest index in the search: includes the 50 families of largest spacing of all lattices
 _MAX_FAMILIES = 50
 
 ZONES = {
@@ -23,7 +23,7 @@ ZONES = {
     "diamond": ((1, 1, 0), (1, 0, 0)),
     "hcp": ((1, 1, -2, 0), (1, 0, -1, 0), (0, 0, 0, 1)),
 }
-"""Families of zone axes with the most poles of wide spacing, in three indices or for hcp in four."""
+"""Families of zone axes with the most poles of large spacing, in three indices (hcp: four)."""
 
 
 class Poles(NamedTuple):
@@ -36,32 +36,32 @@ class Poles(NamedTuple):
     spacings: np.ndarray
     """Distance between neighbouring atomic planes [nm], shape (n,)."""
     labels: tuple
-    """Names of the poles, as matplotlib writes them, with bars over negative indices."""
+    """Labels of the poles in the math syntax of matplotlib, with bars over negative indices."""
 
 
 class Zones(NamedTuple):
-    """Zone axes of a crystal, one of each pair of opposite ones."""
+    """Zone axes of a crystal, one of each pair of opposite directions."""
 
     axes: np.ndarray
     """Indices, int64 of shape (n, 3), for hcp of shape (n, 4)."""
     directions: np.ndarray
     """Unit vectors in the frame of the crystal, shape (n, 3)."""
     families: np.ndarray
-    """Index of the family of each, shape (n,)."""
+    """Index of the family of each axis, shape (n,)."""
 
 
 def poles(material: Material, families: int = 8) -> Poles:
-    """Poles of a crystal: the families of lattice planes with the widest spacing.
+    """Poles of a crystal: the families of lattice planes with the largest spacing.
 
-    A facet is the larger, and its pole the darker on a map, the higher the steps between its terraces are, so that
-    the families come in the order of their spacing: 111, 002, 022, 113, 133, 024, ... for fcc.
+    Higher steps between terraces give a larger facet and a darker pole on a map. So the families are ordered by their
+    spacing: 111, 002, 022, 113, 133, 024, ... for fcc.
 
     Parameters
     ----------
     material : Material
         The crystal.
     families : int
-        How many families, up to 50.
+        Number of families, from 1 to 50.
 
     Returns
     -------
@@ -71,11 +71,11 @@ def poles(material: Material, families: int = 8) -> Poles:
     Raises
     ------
     ValueError
-        If families is not a whole number from 1 to 50.
+        If `families` is not an integer from 1 to 50.
     """
     families = check_count(families, "families", at_least=1)
     if families > _MAX_FAMILIES:
-        raise ValueError(f"families must be at most {_MAX_FAMILIES}, got {families}")
+        raise ValueError(f"families must be <= {_MAX_FAMILIES}, got {families}")
     four = material.structure == "hcp"
     candidates = []
     for h, k, last in product(range(_LARGEST + 1), repeat=3):
@@ -83,7 +83,7 @@ def poles(material: Material, families: int = 8) -> Poles:
             continue
         plane = np.array([h, k, -h - k, last] if four else [h, k, last])
         multiple, spacing = _stacking(material, plane)
-        # rounded: of families as far apart as each other the one with the smaller indices is first
+        # rounded: families of equal spacing are ordered by their indices
         candidates.append(
             (-round(spacing / material.a, 9), int(np.abs(plane).sum()), tuple((multiple * plane).tolist()))
         )
@@ -101,7 +101,7 @@ def poles(material: Material, families: int = 8) -> Poles:
 
 
 def zones(material: Material, families: Sequence[Any] | None = None) -> Zones:
-    """Zone axes of a crystal; the zone line of one is the great circle across it, on which its poles lie.
+    """Zone axes of a crystal; the zone line is the great circle perpendicular to the axis, which contains its poles.
 
     Parameters
     ----------
@@ -119,14 +119,14 @@ def zones(material: Material, families: Sequence[Any] | None = None) -> Zones:
     ValueError
         If an axis is not a lattice direction.
     """
-    given = ZONES[material.structure] if families is None else families
-    if not len(given):
-        raise ValueError("families of zone axes must be some, got none")
+    families = ZONES[material.structure] if families is None else families
+    if not len(families):
+        raise ValueError("families must contain at least one zone axis, got none")
     width = 4 if material.structure == "hcp" else 3
     axes, numbers = [], []
-    for number, axis in enumerate(given):
+    for number, axis in enumerate(families):
         axis = check_array(axis, "a zone axis", (width,), dtype=np.int64)
-        direction_normals(material, axis[None])  # says what is wrong with it
+        direction_normals(material, axis[None])  # validates the axis
         for member in _members(tuple(axis.tolist())):
             if tuple(-index for index in member) not in axes:
                 axes.append(member)
@@ -155,7 +155,7 @@ def plane_normals(material: Material, planes: ArrayLike, name: str = "planes") -
     Raises
     ------
     ValueError
-        If indices are all zero or do not add up.
+        If indices are all zero, or if the sum rule for hcp is violated.
     """
     planes = _three(material, planes, name, lambda h, k, _, last: (h, k, last))
     normals = planes @ _reciprocal(material)
@@ -182,7 +182,7 @@ def direction_normals(material: Material, directions: ArrayLike, name: str = "di
     Raises
     ------
     ValueError
-        If indices are all zero or do not add up.
+        If indices are all zero, or if the sum rule for hcp is violated.
     """
     directions = _three(material, directions, name, lambda u, v, t, w: (u - t, v - t, w))
     vectors = directions @ lattice.direction_vectors(material.structure, material.a, material.c)
@@ -190,32 +190,32 @@ def direction_normals(material: Material, directions: ArrayLike, name: str = "di
 
 
 def label(indices: Iterable[int]) -> str:
-    """Name of a pole or an axis as matplotlib writes it, with bars over negative indices (str)."""
+    """Label of a pole or an axis in the math syntax of matplotlib, with bars over negative indices (str)."""
     space = r"\," if max(abs(int(index)) for index in indices) > 9 else ""
     return "$" + space.join(rf"\bar{{{-index}}}" if index < 0 else str(index) for index in map(int, indices)) + "$"
 
 
 def _three(material, indices, name, from_four):
-    """Three indices of each row of three or, for hcp, four."""
+    """Convert rows of three or, for hcp, four indices to three."""
     four = material.structure == "hcp" and np.ndim(indices) == 2 and np.shape(indices)[1] == 4
     indices = check_array(indices, name, ("n", 4 if four else 3), dtype=np.int64)
     if four:
-        off = indices[:, :3].sum(axis=1) != 0
-        if off.any():
-            raise ValueError(f"{name} must have a sum of 0 over the first three of four indices, got {indices[off][0]}")
+        wrong = indices[:, :3].sum(axis=1) != 0
+        if wrong.any():
+            raise ValueError(f"{name} must have first three indices with a sum of 0, got {indices[wrong][0]}")
         indices = np.column_stack(from_four(*indices.T))
     if not indices.any(axis=1).all():
-        raise ValueError(f"{name} must not have indices that are all 0, got {shown(indices.tolist())}")
+        raise ValueError(f"{name} must not have indices that are all zero, got {short_text(indices.tolist())}")
     return indices
 
 
 def _reciprocal(material):
-    """Rows: reciprocal vectors without 2 pi [1/nm]."""
+    """Reciprocal lattice vectors without 2 pi, one per row [1/nm]."""
     return np.linalg.inv(material.a * lattice.direction_vectors(material.structure, material.a, material.c)).T
 
 
 def _members(indices):
-    """All that the symmetry of the lattice makes of three indices (m-3m) or four (6/mmm)."""
+    """All symmetry-equivalent indices, of three (m-3m) or four (6/mmm)."""
     if len(indices) == 3:
         signs = product((1, -1), repeat=3)
         members = {
@@ -233,11 +233,11 @@ def _members(indices):
 
 
 def _stacking(material, plane):
-    """Even layers of atoms in one repeat of a plane of coprime indices (1 if uneven), and the largest gap [nm]."""
+    """Number of equidistant layers per period of a plane with coprime indices (1 if uneven), and largest gap [nm]."""
     reciprocal = plane[[0, 1, -1]] @ _reciprocal(material)
     sites = np.array(lattice.BASES[material.structure])
     heights = sites * lattice.cell_lengths(material.structure, material.a, material.c) @ reciprocal
-    heights = np.unique(np.round(heights % 1, 6) % 1)  # in repeats; 6 digits tell any layers of these cells apart
+    heights = np.unique(np.round(heights % 1, 6) % 1)  # in periods; 6 digits separate all layers of these cells
     gaps = np.diff(np.append(heights, heights[0] + 1))
     even = np.ptp(gaps) < 1e-5
     return len(gaps) if even else 1, float(gaps.max() / np.linalg.norm(reciprocal))

@@ -1,1 +1,1 @@
-"""Where ions are recorded: the detector, hits, detector maps, mass ranges, projections."""
+"""Detection of the ions: detector, hits, detector maps, mass ranges, projections."""

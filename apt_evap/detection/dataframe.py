@@ -1,4 +1,4 @@
-"""Columns as a DataFrame of pandas, which need not be installed."""
+"""Columns as a DataFrame of pandas, an optional package."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -17,9 +17,9 @@ def to_dataframe(columns: Mapping[str, NDArray[Any]], **attributes: Any) -> "pan
     Parameters
     ----------
     columns : mapping of str to ndarray
-        Columns, shape (n,) or (n, k); one of several values per row becomes name_0, name_1, ...
+        Columns, shape (n,) or (n, k); a column with several values per row becomes name_0, name_1, ...
     **attributes
-        Kept in ``attrs`` of the DataFrame.
+        Stored in ``attrs`` of the DataFrame.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""The detector in front of the specimen, and where a flight that has left the field meets it."""
+"""The detector, and the hits of straight flights onto it."""
 
 from dataclasses import dataclass
 
@@ -18,23 +18,23 @@ PROJECTIONS = {"plane": 1.0, "equidistant": None}
 
 @dataclass(frozen=True)
 class Detector:
-    """A square detector, centred on the axis of the specimen.
+    """Square detector, centred on the axis of the specimen.
 
     Parameters
     ----------
     distance : float
-        From the apex to the detector [mm].
+        Distance from the apex to the detector [mm].
     width : float
         Edge of the square [mm].
     projection : str
-        "plane": a flat detector, on which an ion at the polar angle theta lands at D tan(theta) from the centre, with D
-        the distance. "equidistant": at D theta, the azimuthal equidistant projection that measured maps come close to,
-        whose ions have passed a reflectron or a curved field; the time of flight is that to the sphere of radius D.
+        Position of an ion at the polar angle theta. "plane": a flat detector at the distance D, at D tan(theta) from
+        the centre. "equidistant": at D theta, the azimuthal equidistant projection. It approximates measured maps,
+        whose ions pass a reflectron or a curved field. The time of flight is then that to the sphere of radius D.
 
     Raises
     ------
     ValueError
-        If a length is not above 0 or is above 1 km, or the projection is unknown.
+        If a length is not positive or exceeds 1 km, or the projection is unknown.
     """
 
     distance: float = 100.0
@@ -44,31 +44,31 @@ class Detector:
     def __post_init__(self):
         check_choice(self.projection, "projection", PROJECTIONS)
         for name in ("distance", "width"):
-            # a kilometre is a slip of the unit
+            # more than 1 km is a wrong unit
             checked = check_number(getattr(self, name), name, above=0, at_most=1e6, unit="mm")
             object.__setattr__(self, name, checked)
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """Where it reaches: x_min, x_max, y_min, y_max [mm]."""
+        """Area of the detector: x_min, x_max, y_min, y_max [mm]."""
         half = self.width / 2
         return -half, half, -half, half
 
     @property
     def seen_from_apex(self) -> Projection:
-        """The projection of the directions in which ions fly, as seen from the apex, onto this detector."""
+        """Projection of flight directions, seen from the apex, onto this detector."""
         return Projection(self.distance, compression=PROJECTIONS[self.projection])
 
     def directions(self, positions: Floats, velocities: Floats, apex: float) -> tuple[Floats, Floats]:
-        """Directions in which ions meet the plane, as seen from the apex.
+        """Directions of the hits on the plane, seen from the apex.
 
-        The direction is given stereographically, s = tan(polar angle / 2) (cos, sin)(azimuth): it stays smooth and
-        finite up to ions that fly along the plane and beyond, where the place on the plane does not.
+        The directions are stereographic, s = tan(polar angle / 2) (cos, sin)(azimuth). They stay smooth and finite also
+        for ions that fly parallel to the plane or away from it, where the position on the plane diverges.
 
         Parameters
         ----------
         positions, velocities : ndarray, shape (n, 3)
-            At the end of the flights [nm], any unit.
+            At the end of the flights [nm], [any unit].
         apex : float
             z of the apex [nm].
 
@@ -77,7 +77,7 @@ class Detector:
         directions : ndarray, shape (n, 2)
             Stereographic directions.
         remaining : ndarray, shape (n,)
-            Time from the end of the flight to the plane [nm over the unit of velocity]; infinite if it is never met.
+            Time from the end of the flight to the plane [nm / unit of velocity]; infinite if the ion does not reach it.
         """
         plane = apex + self.distance * NM_PER_MM
         ahead = velocities[:, 2] > 0
@@ -91,12 +91,12 @@ class Detector:
             return stereographic(place), remaining
 
     def impacts(self, directions: Floats, times: Floats) -> tuple[Floats, Floats, Floats, NDArray[np.int8]]:
-        """Where and when ions meet the detector.
+        """Positions and times of the hits.
 
         Parameters
         ----------
         directions : ndarray, shape (n, 2)
-            Stereographic directions, see `directions`; NaN for an ion that never left.
+            Stereographic directions, see `directions`; NaN for an ion that did not escape.
         times : ndarray, shape (n,)
             Times of flight to the plane [ns].
 
@@ -107,14 +107,14 @@ class Detector:
         times : ndarray, shape (n,)
             Times of flight to the detector [ns].
         outcome : ndarray of int8, shape (n,)
-            An `Outcome` each.
+            `Outcome` of each ion.
         """
         s2 = squared_lengths(directions)
         ahead = s2 < 1.0
         with np.errstate(divide="ignore", invalid="ignore"):
             stretch = stereographic_stretch(s2, PROJECTIONS[self.projection])
             if self.projection == "equidistant":
-                times = np.where(ahead, along_axis(times, s2), times)  # cos(theta) of the way to the plane
+                times = np.where(ahead, along_axis(times, s2), times)  # cos(theta) of the path to the plane
             scale = np.where(ahead, self.distance * stretch, np.nan)
         x, y = directions[:, 0] * scale, directions[:, 1] * scale
         outcome = np.full(len(x), Outcome.MISSED, np.int8)

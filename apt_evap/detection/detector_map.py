@@ -1,4 +1,4 @@
-"""Maps of the hits on the detector, binned so that the comb of measured coordinates does not show."""
+"""Maps of the hits on the detector, with bins that avoid stripes from the quantisation of measured coordinates."""
 
 import warnings
 from dataclasses import dataclass, replace
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from apt_evap._common.types import Booleans, Floats, Integers
 from apt_evap._common.validation import check_array, check_kind, check_number, check_seed, check_switch
 from apt_evap._common.warnings import MapWarning
-from apt_evap.detection.binning import bin_edges, count, field_of_view, find_combs
+from apt_evap.detection.binning import bin_edges, count, field_of_view, find_quantisations
 
 if TYPE_CHECKING:
     from apt_evap.detection.hits import Hits
@@ -22,7 +22,7 @@ _MOST_IONS = 2**53  # whole numbers up to here are exact as floats, which sums a
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DetectorMap:
-    """Hits on the detector in bins of one size; made by `from_hits` or `from_array`.
+    """Hits on the detector in bins of equal size; made by `from_hits` or `from_array`.
 
     Parameters
     ----------
@@ -37,13 +37,13 @@ class DetectorMap:
     ions : int or None
         Number of hits inside the detector, None if not known.
     quantum : tuple of float or None
-        Spacing of the comb of the coordinates [mm] in x and y, None if they are continuous.
+        Quantisation step of the coordinates in x and y [mm]; None if they are continuous.
     smoothing : float
-        Standard deviation of the Gaussian the density was smoothed with [mm].
+        Standard deviation of the Gaussian smoothing of the density [mm].
     source : str
-        What the map was made from.
+        Origin of the map.
     detected : int or None
-        Number of hits that `from_hits` was given, those outside the map or its mask too; None if not known.
+        Number of hits in the input of `from_hits`, including those outside the map or its mask; None if not known.
     """
 
     values: np.ndarray
@@ -68,32 +68,31 @@ class DetectorMap:
         mask: ArrayLike | None = None,
         like: "DetectorMap | None" = None,
     ) -> "DetectorMap":
-        """Count the detected ions in bins that are as good as square.
+        """Count the detected ions in approximately square bins.
 
-        Measured coordinates lie on a comb; bins that are no multiple of its spacing, the quantum, hold now
-        one tooth more, now one less, and show stripes. So the bins become multiples of the quantum, with
-        edges half way between teeth: they are then not quite square and not exactly `bins` in number. With
-        `dither_seed` every hit is moved at random within its quantum instead, and bins are square.
+        Measured coordinates are quantised. Bins that are not multiples of the quantisation step alias into stripes. So
+        the bins become multiples of this step, with edges half way between its values: they are then not exactly
+        square, and their number is not exactly `bins`. With `dither_seed` every hit is moved at random within one step
+        instead, and the bins are square.
 
         Parameters
         ----------
         hits : Hits
             Ions with x and y.
         bins : int
-            Number of bins along the longer side; about so many where the hits lie on a comb.
+            Number of bins along the longer side; approximate for quantised coordinates.
         extent : tuple of float, optional
-            x_min, x_max, y_min, y_max [mm]; by default that of the detector for the hits of a run, that of the hits for
-            measured ones. Bins may reach a little over it.
+            x_min, x_max, y_min, y_max [mm]. By default that of the detector for the hits of a run, and that of the hits
+            for measured ions. Bins may extend slightly beyond it.
         quantum : {"auto", None} or tuple of float
-            Spacing of the comb in x and y [mm], "auto" to find it in the data, None for continuous data.
+            Quantisation step in x and y [mm]; "auto" to find it in the data, None for continuous data.
         dither_seed : int, optional
-            Seed; dithers by one quantum instead of fitting the bins to the comb.
+            Seed of a dither by one quantisation step, instead of bins that are multiples of it.
         mask : array_like, optional
-            Which bins are inside the detector. By default all that are for the hits of a run, whose detector is known
-            (`Hits.extent`); for measured ones the convex outline of the field of view, where the density exceeds a
-            tenth of its median.
+            Which bins are inside the detector. By default those on the detector of a run (`Hits.extent`). For measured
+            ions the convex outline of the field of view, where the density exceeds a tenth of its median.
         like : DetectorMap, optional
-            Take edges and mask from this map, for comparison, instead of `bins` and `extent`.
+            Use edges and mask of this map instead of `bins` and `extent`, for comparison.
 
         Returns
         -------
@@ -102,8 +101,7 @@ class DetectorMap:
         Raises
         ------
         ValueError
-            If x or y is missing, no ion was detected, none lies in the extent, or an argument is out of
-            range.
+            If x or y is missing, no ion was detected, no ion is within the extent, or an argument is outside its range.
         """
         x, y = check_kind(hits, "hits", "require", "Hits").require("x", "y")
         if like is not None:
@@ -112,41 +110,45 @@ class DetectorMap:
             check_seed(dither_seed, "dither_seed")
         detected = hits.detected
         if not detected.any():
-            raise ValueError(f"a map needs detected ions, {hits.source or 'these hits'} has none of {len(hits)}")
+            raise ValueError(f"a map needs detected ions, got none of {len(hits)} in {hits.source or 'these hits'}")
         if not detected.all():
             x, y = x[detected], y[detected]
-        combs = find_combs(x, y, quantum)
+        quantisations = find_quantisations(x, y, quantum)
         if dither_seed is not None:
-            if combs is None:
-                raise ValueError("dither_seed needs a quantum to dither by, and the coordinates show no comb")
+            if quantisations is None:
+                raise ValueError(
+                    "dither_seed needs a quantisation step of the coordinates (quantum), but they are continuous"
+                )
             random = np.random.default_rng(dither_seed)
             x, y = (
-                values + comb.spacing * (random.random(len(values)) - 0.5)
-                for values, comb in zip((x, y), combs, strict=True)
+                values + quantisation.spacing * (random.random(len(values)) - 0.5)
+                for values, quantisation in zip((x, y), quantisations, strict=True)
             )
         if like is not None:
             x_edges, y_edges, mask = like.x_edges, like.y_edges, like.mask if mask is None else mask
-            if combs is not None and dither_seed is None and not _fits(like, combs):
+            if quantisations is not None and dither_seed is None and not _fits(like, quantisations):
                 warnings.warn(
-                    "hits on a comb are binned on the edges of another map and may show stripes; dither_seed "
-                    "prevents them",
+                    "the bins of the other map are not multiples of the quantisation step of these hits: stripes are "
+                    "possible; dither_seed prevents them",
                     MapWarning,
                     stacklevel=2,
                 )
         else:
             extent = hits.extent if extent is None else extent
-            x_edges, y_edges = bin_edges(x, y, bins, extent, combs if dither_seed is None else None)
+            x_edges, y_edges = bin_edges(x, y, bins, extent, quantisations if dither_seed is None else None)
         counts = count(x, y, x_edges, y_edges)
         if not counts.any():
             raise ValueError(
-                f"none of {len(x):,} hits lies in x {x_edges[0]:g} to {x_edges[-1]:g}, "
+                f"none of {len(x):,} hits is in x {x_edges[0]:g} to {x_edges[-1]:g}, "
                 f"y {y_edges[0]:g} to {y_edges[-1]:g} mm"
             )
         if mask is not None:
             mask = _check_mask(mask, counts.shape)
         else:
             mask = field_of_view(counts) if hits.extent is None else _on_detector(x_edges, y_edges, hits.extent)
-        spacings = None if combs is None else tuple(float(comb.spacing) for comb in combs)
+        spacings = (
+            None if quantisations is None else tuple(float(quantisation.spacing) for quantisation in quantisations)
+        )
         ions = int(counts[mask].sum())
         return cls(counts, x_edges, y_edges, mask, True, ions, quantum=spacings, source=hits.source, detected=len(x))
 
@@ -161,21 +163,20 @@ class DetectorMap:
         is_counts: bool = False,
         source: str = "",
     ) -> "DetectorMap":
-        """Make a map of a given array, such as a published one.
+        """Make a map from an array, such as a published one.
 
         Parameters
         ----------
         values : array_like
-            Densities in any unit, or hits per bin, shape (ny, nx), indexed [y, x]; NaN is outside the
-            detector.
+            Densities in any unit, or hits per bin, shape (ny, nx), indexed [y, x]; NaN outside the detector.
         x_edges, y_edges : array_like
             Edges of the bins [mm], shapes (nx + 1,) and (ny + 1,), evenly spaced and increasing.
         mask : array_like, optional
-            Which bins are inside the detector; by default those that are not NaN.
+            Which bins are inside the detector; by default those not NaN.
         is_counts : bool
-            Whether `values` are hits per bin; Poisson errors need that.
+            Whether `values` are hits per bin, as needed for Poisson errors.
         source : str
-            What the map is.
+            Origin of the map.
 
         Returns
         -------
@@ -184,7 +185,7 @@ class DetectorMap:
         Raises
         ------
         ValueError
-            If shapes do not fit, edges are not even, values are negative or too many, or the mask is empty.
+            If shapes disagree, edges are not evenly spaced, values are negative or too many, or the mask is empty.
         """
         is_counts = check_switch(is_counts, "is_counts")
         check_kind(source, "source", str, "text")
@@ -194,9 +195,9 @@ class DetectorMap:
         finite = np.isfinite(values)
         mask = _check_mask(finite if mask is None else mask, values.shape)
         if not (finite & mask).any():
-            raise ValueError("values must be finite somewhere in the mask, got none there")
+            raise ValueError("values must be finite in at least one bin of the mask, got none")
         if values[finite].min() < 0:
-            raise ValueError(f"values of a map must be at least 0, got {values[finite].min():g}")
+            raise ValueError(f"values of a map must be >= 0, got {values[finite].min():g}")
         mask = mask & finite
         values = np.where(finite, values, 0.0)
         ions = None
@@ -209,7 +210,7 @@ class DetectorMap:
 
     @cached_property
     def density(self) -> Floats:
-        """Hits per area relative to their mean inside the detector, NaN outside of it, shape (ny, nx)."""
+        """Hits per area relative to their mean inside the detector, NaN outside, shape (ny, nx)."""
         mean = self.values[self.mask].mean()
         if not mean > 0:
             raise ValueError(f"the map {self.source} has no hits inside its mask")
@@ -219,12 +220,12 @@ class DetectorMap:
     def counts(self) -> Integers:
         """Hits per bin, int64 of shape (ny, nx); a ValueError for a map of densities."""
         if not self.is_counts:
-            raise ValueError(f"{self!r} holds densities, not counts of ions")
+            raise ValueError(f"{self!r} contains densities, not counts of ions")
         return self.values
 
     @property
     def shown_ions(self) -> str:
-        """How many ions the map shows, such as "945,058 of 945,211 ions" where some lie outside; "" if not known."""
+        """Number of ions in the map as text, such as "945,058 of 945,211 ions" if some lie outside; "" if not known."""
         if self.ions is None:
             return ""
         outside = f" of {self.detected:,}" if self.detected not in (None, self.ions) else ""
@@ -237,7 +238,7 @@ class DetectorMap:
 
     @property
     def extent(self) -> tuple[float, ...]:
-        """Where the map reaches: x_min, x_max, y_min, y_max [mm]."""
+        """Area of the map: x_min, x_max, y_min, y_max [mm]."""
         return tuple(float(edges[end]) for edges in (self.x_edges, self.y_edges) for end in (0, -1))
 
     @property
@@ -246,9 +247,9 @@ class DetectorMap:
         return tuple((edges[:-1] + edges[1:]) / 2 for edges in (self.x_edges, self.y_edges))
 
     def smoothed(self, sigma: float) -> "DetectorMap":
-        """Smooth the density with a Gaussian that sees only the inside of the detector.
+        """Smooth the density with a Gaussian inside the detector.
 
-        The smoothed density is divided by the smoothed mask, so that it does not fall off at the rim.
+        The smoothed density is divided by the smoothed mask, so that it does not decrease at the rim.
 
         Parameters
         ----------
@@ -258,7 +259,7 @@ class DetectorMap:
         Returns
         -------
         DetectorMap
-            A map of densities; itself for a sigma of 0.
+            A map of densities; the same map if sigma is 0.
 
         Raises
         ------
@@ -270,20 +271,20 @@ class DetectorMap:
         if sigma == 0:
             return self
         total = float(np.hypot(sigma, self.smoothing))
-        return replace(self, values=self._blurred(sigma), is_counts=False, smoothing=total)
+        return replace(self, values=self._smooth(sigma), is_counts=False, smoothing=total)
 
     def flattened(self, sigma: float) -> "DetectorMap":
-        """Divide the density by itself, smoothed broadly: what varies slowly over the detector goes.
+        """Remove slow variations over the detector: divide the density by the smoothed density.
 
         Parameters
         ----------
         sigma : float
-            Standard deviation of the Gaussian of `smoothed` [mm]; variations broader than that go.
+            Standard deviation of the Gaussian [mm]; broader variations are removed.
 
         Returns
         -------
         DetectorMap
-            A map of densities; itself for a sigma of 0.
+            A map of densities; the same map if sigma is 0.
 
         Raises
         ------
@@ -293,13 +294,14 @@ class DetectorMap:
         sigma = check_number(sigma, "sigma", at_least=0, unit="mm")
         if sigma == 0:
             return self
-        broad = self._blurred(sigma)
-        flat = np.divide(self.values, broad, out=np.zeros_like(broad), where=self.mask & (broad > 0))
+        background = self._smooth(sigma)
+        inside = self.mask & (background > 0)
+        flat = np.divide(self.values, background, out=np.zeros_like(background), where=inside)
         return replace(self, values=flat, is_counts=False)
 
-    def _blurred(self, sigma):
+    def _smooth(self, sigma):
         width, height = self.bin_size
-        return blurred(self.values, self.mask, (sigma / height, sigma / width))
+        return masked_gaussian(self.values, self.mask, (sigma / height, sigma / width))
 
     def __repr__(self) -> str:
         ny, nx = self.values.shape
@@ -310,8 +312,8 @@ class DetectorMap:
         return f"<DetectorMap: {what}{source}, {nx} x {ny} bins of {width:.4g} x {height:.4g} mm{smoothing}>"
 
 
-def blurred(values: Floats, mask: Booleans, sigmas: ArrayLike) -> Floats:
-    """Smooth maps with a Gaussian that sees only the inside of a mask.
+def masked_gaussian(values: Floats, mask: Booleans, sigmas: ArrayLike) -> Floats:
+    """Smooth maps with a Gaussian inside a mask.
 
     Parameters
     ----------
@@ -325,14 +327,14 @@ def blurred(values: Floats, mask: Booleans, sigmas: ArrayLike) -> Floats:
     Returns
     -------
     ndarray
-        The smoothed values over the smoothed mask, 0 outside of the mask, of the shape of `values`.
+        The smoothed values divided by the smoothed mask, 0 outside the mask, with the shape of `values`.
     """
     smooth = gaussian(np.where(mask, values, 0).astype(float), sigmas)
     return np.divide(smooth, gaussian(mask.astype(float), sigmas), out=np.zeros_like(smooth), where=mask)
 
 
 def gaussian(values: Floats, sigmas: ArrayLike, truncate: float = 4.0) -> Floats:
-    """Gaussian filter of maps of shape (..., ny, nx), with nothing beyond their ends; lengths as for `blurred`."""
+    """Gaussian filter of maps of shape (..., ny, nx), with zeros outside; `sigmas` as for `masked_gaussian`."""
     return scipy.ndimage.gaussian_filter(values, sigmas, mode="constant", truncate=truncate, axes=(-2, -1))
 
 
@@ -349,19 +351,19 @@ def _check_edges(edges, name, bins):
 def _check_mask(mask, shape):
     mask = check_array(mask, "mask", shape, dtype=bool)
     if not mask.any():
-        raise ValueError("mask must leave some bin inside the detector, got none")
+        raise ValueError("mask must contain at least one bin inside the detector, got none")
     return mask
 
 
 def _on_detector(x_edges, y_edges, extent):
-    """Bins whose centres are on a detector of the given extent."""
+    """Whether the centre of each bin is on a detector with this extent."""
     x, y = ((edges[1:] + edges[:-1]) / 2 for edges in (x_edges, y_edges))
     columns = (extent[0] <= x) & (x <= extent[1])
     rows = (extent[2] <= y) & (y <= extent[3])
     return rows[:, None] & columns
 
 
-def _fits(like, combs):
-    """Whether the bins of a map are whole multiples of the combs' spacings."""
-    multiples = [size / comb.spacing for size, comb in zip(like.bin_size, combs, strict=True)]
+def _fits(like, quantisations):
+    """Whether the bins of a map are multiples of the quantisation steps."""
+    multiples = [size / quantisation.spacing for size, quantisation in zip(like.bin_size, quantisations, strict=True)]
     return all(multiple > 0.99 and abs(multiple - round(multiple)) < 1e-3 for multiple in multiples)

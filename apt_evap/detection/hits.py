@@ -1,6 +1,6 @@
-"""The one type for simulated and measured ions: columns of equal length, one row per ion."""
+"""Simulated or measured ions: columns of equal length, one row per ion."""
 
-from __future__ import annotations  # help() says ArrayLike, not the ten types that it stands for
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from apt_evap._common.types import Booleans
-from apt_evap._common.validation import check_array, check_kind, check_number, did_you_mean, shown
+from apt_evap._common.validation import check_array, check_kind, check_number, did_you_mean, short_text
 from apt_evap.detection.dataframe import to_dataframe
 from apt_evap.detection.detector_map import DetectorMap
 
@@ -21,18 +21,18 @@ if TYPE_CHECKING:
 
 
 class Outcome(IntEnum):
-    """What became of a simulated ion."""
+    """Result of the flight of a simulated ion."""
 
     HIT = 0
-    """It hit the detector."""
+    """The ion hit the detector."""
     MISSED = 1
-    """It flew past the detector."""
+    """The ion missed the detector."""
     NEVER_LEFT = 2
-    """It never got away from the specimen."""
+    """The ion did not escape from the specimen."""
 
 
 _FLOAT = ("x", "y", "time_of_flight", "voltage", "pulse_voltage", "mass_to_charge", "positions")
-_WHOLE = {
+_INTEGER = {
     "pulses": np.uint32,
     "multiplicity": np.uint32,
     "pulse_id": np.int64,
@@ -40,15 +40,15 @@ _WHOLE = {
     "ion": np.int64,
     "outcome": np.int8,
 }
-_COLUMNS = (*_FLOAT, *_WHOLE)
+_COLUMNS = (*_FLOAT, *_INTEGER)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Hits:
-    """Ions as NumPy columns of equal length n; a column that is not there is None.
+    """Ions as NumPy columns of equal length n; a missing column is None.
 
-    Floating point columns keep float32 where given so and are float64 otherwise. Arrays are taken over
-    without a copy where their type and memory order allow.
+    Floating point columns stay float32, and are converted to float64 otherwise. Arrays are not copied if their type and
+    memory order allow it.
 
     Parameters
     ----------
@@ -57,39 +57,37 @@ class Hits:
     time_of_flight : array_like, optional
         Time of flight [ns], shape (n,).
     voltage, pulse_voltage : array_like, optional
-        Standing voltage and height of the pulse [V], shape (n,).
+        DC voltage and height of the voltage pulse [V], shape (n,).
     mass_to_charge : array_like, optional
         Mass over charge state [Da], shape (n,).
     positions : array_like, optional
-        Reconstructed positions of measured ions, launch sites of simulated ones [nm], shape (n, 3).
+        Reconstructed positions of measured ions, or start positions of simulated ions [nm], shape (n, 3).
     pulses : array_like, optional
-        Pulses since the last pulse with an ion, shape (n,).
+        Number of pulses since the last pulse with an ion, shape (n,).
     multiplicity : array_like, optional
-        Number of ions in the pulse of this ion, for every ion, shape (n,).
+        Number of ions in the pulse of each ion, shape (n,).
     pulse_id : array_like, optional
-        Ions of one pulse share it, shape (n,).
+        Number of the pulse, equal for all its ions, shape (n,).
     site : array_like, optional
         Index of the atom in the specimen, shape (n,).
     ion : array_like, optional
-        Place in the sequence of evaporation, shape (n,).
+        Number of the ion in the sequence of evaporation, shape (n,).
     outcome : array_like, optional
-        An `Outcome` for every ion, shape (n,). None for measured ions.
+        `Outcome` of each ion, shape (n,); None for measured ions.
     extra : dict, optional
-        Further columns by name, as a file has them: arrays of any type, shape (n,) or (n, k). A selection carries them.
+        Further columns by name, as stored in a file: arrays of any type, shape (n,) or (n, k). Selections keep them.
     units : dict, optional
-        Units of the further columns by name, where they have one.
+        Units of the further columns by name.
     source : str
-        File name, or what made the ions.
+        File name, or origin of the ions.
     extent : tuple of float, optional
-        Where the detector of a run reaches: x_min, x_max, y_min, y_max [mm], for all ions of the run as it gives them.
-        None for a selection of them, for ions moved elsewhere (give None with their new x and y to
-        `dataclasses.replace`), and for measured ions.
+        Area of the detector of a run: x_min, x_max, y_min, y_max [mm]. None for measured ions, for a selection of the
+        ions, and for ions with changed coordinates (use ``extent=None`` with the new x and y in `dataclasses.replace`).
 
     Raises
     ------
     ValueError
-        If there is no column at all, a column has the wrong shape or type, lengths differ, or an outcome is
-        unknown.
+        If there is no column, a column has the wrong shape or type, lengths differ, or an outcome is unknown.
     """
 
     x: np.ndarray | None = None
@@ -130,20 +128,20 @@ class Hits:
         if not lengths:
             raise ValueError("Hits needs at least one column, got none")
         if len(set(lengths.values())) > 1:
-            listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
-            raise ValueError(f"the columns of Hits must have one length, got {listed}")
+            pairs = ", ".join(f"{name} {length}" for name, length in lengths.items())
+            raise ValueError(f"the columns of Hits must have equal lengths, got {pairs}")
         if self.outcome is not None and len(self):
             low, high = self.outcome.min(), self.outcome.max()
             if low < min(Outcome) or high > max(Outcome):
-                raise ValueError(f"outcome must hold Outcomes, {min(Outcome)} to {max(Outcome)}, got {low} to {high}")
+                raise ValueError(f"outcome must be Outcomes, {min(Outcome)} to {max(Outcome)}, got {low} to {high}")
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of the columns that are there, without those in `extra`, tuple of str."""
+        """Names of the existing columns without those in `extra`, tuple of str."""
         return tuple(name for name in _COLUMNS if getattr(self, name) is not None)
 
     def require(self, *names: str) -> tuple[NDArray[Any], ...]:
-        """Return the named columns, or say which one is missing.
+        """Return columns by name; an error names a missing one.
 
         Parameters
         ----------
@@ -157,12 +155,12 @@ class Hits:
         Raises
         ------
         ValueError
-            Naming the missing column and the source.
+            Names the missing column and the source.
         """
         for name in names:
-            if name not in _FLOAT and name not in _WHOLE:
+            if name not in _FLOAT and name not in _INTEGER:
                 hint = did_you_mean(name, _COLUMNS)
-                raise ValueError(f"Hits has no column {shown(name)}{hint}; its columns are {', '.join(_COLUMNS)}")
+                raise ValueError(f"Hits has no column {short_text(name)}{hint}; its columns are {', '.join(_COLUMNS)}")
             if getattr(self, name) is None:
                 raise ValueError(
                     f"{self.source or 'these hits'} has no column {name!r}, only {', '.join(self.columns)}"
@@ -173,18 +171,17 @@ class Hits:
     def detected(self) -> Booleans:
         """Mask of the ions with an outcome of HIT and finite detector coordinates, bool of shape (n,).
 
-        What is missing is not asked for: measured ions have no outcome, and those of a .pos file no detector
-        coordinates.
+        Missing columns are ignored: measured ions have no outcome, and those of a .pos file no detector coordinates.
         """
-        good = np.ones(len(self), bool) if self.outcome is None else self.outcome == Outcome.HIT
+        mask = np.ones(len(self), bool) if self.outcome is None else self.outcome == Outcome.HIT
         for column in (self.x, self.y):
             if column is not None:
-                good &= np.isfinite(column)
-        return good
+                mask &= np.isfinite(column)
+        return mask
 
     @property
     def counts(self) -> dict[Outcome, int]:
-        """Number of ions with each `Outcome`, dict; measured ions (no outcome) have all hit."""
+        """Number of ions with each `Outcome`, dict; measured ions (no outcome) count as HIT."""
         if self.outcome is None:
             return {outcome: len(self) if outcome == Outcome.HIT else 0 for outcome in Outcome}
         return {outcome: int(np.count_nonzero(self.outcome == outcome)) for outcome in Outcome}
@@ -211,8 +208,8 @@ class Hits:
         Returns
         -------
         pandas.DataFrame
-            One row per ion; positions are position_x, position_y, position_z, and the columns of `extra` follow.
-            ``attrs`` has `source` and `units`.
+            One row per ion; positions become position_x, position_y, position_z; the columns of `extra` follow.
+            ``attrs`` contains `source` and `units`.
         """
         names = [name for name in self.columns if name != "positions"]
         columns = {name: getattr(self, name) for name in names}
@@ -226,19 +223,19 @@ class Hits:
         Parameters
         ----------
         radius : float
-            Radius of the circle [mm]; its rim is inside.
+            Radius of the circle [mm]; the rim is included.
         centre : array_like
-            Its centre [mm], shape (2,).
+            Centre of the circle [mm], shape (2,).
 
         Returns
         -------
         Hits
-            With pulse_id and multiplicity as they were.
+            With unchanged pulse_id and multiplicity.
 
         Raises
         ------
         ValueError
-            If there are no detector coordinates, or the circle is none.
+            If there are no detector coordinates, or the radius or centre is invalid.
         """
         x, y = self.require("x", "y")
         radius = check_number(radius, "radius", above=0, unit="mm")
@@ -253,21 +250,22 @@ class Hits:
         Parameters
         ----------
         **bounds
-            For any column of one value per ion, or of `extra`: (low, high), in its unit, low <= value < high; None
-            is no bound. ``ion`` counts the rows where there is no such column (measured ions). Windows that
-            adjoin share no ion; values that are NaN are in none.
+            (low, high) for any column with one value per ion, also of `extra`, in its unit: low <= value < high, None
+            for no bound. ``ion`` is the row number if there is no such column (measured ions). Adjacent windows share
+            no ion; NaN is in no window.
 
         Returns
         -------
         Hits
-            With pulse_id and multiplicity as they were.
+            With unchanged pulse_id and multiplicity.
 
         Raises
         ------
         ValueError
-            If a column is missing or has several values per ion, or its bounds are not two numbers in order.
+            If a column is missing or has several values per ion, or if its bounds are not two numbers in increasing
+            order.
         """
-        chosen = np.ones(len(self), bool)
+        selection = np.ones(len(self), bool)
         for name, limits in bounds.items():
             if name in self.extra:
                 values = self.extra[name]
@@ -276,10 +274,10 @@ class Hits:
             else:
                 (values,) = self.require(name)
             if values.ndim > 1 or values.dtype.kind not in "biuf":
-                raise ValueError(f"{name} must have one number per ion to select by, got shape {values.shape}")
+                raise ValueError(f"{name} must have one number per ion for a selection, got shape {values.shape}")
             low, high = _bounds(limits, name)
-            chosen &= (values >= low) & (values < high)
-        return self[chosen]
+            selection &= (values >= low) & (values < high)
+        return self[selection]
 
     def __len__(self) -> int:
         for name in _COLUMNS:
@@ -294,15 +292,15 @@ class Hits:
             if index.size == 0 and index.dtype == float:
                 index = index.astype(np.intp)
             if index.ndim > 1 or index.dtype.kind not in "biu":
-                raise ValueError(f"Hits are selected by a slice, a mask or indices, got {shown(selection)}")
+                raise ValueError(f"a selection of Hits must be a slice, a mask or indices, got {short_text(selection)}")
             if index.dtype == bool:
                 if index.shape != (len(self),):
                     raise ValueError(f"the mask must have shape ({len(self)},), got {index.shape}")
                 index = np.flatnonzero(index)
             selection = np.atleast_1d(index)
-        chosen = {name: getattr(self, name)[selection] for name in self.columns}
+        columns = {name: getattr(self, name)[selection] for name in self.columns}
         extra = {name: values[selection] for name, values in self.extra.items()}
-        return Hits(**chosen, extra=extra, units=self.units, source=self.source)
+        return Hits(**columns, extra=extra, units=self.units, source=self.source)
 
     def __repr__(self) -> str:
         detected = np.count_nonzero(self.detected)
@@ -311,32 +309,32 @@ class Hits:
 
 
 def _column(name, value):
-    """Check one column and give it its type."""
-    if name in _WHOLE:
-        if isinstance(value, np.ndarray) and value.ndim == 1 and value.dtype == _WHOLE[name]:
-            return np.ascontiguousarray(value)  # nothing to lose in a cast
-        return check_array(value, name, ("n",), dtype=_WHOLE[name])
-    given = getattr(value, "dtype", None)
-    single = given is not None and given.kind == "f" and given.itemsize == 4
+    """Validate one column and convert it to its type."""
+    if name in _INTEGER:
+        if isinstance(value, np.ndarray) and value.ndim == 1 and value.dtype == _INTEGER[name]:
+            return np.ascontiguousarray(value)  # no conversion needed
+        return check_array(value, name, ("n",), dtype=_INTEGER[name])
+    dtype = getattr(value, "dtype", None)
+    single = dtype is not None and dtype.kind == "f" and dtype.itemsize == 4
     shape = ("n", 3) if name == "positions" else ("n",)
     return check_array(value, name, shape, dtype=np.float32 if single else np.float64, finite=False)
 
 
 def _extra(name, value):
-    """Check one of the further columns."""
+    """Validate one of the further columns."""
     column = np.asarray(value)
     if column.ndim not in (1, 2) or column.dtype == object:
-        raise ValueError(f"extra[{name!r}] must be an array of shape (n,) or (n, k), got {shown(value)}")
+        raise ValueError(f"extra[{name!r}] must be an array of shape (n,) or (n, k), got {short_text(value)}")
     return column
 
 
 def _bounds(limits, name):
-    """Return two bounds, infinite where None."""
+    """Return two bounds, infinite for None."""
     if not isinstance(limits, str) and np.iterable(limits) and len(pair := tuple(limits)) == 2:
         low = -np.inf if pair[0] is None else pair[0]
         high = np.inf if pair[1] is None else pair[1]
         if isinstance(low, Real) and isinstance(high, Real) and low <= high:
             return low, high
     raise ValueError(
-        f"{name} must have two bounds (low, high) with low <= high, None for no bound, got {shown(limits)}"
+        f"{name} must have two bounds (low, high) with low <= high, None for no bound, got {short_text(limits)}"
     )

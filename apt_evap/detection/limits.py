@@ -1,4 +1,4 @@
-"""Bounds of what a map may be asked for; numbers alone, which the shell checks before anything is loaded."""
+"""Bounds of the parameters of maps, in a module without imports, so that the shell can check them quickly."""
 
 MAX_BINS = 16384
-"""Bins along a side: 2 GB of counts."""
+"""Largest number of bins along a side: 2 GB of counts."""

@@ -1,4 +1,4 @@
-"""Ranges of mass over charge state, which tell the species of measured ions."""
+"""Ranges of the mass-to-charge ratio, which assign species to measured ions."""
 
 import warnings
 from collections.abc import Mapping
@@ -8,28 +8,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apt_evap._common.types import Integers
-from apt_evap._common.validation import check_array, check_kind, check_sequence, did_you_mean, shown
+from apt_evap._common.validation import check_array, check_kind, check_sequence, did_you_mean, short_text
 from apt_evap._common.warnings import DataWarning
 from apt_evap.detection.hits import Hits
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Ranges:
-    """Ranges of mass over charge state, low <= m/n < high, and the species each of them is taken for.
+    """Ranges of the mass-to-charge ratio, low <= m/n < high, with the species of each range.
 
-    Where ranges overlap, the first one wins, with a warning. A range that repeats an earlier one of the same name is
-    dropped.
+    If ranges overlap, the first one is used, with a warning. A range that repeats an earlier one of the same name is
+    ignored.
 
     Parameters
     ----------
     names : sequence of str
-        Species of each range, such as "CrO"; several ranges may be of one species.
+        Species of each range, such as "CrO"; several ranges may have the same species.
     low, high : array_like
         Bounds of each range [Da], shape (n,).
     volume : array_like, optional
-        Volume of its ion in a reconstruction [nm^3], shape (n,); NaN where not known.
+        Volume of the ion in a reconstruction [nm^3], shape (n,); NaN if not known.
     colour : sequence of str, optional
-        Colour of each range, such as "#FF0000"; "" where there is none.
+        Colour of each range, such as "#FF0000"; "" if it has none.
     composition : sequence of dict, optional
         Number of atoms of each element in the ion of each range.
     source : str
@@ -38,7 +38,7 @@ class Ranges:
     Raises
     ------
     ValueError
-        If there is no range, one is empty, or lengths differ.
+        If there is no range, a range is empty, or lengths differ.
     """
 
     names: tuple
@@ -71,7 +71,7 @@ class Ranges:
                 raise ValueError(f"{name} must have one entry for each of the {n} ranges, got {len(values)}")
         for name, lower, upper in zip(names, low, high, strict=True):
             if not lower < upper:
-                raise ValueError(f"low must be below high [Da], got {lower:g} to {upper:g} for {name!r}")
+                raise ValueError(f"low must be < high [Da], got {lower:g} to {upper:g} for {name!r}")
         first = {}
         for i, key in enumerate(zip(names, low, high, strict=True)):
             first.setdefault(key, i)
@@ -105,16 +105,16 @@ class Ranges:
         Returns
         -------
         ndarray of int64, shape (n,)
-            Index into the ranges; -1 for an ion in none.
+            Index into the ranges; -1 for an ion in no range.
         """
         (mass,) = check_kind(hits, "hits", Hits, "Hits").require("mass_to_charge")
-        # between two neighbouring bounds one range holds, the first in the file; NaN sorts behind the last bound
+        # between two neighbouring bounds one range applies, the first in the file; NaN is sorted after the last bound
         edges = np.unique(np.concatenate([self.low, self.high]))
-        holder = np.full(len(edges) + 1, -1)
+        owner = np.full(len(edges) + 1, -1)
         first, stop = np.searchsorted(edges, self.low), np.searchsorted(edges, self.high)
         for i in reversed(range(len(self))):
-            holder[first[i] : stop[i]] = i
-        return holder[np.searchsorted(edges, mass, side="right") - 1]
+            owner[first[i] : stop[i]] = i
+        return owner[np.searchsorted(edges, mass, side="right") - 1]
 
     def species(self, hits: Hits) -> Integers:
         """Species of every ion.
@@ -133,7 +133,7 @@ class Ranges:
         return np.array([number[name] for name in self.names] + [-1])[self.index(hits)]
 
     def labels(self, hits: Hits, outside: str = "X") -> NDArray[np.str_]:
-        """Name of the species of every ion, `outside` for one in no range, array of str of shape (n,)."""
+        """Name of the species of every ion, `outside` for an ion in no range, array of str of shape (n,)."""
         return np.array([*self.species_names, check_kind(outside, "outside", str, "text")])[self.species(hits)]
 
     def select(self, hits: Hits, *names: str) -> Hits:
@@ -149,19 +149,19 @@ class Ranges:
         Returns
         -------
         Hits
-            With pulse_id and multiplicity as they were.
+            With unchanged pulse_id and multiplicity.
 
         Raises
         ------
         ValueError
-            If there is no such species.
+            If a species is unknown.
         """
         known = self.species_names
         for name in names or (None,):
             if name not in known:
+                hint = did_you_mean(name, known)
                 raise ValueError(
-                    f"{self.source or 'these ranges'} have no species {shown(name)}{did_you_mean(name, known)}, only "
-                    f"{', '.join(known)}"
+                    f"{self.source or 'these ranges'} have no species {short_text(name)}{hint}, only {', '.join(known)}"
                 )
         return hits[np.isin(self.species(hits), [known.index(name) for name in names])]
 
@@ -171,10 +171,10 @@ class Ranges:
         pairs = np.flatnonzero(self.low[order][1:] < reach[:-1])
         if len(pairs):
             at = pairs[0]
-            holder = order[: at + 1][self.high[order][: at + 1] == reach[at]][0]
-            first, second = sorted((int(holder), int(order[at + 1])))
+            owner = order[: at + 1][self.high[order][: at + 1] == reach[at]][0]
+            first, second = sorted((int(owner), int(order[at + 1])))
             warnings.warn(
-                f"{self.source or 'Ranges'}: {len(pairs)} ranges overlap another, the first in the file wins: "
+                f"{self.source or 'Ranges'}: {len(pairs)} ranges overlap another one, the first in the file is used: "
                 f"{self._text(first)} over {self._text(second)}" + (", ..." if len(pairs) > 1 else ""),
                 DataWarning,
                 stacklevel=4,

@@ -1,6 +1,6 @@
-"""Projections of directions onto the detector: plane, azimuthal equidistant and compressed, forth and back.
+"""Projections of directions onto the detector and back: plane, azimuthal equidistant and compressed.
 
-A projection is the distance r from the centre of the detector for the polar angle theta, over its scale D:
+A projection gives the distance r from the centre of the detector, divided by its scale D, for the polar angle theta:
 
 =====================  ==================  =======================================================
 plane                  tan(theta)          straight flights onto a plane detector, ``compression`` 1
@@ -8,8 +8,8 @@ compressed             xi tan(theta / xi)  the same with the image compression x
 azimuthal equidistant  theta               ``compression`` None, the limit of a large xi
 =====================  ==================  =======================================================
 
-Flights end in stereographic directions, s = tan(theta / 2) (cos, sin)(azimuth), which stay smooth and finite up to ions
-that fly along a plane detector and beyond, where their place on it does not.
+The directions at the end of flights are stereographic, s = tan(theta / 2) (cos, sin)(azimuth). They stay smooth and
+finite also for ions that fly parallel to a plane detector or away from it, where the position on it diverges.
 """
 
 import math
@@ -35,7 +35,7 @@ def stereographic(directions: Floats) -> Floats:
 
 
 def stereographic_stretch(s2: Floats, compression: float | None) -> Floats:
-    """Distance from the centre over the scale and the length of the stereographic direction, r / (D |s|).
+    """Ratio r / (D |s|) of the distance from the centre to the scale and the length of the stereographic direction.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def stereographic_stretch(s2: Floats, compression: float | None) -> Floats:
     Returns
     -------
     ndarray
-        Shape (n,); 2 on the axis, as tan(theta / 2) is half as large as theta.
+        Shape (n,); 2 on the axis, where tan(theta / 2) = theta / 2.
     """
     if compression == 1.0:
         return 2.0 / (1.0 - s2)  # tan(theta) / tan(theta / 2)
@@ -61,35 +61,35 @@ def along_axis(lengths: Floats, s2: Floats) -> Floats:
 
 
 def radius_of(angle: Floats, compression: float | None) -> Floats:
-    """Distances from the centre over the scale for polar angles [rad], of the same shape."""
+    """Distances from the centre divided by the scale for polar angles [rad], of the same shape."""
     return angle if compression is None else compression * np.tan(angle / compression)
 
 
 def angle_of(radius: Floats, compression: float | None) -> Floats:
-    """Polar angles [rad] for distances from the centre over the scale, of the same shape."""
+    """Polar angles [rad] for distances from the centre divided by the scale, of the same shape."""
     return radius if compression is None else compression * np.arctan(radius / compression)
 
 
 @dataclass(frozen=True)
 class Projection:
-    """A projection of the directions of the specimen onto the detector.
+    """Projection of directions in the specimen onto the detector.
 
     Parameters
     ----------
     scale : float
-        Distance on the detector for an angle on the specimen, at the centre [mm/rad].
+        Distance on the detector per angle in the specimen, at the centre [mm/rad].
     centre : tuple of float
-        Where the axis of the specimen meets the detector [mm].
+        Position of the specimen axis on the detector [mm].
     mirror : bool
-        Whether x of the map counts against x of the specimen.
+        Whether x of the map is opposite to x of the specimen.
     compression : float, optional
-        None is the azimuthal equidistant projection. A number is the image compression of a straight flight onto a
-        plane detector, where the detector is seen under the angle of the specimen divided by it.
+        None for the azimuthal equidistant projection. A number is the image compression xi onto a plane detector: the
+        angle in the specimen divided by the angle of the straight flight.
 
     Raises
     ------
     ValueError
-        If the scale or the compression is not above 0, or the centre is not a place.
+        If the scale or the compression is not positive, or the centre is not a position.
 
     Notes
     -----
@@ -112,12 +112,12 @@ class Projection:
             object.__setattr__(self, "compression", compression)
 
     def places(self, directions: ArrayLike) -> Floats:
-        """Where directions appear.
+        """Positions of directions on the detector.
 
         Parameters
         ----------
         directions : array_like
-            In the frame of the specimen, of any length, shape (n, 3).
+            Vectors of any length in the frame of the specimen, shape (n, 3).
 
         Returns
         -------
@@ -134,7 +134,7 @@ class Projection:
         return np.column_stack([-x if self.mirror else x, y]) * stretch[:, None] + self.centre
 
     def directions(self, places: ArrayLike) -> Floats:
-        """Directions that appear at some places.
+        """Directions at positions on the detector.
 
         Parameters
         ----------
@@ -153,24 +153,24 @@ class Projection:
         return np.column_stack([(-x if self.mirror else x) * stretch, y * stretch, np.cos(angle)])
 
     def angles(self, places: ArrayLike) -> Floats:
-        """Polar angles [rad], shape (n,), of the directions that appear at places x and y [mm], shape (n, 2)."""
+        """Polar angles [rad], shape (n,), of the directions at positions x and y [mm], shape (n, 2)."""
         x, y = (check_array(places, "places", ("n", 2), finite=False) - self.centre).T
         return angle_of(np.hypot(x, y) / self.scale, self.compression)
 
     @property
     def last_angle(self) -> float:
-        """Polar angle from which on a direction points away from the detector [rad]."""
+        """Polar angle above which a direction points away from the detector [rad]."""
         return math.pi / 2 if self.compression is None else min(1.0, self.compression) * math.pi / 2
 
     @property
     def rim(self) -> float:
-        """Distance from the centre at which the last directions appear [mm]; infinite up to a compression of 1."""
+        """Distance from the centre for the last angle [mm]; infinite for a compression <= 1."""
         if self.compression is not None and self.compression <= 1:
             return math.inf
         return self.scale * float(radius_of(np.array(self.last_angle), self.compression))
 
     def compressed(self, compression: float) -> "Projection":
-        """The projection of a specimen whose polar angles are `compression` times those seen by this one."""
+        """Projection for polar angles in the specimen that are `compression` times the angles of this projection."""
         compression = check_number(compression, "compression", above=0)
-        own = None if self.compression is None else self.compression * compression
-        return replace(self, scale=self.scale / compression, compression=own)
+        product = None if self.compression is None else self.compression * compression
+        return replace(self, scale=self.scale / compression, compression=product)

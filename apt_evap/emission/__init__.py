@@ -1,1 +1,1 @@
-"""How ions start: emissions, the frame along the surface, energy distributions, perturbations, random numbers."""
+"""Start of the ions: emissions, the tangent frame, energy distributions, perturbations, random numbers."""

@@ -15,7 +15,7 @@ COLUMNS = ("positions", "normals", "neighbours", "charge_states", "masses", "ion
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Emissions:
-    """A batch of atoms about to leave.
+    """A batch of atoms at the moment of their evaporation.
 
     Parameters
     ----------
@@ -59,32 +59,32 @@ class Emissions:
             "ions": check_array(self.ions, "ions", (n,), dtype=np.int64),
             "nearest_neighbour_distance": distance,
         }
-        off = np.abs(np.linalg.norm(checked["normals"], axis=1) - 1)
-        if n and off.max() > 1e-6:
-            raise ValueError(f"normals must have length 1, got one that is off by {off.max():.2g}")
+        deviation = np.abs(np.linalg.norm(checked["normals"], axis=1) - 1)
+        if n and deviation.max() > 1e-6:
+            raise ValueError(f"normals must have length 1, got one that deviates by {deviation.max():.2g}")
         for name, least in (("charge_states", 1), ("masses", np.finfo(np.float64).tiny)):
             if n and checked[name].min() < least:
-                raise ValueError(f"{name} must be above 0, got {checked[name].min()}")
+                raise ValueError(f"{name} must be > 0, got {checked[name].min()}")
         for name, value in checked.items():
             object.__setattr__(self, name, value)
 
     def __len__(self) -> int:
         return len(self.positions)
 
-    def __getitem__(self, chosen: Any) -> "Emissions":
-        """Return the chosen atoms as `Emissions`; takes a slice, a mask or indices."""
-        columns = {name: getattr(self, name)[chosen] for name in COLUMNS}
+    def __getitem__(self, selection: Any) -> "Emissions":
+        """Return selected atoms as `Emissions`; takes a slice, a mask or indices."""
+        columns = {name: getattr(self, name)[selection] for name in COLUMNS}
         return Emissions(**columns, nearest_neighbour_distance=self.nearest_neighbour_distance)
 
     @classmethod
     def join(cls, parts: "Sequence[Emissions]") -> "Emissions":
-        """Join batches, in their order, into one."""
+        """Join batches in their order."""
         columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS}
         return cls(**columns, nearest_neighbour_distance=parts[0].nearest_neighbour_distance)
 
     @property
     def can_roll(self) -> Booleans:
-        """Whether each has a neighbour to roll onto, bool (n,)."""
+        """Whether each atom has a neighbour to roll onto, bool (n,)."""
         return np.isfinite(self.neighbours).all(axis=1)
 
     @property
@@ -94,19 +94,19 @@ class Emissions:
 
     def __repr__(self) -> str:
         lonely = np.count_nonzero(np.isnan(self.neighbours).any(axis=1))
-        return f"<Emissions: {len(self):,} atoms about to leave, {lonely:,} of them without a neighbour to roll onto>"
+        return f"<Emissions: {len(self):,} atoms, {lonely:,} of them without a neighbour to roll onto>"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Launches:
-    """How a batch of ions starts.
+    """Start positions and velocities of a batch of ions.
 
     Parameters
     ----------
     positions : array_like
-        Where [nm], shape (n, 3).
+        Start positions [nm], shape (n, 3).
     velocities : array_like
-        How fast [nm/ns], shape (n, 3).
+        Start velocities [nm/ns], shape (n, 3).
     rolled : array_like of bool
         Whether the ion rolled up onto a neighbour first, shape (n,).
 
@@ -135,7 +135,7 @@ class Launches:
 
 
 def check_launches(perturbation: Any, launches: Any, n: int) -> Launches:
-    """Return what a perturbation launched, or say what is wrong (ValueError): n `Launches`."""
+    """Return the launches of a perturbation; ValueError unless they are `Launches` of n ions."""
     if not isinstance(launches, Launches):
         raise ValueError(f"launch of {perturbation!r:.80} must return Launches, got {launches!r:.80}")
     if len(launches) != n:

@@ -1,4 +1,4 @@
-"""Distributions of the perturbation energy: any object with `quantile(u)` is one."""
+"""Energy distributions: any object with a method `quantile(u)`."""
 
 import math
 from dataclasses import dataclass
@@ -12,18 +12,18 @@ import scipy
 from numpy.typing import ArrayLike
 
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_array, check_number, shown
+from apt_evap._common.validation import check_array, check_number, short_text
 from apt_evap._core.elementary import logarithm, normal_quantile
 from apt_evap.units import BOLTZMANN
 
-HIGHEST_ENERGY = 100.0  # [eV]: more is a slip of the unit, 155 (meV), or ten times any bond
+HIGHEST_ENERGY = 100.0  # [eV]: ten times any bond energy; finds wrong units, such as 155 (meV)
 
 
 _PI = Decimal("3.14159265358979323846264338327950288419716939937510582097494459230781640628620899862803482534")
 
 
 class Distribution(Protocol):
-    """What a distribution of energies of one's own must have; `TruncatedNormal`, `Fixed` and `Thermal` are ones."""
+    """Interface of an energy distribution, such as `TruncatedNormal`, `Fixed` and `Thermal`."""
 
     def quantile(self, u: Floats) -> Floats:
         """Energy [eV] below which the fraction `u` (in (0, 1), any shape) of the distribution lies."""
@@ -53,14 +53,14 @@ def normal_probability(x: float) -> float:
 
 @dataclass(frozen=True)
 class TruncatedNormal:
-    """Normal distribution of the energy, cut off below zero.
+    """Normal distribution of the energy, truncated below zero.
 
     Parameters
     ----------
     mean : float
-        Mean of the normal before the cut [eV], at least 0.
+        Mean before the truncation [eV], from 0 to 100.
     standard_deviation : float
-        Standard deviation before the cut [eV], above 0; both are at most 100.
+        Standard deviation before the truncation [eV], > 0 and <= 100.
 
     Raises
     ------
@@ -82,7 +82,7 @@ class TruncatedNormal:
         u = np.asarray(u, dtype=np.float64)
         ratio = self.mean / self.standard_deviation
         lower = normal_probability(-ratio) + u * normal_probability(ratio)
-        # the tail that is the smaller one keeps all its digits
+        # the smaller tail is used: it keeps full precision
         upper = (1 - u) * normal_probability(ratio)
         deviate = normal_quantile(np.minimum(lower, upper))
         deviate = np.where(lower < 0.5, deviate, -deviate)
@@ -90,12 +90,12 @@ class TruncatedNormal:
 
     @property
     def true_mean(self) -> float:
-        """Mean of the energies after the cut [eV]."""
+        """Mean of the truncated distribution [eV]."""
         return self.mean + self.standard_deviation * self._hazard()
 
     @property
     def true_standard_deviation(self) -> float:
-        """Standard deviation of the energies after the cut [eV]."""
+        """Standard deviation of the truncated distribution [eV]."""
         hazard = self._hazard()
         ratio = self.mean / self.standard_deviation
         return self.standard_deviation * math.sqrt(1 - hazard * (ratio + hazard))
@@ -112,12 +112,12 @@ class Fixed:
     Parameters
     ----------
     energy : float
-        Energy [eV], at least 0 and at most 100.
+        Energy [eV], from 0 to 100.
 
     Raises
     ------
     ValueError
-        If the energy is out of this range or no number.
+        If the energy is outside this range or not a number.
     """
 
     energy: float
@@ -138,17 +138,17 @@ class Thermal:
     Parameters
     ----------
     temperature : float
-        Temperature [K], above 0 and at most 1e5.
+        Temperature [K], > 0 and <= 1e5.
 
     Raises
     ------
     ValueError
-        If the temperature is out of this range.
+        If the temperature is outside this range.
 
     Notes
     -----
-    Each of the two tangential velocities is normal with the variance k T / m (Maxwell-Boltzmann), so that the
-    energy of both is exponential.
+    Each of the two tangential velocities has a normal distribution of variance k T / m (Maxwell-Boltzmann). The sum of
+    their energies therefore has an exponential distribution.
     """
 
     temperature: float
@@ -167,17 +167,17 @@ DISTRIBUTIONS = {kind.__name__: kind for kind in (TruncatedNormal, Fixed, Therma
 
 
 def as_distribution(energy: Any) -> Distribution:
-    """Return a distribution as it is, a number [eV] as `Fixed`, or say what was expected (ValueError)."""
+    """Return a distribution unchanged, a number [eV] as `Fixed`; ValueError otherwise."""
     if isinstance(energy, Real) and not isinstance(energy, bool):
-        return Fixed(energy)  # type: ignore[arg-type]  # any real number; checked there
+        return Fixed(energy)  # type: ignore[arg-type]  # any real number; checked by Fixed
     if not callable(getattr(energy, "quantile", None)):
-        raise ValueError(f"energy must be a number [eV] or have a method quantile(u), got {shown(energy)}")
+        raise ValueError(f"energy must be a number [eV] or have a method quantile(u), got {short_text(energy)}")
     return energy
 
 
 def draw_energies(distribution: Distribution, u: Floats) -> Floats:
-    """Energies of a distribution [eV] at the uniform numbers `u`, shape (n,), checked (ValueError)."""
+    """Energies of a distribution [eV] at the uniform numbers `u`, shape (n,); ValueError if negative or not finite."""
     energies = check_array(distribution.quantile(u), f"quantiles of {distribution!r}", (len(u),))
     if energies.size and energies.min() < 0:
-        raise ValueError(f"quantiles of {distribution!r} must be at least 0 [eV], got {energies.min()}")
+        raise ValueError(f"quantiles of {distribution!r} must be >= 0 [eV], got {energies.min()}")
     return energies

@@ -1,4 +1,4 @@
-"""Random numbers keyed by seed and ion: the same for an ion whatever the batch or the threads."""
+"""Random numbers keyed by seed and ion number: independent of the batches and of the number of threads."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,26 +20,26 @@ def _mix(z):
 
 
 class IonRandom:
-    """Random numbers of a batch of ions, each ion with a stream of its own.
+    """Random numbers of a batch of ions, with a separate stream for each ion.
 
-    Number `j` of an ion is a function of (seed, ion, j) only. Each call continues with new columns.
+    Number `j` of an ion depends only on (seed, ion, j). Each call continues with new columns.
 
     Parameters
     ----------
     seed : int
-        Seed, at least 0 and below 2^64.
+        Seed, from 0 to 2^64 - 1.
     ions : array_like of int
         Number of each ion in the sequence of evaporation, shape (n,).
 
     Raises
     ------
     ValueError
-        If the seed or an ion's number is no such number.
+        If the seed or an ion number is not an integer, or outside its range.
 
     Notes
     -----
-    Each ion has a SplitMix64 generator of its own (Steele, Lea and Flood, OOPSLA 2014). It is seeded with the
-    output of that number of a generator seeded with a hash of `seed`.
+    Each ion has its own SplitMix64 generator (Steele, Lea and Flood, OOPSLA 2014). Its seed is output number `ion` of a
+    generator that is seeded with a hash of `seed`.
     """
 
     def __init__(self, seed: int, ions: ArrayLike) -> None:

@@ -1,8 +1,8 @@
-"""Perturbations of the emission: where an ion starts, and how fast along the surface.
+"""Perturbations of the emission: start position of an ion, and its velocity along the surface.
 
 A perturbation is any object with one method, ``launch(emissions, random) -> Launches``, over a batch of
-emissions. The built-in ones take two random numbers per ion: the first is the quantile of the energy, the
-second the azimuth. The model is that of Shaikh et al., arXiv 2509.13744.
+emissions. The built-in ones use two random numbers per ion: the first is the quantile of the energy, the second gives
+the azimuth. The model is that of Shaikh et al., arXiv 2509.13744.
 """
 
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from apt_evap._common.types import Booleans, Floats
-from apt_evap._common.validation import check_kind, check_number, did_you_mean, shown
+from apt_evap._common.validation import check_kind, check_number, did_you_mean, short_text
 from apt_evap._core.elementary import sine_and_cosine
 from apt_evap.emission.emissions import Emissions, Launches
 from apt_evap.emission.energies import (
@@ -50,23 +50,26 @@ __all__ = [
 
 
 class Perturbation(Protocol):
-    """What a perturbation of one's own must have, to be flown; the built-in ones have it."""
+    """Interface of a perturbation."""
 
     def launch(self, emissions: Emissions, random: IonRandom) -> Launches:
-        """Launch a batch of ions: their positions [nm] and velocities [nm/ns], and who rolled up."""
+        """Launch a batch of ions: positions [nm], velocities [nm/ns], and which ions rolled up."""
         ...
 
 
 class TangentialPerturbation(Perturbation, Protocol):
-    """What it must have besides, to be taken by runs that hold responses: launches along the surface only."""
+    """Interface of a perturbation that only adds velocities along the surface.
+
+    A run with stored responses evaluates its hits without further flights.
+    """
 
     def tangential(self, emissions: Emissions, random: IonRandom) -> tuple[Booleans, Floats, Floats]:
-        """Who rolls up, and the velocities along t1 and t2 of `tangent_frame` [nm/ns], each of shape (n,)."""
+        """Which ions roll up, and the velocities along t1 and t2 of `tangent_frame` [nm/ns], each of shape (n,)."""
         ...
 
 
 class _Tangential:
-    """What the built-in perturbations share: `launch` out of `tangential`."""
+    """Base of the built-in perturbations: `launch` from `tangential`."""
 
     def launch(self: TangentialPerturbation, emissions: Emissions, random: IonRandom) -> Launches:
         """Launch a batch of ions.
@@ -84,7 +87,7 @@ class _Tangential:
         """
         return launch_tangentially(emissions, *self.tangential(emissions, random))
 
-    def _drawn(self, emissions, random):
+    def _draw(self, emissions, random):
         u = random.uniform(2)
         return draw_energies(self.energy, u[:, 0]), 2 * np.pi * u[:, 1]
 
@@ -94,14 +97,14 @@ class Unperturbed(_Tangential):
     """Every ion starts at rest from its site."""
 
     def tangential(self, emissions: Emissions, random: IonRandom) -> tuple[Booleans, Floats, Floats]:
-        """Nobody rolls, and both velocities along the surface are zero: see `Combined.tangential`."""
+        """No ion rolls up; both velocities along the surface are zero: see `Combined.tangential`."""
         n = len(emissions)
         return np.zeros(n, dtype=bool), np.zeros(n), np.zeros(n)
 
 
 @dataclass(frozen=True)
 class LateralVelocity(_Tangential):
-    """Every ion starts from its site, at |v| = sqrt(2 E/m) in a random direction along the surface.
+    """Every ion starts from its site, with |v| = sqrt(2 E/m) in a random direction along the surface.
 
     Parameters
     ----------
@@ -115,8 +118,8 @@ class LateralVelocity(_Tangential):
         object.__setattr__(self, "energy", as_distribution(self.energy))
 
     def tangential(self, emissions: Emissions, random: IonRandom) -> tuple[Booleans, Floats, Floats]:
-        """Nobody rolls; velocities along t1 and t2 [nm/ns]: see `Combined.tangential`."""
-        energy, azimuth = self._drawn(emissions, random)
+        """No ion rolls up; velocities along t1 and t2 [nm/ns]: see `Combined.tangential`."""
+        energy, azimuth = self._draw(emissions, random)
         speed = speed_from_energy(energy, emissions.masses)
         sine, cosine = sine_and_cosine(azimuth)
         return np.zeros(len(emissions), dtype=bool), speed * cosine, speed * sine
@@ -124,10 +127,10 @@ class LateralVelocity(_Tangential):
 
 @dataclass(frozen=True)
 class RollUp(_Tangential):
-    """Every ion rolls up onto its neighbour of highest charge and starts from there, moving on the same way.
+    """Every ion rolls up onto its neighbour of highest charge and starts there, in the direction of the roll-up.
 
-    It starts at p_r = s + d n, at |v| = sqrt(2 E/m) along the part of p_r - p perpendicular to n. An ion
-    without a neighbour does not roll: it starts at rest from its site.
+    It starts at p_r = s + d n, with |v| = sqrt(2 E/m) along the component of p_r - p perpendicular to n. An ion without
+    a neighbour does not roll up: it starts at rest from its site.
 
     Parameters
     ----------
@@ -141,8 +144,8 @@ class RollUp(_Tangential):
         object.__setattr__(self, "energy", as_distribution(self.energy))
 
     def tangential(self, emissions: Emissions, random: IonRandom) -> tuple[Booleans, Floats, Floats]:
-        """Who rolls, and the velocities along t1 and t2 [nm/ns]: see `Combined.tangential`."""
-        energy, _ = self._drawn(emissions, random)
+        """Which ions roll up, and the velocities along t1 and t2 [nm/ns]: see `Combined.tangential`."""
+        energy, _ = self._draw(emissions, random)
         speed = speed_from_energy(energy, emissions.masses)
         rolled, first, second = rollup_direction(emissions)
         return rolled, speed * first, speed * second
@@ -150,28 +153,28 @@ class RollUp(_Tangential):
 
 @dataclass(frozen=True)
 class Combined(_Tangential):
-    """Roll-up with a share of the energy, and a random direction with the rest; the velocities add.
+    """Roll-up with a fraction of the energy, plus a random direction with the rest; the velocities add.
 
-    An ion without a neighbour does not roll: it starts from its site with the random part only.
+    An ion without a neighbour does not roll up: it starts from its site with the random part only.
 
     Parameters
     ----------
     energy : distribution or float
         Energy E: any object with `quantile(u)` [eV], or one number for all ions [eV].
     rollup_fraction : float
-        Share of the energy that goes into the roll-up, from 0 to 1; at 0 the ion still rolls.
+        Fraction of the energy for the roll-up, from 0 to 1; at 0 the ion still rolls up.
     """
 
     energy: Distribution | float
     rollup_fraction: float
 
     def __post_init__(self):
-        share = check_number(self.rollup_fraction, "rollup_fraction", at_least=0, at_most=1)
+        fraction = check_number(self.rollup_fraction, "rollup_fraction", at_least=0, at_most=1)
         object.__setattr__(self, "energy", as_distribution(self.energy))
-        object.__setattr__(self, "rollup_fraction", share)
+        object.__setattr__(self, "rollup_fraction", fraction)
 
     def tangential(self, emissions: Emissions, random: IonRandom) -> tuple[Booleans, Floats, Floats]:
-        """Who rolls, and how fast along the surface.
+        """Which ions roll up, and their velocities along the surface.
 
         Parameters
         ----------
@@ -186,7 +189,7 @@ class Combined(_Tangential):
             Whether each ion rolls up, and its velocity along t1 and t2 of `tangent_frame` [nm/ns], each of
             shape (n,).
         """
-        energy, azimuth = self._drawn(emissions, random)
+        energy, azimuth = self._draw(emissions, random)
         rolled, first, second = rollup_direction(emissions)
         rolling = speed_from_energy(self.rollup_fraction * energy, emissions.masses)
         lateral = speed_from_energy((1 - self.rollup_fraction) * energy, emissions.masses)
@@ -201,7 +204,7 @@ PERTURBATIONS = {kind.__name__: kind for kind in (Unperturbed, LateralVelocity, 
 def to_dict(perturbation: Any) -> dict[str, Any]:
     """Name and parameters of a perturbation or a distribution, in plain types, for files.
 
-    One of a user's own is described by its name and `repr`: enough to know it, not to make it again.
+    A user-defined one is described by its name and `repr`: enough to recognise it, not to rebuild it.
 
     Parameters
     ----------
@@ -222,7 +225,7 @@ def to_dict(perturbation: Any) -> dict[str, Any]:
 
 
 def from_dict(settings: Mapping[str, Any]) -> Any:
-    """Make the perturbation or distribution again that `to_dict` described.
+    """Rebuild a perturbation or distribution from the result of `to_dict`.
 
     Parameters
     ----------
@@ -236,16 +239,19 @@ def from_dict(settings: Mapping[str, Any]) -> Any:
     Raises
     ------
     ValueError
-        If the name or a parameter is unknown, or one is missing.
+        If the name or a parameter is unknown, or if a parameter is missing.
     """
     known = PERTURBATIONS | DISTRIBUTIONS
     name = check_kind(settings, "settings", Mapping, "a mapping with a name and parameters").get("name")
     if not isinstance(name, str) or name not in known:
         hint = did_you_mean(name, known)
-        raise ValueError(f"no perturbation or distribution is named {shown(name)}{hint}; known are {', '.join(known)}")
-    given = {key: value for key, value in settings.items() if key != "name"}
-    wanted = {item.name for item in fields(known[name])}
-    if set(given) != wanted:
-        lists = [", ".join(sorted(names)) or "no parameters" for names in (wanted, given)]
+        raise ValueError(
+            f"no perturbation or distribution is named {short_text(name)}{hint}; known are {', '.join(known)}"
+        )
+    parameters = {key: value for key, value in settings.items() if key != "name"}
+    expected = {item.name for item in fields(known[name])}
+    if set(parameters) != expected:
+        lists = [", ".join(sorted(names)) or "no parameters" for names in (expected, parameters)]
         raise ValueError(f"{name} needs {lists[0]}, got {lists[1]}")
-    return known[name](**{key: from_dict(value) if isinstance(value, dict) else value for key, value in given.items()})
+    parameters = {key: from_dict(value) if isinstance(value, dict) else value for key, value in parameters.items()}
+    return known[name](**parameters)

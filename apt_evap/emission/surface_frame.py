@@ -1,4 +1,4 @@
-"""Where on the surface and which way an ion starts: the tangent frame, the roll-up, the launch."""
+"""Start position and direction of an ion on the surface: the tangent frame, the roll-up, the launch."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,11 +10,11 @@ from apt_evap.emission.emissions import Emissions, Launches
 
 
 def tangent_frame(normals: ArrayLike) -> tuple[Floats, Floats]:
-    """Two unit vectors at right angles to each normal and to each other.
+    """Two unit vectors perpendicular to each normal and to each other.
 
-    They are x and y carried from the apex (0, 0, 1) to the normal along the great circle: t1 is near x and
-    t2 near y on the cap, t1 x t2 = n, and both change smoothly with the normal but for a jump at n_z = -0.9,
-    deep in the foot.
+    They are x and y, rotated from the apex (0, 0, 1) to the normal along the great circle: on the cap t1 is close to x
+    and t2 to y, and t1 x t2 = n. Both change smoothly with the normal, except for a jump at n_z = -0.9, far below the
+    cap.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def tangent_frame(normals: ArrayLike) -> tuple[Floats, Floats]:
 
 
 def rollup_direction(emissions: Emissions) -> tuple[Booleans, Floats, Floats]:
-    """Which ions can roll up, and in which direction.
+    """Ions that can roll up, and the direction of their roll-up.
 
     Parameters
     ----------
@@ -49,9 +49,9 @@ def rollup_direction(emissions: Emissions) -> tuple[Booleans, Floats, Floats]:
     Returns
     -------
     tuple of ndarray
-        Whether there is a neighbour to roll onto, shape (n,), and the components along t1 and t2 of the unit
-        vector from the site to the rolled-up position, perpendicular to the normal, each of shape (n,); zero
-        if there is no neighbour, or if it lies straight along the normal.
+        Whether there is a neighbour to roll onto, shape (n,). Then the components along t1 and t2, each of shape (n,),
+        of the unit vector from the site to the rolled-up position, projected perpendicular to the normal; zero if there
+        is no neighbour, or if it lies along the normal.
     """
     rolled = np.isfinite(emissions.neighbours).all(axis=1)
     step = np.where(rolled[:, None], emissions.neighbours - emissions.positions, 0.0)
@@ -107,8 +107,7 @@ def launch_tangentially(emissions: Emissions, rolled: Booleans, first: Floats, s
     emissions : Emissions
         A batch of n.
     rolled : array_like of bool
-        Ions that start at the position they rolled up to, see `rolled_positions`; the others start at their site.
-        Shape (n,).
+        Whether an ion starts at its rolled-up position, see `rolled_positions`, or at its site, shape (n,).
     first, second : array_like
         Velocity along t1 and t2 of `tangent_frame` [nm/ns], shape (n,).
 

@@ -1,1 +1,1 @@
-"""The emission energies that fit a measured map."""
+"""Fit of the emission energies to a measured map."""

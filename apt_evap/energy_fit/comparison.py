@@ -1,52 +1,54 @@
-"""Similarity of simulated maps with a measured one, with the noise of both taken into account.
+"""Noise-corrected similarity of simulated maps with a measured one.
 
-What is compared is what `DetectorMap.flattened` and `ssim` give, of stacks of maps. The broad density that a stack is
-flattened by is that of its first map, of which the others are resamples.
+The comparison equals that of `DetectorMap.flattened` and `ssim`, for stacks of maps. A stack is flattened by the broad
+density of its first map; the other maps are resamples of the first.
 
-Noise is variance, which the structural similarity takes for contrast: with variances s² of signals and n² of noise, a
-simulated signal of c times the contrast has a similarity near 2 c s² / (c² s² + s² + n²), which is greatest for c > 1.
-With the variance of the noise, which is known, in the numerator too, it is greatest, and 1, for c = 1; and nothing is
-divided by a small difference. In a twin experiment (Ni[111], R = 40 a, 150,000 simulated and 200,000 measured ions
-under lateral energies of 0.3 eV, σ/mean 0.316; 20 pairs of draws, 128 bins, 16 draws an ion) the best σ/mean was 0.1 or
-less in 19 of 20 without it, smoothed by a bin, and in all 20 smoothed by half of one. With it, it was 0.316 in all 20
-either way, and half a bin told it from 0.1 by seven standard deviations instead of three.
+Noise adds variance, which the structural similarity interprets as contrast. With variances s² of the signals and n² of
+the noise, a simulated signal with c times the contrast has a similarity of about 2 c s² / (c² s² + s² + n²), with its
+maximum at c > 1. The variance of the noise is known. If it is added to the numerator too, the maximum is 1 at c = 1,
+and no division by a small difference is needed.
+
+Measured in a twin experiment (Ni[111], R = 40 a, 150,000 simulated and 200,000 measured ions with lateral energies of
+0.3 eV, σ/mean 0.316; 20 pairs of draws, 128 bins, 16 draws per ion): without the correction the best σ/mean was 0.1 or
+less in 19 of 20 pairs with smoothing by one bin, and in all 20 with smoothing by half a bin. With the correction it was
+0.316 in all 20 pairs for both. The difference to 0.1 was seven standard deviations with half a bin, and three with one.
 """
 
 import numpy as np
 
 from apt_evap._common.types import Floats
 from apt_evap.analysis.similarity import WINDOW, local_moments, local_similarity, window_fits, window_mean
-from apt_evap.detection.detector_map import DetectorMap, blurred
+from apt_evap.detection.detector_map import DetectorMap, masked_gaussian
 from apt_evap.energy_fit.resampling import NOISE
 from apt_evap.energy_fit.settings import StudySettings
 
 NOISE_MAPS = 50
-"""Least number of maps that the variance of the measured noise is taken from: to 20 % in a bin, less in a window."""
+"""Smallest number of maps for the variance of the measured noise: error 20 % in a bin, less in a window."""
 
 
 class Comparison:
-    """Structural similarity with one measured map, resampled where it holds counts.
+    """Structural similarity with a measured map, with resamples if it contains counts.
 
     Parameters
     ----------
     measured : DetectorMap
-        The measured map; its mask is the region compared.
+        The measured map; its mask is the compared region.
     settings : StudySettings
-        How maps are compared, and how many resamples are drawn.
+        Settings of the comparison, and number of resamples.
 
     Raises
     ------
     ValueError
-        If no window fits into the mask, or the settings leave the flattening open.
+        If the mask contains no window, or the flattening is not set.
     """
 
     def __init__(self, measured: DetectorMap, settings: StudySettings) -> None:
         if settings.flattening is None:
-            raise ValueError("settings must have a flattening to compare maps with, got None")
+            raise ValueError("settings must have a flattening, got None")
         inside = window_fits(measured.mask)
         if not inside.any():
             raise ValueError(
-                f"the region that both maps show must hold a window of {2 * WINDOW + 1} bins, it has "
+                f"the common region of both maps must contain a window of {2 * WINDOW + 1} bins, got a region of "
                 f"{np.count_nonzero(measured.mask)} bins"
             )
         rows, columns = (np.flatnonzero(measured.mask.any(axis=axis)) for axis in (1, 0))
@@ -69,13 +71,13 @@ class Comparison:
         self._measured = local_moments(self.densities(self.measured))
 
     def densities(self, maps: Floats) -> Floats:
-        """Densities as they are compared: flattened, smoothed, relative to their mean; shape (k, ny, nx)."""
+        """Densities for the comparison: flattened, smoothed, relative to their mean; shape (k, ny, nx)."""
         maps = self._smoothed(maps)
         mean = maps[:, self.mask].mean(axis=1)[:, None, None]
         return np.where(self.mask, np.divide(maps, mean, out=np.zeros_like(maps), where=mean > 0), 1.0)
 
     def variance_of(self, noise: Floats, map: Floats) -> Floats:
-        """Variance in a window that noise, shape (k, ny, nx), gives the densities of a map, shape (1, ny, nx)."""
+        """Variance in a window from noise, shape (k, ny, nx), in the densities of a map, shape (1, ny, nx)."""
         first, *smoothed = self._smoothed(np.concatenate([map, noise]))
         mean = first[self.mask].mean()
         densities = np.divide(smoothed, mean, out=np.zeros_like(smoothed), where=mean > 0)
@@ -84,32 +86,32 @@ class Comparison:
     def _smoothed(self, maps):
         maps = np.where(self.mask, maps, 0.0)
         if self._flattening.any():
-            broad = blurred(maps[:1], self.mask, self._flattening)
+            broad = masked_gaussian(maps[:1], self.mask, self._flattening)
             maps = np.divide(maps, broad, out=np.zeros_like(maps), where=broad > 0)
-        return blurred(maps, self.mask, self._smoothing) if self._smoothing.any() else maps
+        return masked_gaussian(maps, self.mask, self._smoothing) if self._smoothing.any() else maps
 
     def similarities(self, maps: Floats, noise: Floats | None = None, *, plain: bool = False) -> Floats:
-        """Similarity of a map of the box with the measured one, and of its resamples one by one, shape (k,).
+        """Similarities of a map of the box and of its resamples with the measured map and its resamples, shape (k,).
 
-        Those of the resamples have the noise of all ions, and the mean of the first.
+        The similarities of the resamples are scaled to the full noise of the ions, with the first one as their mean.
 
         Parameters
         ----------
         maps, noise : ndarray
-            What `Sampler.maps` gives.
+            Result of `Sampler.maps`.
         plain : bool
-            Whether to count noise as unlike all the same.
+            Whether to omit the noise correction.
         """
-        allowed = 0.0
+        correction = 0.0
         if self.settings.allow_noise and not plain:
-            allowed = self.measured_noise + (0.0 if noise is None else self.variance_of(noise[None], maps[:1]))
-        values = self._mean_similarity(local_moments(self.densities(maps)), self._measured, allowed)
+            correction = self.measured_noise + (0.0 if noise is None else self.variance_of(noise[None], maps[:1]))
+        values = self._mean_similarity(local_moments(self.densities(maps)), self._measured, correction)
         if len(values) > 1:
             values[1:] = values[0] + (values[1:] - values[1:].mean()) / NOISE
         return values
 
     def ceiling(self, divisions: int, seed: tuple[int, int]) -> Floats:
-        """Similarities of the random halves of the measured counts, noise and all, shape (divisions,)."""
+        """Uncorrected similarities of random halves of the measured counts, shape (divisions,)."""
         random = np.random.default_rng(seed)
         counts = self.measured[0].astype(np.int64)
         half = random.binomial(counts, 0.5, (divisions, *counts.shape)).astype(float)

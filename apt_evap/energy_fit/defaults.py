@@ -1,11 +1,11 @@
-"""Mechanisms, and the grid of energies of a study unless it is told otherwise; numbers alone, which help texts show."""
+"""Mechanisms and default grid of energies of a study, in a module without imports for fast help texts."""
 
 MEANS = (0.01, 0.0825, 0.155, 0.2275, 0.3, 0.3725)
 """Means of the paper's grid [eV]: from 0.01 to 0.3725 in even steps."""
 RSDS = (0.01, 0.0316, 0.1, 0.316, 1.0, 3.16)
 """Relative standard deviations of the paper's grid: from 0.01 to 3.16, two per decade."""
 ROLLUP_FRACTIONS = (0.0, 0.25, 0.5, 0.75, 1.0)
-"""Shares of the roll-up in the energy, of the paper's grid."""
+"""Roll-up fractions of the energy in the paper's grid."""
 
 MECHANISMS = ("roll-up", "lateral", "combined")
-"""How ions start: `RollUp`, `LateralVelocity` or `Combined`."""
+"""Mechanisms of emission: `RollUp`, `LateralVelocity` or `Combined`."""

@@ -1,4 +1,4 @@
-"""The search for the emission energies whose simulated map looks most like a measured one."""
+"""Fit of the emission energies: the simulated map with the largest similarity to a measured one."""
 
 import warnings
 from collections.abc import Sequence
@@ -25,10 +25,10 @@ from apt_evap.simulation.run import Run
 
 BINS = 128
 DRAWN = 10
-"""Simulated over measured ions that draws of the same ions are to come to, where `FEWEST` to `MOST` of them do."""
+"""Target ratio of simulated (all draws) to measured ions, with `FEWEST` to `MOST` draws per ion."""
 FEWEST, MOST = 4, 16
 FEWEST_IONS = 0.5
-"""Simulated ions in a bin below which there is a warning; studies of tutorials and twins have 1 to 10."""
+"""Warning below this number of simulated ions per bin; studies of tutorials and twins have 1 to 10."""
 
 
 def fit_energies(
@@ -52,54 +52,55 @@ def fit_energies(
     n_threads: int | None = None,
     progress: bool | None = None,
 ) -> Study:
-    r"""Find the emission energies for which a run looks most like a measurement.
+    r"""Find the emission energies with the largest similarity of a run to a measurement.
 
-    Maps for every energy follow from the responses of one run. They are carried into the measured frame, binned on the
-    measured bins and compared by structural similarity where both show something: inside the mask of the measured map
-    and inside the convex outlines (as in `DetectorMap.from_hits`) of that map, of the unperturbed map and of that of
-    the middle of the grid. The same region serves all energies.
+    The maps for all energies follow from the responses of one run. They are transformed into the measured frame, binned
+    on the measured bins and compared by structural similarity in the common region: the mask of the measured map,
+    within the convex outlines (as in `DetectorMap.from_hits`) of the measured map, of the unperturbed map and of the
+    map in the middle of the grid. The region is the same for all energies.
 
     Parameters
     ----------
     run : Run
         A run with responses.
     measured : Hits or DetectorMap
-        Measured ions, or a map of counts or of densities; densities have no noise of their own to draw from.
+        Measured ions, or a map of counts or of densities. The noise of densities is not known.
     mechanism : {"roll-up", "lateral", "combined"}
-        How ions start: `RollUp`, `LateralVelocity` or `Combined`.
+        Mechanism of emission: `RollUp`, `LateralVelocity` or `Combined`.
     means, rsds : sequence of float
-        Means of the truncated normal distributions [eV], and standard deviations over the means; those of the paper
-        by default.
+        Means of the truncated normal distributions [eV], and standard deviations relative to the means; by default
+        those of the paper.
     rollup_fractions : sequence of float, optional
-        Shares of the roll-up for "combined"; those of the paper by default.
+        Roll-up fractions for "combined"; by default those of the paper.
     registration : Registration, optional
-        Carries simulated hits into the measured frame. By default it is found by `register`, with the middle of the
-        grid and then again with the best point, until that stays, and then moved to where that point is most alike.
+        Carries simulated hits into the measured frame. By default found by `register` with the middle of the
+        grid, repeated with the best point until this is stable, and then refined to the largest similarity of this
+        point.
     bins : int, optional
-        Bins along the longer side: of measured hits, 128 by default; of a map, those it has are merged by a whole
-        factor to come closest, and stay as they are by default.
+        Number of bins along the longer side. For measured hits 128 by default. The bins of a map are merged by an
+        integer factor to come closest to this number, or unchanged by default.
     smoothing : float, optional
-        Standard deviation of a Gaussian for both maps [mm]; by default half a bin for counts, one for densities, whose
-        noise is not known.
+        Standard deviation of the Gaussian that smooths both maps [mm]; by default half a bin for counts, and one bin
+        for densities, whose noise is not known.
     flattening : float, optional
-        Both maps are divided by themselves, smoothed with this standard deviation [mm]; 0 for not. By default
-        0.15 of the square root of the area compared. Gradients across a measured map that come from the instrument, or
-        from the shape of the specimen, follow no energy.
+        Standard deviation of the Gaussian that flattens both maps [mm]: each map is divided by a smoothed copy; 0 for
+        no flattening. By default 0.15 of the square root of the compared area. This removes gradients from the
+        instrument or from the shape of the specimen, which do not depend on the energy.
     data_range : float
-        As for `ssim`.
+        Range of densities, as for `ssim`.
     temperature : float
-        Temperature of the thermal baseline, lateral velocities of Maxwell and Boltzmann [K].
+        Temperature of the thermal baseline, Maxwell-Boltzmann lateral velocities [K].
     allow_noise : bool
-        Whether the similarity allows for the noise of both maps; see the notes. False for `ssim` as it is.
+        Whether the similarity is corrected for the noise of both maps, see the notes. False for the standard `ssim`.
     replicas : int, optional
-        Draws of the energy and direction of every ion, added up: the map of an energy has less noise then. By default
-        so many that they come to ten times the measured ions, but from 4 to 16.
+        Number of draws of energy and direction per ion, which are summed to reduce the noise of a map. By default ten
+        times as many simulated as measured ions, with 4 to 16 draws.
     resamples : int
-        Draws of all measured and simulated ions with replacement, for the errors; 0 for none.
+        Number of resamples of all measured and simulated ions, for the errors; 0 for none.
     seed : int
         Seed of the resamples.
     n_threads : int, optional
-        Threads; by default the processors this process may use. Results do not depend on it.
+        Number of threads; by default the number of processors that this process may use. Results do not depend on it.
     progress : bool, optional
         Whether to show a progress bar; by default if the output is a terminal or a notebook.
 
@@ -110,7 +111,7 @@ def fit_energies(
     Raises
     ------
     ValueError
-        If the run has no responses, the maps share too small a region, or an argument is out of range.
+        If the run has no responses, the common region is too small, or an argument is outside its range.
 
     Warns
     -----
@@ -119,19 +120,19 @@ def fit_energies(
 
     Notes
     -----
-    The method is that of Shaikh et al., arXiv 2509.13744, with errors added. A resample draws every measured bin from
-    a Poisson distribution and weighs the ions of the run at random (see `Sampler`); all energies and baselines see the
-    same draws. The registration is held fixed.
+    The method is that of Shaikh et al., arXiv 2509.13744, with additional errors. A resample draws every measured bin
+    from a Poisson distribution and uses random weights of the ions of the run (see `Sampler`). The draws are the same
+    for all energies and baselines. The registration is fixed.
 
-    Noise is variance, too, and would be taken for contrast: the energies whose map has most contrast would seem best.
-    So the similarity of a window of densities x and y is (`local_similarity`)
+    Noise adds variance, which would count as contrast: the energies of the map with the highest contrast would seem
+    best. So the similarity of a window of densities x and y is (`local_similarity`)
 
     .. math:: \frac{2 μ_x μ_y + C_1}{μ_x^2 + μ_y^2 + C_1} \; \frac{2 σ_{xy} + ν_x + ν_y + C_2}{σ_x^2 + σ_y^2 + C_2}
 
-    with the parts ν of the variances that are noise: Poisson's where the measured map holds counts, and that of the
-    draws where there are several. The true energies have a similarity of about 1. `Study.plain` has similarities
-    without ν, beside which the ceiling stands. Noise of measured densities is not known and stays: their maps look most
-    like those with somewhat more contrast than the truth.
+    with the noise variances ν: Poisson noise for measured counts, and the noise of several draws per ion. The true
+    energies have a similarity of about 1. `Study.plain` contains similarities without ν, for comparison with the
+    ceiling. The noise of measured densities is not known and not corrected: their best energies have slightly more
+    contrast than the true ones.
     """
     grid = EnergyGrid(mechanism, means, rsds, rollup_fractions)  # type: ignore[arg-type]
     if check_kind(run, "run", Run, "a Run").responses is None:
@@ -150,11 +151,11 @@ def fit_energies(
     replicas = settings.replicas
     search = EnergySearch(run, measured, grid, settings, thread_count(n_threads), progress)
     with warnings.catch_warnings():
-        # for every energy anew; what it says is in the settings
+        # once per energy; the settings contain the same information
         warnings.simplefilter("ignore", ResponseWarning)
         rounds: list[Any] = []
         if registration is None:
-            warnings.simplefilter("ignore", RegistrationWarning)  # once, of the last
+            warnings.simplefilter("ignore", RegistrationWarning)  # given once, for the last registration
             registration, rounds = registered(search)
         search.place(registration, settings.resamples)
         values = search.matrix(replicas, "energies")
@@ -173,8 +174,8 @@ def fit_energies(
     density = maps["unperturbed"].ions / search.comparison.mask.sum()
     if density < FEWEST_IONS:
         warnings.warn(
-            f"the run has {density:.2g} ions in a bin that is compared, {FEWEST_IONS:g} or more are needed for a map: "
-            f"give fewer bins than {max(measured.values.shape)}, or simulate more ions",
+            f"the run has {density:.2g} ions per compared bin, but a map needs at least {FEWEST_IONS:g}: "
+            f"use fewer bins than {max(measured.values.shape)}, or simulate more ions",
             MapWarning,
             stacklevel=2,
         )
@@ -212,13 +213,13 @@ def fit_energies(
 
 
 def _replicas(measured, run):
-    """Draws of every ion that come to `DRAWN` times the measured ions, whose number densities do not tell."""
-    drawn = DRAWN * measured.values.sum() / len(run) if measured.is_counts else 2 * FEWEST
-    return int(np.clip(np.ceil(drawn), FEWEST, MOST))
+    """Number of draws per ion for `DRAWN` times the measured ions; their number is not known for densities."""
+    number = DRAWN * measured.values.sum() / len(run) if measured.is_counts else 2 * FEWEST
+    return int(np.clip(np.ceil(number), FEWEST, MOST))
 
 
 def _measured_map(measured, bins):
-    """Map of what was measured, with bins about as many as asked for along the longer side."""
+    """Measured map, with about the requested number of bins along the longer side."""
     if bins is not None:
         bins = check_count(bins, "bins", at_least=2 * WINDOW + 1)
     if isinstance(measured, Hits):
@@ -234,7 +235,7 @@ def _measured_map(measured, bins):
         return values[:rows, :columns].reshape(rows // factor, factor, columns // factor, factor)
 
     inside = blocks(measured.mask)
-    # a bin that lies partly outside is outside
+    # a bin partly outside counts as outside
     mask, values = inside.all(axis=(1, 3)), blocks(np.where(measured.mask, measured.values, 0)).sum(axis=(1, 3))
     if not mask.any():
         raise ValueError(f"bins={bins} leaves no bin inside {measured!r}")

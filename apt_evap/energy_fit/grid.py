@@ -1,4 +1,4 @@
-"""The energies a study tries: a grid of distributions for one mechanism, and the maximum between its points."""
+"""Energies of a study: a grid of distributions for one mechanism, and the maximum between its points."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,23 +20,23 @@ _FINE = np.linspace(-1.0, 1.0, 41)
 
 @dataclass(frozen=True)
 class EnergyGrid:
-    """Truncated normal distributions of the energy, by mean and relative standard deviation, for one mechanism.
+    """Grid of truncated normal energy distributions, by mean and relative standard deviation, for one mechanism.
 
     Parameters
     ----------
     mechanism : {"roll-up", "lateral", "combined"}
-        How ions start: `RollUp`, `LateralVelocity` or `Combined`.
+        Mechanism of emission: `RollUp`, `LateralVelocity` or `Combined`.
     means : tuple of float
-        Means of the normals before the cut [eV], increasing.
+        Means before the truncation [eV], increasing.
     rsds : tuple of float
-        Standard deviations before the cut over the means, increasing.
+        Standard deviations before the truncation, relative to the means, increasing.
     rollup_fractions : tuple of float, optional
-        Shares of the energy that go into the roll-up, increasing; only for "combined".
+        Fractions of the energy for the roll-up, increasing; only for "combined".
 
     Raises
     ------
     ValueError
-        If the mechanism is unknown or an axis is empty, does not increase or is out of range.
+        If the mechanism is unknown, or an axis is empty, not increasing or outside its range.
     """
 
     mechanism: str
@@ -50,7 +50,7 @@ class EnergyGrid:
         if self.mechanism == "combined":
             fractions = ROLLUP_FRACTIONS if fractions is None else fractions
         elif fractions is not None:
-            raise ValueError(f"rollup_fractions are for the mechanism 'combined', got them for {self.mechanism!r}")
+            raise ValueError(f"rollup_fractions are only for the mechanism 'combined', got {self.mechanism!r}")
         else:
             fractions = (1.0,) if self.mechanism == "roll-up" else (0.0,)
         for name, values, low, high in (
@@ -60,7 +60,7 @@ class EnergyGrid:
         ):
             axis = check_array(values, name, ("n",))
             if not (len(axis) and (np.diff(axis) > 0).all() and low <= axis[0] and axis[-1] <= high):
-                bounds = "from 0 to 1" if high == 1 else "above 0"
+                bounds = "from 0 to 1" if high == 1 else "> 0"
                 raise ValueError(f"{name} must be increasing numbers {bounds}, got {axis.tolist()}")
             object.__setattr__(self, name, tuple(axis.tolist()))
 
@@ -75,41 +75,42 @@ class EnergyGrid:
         return list(product(*map(range, self.shape)))
 
     def values_at(self, index: ArrayLike) -> Floats:
-        """Roll-up fraction, relative standard deviation and mean [eV] at an index, whole or between points.
+        """Roll-up fraction, relative standard deviation and mean [eV] at an index, also between points.
 
         Parameters
         ----------
         index : array_like
-            Places on the three axes in steps of the grid, shape (..., 3).
+            Positions on the three axes in steps of the grid, shape (..., 3).
 
         Returns
         -------
         ndarray
-            Shape (..., 3); between two points the relative standard deviation goes geometrically, the others evenly.
+            Shape (..., 3). Interpolation between points is geometric for the relative standard deviation, and linear
+            for the others.
         """
         places = np.moveaxis(np.asarray(index, float), -1, 0)
         axes = np.array(self.rollup_fractions), np.log(self.rsds), np.array(self.means)
         fraction, rsd, mean = (np.interp(p, np.arange(len(a)), a) for p, a in zip(places, axes, strict=True))
         nearest = np.rint(places[1]).astype(int)
-        # a point of the grid is what was given, to the last bit
+        # exact values at the points of the grid, to the last bit
         rsd = np.where(places[1] == nearest, np.array(self.rsds)[nearest], np.exp(rsd))
         return np.stack([fraction, rsd, mean], axis=-1)
 
     def perturbation(self, fraction: float, rsd: float, mean: float) -> Perturbation:
-        """Perturbation of a roll-up fraction, a relative standard deviation and a mean [eV]."""
+        """Perturbation with a roll-up fraction, a relative standard deviation and a mean [eV]."""
         energy = TruncatedNormal(float(mean), float(rsd * mean))
         if self.mechanism == "combined":
             return Combined(energy, float(fraction))
         return (RollUp if self.mechanism == "roll-up" else LateralVelocity)(energy)
 
     def share_above(self, energy: float) -> Floats:
-        """Share of the ions with more than an energy [eV] at every point of the grid, shape `shape`."""
+        """Fraction of the ions above an energy [eV] at every point of the grid, shape `shape`."""
         means, rsds = np.array(self.means), np.array(self.rsds)[:, None]
-        share = scipy.special.ndtr((means - energy) / (rsds * means)) / scipy.special.ndtr(1 / rsds)
-        return np.broadcast_to(share, self.shape)
+        fraction = scipy.special.ndtr((means - energy) / (rsds * means)) / scipy.special.ndtr(1 / rsds)
+        return np.broadcast_to(fraction, self.shape)
 
     def around(self, cell: tuple[int, ...]) -> list[Floats]:
-        """Half steps within one step of a point of the grid, moved inwards at an end, on every axis.
+        """Half steps within one step of a point of the grid on every axis, shifted inwards at the ends.
 
         Parameters
         ----------
@@ -119,7 +120,8 @@ class EnergyGrid:
         Returns
         -------
         list of ndarray
-            Places on the three axes in steps of the grid: five, or only the point's own on an axis of less than three.
+            Positions on the three axes in steps of the grid: five, or only that of the point on an axis of less than
+            three.
         """
         return [
             np.clip(at, 1, number - 2) + _HALVES if number >= 3 else np.array([float(at)])
@@ -128,24 +130,24 @@ class EnergyGrid:
 
 
 def maxima(values: Floats) -> Integers:
-    """Indices of the greatest value in each of k matrices, shape (k, a, b, c); int of shape (k, 3)."""
+    """Indices of the largest value in each of k matrices, shape (k, a, b, c); int of shape (k, 3)."""
     return np.stack(np.unravel_index(values.reshape(len(values), -1).argmax(axis=1), values.shape[1:]), axis=1)
 
 
 def spline_maxima(places: list[Floats], values: Floats) -> Floats:
-    """Maxima of cubic splines through the points of `EnergyGrid.around`, to a 20th of a step.
+    """Maxima of cubic splines through the points of `EnergyGrid.around`, to 1/20 of a step.
 
     Parameters
     ----------
     places : list of ndarray
-        Places on the three axes, five or one.
+        Positions on the three axes, five or one.
     values : ndarray
-        At these places, shape (k, a, b, c).
+        Values at these positions, shape (k, a, b, c).
 
     Returns
     -------
     ndarray
-        Places of the k maxima, shape (k, 3).
+        Positions of the k maxima, shape (k, 3).
     """
     spline, fine = scipy.interpolate.make_interp_spline(_HALVES, np.eye(5))(_FINE), []
     for axis, along in enumerate(places):

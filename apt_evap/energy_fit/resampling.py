@@ -1,7 +1,7 @@
-"""Maps of one run, drawn again and again as the noise of its ions would have it.
+"""Resampled maps of a run, for the statistical errors from the noise of its ions.
 
-Resamples with all the noise once more would have twice that of the maps, and favour other energies. So they have a
-tenth of it, and their deviations count tenfold: the first order in the noise (the infinitesimal jackknife of B. Efron,
+Resamples with the full noise would have twice the noise of the maps, and favour other energies. So they have a tenth of
+the noise, and their deviations are multiplied by ten: first order in the noise (infinitesimal jackknife of B. Efron,
 J. R. Statist. Soc. B 54, 83 (1992)).
 """
 
@@ -19,25 +19,26 @@ from apt_evap.registration.register import Registration
 from apt_evap.simulation.run import Run
 
 NOISE = 0.1
-"""Noise of a resample, over that of the ions."""
+"""Noise of a resample, relative to that of the ions."""
 GROUPS = 1 << 16
-"""Most ions that are resampled one by one. With 256 groups of ions, errors of similarities came out 20 % too large."""
+"""Largest number of ions with separate weights. Measured: with 256 groups of ions, errors were 20 % too large."""
 
 
 class Sampler:
-    """Maps of one run in the measured frame, of all its ions and of resamples of them.
+    """Maps of a run in the measured frame, for all its ions and for resamples of them.
 
-    In a resample every ion has a weight of 1 and a tenth of the noise of a Poisson distribution of mean 1. All
-    perturbations and all replicas of an ion share it: resamples are paired. Of more than `GROUPS` ions, some share it.
+    In a resample the weight of an ion is 1 plus a tenth of the deviation of a Poisson number of mean 1 from its mean.
+    The weight is the same for all perturbations and replicas of an ion: resamples are paired. With more than `GROUPS`
+    ions, some ions have common weights.
 
     Parameters
     ----------
     run : Run
         The run.
     registration : Registration
-        Carries simulated hits into the measured frame.
+        Transform of simulated hits into the measured frame.
     measured : DetectorMap
-        Its edges are those of the maps.
+        Map with the edges of the bins.
     box : tuple of slice
         Rows and columns to keep.
     resamples : int
@@ -68,32 +69,32 @@ class Sampler:
         self._weights = np.concatenate([np.ones((shape[0], 1)), weights], axis=1, dtype=np.float32)
 
     def maps(self, perturbation: Perturbation, replicas: int) -> tuple[Floats, Floats | None]:
-        """Hits per bin of all ions and of each resample, and how the draws differ.
+        """Hits per bin of all ions and of each resample, and the noise of the draws.
 
         Parameters
         ----------
         perturbation : perturbation
-            How the ions start.
+            Perturbation of the ions.
         replicas : int
-            Draws of every ion, added up.
+            Number of draws per ion, which are summed.
 
         Returns
         -------
         maps : ndarray
             Shape (1 + resamples, ny, nx).
         noise : ndarray or None
-            Sum of the draws with weights of sum 0 and mean square 1: as much noise of the draws as in their sum, and no
-            signal; shape (ny, nx). None for a single draw.
+            Sum of the draws with weights of sum 0 and mean square 1: it has the same noise as the sum of the draws, but
+            no signal; shape (ny, nx). None for a single draw.
         """
         size = int(np.prod(self.shape))
-        binned = [self._cells(perturbation, replica) for replica in range(replicas)]
+        draws = [self._cells(perturbation, replica) for replica in range(replicas)]
         noise = None
         if replicas > 1:
             weights = np.linspace(-1, 1, replicas)
             weights /= np.sqrt((weights**2).mean())
-            counts = (np.bincount(cells, minlength=size) for cells, _ in binned)
+            counts = (np.bincount(cells, minlength=size) for cells, _ in draws)
             noise = sum(w * count for w, count in zip(weights, counts, strict=True)).reshape(self.shape)
-        cells, ions = (np.concatenate(parts) for parts in zip(*binned, strict=True))
+        cells, ions = (np.concatenate(parts) for parts in zip(*draws, strict=True))
         if not self.resamples:
             return np.bincount(cells, minlength=size).reshape(1, *self.shape).astype(float), noise
         ones = np.ones(len(cells), np.float32)
@@ -101,7 +102,7 @@ class Sampler:
         return (table @ self._weights).T.reshape(-1, *self.shape).astype(float), noise
 
     def _cells(self, perturbation, replica):
-        """Bin of each ion that lies in the box, and which ions these are."""
+        """Bins and indices of the ions within the box."""
         hits = self.registration.hits(drawn_hits(self.run, perturbation, replica))
         detected = hits.detected
         index = []
@@ -116,9 +117,9 @@ class Sampler:
 
 
 def drawn_hits(run: Run, perturbation: Perturbation, replica: int) -> Hits:
-    """Hits of one draw of the energies and directions of all ions; draw 0 is that of the run itself."""
-    if replica:  # a seed next to that of the run may be that of another run
+    """Hits for one draw of the energies and directions of all ions; replica 0 is that of the run."""
+    if replica:  # derived, because an adjacent seed may be that of another run
         seed = np.random.SeedSequence((run.seed, replica)).generate_state(1, np.uint64)[0]
         run = replace(run, seed=int(seed))
-    # what was flown in the run was flown with its own seed
+    # flights of the run used its own seed
     return run.hits(perturbation, by_response=bool(replica))

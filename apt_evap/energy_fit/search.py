@@ -1,4 +1,4 @@
-"""Similarities of the maps of one run with a measured one: the search of `fit_energies`, and its registration."""
+"""Search of `fit_energies`: similarities of the maps of a run with a measured one, and the registration."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -25,15 +25,15 @@ from apt_evap.registration.register import Registration, register
 from apt_evap.simulation.run import Run
 
 ROUGH = 4
-"""Draws of every ion for the registration."""
+"""Number of draws per ion for the registration."""
 FLATTENING = 0.15
-"""Width of the Gaussian that flattens both maps, over the square root of the area compared."""
+"""Width of the Gaussian that flattens both maps, relative to the square root of the compared area."""
 INTERVAL = 95.0  # percent of the resamples
-_MAX_ROUNDS = 5  # of registration and search
+_MAX_ROUNDS = 5  # of alternating registration and search
 
 
 class EnergySearch:
-    """Similarities of one run with one measured map, in the frame of the registration that `place` gives."""
+    """Similarities of a run with a measured map, for the registration set by `place`."""
 
     def __init__(
         self,
@@ -50,7 +50,7 @@ class EnergySearch:
         self.disable = None if progress is None else not progress
 
     def place(self, registration: Registration, resamples: int) -> None:
-        """Take a registration: find the region that measured and simulated maps show."""
+        """Set the registration, and find the common region of measured and simulated maps."""
         region = self.measured
         mask = region.mask & field_of_view(np.where(region.mask, region.values, 0))
         for perturbation in (Unperturbed(), self.perturbation(self.middle)):
@@ -71,50 +71,51 @@ class EnergySearch:
         return self.grid.perturbation(*self.grid.values_at(index))
 
     def hits(self, index: ArrayLike) -> Hits:
-        """Hits of some draws of all ions at an index of the grid, in the frame of the run."""
-        drawn = [drawn_hits(self.run, self.perturbation(index), replica) for replica in range(ROUGH)]
-        x, y = (np.concatenate([getattr(hits, name) for hits in drawn]) for name in ("x", "y"))
+        """Hits of several draws of all ions at an index of the grid, in the frame of the run."""
+        draws = [drawn_hits(self.run, self.perturbation(index), replica) for replica in range(ROUGH)]
+        x, y = (np.concatenate([getattr(hits, name) for hits in draws]) for name in ("x", "y"))
         return Hits(x=x, y=y)
 
     def polished(self, registration: Registration, index: ArrayLike) -> Registration:
-        """The transform near a registration that makes the map of a point of the grid most alike.
+        """Refined registration with the largest similarity for a point of the grid.
 
-        Of maps whose lines all meet in one pole `register` may miss the scale: by 1.7 % in a twin experiment (Ni[111],
-        R = 40 a, 200,000 ions, lateral energies), by 0.2 % after this, and by 0.6 % with the two specimens exchanged.
+        If all lines of a map cross in one pole, the scale of `register` may be inaccurate. Measured in a twin
+        experiment (Ni[111], R = 40 a, 200,000 ions, lateral energies): error 1.7 %, after this refinement 0.2 %, or 0.6
+        % with the two specimens exchanged.
         """
         region, hits = self.region, self.hits(index)
         bin_size = max(region.bin_size)
-        smoothing = max(self.settings.smoothing, bin_size)  # less is too rough a ground to search on
+        smoothing = max(self.settings.smoothing, bin_size)  # less is too rough for a search
         settings = replace(self.comparison.settings, smoothing=smoothing, resamples=0, seed=0)
         comparison = Comparison(region, settings)
 
         def moved(steps):
             turn, stretch, x, y = steps * np.array([0.5, 0.015, bin_size, bin_size])  # degrees, logarithm, mm
             shift = registration.shift[0] + x, registration.shift[1] + y
-            turned = {"rotation": registration.rotation + turn, "scale": registration.scale * np.exp(stretch)}
-            return replace(registration, shift=shift, **turned)
+            changes = {"rotation": registration.rotation + turn, "scale": registration.scale * np.exp(stretch)}
+            return replace(registration, shift=shift, **changes)
 
-        def unlike(steps):
+        def dissimilarity(steps):
             counts = DetectorMap.from_hits(moved(steps).hits(hits), like=region, quantum=None).counts
             return -comparison.similarities(counts[comparison.box][None])[0]
 
         simplex = np.vstack([np.zeros(4), np.eye(4)])
         options = {"initial_simplex": simplex, "xatol": 0.01, "fatol": 1e-5, "maxfev": 200}
         bounds = scipy.optimize.Bounds(np.full(4, -4.0), np.full(4, 4.0))
-        best = scipy.optimize.minimize(unlike, simplex[0], method="Nelder-Mead", bounds=bounds, options=options)
+        best = scipy.optimize.minimize(dissimilarity, simplex[0], method="Nelder-Mead", bounds=bounds, options=options)
         return moved(best.x)
 
     def scores(self, perturbation: Any, replicas: int) -> Floats:
-        """Similarity of all ions, and of each resample, shape (1 + resamples,)."""
+        """Similarities of all ions and of each resample, shape (1 + resamples,)."""
         return self.comparison.similarities(*self.sampler.maps(perturbation, replicas))
 
     def matrix(self, replicas: int, note: Any, places: Any = None) -> Floats:
-        """Similarities at places on the three axes, the whole grid by default; shape (1 + resamples, a, b, c)."""
+        """Similarities at positions on the three axes, by default the complete grid; shape (1 + resamples, a, b, c)."""
         places = [np.arange(number) for number in self.grid.shape] if places is None else places
-        tried = [self.perturbation(index) for index in product(*places)]
+        perturbations = [self.perturbation(index) for index in product(*places)]
         with (
             ThreadPoolExecutor(self.n_threads) as pool,
-            progress_bar(total=len(tried), unit=" maps", desc=note, disable=self.disable) as bar,
+            progress_bar(total=len(perturbations), unit=" maps", desc=note, disable=self.disable) as bar,
         ):
 
             def scores(perturbation):
@@ -122,13 +123,13 @@ class EnergySearch:
                 bar.update()
                 return similarities
 
-            values = np.stack(list(pool.map(scores, tried)), axis=1)
+            values = np.stack(list(pool.map(scores, perturbations)), axis=1)
         return values.reshape(-1, *map(len, places))
 
     def refine(self, values: Floats, cells: Any, replicas: int) -> Floats:
-        """Places of the maxima between the points, shape (1 + resamples, 3).
+        """Positions of the maxima between the points, shape (1 + resamples, 3).
 
-        They are looked for within a step of the best point; a resample whose best point lies elsewhere keeps that.
+        The search is within one step of the best point. A resample with its best point elsewhere keeps that point.
         """
         places = self.grid.around(cells[0])
         refined = spline_maxima(places, self.matrix(replicas, "between points", places))
@@ -137,7 +138,7 @@ class EnergySearch:
         return np.where(near[:, None], refined, cells)
 
     def optimum(self, index: Any, replicas: int) -> Optimum:
-        """The `Optimum` at an index of the grid, shape (1 + resamples, 3), those of the resamples for its intervals."""
+        """`Optimum` at indices of the grid, shape (1 + resamples, 3); those of the resamples give its intervals."""
         fraction, rsd, mean = self.grid.values_at(index).T
         energies = [TruncatedNormal(m, s * m) for m, s in zip(mean, rsd, strict=True)]
         numbers = {
@@ -167,10 +168,10 @@ class EnergySearch:
         )
 
     def map_and_scores(self, perturbation: Any, replicas: int) -> tuple[DetectorMap, Floats, Floats]:
-        """The simulated map on the measured bins, its similarities and those with noise, shape (1 + resamples,)."""
-        drawn, noise = self.sampler.maps(perturbation, replicas)
+        """Simulated map on the measured bins, its corrected and uncorrected similarities, each (1 + resamples,)."""
+        maps, noise = self.sampler.maps(perturbation, replicas)
         counts = np.zeros(self.region.values.shape, np.int64)
-        counts[self.comparison.box] = drawn[0]
+        counts[self.comparison.box] = maps[0]
         ions = int(counts[self.region.mask].sum())
         source = f"simulation, {perturbation!r}"
         simulated = replace(
@@ -184,7 +185,7 @@ class EnergySearch:
             detected=None,
         )
         similarities = self.comparison.similarities
-        return simulated, similarities(drawn, noise), similarities(drawn, noise, plain=True)
+        return simulated, similarities(maps, noise), similarities(maps, noise, plain=True)
 
     def ceiling(self) -> Score | None:
         """Similarity of two halves of the measured ions, None for densities."""
@@ -195,12 +196,12 @@ class EnergySearch:
 
 
 def registered(search: EnergySearch) -> tuple[Registration, list[dict[str, Any]]]:
-    """Register with the middle of the grid, then with the best point, until that stays; polished, and the rounds."""
+    """Register with the middle of the grid, then with the best point until it is stable; refine. Result and rounds."""
     registration: Any = None
     best, rounds = search.middle, []
     for _ in range(_MAX_ROUNDS):
         registration = register(search.hits(best), search.measured, start=registration)
-        registration = replace(registration, method="search")  # of the first round, which the others start from
+        registration = replace(registration, method="search")  # of the first round, from which the others start
         rounds.append({"perturbation": to_dict(search.perturbation(best)), "registration": registration.to_dict()})
         search.place(registration, 0)
         previous, best = best, tuple(maxima(search.matrix(ROUGH, "registration"))[0])

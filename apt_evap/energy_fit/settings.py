@@ -1,4 +1,4 @@
-"""Settings of a study: how maps are compared, drawn and resampled."""
+"""Settings of a study: comparison, random draws and resampling of maps."""
 
 from dataclasses import dataclass
 
@@ -8,23 +8,24 @@ from apt_evap.emission.energies import Thermal
 
 @dataclass(frozen=True)
 class StudySettings:
-    """How simulated maps are compared with a measured one, drawn and resampled, as `fit_energies` sets it.
+    """Settings of `fit_energies`: comparison, random draws and resampling of maps.
 
     Parameters
     ----------
     smoothing : float
-        Standard deviation of the Gaussian that both maps are smoothed with [mm]; 0 for none.
+        Standard deviation of the Gaussian that smooths both maps [mm]; 0 for none.
     flattening : float, optional
-        Standard deviation of the Gaussian that both maps are flattened by [mm]; 0 for none. None until the region is
-        known whose area sets it.
+        Standard deviation of the Gaussian that flattens both maps [mm]; 0 for none. None until it follows from the area
+        of the compared region.
     data_range : float
         Range of densities, as for `ssim`.
     allow_noise : bool
-        Whether noise counts as alike: that of Poisson of measured counts, that of the draws of simulated ions.
+        Whether the similarity is corrected for noise: the Poisson noise of measured counts, and the noise of the random
+        draws of simulated ions.
     replicas : int
-        Draws of the energy and direction of every ion, added up.
+        Number of draws of energy and direction per ion, which are summed.
     resamples : int
-        Draws of all measured and simulated ions with replacement, for the errors.
+        Number of resamples of all measured and simulated ions, for the errors.
     seed : int
         Seed of the resamples.
     temperature : float
@@ -33,7 +34,7 @@ class StudySettings:
     Raises
     ------
     ValueError
-        If a value is out of range.
+        If a value is outside its range.
     """
 
     smoothing: float

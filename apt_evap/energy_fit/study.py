@@ -1,4 +1,4 @@
-"""What a search for emission energies found: similarities, the best energies, how sure they are."""
+"""Result of a fit of emission energies: similarities, the best energies, their errors."""
 
 import json
 from dataclasses import asdict, dataclass, replace
@@ -17,14 +17,14 @@ from apt_evap.registration.register import Registration
 
 
 class Score(NamedTuple):
-    """A similarity and its standard deviation over the resamples, NaN without any."""
+    """A similarity and its standard deviation over the resamples (NaN without resamples)."""
 
     value: float
     error: float
 
     @classmethod
     def of_resamples(cls, similarities: Floats) -> "Score":
-        """The first similarity, that of all ions, with the standard deviation over the others, of resamples."""
+        """Return the first similarity, for all ions, with the standard deviation of the others, for resamples."""
         error = similarities[1:].std(ddof=1) if len(similarities) > 2 else np.nan
         return cls(float(similarities[0]), float(error))
 
@@ -34,27 +34,26 @@ class Score(NamedTuple):
 
 @dataclass(frozen=True)
 class Optimum:
-    """Energies at which a simulated map is most like the measured one.
+    """Energies with the largest similarity of simulated and measured map.
 
     Parameters
     ----------
     perturbation : perturbation
-        How the ions start.
+        Perturbation of the ions.
     mean : float
-        Mean of the energy before the cut [eV].
+        Mean of the energy before the truncation [eV].
     rsd : float
-        Its standard deviation before the cut, over the mean.
+        Standard deviation before the truncation, relative to the mean.
     rollup_fraction : float
-        Share of the energy in the roll-up.
+        Fraction of the energy for the roll-up.
     true_mean, true_standard_deviation : float
-        Of the energies after the cut [eV].
+        Mean and standard deviation after the truncation [eV].
     score : Score
         Similarity with the measured map.
     intervals : dict
-        For each of these five numbers by name, the bounds between which 95 % of the resamples have it; empty without
-        resamples.
+        Bounds of the central 95 % of the resamples, for each of these five numbers by name; empty without resamples.
     at_edge : tuple of str
-        "mean" and "rsd" where it lies at an end of the grid, so that the energies may be beyond.
+        "mean" and "rsd" if they are at an end of the grid: the best energies may then be beyond it.
     """
 
     perturbation: object
@@ -68,18 +67,18 @@ class Optimum:
     at_edge: tuple
 
     def to_dict(self) -> dict[str, Any]:
-        """Return it in plain types, dict."""
+        """Return the optimum in plain types, dict."""
         return asdict(self) | {"perturbation": to_dict(self.perturbation), "score": self.score._asdict()}
 
     def bounded(self, name: str) -> str:
-        """Say one of the numbers and its interval, str."""
+        """Text of one of the numbers and its interval, str."""
         value = f"{getattr(self, name):.3g}"
         return f"{value} ({self.intervals[name][0]:.3g} to {self.intervals[name][1]:.3g})" if self.intervals else value
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Study:
-    """Similarity of simulated maps with a measured one for a grid of energies; made by `fit_energies`.
+    """Similarity of simulated maps with a measured one for a grid of energies; result of `fit_energies`.
 
     Matrices have the shape (rollup fractions, relative standard deviations, means).
 
@@ -88,35 +87,35 @@ class Study:
     grid : EnergyGrid
         Mechanism and energies.
     ssim, errors : ndarray
-        Structural similarity at every point of the grid, noise allowed for unless `settings` say otherwise, and its
-        standard deviation over the resamples. So allowed for, it is about 1 for the truth: 0.97 to 1.06 in twin
-        experiments, and above that where both maps have noise in common, as those of one run.
+        Structural similarity at every point of the grid (noise-corrected unless switched off in `settings`), and its
+        standard deviation over the resamples. With the correction it is about 1 for the true energies: 0.97 to 1.06 in
+        twin experiments, and larger if both maps have common noise, such as two maps of one run.
     shares : ndarray
-        Share of the resamples in which a point is the best.
+        Fraction of the resamples in which a point is the best.
     resampled : ndarray
         Similarities in every resample, shape (resamples, a, b, c).
     optimum, refined : Optimum
-        The best point of the grid, and that of a smooth model around it.
+        The best point of the grid, and the maximum of a spline around it.
     baselines : dict of Score
         Similarity of "unperturbed" and "thermal" maps.
     plain : dict of Score
-        Structural similarity, noise and all, of "unperturbed", "thermal" and "optimum": what stands beside the ceiling.
+        Uncorrected structural similarity of "unperturbed", "thermal" and "optimum", for comparison with the ceiling.
     gain : Score
-        Similarity of the optimum less that of the unperturbed map, in pairs of resamples.
+        Similarity of the optimum minus that of the unperturbed map, for paired resamples.
     gain_share : float
-        Share of the resamples in which the optimum is better than the unperturbed map.
+        Fraction of the resamples in which the optimum is better than the unperturbed map.
     ceiling : Score or None
-        Structural similarity of two random halves of the measured ions, noise and all; None for a map of densities.
+        Uncorrected structural similarity of two random halves of the measured ions; None for a map of densities.
     registration : Registration
-        Carries simulated hits into the measured frame.
+        Transform of simulated hits into the measured frame.
     measured : DetectorMap
-        The measured map; its mask is the region compared.
+        The measured map; its mask is the compared region.
     maps : dict of DetectorMap
         Simulated maps in the measured frame: "unperturbed", "thermal", "optimum".
     settings : StudySettings
-        How maps were compared, drawn and resampled.
+        Settings of the comparison, the random draws and the resampling.
     provenance : dict
-        Everything else the study was made with, in plain types: run, measured map, bins, rounds of the registration.
+        All other input of the study, in plain types: run, measured map, bins, rounds of the registration.
     """
 
     grid: EnergyGrid
@@ -138,7 +137,7 @@ class Study:
     provenance: dict
 
     def compared(self, map: DetectorMap) -> DetectorMap:
-        """Return a map of the measured frame as it is compared: in the common region, flattened and smoothed."""
+        """Prepare a map of the measured frame as for the comparison: common region, flattened and smoothed."""
         flat = replace(map, mask=self.measured.mask).flattened(self.settings.flattening or 0.0)
         return flat.smoothed(self.settings.smoothing)
 
@@ -153,17 +152,17 @@ class Study:
         return plain(results | {"settings": asdict(self.settings) | self.provenance})
 
     def save(self, path: AnyPath) -> None:
-        """Write results and settings to a JSON file, whole or not at all.
+        """Write results and settings to a JSON file; the file is replaced only when complete.
 
         Parameters
         ----------
         path : str or path-like
-            The file to write or overwrite.
+            File to write or replace.
 
         Raises
         ------
         FileError
-            If it cannot be written.
+            If the file cannot be written.
         """
         with replace_file(path) as file:
             file.write((json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n").encode())
@@ -171,11 +170,11 @@ class Study:
     def __repr__(self) -> str:
         best, refined = self.optimum, self.refined
         combined = self.grid.mechanism == "combined"
-        share = f", roll-up fraction {best.rollup_fraction:g}" if combined else ""
+        fraction = f", roll-up fraction {best.rollup_fraction:g}" if combined else ""
         edge = f" (at the end of the grid in {' and '.join(best.at_edge)})" if best.at_edge else ""
         others = [f"{name} {score}" for name, score in self.baselines.items()]
-        noisy = f";\n noise and all {self.plain['optimum']}, " if self.settings.allow_noise else ", "
-        others = f"{', '.join(others)}, gain over unperturbed {self.gain}" + (noisy if self.ceiling else "")
+        uncorrected = f";\n uncorrected {self.plain['optimum']}, " if self.settings.allow_noise else ", "
+        others = f"{', '.join(others)}, gain over unperturbed {self.gain}" + (uncorrected if self.ceiling else "")
         others += f"two halves of the measured ions {self.ceiling}" if self.ceiling else ""
         between = f"{refined.bounded('mean')} eV, sigma/mean {refined.bounded('rsd')}"
         between += f", roll-up fraction {refined.bounded('rollup_fraction')}" if combined else ""
@@ -184,14 +183,14 @@ class Study:
         radius = run["tip"].get("apex_radius")
         scale = f" at {run['voltage']:g} V" + (f" and R = {radius:.3g} nm" if radius else "")
         return (
-            f"<Study: {self.grid.mechanism}{doubtful}, best at {best.mean:g} eV, sigma/mean {best.rsd:g}{share}{edge}, "
-            f"SSIM {best.score}; {others};\n between points {between}; energies "
+            f"<Study: {self.grid.mechanism}{doubtful}, best at {best.mean:g} eV, sigma/mean {best.rsd:g}{fraction}"
+            f"{edge}, SSIM {best.score}; {others};\n between points {between}; energies "
             f"{refined.bounded('true_mean')} ± {refined.bounded('true_standard_deviation')} eV{scale}>"
         )
 
 
 def plain(value: Any) -> Any:
-    """Return a value in the types of JSON; NaN and infinities become None."""
+    """Return a value in the types of JSON; NaN and infinity become None."""
     if isinstance(value, dict):
         return {str(key): plain(each) for key, each in value.items()}
     if isinstance(value, list | tuple):

@@ -1,1 +1,1 @@
-"""The charged surface and the sequence of atoms that leave it: settings, laws, the emitter and its state."""
+"""The charged surface and the sequence of evaporation: settings, rules, laws, the emitter and its state."""

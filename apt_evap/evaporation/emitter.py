@@ -1,4 +1,4 @@
-"""The emitter: the charged surface of a specimen, and the sequence of atoms that leave it."""
+"""The emitter: the charged surface of a specimen, and the sequence of its evaporating atoms."""
 
 import warnings
 from collections.abc import Callable, Iterator
@@ -27,34 +27,34 @@ from apt_evap.specimen.ase_atoms import to_atoms
 from apt_evap.specimen.tip import Tip
 from apt_evap.units import COULOMB
 
-RECORD = 16_384  # events after which a batch comes with a tree in any case, so that nobody has to keep the journals
-BATCH = 256  # events at a time; results do not depend on it
+RECORD = 16_384  # events after which a batch contains a tree in any case, so that journals need not be kept
+BATCH = 256  # events per batch; results do not depend on it
 
 __all__ = ["BATCH", "DONE", "EXHAUSTED", "SWEEP_DUE", "TOO_SHALLOW", "Batch", "Emitter"]
 
-_MAX_EVENTS = 10_000_000  # at a time: 720 MB of results
+_MAX_EVENTS = 10_000_000  # per call: 720 MB of results
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Batch:
-    """Atoms that left one after the other.
+    """A sequence of evaporated atoms.
 
     Parameters
     ----------
     site : ndarray of int64, shape (n,)
         Index of each atom in the specimen.
     charges : ndarray, shape (n,)
-        Charge before it left [e].
+        Charge before evaporation [e].
     fields : ndarray, shape (n,)
-        Field just outside before it left [V/nm].
+        Field just outside the surface before evaporation [V/nm].
     normals : ndarray, shape (n, 3)
         Outward unit normal.
     neighbour : ndarray of int64, shape (n,)
         Index of the surface nearest neighbour with the highest charge; -1 if there was none.
     journal : Journal
-        What each event changed in the tree.
+        Changes of the tree by each event.
     tree : Octree or None
-        Copy of the tree before the first event, if it was built anew since the batch before, or that was long ago.
+        Copy of the tree before the first event, if it was rebuilt after the previous batch, or long ago.
     status : int
         DONE, SWEEP_DUE, EXHAUSTED or TOO_SHALLOW.
     """
@@ -73,7 +73,7 @@ class Batch:
 
     def __repr__(self) -> str:
         status = {DONE: "done", SWEEP_DUE: "sweep due", EXHAUSTED: "exhausted", TOO_SHALLOW: "too shallow"}[self.status]
-        return f"<Batch: {len(self):,} atoms left one after the other; {status}>"
+        return f"<Batch: {len(self):,} evaporated atoms; {status}>"
 
 
 class Emitter:
@@ -86,19 +86,18 @@ class Emitter:
     voltage : float
         Applied voltage [V].
     law : law, optional
-        Which atom leaves next; by default `Extremal`. One of your own: see `apt_evap.evaporation.law.Law`.
+        Selects the next atom to evaporate; by default `Extremal`. Interface: `apt_evap.evaporation.law.Law`.
     settings : ChargeSettings
-        How finely the charges are solved.
+        Accuracy of the charges.
     n_threads : int, optional
-        Threads; by default the processors this process may use.
+        Number of threads; by default the number of processors that this process may use.
     rule : charging rule, optional
-        How charge distributes over the surface; by default `Robin`. One of your own: see
-        `apt_evap.evaporation.rule.Rule`.
+        Distribution of the charge over the surface; by default `Robin`. Interface: `apt_evap.evaporation.rule.Rule`.
 
     Raises
     ------
     ValueError
-        If the voltage is not above 0, or the specimen has no surface atom that may leave.
+        If the voltage is not positive, or if the specimen has no evaporable surface atom.
     """
 
     def __init__(
@@ -130,17 +129,17 @@ class Emitter:
             self.settings.update_radius * distance,
             self.settings.opening_angle,
         )
-        self._left, self._deepened = [], []  # sites batch by batch; events at which more of the specimen was held
+        self._sites, self._deepened = [], []  # evaporated atoms of each batch; numbers of events before each deepening
         if not tip.evaporable[self._core.atoms.surface].any():
             raise ValueError(f"{tip!r} has no evaporable surface atom")
         self.relax(tolerance=self.settings.start_tolerance)
         if self._core.next_slot < 0:
             raise ValueError(
-                f"law {describe(self.law)['name']} gives no surface atom of {tip!r} a key above 0: no atom may leave"
+                f"law {describe(self.law)['name']} gives no surface atom of {tip!r} a key > 0: no atom can evaporate"
             )
         self.sweep_interval = self.settings.sweep_interval or max(100, len(self) // 300)
 
-    def _neighbourhood_of(self, tip, before=None):
+    def _neighbourhood_of(self, tip, previous=None):
         return Neighbourhood(
             tip.positions,
             tip.neighbour_radius,
@@ -148,14 +147,14 @@ class Emitter:
             tip.support.view(np.int8),
             tip.bond_length,
             usable_threads(self.n_threads),
-            before,
+            previous,
         )
 
     def __len__(self) -> int:
         return len(self._core.slots)
 
     def __reduce__(self):
-        raise TypeError("an Emitter cannot be pickled or copied: make one of the same tip and restore its `state()`")
+        raise TypeError("an Emitter cannot be pickled or copied: make a new one and restore its `state()`")
 
     def __repr__(self) -> str:
         return f"<Emitter: {len(self):,} surface atoms of {len(self.tip.positions):,} at {self.voltage:g} V>"
@@ -180,33 +179,33 @@ class Emitter:
         """Charges of the surface atoms [e], shape (n,)."""
         return self._core.tree.charges[self._core.slots]
 
-    def charge_residuals(self, chosen: Integers) -> Floats:
-        """How far charges are from the equation of the charging rule, by direct sums over all others.
+    def charge_residuals(self, selection: Integers) -> Floats:
+        """Residuals of the equation of the charging rule, by direct sums over all other atoms.
 
         Parameters
         ----------
-        chosen : ndarray of int, shape (m,)
-            Which of the surface atoms.
+        selection : ndarray of int, shape (m,)
+            Indices of surface atoms.
 
         Returns
         -------
         ndarray, shape (m,)
-            Residuals over the mean charge; NaN for a rule that cannot say.
+            Residuals relative to the mean charge; NaN for a rule that does not define them.
         """
-        return self._core.rule.residuals(self.positions, self.normals, self.charges, chosen)
+        return self._core.rule.residuals(self.positions, self.normals, self.charges, selection)
 
     @property
     def fields(self) -> Floats:
         """Fields just outside the surface atoms [V/nm], shape (n,).
 
-        What the law sees. By Robin's rule F_i = 4 pi k_e q_i / s, with s the area per surface atom: the field at the
-        outer face of a charged surface.
+        The input of the law. For Robin's rule F_i = 4 pi k_e q_i / s, with s the area per surface atom: the field at
+        the outer side of a charged surface.
         """
         return self._core.slot_fields[self._core.slots]
 
     @property
     def bonds(self) -> Integers:
-        """Nearest neighbours of the surface atoms that are still there, shape (n,)."""
+        """Number of remaining nearest neighbours of each surface atom, shape (n,)."""
         return self._core.atoms.bond_counts[self.atoms].astype(np.int64)
 
     def to_atoms(self) -> Any:
@@ -215,19 +214,19 @@ class Emitter:
         Returns
         -------
         ase.Atoms
-            With arrays "charge" [e], "field" [V/nm], "normal" and "atom", the index in the specimen.
+            With arrays "charge" [e], "field" [V/nm], "normal" and "atom" (index in the specimen).
         """
         arrays = {"charge": self.charges, "field": self.fields, "normal": self.normals, "atom": self.atoms}
         return to_atoms(self.positions, self.tip.elements, self.tip.species[self.atoms], **arrays)
 
     @property
     def area_per_atom(self) -> float:
-        """Area s of the surface per atom, as of the last relaxation [nm^2]."""
+        """Area s per surface atom at the last relaxation [nm^2]."""
         return self._core.rule.area
 
     @property
     def counts(self) -> dict[str, int]:
-        """Events so far, charges that came out negative and were set to 0, patches that did not settle; dict of int."""
+        """Numbers of events, of negative charges set to 0, and of patches that did not converge; dict of int."""
         core = self._core
         return {"events": core.n_removed, "clipped": core.n_clipped, "unsettled": core.n_unsettled}
 
@@ -237,7 +236,7 @@ class Emitter:
         Parameters
         ----------
         points : array_like, shape (m, 3)
-            Where [nm].
+            Positions [nm].
         opening_angle : float
             See `ChargeSettings`; 0 sums over all atoms.
 
@@ -255,20 +254,20 @@ class Emitter:
         return COULOMB * self._core.tree.potentials(points, opening_angle, usable_threads(self.n_threads))
 
     def relax(self, tolerance: float | None = None) -> tuple[int, float]:
-        """Bring the whole surface to equilibrium at the applied voltage.
+        """Solve the charges of the whole surface at the applied voltage.
 
         Parameters
         ----------
         tolerance : float, optional
-            Change of a charge in the last sweep, relative to the mean charge. By default the one of the settings, and
-            with their `relaxation_angle`; one given here is reached with the finer `opening_angle`.
+            Largest change of a charge in the last sweep, relative to the mean charge. By default `tolerance` of the
+            settings, with their `relaxation_angle`; a value passed here is used with the smaller `opening_angle`.
 
         Returns
         -------
         sweeps : int
-            Sweeps done.
+            Number of sweeps.
         residual : float
-            The change in the last one.
+            Largest change in the last sweep, relative to the mean charge.
         """
         angle = self.settings.relaxation_angle if tolerance is None else self.settings.opening_angle
         tolerance = self.settings.tolerance if tolerance is None else tolerance
@@ -281,7 +280,7 @@ class Emitter:
         outcome = self._core.relax(
             tolerance=tolerance,
             opening_angle=angle,
-            double_precision=tolerance < 1e-6,  # below it the rounding of float32 keeps charges moving
+            double_precision=tolerance < 1e-6,  # below it the rounding of float32 prevents convergence
             n_threads=usable_threads(self.n_threads),
             start=start,
         )
@@ -296,15 +295,15 @@ class Emitter:
         return outcome
 
     def state(self) -> EmitterState:
-        """What rebuilds the surface as its last relaxation left it.
+        """State from which the surface after the last relaxation can be rebuilt.
 
         Returns
         -------
         EmitterState
         """
         start = self._core.start
-        sites = np.concatenate([np.empty(0, np.int64), *self._left])
-        self._left = [sites]
+        sites = np.concatenate([np.empty(0, np.int64), *self._sites])
+        self._sites = [sites]
         tolerance, angle, clipped, unsettled = self._relaxed
         return EmitterState(
             sites=sites[: start.n_removed],
@@ -320,52 +319,52 @@ class Emitter:
         )
 
     def restore(self, state: EmitterState) -> None:
-        """Rebuild the surface that another emitter of the same settings had.
+        """Rebuild the surface of another emitter with the same settings.
 
         Parameters
         ----------
         state : EmitterState
-            Of the other; the surface becomes what its last relaxation left, and events go on from there.
+            State of the other emitter: its surface after its last relaxation, from which events continue.
 
         Raises
         ------
         ValueError
-            If atoms have left already, or the state is of another specimen.
+            If atoms have already evaporated, or if the state is of another specimen.
         """
         if self.counts["events"]:
-            raise ValueError(f"restore needs a new emitter, got one that {self.counts['events']:,} atoms have left")
-        done = 0
+            raise ValueError(f"restore needs a new emitter, got one with {self.counts['events']:,} evaporated atoms")
+        first = 0
         for event in state.deepened:
-            self._core.atoms.remove_atoms(state.sites[done:event])
-            self._hold_more()
-            done = event
-        self._core.atoms.remove_atoms(state.sites[done:])
+            self._core.atoms.remove_atoms(state.sites[first:event])
+            self._extend()
+            first = event
+        self._core.atoms.remove_atoms(state.sites[first:])
         if not np.isin(state.lonely, self._core.atoms.surface).all() or len(state.lonely) != len(state.lonely_normals):
             raise ValueError("lonely must be surface atoms, each with a normal: the state is of another specimen")
-        self._left, self._deepened = [state.sites], list(state.deepened)
+        self._sites, self._deepened = [state.sites], list(state.deepened)
         self._core.n_clipped, self._core.n_unsettled = state.clipped, state.unsettled
         start = Start(len(state.sites), state.charges, state.lonely, state.lonely_normals, state.rule_state)
         self._relax(state.tolerance, state.opening_angle, start)
 
     def hand_out_tree(self) -> None:
-        """Let the next batch come with a copy of the tree, for flights that have not followed the events so far."""
+        """Add a copy of the tree to the next batch, for flights that have not followed the earlier events."""
         self._recorded = RECORD
 
     def deepen(self) -> None:
-        """Hold more of the specimen, after `evaporate` came upon atoms that are only held as support.
+        """Extend the shell of the specimen, after `evaporate` reached its support atoms.
 
-        The atoms held so far keep their numbers.
+        The atoms of the previous shell keep their numbers.
 
         Raises
         ------
         ValueError
-            If the specimen has nothing below: one made from positions.
+            If the specimen is not a shell, such as one made from positions.
         """
-        self._hold_more()
+        self._extend()
         self._deepened.append(self._core.n_removed)
         self.relax()
 
-    def _hold_more(self):
+    def _extend(self):
         tip = self.tip.deepened()
         neighbourhood = self._neighbourhood_of(tip, self._core.atoms)
         self._core.take_over(neighbourhood, kernel_of(self.law, tip))
@@ -374,19 +373,19 @@ class Emitter:
     def evaporate(self, max_events: int) -> Batch:
         """Evaporate up to `max_events` atoms.
 
-        Stops early if the surface must be relaxed, the shell deepened, or no atom is left; `advance` does that by
+        Stops early if the surface must be relaxed, the shell deepened, or no atom is left; `advance` does this by
         itself.
 
         Parameters
         ----------
         max_events : int
-            Events at most.
+            Maximum number of events.
 
         Returns
         -------
         Batch
-            Its status says why it ended: DONE, SWEEP_DUE (call `relax` and continue), EXHAUSTED, TOO_SHALLOW (call
-            `deepen` and continue).
+            Its status is the reason for its end: DONE, SWEEP_DUE (call `relax` and continue), EXHAUSTED or TOO_SHALLOW
+            (call `deepen` and continue).
         """
         n = check_count(max_events, "max_events", at_least=1, at_most=_MAX_EVENTS)
         journal = Journal(self.tip.positions, n)
@@ -396,7 +395,7 @@ class Emitter:
         status = self._core.evaporate(journal, n, self.sweep_interval, site, charges, fields, normals, neighbour)
         n = journal.n_events
         self._recorded = n if tree is not None else self._recorded + n
-        self._left.append(site[:n].copy())
+        self._sites.append(site[:n].copy())
         return Batch(
             site=site[:n],
             charges=charges[:n],
@@ -419,18 +418,18 @@ class Emitter:
         Parameters
         ----------
         n_events : int
-            Atoms to evaporate.
+            Number of atoms to evaporate.
         batch_size : int
-            Events at a time; the sequence does not depend on it.
+            Events per batch; the sequence does not depend on it.
         pause : callable, optional
-            Gives a context in which the surface is relaxed or the shell deepened: what needs the processors, or the
-            specimen as it was, stands still in it.
+            Returns a context in which the surface is relaxed or the shell deepened. Other work that needs the
+            processors, or the unchanged specimen, must stop in this context.
 
         Yields
         ------
         Batch
-            May be empty. What its status asks for is done once the next batch is asked for, so that the surface can be
-            looked at before. The last one is EXHAUSTED if no atom is left.
+            May be empty. The relaxation or deepening follows when the next batch is requested, so that the surface can
+            be inspected before. The last batch is EXHAUSTED if no atom is left.
         """
         n_events = check_count(n_events, "n_events", at_least=0)
         batch_size = check_count(batch_size, "batch_size", at_least=1, at_most=_MAX_EVENTS)

@@ -1,4 +1,4 @@
-"""Evaporation laws: which atom leaves next."""
+"""Evaporation laws: the choice of the next atom to evaporate."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,12 +14,12 @@ from apt_evap.specimen.tip import Tip
 class Law(Protocol):
     """Interface of an evaporation law.
 
-    A law in Python has a method `keys`, which is called after every event for the about 300 atoms around the hole. One
-    that has a method ``kernel(tip)`` besides, which returns a compiled `LawKernel`, runs at full speed.
+    A law in Python has a method `keys`, which is called after every event for the about 300 atoms around the hole. A
+    law that also has a method ``kernel(tip)``, which returns a compiled `LawKernel`, runs at full speed.
     """
 
     def keys(self, tip: Tip, atoms: Integers, fields: Floats, bonds: Integers) -> Floats:
-        """Return the key of each atom: the atom of the largest key leaves next.
+        """Return the key of each atom: the atom with the largest key evaporates next.
 
         Parameters
         ----------
@@ -28,41 +28,42 @@ class Law(Protocol):
         atoms : ndarray of int64, shape (n,)
             Indices of surface atoms in the specimen.
         fields : ndarray, shape (n,)
-            Field just outside of each [V/nm].
+            Field just outside each atom [V/nm].
         bonds : ndarray of int32, shape (n,)
-            Nearest neighbours of each that are still there.
+            Number of remaining nearest neighbours of each atom.
 
         Returns
         -------
         ndarray, shape (n,)
-            Keys; 0 or less for atoms that may not leave. Equal keys go by the number of the atom.
+            Keys; <= 0 for atoms that cannot evaporate. Equal keys are ordered by the index of the atom.
         """
         ...
 
 
 @dataclass(frozen=True)
 class Extremal:
-    """The atom with the largest field over evaporation field leaves; equal ones go by their number.
+    """Extremal law: the atom with the largest ratio of field to evaporation field evaporates next.
 
-    The limit of low temperature of the Arrhenius rate nu_0 exp(-C (1 - F/F_evap)/kT) (Vurpillot et al., 2013).
+    Equal ratios are ordered by the index of the atom. This is the low-temperature limit of the Arrhenius rate nu_0
+    exp(-C (1 - F/F_evap)/kT) (Vurpillot et al., 2013).
     """
 
     def kernel(self, tip: Tip) -> LawKernel:
-        """Return the compiled law for a specimen: F / F_evap, 0 for atoms that may not leave."""
+        """Return the compiled law for a specimen: F / F_evap, 0 for atoms that cannot evaporate."""
         return WeightedField(np.where(tip.evaporable, 1.0 / tip.evaporation_fields[tip.species], 0.0))
 
     def keys(self, tip: Tip, atoms: Integers, fields: Floats, bonds: Integers) -> Floats:
-        """Return the field over the evaporation field of each atom: see `Law.keys`."""
+        """Return the ratio of field to evaporation field of each atom: see `Law.keys`."""
         return np.where(tip.evaporable[atoms], fields / tip.evaporation_fields[tip.species[atoms]], 0.0)
 
 
 def check_law(law: object) -> None:
-    """Refuse what is not a law (ValueError)."""
+    """Raise a ValueError if `law` is not an evaporation law."""
     if isinstance(law, type | Mapping) or not any(callable(getattr(law, name, None)) for name in ("kernel", "keys")):
         raise ValueError(f"law must be an evaporation law with a method keys, such as Extremal(), got {law!r:.80}")
 
 
 def kernel_of(law: Law, tip: Tip) -> LawKernel:
-    """Return the compiled kernel of a law for a specimen; that of a law in Python calls it."""
+    """Return the compiled kernel of a law for a specimen; for a law in Python, a kernel that calls it."""
     make = getattr(law, "kernel", None)
     return PythonLaw(law, tip) if make is None else make(tip)

@@ -1,4 +1,4 @@
-"""How finely charges are solved."""
+"""Accuracy of the charges."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -7,35 +7,35 @@ from apt_evap._common.validation import check_count, check_number
 
 
 def check_angle(angle: Any) -> float:
-    """Return an opening angle [rad] from 0 to 1.5, or say what is wrong (ValueError)."""
+    """Return an opening angle [rad] from 0 to 1.5; ValueError otherwise."""
     return check_number(angle, "opening_angle", at_least=0, at_most=1.5, unit="rad")
 
 
 @dataclass(frozen=True)
 class ChargeSettings:
-    """How finely the charges are solved.
+    """Accuracy of the charges.
 
     Lengths are in nearest neighbour distances d_nn of the specimen.
 
     Parameters
     ----------
     opening_angle : float
-        Full angle under which a cell of the octree stands for its atoms [rad]. 0.4 keeps charges within 3e-4 of what
-        direct sums give (largest difference on a tip of R = 12 a).
+        Largest full angle of an octree cell that replaces its atoms [rad]. Measured: with 0.4, charges deviate by at
+        most 3e-4 from those of direct sums (tip of R = 12 a).
     patch_radius : float
-        Charges are solved within this distance of a hole [d_nn]; 8.5 is 6 lattice constants of fcc.
+        Charges are recomputed within this distance of a hole [d_nn]; 8.5 is 6 lattice constants of fcc.
     update_radius : float
-        Fields are kept up to date within this distance of a hole [d_nn].
+        Fields are updated within this distance of a hole [d_nn].
     sweep_interval : int, optional
-        Events between two relaxations of the whole surface; by default a 300th of the surface
-        atoms there are at the start, but at least 100.
+        Events between two relaxations of the whole surface; by default 1/300 of the initial number of surface atoms,
+        but at least 100.
     tolerance : float
-        Change of a charge, relative to the mean charge, at which a relaxation between events stops.
+        Largest change of a charge, relative to the mean charge, at which a relaxation between events stops.
     start_tolerance : float
-        The same for the first one, which starts from equal charges.
+        The same for the first relaxation, which starts from equal charges.
     relaxation_angle : float
-        Opening angle of the relaxations between events [rad]: 0.6 keeps charges within 2.2e-4 of direct sums (RMS, on a
-        tip of R = 12 a), less than what builds up between two of them.
+        Opening angle of the relaxations between events [rad]. Measured: with 0.6, charges deviate by 2.2e-4 (RMS) from
+        those of direct sums (tip of R = 12 a), less than the error that accumulates between two relaxations.
     """
 
     opening_angle: float = 0.4

@@ -1,4 +1,4 @@
-"""The state of an emitter: what rebuilds its charged surface, bit by bit."""
+"""State of an emitter, from which its charged surface is rebuilt bit by bit."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -8,28 +8,28 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class EmitterState:
-    """What rebuilds a surface, bit by bit, as its last relaxation left it; see `Emitter.restore`.
+    """State from which a surface after its last relaxation is rebuilt bit by bit; see `Emitter.restore`.
 
     Parameters
     ----------
     sites : ndarray of int64, shape (n,)
-        Atoms that had left by then, in their order.
+        Atoms that had evaporated by then, in their order.
     charges : ndarray, shape (m,)
-        Charges from which that relaxation started, of the surface atoms in the order of their numbers [e].
+        Start values of that relaxation for the surface atoms, in the order of their indices [e].
     lonely : ndarray of int64, shape (k,)
-        Surface atoms without neighbours, which keep the normal they had.
+        Surface atoms without neighbours, which keep their last normal.
     lonely_normals : ndarray, shape (k, 3)
-        These normals.
+        Their normals.
     deepened : tuple of int
-        Numbers of atoms that had left whenever more of the specimen came to be held.
+        Number of evaporated atoms at each deepening of the shell.
     tolerance : float
-        Of the relaxation; as in `ChargeSettings`.
+        Tolerance of the relaxation, as in `ChargeSettings`.
     opening_angle : float
-        Of the relaxation [rad].
+        Opening angle of the relaxation [rad].
     clipped, unsettled : int
         As in `Emitter.counts`.
     rule_state : dict
-        What the charging rule started from besides: for Robin the "potential_point" [nm], shape (3,).
+        Further state of the charging rule: for Robin the "potential_point" [nm], shape (3,).
     """
 
     sites: np.ndarray

@@ -1,4 +1,4 @@
-"""Flights of a batch of ions, in parallel, each on a copy of the surface that replays the events."""
+"""Parallel flights of a batch of ions; each thread has a copy of the surface that replays the events."""
 
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -20,25 +20,25 @@ from apt_evap.flight.landing import Ends
 from apt_evap.specimen.tip import Tip
 from apt_evap.units import COULOMB, NM_PER_MM
 
-_MAX_STEPS = 1_000_000  # flights take some tens
+_MAX_STEPS = 1_000_000  # flights take a few tens
 
 
 @dataclass(frozen=True)
 class FlightSettings:
-    """How the flights are integrated.
+    """Accuracy and end of the flights.
 
     Parameters
     ----------
     opening_angle : float
-        Full angle under which a cell of the octree stands for its atoms [rad]. Measured on Ni[111], R = 20 a: 0.3 puts
-        ions within 2 um (median) and 6 um (largest of 40) of where exact sums put them on a detector at 100 mm.
+        Largest full angle of an octree cell that replaces its atoms [rad]. Measured on Ni[111], R = 20 a: with 0.3,
+        hits on a detector at 100 mm deviate by 2 um (median) and 6 um (largest of 40) from those of direct sums.
     tolerance : float
-        Error of a step relative to path and velocity; at 1e-3 it moves ions by 0.1 um.
+        Error of a step relative to path and velocity; 1e-3 moves hits by 0.1 um.
     reach : float
-        Distance from the apex, in nearest neighbour distances, at which a flight ends and the ion goes straight on;
-        11,314 is 8,000 lattice constants of fcc, as in Shaikh et al.
+        Distance from the apex at which the integration ends and the ion continues in a straight line [d_nn]; 11,314 is
+        8,000 lattice constants of fcc, as in Shaikh et al.
     max_steps : int
-        Steps after which an ion counts as one that never left.
+        Number of steps after which an ion counts as not escaped.
     """
 
     opening_angle: float = 0.3
@@ -54,49 +54,49 @@ class FlightSettings:
 
 
 def check_reach(settings: FlightSettings, tip: Tip, detector: Detector) -> None:
-    """Refuse flights that would end beside the specimen, or behind the detector."""
+    """Raise a ValueError if flights would end beside the specimen, or behind the detector."""
     height = tip.apex - float(tip.positions[tip.evaporable, 2].min(initial=tip.apex))
     reach = settings.reach * tip.nearest_neighbour_distance
     if reach < 3 * height:
         raise ValueError(
-            f"reach must be at least three times the {height:.4g} nm between the apex and the lowest atom that may "
-            f"leave, got {settings.reach:g} d_nn, which is {reach:.4g} nm"
+            f"reach must be >= 3 times the height of {height:.4g} nm between the apex and the lowest evaporable "
+            f"atom, got {settings.reach:g} d_nn, which is {reach:.4g} nm"
         )
     if detector.distance * NM_PER_MM < reach:
         raise ValueError(
-            f"distance of the detector must be at least the {reach / NM_PER_MM:.4g} mm that ions fly through the "
-            f"field (reach), got {detector.distance:g} mm: it would be behind the end of the flights"
+            f"distance of the detector must be >= {reach / NM_PER_MM:.4g} mm, the reach of the flights in the field, "
+            f"got {detector.distance:g} mm"
         )
 
 
 @dataclass(frozen=True, eq=False)
 class _Record:
-    """The surface after a relaxation, and the journals of the batches since."""
+    """The surface after a relaxation, and the journals of the batches since then."""
 
     tree: Octree
     journals: list = field(default_factory=list)
 
 
 class FlightCrew:
-    """Threads that take the ions of one batch after the other from its counter.
+    """Threads that fly the ions of successive batches, each taken from the counter of its batch.
 
-    Of n threads n - 1 fly while the one that calls lets events happen; that one takes part once it waits for a batch.
-    Each has a copy of the surface, made to follow the events when it comes to fly.
+    Of n threads, n - 1 fly ions while the calling thread computes events. The calling thread also flies ions while it
+    waits for a batch. Each thread has a copy of the surface, which follows the events before a flight.
 
     Parameters
     ----------
     tip : Tip
         The specimen.
     settings : FlightSettings
-        How flights are integrated.
+        Accuracy and end of the flights.
     n_threads : int
-        Threads.
+        Number of threads.
     """
 
     def __init__(self, tip: Tip, settings: FlightSettings, n_threads: int) -> None:
         self._n_helpers = n_threads - 1
         self._pool = self._record = None
-        self._own = threading.local()  # of each thread: its flights, the record and how many journals they followed
+        self._own = threading.local()  # per thread: its flights, the record and the number of journals they followed
         self._halt, self._go = np.zeros(1, np.int64), threading.Event()
         self._go.set()
         self._options = {
@@ -111,7 +111,7 @@ class FlightCrew:
 
     @contextmanager
     def at_work(self) -> Iterator[Any]:
-        """The threads, as long as there are batches. What is still to be flown at the end is left."""
+        """Start the threads, and end them with the block. Flights that are not complete by then are cancelled."""
         with ThreadPoolExecutor(max(1, self._n_helpers)) as self._pool:
             try:
                 yield self
@@ -120,7 +120,7 @@ class FlightCrew:
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Let the flights stand still while all threads are needed elsewhere."""
+        """Stop the flights while all threads are needed elsewhere."""
         self._halt[0] = 1
         self._go.clear()
         try:
@@ -130,20 +130,20 @@ class FlightCrew:
             self._go.set()
 
     def start(self, batch: Batch, groups: Sequence[tuple[Floats, Floats]]) -> Callable[[], list[Ends]]:
-        """Begin the flights of a batch.
+        """Start the flights of a batch.
 
         Parameters
         ----------
         batch : Batch
-            Of n events, the one after that of the call before; its first one comes with a tree.
+            Batch of n events, which follows that of the previous call; the first batch contains a tree.
         groups : sequence of (ndarray, ndarray)
-            Positions [nm] and velocities [sqrt(V)] of launches, each of shape (n, m, 3): m of every ion, which share
-            their steps. NaN for an ion that is not flown.
+            Positions [nm] and velocities [sqrt(V)] of launches, each of shape (n, m, 3): m launches per ion, with
+            common time steps. NaN for launches that are not flown.
 
         Returns
         -------
         callable
-            Flies what is left of the batch, and gives the `Ends` of each group.
+            Completes the flights of the batch and returns the `Ends` of each group.
         """
         if batch.tree is not None:
             self._record = _Record(batch.tree)
@@ -153,10 +153,10 @@ class FlightCrew:
         positions = np.concatenate([group[0] for group in groups], axis=1).reshape(-1, 3)
         velocities = np.concatenate([group[1] for group in groups], axis=1).reshape(-1, 3)
         # an ion without a neighbour has no rolled-up position: its launches are not flown
-        flown = np.isfinite(positions).all(axis=1)
+        finite = np.isfinite(positions).all(axis=1)
         counts = np.concatenate(
             [
-                flown.reshape(n, sum(sizes))[:, start : start + size].sum(axis=1)[:, None]
+                finite.reshape(n, sum(sizes))[:, start : start + size].sum(axis=1)[:, None]
                 for start, size in zip(np.cumsum([0, *sizes[:-1]]), sizes, strict=True)
             ],
             axis=1,
@@ -165,13 +165,13 @@ class FlightCrew:
         outcome = np.empty(len(end), np.int8)
         event = np.repeat(np.arange(n), len(groups))
         start = np.concatenate([[0], np.cumsum(counts)])
-        launches = np.ascontiguousarray(positions[flown]), np.ascontiguousarray(velocities[flown])
+        launches = np.ascontiguousarray(positions[finite]), np.ascontiguousarray(velocities[finite])
         counter = np.zeros(1, np.int64)
 
         def fly():
             while counter[0] < len(event):
                 self._go.wait()
-                flights = self._caught_up(record, number)
+                flights = self._flights_at(record, number)
                 flights.fly(batch.journal, event, start, *launches, end, outcome, counter, self._halt)
 
         helpers = [self._pool.submit(fly) for _ in range(self._n_helpers)]
@@ -180,10 +180,10 @@ class FlightCrew:
             fly()
             for helper in helpers:
                 helper.result()
-            ends = np.full((len(flown), 7), np.nan)
-            ends[flown] = end
-            left = np.zeros(len(flown), bool)
-            left[flown] = outcome == LEFT
+            ends = np.full((len(finite), 7), np.nan)
+            ends[finite] = end
+            left = np.zeros(len(finite), bool)
+            left[finite] = outcome == LEFT
             ends, left = ends.reshape(n, sum(sizes), 7), left.reshape(n, sum(sizes))
             edges = np.cumsum([0, *sizes])
             return [
@@ -192,8 +192,8 @@ class FlightCrew:
 
         return wait
 
-    def _caught_up(self, record, number):
-        """Flights of the calling thread, after the events of all journals of the record before this number."""
+    def _flights_at(self, record, number):
+        """Flights of the calling thread, after the events of the first `number` journals of the record."""
         own = self._own
         if getattr(own, "record", None) is not record:
             own.flights, own.record, own.followed = Flights(record.tree, **self._options), record, 0

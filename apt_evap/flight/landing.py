@@ -1,4 +1,4 @@
-"""From the end of a flight to the detector: direction and time of flight."""
+"""Straight flight to the detector: direction and time of flight."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ from apt_evap.detection.detector import Detector
 
 
 class Ends(NamedTuple):
-    """Where flights ended, beyond the field: m launches of each of n ions."""
+    """Ends of the flights, outside the field: m launches of each of n ions."""
 
     positions: Floats
     """[nm], shape (n, m, 3); NaN where there was no flight."""
@@ -18,16 +18,16 @@ class Ends(NamedTuple):
     times: Floats
     """Reduced times [nm/sqrt(V)], shape (n, m)."""
     left: Booleans
-    """Whether the ion left, shape (n, m)."""
+    """Whether the ion escaped, shape (n, m)."""
 
 
 def land(ends: Ends, slowness: Floats, detector: Detector, apex: float) -> tuple[Floats, Floats]:
-    """Continue flights that have left the field straight to the detector.
+    """Continue flights in a straight line from the end of the field to the detector.
 
     Parameters
     ----------
     ends : Ends
-        Of m launches of each of n ions.
+        Ends of m launches of each of n ions.
     slowness : ndarray, shape (n,)
         Time of flight per reduced time, see `Emissions.slowness`.
     detector : Detector
@@ -38,9 +38,9 @@ def land(ends: Ends, slowness: Floats, detector: Detector, apex: float) -> tuple
     Returns
     -------
     directions : ndarray, shape (n, m, 2)
-        Stereographic directions, see `Detector.directions`; NaN where an ion never left.
+        Stereographic directions, see `Detector.directions`; NaN for an ion that did not escape.
     times : ndarray, shape (n, m)
-        Times of flight [ns]; NaN where an ion never left.
+        Times of flight [ns]; NaN for an ion that did not escape.
     """
     n, m = ends.left.shape
     left = ends.left.ravel()

@@ -1,11 +1,12 @@
-"""The response of an ion: where and when it lands, as polynomials of its launch velocity along the surface.
+"""The response of an ion: position and time of its hit, as polynomials of its launch velocity along the surface.
 
-For one ion the place on the detector is a smooth function of the two tangential launch velocities. A few flights fix a
-polynomial for launches from the site, and another for launches from the rolled-up position; together they give the hits
-of any perturbation that launches along the surface, without another flight.
+The detector position of an ion is a smooth function of its two tangential launch velocities. A few flights determine
+one polynomial for launches from the site, and another for launches from the rolled-up position. Together they give the
+hits of any perturbation along the surface, without further flights.
 
-What is fitted is the stereographic direction (see `Detector.directions`) and the time of flight times the cosine of the
-polar angle: smoother than the place itself, which grows without bound for ions that fly along the detector.
+The fitted quantities are the stereographic direction (see `Detector.directions`), and the time of flight times the
+cosine of the polar angle. They are smoother than the detector position, which diverges for ions that fly parallel to
+the detector.
 """
 
 import warnings
@@ -19,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from apt_evap._common.small_matrices import pseudo_inverse, squared_lengths
 from apt_evap._common.types import Booleans, Floats
-from apt_evap._common.validation import check_count, check_kind, check_number, check_sequence, shown
+from apt_evap._common.validation import check_count, check_kind, check_number, check_sequence, short_text
 from apt_evap._common.warnings import ResponseWarning
 from apt_evap._core import polynomials
 from apt_evap._core.elementary import sine_and_cosine
@@ -36,20 +37,20 @@ CHUNK = 1 << 16  # ions evaluated at once: their monomials stay below 10 MB
 
 @dataclass(frozen=True)
 class Design:
-    """Launches that fix a polynomial.
+    """Launches that determine a polynomial.
 
     Parameters
     ----------
     degree : int
         Total degree of the polynomial in the two velocities.
     rings : tuple of (float, int)
-        Radius in units of the largest velocity, and number of launches, of each ring; every other ring is turned by
+        Radius in units of the largest velocity, and number of launches, of each ring; every second ring is rotated by
         half a step.
 
     Raises
     ------
     ValueError
-        If the launches do not fix the polynomial.
+        If the launches do not determine the polynomial.
     """
 
     degree: int
@@ -59,12 +60,12 @@ class Design:
         check_count(self.degree, "degree", at_most=polynomials.HIGHEST_DEGREE)
         rings = [_ring(ring) for ring in check_sequence(self.rings, "rings", "(radius, launches)")]
         if not rings:
-            raise ValueError("rings must hold at least one (radius, launches), got none")
+            raise ValueError("rings must contain at least one (radius, launches), got none")
         object.__setattr__(self, "rings", tuple(rings))
         matrix = self.monomials(self.velocities)
         if np.linalg.matrix_rank(matrix) < matrix.shape[1]:
             raise ValueError(
-                f"rings must fix the {matrix.shape[1]} coefficients of degree {self.degree}, got {self.rings}"
+                f"rings must determine the {matrix.shape[1]} coefficients of degree {self.degree}, got {self.rings}"
             )
 
     @property
@@ -87,22 +88,22 @@ class Design:
         Parameters
         ----------
         values : ndarray, shape (n, m, 3)
-            What the m launches of each of n ions gave.
+            Three quantities of the m launches of each of n ions.
 
         Returns
         -------
         coefficients : ndarray of float32, shape (n, 3, coefficients)
-            Of the three quantities.
+            Coefficients of the three quantities.
         residual : ndarray, shape (n,)
-            Root mean square over the launches of the misfit of the first two, per degree of freedom. Infinite where
-            some launches are NaN: the polynomial is the smallest through the others; NaN where all are.
+            Root mean square residual of the first two quantities over the launches, per degree of freedom. Infinite if
+            some launches are NaN (the coefficients are then the minimum norm solution for the others); NaN if all are.
         """
         matrix, inverse = _matrices(self)
         values = np.ascontiguousarray(values, np.float64)
         coefficients = polynomials.fit(inverse, values)
         freedom = max(1, len(matrix) - matrix.shape[1])
         residual = np.sqrt(polynomials.misfits(matrix, coefficients, values) / freedom)
-        # a time may be infinite where the place is not: a launch that never meets the plane of the detector
+        # the time may be infinite at a finite direction: a launch that never reaches the plane of the detector
         for ion in np.flatnonzero(~(np.isfinite(residual) & np.isfinite(values).all(axis=(1, 2)))):
             good = np.isfinite(values[ion]).all(axis=1)
             if good.any():
@@ -111,7 +112,7 @@ class Design:
         return np.ascontiguousarray(coefficients, np.float32), residual
 
     def evaluate(self, coefficients: NDArray[np.float32], velocities: Floats) -> Floats:
-        """Values of the polynomials of n ions, each at a velocity of its own; shape (n, 3)."""
+        """Values of the polynomials of n ions, each at its own velocity; shape (n, 3)."""
         return polynomials.evaluate(
             self.degree, np.ascontiguousarray(coefficients, np.float32), np.ascontiguousarray(velocities, np.float64)
         )
@@ -125,10 +126,10 @@ def _matrices(design):
 
 
 def _ring(ring):
-    """Radius and launches of a ring, checked."""
+    """Validated radius and number of launches of a ring."""
     pair = check_sequence(ring, "rings", "(radius, launches)")
     if len(pair) != 2:
-        raise ValueError(f"rings must be pairs (radius, launches), got {shown(ring)}")
+        raise ValueError(f"rings must be pairs (radius, launches), got {short_text(ring)}")
     radius = check_number(pair[0], "radius of a ring in rings", at_least=0)
     return radius, check_count(pair[1], "launches of a ring in rings", at_least=1, at_most=_MAX_LAUNCHES)
 
@@ -140,12 +141,12 @@ class ResponseSettings:
     Parameters
     ----------
     energy_limit : float
-        Largest energy of the launches flown [eV]; beyond it the polynomials extrapolate.
+        Largest energy of the launches [eV]; above it the polynomials extrapolate.
     site, rolled : Design
-        Launches from the site and from the rolled-up position. Measured on Ni[111], R = 80 a, 300 ions, against flights
-        at random energies up to 1.5 eV: median 0.008 mm and 0.0016 mm on a detector at 100 mm.
+        Launches from the site and from the rolled-up position. Measured on Ni[111], R = 80 a, 300 ions: median
+        deviation from flights at random energies up to 1.5 eV 0.008 mm and 0.0016 mm on a detector at 100 mm.
     bound : float
-        Residual of a fit, on the detector, above which an ion is flagged [mm].
+        Residual of a fit on the detector above which an ion is flagged [mm].
     """
 
     energy_limit: float = 1.5
@@ -164,14 +165,15 @@ class ResponseSettings:
         return velocities * (FLIGHT_TIME * np.sqrt(np.asarray(masses) / (2.0 * self.energy_limit)))[:, None]
 
     def launched(self, velocities: Floats, charge_states: ArrayLike) -> Floats:
-        """Velocities of the designs, in sqrt(V), of ions of some charge states [e]; shape (n, m, 2)."""
+        """Velocities of the designs [sqrt(V)] for ions with these charge states [e]; shape (n, m, 2)."""
         return np.sqrt(2.0 * self.energy_limit / np.asarray(charge_states))[:, None, None] * velocities
 
 
 class Responses(NamedTuple):
     """Responses of n ions: coefficients of three quantities, and the residuals of the fits [mm].
 
-    The quantities are the two components of the stereographic direction, and time of flight times cosine [ns].
+    The quantities are the two components of the stereographic direction, and the time of flight times the cosine of the
+    polar angle [ns].
     """
 
     site: np.ndarray
@@ -184,12 +186,12 @@ class Responses(NamedTuple):
 
 
 class ResponseModel:
-    """The responses of a run: which launches are flown for them, the fit, and the hits that follow.
+    """The responses of a run: launches, fit and evaluation.
 
     Parameters
     ----------
     settings : ResponseSettings
-        Designs of the launches, energy limit and bound.
+        Designs of the launches, energy limit and bound of the residuals.
     detector : Detector
         The detector.
     """
@@ -198,7 +200,7 @@ class ResponseModel:
         self.settings, self.detector = settings, detector
 
     def launches(self, emissions: Emissions) -> list[tuple[Floats, Floats]]:
-        """Launches of the two designs, from the site and rolled up.
+        """Launches of the two designs, from the site and from the rolled-up position.
 
         Parameters
         ----------
@@ -208,7 +210,7 @@ class ResponseModel:
         Returns
         -------
         list of (ndarray, ndarray)
-            Positions [nm] and velocities [sqrt(V)] of each design, shape (n, m, 3); NaN for ions that cannot roll.
+            Positions [nm] and velocities [sqrt(V)] of each design, shape (n, m, 3); NaN for ions that cannot roll up.
         """
         groups = []
         starts = emissions.positions, rolled_positions(emissions)
@@ -219,12 +221,12 @@ class ResponseModel:
         return groups
 
     def fit(self, ends: Sequence[Ends], slowness: Floats, apex: float) -> Responses:
-        """Fit the polynomials to the ends of these launches.
+        """Fit the polynomials to the ends of the launches.
 
         Parameters
         ----------
         ends : sequence of Ends
-            Of the launches of the two designs, for n ions.
+            Ends of the launches of the two designs, for n ions.
         slowness : ndarray, shape (n,)
             See `Emissions.slowness`.
         apex : float
@@ -239,8 +241,8 @@ class ResponseModel:
             directions, times = land(each, slowness, self.detector, apex)
             n, m = times.shape
             values = flattened(directions.reshape(-1, 2), times.ravel()).reshape(n, m, 3)
-            fitted, residual = design.fit(values)
-            coefficients.append(fitted)
+            polynomials, residual = design.fit(values)
+            coefficients.append(polynomials)
             # a small change of the stereographic direction is half as large on a plane at unit distance
             residuals.append(2.0 * self.detector.distance * residual)
         site, rolled = coefficients
@@ -249,14 +251,14 @@ class ResponseModel:
     def evaluate(
         self, responses: Responses, rolled: Booleans, first: Floats, second: Floats, masses: Floats
     ) -> tuple[Floats, Floats]:
-        """Directions and times of flight of ions that launch along the surface.
+        """Directions and times of flight of ions launched along the surface.
 
         Parameters
         ----------
         responses : Responses
-            Of n ions.
+            Responses of n ions.
         rolled : ndarray of bool, shape (n,)
-            Ions that rolled up.
+            Whether an ion rolled up.
         first, second : ndarray, shape (n,)
             Velocities along t1 and t2 of `tangent_frame` [nm/ns].
         masses : ndarray, shape (n,)
@@ -272,35 +274,35 @@ class ResponseModel:
         Warns
         -----
         ResponseWarning
-            If ions launch above the energy limit: their places are extrapolated.
+            If launch energies exceed the energy limit: those hits are extrapolated.
         """
         velocities = self.settings.reduced(np.column_stack([first, second]), masses)
         faster = int(np.count_nonzero(squared_lengths(velocities) > 1.0001))
         if faster:
             warnings.warn(
-                f"{faster:,} of {len(velocities):,} ions launch above the {self.settings.energy_limit:g} eV of the "
-                "responses: their places are extrapolated; run with a larger energy_limit, of ResponseSettings or in "
-                "[responses] of a settings file",
+                f"{faster:,} of {len(velocities):,} ions launch above the energy limit of the responses "
+                f"({self.settings.energy_limit:g} eV): their hits are extrapolated; run with a larger energy_limit "
+                "(ResponseSettings, or [responses] in a settings file)",
                 ResponseWarning,
                 stacklevel=3,
             )
         values = np.empty((len(velocities), 3))
-        for design, coefficients, chosen in (
+        for design, coefficients, mask in (
             (self.settings.site, responses.site, ~rolled),
             (self.settings.rolled, responses.rolled, rolled),
         ):
-            every = slice(None) if chosen.all() else chosen
-            values[every] = design.evaluate(coefficients[every], velocities[every])
+            ions = slice(None) if mask.all() else mask
+            values[ions] = design.evaluate(coefficients[ions], velocities[ions])
         return unflattened(values)
 
     def flagged(self, responses: Responses, can_roll: Booleans) -> Booleans:
-        """Ions whose responses miss their own flights by more than the bound, or could not be fitted, bool (n,)."""
-        bad = ~(responses.residuals <= self.settings.bound)
-        return bad[:, 0] | (bad[:, 1] & can_roll)
+        """Whether the response of an ion has a residual above the bound, or could not be fitted, bool (n,)."""
+        inexact = ~(responses.residuals <= self.settings.bound)
+        return inexact[:, 0] | (inexact[:, 1] & can_roll)
 
 
 def flattened(directions: Floats, times: Floats) -> Floats:
-    """The three quantities that are fitted, shape (n, 3), from directions (n, 2) and times of flight (n,)."""
+    """The three fitted quantities, shape (n, 3), from directions (n, 2) and times of flight (n,)."""
     s2 = squared_lengths(directions)
     return np.column_stack([directions, times * (1.0 - s2) / (1.0 + s2)])
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from apt_evap._common.files import FileError, TruncatedFile, open_for_reading, replace_file
 from apt_evap._common.types import AnyPath
-from apt_evap._common.validation import check_choice, check_switch, shown
+from apt_evap._common.validation import check_choice, check_switch, short_text
 from apt_evap._common.warnings import DataWarning
 from apt_evap._common.wording import argument
 from apt_evap.detection.hits import Hits, Outcome
@@ -203,7 +203,7 @@ def check_columns(columns: str | Sequence[str] | None, available: Sequence[str],
         chosen = ()
     for name in chosen or (columns,):
         if name not in available:
-            raise FileError(f"{str(path)!r} has no column {shown(name)}, expected some of {', '.join(available)}")
+            raise FileError(f"{str(path)!r} has no column {short_text(name)}, expected some of {', '.join(available)}")
     return chosen
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from apt_evap._common.files import FileError, TruncatedFile, check_path, open_for_reading
 from apt_evap._common.types import AnyPath
-from apt_evap._common.validation import check_count, check_kind, shown
+from apt_evap._common.validation import check_count, check_kind, short_text
 from apt_evap._common.wording import argument
 from apt_evap.detection.hits import Hits
 from apt_evap.io._apt_sections import SIGNATURE
@@ -152,7 +152,7 @@ def write(path: AnyPath, hits: Hits, *, format: str | None = None, **options: An
         reason = "holds a Run (run.save)" if chosen.suffix == ".h5" else "is only read"
         raise FileError(f"hits cannot be written to {str(path)!r}: a {chosen.suffix} file {reason}")
     if not isinstance(hits, Hits):
-        raise ValueError(f"hits must be Hits, such as run.hits(perturbation) gives, got {shown(hits)}")
+        raise ValueError(f"hits must be Hits, such as run.hits(perturbation) gives, got {short_text(hits)}")
     _check_options(path, chosen, "writing", _known(chosen.write, "hits"), options)
     chosen.write(path, hits, **options)
 
@@ -184,7 +184,7 @@ def _options(path, chosen, reader, columns, options):
     if columns is None:
         return options
     if "columns" not in _known(reader):
-        raise FileError(f"{str(path)!r}: reading {chosen.suffix} files takes no columns, got {shown(columns)}")
+        raise FileError(f"{str(path)!r}: reading {chosen.suffix} files takes no columns, got {short_text(columns)}")
     return {**options, "columns": columns}
 
 

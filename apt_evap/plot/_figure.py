@@ -1,4 +1,4 @@
-"""Figures and colour bars, the same for every picture."""
+"""Figures and colour bars of all plots."""
 
 import importlib
 import re
@@ -14,22 +14,22 @@ from matplotlib.image import AxesImage
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 OUTSIDE = "0.88"
-"""Colour of what is outside the detector."""
+"""Colour outside the detector."""
 
 
 def add_colorbar(
     images: Sequence[AxesImage], ax: Axes | Sequence[Axes], label: str = "hits per area / mean"
 ) -> Colorbar:
-    """Add a colour bar for images of one scale, with arrows where it cuts off values.
+    """Add a colour bar for images with a common scale; arrows mark ends with values beyond the scale.
 
     Parameters
     ----------
     images : sequence of matplotlib.image.AxesImage
-        What is coloured.
+        Images with the colours.
     ax : matplotlib.axes.Axes or list of them
-        Axes the bar takes its place from.
+        Axes that give space to the bar.
     label : str
-        What the colours mean, with its unit.
+        Quantity of the colours, with its unit.
 
     Returns
     -------
@@ -44,13 +44,13 @@ def add_colorbar(
 
 
 def set_title(ax: Axes, title: str | None, **options: Any) -> None:
-    """Write a title as it is: a file name may hold dollar signs, and bytes that are not text."""
+    """Set a title without math syntax: a file name may contain dollar signs, and bytes that are not text."""
     if title:
         ax.set_title(re.sub("[\ud800-\udfff]", "\N{REPLACEMENT CHARACTER}", title), parse_math=False, **options)
 
 
 class _Layout(ConstrainedLayoutEngine):
-    """Constrained layout, repeated: maps of equal scale in x and y have ticks and labels that depend on their size."""
+    """Repeated constrained layout: ticks and labels of maps with equal scales in x and y depend on their size."""
 
     def execute(self, fig: Figure) -> None:
         for _ in range(3):
@@ -60,8 +60,8 @@ class _Layout(ConstrainedLayoutEngine):
 def new_figure(size: tuple[float, float]) -> Figure:
     """Make a figure of (width, height) `size` [inch].
 
-    In a notebook, or where pyplot has been imported, pyplot makes it, so that it is shown; otherwise, as in a batch
-    job, it needs no display.
+    In a notebook, or if pyplot is imported, the figure is made by pyplot and displayed. Otherwise, as in a batch job,
+    it needs no display.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def new_figure(size: tuple[float, float]) -> Figure:
     matplotlib.figure.Figure
     """
     if "ipykernel" in sys.modules:
-        importlib.import_module("matplotlib.pyplot")  # with the backend that puts pictures under their cells
+        importlib.import_module("matplotlib.pyplot")  # with the backend that displays figures below their cells
     pyplot = sys.modules.get("matplotlib.pyplot")
     make = Figure if pyplot is None else pyplot.figure
     return make(figsize=size, layout=_Layout(compress=True, h_pad=0.08, w_pad=0.06), dpi=150)

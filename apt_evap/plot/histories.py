@@ -1,4 +1,4 @@
-"""Field and voltage in the course of a run."""
+"""Field and voltage during a run."""
 
 from collections.abc import Sequence
 
@@ -14,16 +14,16 @@ from apt_evap.simulation.run import Run
 
 
 def history(run: Run | Hits, axes: Sequence[Axes] | None = None, *, points: int = 200) -> NDArray[np.object_]:
-    """Draw the field at which atoms left and the voltage it takes, or the voltage of a measurement, against the ions.
+    """Draw field and voltage of the evaporation of a run, or the voltage of a measurement, against the ions.
 
-    The line is the median of successive ions, the band holds 90 % of them.
+    The line is the median of successive ions, the band contains 90 % of them.
 
     Parameters
     ----------
     run : Run or Hits
-        A run; or measured ions with a voltage.
+        A run, or measured ions with a voltage.
     axes : sequence of matplotlib.axes.Axes, optional
-        Where to draw: two for a run, one for measured ions; a new figure by default.
+        Two axes for a run, one for measured ions; a new figure by default.
     points : int
         Number of points along each line.
 
@@ -35,11 +35,11 @@ def history(run: Run | Hits, axes: Sequence[Axes] | None = None, *, points: int 
     Raises
     ------
     ValueError
-        If measured ions have no voltage, or the number of axes is not the one needed.
+        If measured ions have no voltage, or the number of axes is wrong.
 
     Notes
     -----
-    The voltage of a run is that of `evaporation_voltages`.
+    The voltage of a run is from `evaporation_voltages`.
     """
     points = check_count(points, "points", at_least=1)
     panels = _panels(run)

@@ -1,4 +1,4 @@
-"""Detector maps, alone or side by side."""
+"""Detector maps, single or side by side."""
 
 from collections.abc import Sequence
 from math import ceil, sqrt
@@ -27,7 +27,7 @@ def detector_map(
     Parameters
     ----------
     map : DetectorMap
-        The map; its density relative to the mean is shown.
+        The map; its density relative to the mean is drawn.
     ax : matplotlib.axes.Axes, optional
         Where to draw; a new figure by default.
     title : str, optional
@@ -37,12 +37,12 @@ def detector_map(
     colormap : str
         Name of a colour map of matplotlib.
     colorbar, caption : bool
-        Whether to draw a colour bar, and the number of ions and size of the bins above the map.
+        Whether to draw a colour bar; whether to write the number of ions and the bin size above the map.
 
     Returns
     -------
     matplotlib.axes.Axes
-        Its ``figure.savefig`` writes the picture.
+        Its ``figure.savefig`` writes a file.
     """
     if ax is None:
         ax = new_figure((5.6, 5.0)).subplots()
@@ -56,14 +56,14 @@ def detector_map(
         vmax=high,
         interpolation="nearest",
     )
-    # bins outside the mask are NaN and let the background through
+    # bins outside the mask are NaN: the background is visible there
     ax.set(facecolor=OUTSIDE, aspect="equal", xlabel="x [mm]", ylabel="y [mm]")
-    described = _wrap(describe(map), 54)  # what fits above a map of `detector_maps`
+    text = _wrap(describe(map), 54)  # fits above a map of `detector_maps`
     if title:
-        set_title(ax, _wrap(title, 36), pad=10 + 10 * len(described.splitlines()) if caption else 8)
+        set_title(ax, _wrap(title, 36), pad=10 + 10 * len(text.splitlines()) if caption else 8)
     if caption:
         ax.annotate(
-            described, (0.5, 1), xytext=(0, 5), xycoords="axes fraction", textcoords="offset points",
+            text, (0.5, 1), xytext=(0, 5), xycoords="axes fraction", textcoords="offset points",
             ha="center", fontsize="small", color="0.35",
         )  # fmt: skip
     if colorbar:
@@ -79,35 +79,36 @@ def detector_maps(
     colormap: str = "inferno",
     columns: int | None = None,
 ) -> NDArray[np.object_]:
-    """Draw several detector maps side by side with one colour scale.
+    """Draw several detector maps side by side with a common colour scale.
 
     Parameters
     ----------
     maps : sequence of DetectorMap
         The maps.
     titles : sequence of str, optional
-        A title for each.
+        One title per map.
     limits : tuple of float, optional
-        Densities at the ends of the colour scale; by default the widest of `color_limits`.
+        Densities at the ends of the colour scale; by default the widest range of `color_limits`.
     colormap : str
         Name of a colour map of matplotlib.
     columns : int, optional
-        Maps in a row; by default all of up to three, and as many rows as columns, or one fewer, of more.
+        Maps per row. By default up to three maps are in one row; more maps are arranged in about as many rows as
+        columns.
 
     Returns
     -------
     ndarray of matplotlib.axes.Axes
-        One for each map, shape (n,).
+        Shape (n,), one per map.
 
     Raises
     ------
     ValueError
-        If there is no map, or not one title for each.
+        If there is no map, or the number of titles differs.
     """
     maps = list(maps)
     titles = [None] * len(maps) if titles is None else list(titles)
     if not maps or len(titles) != len(maps):
-        raise ValueError(f"detector_maps needs maps and a title for each, got {len(maps)} and {len(titles)}")
+        raise ValueError(f"detector_maps needs maps and one title per map, got {len(maps)} and {len(titles)}")
     n = len(maps)
     columns = min(n, columns or (n if n <= 3 else ceil(sqrt(n))))
     rows = -(-len(maps) // columns)
@@ -126,7 +127,7 @@ def detector_maps(
 
 
 def color_limits(map: DetectorMap) -> tuple[float, float]:
-    """Robust ends of a colour scale: the 0.5 and 99.5 percentiles of the density inside the detector.
+    """Robust limits of a colour scale: the 0.5 and 99.5 percentiles of the density inside the detector.
 
     Parameters
     ----------
@@ -136,16 +137,16 @@ def color_limits(map: DetectorMap) -> tuple[float, float]:
     Returns
     -------
     tuple of float
-        Lowest and highest density; 0 and 2 if all are the same.
+        Lowest and highest density; 0 and 2 if all are equal.
     """
     low, high = np.percentile(map.density[map.mask], [0.5, 99.5])
     return (float(low), float(high)) if high > low else (0.0, 2.0)
 
 
 def common_limits(maps: Sequence[DetectorMap]) -> tuple[float, float]:
-    """One colour scale for maps side by side: the 0.5 and 99.5 percentiles of the densities of all of them.
+    """Common limits of a colour scale for several maps: the 0.5 and 99.5 percentiles of all densities.
 
-    A low end below a twentieth of the high one becomes 0.
+    The lower limit becomes 0 if it is less than 1/20 of the upper one.
 
     Parameters
     ----------
@@ -155,7 +156,7 @@ def common_limits(maps: Sequence[DetectorMap]) -> tuple[float, float]:
     Returns
     -------
     tuple of float
-        Lowest and highest density; 0 and 2 if all are the same.
+        Lowest and highest density; 0 and 2 if all are equal.
     """
     low, high = np.percentile(np.concatenate([map.density[map.mask] for map in maps]), [0.5, 99.5])
     if not high > low:
@@ -175,7 +176,7 @@ def describe(map: DetectorMap) -> str:
 
 
 def _wrap(text, width):
-    """Break text into lines, at its commas where that will do."""
+    """Break text into lines, at commas if possible."""
     unbroken = text.replace(" ", "\N{NO-BREAK SPACE}").replace(",\N{NO-BREAK SPACE}", ", ")
     lines = "\n".join(fill(line, width, break_long_words=False) for line in unbroken.splitlines())
     return "\n".join(fill(line.replace("\N{NO-BREAK SPACE}", " "), width) for line in lines.splitlines())

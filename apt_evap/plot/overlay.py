@@ -1,4 +1,4 @@
-"""A simulated map drawn over a measured one, as they are registered."""
+"""Overlay of a registered simulated map on a measured one."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,7 +13,7 @@ from apt_evap.registration.register import Registration
 
 BRIGHT, DARK, RIM = "cyan", "lime", "white"
 _SMOOTHING = 0.015
-"""Of the contours [diameters of the measured field of view]."""
+"""Smoothing of the contours [diameters of the measured field of view]."""
 _ABOVE = {
     "xytext": (0, 5), "xycoords": "axes fraction", "textcoords": "offset points", "ha": "center", "fontsize": "small",
     "color": "0.35",
@@ -30,19 +30,19 @@ def overlay(
     colormap: str = "inferno",
     colorbar: bool = True,
 ) -> Axes:
-    """Draw a measured map with contours of the simulated one moved onto it, and that one beside it.
+    """Draw a measured map with contours of the registered simulated map, and the simulated map beside it.
 
-    Contours are those of the flattened simulated map, where it is brightest and darkest: the outermost eighths of the
-    area. A dashed line is the simulated field of view.
+    The contours enclose the brightest and the darkest eighth of the area of the flattened simulated map. A dashed line
+    is the simulated field of view.
 
     Parameters
     ----------
     simulated, measured : DetectorMap or Hits
         The maps.
     registration : Registration
-        What moves the simulated map onto the measured one.
+        Transform of the simulated map to the measured one.
     ax : matplotlib.axes.Axes, optional
-        Where to draw the measured map, and nothing beside it; a new figure with both by default.
+        Axes for the measured map only; by default a new figure with both maps.
     title : str, optional
         Title above the map.
     colormap : str
@@ -53,7 +53,7 @@ def overlay(
     Returns
     -------
     matplotlib.axes.Axes
-        That of the measured map; its ``figure.savefig`` writes the picture.
+        Axes of the measured map; its ``figure.savefig`` writes a file.
     """
     simulated, measured = (m if isinstance(m, DetectorMap) else DetectorMap.from_hits(m) for m in (simulated, measured))
     beside = None
@@ -67,12 +67,12 @@ def overlay(
     x, y = np.meshgrid(np.linspace(low_x, high_x, 400), np.linspace(low_y, high_y, 400))
     back_x, back_y = registration.inverse.points(x, y)
     values, covered = image.sample(back_x + 1j * back_y)
-    compared = _on(measured, x, y) & covered  # contours beyond the measured map tell nothing
+    common = _on(measured, x, y) & covered  # contours outside the measured map are meaningless
     legend = []
-    if compared.any() and np.ptp(values[compared]) > 0:
-        field = np.ma.masked_array(values, ~compared)
+    if common.any() and np.ptp(values[common]) > 0:
+        field = np.ma.masked_array(values, ~common)
         for percent, color, label in ((87.5, BRIGHT, "simulated, bright"), (12.5, DARK, "simulated, dark")):
-            level = np.percentile(values[compared], percent)
+            level = np.percentile(values[common], percent)
             for panel in (ax,) if beside is None else (ax, beside):
                 panel.contour(x, y, field, levels=[level], colors=color, linewidths=0.9, linestyles="solid")
             legend.append(Line2D([], [], color=color, label=label))
@@ -88,28 +88,28 @@ def overlay(
     if not covered.all():
         ax.contour(x, y, covered.astype(float), levels=[0.5], colors=RIM, linewidths=1.2, linestyles="dashed")
         legend.append(Line2D([], [], color="0.4", linestyle="dashed", label="simulated field of view"))
-    how = {"handles": legend, "ncols": 3, "fontsize": "small", "frameon": False}
+    options = {"handles": legend, "ncols": 3, "fontsize": "small", "frameon": False}
     if beside is None:
-        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.11), **how)
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.11), **options)
     else:
-        ax.figure.legend(loc="outside lower center", **how)
+        ax.figure.legend(loc="outside lower center", **options)
     ax.annotate(_caption(registration), (0.5, 1), **_ABOVE)
     set_title(ax, title, pad=34)
     return ax
 
 
 def _on(map, x, y):
-    """Whether points are on bins inside the mask of a map."""
+    """Whether points are in bins inside the mask of a map."""
     columns = np.searchsorted(map.x_edges[1:-1], x)
     return map.mask[np.searchsorted(map.y_edges[1:-1], y), columns]
 
 
 def _caption(registration):
-    """The transform and how well it fits, in two lines."""
+    """Text of the transform and its quality, in two lines."""
     if np.isfinite(registration.score):
-        quality = f"correlation {registration.score:.2f}, {registration.overlap:.0%} of the field of view shared"
+        quality = f"correlation {registration.score:.2f}, common area {registration.overlap:.0%} of the field of view"
     elif np.isfinite(registration.residual):
-        quality = f"from points, {registration.residual:.2g} mm off (RMS)"
+        quality = f"from points, residual {registration.residual:.2g} mm (RMS)"
     else:
         quality = "as given"
     return f"{registration}\n{quality}"

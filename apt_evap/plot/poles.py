@@ -15,7 +15,7 @@ from apt_evap.detection.projection import Projection
 
 _COLORS = ("#35b6ff", "#ff9d3b", "#7be07b", "#e58cff")
 _AZIMUTHS = np.radians(np.arange(0.0, 360.5, 0.5))
-_APART = 30  # points between a label and one drawn before, at font size 9
+_APART = 30  # smallest distance between labels [points], at font size 9
 
 
 def poles(
@@ -34,22 +34,21 @@ def poles(
     Parameters
     ----------
     ax : matplotlib.axes.Axes
-        Axes of a map in mm, such as `detector_map` returns; only what is within their limits is drawn.
+        Axes of a map in mm, such as `detector_map` returns; only points within their limits are drawn.
     orientation : Orientation
-        How the crystal is oriented: of a fit, or ``Orientation.from_settings(run.settings["tip"])``.
+        Orientation of the crystal, from a fit, or ``Orientation.from_settings(run.settings["tip"])``.
     projection : Projection
-        How directions appear on the map: of a fit, or ``image_compression(run).projection``.
+        Projection of directions onto the map, from a fit, or ``image_compression(run).projection``.
     families : int
-        How many families of poles, see `poles.poles`; 0 for none.
+        Number of families of poles, see `poles.poles`; 0 for none.
     zone_families : sequence, optional
         Families of zone axes whose lines are drawn, by default those of `poles.ZONES`; () for none.
     labels : bool
-        Whether poles have their names beside them. Of names that would overlap only that of the wider spacing is
-        written.
+        Whether to label the poles. Of overlapping labels only that of the larger spacing is drawn.
     region : DetectorMap, optional
-        The map, to draw only what is inside its detector.
+        The map, to draw only inside its detector.
     size : float
-        Size of the names [points].
+        Font size of the labels [points].
 
     Returns
     -------
@@ -58,7 +57,7 @@ def poles(
     x_limits, y_limits = sorted(ax.get_xlim()), sorted(ax.get_ylim())
     material = orientation.material
 
-    def shown(places):
+    def is_visible(places):
         with np.errstate(invalid="ignore"):
             inside = (places[:, 0] > x_limits[0]) & (places[:, 0] < x_limits[1])
             inside &= (places[:, 1] > y_limits[0]) & (places[:, 1] < y_limits[1])
@@ -66,9 +65,9 @@ def poles(
             columns = np.searchsorted(region.x_edges, places[inside, 0]) - 1
             rows = np.searchsorted(region.y_edges, places[inside, 1]) - 1
             ny, nx = region.mask.shape
-            there = (columns >= 0) & (columns < nx) & (rows >= 0) & (rows < ny)
-            there[there] = region.mask[rows[there], columns[there]]
-            inside[inside] = there
+            visible = (columns >= 0) & (columns < nx) & (rows >= 0) & (rows < ny)
+            visible[visible] = region.mask[rows[visible], columns[visible]]
+            inside[inside] = visible
         return inside
 
     if zone_families is None or len(zone_families):
@@ -77,23 +76,23 @@ def poles(
             first, second = np.linalg.svd(axis[None])[2][1:]
             circle = np.cos(_AZIMUTHS)[:, None] * first + np.sin(_AZIMUTHS)[:, None] * second
             places = projection.places(circle)
-            places[~shown(places)] = np.nan
+            places[~is_visible(places)] = np.nan
             ax.plot(*places.T, color=_COLORS[family % len(_COLORS)], linewidth=0.8, alpha=0.9, zorder=2.5)
     if families:
         crystal_poles = poles_of(material, families)
         places = projection.places(orientation.directions(crystal_poles.normals))
-        chosen = np.flatnonzero(shown(places))
-        areas = 60 * (crystal_poles.spacings[chosen] / crystal_poles.spacings.max()) ** 2
+        selection = np.flatnonzero(is_visible(places))
+        areas = 60 * (crystal_poles.spacings[selection] / crystal_poles.spacings.max()) ** 2
         outline = [withStroke(linewidth=2, foreground="black")]
-        ax.scatter(*places[chosen].T, s=areas, facecolors="none", edgecolors="white", linewidths=1.2, zorder=3,
+        ax.scatter(*places[selection].T, s=areas, facecolors="none", edgecolors="white", linewidths=1.2, zorder=3,
                    path_effects=outline)  # fmt: skip
-        written = []
-        box = ax.get_window_extent()  # maps have one scale in x and y, which the axes have only once they are drawn
+        label_points = []
+        box = ax.get_window_extent()  # equal scales in x and y, as the axes have only after drawing
         scale = min(box.width / np.ptp(x_limits), box.height / np.ptp(y_limits)) * 72 / ax.figure.dpi
-        for index in chosen if labels else ():
+        for index in selection if labels else ():
             point = places[index] * scale
-            if all(np.hypot(*(point - other)) > _APART * size / 9 for other in written):
-                written.append(point)
+            if all(np.hypot(*(point - other)) > _APART * size / 9 for other in label_points):
+                label_points.append(point)
                 at_edge = places[index, 0] > x_limits[1] - 0.07 * (x_limits[1] - x_limits[0])
                 ax.annotate(crystal_poles.labels[index], places[index], xytext=(-4 if at_edge else 4, 4), size=size,
                             textcoords="offset points", ha="right" if at_edge else "left", color="white",

@@ -1,4 +1,4 @@
-"""Profiles, the lines fitted to them, two of them compared; rectangles on a map."""
+"""Profiles, fitted lines and the comparison of two profiles; rectangles on a map."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -21,20 +21,20 @@ def profile(
     lines: Sequence[ZoneLine] | None = None,
     xlabel: str = "distance from the line [mm]",
 ) -> Axes:
-    """Draw profiles with their errors, and the lines fitted to them.
+    """Draw profiles with their errors, and fitted lines.
 
     Parameters
     ----------
     profiles : Profile or sequence of Profile
         The profiles.
     labels : sequence of str, optional
-        A label for each.
+        One label each.
     ax : matplotlib.axes.Axes, optional
         Where to draw; a new figure by default.
     lines : sequence of ZoneLine, optional
-        What `fit_zone_line` gave for each; None for one without.
+        Results of `fit_zone_line`; None for a profile without.
     xlabel : str
-        What the positions are, with their unit.
+        Quantity of the positions, with its unit.
 
     Returns
     -------
@@ -43,7 +43,7 @@ def profile(
     Raises
     ------
     ValueError
-        If there is no profile, or not one label or line for each.
+        If there is no profile, or the numbers of profiles, labels and lines differ.
     """
     profiles = [profiles] if isinstance(profiles, Profile) else list(profiles)
     n = len(profiles)
@@ -51,7 +51,7 @@ def profile(
     lines = [None] * n if lines is None else list(lines)
     if not n or len(labels) != n or len(lines) != n:
         raise ValueError(
-            f"a picture needs profiles, and a label and a line for each, got {n}, {len(labels)} and {len(lines)}"
+            f"a plot needs profiles, with one label and line each, got {n}, {len(labels)} and {len(lines)}"
         )
     if ax is None:
         ax = new_figure((5.6, 4.0)).subplots()
@@ -69,7 +69,7 @@ def profile(
     ax.set(xlabel=xlabel, ylabel="hits per area / mean", ylim=(0, None))
     ax.grid(alpha=0.3)
     if any(label or line for label, line in zip(labels, lines, strict=True)):
-        ax.set_ylim(0, 1.25 * ax.get_ylim()[1])  # room for the legend
+        ax.set_ylim(0, 1.25 * ax.get_ylim()[1])  # space for the legend
         ax.legend(loc="upper center", frameon=False, fontsize="small")
     return ax
 
@@ -82,18 +82,18 @@ def profile_comparison(
     *,
     lines: Sequence[ZoneLine] | None = None,
 ) -> NDArray[np.object_]:
-    """Draw two profiles of one rectangle, and below them their difference in units of its error.
+    """Draw two profiles of the same rectangle, and below them their difference in units of the error.
 
     Parameters
     ----------
     first, second : Profile
         Profiles with the same bins and with errors.
     labels : sequence of str, optional
-        A label for each.
+        One label each.
     axes : sequence of matplotlib.axes.Axes, optional
-        Two, for the profiles and for the difference; a new figure by default.
+        Two axes, for the profiles and for the difference; a new figure by default.
     lines : sequence of ZoneLine, optional
-        The line fitted to each.
+        Fitted line of each profile.
 
     Returns
     -------
@@ -105,21 +105,21 @@ def profile_comparison(
     ValueError
         If bins differ, or a profile has no errors.
     """
-    compared = compare_profiles(first, second)
+    comparison = compare_profiles(first, second)
     if axes is None:
         axes = new_figure((5.6, 5.2)).subplots(2, 1, sharex=True, height_ratios=(3, 1))
     upper, lower = axes
     profile([first, second], labels, upper, lines=lines)
     upper.set_xlabel("")
     upper.tick_params(labelbottom=False)
-    bin_width = compared.position[1] - compared.position[0] if len(compared.position) > 1 else 1.0
+    bin_width = comparison.position[1] - comparison.position[0] if len(comparison.position) > 1 else 1.0
     lower.axhspan(-1, 1, color="0.9", linewidth=0)
     lower.axhline(0, color="0.4", linewidth=0.8)
-    lower.bar(compared.position, compared.difference, 0.8 * bin_width, color="0.35")
-    reach = max(4.0, 1.6 * np.nanmax(np.abs(compared.difference)))  # room for the text above the bars
+    lower.bar(comparison.position, comparison.difference, 0.8 * bin_width, color="0.35")
+    reach = max(4.0, 1.6 * np.nanmax(np.abs(comparison.difference)))  # space for the text above the bars
     lower.set(ylim=(-reach, reach), xlabel="distance from the line [mm]", ylabel="difference\n/ error")
     lower.annotate(
-        f"$\\chi^2$ = {compared.chi_square:.0f} for {compared.degrees_of_freedom}", (0.02, 0.95),
+        f"$\\chi^2$ = {comparison.chi_square:.0f} for {comparison.degrees_of_freedom}", (0.02, 0.95),
         xycoords="axes fraction", va="top", fontsize="small",
     )  # fmt: skip
     return np.array([upper, lower])
@@ -128,18 +128,18 @@ def profile_comparison(
 def rectangles(
     chosen: Rectangle | Sequence[Rectangle], ax: Axes, *, colors: Any = "cyan", labels: Sequence[str] | None = None
 ) -> Axes:
-    """Draw rectangles on a detector map, with a thin line where the profile is zero.
+    """Draw rectangles on a detector map, with a thin line at the zero of the profile.
 
     Parameters
     ----------
     chosen : Rectangle or sequence of Rectangle
         The rectangles.
     ax : matplotlib.axes.Axes
-        The picture of the map.
+        Axes of the map.
     colors : color or sequence of them
-        Of the rectangles.
+        Colours of the rectangles.
     labels : sequence of str, optional
-        A label for each.
+        One label each.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Where chosen ions land as the energy of the perturbation grows."""
+"""Hits of selected ions for increasing energy of the perturbation."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ MECHANISMS = ("lateral velocity", "roll-up")
 
 
 def ion_colors(n: int) -> list[str]:
-    """Colours that tell n chosen ions apart, the same in every picture (list of str)."""
+    """Colours of n selected ions, the same in every plot (list of str)."""
     return [f"C{index % 10}" for index in range(n)]
 
 
@@ -34,33 +34,33 @@ def response(
     zoom: int | None = None,
     title: str | None = None,
 ) -> Axes:
-    """Draw where chosen ions land under launch energies from none to the highest.
+    """Draw the hits of selected ions for increasing launch energies.
 
-    For a lateral velocity, every direction along the surface is shown; for roll-up, the track that leads from the
-    place without perturbation (dot), by the roll alone (dashed), through the places of growing energy.
+    For a lateral velocity, all directions along the surface are drawn. For roll-up, a track is drawn: from the hit
+    without perturbation (dot), by the roll-up without energy (dashed), through the hits of increasing energy.
 
     Parameters
     ----------
     run : Run
         A run with responses.
     ions : array_like of int
-        Which ions of the run, shape (n,).
+        Indices of ions of the run, shape (n,).
     mechanism : {"lateral velocity", "roll-up"}
-        How they are perturbed.
+        Mechanism of the perturbation.
     ax : matplotlib.axes.Axes, optional
-        Where to draw; a new figure by default.
+        Axes for the plot; a new figure by default.
     energies : array_like, optional
         Launch energies [eV], increasing, shape (m,); 0 to 1 eV by default.
     colors : sequence of colors, optional
-        Of the dots, one for each ion; `ion_colors` by default.
+        Colours of the dots, one for each ion; `ion_colors` by default.
     colormap : str
         Colour map of the energies.
     colorbar : bool
         Whether to draw a colour bar.
     zoom : int, optional
-        Which of the n ions is shown larger in an inset, from 0.
+        Index, from 0, of one of the n ions to enlarge in an inset.
     title : str, optional
-        Title above the picture.
+        Title above the plot.
 
     Returns
     -------
@@ -69,15 +69,15 @@ def response(
     Raises
     ------
     ValueError
-        If the run has no responses, or an argument is none of those allowed.
+        If the run has no responses, or an argument is invalid.
     """
     if mechanism not in MECHANISMS:
         raise ValueError(f"mechanism must be one of {', '.join(MECHANISMS)}, got {mechanism!r}")
     energies = np.linspace(0, 1, 51) if energies is None else np.asarray(energies, float)
-    still = lateral_tracks(run, ions, [0.0], [0.0])
-    dots = np.column_stack([still.x[:, 0, 0], still.y[:, 0, 0]])
+    unperturbed = lateral_tracks(run, ions, [0.0], [0.0])
+    dots = np.column_stack([unperturbed.x[:, 0, 0], unperturbed.y[:, 0, 0]])
     if zoom is not None and not 0 <= zoom < len(dots):
-        raise ValueError(f"zoom must be one of the {len(dots)} ions, 0 to {len(dots) - 1}, got {zoom!r}")
+        raise ValueError(f"zoom must be an index from 0 to {len(dots) - 1}, got {zoom!r}")
     colors = ion_colors(len(dots)) if colors is None else list(colors)
     if mechanism == MECHANISMS[0]:
         draw, tracks = _directions, lateral_tracks(run, ions, energies, np.arange(0, 360, 2))
@@ -112,7 +112,7 @@ def response(
 
 
 def _directions(ax, tracks, dots, scale, size):
-    """All directions at every energy, the highest first so that the lowest are seen."""
+    """Draw all directions at every energy, the highest first so that the lowest are visible."""
     n, _, k = tracks.x.shape
     order = np.argsort(-tracks.energies, kind="stable")
     x, y = (np.moveaxis(values[:, order], 1, 0) for values in (tracks.x, tracks.y))
@@ -134,15 +134,15 @@ def _dots(ax, dots, colors, size):
 
 
 def _emptiest_corner(ax, tracks):
-    """Bounds of an inset, in fractions of the axes, where the fewest places are."""
+    """Bounds of an inset, in fractions of the axes, in the corner with the fewest points."""
     places = np.column_stack([tracks.x.ravel(), tracks.y.ravel()])
-    ax.figure.draw_without_rendering()  # the limits of the axes settle
+    ax.figure.draw_without_rendering()  # sets the limits of the axes
     places = ax.transAxes.inverted().transform(ax.transData.transform(places[np.isfinite(places).all(axis=1)]))
     side, gap = 0.34, 0.1
     corners = [(x, y) for y in (gap, 1 - side - 0.02) for x in (gap, 1 - side - 0.02)]
-    labels = 0.1  # room for the numbers along the inset's axes
-    crowd = [
+    labels = 0.1  # space for the tick labels of the inset
+    points_inside = [
         np.sum(np.all((places > np.subtract(corner, labels)) & (places < np.add(corner, side)), axis=1))
         for corner in corners
     ]
-    return (*corners[int(np.argmin(crowd))], side, side)
+    return (*corners[int(np.argmin(points_inside))], side, side)

@@ -1,4 +1,4 @@
-"""The surface of a specimen, atom by atom, seen from any side."""
+"""Surface atoms of a specimen, seen from any direction."""
 
 from typing import Any
 
@@ -27,24 +27,24 @@ def specimen(
     colorbar: bool = True,
     title: str | None = None,
 ) -> Axes:
-    """Draw the surface atoms of a specimen as discs of their size, those in front over those behind.
+    """Draw the surface atoms of a specimen as discs, front atoms over back atoms.
 
     Parameters
     ----------
     emitter : Emitter
         The charged surface.
     color : str or array_like
-        "fields", "charges", or a number for each surface atom, shape (n,).
+        "fields", "charges", or one number per surface atom, shape (n,).
     ax : matplotlib.axes.Axes, optional
         Where to draw; a new figure by default.
     elevation, azimuth : float
-        Where the viewer is [degrees]: above the x-y plane, and around z from x towards y. By default above the
-        apex, with x to the right and y upwards; 25 and -60 show the specimen from the side.
+        Position of the viewer [degrees]: above the x-y plane, and around z from x towards y. By default above the apex,
+        with x to the right and y upwards; 25 and -60 give a side view.
     label : str, optional
-        What the colours mean, with its unit, for numbers of one's own.
+        Quantity of the colours, with its unit, if `color` is an array.
     limits : tuple of float, optional
-        Values at the ends of the colour scale; by default the 1 and 99.5 percentiles of the atoms shown that may
-        leave: the rim of the foot does not count.
+        Values at the ends of the colour scale; by default the 1 and 99.5 percentiles of the visible evaporable atoms,
+        without the rim of the base.
     colormap : str
         Name of a colour map of matplotlib.
     colorbar : bool
@@ -60,7 +60,7 @@ def specimen(
     Raises
     ------
     ValueError
-        If `color` is no such name, or not one number for each surface atom.
+        If `color` is neither of these names nor one number per surface atom.
     """
     if isinstance(color, str):
         if color not in COLORED_BY:
@@ -69,22 +69,22 @@ def specimen(
     else:
         values = check_array(color, "color", (len(emitter),), finite=False)
     right, up, towards = _viewed_from(elevation, azimuth)
-    facing = np.flatnonzero(emitter.normals @ towards > 1e-9)  # the others face away; symmetric ones lie across
+    facing = np.flatnonzero(emitter.normals @ towards > 1e-9)  # 1e-9: perpendicular normals do not count
     positions = emitter.positions[facing]
-    facing = facing[np.argsort(positions @ towards, kind="stable")]  # what is drawn last is in front
+    facing = facing[np.argsort(positions @ towards, kind="stable")]  # front atoms are drawn last
     positions, values = emitter.positions[facing], values[facing]
     if limits is None:
-        counted = values[emitter.tip.evaporable[emitter.atoms[facing]]]
-        limits = np.nanpercentile(counted if len(counted) else values, [1, 99.5])
+        evaporable = values[emitter.tip.evaporable[emitter.atoms[facing]]]
+        limits = np.nanpercentile(evaporable if len(evaporable) else values, [1, 99.5])
     diameter = emitter.tip.nearest_neighbour_distance
     places = np.column_stack([positions @ right, positions @ up])
     low, high = places.min(axis=0) - diameter, places.max(axis=0) + diameter
     if ax is None:
         width, height = (high - low) * (4.5 / max(high - low))
         figure = new_figure((width + 1.2, height + 0.5))
-        figure.set_layout_engine("compressed")  # made for axes of a fixed shape
+        figure.set_layout_engine("compressed")  # for axes with a fixed aspect ratio
         ax = figure.subplots()
-    _discs(ax, places, 2 * diameter, color="0.2")  # what lies below the gaps of the surface, and its outline
+    _discs(ax, places, 2 * diameter, color="0.2")  # background in the gaps of the surface, and outline
     atoms = _discs(ax, places, diameter, array=values, cmap=colormap, clim=tuple(limits))
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     set_title(ax, title)
@@ -98,7 +98,7 @@ def specimen(
 
 
 def _discs(ax, places, diameter, **colors):
-    """Discs of a diameter [nm], which keep their size relative to the axes."""
+    """Draw discs with a diameter [nm] that scales with the axes."""
     sizes = np.full(len(places), diameter)
     discs = EllipseCollection(
         sizes, sizes, np.zeros(len(places)), units="xy", offsets=places, offset_transform=ax.transData,
@@ -117,18 +117,18 @@ def mark_atoms(
     azimuth: float = -90.0,
     size: float = 14.0,
 ) -> Axes:
-    """Draw a dashed circle around each of some atoms in a picture of the specimen.
+    """Draw dashed circles around atoms in a plot of the specimen.
 
     Parameters
     ----------
     positions : array_like
         The atoms [nm], shape (n, 3), such as ``run.emissions.positions[ions]``.
     ax : matplotlib.axes.Axes
-        The picture.
+        Axes of the plot.
     colors : color or sequence of them
-        Of the circles.
+        Colours of the circles.
     elevation, azimuth : float
-        Those of the picture [degrees].
+        As for the plot [degrees].
     size : float
         Diameter of the circles [points].
 
@@ -159,7 +159,7 @@ def _viewed_from(elevation, azimuth):
 
 
 def _scale_instead_of_axes(ax, right, up, low, high):
-    """Where picture and crystal axes differ: a bar of a round length, and arrows along x, y and z."""
+    """Draw a scale bar and arrows along x, y and z, for views that are not along an axis."""
     ax.axis("off")
     width = high[0] - low[0]
     length = max(length for power in range(-1, 5) for length in (10**power * np.array([1, 2, 5])) if length < width / 3)

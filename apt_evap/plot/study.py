@@ -1,4 +1,4 @@
-"""Pictures of a study: similarity against energies, and the maps side by side."""
+"""Plots of a study: similarity against energies, and the maps side by side."""
 
 from collections.abc import Sequence
 
@@ -13,33 +13,33 @@ from apt_evap.energy_fit.study import Study
 from apt_evap.plot._figure import OUTSIDE, add_colorbar, new_figure
 from apt_evap.plot.maps import common_limits, detector_map
 
-_MARK = "#00d0ff"  # seen on every colour of both maps
+_MARK = "#00d0ff"  # visible on all colours of both maps
 
 
 def ssim_matrix(study: Study, axes: Sequence[Axes] | None = None, *, colormap: str = "viridis") -> NDArray[np.object_]:
     """Draw the similarity with the measured map against mean and relative standard deviation of the energy.
 
-    The best point of the grid is framed; a circle is the best place between points, with the interval of 95 % of the
-    resamples. A new figure has a legend.
+    A frame marks the best point of the grid. A circle marks the maximum between points, with the interval of 95 % of
+    the resamples. A new figure has a legend.
 
     Parameters
     ----------
     study : Study
-        What `fit_energies` gives.
+        Result of `fit_energies`.
     axes : sequence of matplotlib.axes.Axes, optional
-        Where to draw, one for each roll-up fraction, three of them a row; a new figure by default.
+        Axes for the plots, one per roll-up fraction; by default a new figure with three per row.
     colormap : str
         Name of a colour map of matplotlib.
 
     Returns
     -------
     ndarray of matplotlib.axes.Axes
-        One for each roll-up fraction, shape (n,).
+        Shape (n,), one per roll-up fraction.
 
     Raises
     ------
     ValueError
-        If there are not as many axes as roll-up fractions.
+        If the numbers of axes and roll-up fractions differ.
     """
     grid = study.grid
     layers, rows, columns = grid.shape
@@ -52,14 +52,14 @@ def ssim_matrix(study: Study, axes: Sequence[Axes] | None = None, *, colormap: s
     elif len(axes) == layers:
         panels = np.array(axes, object)
     else:
-        raise ValueError(f"axes must be {layers}, one for each roll-up fraction, got {len(axes)}")
+        raise ValueError(f"axes must be {layers}, one per roll-up fraction, got {len(axes)}")
     limits = {"vmin": study.ssim.min(), "vmax": study.ssim.max()}
     for ax, values, fraction in zip(panels, study.ssim, grid.rollup_fractions, strict=False):
         image = ax.imshow(values, origin="lower", cmap=colormap, aspect="auto", **limits)
         for (row, column), value in np.ndenumerate(values):
             shade = image.cmap(image.norm(value))
             light = np.dot(shade[:3], (0.299, 0.587, 0.114)) > 0.5
-            # in a corner, since the circle is most often near a centre; legible where bars cross it
+            # in a corner, because the circle is usually near a centre; legible across error bars
             text = ax.text(column - 0.4, row + 0.38, f"{value:z.3f}", ha="left", va="top", fontsize=8, zorder=5)
             text.set(color="k" if light else "w", path_effects=[withStroke(linewidth=3, foreground=shade)])
         ax.set_xticks(range(columns), [f"{mean:.4g}" for mean in grid.means])
@@ -81,13 +81,13 @@ def ssim_matrix(study: Study, axes: Sequence[Axes] | None = None, *, colormap: s
     add_colorbar(
         [ax.images[0] for ax in panels],
         list(panels),
-        label="SSIM, noise allowed for" if study.settings.allow_noise else "SSIM",
+        label="noise-corrected SSIM" if study.settings.allow_noise else "SSIM",
     )
     return panels
 
 
 def _mark_optima(study, axes):
-    """Frame the best point, and put a circle with its interval on the best place between points; return both."""
+    """Mark the best point by a frame, and the maximum between points by a circle with its interval; return both."""
     grid, best, refined = study.grid, study.optimum, study.refined
     column, row = grid.means.index(best.mean), grid.rsds.index(best.rsd)
     ax = axes[grid.rollup_fractions.index(best.rollup_fraction)]
@@ -116,19 +116,19 @@ def side_by_side(
     titles: Sequence[str] | None = None,
     colormap: str = "inferno",
 ) -> NDArray[np.object_]:
-    """Draw the measured map beside the simulated ones, unperturbed and at the optimum, and a part of them magnified.
+    """Draw the measured map, the unperturbed map and the optimum side by side, and an enlarged part of them.
 
-    Maps are drawn as they are compared: flattened and smoothed, inside the region that all show. The measured map has a
-    colour scale of its own, from the 2 to the 99.5 percentile, since its contrast may be much lower than that of the
-    simulated ones, which share one.
+    The maps are flattened and smoothed as for the comparison, inside the common region. The measured map has a separate
+    colour scale, from the 2 to the 99.5 percentile, because its contrast may be much lower. The simulated maps have a
+    common scale.
 
     Parameters
     ----------
     study : Study
-        What `fit_energies` gives.
+        Result of `fit_energies`.
     circle : tuple of float, optional
-        x, y and radius [mm] of the part to magnify; by default about the axis of the simulated specimen if that lies
-        inside, about the middle if not.
+        x, y and radius [mm] of the enlarged part; by default around the axis of the simulated specimen if this is
+        inside the region, otherwise around the centre of the region.
     titles : sequence of str, optional
         Titles of the three maps.
     colormap : str
@@ -137,7 +137,7 @@ def side_by_side(
     Returns
     -------
     ndarray of matplotlib.axes.Axes
-        Measured, unperturbed, optimum, and magnified measured and optimum, shape (5,).
+        Measured, unperturbed, optimum, and enlarged measured and optimum, shape (5,).
     """
     maps = [study.compared(study.measured), *(study.compared(study.maps[name]) for name in ("unperturbed", "optimum"))]
     x, y, radius = _default_circle(study) if circle is None else check_array(circle, "circle", (3,))
@@ -149,7 +149,7 @@ def side_by_side(
             mechanism += f", roll-up fraction {best.rollup_fraction:g}"
         energies = f"{best.mean:g} eV, σ/mean {best.rsd:g}"
         titles = "measured", "simulated, unperturbed", f"simulated, {mechanism}\n{energies}"
-    # percents below 2 may be a dark rim
+    # below 2 percent may be a dark rim
     low, high = np.percentile(maps[0].density[maps[0].mask], [2, 99.5])
     measured = (float(low), float(high)) if high > low else (0.0, 2.0)
     simulated = common_limits(maps[1:])
@@ -171,15 +171,15 @@ def side_by_side(
         ax.add_patch(Circle((x, y), radius, fill=False, edgecolor=_MARK, linewidth=2))
     axes[1, 1].axis("off")
     axes[1, 1].text(0.5, 0.5, _scores(study), ha="center", va="center", transform=axes[1, 1].transAxes, linespacing=1.7)
-    drawn = [*axes[0], axes[1, 0], axes[1, 2]]
-    for ax in drawn:
+    panels = [*axes[0], axes[1, 0], axes[1, 2]]
+    for ax in panels:
         label = "hits per area / mean, flattened" if ax in axes[:, 2] else ""
         add_colorbar([ax.images[0]], ax, label=label)
-    return np.array(drawn)
+    return np.array(panels)
 
 
 def _show_inside(ax, map):
-    """Show only where the mask is, with a margin of two bins."""
+    """Limit the axes to the mask, with a margin of two bins."""
     rows, columns = (np.flatnonzero(map.mask.any(axis=axis)) for axis in (1, 0))
     ends = []
     for edges, index in ((map.x_edges, columns), (map.y_edges, rows)):
@@ -198,11 +198,11 @@ def _default_circle(study):
 
 
 def _scores(study):
-    """The similarities as text."""
-    allowed = study.settings.allow_noise
+    """Text with the similarities."""
+    corrected = study.settings.allow_noise
     lines = [
         "SSIM with the measured map",
-        f"in {study.provenance['bins_compared']:,} bins" + ", noise allowed for" * allowed,
+        f"in {study.provenance['bins_compared']:,} bins" + ", noise-corrected" * corrected,
     ]
     if study.registration.doubtful:
         lines.insert(0, f"THE REGISTRATION IS DOUBTFUL: correlation {study.registration.score:.2f}\n")
@@ -210,7 +210,7 @@ def _scores(study):
     lines.append(f"{study.grid.mechanism}: {study.optimum.score}")
     lines.append(f"gain over unperturbed: {study.gain}")
     if study.ceiling is not None:
-        lines += [f"noise and all: {study.plain['optimum']}"] * allowed
+        lines += [f"uncorrected: {study.plain['optimum']}"] * corrected
         lines.append(f"two halves of the measured ions: {study.ceiling}")
     width, height = study.measured.bin_size
     lines.append(f"bins {width:.3g} × {height:.3g} mm, smoothed by {study.settings.smoothing:.3g} mm")

@@ -1,1 +1,1 @@
-"""Bringing two detector maps into register: rotation, scale, shift and mirror."""
+"""Registration of two detector maps: rotation, scale, shift and mirror."""

@@ -13,46 +13,46 @@ from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.registration.transform import SimilarityTransform
 
 COARSE, MEDIUM, FINE = 40, 60, 100
-"""Pixels across the field of view in the search, when its best places are refined, and at the end."""
+"""Pixels across the field of view in the search, in the refinement of its best results, and in the final refinement."""
 BROAD = 1 / 8
-"""Standard deviation of the Gaussian that maps are flattened with, in diameters of the field of view."""
+"""Standard deviation of the Gaussian that flattens maps, in diameters of the field of view."""
 NARROW = 0.8
-"""Standard deviation of the Gaussian that maps are smoothed with, in pixels."""
+"""Standard deviation of the Gaussian that smooths maps, in pixels."""
 RIM = 0.03
-"""What is cut off at the rim of the field of view, in its diameters."""
+"""Width of the excluded rim of the field of view, in its diameters."""
 ROTATION_STEP, SCALE_STEP = 6.0, 0.1
-"""Steps of the search [degrees] and in the logarithm of the scale: some two coarse pixels at the rim."""
+"""Steps of the search, in rotation [degrees] and in the logarithm of the scale: about two coarse pixels at the rim."""
 
 
 class Fit(NamedTuple):
-    """A transform and how well the images fit under it."""
+    """A transform and the similarity of the images under it."""
 
     transform: SimilarityTransform
     score: float
-    """Correlation coefficient where both show something."""
+    """Correlation coefficient in the common area."""
     overlap: float
-    """Share of the measured field of view where both do."""
+    """Fraction of the measured field of view in the common area."""
 
     @property
     def rank(self) -> float:
-        """What the search maximises: a match of more of the map counts more, as the error of a mean does."""
+        """Quantity that the search maximises: the score times the square root of the overlap."""
         return self.score * np.sqrt(self.overlap)
 
 
 class Near(NamedTuple):
-    """Where a simulated point must come to lie."""
+    """Bounds of the shift: the measured position of a simulated point."""
 
     anchor: complex
     """The simulated point [mm]."""
     place: complex
     """The measured point [mm]."""
     tolerance: float
-    """How far off it may lie, in x and in y [mm]."""
+    """Largest deviation in x and in y [mm]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """A flattened map, sampled anywhere; coordinates are complex numbers x + iy [mm]."""
+    """A flattened map with interpolation; coordinates are complex numbers x + iy [mm]."""
 
     values: np.ndarray
     mask: np.ndarray
@@ -60,7 +60,7 @@ class Image:
     bin_size: tuple
 
     def sample(self, points: Any) -> tuple[Floats, Booleans]:
-        """Values at points, 0 outside, and whether points are inside; both of the shape of `points`."""
+        """Values at points (0 outside) and whether points are inside, both with the shape of `points`."""
         place = points - self.origin
         index = np.stack([place.imag / self.bin_size[1], place.real / self.bin_size[0]])
         inside = scipy.ndimage.map_coordinates(self.mask, index, order=0, mode="constant") > 0
@@ -68,7 +68,7 @@ class Image:
 
 
 class View:
-    """A map within its field of view, less a rim.
+    """A map within its field of view, without the rim.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ class View:
     """
 
     def __init__(self, map: DetectorMap) -> None:
-        # densities are as good as 20 hits per bin, over which field_of_view averages
+        # densities are scaled to a mean of 20 hits per bin, as field_of_view averages over 20 hits
         values = map.values if map.is_counts else map.values * (20 / map.values[map.mask].mean())
         mask = np.pad(map.mask & field_of_view(np.where(map.mask, values, 0)), 1)
         width, height = map.bin_size
@@ -91,13 +91,13 @@ class View:
         self.reach = float(np.abs(points - self.centre).max())
 
     def flatten(self, narrow: float, broad: float) -> Image:
-        """Density smoothed by `narrow` relative to that smoothed by `broad` [mm], less its mean, as an `Image`.
+        """Density smoothed by `narrow` divided by that smoothed by `broad` [mm], minus the mean, as an `Image`.
 
-        A tenth of the median density is added to the denominator and the outermost percents are cut off, so that
-        neither thinly filled corners nor single bright spots dominate.
+        A tenth of the median density is added to the denominator, and values are clipped at the 1 and 99 percentiles,
+        so that neither regions of low density nor single bright spots dominate.
         """
         x_min, x_max, y_min, y_max = self.map.extent
-        widest = max(x_max - x_min, y_max - y_min)  # a Gaussian of this width is flat over the map
+        widest = max(x_max - x_min, y_max - y_min)  # a Gaussian of this width is constant over the map
         fine, wide = (self.map.smoothed(min(sigma, widest)).values for sigma in (narrow, broad))
         ratio = (fine - wide) / (wide + 0.1 * np.median(wide[self.mask]))
         ratio = np.clip(ratio, *np.percentile(ratio[self.mask], [1, 99]))
@@ -107,31 +107,31 @@ class View:
 
 
 def correlation(a: Floats, b: Floats) -> float:
-    """Correlation coefficient of two sets of values, 0 if one is constant (float)."""
+    """Correlation coefficient of two arrays, 0 if one is constant (float)."""
     a, b = a - a.mean(), b - b.mean()
     norm = np.sqrt((a @ a) * (b @ b))
     return float(a @ b / norm) if norm > 0 else 0.0
 
 
 def spectra(values: Any, inside: Any, size: int) -> Any:
-    """Fourier transforms of a mask, an image that is 0 outside of it and its square, padded to (size, size)."""
+    """Fourier transforms of a mask, an image (0 outside the mask) and its square, padded to (size, size)."""
     return scipy.fft.rfft2(np.stack([inside, values, values**2]).astype(np.float32), (size, size))
 
 
 def correlate(moving: Any, fixed: Any, size: int) -> tuple[Floats, Floats]:
-    """Correlation coefficients of one image and another that it is shifted over, where both are inside.
+    """Correlation coefficients of two images in their common area, for all shifts.
 
     Parameters
     ----------
     moving, fixed : ndarray
-        Their `spectra`.
+        `spectra` of the images.
     size : int
-        Length of the sides they are padded to.
+        Padded length of the sides.
 
     Returns
     -------
     coefficients, shared : ndarray, shape (size, size)
-        For every shift of the first image in y and x, the correlation coefficient and the number of shared pixels;
+        For every shift of the first image in y and x, the correlation coefficient and the number of common pixels;
         negative shifts count from the end.
 
     Notes
@@ -144,9 +144,9 @@ def correlate(moving: Any, fixed: Any, size: int) -> tuple[Floats, Floats]:
     shared = np.rint(shared)
     number = np.maximum(shared, 1)
     spread = np.maximum(aa - a * a / number, 0) * np.maximum(bb - b * b / number, 0)
-    # float32 leaves some 1e-6 of the largest spread where there is none
-    good = spread > 1e-6 * spread.max()
-    return np.where(good, (ab - a * b / number) / np.sqrt(np.where(good, spread, 1)), 0), shared
+    # a zero spread becomes about 1e-6 of the largest one in float32
+    varied = spread > 1e-6 * spread.max()
+    return np.where(varied, (ab - a * b / number) / np.sqrt(np.where(varied, spread, 1)), 0), shared
 
 
 def search(
@@ -165,38 +165,38 @@ def search(
     simulated, measured : View
         The maps.
     rotations, scales, mirrors : sequence
-        What to try: degrees, numbers, bools.
+        Values to try: [degrees], numbers, bools.
     least : float
-        Least share of the measured field of view that both must show.
+        Smallest common fraction of the measured field of view.
     near : Near, optional
         Bounds of the shift.
 
     Returns
     -------
     list of Fit
-        The best first.
+        Sorted, the best first.
     """
     pixel, broad = measured.diameter / COARSE, BROAD * measured.diameter
     grid = _square(measured.reach, pixel)
     image = measured.flatten(NARROW * pixel, broad)
-    # frames about the measured centre that turn with the simulated map
+    # frames at the measured centre that rotate with the simulated map
     frames = [SimilarityTransform(float(rotation), 1.0, place=measured.centre) for rotation in rotations]
-    turned = [image.sample(frame.forth(grid)) for frame in frames]
+    rotated = [image.sample(frame.forth(grid)) for frame in frames]
     fits = []
     for scale in scales:
         image = simulated.flatten(NARROW * pixel / scale, broad / scale)
         points = _square(simulated.reach * scale, pixel)
         size = scipy.fft.next_fast_len(len(points) + len(grid) - 1, real=True)
-        # shifts of the simulated centre from the measured one, in these frames
+        # shifts of the simulated centre relative to the measured one, in these frames
         steps = np.arange(size)
         steps = (np.where(steps < len(grid), steps, steps - size) + len(points) // 2 - len(grid) // 2) * pixel
         shifts = steps + 1j * steps[:, None]
-        fixed = [spectra(*values, size) for values in turned]
+        fixed = [spectra(*values, size) for values in rotated]
         for mirror in mirrors:
             unshifted = SimilarityTransform(0.0, float(scale), mirror, simulated.centre)
             moving = spectra(*image.sample(unshifted.back(points)), size)
             allowed: Any = True
-            for frame, values, (_, inside) in zip(frames, fixed, turned, strict=True):
+            for frame, values, (_, inside) in zip(frames, fixed, rotated, strict=True):
                 if near is not None:
                     target = frame.back(near.place) - unshifted.forth(near.anchor)
                     allowed = np.abs(shifts - target) <= max(near.tolerance, pixel)
@@ -210,11 +210,11 @@ def search(
     return sorted(fits, key=lambda fit: -fit.rank)
 
 
-def distinct(fits: Sequence[Fit], most: int) -> list[Fit]:
-    """The first `most` fits that are no neighbours in rotation and scale of a better one."""
+def distinct(fits: Sequence[Fit], n_max: int) -> list[Fit]:
+    """The first `n_max` fits that are not close to a better one in rotation and scale."""
     best = []
     for fit in fits:
-        if len(best) < most and not any(_close(fit.transform, other.transform) for other in best):
+        if len(best) < n_max and not any(_close(fit.transform, other.transform) for other in best):
             best.append(fit)
     return best
 
@@ -236,13 +236,13 @@ def refine(
     simulated, measured : View
         The maps.
     transform : SimilarityTransform
-        Where to begin.
+        Start of the search.
     pixels : int
         Pixels across the measured field of view.
     least : float
-        Least share of the measured field of view that both must show.
+        Smallest common fraction of the measured field of view.
     rotations, scales : tuple of float, optional
-        Bounds; equal ones fix the value.
+        Lower and upper bound; equal bounds fix the value.
     near : Near, optional
         Bounds of the shift.
 
@@ -257,9 +257,9 @@ def refine(
     image = simulated.flatten(NARROW * pixel / transform.scale, broad / transform.scale)
     start = transform.anchored(measured.centre)
     if near is not None:
-        away = transform.forth(near.anchor) - near.place
-        away = complex(*np.clip((away.real, away.imag), -near.tolerance, near.tolerance))
-        start = replace(transform, anchor=near.anchor, place=near.place + away)
+        offset = transform.forth(near.anchor) - near.place
+        offset = complex(*np.clip((offset.real, offset.imag), -near.tolerance, near.tolerance))
+        start = replace(transform, anchor=near.anchor, place=near.place + offset)
     free = [rotations is None or rotations[0] < rotations[1], scales is None or scales[0] < scales[1], True, True]
     units = np.array([ROTATION_STEP / 2, SCALE_STEP / 2, pixel, pixel])
     low, high = np.full(4, -np.inf), np.full(4, np.inf)
@@ -268,10 +268,10 @@ def refine(
     if scales is not None:
         low[1], high[1] = np.log(np.asarray(scales) / start.scale) / units[1]
     if near is not None:
-        offset = np.array([away.real, away.imag])
+        offset = np.array([offset.real, offset.imag])
         low[2:], high[2:] = (-near.tolerance - offset) / pixel, (near.tolerance - offset) / pixel
 
-    def placed(steps):
+    def moved(steps):
         turn, stretch, x, y = _spread(steps, free) * units
         return replace(
             start,
@@ -281,12 +281,12 @@ def refine(
         )
 
     def fit(steps):
-        transform = placed(steps)
-        sampled, shared = image.sample(transform.back(points))
+        transform = moved(steps)
+        values_there, shared = image.sample(transform.back(points))
         overlap = np.count_nonzero(shared) / len(points)
-        return Fit(transform, correlation(sampled[shared], values[shared]) if overlap >= least else -1.0, overlap)
+        return Fit(transform, correlation(values_there[shared], values[shared]) if overlap >= least else -1.0, overlap)
 
-    low, high = np.minimum(low, 0)[free], np.maximum(high, 0)[free]  # the start is inside but for rounding
+    low, high = np.minimum(low, 0)[free], np.maximum(high, 0)[free]  # the start is inside, apart from rounding
     simplex = np.vstack([np.zeros(len(low)), np.diag(np.where(high >= 1, 1.0, -1.0))])
     options = {"initial_simplex": np.clip(simplex, low, high), "xatol": 2e-3, "fatol": 1e-6, "maxiter": 400}
     bounds = scipy.optimize.Bounds(low, high)
@@ -312,7 +312,7 @@ def _close(a, b):
 
 
 def _square(reach, pixel):
-    """Points of a square grid around 0 that covers a distance of `reach`, complex of shape (n, n) [mm]."""
+    """Points of a square grid around 0 that extends to a distance of `reach`, complex of shape (n, n) [mm]."""
     half = int(np.ceil(reach / pixel))
     side = np.arange(-half, half + 1) * pixel
     return side + 1j * side[:, None]

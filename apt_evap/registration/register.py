@@ -1,4 +1,4 @@
-"""Registration: the rotation, scale, shift and mirror that bring a simulated map into the frame of a measured one."""
+"""Registration: rotation, scale, shift and mirror that transform a simulated map into the frame of a measured one."""
 
 import warnings
 from collections.abc import Sequence
@@ -28,9 +28,9 @@ from apt_evap.registration.correlation_search import (
 from apt_evap.registration.transform import SimilarityTransform
 
 DOUBTFUL = 0.5
-"""Score times root of the overlap that wrong places reach: up to 0.25 on noise, 0.5 on maps of other poles."""
-_KEPT = 12  # places that are refined: as many as there are symmetric ones of a threefold axis with mirrors, twice
-_BINS = 384  # of a map of simulated hits
+"""Limit of score times square root of the overlap. Wrong transforms reach 0.25 on noise, 0.5 on maps of other poles."""
+_MAX_FITS = 12  # transforms that are refined: twice the number of symmetric ones of a threefold axis with mirrors
+_BINS = 384  # bins of a map of simulated hits
 
 
 @dataclass(frozen=True)
@@ -46,21 +46,21 @@ class Registration:
     shift : tuple of float
         Shift in x and y, applied last [mm].
     mirror : bool
-        Whether y changes its sign, before the rotation.
+        Whether y changes sign, before the rotation.
     score : float
-        Correlation coefficient of the flattened maps where both show something; NaN if points were registered.
+        Correlation coefficient of the flattened maps in their common area; NaN if points were registered.
     overlap : float
-        Share of the measured field of view that the simulated map covers; NaN if points were registered.
+        Fraction of the measured field of view that the simulated map covers; NaN if points were registered.
     residual : float
         Root mean square distance of registered points [mm]; NaN if maps were registered.
     method : str
-        How it was found: "search", "start", "pole", "points", or "" if given.
+        Origin of the transform: "search", "start", "pole", "points", or "" if given by the user.
     ties : tuple of Registration
-        Other transforms that fit as well within the noise: the symmetry of the crystal, as a rule.
+        Other transforms that are equally good within the noise, usually by the symmetry of the crystal.
 
     Notes
     -----
-    With z = x + iy, a point goes to z' = scale exp(i rotation) z + shift, or with the conjugate of z if mirrored.
+    With z = x + iy, a point moves to z' = scale exp(i rotation) z + shift, with the conjugate of z if mirrored.
     """
 
     rotation: float
@@ -101,8 +101,8 @@ class Registration:
             Measured detector coordinates [mm].
         """
         z = np.asarray(x, float) + 1j * np.asarray(y, float)
-        moved = self.transform.forth(z)
-        return moved.real, moved.imag
+        z = self.transform.forth(z)
+        return z.real, z.imag
 
     def hits(self, hits: Hits) -> "Hits":
         """Move hits into the measured frame.
@@ -125,40 +125,39 @@ class Registration:
         """The transform from the measured into the simulated frame, a Registration without score."""
         inverse = self.transform.inverse
         back = Registration(inverse.rotation, inverse.scale, (0.0, 0.0), inverse.mirror)
-        shift = -back.transform.forth(inverse.anchor)  # with the angle that `back` has, to the last bit
+        shift = -back.transform.forth(inverse.anchor)  # with the angle of `back`, to the last bit
         return replace(back, shift=(float(shift.real), float(shift.imag)))
 
     @property
     def doubtful(self) -> bool:
-        """Whether it was searched for everywhere, and maps that have nothing to do with each other may fit as well."""
+        """Whether the search had no start, and its score is in the range of unrelated maps."""
         return self.method == "search" and self.score * np.sqrt(self.overlap) < DOUBTFUL
 
     def warn_if_doubtful(self) -> None:
-        """Warn if it is `doubtful`."""
+        """Warn if the registration is `doubtful`."""
         if self.doubtful:
             warnings.warn(
-                f"the registration is doubtful: the maps correlate by only {self.score:.2f} where both show something "
-                f"({self.overlap:.0%} of the measured one), as maps may that have nothing to do with each other; lay "
-                "one over the other, make sure that the specimen was simulated along its axis, and give what is known "
-                "of rotation, scale and shift",
+                f"the registration is doubtful: the correlation of the maps is only {self.score:.2f} in their common "
+                f"area ({self.overlap:.0%} of the measured one), as for unrelated maps; plot the overlay, check the "
+                "axis of the simulated specimen, and give known values of rotation, scale and shift",
                 RegistrationWarning,
                 stacklevel=3,
             )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return it as plain types that JSON can hold (dict); NaN becomes None."""
+        """Return the registration in the plain types of JSON (dict); NaN becomes None."""
         plain = asdict(self)
         plain.update(shift=list(self.shift), ties=[tie.to_dict() for tie in self.ties], doubtful=bool(self.doubtful))
         return {name: None if value != value else value for name, value in plain.items()}
 
     @classmethod
     def from_dict(cls, settings: dict[str, Any]) -> "Registration":
-        """Make it from what `to_dict` returned.
+        """Rebuild a registration from the result of `to_dict`.
 
         Parameters
         ----------
         settings : dict
-            Plain types.
+            Result of `to_dict`.
 
         Returns
         -------
@@ -189,65 +188,68 @@ def register(
     mirrors: Sequence[bool] | None = None,
     overlap: float = 0.5,
 ) -> "Registration":
-    """Find the rotation, scale, shift and mirror that bring a simulated map onto a measured one.
+    """Find the rotation, scale, shift and mirror that transform a simulated map into a measured one.
 
-    Both maps are smoothed a little and divided by themselves, smoothed a lot: what is left are poles and zone lines,
-    not the broad gradients of density, which would draw the scale to a wrong value. Rotations, scales and mirrors
-    are tried one by one with all shifts at once; the best places are then refined.
+    Each map is smoothed slightly and divided by a strongly smoothed copy. Poles and zone lines remain; broad density
+    gradients, which would bias the scale, are removed. Every combination of rotation, scale and mirror is tried with
+    all shifts at once. The best ones are then refined.
 
     Parameters
     ----------
     simulated, measured : DetectorMap or Hits
-        The maps; a measured one may show any part of the simulated one.
+        The maps; the measured map may show any part of the simulated one.
     start : Registration, optional
-        Roughly the answer: within 15 degrees, 20 % of the scale and a fifth of the measured diameter, of the same
-        mirror, unless the following say otherwise.
+        Approximate transform. The search is limited to 15 degrees, 20 % of the scale, a fifth of the measured diameter
+        and the same mirror, unless the following parameters are given.
     pole : tuple, optional
-        A pole that is known in both frames: its simulated and its measured place, ((x, y), (x, y)) [mm].
+        Position of one pole in both frames, simulated and measured: ((x, y), (x, y)) [mm].
     tolerance : float, optional
-        How far the simulated pole may come to lie from the measured one, in x and in y [mm]; by default a 50th of
-        the measured diameter. With `start` and no pole, that of the middle of the measured map.
+        Largest distance between the transformed simulated pole and the measured one, in x and in y [mm]; by default
+        1/50 of the measured diameter. With `start` and no pole, that of the centre of the measured map.
     rotations : float or tuple of float, optional
-        Rotation, or its lowest and highest value [degrees]; all by default.
+        Rotation, or its lower and upper bound [degrees]; all by default.
     scales : float or tuple of float, optional
-        Scale, or its lowest and highest value [measured mm per simulated mm], where known from angles between
-        poles, say. By default from where the simulated map covers half of the measured one to where the
-        measured one shows a 25th of the simulated one (areas).
+        Scale, or its lower and upper bound [measured mm per simulated mm], known for example from angles between poles.
+        By default the simulated map covers at least half of the measured area, and the measured map at least 1/25 of
+        the simulated area.
     mirrors : sequence of bool, optional
-        Whether to try the simulated map as it is, mirrored, or both: (False, True), the default.
+        Whether to try the simulated map unmirrored, mirrored, or both: (False, True), the default.
     overlap : float
-        Least share of the measured field of view that the simulated map must cover.
+        Smallest fraction of the measured field of view that the simulated map must cover.
 
     Returns
     -------
     Registration
-        The best one, or among those that fit as well within the noise the best that is not mirrored; the others are
-        its ``ties``. A pole with mirror symmetry, such as fcc [111], always has ties.
+        The best transform; among equally good ones within the noise, the best unmirrored one. The others are its
+        ``ties``. A pole with mirror symmetry, such as fcc [111], always has ties.
 
     Raises
     ------
     ValueError
-        If an argument is out of range, or there is no place with that overlap.
+        If an argument is outside its range, or no transform has this overlap.
 
     Warns
     -----
     RegistrationWarning
-        If it was searched for everywhere, and has a score that maps reach which have nothing to do with each other.
+        If the search had no start, and the score is in the range of unrelated maps.
 
     Notes
     -----
-    Shifts by masked correlation in Fourier space (Padfield, IEEE Trans. Image Process. 21, 2706 (2012)), refinement
-    by the simplex method of Nelder and Mead. Two scores r are alike within the noise if they differ by less than
-    2 sqrt(2 / n) (1 - r^2), two standard errors of a difference of correlation coefficients of n independent patches
-    (here of 4 pi sigma^2, sigma the smoothing, 0.8 % of the diameter).
+    The shifts are found by masked correlation in Fourier space (Padfield, IEEE Trans. Image Process. 21, 2706 (2012)),
+    the refinement uses the simplex method of Nelder and Mead. Two scores r are equal within the noise if they differ by
+    less than 2 sqrt(2 / n) (1 - r^2): two standard errors of a difference of correlation coefficients of n independent
+    patches (here of area 4 pi sigma^2, with the smoothing sigma, 0.8 % of the diameter).
 
-    Transforms of simulated maps were found again within 0.2 degrees and 0.6 %, with scores of 0.83 to 0.92, for
-    50,000 to 100,000 ions of another energy and a measured density that falls across the map. What draws the
-    scale away or prevents a match: lines that are wider in one map, as those of a smaller tip are (between two halves
-    of a run in which the tip got blunter, up to 2 %); lines that are dark in one and bright in the other, as
-    without and with roll-up; a simulated field of view of less than `overlap` of the measured one, for which a
-    larger scale is found. Lines through a single pole look the same at any scale. Wrong places reach scores of 0.5 on
-    maps of other poles, and 0.6 to 0.7 on those of the same crystal along another axis, whose poles are alike.
+    Measured: known transforms of simulated maps were recovered within 0.2 degrees and 0.6 %, with scores of 0.83 to
+    0.92, for 50,000 to 100,000 ions of another energy and a measured density that decreases across the map.
+
+    The scale is biased, or the registration fails, in these cases. Lines are wider in one map, as for a smaller tip
+    (between two halves of a run in which the tip got blunter: up to 2 %). Lines are dark in one map and bright in the
+    other, as without and with roll-up. The simulated field of view covers less than `overlap` of the measured one; then
+    a larger scale is found. Lines through a single pole look the same at any scale.
+
+    Wrong transforms reach scores of 0.5 on maps of other poles, and 0.6 to 0.7 on maps of the same crystal along
+    another axis, with similar poles.
     """
     simulated, measured = (_view(value, name) for value, name in ((simulated, "simulated"), (measured, "measured")))
     if start is not None and not isinstance(start, Registration):
@@ -263,29 +265,29 @@ def register(
         rotations = None if rotations[1] - rotations[0] >= 360 else rotations
     if scales is None:
         ratio = measured.diameter / simulated.diameter
-        tried, scales = (np.sqrt(0.5) * ratio, 5 * ratio), None
+        scale_range, scales = (np.sqrt(0.5) * ratio, 5 * ratio), None
     else:
-        tried = scales = _range(scales, "scales", above=0)
+        scale_range = scales = _range(scales, "scales", above=0)
     mirrors = (False, True) if mirrors is None else check_sequence(mirrors, "mirrors", "True and False")
     mirrors = tuple(dict.fromkeys(check_switch(mirror, "mirrors") for mirror in mirrors))
     if not mirrors:
-        raise ValueError("mirrors must hold False, True or both, got none")
+        raise ValueError("mirrors must contain False, True or both, got none")
     angles = np.arange(0, 360, ROTATION_STEP) if rotations is None else _steps(rotations, ROTATION_STEP)
-    fits = search(simulated, measured, angles, np.exp(_steps(np.log(tried), SCALE_STEP)), mirrors, least, near)
+    fits = search(simulated, measured, angles, np.exp(_steps(np.log(scale_range), SCALE_STEP)), mirrors, least, near)
     if not fits:
         raise ValueError(
-            f"the maps must share {least:.0%} of the measured field of view (overlap), and do not for scales of "
-            f"{tried[0]:.3g} to {tried[1]:.3g}"
+            f"the simulated map must cover at least {least:.0%} of the measured field of view (overlap), which is "
+            f"impossible for scales of {scale_range[0]:.3g} to {scale_range[1]:.3g}"
         )
     bounds = rotations, scales, near
-    fits = [refine(simulated, measured, fit.transform, MEDIUM, least, *bounds) for fit in distinct(fits, _KEPT)]
-    fits = distinct(sorted(fits, key=lambda fit: -fit.rank), _KEPT)
+    fits = [refine(simulated, measured, fit.transform, MEDIUM, least, *bounds) for fit in distinct(fits, _MAX_FITS)]
+    fits = distinct(sorted(fits, key=lambda fit: -fit.rank), _MAX_FITS)
     fits = [fit for fit in fits if fit.rank > fits[0].rank - 2 * _noise(fits[0], MEDIUM)]
-    for _ in range(2):  # once more, flattened at the new scale
+    for _ in range(2):  # repeated, with flattening at the new scale
         fits = [refine(simulated, measured, fit.transform, FINE, least, *bounds) for fit in fits]
     fits = sorted(fits, key=lambda fit: -fit.rank)
-    fits = distinct([fit for fit in fits if fit.rank > fits[0].rank - _noise(fits[0], FINE)], _KEPT)
-    fits.sort(key=lambda fit: fit.transform.mirror)  # stable: the best stays first among either kind
+    fits = distinct([fit for fit in fits if fit.rank > fits[0].rank - _noise(fits[0], FINE)], _MAX_FITS)
+    fits.sort(key=lambda fit: fit.transform.mirror)  # stable: each kind stays in the order of its rank
     method = "search" if near is None else "start" if pole is None else "pole"
     best, *ties = (_registration(fit, method) for fit in fits)
     best = replace(best, ties=tuple(ties))
@@ -296,15 +298,15 @@ def register(
 def register_points(
     simulated_points: ArrayLike, measured_points: ArrayLike, mirror: bool | None = None
 ) -> "Registration":
-    """Find the transform that brings simulated points, such as poles, onto measured ones (least squares).
+    """Find the transform of simulated points, such as poles, to measured points by least squares.
 
     Parameters
     ----------
     simulated_points, measured_points : array_like
         The same n >= 2 points in both frames [mm], shape (n, 2).
     mirror : bool, optional
-        Whether the frames are mirror images. By default what fits better, for n >= 3; two points do not tell, and
-        are taken as not mirrored.
+        Whether the frames are mirror images. By default the better fit for n >= 3, and False for two points, which fit
+        both ways.
 
     Returns
     -------
@@ -318,44 +320,44 @@ def register_points(
     simulated = check_array(simulated_points, "simulated_points", ("n", 2))
     measured = check_array(measured_points, "measured_points", (len(simulated), 2))
     if len(simulated) < 2:
-        raise ValueError(f"simulated_points must be two or more points, got {len(simulated)}")
+        raise ValueError(f"simulated_points must contain at least two points, got {len(simulated)}")
     for points, name in ((simulated, "simulated_points"), (measured, "measured_points")):
         if not np.ptp(points, axis=0).any():
-            raise ValueError(f"{name} must be different points, got {points[0].tolist()} {len(points)} times")
+            raise ValueError(f"{name} must contain different points, got {points[0].tolist()} {len(points)} times")
     choices = (False, True) if mirror is None else (check_switch(mirror, "mirror"),)
     source, target = (points[:, 0] + 1j * points[:, 1] for points in (simulated, measured))
     fits = [_least_squares(source, target, choice) for choice in choices]
-    # rounding must not decide where both fit exactly
+    # rounding must not decide if both fit exactly
     best = min(fits, key=lambda one: (round(one.residual / np.ptp(target.real + target.imag), 9), one.mirror))
     if not best.scale > 0:
-        raise ValueError("simulated_points and measured_points must be alike but for rotation, scale and shift")
+        raise ValueError("simulated_points and measured_points must be related by rotation, scale and shift")
     return best
 
 
 def _least_squares(source, target, mirror):
-    moved = source.conj() if mirror else source
-    matrix = np.column_stack([moved, np.ones(len(source))])
-    (turn, shift), *_ = np.linalg.lstsq(matrix, target, rcond=None)
-    residual = np.sqrt(np.mean(np.abs(matrix @ (turn, shift) - target) ** 2))
+    points = source.conj() if mirror else source
+    matrix = np.column_stack([points, np.ones(len(source))])
+    (factor, shift), *_ = np.linalg.lstsq(matrix, target, rcond=None)
+    residual = np.sqrt(np.mean(np.abs(matrix @ (factor, shift) - target) ** 2))
     shift = (float(shift.real), float(shift.imag))
-    angle = float(np.degrees(np.angle(turn)))
-    return Registration(angle, float(abs(turn)), shift, mirror, residual=float(residual), method="points")
+    angle = float(np.degrees(np.angle(factor)))
+    return Registration(angle, float(abs(factor)), shift, mirror, residual=float(residual), method="points")
 
 
 def _near(start, pole, tolerance, measured):
-    """Bounds of the shift from what is known of it, or None."""
+    """Bounds of the shift from a pole or a start, or None."""
     if pole is not None:
         (x, y), (at_x, at_y) = check_array(pole, "pole", (2, 2)).tolist()
-        anchor, place, share = complex(x, y), complex(at_x, at_y), 1 / 50
+        anchor, place, fraction = complex(x, y), complex(at_x, at_y), 1 / 50
     elif start is not None:
         x, y = start.inverse.points(measured.centre.real, measured.centre.imag)
-        anchor, place, share = complex(x, y), measured.centre, 1 / 5
+        anchor, place, fraction = complex(x, y), measured.centre, 1 / 5
     elif tolerance is not None:
-        raise ValueError(f"tolerance needs a pole or a start that it is the tolerance of, got {tolerance!r} alone")
+        raise ValueError(f"tolerance needs a pole or a start, got {tolerance!r} alone")
     else:
         return None
     if tolerance is None:
-        tolerance = share * measured.diameter
+        tolerance = fraction * measured.diameter
     return Near(anchor, place, check_number(tolerance, "tolerance", at_least=0, unit="mm"))
 
 
@@ -363,7 +365,7 @@ def _view(value, name):
     if not isinstance(value, DetectorMap):
         if not hasattr(value, "detected"):
             raise ValueError(f"{name} must be a DetectorMap or Hits, got {value!r:.80}")
-        # a copy does not know the detector: bins for where the hits are, not for all of that
+        # without the extent of the detector the bins cover only the hits
         value = DetectorMap.from_hits(replace(value, extent=None), bins=_BINS if name == "simulated" else 256)
     return View(value)
 
@@ -380,14 +382,14 @@ def _steps(ends, step):
 
 
 def _noise(fit, pixels):
-    """By how much the scores of two fits may differ by chance: two standard errors of a difference."""
-    patches = fit.overlap * pixels**2 / 4 / (4 * NARROW**2)  # disc of the field of view over 4 pi sigma^2
+    """Difference of the scores of two fits by chance: two standard errors of a difference."""
+    patches = fit.overlap * pixels**2 / 4 / (4 * NARROW**2)  # area of the field of view divided by 4 pi sigma^2
     return 2 * np.sqrt(2 / patches) * (1 - fit.score**2)
 
 
 def _registration(fit, method):
     transform = fit.transform
-    shift = complex(transform.forth(0j))  # where the origin goes
+    shift = complex(transform.forth(0j))  # image of the origin
     return Registration(
         rotation=float(transform.rotation),
         scale=float(transform.scale),

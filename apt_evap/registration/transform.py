@@ -13,20 +13,20 @@ class SimilarityTransform:
     Parameters
     ----------
     rotation : float
-        Anticlockwise [degrees].
+        Rotation, anticlockwise [degrees].
     scale : float
         Measured mm per simulated mm.
     mirror : bool
-        Whether y changes its sign, before the rotation.
+        Whether y changes sign, before the rotation.
     anchor : complex
         A simulated point [mm].
     place : complex
-        The measured point that it is moved to [mm].
+        The measured point to which the anchor is moved [mm].
 
     Notes
     -----
-    With the anchor a and its place b, a point goes to z' = b + scale exp(i rotation) (z - a), or with the complex
-    conjugate of z - a if mirrored. Rotation and scale leave the place of the anchor where it is.
+    With the anchor a and its place b, a point z moves to z' = b + scale exp(i rotation) (z - a), with the complex
+    conjugate of z - a if mirrored. Rotation and scale do not move the place of the anchor.
     """
 
     rotation: float
@@ -51,7 +51,7 @@ class SimilarityTransform:
         return self.anchor + (np.conj(offset) if self.mirror else offset)
 
     def anchored(self, place: complex) -> "SimilarityTransform":
-        """Return the same transform with the anchor that is moved to `place`."""
+        """Return the same transform, with the point that is moved to `place` as its anchor."""
         return replace(self, anchor=self.back(place), place=place)
 
     @property

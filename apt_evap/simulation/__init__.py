@@ -1,1 +1,1 @@
-"""The simulation, its runs, their monitoring, files and checkpoints."""
+"""The simulation and its runs: monitoring, files and checkpoints."""

@@ -1,4 +1,4 @@
-"""How runs end, and the errors that carry what had been done."""
+"""Ends of runs, and the errors that contain the ions of an unfinished run."""
 
 from enum import StrEnum
 from typing import TYPE_CHECKING
@@ -10,27 +10,27 @@ if TYPE_CHECKING:
 
 
 class Ending(StrEnum):
-    """Why a run ended; its value is what files say. Any other text is the error that ended it."""
+    """Reason for the end of a run; files store its value. Any other text is the error that ended the run."""
 
     COMPLETE = ""
-    """It has all ions that were asked for."""
+    """The run has all requested ions."""
     EXHAUSTED = "no atom is left that may evaporate"
-    """It is complete, though shorter than asked for."""
+    """No evaporable atom is left: the run is complete, but shorter than requested."""
     INTERRUPTED = "interrupted"
-    """By Ctrl-C, or the end of its time."""
+    """Ended by Ctrl-C, or by a time limit."""
     UNFINISHED = "unfinished"
-    """It was read from its checkpoints."""
+    """The run was read from its checkpoints."""
 
 
 class RunInterrupted(RuntimeError):
-    """An error ended a run after some of its ions; raised from that error.
+    """Error that ended a run after its first ions; raised from the original error.
 
     Parameters
     ----------
     message : str
-        What happened.
+        Description of the error.
     run : Run
-        The ions done before.
+        The ions before the error.
     """
 
     def __init__(self, message: str, run: "Run") -> None:
@@ -39,14 +39,14 @@ class RunInterrupted(RuntimeError):
 
 
 class RunNotSaved(FileError):
-    """A run that has ended cannot be written.
+    """Error for a completed run that cannot be written.
 
     Parameters
     ----------
     message : str
-        Why.
+        Reason.
     run : Run
-        The whole run.
+        The complete run.
     """
 
     def __init__(self, message: str, run: "Run") -> None:

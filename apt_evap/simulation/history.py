@@ -1,4 +1,4 @@
-"""The history of a run: what the monitor saw of its charges and ions as it went on."""
+"""The history of a run: its charges and ions at each check of the monitor."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -7,19 +7,19 @@ import numpy as np
 
 
 class History(NamedTuple):
-    """What was seen at each look, and of the ions since the look before.
+    """Results of each check of the monitor, for the charges and for the ions since the previous check.
 
     Parameters
     ----------
     ions : ndarray of int64, shape (k,)
-        Ions that had left by then.
+        Number of evaporated ions at the check.
     residual_rms, residual_max : ndarray, shape (k,)
-        Of the residuals of the sampled charges, relative to the mean charge; see `charge_residuals`.
+        RMS and largest residual of the sampled charges, relative to the mean charge; see `charge_residuals`.
     missed, never_left, flagged : ndarray, shape (k,)
-        Fractions of the ions since the look before that missed the detector or never left, under the first perturbation
-        of the run, and whose responses are flagged as inexact.
+        Fractions of the ions since the previous check that missed the detector, that did not escape (both for the first
+        perturbation of the run), and that are flagged for inexact responses.
     field : ndarray, shape (k,)
-        Mean field at which these ions left [V/nm].
+        Mean field at the evaporation of these ions [V/nm].
     """
 
     ions: np.ndarray
@@ -32,10 +32,10 @@ class History(NamedTuple):
 
     @classmethod
     def empty(cls) -> "History":
-        """A history without a look."""
+        """History without a check."""
         return cls(np.empty(0, np.int64), *(np.empty(0) for _ in cls._fields[1:]))
 
     @classmethod
     def join(cls, parts: "Iterable[History]") -> "History":
-        """Join the parts of one history, in their order, into one."""
+        """Join the parts of a history in their order."""
         return cls(*(np.concatenate(columns) for columns in zip(cls.empty(), *parts, strict=True)))

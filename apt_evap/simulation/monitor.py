@@ -1,4 +1,4 @@
-"""The monitor of a run: how well its charges have converged, and the fractions of ions that went badly."""
+"""The monitor of a run: convergence of the charges, and fractions of ions with problems."""
 
 import warnings
 from collections.abc import Sequence
@@ -20,21 +20,22 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class WatchSettings:
-    """How a run is watched; it changes no result.
+    """Monitoring of a run; it does not change the results.
 
     Parameters
     ----------
     interval : int, optional
-        Ions between two looks, which come just before relaxations, when charges are worst; by default ten relaxations.
+        Ions between two checks, by default those of ten relaxations. A check comes just before a relaxation, when the
+        errors of the charges are largest.
     sample : int
         Surface atoms whose charges are checked by direct sums.
     charge_bound : float
-        RMS residual of the charges, relative to the mean charge, above which a warning says so. Measured on Ni[111]
-        with the default settings: 0.0005 to 0.0032 (R = 20 a and 40 a, 4,000 events), with RMS errors of the charges,
-        against converged ones, of 0.8 to 2.5 times as much.
+        RMS residual of the charges, relative to the mean charge, above which a warning is given. Measured on Ni[111]
+        with the default settings (R = 20 a and 40 a, 4,000 events): 0.0005 to 0.0032. The RMS deviation from converged
+        charges was 0.8 to 2.5 times the residual.
     fraction_bound : float
-        Fraction of the ions between two looks that never leave, or whose responses are inexact, above which a warning
-        says so; in the same runs there were none.
+        Fraction of the ions between two checks that do not escape, or that have inexact responses, above which a
+        warning is given; in the same runs there were none.
     """
 
     interval: int | None = None
@@ -51,48 +52,48 @@ class WatchSettings:
 
 
 def charge_residuals(emitter: Emitter, sample: int, seed: int) -> Floats:
-    """How far sampled charges are from the equation of the charging rule, by direct sums.
+    """Residuals of the equation of the charging rule for sampled charges, by direct sums.
 
     Parameters
     ----------
     emitter : Emitter
         The charged surface.
     sample : int
-        Surface atoms that may leave, drawn at random; all of them if there are not more.
+        Number of evaporable surface atoms in the random sample; all of them if there are fewer.
     seed : int
-        Seed of the draw.
+        Seed of the sample.
 
     Returns
     -------
     ndarray, shape (sample,)
-        Residuals over the mean charge of the surface; NaN for a rule that cannot say.
+        Residuals relative to the mean charge of the surface; NaN for a rule that does not define them.
     """
-    chosen = np.flatnonzero(emitter.tip.evaporable[emitter.atoms])
-    if len(chosen) > sample:
-        chosen = np.sort(np.random.default_rng(seed).choice(chosen, sample, replace=False))
-    return emitter.charge_residuals(chosen)
+    selection = np.flatnonzero(emitter.tip.evaporable[emitter.atoms])
+    if len(selection) > sample:
+        selection = np.sort(np.random.default_rng(seed).choice(selection, sample, replace=False))
+    return emitter.charge_residuals(selection)
 
 
 class Monitor:
-    """Looks at a run as it goes on.
+    """Monitor of a run: checks its charges at intervals and counts its ions.
 
     Parameters
     ----------
     settings : WatchSettings
-        When to look, and what to warn of.
+        Interval of the checks, and bounds of the warnings.
     interval : int
-        Ions between two looks.
+        Ions between two checks.
     first : int
         Number of the first ion.
     done : sequence of Run
-        Parts of the run that are there already.
+        Existing parts of the run.
     """
 
     def __init__(self, settings: WatchSettings, interval: int, first: int = 0, done: "Sequence[Run]" = ()) -> None:
         self._settings, self._interval = settings, interval
-        self._rows = []  # looks whose ions have all been counted, not taken yet
-        self._open = None  # ions, RMS and largest residual of a look whose ions are still flying
-        self._since = []  # outcomes, marks and fields of the ions since the last look, batch by batch
+        self._rows = []  # complete checks that have not been taken yet
+        self._open = None  # ions, RMS and largest residual of a check whose ions are not all counted
+        self._since = []  # outcomes, flags and fields of the ions since the last check, batch by batch
         self._counted, self._warned = first, set()
         self._last = max((int(part.history.ions[-1]) for part in done if len(part.history.ions)), default=first)
         self._latest = {}
@@ -100,11 +101,11 @@ class Monitor:
             self.count(part)
 
     def due(self, ions: int) -> bool:
-        """Whether it is time for a look after so many ions."""
+        """Whether a check is due after this number of ions."""
         return ions - self._last >= self._interval
 
     def look(self, emitter: Emitter, ions: int) -> None:
-        """Check the charges; the fractions follow once all of these ions have been counted."""
+        """Check the charges; the fractions follow when all ions up to this number are counted."""
         residuals = charge_residuals(emitter, self._settings.sample, seed=ions)
         rms, largest = float(np.sqrt(np.mean(residuals**2))), float(np.abs(residuals).max())
         self._last, self._open = ions, (ions, rms, largest)
@@ -113,18 +114,18 @@ class Monitor:
             self._warn(
                 ChargesWarning,
                 "charges",
-                f"after {ions:,} ions the residuals of the charges are {rms:.2g} of the mean charge (RMS of "
-                f"{len(residuals)}), above the bound of {self._settings.charge_bound:g}: take a smaller sweep_interval "
-                "or tolerance, or a larger patch_radius, of ChargeSettings, [charges] in a file",
+                f"after {ions:,} ions the RMS residual of {len(residuals)} charges is {rms:.2g} of the mean charge, "
+                f"above the bound of {self._settings.charge_bound:g}: use a smaller sweep_interval or tolerance, or a "
+                "larger patch_radius (ChargeSettings, or [charges] in a settings file)",
             )
         self._close()
 
     def count(self, part: "Run") -> None:
         """Count the ions of the next part of the run."""
         if len(part):
-            known = part.emissions.ions >= self._last if self._open is None else slice(None)
+            new = part.emissions.ions >= self._last if self._open is None else slice(None)
             hits = part.hits(part.first_perturbation)
-            self._since.append((hits.outcome[known], part.flagged[known], part.fields[known]))
+            self._since.append((hits.outcome[new], part.flagged[new], part.fields[new]))
             self._counted = int(part.emissions.ions[-1]) + 1
         self._close()
 
@@ -145,36 +146,36 @@ class Monitor:
             (
                 never_left,
                 RunWarning,
-                "never left the specimen",
-                "more max_steps of FlightSettings, [flights] in a file, may help",
+                "did not escape",
+                "a larger max_steps (FlightSettings, or [flights] in a settings file) may help",
             ),
             (
                 flagged,
                 ResponseWarning,
                 "have inexact responses",
-                "a smaller energy_limit of ResponseSettings, [responses] in a file, helps",
+                "use a smaller energy_limit (ResponseSettings, or [responses] in a settings file)",
             ),
         ):
             if fraction > self._settings.fraction_bound:
                 self._warn(
                     kind,
                     what,
-                    f"{fraction:.1%} of the last ions, up to {self._last:,}, {what}, expected at most "
-                    f"{self._settings.fraction_bound:.2g}: {advice}",
+                    f"{fraction:.1%} of the last ions, up to number {self._last:,}, {what} (bound "
+                    f"{self._settings.fraction_bound:.2g}): {advice}",
                 )
 
     def _warn(self, kind, what, message):
-        if what not in self._warned:  # once in a run, not at every look
+        if what not in self._warned:  # once per run, not at every check
             self._warned.add(what)
             warnings.warn(message, kind, stacklevel=6)
 
     def take(self) -> History:
-        """History of the looks since it was last taken."""
+        """Return and clear the history of the checks since the last call."""
         rows, self._rows = self._rows, []
         columns = list(zip(*rows, strict=True)) or History.empty()
         return History(np.array(columns[0], np.int64), *(np.array(column, float) for column in columns[1:]))
 
     @property
     def latest(self) -> dict[str, Any]:
-        """What the progress line shows of the latest look, dict."""
+        """Results of the latest check for the progress line, dict."""
         return dict(self._latest)

@@ -12,7 +12,7 @@ import numpy as np
 
 from apt_evap._common.files import FileError, check_path
 from apt_evap._common.types import AnyPath, Booleans
-from apt_evap._common.validation import check_kind, check_switch, shown
+from apt_evap._common.validation import check_kind, check_switch, short_text
 from apt_evap._common.warnings import DataWarning
 from apt_evap.detection.detector import Detector
 from apt_evap.detection.hits import Hits
@@ -186,11 +186,11 @@ class Run:
         if not callable(getattr(perturbation, "tangential", None)):
             check_kind(perturbation, "perturbation", "launch", "a perturbation such as Unperturbed() or RollUp(0.2)")
             raise ValueError(
-                f"perturbation {shown(perturbation)} was not flown in this run and does not say how it launches along "
-                "the surface; name it when the run starts: simulation.run(n, emissions=[...])"
+                f"perturbation {short_text(perturbation)} was not flown in this run and does not say how it launches "
+                "along the surface; name it when the run starts: simulation.run(n, emissions=[...])"
             )
         if self.responses is None:
-            raise ValueError(f"this run has no responses and {shown(perturbation)} was not flown in it")
+            raise ValueError(f"this run has no responses and {short_text(perturbation)} was not flown in it")
         emissions = self.emissions
         rolled, first, second = perturbation.tangential(emissions, IonRandom(self.seed, emissions.ions))  # type: ignore[attr-defined]
         landed = self.response_model.evaluate(self.responses, rolled, first, second, emissions.masses)

@@ -1,8 +1,8 @@
-"""The simulation: atoms leave one by one, their flights follow in parallel, and a run comes out.
+"""The simulation: atoms evaporate one by one, their flights follow in parallel, and the result is a run.
 
-Events and flights are a pipeline. While a batch of events happens, the flights of batches before are flown on copies of
-the surface that replay the events one by one, so each ion flies in exactly the field that its own event left behind,
-whatever the number of threads and the size of a batch.
+Events and flights form a pipeline. During the events of one batch, the ions of earlier batches fly on copies of the
+surface that replay the events one by one. So each ion flies in exactly the field after its own event, for any number of
+threads and any size of a batch.
 """
 
 import threading
@@ -37,7 +37,7 @@ from apt_evap.simulation.recorder import Recorder
 from apt_evap.simulation.run import Flown, Run
 from apt_evap.specimen.tip import Tip
 
-BACKLOG = 4  # batches whose flights may wait while events happen
+BACKLOG = 4  # batches whose flights may be pending during further events
 
 
 class Simulation:
@@ -54,24 +54,25 @@ class Simulation:
     detector : Detector, optional
         By default a square of 300 mm at 100 mm.
     law : law, optional
-        Which atom leaves next; by default `Extremal`.
+        Selects the next atom to evaporate; by default `Extremal`.
     charge_settings : ChargeSettings, optional
-        How finely charges are solved.
+        Accuracy of the charges.
     flight_settings : FlightSettings, optional
-        How flights are integrated.
+        Accuracy and end of the flights.
     response_settings : ResponseSettings, optional
         Flights and polynomials of the responses.
     n_threads : int, optional
-        Threads; by default the processors this process may use. The results do not depend on it.
+        Number of threads; by default the number of processors that this process may use. The results do not depend on
+        it.
     rule : charging rule, optional
-        How charge distributes over the surface; by default `Robin`.
+        Distribution of the charge over the surface; by default `Robin`.
     watch_settings : WatchSettings, optional
-        How the run is monitored.
+        Monitoring of the run.
 
     Raises
     ------
     ValueError
-        If a setting is out of its range.
+        If a setting is outside its range.
     """
 
     def __init__(
@@ -111,7 +112,7 @@ class Simulation:
 
     @property
     def tip(self) -> Tip:
-        """The specimen, as deep as it is held by now."""
+        """The specimen, with its current shell."""
         return self.emitter.tip
 
     def __repr__(self) -> str:
@@ -133,27 +134,27 @@ class Simulation:
     ) -> Run:
         """Evaporate atoms and fly their ions.
 
-        Ctrl-C ends the run after the batch under way, with everything done so far; a second one ends it at once. A run
-        after a run goes on where the one before ended.
+        Ctrl-C ends the run after the current batch and keeps all ions so far; a second Ctrl-C ends it at once. Another
+        call continues where the previous run ended.
 
         Parameters
         ----------
         n_ions : int
-            Number of atoms to evaporate; of a run that is resumed, those done before included.
+            Number of atoms to evaporate; for a resumed run, including its earlier ions.
         emissions : sequence of perturbations
-            Flown as they are, beside the responses: needed for one of your own that launches from elsewhere than the
-            site or the rolled-up position.
+            Perturbations with their own flights, in addition to the responses. Needed for a user-defined perturbation
+            that does not launch from the site or the rolled-up position along the surface.
         responses : bool
-            Whether to fly what the responses need, so that `Run.hits` takes any built-in perturbation afterwards.
-            Without, and without `emissions`, the unperturbed ions are flown.
+            Whether to compute responses, so that `Run.hits` accepts any built-in perturbation in post-processing.
+            Without them, and without `emissions`, the unperturbed ions are flown.
         progress : bool or callable, optional
             Whether to show a progress bar; by default if the output is a terminal or a notebook. A function is called
-            after every batch instead, with the ions done and the ions asked for.
+            after every batch instead, with the number of ions so far and the requested number.
         batch_size : int
-            Events at a time; the results do not depend on it.
+            Events per batch; the results do not depend on it.
         checkpoint : Checkpoint or str or path-like, optional
-            Where the run is kept while it goes on, and saved once it has ended; a file name for the usual settings. A
-            run that is killed and resumed has the bits of one that was not.
+            File in which the run is stored at intervals and at its end; a file name for the default settings. A run
+            that is killed and resumed gives the same bits as an uninterrupted one.
 
         Returns
         -------
@@ -162,11 +163,11 @@ class Simulation:
         Raises
         ------
         FileError
-            If the file of the checkpoints cannot be written, belongs to somebody else or does not fit.
+            If the checkpoint file cannot be written, is in use by another process, or is of another run.
         ValueError
-            If an argument is out of its range, or a perturbation has no `launch`.
+            If an argument is outside its range, or a perturbation has no method `launch`.
         RunInterrupted
-            If an error ends the run after some of its ions; they are in its attribute `run`.
+            If an error ends the run after its first ions; its attribute `run` contains them.
         """
         n_ions = check_count(n_ions, "n_ions", at_least=1)
         batch_size = check_count(batch_size, "batch_size", at_least=1)
@@ -187,12 +188,12 @@ class Simulation:
             return self._run(n_ions, emissions, responses, progress, batch_size, keeper)
 
     def __reduce__(self):
-        raise TypeError("a Simulation cannot be pickled or copied: save its run, and make one with the same arguments")
+        raise TypeError("a Simulation cannot be pickled or copied: save its run, and make a new simulation")
 
     def _run(self, n_ions, emissions, responses, progress, batch_size, keeper):
         if not self._running.acquire(blocking=False):
             raise ValueError(
-                "a run of this simulation is under way in another thread: wait for it, or make another one"
+                "a run of this simulation is active in another thread: wait for it, or make another simulation"
             )
         try:
             return self._run_alone(n_ions, emissions, responses, progress, batch_size, keeper)
@@ -201,7 +202,7 @@ class Simulation:
 
     def _run_alone(self, n_ions, emissions, responses, progress, batch_size, keeper):
         self._catch_up(keeper.done if keeper else None)
-        self.emitter.hand_out_tree()  # somebody may have let atoms evaporate without flights
+        self.emitter.hand_out_tree()  # atoms may have evaporated without flights before
         backlog = BACKLOG if self.n_threads > 1 else 0
         with (
             self._crew.at_work(),
@@ -217,55 +218,55 @@ class Simulation:
         return recorder.run
 
     def _catch_up(self, done):
-        """Bring a new surface to where a run ends that is resumed, by its state and the events since.
+        """Bring a new surface to the end of a resumed run, by its stored state and the events since then.
 
-        Raises ValueError if atoms have left the emitter, or its events are not those of the run.
+        Raises ValueError if atoms have already evaporated, or if the events differ from those of the run.
         """
         if done is None:
             return
         emitter = self.emitter
-        if left := emitter.counts["events"]:
-            raise ValueError(f"a run is resumed by a new Simulation, got one that {left:,} atoms left")
+        if n_evaporated := emitter.counts["events"]:
+            raise ValueError(f"resume needs a new Simulation, got one with {n_evaporated:,} evaporated atoms")
         if done.state is not None:
             try:
                 emitter.restore(done.state)
             except (ValueError, KeyError) as error:
                 raise FileError(f"the run cannot be resumed, its state does not fit: {error}") from error
-        ions = emitter.counts["events"] - done.first_event  # ions of the run that have left; those before it count down
+        ions = emitter.counts["events"] - done.first_event  # evaporated ions of the run; negative before its first ion
         same = ions <= len(done)
         for batch in emitter.advance(max(len(done) - ions, 0)):
-            known = slice(max(ions, 0), max(ions + len(batch), 0))
-            kept = slice(len(batch) - (known.stop - known.start), None)
-            same = same and np.array_equal(batch.site[kept], done.site[known])
-            same = same and np.array_equal(batch.charges[kept], done.charges[known])
+            stored = slice(max(ions, 0), max(ions + len(batch), 0))
+            common = slice(len(batch) - (stored.stop - stored.start), None)
+            same = same and np.array_equal(batch.site[common], done.site[stored])
+            same = same and np.array_equal(batch.charges[common], done.charges[stored])
             ions += len(batch)
             if not same:
                 break
         if not same or ions != len(done):
             raise ValueError(
-                "the run cannot be resumed: its events do not come out the same again, as with another version of the "
-                "program, another kind of processor, or a surface that was changed by hand"
+                "the run cannot be resumed: its recomputed events differ; possible reasons are another version of the "
+                "program, another type of processor, or a surface changed by hand"
             )
         self.n_evaporated = int(done.emissions.ions[-1]) + 1
 
     # ---- one batch -------------------------------------------------------------------------------------------------
 
     def _start_flights(self, batch, emissions, responses):
-        """Begin the flights of a batch; return a function that waits for them and returns the batch as a Run."""
+        """Start the flights of a batch; return a function that waits for them and returns the batch as a Run."""
         ions = np.arange(self.n_evaporated, self.n_evaporated + len(batch))
         self.n_evaporated += len(batch)
-        emitted = self._emissions(batch, ions)
+        emission_batch = self._emissions(batch, ions)
         launches = [
-            check_launches(perturbation, perturbation.launch(emitted, IonRandom(self.seed, ions)), len(batch))
+            check_launches(perturbation, perturbation.launch(emission_batch, IonRandom(self.seed, ions)), len(batch))
             for perturbation in (emissions if len(batch) else ())
         ]
-        slowness = emitted.slowness
-        nobody = np.empty((0, 1, 3))
+        slowness = emission_batch.slowness
+        no_launches = np.empty((0, 1, 3))
         groups = [(launch.positions[:, None], (launch.velocities * slowness[:, None])[:, None]) for launch in launches]
-        groups += [(nobody, nobody)] * (len(emissions) - len(launches))
+        groups += [(no_launches, no_launches)] * (len(emissions) - len(launches))
         model = ResponseModel(self.response_settings, self.detector)
         if responses:
-            groups += model.launches(emitted)
+            groups += model.launches(emission_batch)
         flight = self._crew.start(batch, groups)
 
         def finish():
@@ -275,7 +276,7 @@ class Simulation:
                 directions, times = land(each, slowness, self.detector, apex)
                 flown.append(Flown(directions[:, 0], times[:, 0]))
             return Run(
-                emissions=emitted,
+                emissions=emission_batch,
                 site=batch.site,
                 species=self.tip.species[batch.site],
                 charges=batch.charges,
@@ -308,17 +309,18 @@ class Simulation:
         )
 
     def _check_atoms(self, n_ions):
-        """Warn of a run that cannot be as long as asked for."""
-        left = self.tip.max_ions - self.emitter.counts["events"]
-        if n_ions > left:
+        """Warn if there are fewer evaporable atoms than requested ions."""
+        available = self.tip.max_ions - self.emitter.counts["events"]
+        if n_ions > available:
             warnings.warn(
-                f"n_ions is {n_ions:,} but only about {max(left, 0):,} atoms may leave: the run ends with the last",
+                f"n_ions is {n_ions:,} but only about {max(available, 0):,} atoms can evaporate: the run will be "
+                "shorter",
                 RunWarning,
                 stacklevel=3,
             )
 
     def _settings_of(self, tip):
-        """Everything a run is made with, in plain types."""
+        """All settings of a run, in plain types."""
         return {
             "tip": tip.settings,
             "voltage": self.voltage,

@@ -1,4 +1,4 @@
-"""Random substitutional alloys: which atom is of which species."""
+"""Random substitutional alloys: the species of each atom."""
 
 from collections.abc import Mapping
 
@@ -28,7 +28,7 @@ def check_solutes(
     Raises
     ------
     ValueError
-        If a fraction is not above 0, they sum to more than 1, or there is no seed.
+        If a fraction is not positive, if they sum to more than 1, or if there is no seed.
     """
     fractions = {}
     if solutes is not None:
@@ -37,9 +37,9 @@ def check_solutes(
         solute = as_material(element, "solutes")
         fractions[solute] = check_number(fraction, f"fraction of {solute.name}", above=0, at_most=1)
     if sum(fractions.values()) > 1:
-        raise ValueError(f"solutes must have fractions that sum to at most 1, got {sum(fractions.values()):g}")
+        raise ValueError(f"solutes must have fractions with a sum <= 1, got {sum(fractions.values()):g}")
     if fractions or seed is not None:
-        check_seed(seed, "seed (the random places of the solutes are drawn from it)")
+        check_seed(seed, "seed (of the random sites of the solutes)")
     return fractions
 
 
@@ -62,5 +62,5 @@ def draw_species(n: int, fractions: Mapping[Material, float], seed: int | None) 
     if not fractions:
         return np.zeros(n, dtype=np.int32)
     edges = np.cumsum(list(fractions.values()))
-    drawn = np.searchsorted(edges, np.random.default_rng(seed).random(n), side="right")
-    return ((drawn + 1) % (len(fractions) + 1)).astype(np.int32)
+    index = np.searchsorted(edges, np.random.default_rng(seed).random(n), side="right")
+    return ((index + 1) % (len(fractions) + 1)).astype(np.int32)

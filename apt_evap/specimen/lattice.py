@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from apt_evap._common.small_matrices import lengths, matrix_product, products
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_array, check_choice, check_number, shown
+from apt_evap._common.validation import check_array, check_choice, check_number, short_text
 from apt_evap._core.elementary import sine_and_cosine
 
 _HALF = ((0, 0, 0), (0, 1 / 2, 1 / 2), (1 / 2, 0, 1 / 2), (1 / 2, 1 / 2, 0))
@@ -26,26 +26,26 @@ BASES = {
 COORDINATION = {"fcc": 12, "bcc": 8, "sc": 6, "diamond": 4, "hcp": 12}
 """Nearest neighbours in the bulk (hcp: the two shells of six, which fall together at c/a = 1.633)."""
 
-# Caps of 14 d_nn along 4 or 5 axes: of the atoms with fewer nearest neighbours than in the bulk, and of the
-# others down to 4 d_nn, so many are taken for surface atoms
 BOND_FACTORS = {"fcc": 1.2, "bcc": 1.077, "sc": 1.2, "diamond": 1.3, "hcp": 1.2}
-"""Nearest neighbours are closer than this many nearest neighbour distances: half way to the second shell."""
+"""Cutoff distance of nearest neighbours, in nearest neighbour distances: half way to the second shell."""
 
+# Percentages: fraction classified as surface atoms, of the atoms with fewer nearest neighbours than in the bulk, and of
+# the other atoms down to 4 d_nn; measured on caps of radius 14 d_nn along 4 or 5 axes
 SURFACE_FACTORS = {
-    "fcc": (2.19, 0.42),  # 88 %, none (12 % have lost one neighbour only)
+    "fcc": (2.19, 0.42),  # 88 %, none (12 % miss only one neighbour)
     "bcc": (2.41, 0.49),  # 92 %, none; (2.19, 0.42): 94 %, 0.9 %, which is 2.6 % of the surface
     "sc": (2.19, 0.42),  # 87 %, 0.1 %
     "diamond": (2.19, 0.50),  # 91 %, 0.1 %; (2.19, 0.42): 98 %, 5 %, which is 14 % of the surface
     "hcp": (2.19, 0.42),  # 86 %, 0.01 %
 }
-"""Neighbourhood radius and least distance of a surface atom from its mean, in nearest neighbour distances."""
+"""Neighbourhood radius, and smallest distance of a surface atom from the mean of its neighbourhood [d_nn]."""
 
-_BLOCK = 8  # cells per block edge: a block is cheap to test and its surface layer cheap to waste
-_CHUNK = 2**19  # candidate points expanded at once, about 50 MB of temporaries
+_BLOCK = 8  # cells per block edge: few blocks to test, few points outside the shape
+_CHUNK = 2**19  # candidate points generated at once, about 50 MB of temporary arrays
 
 
 def check_structure(structure: str) -> str:
-    """Return `structure` if it is known, or say which ones are (ValueError)."""
+    """Return `structure` if it is known; otherwise a ValueError lists the known ones."""
     return check_choice(structure, "structure", BASES)
 
 
@@ -59,7 +59,7 @@ def cell_lengths(structure: str, a: float, c: float | None = None) -> Floats:
     a : float
         Lattice constant [nm].
     c : float, optional
-        Height of the hexagonal cell [nm]; hcp only, the ideal sqrt(8/3) a if not given.
+        Height of the hexagonal cell [nm]; only for hcp; sqrt(8/3) a by default.
 
     Returns
     -------
@@ -84,7 +84,7 @@ def nearest_neighbour_distance(structure: str, a: float, c: float | None = None)
 
 
 def direction_vectors(structure: str, a: float, c: float | None = None) -> Floats:
-    """Vectors that the indices of a direction multiply, in units of a, one a row, shape (3, 3).
+    """Basis vectors of the indices of a direction, in units of a, one per row, shape (3, 3).
 
     The cubic axes, or for hcp a1, a2 (120 degrees apart) and c; parameters as for `cell_lengths`.
     """
@@ -95,7 +95,7 @@ def direction_vectors(structure: str, a: float, c: float | None = None) -> Float
 
 
 def check_axis(structure: str, axis: Sequence[float], name: str = "axis") -> tuple[int | float, ...]:
-    """Return a crystal direction as three plain numbers in a tuple, or say what is wrong.
+    """Return a crystal direction as a tuple of three numbers, or raise an error that names the argument.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def check_axis(structure: str, axis: Sequence[float], name: str = "axis") -> tup
     Returns
     -------
     tuple
-        Ints without a common factor if all are whole numbers, else floats as they are given.
+        Ints without a common factor if all numbers are integers, otherwise the floats unchanged.
 
     Raises
     ------
@@ -121,17 +121,17 @@ def check_axis(structure: str, axis: Sequence[float], name: str = "axis") -> tup
         indices = check_array(axis, name, (4 if four else 3,), finite=False)
     except ValueError as error:
         more = ", or four such as [2, -1, -1, 0]" if structure == "hcp" else ""
-        raise ValueError(f"{name} must be three numbers such as [0, 1, 2]{more}, got {shown(axis)}") from error
+        raise ValueError(f"{name} must be three numbers such as [0, 1, 2]{more}, got {short_text(axis)}") from error
     if not np.isfinite(indices).all():
-        raise ValueError(f"{name} must be finite, got {shown(axis)}")
+        raise ValueError(f"{name} must be finite, got {short_text(axis)}")
     if four:
         u, v, t, w = indices
-        # of whole numbers exactly; else to the rounding of a few decimals
+        # exactly for integers; otherwise to the rounding of a few decimals
         if abs(u + v + t) > (0 if (indices == np.rint(indices)).all() else 1e-6 * np.abs(indices).max()):
             raise ValueError(f"{name} must have u + v + t = 0 for a direction [u v t w], got {axis!r}")
         indices = np.array([u - t, v - t, w])
     if not indices.any():
-        raise ValueError(f"{name} must be a direction, got {axis!r}")
+        raise ValueError(f"{name} must not be zero, got {axis!r}")
     if np.abs(indices).max() > 1e6 or np.abs(indices).max() < 1e-6:
         raise ValueError(f"{name} must have its largest number between 1e-6 and 1e6, got {axis!r}")
     if (indices == np.rint(indices)).all():
@@ -141,11 +141,11 @@ def check_axis(structure: str, axis: Sequence[float], name: str = "axis") -> tup
 
 
 def _perpendicular(structure, indices, vectors):
-    """Find the shortest lattice direction perpendicular to `indices`; of equals the largest indices."""
+    """Shortest lattice direction perpendicular to `indices`; among equal ones, the one with the largest indices."""
     u, v, w = indices
-    sure = [(u - 2 * v, 2 * u - v, 0)] if structure == "hcp" else [(v, -u, 0), (w, 0, -u), (0, w, -v)]
+    certain = [(u - 2 * v, 2 * u - v, 0)] if structure == "hcp" else [(v, -u, 0), (w, 0, -u), (0, w, -v)]
     small = np.indices((7, 7, 7)).reshape(3, -1).T - 3
-    candidates = np.concatenate([small, sure])
+    candidates = np.concatenate([small, certain])
     cartesian = matrix_product(candidates, vectors)
     long = lengths(cartesian)
     axis = matrix_product(indices, vectors)
@@ -158,16 +158,16 @@ def _perpendicular(structure, indices, vectors):
 def rotation_to_axis(material: Any, axis: Sequence[int], rotation: float = 0.0) -> Floats:
     """Rotation that brings a crystal direction onto +z.
 
-    For whole numbers, of the lattice directions perpendicular to `axis` the shortest is put along +x: [1 0 0] for
-    [0 1 2]; of several equally short ones the one with the largest indices, compared in turn: [1 0 -1] for [1 1 1].
-    A direction of other numbers seldom has one: then +x is the part perpendicular to it of the edge of the
-    right-angled cell (hcp: a, sqrt(3) a, c) that is most nearly perpendicular to it, of equals the first. Then
-    everything is turned about z by `rotation`.
+    If `axis` has integer indices, +x is the shortest lattice direction perpendicular to it: [1 0 0] for [0 1 2]. Among
+    equally short ones it is the one with the largest indices, compared in order: [1 0 -1] for [1 1 1]. Other directions
+    rarely have a perpendicular lattice direction. Then +x is taken from the edge of the right-angled cell (hcp: a,
+    sqrt(3) a, c) that is most nearly perpendicular to `axis` (the first of equal ones): its component perpendicular to
+    `axis`. Finally the crystal is rotated about z by `rotation`.
 
     Parameters
     ----------
     material : Material or str
-        A material, or the name of a structure (hcp then has the ideal c/a).
+        A material, or the name of a structure (hcp: with the ideal c/a).
     axis : sequence of float
         Direction [u v w] of any length. For hcp either [u v t w] with u + v + t = 0 (Miller-Bravais), or [u v w] in
         the vectors a1, a2 (120 degrees apart) and c.
@@ -182,7 +182,7 @@ def rotation_to_axis(material: Any, axis: Sequence[int], rotation: float = 0.0) 
     Raises
     ------
     ValueError
-        For an unknown structure, an axis that is not finite or all zeros.
+        If the structure is unknown, or the axis is zero or not finite.
     """
     structure = check_structure(material if isinstance(material, str) else material.structure)
     a, c = (1.0, None) if isinstance(material, str) else (material.a, material.c)
@@ -226,11 +226,11 @@ def lattice_points_in(
     tolerance: float = 0.0,
     block: int = _BLOCK,
 ) -> Floats:
-    """Lattice points inside a shape, or in a shell under its surface.
+    """Lattice points inside a shape, or in a shell below its surface.
 
-    Space is cut into blocks of cells; only blocks that the signed distance at their centre does not rule out
-    are expanded. The points come in the order of their cell (first, second, third index), then of the site in
-    the cell, whatever the size of the blocks.
+    Space is divided into blocks of cells. The signed distance at the centre of a block excludes most blocks; the points
+    of the others are tested. Points are ordered by their cell (first, second, third index), then by the site in the
+    cell, for any size of the blocks.
 
     Parameters
     ----------
@@ -239,17 +239,17 @@ def lattice_points_in(
     orientation : array_like
         Rotation from crystal to specimen, shape (3, 3).
     origin : array_like
-        Where the lattice has its first site [nm], shape (3,).
+        Position of the first lattice site [nm], shape (3,).
     signed_distance : callable
-        Takes points (n, 3) [nm], returns (n,) [nm]: negative inside, and never changing faster than the
-        distance between the points.
+        Takes points (n, 3) [nm], returns (n,) [nm], negative inside. The values at two points must not differ by more
+        than the distance between the points.
     bounds : array_like
         Lower and upper corner of a box around the shape [nm], shape (2, 3).
     depth : callable, optional
-        Takes points (n, 3) [nm], returns (n,) [nm]: only points at most this far below the surface. It must not
-        change faster than the distance between the points either.
+        Takes points (n, 3) [nm], returns (n,) [nm]: the largest distance of a point below the surface. Its values at
+        two points must not differ by more than the distance between the points either.
     tolerance : float
-        Points at most this far outside count as inside [nm]: points that lie on the surface but for rounding.
+        Points at most this far outside count as inside [nm], to include points on the surface in spite of rounding.
     block : int
         Cells per edge of a block.
 
@@ -272,13 +272,13 @@ def lattice_points_in(
 
     def inside(points, margin):
         distance = signed_distance(points)
-        kept = distance <= margin
+        mask = distance <= margin
         if depth is not None:
-            kept &= distance >= -(depth(points) + 2 * margin)
-        return kept
+            mask &= distance >= -(depth(points) + 2 * margin)
+        return mask
 
     def slab(layer):
-        """Points of one layer of blocks, whose first cell indices no other layer has."""
+        """Points of one layer of blocks, which shares no first cell index with other layers."""
         rows = np.indices((1, count[1], count[2])).reshape(3, -1)
         rows[0] = layer
         low = (rows + first[:, None]) * block
@@ -287,9 +287,9 @@ def lattice_points_in(
             cell = (low[:, start : start + step, None] + cells[:, None, :]).reshape(3, -1)
             for site, fraction in enumerate(basis):
                 points = _to_specimen((cell + fraction[:, None]) * edges[:, None], orientation, origin)
-                kept = inside(points, tolerance)
-                i, j, k = cell[:, kept] - (first * block)[:, None]
-                yield ((i * count[1] * block + j) * count[2] * block + k) * len(basis) + site, points[kept]
+                mask = inside(points, tolerance)
+                i, j, k = cell[:, mask] - (first * block)[:, None]
+                yield ((i * count[1] * block + j) * count[2] * block + k) * len(basis) + site, points[mask]
 
     step = max(1, _CHUNK // block**3)
     layers = []

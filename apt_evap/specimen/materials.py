@@ -1,10 +1,10 @@
-"""Materials: the numbers a specimen needs of an element, each with its source."""
+"""Materials: properties of the elements, each number with its source."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
-from apt_evap._common.validation import check_count, check_kind, check_number, did_you_mean, shown
+from apt_evap._common.validation import check_count, check_kind, check_number, did_you_mean, short_text
 from apt_evap.specimen.lattice import check_structure, nearest_neighbour_distance
 from apt_evap.units import ELEMENTARY_CHARGE
 
@@ -13,7 +13,7 @@ _TSONG = "Tsong, Surf. Sci. 70, 211 (1978), image-hump model, charge state of lo
 _MULLER = "measured; Mueller and Tsong, Field Ion Microscopy (1969)"
 _IUPAC = "IUPAC standard atomic weights, abridged (Prohaska et al., Pure Appl. Chem. 94, 573, 2022)"
 _SHAIKH = "Shaikh et al., arXiv 2509.13744, appendix on polarization"
-# more is a slip of the unit, 3.52 (Angstrom) for a or 35e9 (V/m): no element has it
+# larger than for any element: finds wrong units, such as a = 3.52 (Angstrom) or 35e9 (V/m)
 _LONGEST = 2.0
 _HIGHEST_FIELD = 1000.0
 
@@ -41,12 +41,12 @@ class Material:
     polarizability : float, optional
         Polarizability of the free atom [F m^2].
     sources : mapping of str to str
-        Where each number comes from, by the name of the field.
+        Source of each number, by the name of the field.
 
     Raises
     ------
     ValueError
-        If a number is outside its range, the structure unknown, or `c` missing or out of place.
+        If a number is outside its range, if the structure is unknown, or if `c` is missing or not allowed.
     """
 
     name: str
@@ -61,7 +61,7 @@ class Material:
 
     def __post_init__(self):
         if not isinstance(self.name, str) or not self.name:
-            raise ValueError(f"name must be a word such as 'Ni', got {shown(self.name)}")
+            raise ValueError(f"name must be text such as 'Ni', got {short_text(self.name)}")
         check_structure(self.structure)
         checked = {
             "a": check_number(self.a, "a", above=0, at_most=_LONGEST, unit="nm"),
@@ -73,8 +73,8 @@ class Material:
             "sources": dict(check_kind(self.sources, "sources", Mapping, "a mapping of a field to its source")),
         }
         if (self.structure == "hcp") != (self.c is not None):
-            wanted = "be given for hcp" if self.structure == "hcp" else f"be None for {self.structure}"
-            raise ValueError(f"c must {wanted}, got {shown(self.c)}")
+            requirement = "be a number for hcp" if self.structure == "hcp" else f"be None for {self.structure}"
+            raise ValueError(f"c must {requirement}, got {short_text(self.c)}")
         if self.c is not None:
             checked["c"] = check_number(self.c, "c", above=0, at_most=_LONGEST, unit="nm")
         if self.polarizability is not None:
@@ -117,7 +117,7 @@ MATERIALS = {
         _element("Au", "fcc", 0.408, 53.0, 1, 196.97),
     )
 }
-"""Known materials by name. Ni and Au are seen as 1+ and 2+ side by side: the fields of both are close."""
+"""Known materials by name. Ni and Au are observed as 1+ and 2+: their evaporation fields are close."""
 
 
 _WORDS = {
@@ -135,7 +135,7 @@ _WORDS = {
 
 
 def material(name: str, **changes: Any) -> Material:
-    """Return a known material, with some of its numbers changed if wanted.
+    """Return a known material, optionally with changed numbers.
 
     Parameters
     ----------
@@ -158,21 +158,21 @@ def material(name: str, **changes: Any) -> Material:
         if change not in known:
             raise ValueError(f"a material has no {change!r}{did_you_mean(change, known)}; it has {', '.join(known)}")
     if not isinstance(name, str) or name not in MATERIALS:
-        known = f"known are {', '.join(MATERIALS)}, any other is a Material(...) of your own"
-        meant = _WORDS.get(name.strip().lower()) if isinstance(name, str) else None
-        hint = did_you_mean(meant or name, MATERIALS)
-        raise ValueError(f"no material is named {shown(name)}{hint}; {known}")
-    found = MATERIALS[name]
-    return replace(found, **changes, sources=found.sources | dict.fromkeys(changes, "given by the user"))
+        known = f"known are {', '.join(MATERIALS)}, define others as Material(...)"
+        symbol = _WORDS.get(name.strip().lower()) if isinstance(name, str) else None
+        hint = did_you_mean(symbol or name, MATERIALS)
+        raise ValueError(f"no material is named {short_text(name)}{hint}; {known}")
+    element = MATERIALS[name]
+    return replace(element, **changes, sources=element.sources | dict.fromkeys(changes, "given by the user"))
 
 
 def as_material(value: Material | str, name: str = "material") -> Material:
-    """Return a Material as it is, and the known one of a name.
+    """Return a Material, looked up if `value` is a name.
 
     Parameters
     ----------
     value : Material or str
-        What the user gave.
+        Material, or the name of a known one.
     name : str
         Name of the argument, for the message.
 
@@ -183,17 +183,17 @@ def as_material(value: Material | str, name: str = "material") -> Material:
     Raises
     ------
     ValueError
-        If it is neither, or no material has this name.
+        If it is neither, or if no material has this name.
     """
     if isinstance(value, str):
         return material(value)
-    return check_kind(value, name, Material, "a Material or the name of one")
+    return check_kind(value, name, Material, "a Material or its name")
 
 
 def polarization_energy(
     polarizability: float, voltage: float, field_factor: float, radius: float, step: float
 ) -> float:
-    """Energy that polarization gives an atom moving one step up the field gradient: a lower bound of E_perp.
+    """Energy gain by polarization of an atom that moves one step up the field gradient: a lower bound of E_perp.
 
     Parameters
     ----------

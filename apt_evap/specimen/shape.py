@@ -9,16 +9,16 @@ from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_choice, check_number
 from apt_evap._core.elementary import sine_and_cosine
 
-_LONGEST = 1e7  # [nm]: a centimetre is no tip, and volumes keep their digits
+_LONGEST = 1e7  # [nm]: 1 cm is larger than any tip, and volumes keep their precision
 
 
 @dataclass(frozen=True)
 class TaperedCap:
     """A spherical cap on a shank that widens downwards.
 
-    The convex hull of two spheres, tangent everywhere: the cap of radius R around the origin, its apex at
-    z = R, and the foot of radius R + L sin(alpha) around z = -L. Between them is the cone
-    rho cos(alpha) + z sin(alpha) = R. With ``base="flat"`` this cone goes on to z = -L and is cut there.
+    The convex hull of two spheres, tangent everywhere: the cap of radius R around the origin, its apex at z = R, and
+    the foot of radius R + L sin(alpha) around z = -L. Between them is the cone rho cos(alpha) + z sin(alpha) = R. With
+    ``base="flat"`` this cone continues to z = -L and is cut there.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ class TaperedCap:
     shank_length : float
         Length L of the shank [nm].
     shank_angle : float
-        Half the opening angle alpha of the shank [degrees], at least 0 and below 45.
+        Half the opening angle alpha of the shank [degrees], >= 0 and < 45.
     base : str
         "rounded" or "flat".
 
@@ -67,8 +67,8 @@ class TaperedCap:
     def signed_distance(self, points: Floats) -> Floats:
         """Distance from the surface [nm], negative inside.
 
-        Exact for the rounded base. For the flat one the larger of the distances from the cone and from the
-        plane of the base, which falls short of the distance from the rim outside of it.
+        Exact for the rounded base. For the flat base it is the larger of the distances from the cone and from the plane
+        of the base, which outside near the rim is smaller than the true distance.
 
         Parameters
         ----------
@@ -94,7 +94,7 @@ class TaperedCap:
         return distance
 
     def volume(self, depth: float | None = None) -> float:
-        """Volume of the shape, or of the shell under its surface down to `depth` [nm^3]."""
+        """Volume of the shape, or of the shell from its surface down to `depth` [nm^3]."""
         if depth is not None:
             inner = self.apex_radius - depth, self.shank_length - depth * (self.base == "flat")
             hollow = min(inner) > 0

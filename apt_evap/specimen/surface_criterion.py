@@ -1,4 +1,4 @@
-"""How surface atoms and nearest neighbours are told, by distances in units of the nearest neighbour distance."""
+"""Criteria for surface atoms and nearest neighbours: distances in units of the nearest neighbour distance."""
 
 from dataclasses import dataclass
 
@@ -7,10 +7,10 @@ from apt_evap.specimen import lattice
 
 @dataclass(frozen=True)
 class SurfaceCriterion:
-    """Distances that tell surface atoms and nearest neighbours.
+    """Distances that define surface atoms and nearest neighbours.
 
-    An atom is at the surface if the mean position of its neighbourhood is farther from it than a threshold (Rolland et
-    al., Microsc. Microanal. 21, 1649, 2015).
+    An atom is a surface atom if its distance from the mean position of its neighbourhood exceeds a threshold (Rolland
+    et al., Microsc. Microanal. 21, 1649, 2015).
 
     Parameters
     ----------
@@ -19,7 +19,7 @@ class SurfaceCriterion:
     neighbour_radius : float
         Radius of the neighbourhood [nm], see `lattice.SURFACE_FACTORS`.
     surface_threshold : float
-        Least distance of a surface atom from the mean of its neighbourhood [nm].
+        Smallest distance of a surface atom from the mean of its neighbourhood [nm].
     bond_length : float
         Atoms closer than this are nearest neighbours [nm], see `lattice.BOND_FACTORS`.
     """

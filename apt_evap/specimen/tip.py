@@ -11,7 +11,15 @@ from numpy.typing import ArrayLike
 from apt_evap._common.memory import check_memory
 from apt_evap._common.small_matrices import lengths, matrix_product
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_array, check_kind, check_number, check_seed, check_sequence, digest, shown
+from apt_evap._common.validation import (
+    check_array,
+    check_kind,
+    check_number,
+    check_seed,
+    check_sequence,
+    digest,
+    short_text,
+)
 from apt_evap.specimen import ase_atoms, lattice
 from apt_evap.specimen.alloy import check_solutes, draw_species
 from apt_evap.specimen.materials import Material, as_material
@@ -19,11 +27,11 @@ from apt_evap.specimen.shape import TaperedCap
 from apt_evap.specimen.shell import Shell
 from apt_evap.specimen.surface_criterion import SurfaceCriterion
 
-_ROUNDING = 1e-6  # nearest neighbour distances: sites on the surface stay together whatever their rounding
-_LAYER = 0.74  # thickness of the layer of surface atoms [d_nn]: 0.48 a^2 of the surface for each one of fcc
-_WIDEST = 10  # neighbourhood [d_nn]: 6,000 atoms each, more do not fit into the memory
-_MAX_CELLS = 5e8  # neighbourhoods in the box of all atoms: 2 GB of the grid that finds neighbours
-_SAMPLE = 10_000  # atoms asked for their nearest neighbour
+_ROUNDING = 1e-6  # [d_nn]: sites on the surface are all included, in spite of rounding
+_LAYER = 0.74  # thickness of the layer of surface atoms [d_nn]: for fcc, 0.48 a^2 of the surface per atom
+_WIDEST = 10  # largest neighbourhood [d_nn]: 6,000 atoms each; larger ones do not fit into memory
+_MAX_CELLS = 5e8  # neighbourhoods in the bounding box of all atoms: 2 GB for the neighbour grid
+_SAMPLE = 10_000  # atoms whose nearest neighbour distance is measured
 
 
 class Tip:
@@ -39,22 +47,24 @@ class Tip:
     apex_radius : float
         Radius R of the cap [nm].
     axis : sequence of float
-        Crystal direction along +z, of whole numbers or any others, see `lattice.rotation_to_axis`.
+        Crystal direction along +z, of integers or any other numbers, see `lattice.rotation_to_axis`.
     shank_angle : float
-        Half the opening angle of the shank [degrees], at least 0 and below 45.
+        Half the opening angle of the shank [degrees], >= 0 and < 45.
     shank_length : float, optional
-        Length L of the shank [nm]; 2 R if not given.
+        Length L of the shank [nm]; 2 R by default.
     base : str
         "rounded" or "flat".
     rotation : float
         Rotation of the crystal about z [degrees].
     origin : sequence of float
-        Where the lattice has an atom [nm]; an atom at the centre of the cap makes the tip symmetric.
+        Position of one lattice site [nm]. A site at the centre of the cap makes the tip symmetric.
     offset_seed : int, optional
-        Moves the lattice by a random part of its cell on top of `origin`: a tip without symmetry.
+        Seed of a random shift of the lattice by a fraction of its cell, in addition to `origin`: a tip without
+        symmetry.
     depth : float, optional
-        Hold only atoms at most this far below the surface of the cap [nm]; None holds all of them. Below z = -R/2,
-        where hardly an atom leaves, only a skin is held. The innermost layer, one neighbourhood thick, is `support`.
+        Keep only a shell: atoms at most this far below the surface of the cap [nm]; None keeps all atoms. Below z =
+        -R/2, where few atoms evaporate, the shell is thinner. Its innermost layer, one neighbourhood thick, is
+        `support`.
     solutes : mapping, optional
         Substitutional solutes of a random alloy: atomic fraction by element (str or Material).
     seed : int, optional
@@ -69,9 +79,9 @@ class Tip:
     species : ndarray of int32
         Index into `elements`, shape (n,).
     evaporable, support : ndarray of bool
-        Whether an atom may leave; whether it only completes the neighbourhoods of others, shape (n,).
+        Whether an atom can evaporate; whether it only completes the neighbourhoods of others, shape (n,).
     criterion : SurfaceCriterion
-        Distances that tell surface atoms and nearest neighbours.
+        Distances that define surface atoms and nearest neighbours.
     evaporation_fields, charge_states, masses : ndarray
         Of each species [V/nm], [e], [Da].
     apex : float
@@ -79,12 +89,12 @@ class Tip:
     potential_point : ndarray
         Where the potential is the applied voltage [nm], shape (3,).
     settings : dict
-        What the tip was made from, in plain types.
+        Parameters of the tip, in plain types.
 
     Raises
     ------
     ValueError
-        For a shape that is impossible, or that needs more memory than there is.
+        If the shape is impossible, or needs more memory than is free.
     """
 
     def __init__(
@@ -132,7 +142,7 @@ class Tip:
             depth=None if depth is None else self._shell.depth_at,
             tolerance=_ROUNDING * d,
         )
-        self._mark()
+        self._set_flags()
         self._set_elements((host, *fractions), draw_species(len(self), fractions, seed))
         self.apex = radius
         self.potential_point = np.zeros(3)
@@ -163,7 +173,7 @@ class Tip:
         surface_threshold: float | None = None,
         potential_point: ArrayLike | None = None,
     ) -> "Tip":
-        """Make a tip of any arrangement of atoms, its axis along +z.
+        """Make a tip from any arrangement of atoms, with its axis along +z.
 
         Parameters
         ----------
@@ -172,15 +182,15 @@ class Tip:
         species : array_like of int
             Index of each atom into `elements`, shape (n,).
         elements : sequence of Material or str
-            The species; the structure of the first one says how surface atoms are told.
+            The species; the structure of the first one sets the criterion for surface atoms.
         evaporable : array_like of bool, optional
-            Which atoms may leave, shape (n,); the upper half of the tip's height if not given, because the
-            rim of a cut base carries the largest charges of all.
+            Which atoms can evaporate, shape (n,). By default those in the upper half of the tip, because the rim of a
+            cut base carries the largest charges.
         neighbour_radius, surface_threshold : float, optional
-            [nm]; from the measured nearest neighbour distance (a median) if not given.
+            [nm]; by default from the median nearest neighbour distance.
         potential_point : array_like, optional
-            Where the potential is the applied voltage [nm], shape (3,): any point well inside the cap. On the
-            mean axis, as far below the apex as the tip is wide to the side, if not given.
+            Where the potential is the applied voltage [nm], shape (3,): any point well inside the cap. By default on
+            the mean axis, half the smallest extent of the tip below the apex.
 
         Returns
         -------
@@ -189,17 +199,17 @@ class Tip:
         Raises
         ------
         ValueError
-            If shapes disagree, an index names no element, or two atoms are at the same place.
+            If shapes disagree, if an index has no element, or if two atoms are at the same place.
         """
         tip = cls.__new__(cls)
         tip._shell = None  # type: ignore[assignment]
         tip.positions = check_array(positions, "positions", ("n", 3))
         n = len(tip.positions)
         if n < 2:
-            raise ValueError(f"positions must hold at least 2 atoms, got {n}")
+            raise ValueError(f"positions must contain at least 2 atoms, got {n}")
         elements = check_sequence(elements, "elements", "materials, such as ('Ni',)")
         if not elements:
-            raise ValueError("elements must name at least one material, got none")
+            raise ValueError("elements must contain at least one material, got none")
         elements = tuple(as_material(element, "elements") for element in elements)
         tip._set_elements(elements, check_array(species, "species", (n,), dtype=np.int32))
         if not 0 <= tip.species.min() <= tip.species.max() < len(elements):
@@ -226,8 +236,8 @@ class Tip:
         span = high - low
         if np.prod(span / tip.neighbour_radius + 1) > _MAX_CELLS:
             raise ValueError(
-                f"positions must lie together, got {n:,} atoms that span {span[0]:.4g} x {span[1]:.4g} x "
-                f"{span[2]:.4g} nm: is one of them far away?"
+                f"positions must be close together, got {n:,} atoms that span {span[0]:.4g} x {span[1]:.4g} x "
+                f"{span[2]:.4g} nm: is one atom far away?"
             )
         tip.apex = float(high[2])
         if evaporable is None:
@@ -250,14 +260,14 @@ class Tip:
 
     @classmethod
     def from_atoms(cls, atoms: Any, materials: Mapping[str, Material] | None = None, **options: Any) -> "Tip":
-        """Make a tip of an ASE Atoms object, its axis along +z.
+        """Make a tip from an ASE Atoms object, with its axis along +z.
 
         Parameters
         ----------
         atoms : ase.Atoms
-            Positions in Angstrom; the cell is not looked at. An array "evaporable" says which atoms may leave.
+            Positions in Angstrom; the cell is ignored. An array "evaporable" sets which atoms can evaporate.
         materials : mapping of str to Material, optional
-            Materials by chemical symbol, in place of those that `material` knows.
+            Materials by chemical symbol, instead of those that `material` knows.
         **options
             Passed to `from_positions`.
 
@@ -269,7 +279,7 @@ class Tip:
         Raises
         ------
         ValueError
-            If a symbol has no material, or as `from_positions` does.
+            If a symbol has no material, or as in `from_positions`.
         """
         return cls.from_positions(**(ase_atoms.from_atoms(atoms, materials) | options))
 
@@ -280,7 +290,7 @@ class Tip:
 
     @classmethod
     def from_settings(cls, settings: Mapping[str, Any]) -> "Tip":
-        """Make the tip again that has these `settings`; one made from positions has none to go by.
+        """Rebuild a tip from its `settings`; not possible for a tip made from positions.
 
         Raises
         ------
@@ -290,14 +300,15 @@ class Tip:
         settings = dict(check_kind(settings, "settings", Mapping, "the settings of a tip"))
         if "apex_radius" not in settings:
             raise ValueError(
-                f"settings must hold 'apex_radius' (a tip made from positions needs those), got {', '.join(settings)}"
+                "settings must contain 'apex_radius' (a tip made from positions cannot be rebuilt), "
+                f"got {', '.join(settings)}"
             )
         try:
             settings["material"] = Material(**settings["material"])
             settings["solutes"] = {Material(**solute): fraction for solute, fraction in settings.get("solutes") or ()}
             return cls(**settings)
         except (KeyError, TypeError) as error:
-            raise ValueError(f"settings must be those of a tip, got {shown(settings)}: {error}") from error
+            raise ValueError(f"settings must be those of a tip, got {short_text(settings)}: {error}") from error
 
     @property
     def nearest_neighbour_distance(self) -> float:
@@ -306,12 +317,12 @@ class Tip:
 
     @property
     def neighbour_radius(self) -> float:
-        """Radius of the neighbourhood whose mean position tells surface atoms [nm]."""
+        """Radius of the neighbourhood whose mean position identifies surface atoms [nm]."""
         return self.criterion.neighbour_radius
 
     @property
     def surface_threshold(self) -> float:
-        """Least distance of a surface atom from the mean of its neighbourhood [nm]."""
+        """Smallest distance of a surface atom from the mean of its neighbourhood [nm]."""
         return self.criterion.surface_threshold
 
     @property
@@ -328,21 +339,21 @@ class Tip:
             return f"<Tip: {len(self):,} atoms of {names} from positions>"
         shape, depth = self._shell.shape, self._shell.depth
         axis = " ".join(f"{index:.4g}" for index in self.settings["axis"])
-        held = "" if depth is None else f", held to a depth of {depth:.4g} nm"
+        shell = "" if depth is None else f", shell to a depth of {depth:.4g} nm"
         return (
             f"<Tip: {len(self):,} atoms of {names} [{axis}], apex radius {shape.apex_radius:.4g} nm, "
-            f"shank {shape.shank_length:.4g} nm at {shape.shank_angle:g} degrees, {shape.base} base{held}>"
+            f"shank {shape.shank_length:.4g} nm at {shape.shank_angle:g} degrees, {shape.base} base{shell}>"
         )
 
     @property
     def max_ions(self) -> int:
-        """How many atoms may leave, those that a shell does not hold yet included: exact only without `depth`."""
-        held = int(np.count_nonzero(self.evaporable))
+        """Number of atoms that can evaporate, including those below a shell; exact only without `depth`."""
+        n_evaporable = int(np.count_nonzero(self.evaporable))
         if self._shell is None or self._shell.depth is None:
-            return held
+            return n_evaporable
         host, shape = self.elements[0], self._shell.shape
         volume = shape.volume_above(-shape.shank_length / 2)
-        return max(held, round(volume * lattice.atom_density(host.structure, host.a, host.c)))
+        return max(n_evaporable, round(volume * lattice.atom_density(host.structure, host.a, host.c)))
 
     def signed_distance(self, points: Floats) -> Floats:
         """Distance from the surface of the shape [nm], negative inside: see `TaperedCap.signed_distance`.
@@ -353,40 +364,40 @@ class Tip:
             If the tip was made from positions.
         """
         if self._shell is None:
-            raise ValueError("a tip made from positions has no shape to measure a distance from")
+            raise ValueError("a tip made from positions has no shape, and so no signed distance")
         return self._shell.shape.signed_distance(check_array(points, "points", ("n", 3)))
 
     def deepened(self, by: float | None = None) -> "Tip":
-        """Hold a shell to a greater depth.
+        """Return this tip with a thicker shell.
 
         Parameters
         ----------
         by : float, optional
-            How much deeper [nm]; by default two neighbourhoods.
+            Increase of the depth [nm]; by default two neighbourhood radii.
 
         Returns
         -------
         Tip
-            Its first atoms are those of this one, in the same order.
+            Its first atoms are those of this tip, in the same order.
 
         Raises
         ------
         ValueError
-            If this tip is not a shell: it was made from positions, or holds every atom.
+            If this tip is not a shell: it was made from positions, or contains all atoms.
         """
         if self._shell is None or self._shell.depth is None:
-            raise ValueError(f"{self!r} is not a shell that could be deepened, it holds every atom there is")
+            raise ValueError(f"{self!r} is not a shell that can be deepened: it contains all atoms")
         by = 2 * self.neighbour_radius if by is None else check_number(by, "by", above=0, unit="nm")
         deeper = Tip.from_settings({**self.settings, "depth": self._shell.depth + by})
         rounding = 2 * _ROUNDING * self.nearest_neighbour_distance
         below = self._shell.below(deeper.positions, rounding)
         deeper.positions = np.concatenate([self.positions, deeper.positions[below]])
         deeper.species = np.concatenate([self.species, deeper.species[below]])
-        deeper._mark()
+        deeper._set_flags()
         return deeper
 
-    def _mark(self):
-        """Tell the support from the others, and which atoms may leave."""
+    def _set_flags(self):
+        """Set which atoms are support, and which can evaporate."""
         self.support = self._shell.support(self.positions)
         self.evaporable = self._shell.evaporable(self.positions, self.support)
 

@@ -15,7 +15,7 @@ import pytest
 
 import apt_evap as ae
 from apt_evap._common import memory
-from apt_evap._common.validation import shown
+from apt_evap._common.validation import short_text
 from apt_evap.config.simulation_file import read_config
 from apt_evap.emission.perturbations import from_dict
 from apt_evap.specimen.shape import TaperedCap
@@ -452,8 +452,8 @@ def check(function, good, argument, values, folder):
         except ValueError as error:
             sentence = str(error)
         else:
-            pytest.fail(f"{argument}={shown(value)} is taken")
-        value = shown(value) if isinstance(value, int) else value  # too long to print
+            pytest.fail(f"{argument}={short_text(value)} is taken")
+        value = short_text(value) if isinstance(value, int) else value  # too long to print
         assert re.search(OTHER_WORDS.get(argument, argument), sentence), (value, sentence)
         assert "\n" not in sentence and len(sentence) < 420, (value, sentence)
         assert re.search("got|is (named|missing|not known)|(cannot|cannot be) (read|written|write)", sentence), (
@@ -461,7 +461,7 @@ def check(function, good, argument, values, folder):
             sentence,
         )
         listed = isinstance(value, list | tuple | dict | np.ndarray)  # told by their shape or a member
-        assert listed or shown(value) in sentence or str(value) in sentence, (value, sentence)
+        assert listed or short_text(value) in sentence or str(value) in sentence, (value, sentence)
     assert not os.listdir(folder)
 
 
@@ -499,14 +499,14 @@ def test_every_public_name_with_arguments_is_in_the_table():
 
 
 def test_a_detector_behind_the_end_of_the_flights():
-    with pytest.raises(ValueError, match=r"distance of the detector must be at least the 0.002816 mm .* got 0.001 mm"):
+    with pytest.raises(ValueError, match=r"distance of the detector must be >= 0.002816 mm, .* got 0.001 mm"):
         ae.Simulation(shell, detector=ae.Detector(distance=0.001))
 
 
 def test_more_ions_than_atoms_are_said_before_the_run_starts():
     simulation = ae.Simulation(shell, n_threads=1)
     shell_and_below = round(simulation.tip.max_ions)
-    with pytest.warns(UserWarning, match=rf"n_ions is 100,000 but only about {shell_and_below:,} atoms may leave"):
+    with pytest.warns(UserWarning, match=rf"n_ions is 100,000 but only about {shell_and_below:,} atoms can evaporate"):
         with pytest.raises(KeyboardInterrupt):
             simulation.run(100_000, emissions=(_Interrupting(),), progress=False)
 
@@ -526,7 +526,7 @@ def test_the_atoms_that_may_leave_a_shell_are_those_of_the_whole(shape):
 
 
 def test_unknown_materials_come_with_the_nearest_known():
-    with pytest.raises(ValueError, match=r"'Nickel' \(did you mean 'Ni'\?\); known are Al, .* any other is a Material"):
+    with pytest.raises(ValueError, match=r"'Nickel' \(did you mean 'Ni'\?\); known are Al, .* others as Material"):
         ae.Tip("Nickel", 5.0)
 
 
@@ -619,4 +619,4 @@ def test_everything_says_in_one_line_what_it_holds(ready, tmp_path):
         assert all(word in repr(thing) for word in words), repr(thing)
         assert "\n" not in repr(thing) and len(repr(thing)) < 260 and "0x" not in repr(thing)
     assert repr(run.responses) == "<Responses: 12 ions, 15 coefficients from the site, 10 rolled up>"
-    assert "atoms left one after the other" in repr(emitter.evaporate(1))
+    assert "evaporated atoms" in repr(emitter.evaporate(1))

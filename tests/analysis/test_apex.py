@@ -77,9 +77,9 @@ def test_the_field_factor_of_a_run_is_that_of_its_apex():
 def test_field_factor():
     assert ae.field_factor(1000.0, 20.0, 50.0) == 1.0
     np.testing.assert_array_equal(ae.field_factor([1000, 2000], 20, 25), [2, 4])
-    with pytest.raises(ValueError, match=r"radius must be a finite number above 0, got 0\.0"):
+    with pytest.raises(ValueError, match=r"radius must be a finite number > 0, got 0\.0"):
         ae.field_factor(1000.0, 20.0, 0.0)
-    with pytest.raises(ValueError, match="a window of ions must have 50 near the axis"):
+    with pytest.raises(ValueError, match="a window must have at least 50 ions near the axis"):
         ae.fit_caps(Receding(1.5), windows=2000)
 
 

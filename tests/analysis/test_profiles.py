@@ -131,22 +131,22 @@ def test_a_map_counts_only_inside_its_mask():
     "call, message",
     [
         (lambda hits: azimuthal_profile(hits, inner=3, outer=2), "outer must be"),
-        (lambda hits: radial_profile(hits, (99, 99), outer=1), "there are none between inner and outer"),
-        (lambda hits: zone_line_profile(hits, Rectangle((99, 99), 0, 1, 1)), r"there are none in Rectangle\(centre="),
+        (lambda hits: radial_profile(hits, (99, 99), outer=1), "got none between inner and outer"),
+        (lambda hits: zone_line_profile(hits, Rectangle((99, 99), 0, 1, 1)), r"got none in Rectangle\(centre="),
         (
             lambda hits: zone_line_profile(hits, AROUND, bins=0),
-            "bins must be a whole number of at least 1 and at most 16,384, got 0",
+            "bins must be an integer from 1 to 16,384, got 0",
         ),
         (
             lambda hits: zone_line_profile(hits, []),
-            r"rectangles must be at least one, all of one width, got widths \[\]",
+            r"rectangles must contain at least one, all of equal width, got widths \[\]",
         ),
         (
             lambda hits: zone_line_profile(hits, [AROUND, Rectangle((0, 0), 0, 3, 2)]),
-            r"all of one width, got widths \[2.0, 5.0\] mm",
+            r"all of equal width, got widths \[2.0, 5.0\] mm",
         ),
         (lambda hits: zone_line_profile(Hits(voltage=[1.0]), AROUND), "no column 'x'"),
-        (lambda hits: Rectangle((0, 0), 0, 0, 1), r"length must be a finite number \[mm\] above 0, got 0"),
+        (lambda hits: Rectangle((0, 0), 0, 0, 1), r"length must be a finite number \[mm\] > 0, got 0"),
         (lambda hits: Rectangle((0, 0, 0), 0, 1, 1), r"centre must have shape \(2,\)"),
         (lambda hits: Rectangle((0, 0), np.nan, 1, 1), "angle must be a finite number"),
     ],

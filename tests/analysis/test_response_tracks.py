@@ -63,11 +63,11 @@ def test_an_ion_without_a_neighbour_has_no_track(run):
 @pytest.mark.parametrize(
     "call, message",
     [
-        (lambda run: ae.rollup_tracks(run, [60], [0.1]), r"ions must be places in the run, 0 to 59, got \[60\]"),
-        (lambda run: ae.rollup_tracks(run, [], [0.1]), "ions must be places in the run"),
-        (lambda run: ae.lateral_tracks(run, [0.5], [0.1]), "ions must hold whole numbers"),
-        (lambda run: ae.lateral_tracks(run, [0], [1.6]), "energies must be 0 to 1.5 eV, the limit of the responses"),
-        (lambda run: ae.rollup_tracks(run, [0], [-0.1]), "energies must be 0 to 1.5 eV"),
+        (lambda run: ae.rollup_tracks(run, [60], [0.1]), r"ions must be indices from 0 to 59, got \[60\]"),
+        (lambda run: ae.rollup_tracks(run, [], [0.1]), "ions must be indices"),
+        (lambda run: ae.lateral_tracks(run, [0.5], [0.1]), "ions must contain integers"),
+        (lambda run: ae.lateral_tracks(run, [0], [1.6]), "energies must be from 0 to 1.5 eV, the limit of"),
+        (lambda run: ae.rollup_tracks(run, [0], [-0.1]), "energies must be from 0 to 1.5 eV"),
         (lambda run: ae.lateral_tracks(run, [0], [0.1], [[0.0]]), r"azimuths must have shape \(k,\)"),
     ],
 )

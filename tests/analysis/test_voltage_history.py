@@ -57,7 +57,7 @@ def test_the_course_of_a_quantity():
     assert course(values[:7], 10).median.tolist() == values[:7].tolist()
     with pytest.raises(ValueError, match="points must be"):
         course(values, 0)
-    with pytest.raises(ValueError, match="one or more, got none"):
+    with pytest.raises(ValueError, match="at least one, got none"):
         course([])
     with pytest.raises(ValueError, match="run must be a Run"):
         evaporation_voltages(ae.Hits(voltage=values))

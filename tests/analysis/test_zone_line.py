@@ -82,7 +82,7 @@ def test_where_there_is_no_line_none_is_significant(n_fits):
         try:
             line = fit_zone_line(profile_of(random.poisson(mean).astype(float)))
         except ValueError as error:
-            assert "shows no line" in str(error)
+            assert "has no line" in str(error)
         else:
             heights.append(line.height / line.height_error)
     # the best of some 20 places for a line, 60 times over at most: 1,200 normal numbers stay below 4.5
@@ -129,10 +129,10 @@ def test_profiles_of_one_line_differ_by_noise_and_of_two_by_more():
     "call, message",
     [
         (lambda good: fit_zone_line(Profile(*(column[:7] for column in good))), "at least 8 bins to fit a line, got 7"),
-        (lambda good: fit_zone_line(profile_of(1e4 * expected(centre=-19.0))), "shows no line"),
-        (lambda good: fit_zone_line(good, exponent=0.5), "exponent must be a finite number at least 1 and at most 12"),
+        (lambda good: fit_zone_line(profile_of(1e4 * expected(centre=-19.0))), "has no line"),
+        (lambda good: fit_zone_line(good, exponent=0.5), "exponent must be a finite number >= 1 and <= 12"),
         (lambda good: compare_profiles(good, good.density), "second must be a Profile"),
-        (lambda good: compare_profiles(good, Profile(*(column[1:] for column in good))), "same bins, got 40 and 39"),
+        (lambda good: compare_profiles(good, Profile(*(column[1:] for column in good))), "equal bins, got 40 and 39"),
         (lambda good: compare_profiles(good._replace(error=good.error * np.nan), good), "first must have errors"),
     ],
 )

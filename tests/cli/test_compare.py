@@ -147,7 +147,7 @@ def test_a_registration_from_a_file(folder, capsys):
     assert held[0] == held[1] == held[2]
     assert held[0]["registration"] == turned.to_dict()
     Path("bad.json").write_text("[]")
-    assert "'bad.json' does not hold a registration" in failed(
+    assert "'bad.json' does not contain a registration" in failed(
         capsys, "run.h5", "map.npz", "--registration", "bad.json"
     )
 
@@ -167,18 +167,18 @@ def test_arrays_by_name(folder, capsys):
     "arguments, sentence",
     [
         (["run.h5"], "the following arguments are required: MEASURED"),
-        (["run.h5", "map.npz", "--means", "a"], "--means: must be numbers with commas between, got 'a'"),
-        (["run.h5", "map.npz", "--means", "0.2,0.1"], "means must be increasing numbers above 0"),
+        (["run.h5", "map.npz", "--means", "a"], "--means: must be numbers separated by commas, got 'a'"),
+        (["run.h5", "map.npz", "--means", "0.2,0.1"], "means must be increasing numbers > 0"),
         (["run.h5", "map.npz", "--mechanism", "both"], "invalid choice: 'both'"),
         (["run.h5", "map.npz", "--mechanism", "rollup"], "invalid choice: 'rollup' (did you mean 'roll-up'?)"),
-        (["run.h5", "map.npz", "--rollup-fractions", "0.5"], "rollup_fractions are for the mechanism 'combined'"),
+        (["run.h5", "map.npz", "--rollup-fractions", "0.5"], "rollup_fractions are only for the mechanism 'combined'"),
         (["run.h5", "map.npz", "--registration", "1,2"], "--registration must be a .json file or ROTATION,SCALE"),
-        (["run.h5", "map.npz", "--registration", "0,-1,0,0"], "scale must be a finite number above 0"),
-        (["run.h5", "map.npz", "--temperature", "0"], "temperature must be a finite number [K] above 0"),
+        (["run.h5", "map.npz", "--registration", "0,-1,0,0"], "scale must be a finite number > 0"),
+        (["run.h5", "map.npz", "--temperature", "0"], "temperature must be a finite number [K] > 0"),
         (["run.h5", "map.npz", "--arrays", "counts"], "--arrays must name values, edges in x and y"),
         (["run.h5", "ions.epos", "--unit", "mm"], "--unit is for a map in an .npz file, got 'ions.epos'"),
-        (["run.h5", "other.h5"], "'other.h5' is a run: say by --perturbation how its ions start"),
-        (["run.h5", "ions.epos", "--perturbation", "Unperturbed"], "'ions.epos' holds measured ions"),
+        (["run.h5", "other.h5"], "'other.h5' is a run: its ions need --perturbation"),
+        (["run.h5", "ions.epos", "--perturbation", "Unperturbed"], "'ions.epos' contains measured ions"),
         (["run.h5", "none.epos"], "cannot read 'none.epos'"),
         (["ions.epos", "map.npz"], "'ions.epos'"),
     ],
@@ -200,7 +200,7 @@ def test_measured_ions_are_selected(folder, capsys):
 
 def test_a_run_without_responses_is_refused(folder, small_tip, capsys):
     ae.Simulation(small_tip).run(50, responses=False, progress=False).save("nr.h5")
-    sentence = "'nr.h5' has no responses: run again with responses = true in [simulation]"
+    sentence = "'nr.h5' has no responses: repeat the run with responses = true in [simulation]"
     assert sentence in failed(capsys, "nr.h5", "map.npz", *HERE)
 
 
@@ -219,7 +219,7 @@ def test_a_doubtful_registration_is_told_once_and_kept(folder, capsys):
     assert main(["compare", "run.h5", "noise.npz", "-o", "noise", *QUICK]) == 0
     out, err = capsys.readouterr()
     assert err.count("the registration is doubtful") == 1
-    assert f"note: look at {Path('noise/registration.png')}; --registration gives" in err
+    assert f"note: look at {Path('noise/registration.png')}; --registration sets" in err
     assert "roll-up, registration doubtful, best at" in out
     assert json.loads(Path("noise/study.json").read_text())["registration"]["doubtful"] is True
     assert main(["compare", "run.h5", "noise.npz", "-o", "given", *QUICK, *HERE]) == 0

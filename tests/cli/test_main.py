@@ -170,7 +170,7 @@ def test_an_unfinished_run_is_resumed_or_begun_anew_as_asked(folder, made, capsy
     assert "unfinished run of 25 ions" in message and "--resume goes on with it, --force begins anew" in message
     assert main(["info", "small.h5.unfinished"]) == 0
     told = capsys.readouterr().out
-    assert "unfinished run of 25 ions" in told and "the command that began it, with --resume, goes on" in told
+    assert "unfinished run of 25 ions" in told and "continue with the same command and --resume" in told
     assert "No such file or directory; an unfinished run is in 'small.h5.unfinished'" in failed(
         capsys, "info", "small.h5"
     )
@@ -225,7 +225,7 @@ def test_what_cannot_be_written_is_said_before_computing(folder, capsys, monkeyp
     assert "cannot write 'none/a.png'" in failed(capsys, "run", "small.toml", "--map", "none/a.png")
     (folder / "folder.h5").mkdir()
     assert "cannot write 'folder.h5': Is a directory" in failed(capsys, "run", "small.toml", "-o", "folder.h5")
-    assert "whose name ends in .h5, got 'a.hdf'" in failed(capsys, "run", "small.toml", "-o", "a.hdf")
+    assert "with the suffix .h5, got 'a.hdf'" in failed(capsys, "run", "small.toml", "-o", "a.hdf")
     assert "a picture is a .png, .pdf, .svg file, got 'a.jpg'" in failed(capsys, "run", "small.toml", "--map", "a.jpg")
     assert [config.simulated for config in checked.given] == [False] * 5
 
@@ -257,8 +257,8 @@ def test_wrong_configs_are_one_sentence(folder, made, capsys):
         return failed(capsys, "run", "wrong.toml")
 
     assert "'wrong.toml', [tip]: no key is named 'apex' (did you mean 'apex_radius'?)" in wrong("apex_radius", "apex")
-    assert "'wrong.toml', [tip]: apex_radius must be a finite number [nm] at least" in wrong("6 a", "1 a")
-    assert "'wrong.toml', [simulation]: ions must be a whole number of at least 1, got 'many'" in wrong("60", '"many"')
+    assert "'wrong.toml', [tip]: apex_radius must be a finite number [nm] >=" in wrong("6 a", "1 a")
+    assert "'wrong.toml', [simulation]: ions must be an integer >= 1, got 'many'" in wrong("60", '"many"')
     assert "GB are free; give a depth" in wrong("6 a", "90000 a")
     assert "'wrong.toml' is not a TOML file" in wrong("=", ":")
     assert "cannot read 'none.toml'" in failed(capsys, "run", "none.toml")
@@ -271,9 +271,7 @@ def test_a_run_that_ends_early_says_why(folder, capsys):
     assert main(["run", "small.toml", "--ions", "100000"]) == 0
     run = load("small.h5")
     assert 0 < len(run) < 100_000 and run.ended
-    assert f"apt-evap: note: the run ended before its time: {run.ended}; the {len(run):,} ions so far" in (
-        capsys.readouterr().err
-    )
+    assert f"apt-evap: note: the run ended early: {run.ended}; its {len(run):,} ions" in (capsys.readouterr().err)
 
 
 def test_a_failing_picture_leaves_the_run(folder, capsys, monkeypatch):
@@ -321,7 +319,8 @@ def test_a_run_that_misses_the_detector_says_so(folder, capsys):
     (folder / "small.toml").write_text(SMALL + "[detector]\nwidth = 40\n")
     assert main(["run", "small.toml"]) == 0
     note = (
-        r"note: (\d+) of 60 ions miss the detector, which is 40 mm wide at 100 mm: a larger width or a smaller distance"
+        r"note: (\d+) of 60 ions miss the detector, which is 40 mm wide at 100 mm: use a larger width or a "
+        r"smaller distance"
     )
     assert int(re.search(note, capsys.readouterr().err)[1]) > 30
 
@@ -360,7 +359,7 @@ def test_ctrl_c_and_sigterm_keep_what_is_done(folder, sent, code):
     assert process.returncode == code
     run = load(folder / "small.h5")
     assert run.ended == "interrupted" and 0 < len(run) < 5000
-    said = f"interrupted; {len(run):,} of 5,000 ions are in 'small.h5'; the same command with --resume goes on"
+    said = f"interrupted; {len(run):,} of 5,000 ions are in 'small.h5'; the same command with --resume continues"
     assert said.encode() in seen
     assert b"Traceback" not in seen and out.endswith("wrote small.h5\nwrote small.png\n")
     assert sorted(os.listdir(folder)) == ["small.h5", "small.png", "small.toml"]
@@ -455,19 +454,15 @@ def test_map_errors(measured, made, capsys):
         "'ions.pos' has no detector coordinates x and y, which a map needs, only mass_to_charge, positions"
         in failed(capsys, "map", "ions.pos")
     )
-    assert "--perturbation needs a run (.h5), 'ions.epos' holds measured ions" in failed(
+    assert "--perturbation needs a run (.h5), 'ions.epos' contains measured ions" in failed(
         capsys, "map", "ions.epos", "--perturbation", "Unperturbed"
     )
     assert "did you mean 'RollUp'" in failed(capsys, "map", made, "--perturbation", "Rollup:0.1")
     assert "RollUp needs energy, got no parameters; an example is RollUp:0.155,0.155" in failed(
         capsys, "map", made, "--perturbation", "RollUp"
     )
-    assert "argument --bins: must be a whole number from 1 to 16384, got '0'" in failed(
-        capsys, "map", made, "--bins", "0"
-    )
-    assert "argument --smooth: must be a number [mm] of at least 0, got 'nan'" in failed(
-        capsys, "map", made, "--smooth", "nan"
-    )
+    assert "argument --bins: must be an integer from 1 to 16384, got '0'" in failed(capsys, "map", made, "--bins", "0")
+    assert "argument --smooth: must be a number [mm] >= 0, got 'nan'" in failed(capsys, "map", made, "--smooth", "nan")
     assert "exists and was not made by apt-evap" not in failed(capsys, "map", "none.epos")
     Path("ions_map.png").write_bytes(b"a photograph")
     assert "'ions_map.png' exists and was not made by apt-evap" in failed(capsys, "map", "ions.epos")
@@ -555,11 +550,11 @@ def test_map_and_info_of_a_map(folder, monkeypatch, capsys):
     assert told["x"] == [-20, 20] and told["values"] == [values.min() / 5, values.max() / 5]
     assert main(["info", "counts.npz"]) == 0
     assert re.search(r"^bin size \[mm\] +1 x 1$", capsys.readouterr().out, re.M)
-    assert "--bins is for ions, 'counts.npz' is a map: its bins are 40 x 40" in failed(
+    assert "--bins is only for ions, 'counts.npz' is a map: its bins are 40 x 40" in failed(
         capsys, "map", "counts.npz", "--bins", "20"
     )
     assert "--mass is for ions, got 'counts.npz'" in failed(capsys, "info", "counts.npz", "--mass", "1,2")
-    assert "'counts.npz' holds a map" in failed(capsys, "map", "counts.npz", "--perturbation", "Unperturbed")
+    assert "'counts.npz' contains a map" in failed(capsys, "map", "counts.npz", "--perturbation", "Unperturbed")
 
 
 # ---- a selection of ions ---------------------------------------------------------------------------------------------
@@ -612,11 +607,11 @@ def test_ions_of_a_run_are_selected(folder, made, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (["--mass", "29,27"], "argument --mass: must be two numbers in order, such as 27,29.5, got '29,27'"),
+        (["--mass", "29,27"], "argument --mass: must be two increasing numbers, such as 27,29.5, got '29,27'"),
         (["--circle", "1,2"], "argument --circle: must be a radius, or R,X,Y, such as 15,0,-2 [mm], got '1,2'"),
-        (["--species", "Si"], "--ranges and --species go together"),
+        (["--species", "Si"], "--ranges and --species must be used together"),
         (["--ranges", "mixed.rrng", "--species", "Sn"], "--species: mixed.rrng have no species 'Sn'"),
-        (["--mass", "1,2"], "no ion is selected of the 1,000 of 'mixed.epos'"),
+        (["--mass", "1,2"], "the options select none of the 1,000 ions of 'mixed.epos'"),
     ],
 )
 def test_selections_that_are_refused(mixed, capsys, options, sentence):
@@ -640,8 +635,8 @@ def test_a_selection_by_a_missing_column_is_refused(folder, capsys):
         (["fly"], "invalid choice: 'fly'"),
         (["mpa"], "invalid choice: 'mpa' (did you mean 'map'?)"),
         (["run"], "the following arguments are required: CONFIG.toml (see apt-evap run --help)"),
-        (["run", "small.toml", "--ions", "0"], "argument --ions: must be a whole number of at least 1, got '0'"),
-        (["run", "small.toml", "--threads", "x"], "argument --threads: must be a whole number of at least 1, got 'x'"),
+        (["run", "small.toml", "--ions", "0"], "argument --ions: must be an integer >= 1, got '0'"),
+        (["run", "small.toml", "--threads", "x"], "argument --threads: must be an integer >= 1, got 'x'"),
         (["run", "small.toml", "--colour"], "unrecognized arguments: --colour (see apt-evap run --help)"),
         (["info", "a.epos", "--byte-order", "up"], "argument --byte-order: invalid choice: 'up'"),
     ],
@@ -683,13 +678,13 @@ def test_a_reader_of_the_output_may_leave(made):
 
 def test_maps_that_cannot_be_drawn_are_told_before_the_simulation(folder, capsys):
     (folder / "broad.toml").write_text(SMALL + "[maps]\nsmoothing = 500.0\n")
-    assert "'broad.toml', [maps]: smoothing must be a finite number [mm] at most 300 (the width of the detector)" in (
+    assert "'broad.toml', [maps]: smoothing must be a finite number [mm] <= 300 (the width of the detector)" in (
         failed(capsys, "run", "broad.toml")
     )
 
 
 def test_a_smoothing_broader_than_the_detector(made, folder, capsys):
-    assert "smoothing must be a finite number [mm] at most 300 (the width of the detector), got 400.0" in failed(
+    assert "smoothing must be a finite number [mm] <= 300 (the width of the detector), got 400.0" in failed(
         capsys, "map", made, "--smooth", "400"
     )
 

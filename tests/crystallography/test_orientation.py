@@ -101,7 +101,7 @@ def test_a_pole_and_a_zone_line_are_enough(seed):
     # one point is enough, on the other side it is the line away from 002
     fit = fit_orientation("Ni", [(1, 1, 1)], [place], scale=30.0, **options | {"lines": [((0, 0, 2), points[:1])]})
     assert between(fit.orientation.matrix, matrix) < 1e-5
-    with pytest.raises(ValueError, match=r"scale must be given \[mm/rad\]"):
+    with pytest.raises(ValueError, match=r"scale \[mm/rad\] must be given"):
         fit_orientation("Ni", [(1, 1, 1)], [place], **options)
 
 
@@ -139,14 +139,14 @@ def test_given_indices_tell_the_handedness_and_the_lattice_does_not():
     [
         ({"planes": [(1, 1, 1), (2, 2, 2)]}, "needs two poles in different directions, or a pole and a zone line"),
         ({"planes": [(1, 1, 1)], "places": [(0, 0)]}, "needs two poles"),
-        ({"places": [(1, 0), (1, 0)]}, "places must be different for different poles"),
+        ({"places": [(1, 0), (1, 0)]}, "places of the poles must be different"),
         ({"places": [(1, 0)]}, r"places must have shape \(2, 2\)"),
-        ({"planes": [(1, 1, 1), (0, 0, 0)]}, "planes must not have indices that are all 0"),
+        ({"planes": [(1, 1, 1), (0, 0, 0)]}, "planes must not have indices that are all zero"),
         ({"lines": [(1, 1, 1)]}, "lines must be pairs of Miller indices and points"),
-        ({"lines": [((2, 2, 2), [(3, 3)])]}, "must be another one than that of the first pole"),
+        ({"lines": [((2, 2, 2), [(3, 3)])]}, "must differ from that of the first pole"),
         ({"mirror": "yes"}, "mirror must be True or False, got"),
         ({"scale": -1}, "scale must be a finite number"),
-        ({"material": 3}, "material must be a Material or the name of one"),
+        ({"material": 3}, "material must be a Material or its name"),
     ],
 )
 def test_what_is_refused(changes, message):
@@ -158,7 +158,7 @@ def test_what_is_refused(changes, message):
 def test_a_matrix_that_is_no_rotation_and_settings_without_a_crystal():
     with pytest.raises(ValueError, match="matrix must be a rotation"):
         Orientation.from_matrix("Ni", np.diag([1, 1, -1]))
-    with pytest.raises(ValueError, match="settings must hold the axis of a crystal, got atoms"):
+    with pytest.raises(ValueError, match="settings must contain the axis of a crystal, got atoms"):
         Orientation.from_settings({"atoms": 3})
 
 

@@ -95,13 +95,13 @@ def test_labels_have_bars():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: poles(OF_STRUCTURE["fcc"], 0), "families must be a whole number of at least 1, got 0"),
-        (lambda: poles(OF_STRUCTURE["fcc"], 51), "families must be at most 50"),
-        (lambda: plane_normals(OF_STRUCTURE["fcc"], [(0, 0, 0)]), "planes must not have indices that are all 0"),
+        (lambda: poles(OF_STRUCTURE["fcc"], 0), "families must be an integer >= 1, got 0"),
+        (lambda: poles(OF_STRUCTURE["fcc"], 51), "families must be <= 50"),
+        (lambda: plane_normals(OF_STRUCTURE["fcc"], [(0, 0, 0)]), "planes must not have indices that are all zero"),
         (lambda: plane_normals(OF_STRUCTURE["fcc"], [(1, 0, -1, 0)]), r"planes must have shape \(n, 3\)"),
         (lambda: plane_normals(OF_STRUCTURE["hcp"], [(1, 0, 0, 0)]), "sum of 0"),
         (lambda: zones(OF_STRUCTURE["hcp"], [(1, 1, 0)]), r"a zone axis must have shape \(4,\)"),
-        (lambda: zones(OF_STRUCTURE["fcc"], []), "must be some, got none"),
+        (lambda: zones(OF_STRUCTURE["fcc"], []), "at least one zone axis, got none"),
     ],
 )
 def test_what_is_refused(call, message):

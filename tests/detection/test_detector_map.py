@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as hnp
 from skimage.morphology import convex_hull_image
 
 from apt_evap import plot
-from apt_evap.detection.binning import bin_edges, convex_hull, count, field_of_view, find_comb
+from apt_evap.detection.binning import bin_edges, convex_hull, count, field_of_view, find_quantisation
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.io.formats import read
@@ -74,7 +74,7 @@ def test_bins_are_square_and_hold_every_hit(single, bins):
 @pytest.mark.parametrize("dtype", ["f4", "f8"])
 def test_comb_is_found(spacing, origin, dtype):
     number = np.random.default_rng(3).integers(0, 900, 20_000)
-    comb = find_comb((origin + spacing * number).astype(dtype))
+    comb = find_quantisation((origin + spacing * number).astype(dtype))
     # the tooth furthest away is then off by less than 2 % of a spacing
     assert comb.spacing == pytest.approx(spacing, rel=2e-5)
     assert (comb.origin - origin) / spacing % 1 == pytest.approx(0, abs=0.02) or (
@@ -85,14 +85,14 @@ def test_comb_is_found(spacing, origin, dtype):
 def test_irregular_comb_is_found():
     random = np.random.default_rng(4)
     teeth = 0.03 * (np.arange(800) + random.uniform(-0.08, 0.08, 800))
-    assert find_comb(random.choice(teeth, 50_000)).spacing == pytest.approx(0.03, rel=1e-4)
+    assert find_quantisation(random.choice(teeth, 50_000)).spacing == pytest.approx(0.03, rel=1e-4)
 
 
 @given(st.integers(0, 2**32), st.sampled_from(["f4", "f8"]), st.sampled_from([10, 1000, 150_000]), st.booleans())
 def test_continuous_coordinates_have_no_comb(seed, dtype, n, repeated):
     random = np.random.default_rng(seed)
     values = random.normal(0, 10, n).astype(dtype)
-    assert find_comb(random.choice(values, n) if repeated else values) is None
+    assert find_quantisation(random.choice(values, n) if repeated else values) is None
 
 
 @pytest.mark.parametrize("bins", [60, 200, 256, 333])
@@ -128,7 +128,7 @@ def test_dither_is_keyed_by_its_seed_and_needs_a_comb():
     assert np.array_equal(first, same)
     assert first.shape != other.shape or not np.array_equal(first, other)
     x, y = disc(5000)
-    with pytest.raises(ValueError, match="no comb"):
+    with pytest.raises(ValueError, match="needs a quantisation step"):
         Hits(x=x, y=y).map(dither_seed=1)
 
 
@@ -225,25 +225,25 @@ def test_bad_arguments_are_named():
     hits = Hits(x=x, y=y)
     even, uneven = np.arange(4.0), np.array([0, 1, 2, 4.0])
     cases = [
-        (lambda: hits.map(bins=0), "bins must be a whole number"),
+        (lambda: hits.map(bins=0), "bins must be an integer"),
         (lambda: hits.map(extent=(1, 0, 0, 1)), "extent must be"),
         (lambda: hits.map(extent=(50, 60, 50, 60)), "none of 1,000 hits"),
         (lambda: hits.map(mask=np.ones((2, 2), bool)), "mask must have shape"),
         (
             lambda: Hits(x=[1.0], y=[2.0]).map(),
-            r"the only ion lies at \(1, 2\) mm: .* select more of them or give ext",
+            r"the only ion lies at \(1, 2\) mm: .* select more ions or give ext",
         ),
         (lambda: Hits(x=[1.0] * 3, y=[2.0] * 3).map(), r"all 3 ions lie at \(1, 2\) mm"),
-        (lambda: hits.map(extent=(1, 1, 2, 2)), "not a point"),
-        (lambda: Hits(x=[np.nan], y=[1.0], source="f").map(), "f has none of 1"),
+        (lambda: hits.map(extent=(1, 1, 2, 2)), "with a non-zero size"),
+        (lambda: Hits(x=[np.nan], y=[1.0], source="f").map(), "got none of 1 in f"),
         (lambda: hits.map().smoothed(-1), "sigma must be"),
         (
             lambda: DetectorMap.from_array(np.ones((3, 3)), even, uneven),
             "y_edges must increase in even steps",
         ),
         (lambda: DetectorMap.from_array(np.ones((3, 2)), even, even), "x_edges must have shape"),
-        (lambda: DetectorMap.from_array(-np.ones((3, 3)), even, even), "values of a map must be at least 0, got -1"),
-        (lambda: DetectorMap.from_array(np.full((3, 3), np.nan), even, even), "mask must leave"),
+        (lambda: DetectorMap.from_array(-np.ones((3, 3)), even, even), "values of a map must be >= 0, got -1"),
+        (lambda: DetectorMap.from_array(np.full((3, 3), np.nan), even, even), "mask must contain"),
     ]
     for call, message in cases:
         with pytest.raises(ValueError, match=message):
@@ -260,7 +260,7 @@ def test_pictures_share_a_scale_and_state_what_they_show(tmp_path):
     assert len({ax.images[0].get_clim() for ax in axes}) == 1
     low, high = plot.color_limits(map)
     assert low < 1 < high and "smoothed by 1 mm" in plot.describe(map.smoothed(1.0))
-    with pytest.raises(ValueError, match="a title for each"):
+    with pytest.raises(ValueError, match="one title per map"):
         plot.detector_maps([map], ["a", "b"])
 
 

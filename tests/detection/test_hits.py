@@ -81,9 +81,9 @@ def test_missing_column_names_column_and_source():
         ({"x": [1.0], "y": [1.0, 2.0]}, "x 1, y 2"),
         ({"x": [[1.0]]}, r"x must have shape \(n,\)"),
         ({"positions": np.zeros((3, 2))}, r"positions must have shape \(n, 3\)"),
-        ({"pulses": [-1]}, "pulses must hold whole numbers"),
-        ({"site": [0.5]}, "site must hold whole numbers"),
-        ({"outcome": [3]}, "outcome must hold"),
+        ({"pulses": [-1]}, "pulses must contain integers"),
+        ({"site": [0.5]}, "site must contain integers"),
+        ({"outcome": [3]}, "outcome must be"),
         ({"x": ["far"]}, "x must be an array of numbers"),
     ],
 )

@@ -125,9 +125,9 @@ def test_what_points_away_has_no_place():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"scale": 0}, r"scale must be a finite number \[mm/rad\] above 0, got 0"),
+        ({"scale": 0}, r"scale must be a finite number \[mm/rad\] > 0, got 0"),
         ({"scale": 3, "centre": (1, 2, 3)}, r"centre must have shape \(2,\)"),
-        ({"scale": 3, "compression": -1}, "compression must be a finite number above 0"),
+        ({"scale": 3, "compression": -1}, "compression must be a finite number > 0"),
         ({"scale": 3, "mirror": "x"}, "mirror must be True or False"),
     ],
 )

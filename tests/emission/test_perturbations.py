@@ -256,7 +256,7 @@ def test_tangent_frame_is_x_and_y_at_the_apex_and_continuous_above_the_seam():
     [
         (lambda: LateralVelocity("0.3"), r"energy must be a number \[eV\] or have a method quantile"),
         (lambda: RollUp(None), "energy must be"),
-        (lambda: Combined(0.3, 1.2), "rollup_fraction must be .* at most 1, got 1.2"),
+        (lambda: Combined(0.3, 1.2), "rollup_fraction must be .* <= 1, got 1.2"),
         (lambda: from_dict({"name": "Rollup", "energy": 0.1}), "named 'Rollup' .did you mean 'RollUp'"),
         (lambda: from_dict({"name": "RollUp"}), "RollUp needs energy, got no parameters"),
         (lambda: from_dict({"name": "Fixed", "energy": 1.0, "x": 2}), "Fixed needs energy, got energy, x"),
@@ -277,8 +277,8 @@ def test_plain_number_in_settings_is_a_fixed_energy():
     ("change", "message"),
     [
         ({"normals": [[0, 0, 2.0]]}, "normals must have length 1"),
-        ({"masses": [0.0]}, "masses must be above 0"),
-        ({"charge_states": [0]}, "charge_states must be above 0"),
+        ({"masses": [0.0]}, "masses must be > 0"),
+        ({"charge_states": [0]}, "charge_states must be > 0"),
         ({"masses": [1.0, 2.0]}, r"masses must have shape \(1,\)"),
         ({"positions": [[0, 0, np.inf]]}, "positions must be finite"),
         ({"nearest_neighbour_distance": 0.0}, "nearest_neighbour_distance must be"),
@@ -309,7 +309,7 @@ def test_distribution_of_a_users_own_is_checked():
             return u[:3]
 
     batch = emissions()
-    with pytest.raises(ValueError, match=r"must be at least 0 \[eV\], got -0\."):
+    with pytest.raises(ValueError, match=r"must be >= 0 \[eV\], got -0\."):
         LateralVelocity(Negative()).launch(batch, IonRandom(1, batch.ions))
     with pytest.raises(ValueError, match=r"must have shape \(400,\), got \(3,\)"):
         RollUp(Short()).launch(batch, IonRandom(1, batch.ions))

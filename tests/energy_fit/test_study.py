@@ -111,10 +111,10 @@ def test_the_box_around_a_point_stays_on_the_grid():
             {"mechanism": "rollup"},
             "mechanism must be one of roll-up, lateral, combined, got 'rollup'",
         ),
-        ({"means": (0.1, 0.1)}, "means must be increasing numbers above 0"),
-        ({"means": (0.0, 0.1)}, "means must be increasing numbers above 0"),
-        ({"rsds": ()}, "rsds must be increasing numbers above 0"),
-        ({"rollup_fractions": (0.5,)}, "rollup_fractions are for the mechanism 'combined'"),
+        ({"means": (0.1, 0.1)}, "means must be increasing numbers > 0"),
+        ({"means": (0.0, 0.1)}, "means must be increasing numbers > 0"),
+        ({"rsds": ()}, "rsds must be increasing numbers > 0"),
+        ({"rollup_fractions": (0.5,)}, "rollup_fractions are only for the mechanism 'combined'"),
         ({"mechanism": "combined", "rollup_fractions": (0.5, 1.5)}, "rollup_fractions must be .* from 0 to 1"),
     ],
 )
@@ -350,7 +350,7 @@ def test_settings_are_recorded(twin, tmp_path):
 def test_study_settings_are_checked():
     assert StudySettings(1, flattening=0).flattening == 0.0
     for wrong, words in (
-        ({"smoothing": -1.0}, r"smoothing must be a finite number \[mm\] at least 0, got -1.0"),
+        ({"smoothing": -1.0}, r"smoothing must be a finite number \[mm\] >= 0, got -1.0"),
         ({"flattening": -1.0}, "flattening must be"),
         ({"data_range": 0}, "data_range must be"),
         ({"allow_noise": "no"}, "allow_noise must be True or False"),
@@ -430,9 +430,9 @@ def test_studies_that_cannot_be(run, other):
         ae.fit_energies(run, measured, registration=HERE, replicas=0)
     with pytest.raises(ValueError, match="smoothing"):
         ae.fit_energies(run, measured, registration=HERE, smoothing=-1)
-    with pytest.raises(ValueError, match=r"none of [\d,]+ hits lies in"):
+    with pytest.raises(ValueError, match=r"none of [\d,]+ hits is in"):
         ae.fit_energies(run, measured, registration=ae.Registration(0.0, 1.0, (1e6, 0.0)))
-    with pytest.raises(ValueError, match="must hold a window of 11 bins"):
+    with pytest.raises(ValueError, match="must contain a window of 11 bins"):
         small = replace(measured, mask=np.add.outer(np.arange(48), np.arange(48)) < 9)
         ae.fit_energies(run, small, registration=HERE)
 

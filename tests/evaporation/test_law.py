@@ -87,8 +87,8 @@ class Bad:
         (3, "law must be an evaporation law with a method keys"),
         (Bad(np.nan), "keys of Bad must be numbers, got NaN"),
         (Bad(np.ones(3)), "keys of Bad must return .* values, one per atom, got 3"),
-        (Bad(-1.0), "law Bad gives no surface atom of .* a key above 0"),
-        (Bad(0.0), "law Bad gives no surface atom of .* a key above 0"),
+        (Bad(-1.0), "law Bad gives no surface atom of .* a key > 0"),
+        (Bad(0.0), "law Bad gives no surface atom of .* a key > 0"),
     ],
 )
 def test_bad_laws_are_refused(small_tip, law, message):

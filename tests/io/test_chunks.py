@@ -166,7 +166,7 @@ def test_arguments(tmp_path):
     path = tmp_path / "a.pos"
     path.write_bytes(pos(3))
     for rows in (0, -1, 1.5, True, None):
-        with pytest.raises(ValueError, match="rows must be a whole number of at least 1"):
+        with pytest.raises(ValueError, match="rows must be an integer >= 1"):
             chunks(path, rows)
     with pytest.raises(FileError, match="takes partial, byte_order, got 'rows'"):
         read(path, rows=3)

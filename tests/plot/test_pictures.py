@@ -242,7 +242,7 @@ def test_response_to_rollup(run, tmp_path):
         np.testing.assert_allclose(line.get_array(), energies[:-1] + 0.1)
     with pytest.raises(ValueError, match="mechanism must be one of lateral velocity, roll-up, got 'rollup'"):
         plot.response(run, ions, "rollup")
-    with pytest.raises(ValueError, match="zoom must be one of the 2 ions, 0 to 1, got 2"):
+    with pytest.raises(ValueError, match="zoom must be an index from 0 to 1, got 2"):
         plot.response(run, ions, zoom=2)
 
 
@@ -269,7 +269,7 @@ def test_profiles_with_their_lines(two_profiles, tmp_path):
     alone = plot.profile(two_profiles[0], xlabel="azimuth [degrees]")
     assert alone.get_xlabel() == "azimuth [degrees]" and alone.get_legend() is None
     for wrong in ({"labels": ["a"]}, {"lines": lines[:1]}):
-        with pytest.raises(ValueError, match="a label and a line for each"):
+        with pytest.raises(ValueError, match="one label and line each"):
             plot.profile(two_profiles, **wrong)
 
 

@@ -322,7 +322,7 @@ def test_other_settings_are_refused(unfinished):
         small().run(50, [Interrupting()], **options)
     used = small()
     used.run(5, responses=False, progress=False)
-    with pytest.raises(ValueError, match="resumed by a new Simulation, got one that 5 atoms left"):
+    with pytest.raises(ValueError, match="resume needs a new Simulation, got one with 5 evaporated atoms"):
         used.run(90, [Interrupting()], **options)
     assert len(interrupted(unfinished, (), resume=True)) == 90
 
@@ -357,7 +357,7 @@ def test_a_refused_resume_leaves_nothing_behind(tmp_path):
         run_small(tmp_path / "run.h5", 60, resume=True)
     used = small()
     used.run(5, responses=False, progress=False)
-    with pytest.raises(ValueError, match="resumed by a new Simulation"):
+    with pytest.raises(ValueError, match="resume needs a new Simulation"):
         used.run(120, responses=False, progress=False, checkpoint=ae.Checkpoint(tmp_path / "run.h5", resume=True))
     assert [item.name for item in tmp_path.iterdir()] == ["run.h5"]
 
@@ -402,7 +402,7 @@ def test_the_progress_may_be_told_to_a_function():
     [
         ({"path": "run.txt"}, r"ends in \.h5, got 'run\.txt'"),
         ({"path": "run.h5", "minutes": -1}, "minutes must be a finite number"),
-        ({"path": "run.h5", "ions": 0}, "ions must be a whole number"),
+        ({"path": "run.h5", "ions": 0}, "ions must be an integer"),
     ],
 )
 def test_settings_that_are_refused(options, message):

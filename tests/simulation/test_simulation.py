@@ -226,22 +226,22 @@ class Half:
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda s: s.run(0), "n_ions must be a whole number of at least 1, got 0"),
-        (lambda s: s.run(10.5), "n_ions must be a whole number"),
-        (lambda s: s.run(10, batch_size=0), "batch_size must be a whole number"),
+        (lambda s: s.run(0), "n_ions must be an integer >= 1, got 0"),
+        (lambda s: s.run(10.5), "n_ions must be an integer"),
+        (lambda s: s.run(10, batch_size=0), "batch_size must be an integer"),
         (lambda s: s.run(10, [3]), "emissions must be perturbations with a method launch, got 3"),
         (lambda s: s.run(10, [Half()]), "must launch 10 ions, one per emission, got 5"),
         (
             lambda s: ae.Simulation(s.tip, voltage=-1.0),
-            r"voltage must be .* \[V\] above 0 and at most 1e\+06, got -1.0",
+            r"voltage must be .* \[V\] > 0 and <= 1e\+06, got -1.0",
         ),
-        (lambda s: ae.Simulation(s.tip, seed=-1), "seed must be a whole number"),
-        (lambda s: ae.Simulation(s.tip, n_threads=0), "n_threads must be a whole number"),
+        (lambda s: ae.Simulation(s.tip, seed=-1), "seed must be an integer"),
+        (lambda s: ae.Simulation(s.tip, n_threads=0), "n_threads must be an integer"),
         (lambda s: ae.FlightSettings(opening_angle=2.0), "opening_angle must be a finite number"),
         (lambda s: ae.FlightSettings(tolerance=0.0), "tolerance must be a finite number"),
         (lambda s: ae.ChargeSettings(patch_radius=0.5), "patch_radius must be a finite number"),
         (lambda s: ae.ChargeSettings(update_radius=3.0), "update_radius must be a finite number"),
-        (lambda s: ae.ChargeSettings(sweep_interval=0), "sweep_interval must be a whole number"),
+        (lambda s: ae.ChargeSettings(sweep_interval=0), "sweep_interval must be an integer"),
     ],
 )
 def test_bad_input_gets_one_clear_sentence(small_tip, call, message):
@@ -403,6 +403,6 @@ def test_an_exception_keeps_what_is_done(small_tip):
 
 
 def test_reach_must_be_beyond_the_specimen(small_tip):
-    with pytest.raises(ValueError, match="reach must be at least three times the"):
+    with pytest.raises(ValueError, match="reach must be >= 3 times the"):
         tip = ae.Tip("Ni", apex_radius=10.0, shank_length=60.0, depth=1.5)
         ae.Simulation(tip, flight_settings=ae.FlightSettings(reach=120.0))

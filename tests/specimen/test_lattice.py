@@ -161,8 +161,8 @@ def test_four_indices_are_the_same_directions_as_three():
 @pytest.mark.parametrize(
     ("structure", "axis", "message"),
     [
-        ("fcc", (0, 0, 0), "axis must be a direction"),
-        ("hcp", (0, 0, 0, 0), "axis must be a direction"),
+        ("fcc", (0, 0, 0), "axis must not be zero"),
+        ("hcp", (0, 0, 0, 0), "axis must not be zero"),
         ("hcp", (1, 1, 1, 0), r"u \+ v \+ t = 0"),
         ("fcc", (1, 1, -2, 0), r"axis must be three numbers such as \[0, 1, 2\], got \(1, 1, -2, 0\)"),
         ("hcp", (0.5, 0.1, 0.3, 1.0), r"u \+ v \+ t = 0"),
