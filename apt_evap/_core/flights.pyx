@@ -86,7 +86,7 @@ cdef class Flights:
     tolerance : float
         Error of a step, of the position relative to the path and of the velocity.
     max_steps : int
-        Number of steps after which an ion counts as not escaped.
+        Number of steps after which an ion counts as one that never left.
     """
 
     cdef Octree tree

@@ -20,7 +20,7 @@ from apt_evap.io.rrng import read_ranges
 from apt_evap.simulation.run import Run, load
 
 _MARK = f"apt_evap {__version__}"
-_MARKED = 1 << 16  # bytes: the mark is at the beginning of a .png or .svg, and at the end of a .pdf
+_MARK_RANGE = 1 << 16  # bytes: the mark is at the beginning of a .png or .svg, and at the end of a .pdf
 _MARK_KEYS = {".png": "Software", ".pdf": "Creator", ".svg": "Creator"}
 
 
@@ -135,6 +135,6 @@ def check_output(path: AnyPath, is_ours: Callable[[Path], bool], force: bool) ->
 def is_picture(path: Path) -> bool:
     """Whether a picture has the mark of this package, near its beginning or its end."""
     with open_for_reading(path) as file:
-        beginning = file.read(_MARKED)
-        file.seek(max(0, path.stat().st_size - _MARKED))
-        return b"apt_evap" in beginning or b"apt_evap" in file.read(_MARKED)
+        beginning = file.read(_MARK_RANGE)
+        file.seek(max(0, path.stat().st_size - _MARK_RANGE))
+        return b"apt_evap" in beginning or b"apt_evap" in file.read(_MARK_RANGE)

@@ -21,8 +21,7 @@ exit codes:
 """Meaning of the exit codes, for the help."""
 
 _PATH = """\
-from a simulation to its map, and to the emission energies of a measured map (the first command writes the input of the
-others):
+from a simulation to its map, and to the emission energies of a measured map:
   apt-evap run examples/ni111.toml                   simulate; write ni111.h5 and its maps ni111.png
   apt-evap info ni111.h5                             contents of the run: specimen, ions, outcomes
   apt-evap map ni111.h5 --perturbation RollUp:0.3 -o rolled.png
@@ -218,7 +217,7 @@ def _add_compare(commands: Any) -> None:
     command.add_argument("--plain", action="store_true", help="SSIM without noise correction")
     command.add_argument("--replicas", type=_integer(1), metavar="N", help="draws per ion; default: 4 to 16")
     command.add_argument(
-        "--resamples", type=_integer(0), default=200, metavar="N", help="number, for the errors; default: 200"
+        "--resamples", type=_integer(0), default=200, metavar="N", help="resamples for errors; default: 200"
     )
     command.add_argument("--seed", type=_integer(0), default=0, metavar="N", help="seed of the resamples; default: 0")
     command.add_argument("--threads", type=_integer(1), metavar="N", help="default: all processors")
@@ -247,7 +246,7 @@ def _add_reading(parser: argparse.ArgumentParser) -> Any:
     selection.add_argument(
         "--ions", type=_bounds, metavar="FIRST,LAST", help="in the order of the file, from 0; LAST is not included"
     )
-    selection.add_argument("--circle", type=_circle, metavar="R[,X,Y]", help="radius, and centre, on the detector [mm]")
+    selection.add_argument("--circle", type=_circle, metavar="R[,X,Y]", help="radius and centre on the detector [mm]")
     selection.add_argument("--ranges", metavar="FILE.rrng", help="ranges of mass, for --species")
     selection.add_argument("--species", metavar="NAME[,NAME]", help="ions in the ranges of these names, such as Si")
     return group

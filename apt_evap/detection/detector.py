@@ -45,8 +45,8 @@ class Detector:
         check_choice(self.projection, "projection", PROJECTIONS)
         for name in ("distance", "width"):
             # more than 1 km is a wrong unit
-            checked = check_number(getattr(self, name), name, above=0, at_most=1e6, unit="mm")
-            object.__setattr__(self, name, checked)
+            length = check_number(getattr(self, name), name, above=0, at_most=1e6, unit="mm")
+            object.__setattr__(self, name, length)
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
@@ -96,7 +96,7 @@ class Detector:
         Parameters
         ----------
         directions : ndarray, shape (n, 2)
-            Stereographic directions, see `directions`; NaN for an ion that did not escape.
+            Stereographic directions, see `directions`; NaN for an ion that never left.
         times : ndarray, shape (n,)
             Times of flight to the plane [ns].
 

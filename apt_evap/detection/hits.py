@@ -28,7 +28,7 @@ class Outcome(IntEnum):
     MISSED = 1
     """The ion missed the detector."""
     NEVER_LEFT = 2
-    """The ion did not escape from the specimen."""
+    """The ion never left the specimen."""
 
 
 _FLOAT = ("x", "y", "time_of_flight", "voltage", "pulse_voltage", "mass_to_charge", "positions")

@@ -50,7 +50,7 @@ class Emissions:
         positions = check_array(self.positions, "positions", ("n", 3))
         n = len(positions)
         distance = check_number(self.nearest_neighbour_distance, "nearest_neighbour_distance", above=0, unit="nm")
-        checked = {
+        values = {
             "positions": positions,
             "normals": check_array(self.normals, "normals", (n, 3)),
             "neighbours": check_array(self.neighbours, "neighbours", (n, 3), finite=False),
@@ -59,13 +59,13 @@ class Emissions:
             "ions": check_array(self.ions, "ions", (n,), dtype=np.int64),
             "nearest_neighbour_distance": distance,
         }
-        deviation = np.abs(np.linalg.norm(checked["normals"], axis=1) - 1)
+        deviation = np.abs(np.linalg.norm(values["normals"], axis=1) - 1)
         if n and deviation.max() > 1e-6:
             raise ValueError(f"normals must have length 1, got one that deviates by {deviation.max():.2g}")
         for name, least in (("charge_states", 1), ("masses", np.finfo(np.float64).tiny)):
-            if n and checked[name].min() < least:
-                raise ValueError(f"{name} must be > 0, got {checked[name].min()}")
-        for name, value in checked.items():
+            if n and values[name].min() < least:
+                raise ValueError(f"{name} must be > 0, got {values[name].min()}")
+        for name, value in values.items():
             object.__setattr__(self, name, value)
 
     def __len__(self) -> int:

@@ -17,7 +17,7 @@ from apt_evap.emission.energies import Thermal
 from apt_evap.emission.perturbations import LateralVelocity, Unperturbed
 from apt_evap.energy_fit.defaults import MEANS, RSDS
 from apt_evap.energy_fit.grid import EnergyGrid, maxima
-from apt_evap.energy_fit.search import EnergySearch, registered
+from apt_evap.energy_fit.search import EnergySearch, register_repeatedly
 from apt_evap.energy_fit.settings import StudySettings
 from apt_evap.energy_fit.study import Score, Study, plain
 from apt_evap.registration.register import Registration
@@ -156,7 +156,7 @@ def fit_energies(
         rounds: list[Any] = []
         if registration is None:
             warnings.simplefilter("ignore", RegistrationWarning)  # given once, for the last registration
-            registration, rounds = registered(search)
+            registration, rounds = register_repeatedly(search)
         search.place(registration, settings.resamples)
         values = search.matrix(replicas, "energies")
         cells = maxima(values)

@@ -103,7 +103,7 @@ class Sampler:
 
     def _cells(self, perturbation, replica):
         """Bins and indices of the ions within the box."""
-        hits = self.registration.hits(drawn_hits(self.run, perturbation, replica))
+        hits = self.registration.hits(hits_of_draw(self.run, perturbation, replica))
         detected = hits.detected
         index = []
         for values, edges in zip((hits.y, hits.x), self._edges, strict=True):
@@ -116,7 +116,7 @@ class Sampler:
         return row * self.shape[1] + column, inside
 
 
-def drawn_hits(run: Run, perturbation: Perturbation, replica: int) -> Hits:
+def hits_of_draw(run: Run, perturbation: Perturbation, replica: int) -> Hits:
     """Hits for one draw of the energies and directions of all ions; replica 0 is that of the run."""
     if replica:  # derived, because an adjacent seed may be that of another run
         seed = np.random.SeedSequence((run.seed, replica)).generate_state(1, np.uint64)[0]

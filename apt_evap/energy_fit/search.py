@@ -18,7 +18,7 @@ from apt_evap.emission.energies import TruncatedNormal
 from apt_evap.emission.perturbations import Perturbation, Unperturbed, to_dict
 from apt_evap.energy_fit.comparison import Comparison
 from apt_evap.energy_fit.grid import EnergyGrid, maxima, spline_maxima
-from apt_evap.energy_fit.resampling import Sampler, drawn_hits
+from apt_evap.energy_fit.resampling import Sampler, hits_of_draw
 from apt_evap.energy_fit.settings import StudySettings
 from apt_evap.energy_fit.study import Optimum, Score
 from apt_evap.registration.register import Registration, register
@@ -72,11 +72,11 @@ class EnergySearch:
 
     def hits(self, index: ArrayLike) -> Hits:
         """Hits of several draws of all ions at an index of the grid, in the frame of the run."""
-        draws = [drawn_hits(self.run, self.perturbation(index), replica) for replica in range(ROUGH)]
+        draws = [hits_of_draw(self.run, self.perturbation(index), replica) for replica in range(ROUGH)]
         x, y = (np.concatenate([getattr(hits, name) for hits in draws]) for name in ("x", "y"))
         return Hits(x=x, y=y)
 
-    def polished(self, registration: Registration, index: ArrayLike) -> Registration:
+    def refine_registration(self, registration: Registration, index: ArrayLike) -> Registration:
         """Refined registration with the largest similarity for a point of the grid.
 
         If all lines of a map cross in one pole, the scale of `register` may be inaccurate. Measured in a twin
@@ -195,7 +195,7 @@ class EnergySearch:
         return Score(float(halves.mean()), float(halves.std(ddof=1)))
 
 
-def registered(search: EnergySearch) -> tuple[Registration, list[dict[str, Any]]]:
+def register_repeatedly(search: EnergySearch) -> tuple[Registration, list[dict[str, Any]]]:
     """Register with the middle of the grid, then with the best point until it is stable; refine. Result and rounds."""
     registration: Any = None
     best, rounds = search.middle, []
@@ -207,4 +207,4 @@ def registered(search: EnergySearch) -> tuple[Registration, list[dict[str, Any]]
         previous, best = best, tuple(maxima(search.matrix(ROUGH, "registration"))[0])
         if best == previous:
             break
-    return search.polished(registration, best), rounds
+    return search.refine_registration(registration, best), rounds

@@ -47,7 +47,7 @@ class StudySettings:
     temperature: float = 50.0
 
     def __post_init__(self):
-        checked = {
+        values = {
             "smoothing": check_number(self.smoothing, "smoothing", at_least=0, unit="mm"),
             "data_range": check_number(self.data_range, "data_range", above=0),
             "allow_noise": check_switch(self.allow_noise, "allow_noise"),
@@ -57,6 +57,6 @@ class StudySettings:
             "temperature": Thermal(self.temperature).temperature,
         }
         if self.flattening is not None:
-            checked["flattening"] = check_number(self.flattening, "flattening", at_least=0, unit="mm")
-        for name, value in checked.items():
+            values["flattening"] = check_number(self.flattening, "flattening", at_least=0, unit="mm")
+        for name, value in values.items():
             object.__setattr__(self, name, value)

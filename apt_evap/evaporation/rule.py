@@ -110,11 +110,11 @@ class Robin:
     window: int = 8
 
     def __post_init__(self):
-        checked = {
+        values = {
             "tolerance": check_number(self.tolerance, "tolerance", above=0, at_most=1),
             "window": check_count(self.window, "window", at_most=32),
         }
-        for name, value in checked.items():
+        for name, value in values.items():
             object.__setattr__(self, name, value)
 
     def kernel(self, tip: Tip) -> ChargingRule:

@@ -38,7 +38,7 @@ class FlightSettings:
         Distance from the apex at which the integration ends and the ion continues in a straight line [d_nn]; 11,314 is
         8,000 lattice constants of fcc, as in Shaikh et al.
     max_steps : int
-        Number of steps after which an ion counts as not escaped.
+        Number of steps after which an ion counts as one that never left.
     """
 
     opening_angle: float = 0.3

@@ -18,7 +18,7 @@ class Ends(NamedTuple):
     times: Floats
     """Reduced times [nm/sqrt(V)], shape (n, m)."""
     left: Booleans
-    """Whether the ion escaped, shape (n, m)."""
+    """Whether the ion left the field, shape (n, m)."""
 
 
 def land(ends: Ends, slowness: Floats, detector: Detector, apex: float) -> tuple[Floats, Floats]:
@@ -38,9 +38,9 @@ def land(ends: Ends, slowness: Floats, detector: Detector, apex: float) -> tuple
     Returns
     -------
     directions : ndarray, shape (n, m, 2)
-        Stereographic directions, see `Detector.directions`; NaN for an ion that did not escape.
+        Stereographic directions, see `Detector.directions`; NaN for an ion that never left.
     times : ndarray, shape (n, m)
-        Times of flight [ns]; NaN for an ion that did not escape.
+        Times of flight [ns]; NaN for an ion that never left.
     """
     n, m = ends.left.shape
     left = ends.left.ravel()

@@ -240,7 +240,7 @@ class ResponseModel:
         for design, each in zip((self.settings.site, self.settings.rolled), ends, strict=True):
             directions, times = land(each, slowness, self.detector, apex)
             n, m = times.shape
-            values = flattened(directions.reshape(-1, 2), times.ravel()).reshape(n, m, 3)
+            values = fit_quantities(directions.reshape(-1, 2), times.ravel()).reshape(n, m, 3)
             polynomials, residual = design.fit(values)
             coefficients.append(polynomials)
             # a small change of the stereographic direction is half as large on a plane at unit distance
@@ -293,7 +293,7 @@ class ResponseModel:
         ):
             ions = slice(None) if mask.all() else mask
             values[ions] = design.evaluate(coefficients[ions], velocities[ions])
-        return unflattened(values)
+        return directions_and_times(values)
 
     def flagged(self, responses: Responses, can_roll: Booleans) -> Booleans:
         """Whether the response of an ion has a residual above the bound, or could not be fitted, bool (n,)."""
@@ -301,14 +301,14 @@ class ResponseModel:
         return inexact[:, 0] | (inexact[:, 1] & can_roll)
 
 
-def flattened(directions: Floats, times: Floats) -> Floats:
+def fit_quantities(directions: Floats, times: Floats) -> Floats:
     """The three fitted quantities, shape (n, 3), from directions (n, 2) and times of flight (n,)."""
     s2 = squared_lengths(directions)
     return np.column_stack([directions, times * (1.0 - s2) / (1.0 + s2)])
 
 
-def unflattened(values: Floats) -> tuple[Floats, Floats]:
-    """Directions (n, 2) and times of flight (n,) from the three quantities, the inverse of `flattened`."""
+def directions_and_times(values: Floats) -> tuple[Floats, Floats]:
+    """Directions (n, 2) and times of flight (n,) from the three quantities, the inverse of `fit_quantities`."""
     directions = values[:, :2]
     s2 = squared_lengths(directions)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -34,7 +34,7 @@ class WatchSettings:
         with the default settings (R = 20 a and 40 a, 4,000 events): 0.0005 to 0.0032. The RMS deviation from converged
         charges was 0.8 to 2.5 times the residual.
     fraction_bound : float
-        Fraction of the ions between two checks that do not escape, or that have inexact responses, above which a
+        Fraction of the ions between two checks that never left, or that have inexact responses, above which a
         warning is given; in the same runs there were none.
     """
 
@@ -146,7 +146,7 @@ class Monitor:
             (
                 never_left,
                 RunWarning,
-                "did not escape",
+                "never left the specimen",
                 "a larger max_steps (FlightSettings, or [flights] in a settings file) may help",
             ),
             (

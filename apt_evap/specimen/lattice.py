@@ -278,7 +278,7 @@ def lattice_points_in(
         return mask
 
     def slab(layer):
-        """Points of one layer of blocks, which shares no first cell index with other layers."""
+        """Points of one layer of blocks; its first cell indices occur in no other layer."""
         rows = np.indices((1, count[1], count[2])).reshape(3, -1)
         rows[0] = layer
         low = (rows + first[:, None]) * block

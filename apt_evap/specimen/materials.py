@@ -63,7 +63,7 @@ class Material:
         if not isinstance(self.name, str) or not self.name:
             raise ValueError(f"name must be text such as 'Ni', got {short_text(self.name)}")
         check_structure(self.structure)
-        checked = {
+        values = {
             "a": check_number(self.a, "a", above=0, at_most=_LONGEST, unit="nm"),
             "evaporation_field": check_number(
                 self.evaporation_field, "evaporation_field", above=0, at_most=_HIGHEST_FIELD, unit="V/nm"
@@ -76,12 +76,12 @@ class Material:
             requirement = "be a number for hcp" if self.structure == "hcp" else f"be None for {self.structure}"
             raise ValueError(f"c must {requirement}, got {short_text(self.c)}")
         if self.c is not None:
-            checked["c"] = check_number(self.c, "c", above=0, at_most=_LONGEST, unit="nm")
+            values["c"] = check_number(self.c, "c", above=0, at_most=_LONGEST, unit="nm")
         if self.polarizability is not None:
-            checked["polarizability"] = check_number(
+            values["polarizability"] = check_number(
                 self.polarizability, "polarizability", above=0, at_most=1e-30, unit="F m^2"
             )
-        for name, value in checked.items():
+        for name, value in values.items():
             object.__setattr__(self, name, value)
 
     @property

@@ -391,7 +391,7 @@ def test_maps_round_trip():
 
 def test_the_tables_commented_out_in_the_example_are_the_defaults(tmp_path):
     lines = EXAMPLE.read_text().splitlines()
-    begin = lines.index("# [charges]              # how finely the charges are solved")
+    begin = next(number for number, line in enumerate(lines) if line.startswith("# [charges]"))
     end = next(number for number, line in enumerate(lines) if line.startswith("[maps]"))
     shown = [line.removeprefix("#").strip() for line in lines[begin:end]]
     (tmp_path / "all.toml").write_text("\n".join([*lines[:begin], *shown, *lines[end:]]))

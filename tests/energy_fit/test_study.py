@@ -291,12 +291,12 @@ def test_hidden_energies_are_found(twin):
     assert low <= study.refined.true_mean <= high and high - low < 0.2
 
 
-def test_a_registration_is_polished(run, other):
+def test_a_registration_is_refined(run, other):
     """From 1.5 degrees, 3 % and 1 mm off, back to the frame in which the map was made."""
     search = EnergySearch(run, measured_map(other, ROLLUP), EnergyGrid("roll-up"), StudySettings(0.6), 1, False)
     rough = ae.Registration(1.5, 1.03, (1.0, -0.5), score=0.8, overlap=1.0)
     search.place(rough, 0)
-    found = search.polished(rough, (0, 4, 2))
+    found = search.refine_registration(rough, (0, 4, 2))
     assert abs(found.rotation) < 0.3 and found.scale == pytest.approx(1, abs=0.006)
     assert np.hypot(*found.shift) < 0.3
     assert (found.score, found.overlap) == (0.8, 1.0)
@@ -449,7 +449,7 @@ def test_pictures(twin, tmp_path):
     given = axes[0].figure.add_subplot()
     assert ae.plot.ssim_matrix(study, [given])[0] is given
     given.remove()
-    with pytest.raises(ValueError, match="axes must be 1, one for each roll-up fraction, got 2"):
+    with pytest.raises(ValueError, match="axes must be 1, one per roll-up fraction, got 2"):
         ae.plot.ssim_matrix(study, [given, given])
     parts = ae.plot.side_by_side(study, circle=(5, -5, 20))
     assert parts[3].get_xlim() == (-15, 25)

@@ -8,7 +8,7 @@ from hypothesis.extra.numpy import arrays
 
 import apt_evap as ae
 from apt_evap.detection.hits import Outcome
-from apt_evap.flight.response import Responses, flattened, unflattened
+from apt_evap.flight.response import Responses, directions_and_times, fit_quantities
 
 ENERGY = ae.TruncatedNormal(0.155, 0.155)
 WIDE = ae.TruncatedNormal(0.4, 0.3)  # up to the 1.5 eV of the designs and somewhat beyond
@@ -87,15 +87,15 @@ def test_the_residual_is_that_of_the_fit():
 )
 def test_flattened_and_back(radius, azimuth, times):
     directions = radius[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
-    values = flattened(directions, times)
+    values = fit_quantities(directions, times)
     assert values.shape == (7, 3)
-    back, again = unflattened(values)
+    back, again = directions_and_times(values)
     assert np.array_equal(back, directions)
     assert again == pytest.approx(times, rel=1e-13)
 
 
 def test_ions_along_the_plane_never_get_there():
-    _, times = unflattened(np.array([[1.0, 0.0, 3.0], [2.0, 0.0, 3.0], [0.0, 0.0, 3.0]]))
+    _, times = directions_and_times(np.array([[1.0, 0.0, 3.0], [2.0, 0.0, 3.0], [0.0, 0.0, 3.0]]))
     assert np.array_equal(times, [np.inf, np.inf, 3.0])
 
 
@@ -106,7 +106,7 @@ def test_a_straight_flight_of_one_speed_is_flat():
     velocities = np.stack([np.sin(angle), np.zeros(3), np.cos(angle)], axis=1)
     directions, times = detector.directions(np.zeros((3, 3)), velocities, 0.0)
     assert directions[:, 0] == pytest.approx(np.tan(angle / 2), abs=1e-15)
-    assert flattened(directions, times)[:, 2] == pytest.approx(times[0], rel=1e-14)
+    assert fit_quantities(directions, times)[:, 2] == pytest.approx(times[0], rel=1e-14)
     x, y, at, _ = detector.impacts(directions, times)
     assert x == pytest.approx(100 * np.tan(angle), rel=1e-13)
     assert np.array_equal(at, times)

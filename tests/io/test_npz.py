@@ -57,7 +57,7 @@ def test_names_and_unit_can_be_given(tmp_path):
         ({"a": COUNTS, "b": COUNTS, "x_edges_mm": X, "y_edges_mm": Y}, "one array to be the values, it holds a int16"),
         ({"counts": COUNTS, "y_edges_mm": Y}, r"one array to be the edges in x \(x_edges_mm\)"),
         ({"counts": COUNTS, "x_edges_mm": X[:-1], "y_edges_mm": Y}, r"x_edges must have shape \(21,\), got \(20,\)"),
-        ({"counts": -COUNTS, "x_edges_mm": X, "y_edges_mm": Y}, "must be at least 0, got -"),
+        ({"counts": -COUNTS, "x_edges_mm": X, "y_edges_mm": Y}, "must be >= 0, got -"),
         ({"counts": np.array([None]), "x_edges_mm": X}, "as an .npz file: Object arrays"),
         ({"counts": COUNTS, "x_edges_mm": X.astype("U9"), "y_edges_mm": Y}, "x_edges_mm must hold numbers, got <U9"),
         ({"counts": COUNTS, "x_edges_mm": X, "y_edges_mm": Y > 0}, "y_edges_mm must hold numbers, got bool"),

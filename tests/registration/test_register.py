@@ -331,7 +331,7 @@ def test_overlay(low, simulated, tmp_path):
     ax.figure.savefig(tmp_path / "a.png")
     (caption,) = (text.get_text() for text in ax.texts)
     assert caption == "mirrored, rotated by 17.00°, scaled by 0.45, shifted by (8.00, 3.00) mm\n" + (
-        "correlation 0.90, 100% of the field of view shared"
+        "correlation 0.90, common area 100% of the field of view"
     )
     labels = [text.get_text() for text in ax.figure.legends[0].get_texts()]
     assert labels == ["simulated, bright", "simulated, dark"]
