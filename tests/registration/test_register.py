@@ -354,4 +354,4 @@ def test_overlay(low, simulated, tmp_path):
         plot.new_figure((5, 5)).subplots(),
     )
     assert partial.get_legend().get_texts()[-1].get_text() == "simulated field of view"
-    assert "from points, 0.25 mm off (RMS)" in partial.texts[0].get_text()
+    assert "from points, residual 0.25 mm (RMS)" in partial.texts[0].get_text()
