@@ -102,8 +102,8 @@ class Robin:
 
     Notes
     -----
-    q_i <- (s/2 pi) sum_{k != i} q_k n_i . (r_i - r_k)/|r_i - r_k|^3 with s, the area per atom, chosen in every sweep so
-    that the total charge is conserved (Robin, 1886; Rolland et al., Microsc. Microanal. 21, 1649, 2015).
+    ``q_i <- (s/2 pi) sum_{k != i} q_k n_i . (r_i - r_k)/|r_i - r_k|^3``, where s, the area per atom, is chosen in every
+    sweep such that the total charge is conserved (Robin, 1886; Rolland et al., Microsc. Microanal. 21, 1649, 2015).
     """
 
     tolerance: float = 1e-5
