@@ -99,6 +99,7 @@ class Evaporation:
         field: NDArray[np.float64],
         normal: NDArray[np.float64],
         neighbour: NDArray[np.int64],
+        detached: NDArray[np.int8],
     ) -> int: ...
     @property
     def next_slot(self) -> int: ...

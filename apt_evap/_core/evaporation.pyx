@@ -324,8 +324,11 @@ cdef class Evaporation:
         return 0
 
     def evaporate(self, Journal journal, long max_events, long sweep_interval, long long[::1] atom,
-                  double[::1] charge, double[::1] field, double[:, ::1] normal, long long[::1] neighbour):
+                  double[::1] charge, double[::1] field, double[:, ::1] normal, long long[::1] neighbour,
+                  signed char[::1] detached):
         """Evaporate up to `max_events` atoms; stops early if a relaxation or deepening is needed, or no atom is left.
+
+        Atoms that have lost all chains of bonds to the body leave at once, before the law selects the next atom.
 
         Parameters
         ----------
@@ -335,9 +338,10 @@ cdef class Evaporation:
             Maximum number of events.
         sweep_interval : int
             Events after which a relaxation is due.
-        atom, charge, field, normal, neighbour : ndarray, shapes (m,), (m,), (m,), (m, 3), (m,)
+        atom, charge, field, normal, neighbour, detached : ndarray, shapes (m,), (m,), (m,), (m, 3), (m,), (m,)
             Filled, for each event, with the evaporated atom, its charge [e], the field just outside before evaporation
-            [V/nm], its normal, and its surface nearest neighbour with the highest charge (-1: none).
+            [V/nm], its normal, its surface nearest neighbour with the highest charge (-1: none), and 1 for an atom that
+            left because it was detached.
 
         Returns
         -------
@@ -352,7 +356,8 @@ cdef class Evaporation:
         with nogil:
             while journal.n_events < max_events:
                 n = journal.n_events
-                best = self.chooser.choose(0.5)
+                leaving = self.atoms.next_detached(&self.slot_of[0]) if self.atoms.n_waiting else -1
+                best = self.slot_of[leaving] if leaving >= 0 else self.chooser.choose(0.5)
                 if self.since_relaxation < NOT_RELAXED and best < 0:
                     status = STATUS_EXHAUSTED
                     break
@@ -360,6 +365,7 @@ cdef class Evaporation:
                     status = STATUS_SWEEP_DUE
                     break
                 leaving = self.tree.atom[best]
+                detached[n] = self.atoms.detached[leaving]
                 if self.has_support and self.atoms.reaches_support(leaving):
                     status = STATUS_TOO_SHALLOW
                     break

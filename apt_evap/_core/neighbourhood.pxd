@@ -2,6 +2,8 @@
 
 cdef enum:
     MAX_NEAR = 1024    # largest number of atoms within the radius of an atom; a dense metal has 54
+    MAX_BONDS = 64     # nearest neighbours of a removed atom that are checked for their hold; fcc has 12
+    MAX_PIECE = 2048   # atoms visited to decide which part has lost its hold; larger parts count as the body
 
 
 cdef class Neighbourhood:
@@ -12,7 +14,13 @@ cdef class Neighbourhood:
     cdef const double[:, ::1] positions # (n, 3) nm, array of the caller
     cdef signed char[::1] alive                # (n,)
     cdef const signed char[::1] support              # (n,) atoms that never become surface atoms
+    cdef const signed char[::1] anchored       # (n,) atoms that never evaporate: whatever is bonded to them has hold
     cdef signed char[::1] exposed              # (n,) surface atoms
+    cdef signed char[::1] detached             # (n,) atoms without a chain of bonds to the body
+    cdef readonly long n_detached              # detached atoms removed so far
+    cdef int[::1] waiting               # detached atoms in the order in which they leave
+    cdef long n_waiting
+    cdef int[::1] visited, piece_of, following, table   # search for parts without hold: atoms, their part, its next atom
     cdef int[::1] count                 # (n,) neighbours within the radius
     cdef signed char[::1] bonds         # (n,) number of nearest neighbours, closer than `bond_length`
     cdef double[:, ::1] offset          # (n, 3) sum of (neighbour - atom) over the neighbours [nm]
@@ -26,4 +34,10 @@ cdef class Neighbourhood:
     cdef bint judge(self, long atom) noexcept nogil
     cdef void normal(self, long atom, double* normal) noexcept nogil
     cdef int remove(self, long atom, int* fresh) noexcept nogil
+    cdef bint bonded(self, long first, long second) noexcept nogil
+    cdef void release(self, const int* nearest, int n) noexcept nogil
+    cdef long visit(self, int atom, int piece, long n, long* known) noexcept nogil
+    cdef void append(self, long at, int piece, int* front, int* last) noexcept nogil
+    cdef void detach(self, int atom) noexcept nogil
+    cdef long next_detached(self, const int* slot_of) noexcept nogil
     cdef bint reaches_support(self, long atom) noexcept nogil

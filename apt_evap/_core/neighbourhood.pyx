@@ -3,12 +3,23 @@
 For atom i at p_i with the mean c_i of all other atoms within a radius, d_i = |p_i - c_i|: a surface atom has d_i above
 a threshold, its outward normal is (p_i - c_i)/d_i (Rolland et al., Microsc. Microanal. 21, 1649, 2015). An exposed atom
 stays exposed until it evaporates.
+
+Atoms without a chain of nearest neighbour bonds to the body are detached. Only the removal of an atom can detach others,
+and each part that it cuts off contains one of its nearest neighbours: the search starts there.
 """
 
 from cython.parallel cimport prange
 from libc.math cimport floor, sqrt
 
 import numpy as np
+
+
+cdef int root(int* parent, int i) noexcept nogil:
+    # The part that an atom belongs to, of parts that have met.
+    while parent[i] != i:
+        parent[i] = parent[parent[i]]
+        i = parent[i]
+    return i
 
 
 cdef class Neighbourhood:
@@ -29,11 +40,14 @@ cdef class Neighbourhood:
     n_threads : int
         Number of threads.
     before : Neighbourhood, optional
-        Neighbourhood of the first of these atoms: its removed and exposed atoms stay removed and exposed.
+        Neighbourhood of the first of these atoms: its removed, exposed and detached atoms remain so.
+    anchored : ndarray of int8, shape (n,), optional
+        1 for atoms that never evaporate; whatever is bonded to them has hold. By default the support atoms.
     """
 
     def __init__(self, const double[:, ::1] positions, double radius, double threshold, const signed char[::1] support,
-                 double bond_length=0.0, int n_threads=1, Neighbourhood before=None):
+                 double bond_length=0.0, int n_threads=1, Neighbourhood before=None,
+                 const signed char[::1] anchored=None):
         cdef long n = positions.shape[0], i
         if n == 0:
             raise ValueError("a specimen needs at least one atom, got none")
@@ -44,11 +58,19 @@ cdef class Neighbourhood:
         self.positions, self.support = positions, support
         self.alive = np.ones(n, np.int8)
         self.exposed = np.zeros(n, np.int8)
+        self.detached = np.zeros(n, np.int8)
+        self.anchored = support if anchored is None else anchored
+        self.n_detached = self.n_waiting = 0
+        self.waiting = np.empty(MAX_PIECE, np.int32)
+        self.visited, self.piece_of = np.empty(MAX_PIECE, np.int32), np.empty(MAX_PIECE, np.int32)
+        self.following, self.table = np.empty(MAX_PIECE, np.int32), np.full(4 * MAX_PIECE, -1, np.int32)
         self.count = np.zeros(n, np.int32)
         self.bonds = np.zeros(n, np.int8)
         self.offset = np.zeros((n, 3))
         if before is not None:
             np.asarray(self.alive)[:before.n_atoms] = before.alive
+            np.asarray(self.detached)[:before.n_atoms] = before.detached
+            self.waiting, self.n_waiting, self.n_detached = before.waiting, before.n_waiting, before.n_detached
         where = np.asarray(positions)
         low = where.min(axis=0)
         self.low = low
@@ -125,11 +147,13 @@ cdef class Neighbourhood:
     cdef int remove(self, long atom, int* fresh) noexcept nogil:
         # Removes an atom and updates the normals around it; lists the newly exposed atoms and returns their number.
         cdef int[MAX_NEAR] others
-        cdef int n = self.near(atom, others), i, other, n_fresh = 0
+        cdef int[MAX_BONDS] nearest
+        cdef int n = self.near(atom, others), i, other, n_fresh = 0, n_nearest = 0
         cdef double step, s, bond = self.bond_length * self.bond_length
         cdef int axis
         self.alive[atom] = 0
         self.exposed[atom] = 0
+        self.n_detached += self.detached[atom]
         for i in range(n):
             other = others[i]
             self.count[other] -= 1
@@ -138,12 +162,166 @@ cdef class Neighbourhood:
                 step = self.positions[atom, axis] - self.positions[other, axis]
                 self.offset[other, axis] -= step
                 s += step * step
-            self.bonds[other] -= s <= bond
+            if s <= bond:
+                self.bonds[other] -= 1
+                if not self.detached[other]:
+                    if n_nearest < MAX_BONDS:
+                        nearest[n_nearest] = other
+                    n_nearest += 1
             if self.judge(other) and not self.exposed[other]:
                 self.exposed[other] = 1
                 fresh[n_fresh] = other
                 n_fresh += 1
+        if 1 < n_nearest <= MAX_BONDS:
+            self.release(nearest, n_nearest)
         return n_fresh
+
+    # ---- atoms without hold ----------------------------------------------------------------------------------------
+
+    cdef bint bonded(self, long first, long second) noexcept nogil:
+        # Whether two atoms are nearest neighbours.
+        cdef double s = 0.0, step
+        cdef int axis
+        for axis in range(3):
+            step = self.positions[first, axis] - self.positions[second, axis]
+            s += step * step
+        return s <= self.bond_length * self.bond_length
+
+    cdef void release(self, const int* nearest, int n) noexcept nogil:
+        # Detaches the parts of the specimen that lost their hold when a common neighbour of these atoms was removed. All
+        # parts grow in turn, one atom at a time, until they meet, touch an anchored atom, or have no further atom. If no
+        # part touches an anchored atom, the last one that grows is the body.
+        cdef int[MAX_NEAR] others
+        cdef int[MAX_BONDS] parent, front, last
+        cdef bint[MAX_BONDS] held
+        cdef int i, j, k, m, piece, other_piece, growing, n_held
+        cdef long at, known, n_visited = 0
+        for i in range(n):   # most often they are neighbours of each other
+            parent[i] = i
+        for i in range(n):
+            for j in range(i):
+                if root(parent, i) != root(parent, j) and self.bonded(nearest[i], nearest[j]):
+                    parent[root(parent, i)] = root(parent, j)
+        growing = 0
+        for i in range(n):
+            growing += parent[i] == i
+        if growing == 1:
+            return
+        for i in range(n):
+            held[i], front[i], last[i] = False, -1, -1
+        for i in range(n):
+            piece = root(parent, i)
+            n_visited = self.visit(nearest[i], piece, n_visited, &known)
+            self.append(n_visited - 1, piece, front, last)
+            held[piece] = held[piece] or self.anchored[nearest[i]]
+        while True:
+            growing = n_held = 0
+            for i in range(n):
+                if parent[i] == i:
+                    n_held += held[i]
+                    growing += not held[i] and front[i] >= 0
+            if growing == 0 or (growing == 1 and n_held == 0):
+                break
+            for i in range(n):
+                if parent[i] != i or held[i] or front[i] < 0:
+                    continue
+                at = front[i]
+                front[i] = self.following[at]
+                m = self.near(self.visited[at], others)
+                for k in range(m):
+                    if self.detached[others[k]] or not self.bonded(self.visited[at], others[k]):
+                        continue
+                    piece = root(parent, i)
+                    n_visited = self.visit(others[k], piece, n_visited, &known)
+                    if known < 0:
+                        self.append(n_visited - 1, piece, front, last)
+                        held[piece] = held[piece] or self.anchored[others[k]]
+                    else:
+                        other_piece = root(parent, self.piece_of[known])
+                        if other_piece != piece:   # two parts meet
+                            parent[piece] = other_piece
+                            held[other_piece] = held[other_piece] or held[piece]
+                            if front[piece] >= 0:
+                                if front[other_piece] < 0:
+                                    front[other_piece] = front[piece]
+                                else:
+                                    self.following[last[other_piece]] = front[piece]
+                                last[other_piece] = last[piece]
+                    if n_visited == MAX_PIECE:
+                        break
+                if n_visited == MAX_PIECE:
+                    break
+            if n_visited == MAX_PIECE:
+                break
+        if growing == 0 and n_held == 0:   # all parts ended in the same round: the largest one is the body
+            for i in range(n):
+                last[i] = 0
+            for at in range(n_visited):
+                last[root(parent, self.piece_of[at])] += 1
+            piece = 0
+            for i in range(n):
+                if last[i] > last[piece]:
+                    piece = i
+            held[piece] = True
+        for at in range(n_visited):
+            piece = root(parent, self.piece_of[at])
+            if not held[piece] and front[piece] < 0:
+                self.detach(self.visited[at])
+        for i in range(self.table.shape[0]):
+            self.table[i] = -1
+
+    cdef long visit(self, int atom, int piece, long n, long* known) noexcept nogil:
+        # Adds an atom to those visited, of which there are n; returns their new number. known: its place if it was there.
+        cdef long size = self.table.shape[0], key = (<long>atom * 40503) % size
+        while self.table[key] >= 0:
+            if self.visited[self.table[key]] == atom:
+                known[0] = self.table[key]
+                return n
+            key = (key + 1) % size
+        known[0] = -1
+        self.table[key] = <int>n
+        self.visited[n], self.piece_of[n], self.following[n] = atom, piece, -1
+        return n + 1
+
+    cdef void append(self, long at, int piece, int* front, int* last) noexcept nogil:
+        # Adds a visited atom to those from which its part still has to grow.
+        if front[piece] < 0:
+            front[piece] = <int>at
+        else:
+            self.following[last[piece]] = <int>at
+        last[piece] = <int>at
+
+    cdef void detach(self, int atom) noexcept nogil:
+        # Adds an atom to those that leave next, sorted by index.
+        cdef long i = self.n_waiting
+        if i == self.waiting.shape[0]:
+            with gil:
+                self.waiting = np.concatenate([self.waiting, np.empty(i, np.int32)])
+        self.detached[atom] = 1
+        while i > 0 and self.waiting[i - 1] > atom:
+            self.waiting[i] = self.waiting[i - 1]
+            i -= 1
+        self.waiting[i] = atom
+        self.n_waiting += 1
+
+    cdef long next_detached(self, const int* slot_of) noexcept nogil:
+        # The next detached atom with a slot; -1 if there is none.
+        cdef long i, n = 0, atom, best = -1
+        for i in range(self.n_waiting):
+            atom = self.waiting[i]
+            if self.alive[atom]:
+                self.waiting[n] = <int>atom
+                n += 1
+                if best < 0 and slot_of[atom] >= 0:
+                    best = atom
+        self.n_waiting = n
+        return best
+
+    @property
+    def waiting_atoms(self):
+        """Detached atoms that have not left yet, shape (m,)."""
+        waiting = np.asarray(self.waiting)[:self.n_waiting]
+        return waiting[np.asarray(self.alive)[waiting].view(bool)].astype(np.int64)
 
     cdef bint reaches_support(self, long atom) noexcept nogil:
         # Whether the removal of this atom could expose support atoms.

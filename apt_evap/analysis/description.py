@@ -106,6 +106,7 @@ def _of_run(run):
         "field_before_leaving": _extent(run.fields),
         "outcomes": {key: summary[key] for key in ("perturbation", "hit", "missed", "never_left")},
         "without_neighbour_to_roll_onto": summary["without_neighbour"],
+        "detached": summary["detached"],
         "perturbations_flown": [str(each["repr"] if isinstance(each, dict) else each) for each in run.perturbations],
         "responses": responses,
     }

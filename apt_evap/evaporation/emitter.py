@@ -51,6 +51,8 @@ class Batch:
         Outward unit normal.
     neighbour : ndarray of int64, shape (n,)
         Index of the surface nearest neighbour with the highest charge; -1 if there was none.
+    detached : ndarray of bool, shape (n,)
+        Atoms that left because they had lost all chains of bonds to the body.
     journal : Journal
         Changes of the tree by each event.
     tree : Octree or None
@@ -64,6 +66,7 @@ class Batch:
     fields: np.ndarray
     normals: np.ndarray
     neighbour: np.ndarray
+    detached: np.ndarray
     journal: Journal
     tree: Octree | None
     status: int
@@ -148,6 +151,7 @@ class Emitter:
             tip.bond_length,
             usable_threads(self.n_threads),
             previous,
+            (tip.support | ~tip.evaporable).view(np.int8),
         )
 
     def __len__(self) -> int:
@@ -226,9 +230,10 @@ class Emitter:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Numbers of events, of negative charges set to 0, and of patches that did not converge; dict of int."""
+        """Numbers of events, of detached atoms, of negative charges set to 0, of patches that did not converge."""
         core = self._core
-        return {"events": core.n_removed, "clipped": core.n_clipped, "unsettled": core.n_unsettled}
+        counts = {"clipped": core.n_clipped, "unsettled": core.n_unsettled}
+        return {"events": core.n_removed, "detached": core.atoms.n_detached, **counts}
 
     def field_at(self, points: ArrayLike, opening_angle: float = 0.3) -> Floats:
         """Electric field of the surface charges.
@@ -390,9 +395,11 @@ class Emitter:
         n = check_count(max_events, "max_events", at_least=1, at_most=_MAX_EVENTS)
         journal = Journal(self.tip.positions, n)
         site, neighbour = np.empty(n, np.int64), np.empty(n, np.int64)
-        charges, fields, normals = np.empty(n), np.empty(n), np.empty((n, 3))
+        charges, fields, normals, detached = np.empty(n), np.empty(n), np.empty((n, 3)), np.empty(n, np.int8)
         tree = self._core.tree.copy() if self._recorded >= RECORD else None
-        status = self._core.evaporate(journal, n, self.sweep_interval, site, charges, fields, normals, neighbour)
+        status = self._core.evaporate(
+            journal, n, self.sweep_interval, site, charges, fields, normals, neighbour, detached
+        )
         n = journal.n_events
         self._recorded = n if tree is not None else self._recorded + n
         self._sites.append(site[:n].copy())
@@ -402,6 +409,7 @@ class Emitter:
             fields=fields[:n],
             normals=normals[:n],
             neighbour=neighbour[:n],
+            detached=detached[:n].view(bool),
             journal=journal,
             tree=tree,
             status=status,

@@ -32,7 +32,6 @@ from apt_evap.flight.landing import Ends, land
 from apt_evap.units import FLIGHT_TIME
 
 _MAX_LAUNCHES = 1000
-CHUNK = 1 << 16  # ions evaluated at once: their monomials stay below 10 MB
 
 
 @dataclass(frozen=True)

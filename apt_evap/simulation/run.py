@@ -82,6 +82,9 @@ class Run:
         Why the run ended before its time; "" if it did not.
     provenance : dict
         Version, time, and under "systems" the processors and libraries that it was computed with.
+    detached : ndarray of bool, shape (n,), optional
+        Atoms that left because they had lost all chains of bonds to the body; by default none, as in files of earlier
+        versions.
     """
 
     emissions: Emissions
@@ -103,6 +106,11 @@ class Run:
     first_event: int = 0
     ended: str = ""
     provenance: dict = field(default_factory=provenance_now)
+    detached: Any = None
+
+    def __post_init__(self):
+        if self.detached is None:
+            object.__setattr__(self, "detached", np.zeros(len(self.site), bool))
 
     def __len__(self) -> int:
         return len(self.site)
@@ -238,6 +246,7 @@ class Run:
             "perturbation": _describe(first),
             **counts,
             "without_neighbour": int((~self.emissions.can_roll).sum()),
+            "detached": int(self.detached.sum()),
             "flagged": int(self.flagged.sum()),
             "ended": self.ended,
         }
@@ -251,7 +260,7 @@ class Run:
         emissions = Emissions.join([run.emissions for run in runs])
         columns: dict[str, Any] = {
             name: np.concatenate([getattr(run, name) for run in runs])
-            for name in ("site", "species", "charges", "fields")
+            for name in ("site", "species", "charges", "fields", "detached")
         }
         flown = tuple(
             Flown(

@@ -42,6 +42,7 @@ _ENTRY = "entry1"
 _ATOM_PROBE, _SIMULATION = f"{_ENTRY}/atom_probe", f"{_ENTRY}/simulation"
 _EMISSIONS = ("positions", "normals", "neighbours", "charge_states", "masses")
 _COLUMNS = ("site", "species", "charges", "fields")
+_DETACHED = "detached", (f"{_SIMULATION}/detached", np.int8, ())  # not in files of earlier versions
 _UNITS = {
     "positions": "nm",
     "neighbours": "nm",
@@ -142,6 +143,7 @@ def _write(file, run):
         _put(simulation, name, getattr(run.emissions, name))
     for name in _COLUMNS:
         _put(simulation, name, getattr(run, name))
+    _put(simulation, "detached", run.detached.astype(np.int8))
     for index, (perturbation, flown) in enumerate(zip(run.perturbations, run.flown, strict=True)):
         group = simulation.create_group(f"flown/{index}")
         _put_text(group, "perturbation", json.dumps(described(perturbation)))
@@ -247,6 +249,8 @@ def _read(file, partial):
             n_coefficients = design.monomials(np.zeros((1, 2))).shape[1]
             kinds[f"responses {name}"] = f"{group}/{name}", np.float32, (3, n_coefficients)
         kinds["responses residuals"] = f"{group}/residuals", np.float32, (2,)
+    if _DETACHED[1][0] in file:
+        kinds |= dict([_DETACHED])
     columns, lost = _columns(file, kinds, partial)
     if len(columns["ions"]) and not 0 <= columns["species"].min() <= columns["species"].max() < len(elements):
         raise ValueError(f"species must be 0 to {len(elements) - 1}, as there are {len(elements)} elements")
@@ -264,6 +268,7 @@ def _read(file, partial):
             nearest_neighbour_distance=float(file.attributes()["nearest_neighbour_distance"]),
         ),
         **{name: columns[name] for name in _COLUMNS},
+        "detached": columns["detached"].astype(bool) if "detached" in columns else None,
         "perturbations": tuple(perturbations),
         "flown": tuple((columns[f"{k} directions"], columns[f"{k} times"]) for k in range(len(perturbations))),
         "responses": Responses(*(columns[f"responses {name}"] for name in Responses._fields))

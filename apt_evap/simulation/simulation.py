@@ -290,6 +290,7 @@ class Simulation:
                 response_settings=self.response_settings,
                 elements=tuple(element.name for element in self.tip.elements),
                 settings=self.settings,
+                detached=batch.detached,
             )
 
         return finish
