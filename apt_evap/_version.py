@@ -1,3 +1,3 @@
-"""The version, on a line of its own so that building needs no import of the package."""
+"""Version of the package, in a separate module so that the build can read it without an import of the package."""
 
 __version__ = "0.1.0"

@@ -1,4 +1,4 @@
-"""What every reader and writer shares: errors in one sentence, whole files or none."""
+"""Reading and writing of files: error messages of one sentence, and no incomplete files."""
 
 import os
 import re
@@ -15,18 +15,18 @@ from apt_evap._common.types import AnyPath
 
 try:
     import fcntl
-except ImportError:  # not on this system: unfinished files of killed processes stay
+except ImportError:  # not on this system: temporary files of killed processes remain
     fcntl = None  # type: ignore[assignment]
 
-_ABANDONED_AFTER = 60.0  # seconds: a file that was made just now may not be locked yet
+_ABANDONED_AFTER = 60.0  # seconds: a new file may not be locked yet
 
 
 class FileError(ValueError):
-    """A file that cannot be read or written; the message names it and says why."""
+    """Error for a file that cannot be read or written; the message gives its name and the reason."""
 
 
 class TruncatedFile(FileError):
-    """A file that ends in the middle of an ion."""
+    """Error for a file that ends in the middle of an ion."""
 
 
 def check_path(path: Any) -> Path:
@@ -35,7 +35,7 @@ def check_path(path: Any) -> Path:
     Raises
     ------
     FileError
-        If it is not a str or a path, or holds a null character.
+        If it is not a str or a path, or contains a null character.
     """
     if not isinstance(path, str | os.PathLike) or "\0" in os.fspath(path):
         raise FileError(f"path must be a file name, got {path!r:.80}")
@@ -59,7 +59,7 @@ def open_for_reading(path: AnyPath) -> Iterator[BinaryIO]:
     Raises
     ------
     FileError
-        If it is missing, unreadable or not a regular file: a pipe would be waited for.
+        If it is missing, unreadable or not a regular file. Reading from a pipe could block forever.
     """
     path = check_path(path)
     try:
@@ -70,16 +70,16 @@ def open_for_reading(path: AnyPath) -> Iterator[BinaryIO]:
 
 
 def read_small_file(path: AnyPath, at_most: int, what: str) -> bytes:
-    """Read a whole file that is not meant to be large.
+    """Read a complete small file.
 
     Parameters
     ----------
     path : str or path-like
         The file.
     at_most : int
-        Bytes that it may have.
+        Largest allowed size [bytes].
     what : str
-        What was expected, for the message.
+        Expected content, for the message.
 
     Returns
     -------
@@ -101,10 +101,10 @@ def read_small_file(path: AnyPath, at_most: int, what: str) -> bytes:
 
 @contextmanager
 def replace_file(path: AnyPath) -> Iterator[BinaryIO]:
-    """Write a file under another name in the same folder, and rename it once it is complete.
+    """Write a file under a temporary name in the same folder, and rename it when it is complete.
 
-    A file that is overwritten keeps its mode. The other name is random and never that of a file or link which is there
-    already; what a killed process has left of the same file is removed.
+    A file that is overwritten keeps its mode. The temporary name is random and never that of an existing file or link.
+    Temporary files of killed processes for the same file are removed.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ def replace_file(path: AnyPath) -> Iterator[BinaryIO]:
     Raises
     ------
     FileError
-        If the file cannot be written, or is not a regular file; nothing is left behind then.
+        If the file cannot be written, or is not a regular file. The temporary file is then removed.
     """
     path = check_path(path)
     aside = None
@@ -137,7 +137,7 @@ def replace_file(path: AnyPath) -> Iterator[BinaryIO]:
                 _lock(descriptor)
             yield file
             file.flush()
-            os.fsync(descriptor)  # a name must not come before the bytes, should the power fail
+            os.fsync(descriptor)  # the bytes must be on the disk before the name, in case of a power cut
             os.replace(name, target)
             aside = None
         flush_folder(target.parent)
@@ -155,7 +155,7 @@ _UNFINISHED = re.compile(r"\..*\.[\w-]*\.[0-9a-f]{16}\.part")
 
 
 def is_unfinished(name: str) -> bool:
-    """Whether a file has the name of one that `replace_file` has not completed."""
+    """Whether a name is that of a temporary file of `replace_file`."""
     return _UNFINISHED.fullmatch(name) is not None
 
 
@@ -178,7 +178,7 @@ def check_regular(status: os.stat_result) -> None:
 
 
 def _mode_of(target):
-    """Mode of a file that is there, None if it is not; OSError if it is not a regular one."""
+    """Mode of a file, None if it does not exist; OSError if it is not a regular file."""
     try:
         status = os.stat(target)
     except FileNotFoundError:
@@ -188,7 +188,7 @@ def _mode_of(target):
 
 
 def _stem(target):
-    return target.name[:40]  # with all the rest no name is longer than a file system takes
+    return target.name[:40]  # the complete temporary name must not be too long for the file system
 
 
 def _host():
@@ -202,7 +202,7 @@ def _lock(descriptor):
 
 
 def _remove_abandoned(target):
-    """Remove what killed processes have left of a file: files of this user that nobody has locked."""
+    """Remove temporary files of killed processes for a file: files of this user that are not locked."""
     if fcntl is None:
         return
     with suppress(OSError):
@@ -225,12 +225,12 @@ def _remove_if_abandoned(path):
 
 
 def move_file(written: Path, target: Path) -> None:
-    """Give a complete file the name of another, whose mode it takes over if that one is there.
+    """Rename a complete file; if `target` exists, it is replaced and its mode is kept.
 
     Raises
     ------
     OSError
-        If it cannot be done, or the other one is not a regular file.
+        If the file cannot be renamed, or `target` is not a regular file.
     """
     mode = _mode_of(target)
     if mode is not None:
@@ -240,7 +240,7 @@ def move_file(written: Path, target: Path) -> None:
 
 
 def flush_folder(folder: AnyPath) -> None:
-    """Make sure that the names of new files are on the disk too, where the system can do that."""
+    """Flush the names of new files to the disk, if the system supports it."""
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:

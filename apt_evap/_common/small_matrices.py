@@ -1,7 +1,7 @@
 """Products, inverses and lengths of small matrices, with the same bits on every processor and with every BLAS.
 
-They use only additions, multiplications, divisions and square roots in a fixed order: these are rounded correctly
-everywhere (IEEE 754), while BLAS and LAPACK choose their order of summation by the processor.
+Only additions, multiplications, divisions and square roots in a fixed order are used: these are rounded correctly on
+every processor (IEEE 754). The order of summation of BLAS and LAPACK depends on the processor.
 """
 
 import math
@@ -47,12 +47,12 @@ def products(first: ArrayLike, second: ArrayLike) -> Any:
 def pseudo_inverse(matrix: Floats) -> Floats:
     """Moore-Penrose inverse of a small matrix, shape (m, n) -> (n, m).
 
-    By one-sided Jacobi rotations (Hestenes, J. SIAM 6, 51, 1958): columns are rotated in pairs until they are at right
-    angles; then their lengths are the singular values. Those below 1e-13 of the largest count as 0.
+    One-sided Jacobi rotations (Hestenes, J. SIAM 6, 51, 1958): pairs of columns are rotated until all columns are
+    orthogonal. Their lengths are then the singular values. Values below 1e-13 of the largest one are treated as 0.
     """
     if matrix.shape[0] < matrix.shape[1]:
         return np.ascontiguousarray(pseudo_inverse(matrix.T).T)
-    columns = np.array(matrix.T, dtype=np.float64)  # one in a row
+    columns = np.array(matrix.T, dtype=np.float64)  # each column is a row here
     rotations = np.eye(len(columns))
     for _ in range(60):
         rotated = False

@@ -1,7 +1,8 @@
-/* Elementary functions of one number, with the same bits on every processor and with every C library.
+/* Elementary functions of one number, bit-identical on every processor and with every C library.
  *
- * They use only additions, multiplications, divisions, square roots and exact operations on the exponent, in a fixed order:
- * these are rounded correctly everywhere (IEEE 754). The functions of C libraries are not, and choose by the processor. */
+ * Only additions, multiplications, divisions, square roots and exact operations on the exponent are used, in a fixed
+ * order: these are rounded correctly on every processor (IEEE 754). The functions of C libraries are not always rounded
+ * correctly, and their implementation depends on the processor. */
 
 #include <math.h>
 
@@ -13,8 +14,8 @@ static inline double horner(int n, const double *coefficient, double x)
     return value;
 }
 
-/* Sine and cosine for |angle| <= 1e5; errors below 3e-16. Quarter turns are taken off with pi / 2 as a sum of three, of
- * which the first two have 33 bits, so that small multiples are exact; then Taylor's series for |x| <= pi / 4. */
+/* Sine and cosine for |angle| <= 1e5; errors below 3e-16. Quarter turns are subtracted with pi / 2 as a sum of three
+ * numbers. The first two have 33 bits, so that small multiples are exact. Taylor series for |x| <= pi / 4. */
 static inline void sine_cosine(double angle, double *sine, double *cosine)
 {
     static const double s[9] = {1.0, -0.16666666666666666, 0.008333333333333333, -0.0001984126984126984, 2.7557319223985893e-06,
@@ -32,7 +33,7 @@ static inline void sine_cosine(double angle, double *sine, double *cosine)
     *cosine = quarter == 0 ? b : quarter == 1 ? -a : quarter == 2 ? -b : a;
 }
 
-/* Arcus tangens; relative errors below 1e-15. The angle is halved twice: tan(a / 2) = t / (1 + sqrt(1 + t^2)). */
+/* Arctangent; relative errors below 1e-15. The angle is halved twice: tan(a / 2) = t / (1 + sqrt(1 + t^2)). */
 static inline double arc_tangent(double x)
 {
     static const double c[13] = {1.0, -0.3333333333333333, 0.2, -0.14285714285714285, 0.1111111111111111, -0.09090909090909091,

@@ -1,4 +1,4 @@
-"""Elementary functions with the same bits on every processor, with every C library and every version of NumPy."""
+"""Elementary functions, bit-identical on every processor, with every C library and every version of NumPy."""
 
 import numpy as np
 
@@ -24,7 +24,7 @@ def sine_and_cosine(angles):
 
 
 def arctangent(numbers):
-    """Arcus tangens [rad] of numbers of any shape; relative errors below 1e-15."""
+    """Arctangent [rad] of numbers of any shape; relative errors below 1e-15."""
     cdef long i
     cdef const double[::1] values = np.ascontiguousarray(numbers, np.float64).reshape(-1)
     cdef double[::1] angles = np.empty(values.shape[0])
@@ -46,7 +46,7 @@ def logarithm(numbers):
 
 
 def seventh_root_of_reciprocal(numbers):
-    """x^(-1/7) of positive numbers of any shape, for the steps of flights; relative errors below 2e-15."""
+    """x^(-1/7) of positive numbers of any shape, for the step size of flights; relative errors below 2e-15."""
     cdef long i
     cdef const double[::1] values = np.ascontiguousarray(numbers, np.float64).reshape(-1)
     cdef double[::1] roots = np.empty(values.shape[0])

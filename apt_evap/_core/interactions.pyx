@@ -77,7 +77,7 @@ cdef class InteractionLists:
 
     def __init__(self, Octree tree, double opening_angle, int n_threads=1):
         if tree.n_slots != tree.n_sorted:
-            raise ValueError("lists need a tree with no atoms put in since it was built")
+            raise ValueError("lists need a tree without inserted atoms")
         cdef long node = 0, count = 0, group, chunk, n_chunks
         cdef long[::1] chunk_node = np.empty(tree.n_nodes, np.int64), chunk_group = np.zeros(tree.n_nodes + 1, np.int64)
         self.tree = tree

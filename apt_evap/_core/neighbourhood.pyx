@@ -50,11 +50,11 @@ cdef class Neighbourhood:
                  const signed char[::1] anchored=None):
         cdef long n = positions.shape[0], i
         if n == 0:
-            raise ValueError("a specimen needs at least one atom, got none")
+            raise ValueError("a specimen must have at least one atom, got none")
         self.n_atoms = n
         self.radius, self.threshold, self.bond_length = radius, threshold, bond_length
         if n >= 2**31:
-            raise ValueError(f"a specimen holds fewer than 2**31 atoms, got {n}")
+            raise ValueError(f"a specimen must have fewer than 2**31 atoms, got {n}")
         self.positions, self.support = positions, support
         self.alive = np.ones(n, np.int8)
         self.exposed = np.zeros(n, np.int8)
@@ -91,7 +91,7 @@ cdef class Neighbourhood:
         if before is not None:
             np.asarray(self.exposed)[:before.n_atoms] |= before.exposed
         if np.asarray(self.count).min() < 0:
-            raise ValueError(f"radius must hold at most {MAX_NEAR} atoms around each atom, got {radius!r} nm")
+            raise ValueError(f"radius must include at most {MAX_NEAR} neighbours of each atom, got {radius!r} nm")
 
     cdef int near(self, long atom, int* others) noexcept nogil:
         # The remaining atoms within the radius of an atom, in the order of the cells; -1: more than MAX_NEAR.
@@ -343,7 +343,7 @@ cdef class Neighbourhood:
         cdef long i
         for i in range(atoms.shape[0]):
             if not (0 <= atoms[i] < self.n_atoms and self.alive[atoms[i]]):
-                raise ValueError(f"atoms to take away must be there, got {atoms[i]} of {self.n_atoms}")
+                raise ValueError(f"atoms to remove must be in the specimen, got {atoms[i]} of {self.n_atoms}")
         with nogil:
             for i in range(atoms.shape[0]):
                 self.remove(atoms[i], &fresh[0])

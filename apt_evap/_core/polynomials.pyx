@@ -1,6 +1,6 @@
-"""Polynomials of two velocities, as the responses of ions are: their fit and their values, summed in a fixed order.
+"""Fit and evaluation of polynomials of two velocities, for the responses of ions; sums in a fixed order.
 
-The monomials of degree d are u^(t - j) v^j for t = 0 ... d and j = 0 ... t, (d + 1)(d + 2)/2 of them.
+The (d + 1)(d + 2)/2 monomials up to degree d are u^(t - j) v^j for t = 0 ... d and j = 0 ... t.
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ HIGHEST_DEGREE = MAX_DEGREE
 
 
 cdef int fill(int degree, double u, double v, double* monomial) noexcept nogil:
-    # All monomials of one velocity; returns how many.
+    # All monomials of one velocity; returns their number.
     cdef double power_u[MAX_DEGREE + 1]
     cdef double power_v[MAX_DEGREE + 1]
     cdef int total, j, n = 0
@@ -28,7 +28,7 @@ cdef int fill(int degree, double u, double v, double* monomial) noexcept nogil:
 
 
 def monomials(int degree, const double[:, ::1] velocities):
-    """Monomials of velocities, shape (n, 2); shape (n, monomials)."""
+    """Monomials of velocities, shape (n, 2) -> (n, monomials)."""
     cdef long i
     cdef double[:, ::1] values = np.empty((velocities.shape[0], (degree + 1) * (degree + 2) // 2))
     if not 0 <= degree <= MAX_DEGREE:
@@ -40,7 +40,7 @@ def monomials(int degree, const double[:, ::1] velocities):
 
 
 def fit(const double[:, ::1] inverse, const double[:, :, ::1] values):
-    """Coefficients of the least squares fit.
+    """Coefficients of the least-squares fit.
 
     Parameters
     ----------
@@ -75,9 +75,9 @@ def misfits(const double[:, ::1] matrix, const double[:, :, ::1] coefficients, c
     matrix : ndarray, shape (m, c)
         Monomials of the launches.
     coefficients : ndarray, shape (n, 3, c)
-        Of the polynomials.
+        Coefficients of the polynomials.
     values : ndarray, shape (n, m, 3)
-        What the launches gave.
+        Results of the launches.
     """
     cdef long i, j, k, c
     cdef double total, squares
@@ -104,7 +104,7 @@ def evaluate(int degree, const float[:, :, ::1] coefficients, const double[:, ::
     degree : int
         Degree, at most 12.
     coefficients : ndarray of float32, shape (n, 3, c)
-        Of the three quantities of each ion.
+        Coefficients of the three quantities of each ion.
     velocities : ndarray, shape (n, 2)
         Velocities.
 

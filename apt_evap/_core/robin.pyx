@@ -1,4 +1,4 @@
-"""Charges of the surface atoms: Robin's iteration, for the whole surface and for a patch of it.
+"""Charges of the surface atoms: Robin's iteration for the whole surface or for a patch of it.
 
 q_i <- (s/2 pi) sum_{k != i} q_k n_i . (r_i - r_k)/|r_i - r_k|^3, with s, the area per atom, chosen in every sweep so
 that the total charge is conserved (Robin, 1886; Rolland et al., Microsc. Microanal. 21, 1649, 2015).
@@ -23,7 +23,7 @@ cdef extern from "kernels.h":
 
 
 cdef double dot(const double[::1] first, const double[::1] second) noexcept nogil:
-    # Scalar product; eight sums, so that it vectorises, in an order that no processor chooses.
+    # Scalar product; eight sums allow vectorisation in an order that does not depend on the processor.
     cdef double sums[8]
     cdef long i, n = first.shape[0]
     cdef int lane
@@ -38,8 +38,8 @@ cdef double dot(const double[::1] first, const double[::1] second) noexcept nogi
 
 
 cdef eliminate(double[:, ::1] matrix, double[::1] right):
-    # Solution of a few symmetric positive equations by Gaussian elimination, in place of `right`; LAPACK's bits depend on
-    # the processor.
+    # Solution of a small symmetric positive definite system by Gaussian elimination, stored in `right`. Not by LAPACK,
+    # whose bits depend on the processor.
     cdef long i, j, k, n = right.shape[0]
     cdef double factor
     for k in range(n):
@@ -55,7 +55,7 @@ cdef eliminate(double[:, ::1] matrix, double[::1] right):
 
 
 cdef class Robin(FieldRule):
-    """Robin's iteration; its parameters are those of `apt_evap.Robin`."""
+    """Robin's iteration; the parameters are those of `apt_evap.Robin`."""
 
     def __init__(self, double tolerance, int window):
         self.tolerance = tolerance
@@ -66,7 +66,7 @@ cdef class Robin(FieldRule):
         self.grow(512)
 
     def begin(self, point):
-        """Set the point inside the specimen where the potential is given [nm], shape (3,)."""
+        """Set the point inside the specimen with the given potential [nm], shape (3,)."""
         self.point = np.array(point, dtype=np.float64).reshape(1, 3)
 
     @property
@@ -92,7 +92,7 @@ cdef class Robin(FieldRule):
         np.asarray(self.field)[:] *= factor
 
     def keep_inside(self, Octree tree):
-        """Distances of the surface from the point of the potential [nm]; moves the point down if one is small."""
+        """Distances of the surface atoms from the point of the potential [nm]; moves the point down if it is close."""
         away = self.distances(tree)
         if self.clearance == 0.0:
             self.clearance = away.min()
@@ -104,7 +104,7 @@ cdef class Robin(FieldRule):
         return np.maximum(away, 1e-3 * self.clearance)
 
     def distances(self, Octree tree):
-        """Distances of the surface from the point of the potential [nm]."""
+        """Distances of the surface atoms from the point of the potential [nm]."""
         columns = np.asarray(tree.x), np.asarray(tree.y), np.asarray(tree.z)
         return np.sqrt(sum((column[:tree.n_slots] - at) ** 2 for column, at in zip(columns, self.point[0])))
 
@@ -129,7 +129,7 @@ cdef class Robin(FieldRule):
         Parameters
         ----------
         tree : Octree
-            Its charges are the start values, and are replaced; their sum is conserved.
+            Its charges are the initial values and are replaced; their sum is conserved.
         normals : ndarray, shape (n, 3)
             Outward unit normals in the order of the slots.
         lists : InteractionLists
@@ -156,12 +156,12 @@ cdef class Robin(FieldRule):
         self.field = np.zeros((tree.x.shape[0], 3))
         charges = tree.charges
         total = charges.sum()
-        maps, steps = [], []   # of the last sweeps: results of Robin's iteration, and their changes
+        maps, steps = [], []   # results of the last sweeps of Robin's iteration, and their changes
         for sweeps in range(1, max_sweeps + 1):
             lists.sweep(self.field, double_precision, n_threads)
             flux = np.maximum(self.normal_field(normals, n), 0.0)   # a site deep in a notch has no charge
             if not flux.sum() > 0.0:
-                raise ValueError(f"{n} surface atoms hold no charge together: expected normals that point outwards")
+                raise ValueError(f"the total charge of {n} surface atoms is not positive: normals must point outwards")
             self.area = 2.0 * M_PI * total / flux.sum()
             flux *= total / flux.sum()
             maps.append(flux)
@@ -176,7 +176,7 @@ cdef class Robin(FieldRule):
         return sweeps, residual
 
     cdef normal_field(self, const double[:, ::1] normals, long n):
-        # Field of all the others along the normal of each slot [e/nm^2].
+        # Field of all other charges along the normal of each slot [e/nm^2].
         cdef double[::1] along = np.empty(n)
         cdef long i
         for i in range(n):

@@ -21,7 +21,7 @@ from apt_evap.simulation.run import Run, load
 from apt_evap.simulation.run_hdf5 import is_run
 
 _STUDY = "study.json"
-_MOST = 1 << 28  # bytes: a study holds three numbers for each cell of its grid
+_MOST = 1 << 28  # bytes: a study contains three numbers for each point of its grid
 OVERLAY = "registration.png"
 
 
@@ -53,7 +53,7 @@ def execute(options: argparse.Namespace) -> int:
     )
     _write(study, run, folder)
     if study.registration.doubtful:
-        say("note", f"look at {folder / OVERLAY}; --registration sets a known registration")
+        say("note", f"check {folder / OVERLAY}; --registration sets a known registration")
     if not options.quiet:
         put(repr(study).strip("<>"))
         put(f"wrote {', '.join(FILES)} to {folder}")

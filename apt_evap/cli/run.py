@@ -36,19 +36,19 @@ def execute(options: argparse.Namespace) -> int:
     provenance = {"config": config.path.name, "maps": config.maps.to_dict()}
     n_ions = options.ions or config.n_ions
     replaced, unfinished = output.exists(), checkpoint.folder.exists()
-    done = checkpoint.ions_there() if options.resume else 0
-    if 0 < done < n_ions:
-        tell(options, f"resumed at {done:,} of {n_ions:,} ions")
+    n_previous = checkpoint.ions_there() if options.resume else 0
+    if 0 < n_previous < n_ions:
+        tell(options, f"resumed at {n_previous:,} of {n_ions:,} ions")
     run = _simulate(options, config, simulation, checkpoint, n_ions, provenance)
     seconds = time.perf_counter() - began
-    if done == n_ions and not unfinished:
+    if n_previous == n_ions and not unfinished:
         tell(options, f"{output} is complete: nothing to do")
         tell_json(options, {"wrote": None, "picture": None, "maps": [], **_counts(run, seconds)})
         return 0
     run = replace(run, provenance=run.provenance | provenance)
     run.save(output)
-    new = "" if not done else f", {len(run) - done:,} of them new,"
-    tell(options, f"{len(run):,} ions{new} in {seconds:.1f} s, {(len(run) - done) / seconds:,.0f} ions/s")
+    new = "" if not n_previous else f", {len(run) - n_previous:,} of them new,"
+    tell(options, f"{len(run):,} ions{new} in {seconds:.1f} s, {(len(run) - n_previous) / seconds:,.0f} ions/s")
     _tell_outcomes(options, config, run, output, n_ions)
     tell(options, f"{'replaced' if replaced and not options.resume else 'wrote'} {output}")
     try:
@@ -117,15 +117,15 @@ class _Lines:
     def __init__(self) -> None:
         self._began = self._printed = self._first = 0.0
 
-    def __call__(self, done: int, n_ions: int) -> None:
+    def __call__(self, ions: int, n_ions: int) -> None:
         now = time.monotonic()
         if not self._began:
-            self._began, self._printed, self._first = now, now, done
-        elif now - self._printed >= SECONDS_BETWEEN_LINES and done > self._first:
+            self._began, self._printed, self._first = now, now, ions
+        elif now - self._printed >= SECONDS_BETWEEN_LINES and ions > self._first:
             self._printed = now
-            rate = (done - self._first) / (now - self._began)
-            remaining, speed = _duration((n_ions - done) / rate), f"{rate:,.0f}" if rate >= 10 else f"{rate:.2g}"
-            line = f"{done:,} of {n_ions:,} ions ({done / n_ions:.0%}), {speed} ions/s, {remaining} left"
+            rate = (ions - self._first) / (now - self._began)
+            remaining, speed = _duration((n_ions - ions) / rate), f"{rate:,.0f}" if rate >= 10 else f"{rate:.2g}"
+            line = f"{ions:,} of {n_ions:,} ions ({ions / n_ions:.0%}), {speed} ions/s, {remaining} left"
             print(line, file=sys.stderr, flush=True)
 
 

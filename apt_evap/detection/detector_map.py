@@ -17,7 +17,7 @@ from apt_evap.detection.binning import bin_edges, count, field_of_view, find_qua
 if TYPE_CHECKING:
     from apt_evap.detection.hits import Hits
 
-_MOST_IONS = 2**53  # whole numbers up to here are exact as floats, which sums and densities are made of
+_MOST_IONS = 2**53  # integers up to here are exact as float64, the type of sums and densities
 
 
 @dataclass(frozen=True, eq=False, repr=False)

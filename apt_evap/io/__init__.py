@@ -1,1 +1,1 @@
-"""Files of ions: one module per format, and in `formats` the table of them with `read`, `write` and `chunks`."""
+"""File formats of ions: one module per format; `formats` lists them and contains `read`, `write` and `chunks`."""

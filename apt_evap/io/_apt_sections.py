@@ -1,4 +1,4 @@
-"""The skeleton of an .apt file: its header and the headers of its sections."""
+"""Header of an .apt file and headers of its sections."""
 
 import os
 import struct
@@ -18,14 +18,14 @@ _SECTION = b"SEC\0"
 _HEADER_SIZE = 540
 _SECTION_SIZE = 148
 _PADDING = 1 << 16
-_MOST_PADDING = 1 << 24  # sections begin at whole pages of 4 kB: far more zeros than that are not padding
+_MOST_PADDING = 1 << 24  # bytes; sections begin at multiples of 4 kB, so that more zeros than this are not padding
 _KINDS = {1: "i", 2: "u", 3: "f"}
 _BITS = {"i": (8, 16, 32, 64), "u": (8, 16, 32, 64), "f": (16, 32, 64)}
 
 
 @dataclass(frozen=True)
 class Section:
-    """A section of fixed records, one to an ion: where its data begin and what they are."""
+    """A section with one fixed record per ion: position and type of its data."""
 
     name: str
     unit: str
@@ -45,7 +45,7 @@ def read_sections(file: BinaryIO, path: AnyPath, partial: bool) -> tuple[int, li
     path : str or path-like
         For messages.
     partial : bool
-        Leave out a section whose end is missing, with a warning, rather than complain.
+        Skip an incomplete last section with a warning; otherwise it is an error.
 
     Returns
     -------
@@ -56,26 +56,26 @@ def read_sections(file: BinaryIO, path: AnyPath, partial: bool) -> tuple[int, li
     Raises
     ------
     FileError
-        If the file is damaged or holds no ion.
+        If the file is damaged or contains no ion.
     TruncatedFile
         If it ends in the middle of a section and `partial` is False, or before the end of the first one.
     """
     size = os.fstat(file.fileno()).st_size
     if size == 0:
-        raise FileError(f"{str(path)!r} is empty (0 bytes), expected an .apt file, which begins with {SIGNATURE!r}")
+        raise FileError(f"{str(path)!r} is empty (0 bytes), expected an .apt file, beginning with {SIGNATURE!r}")
     head = _at(file, 0, _HEADER_SIZE)
     if not head.startswith(SIGNATURE):
-        raise FileError(f"{str(path)!r} does not begin as an .apt file, expected {SIGNATURE!r}, got {head[:4]!r}")
+        raise FileError(f"{str(path)!r} does not begin like an .apt file, expected {SIGNATURE!r}, got {head[:4]!r}")
     if len(head) < _HEADER_SIZE:
         raise TruncatedFile(f"{str(path)!r} ends in its header, after {size} of {_HEADER_SIZE} bytes")
     header_size, version = struct.unpack_from("<2i", head, 4)
     (n,) = struct.unpack_from("<Q", head, 532)
     if header_size < _HEADER_SIZE:
-        raise FileError(f"{str(path)!r} has a header size of {header_size}, expected at least {_HEADER_SIZE}")
+        raise FileError(f"{str(path)!r} has a header size of {header_size}, expected >= {_HEADER_SIZE}")
     if version != 2:
-        warnings.warn(f"{str(path)!r} is of version {version} of .apt, read as version 2", DataWarning, stacklevel=6)
+        warnings.warn(f"{str(path)!r} has version {version} of .apt, read as version 2", DataWarning, stacklevel=6)
     if n == 0:
-        raise FileError(f"{str(path)!r} says that it holds 0 ions, expected at least 1")
+        raise FileError(f"{str(path)!r} has 0 ions according to its header, expected >= 1")
 
     sections = []
     end = None
@@ -92,7 +92,7 @@ def read_sections(file: BinaryIO, path: AnyPath, partial: bool) -> tuple[int, li
             problem += f" of {end}" if name else ""
             if not partial:
                 raise TruncatedFile(
-                    f"{problem}; {argument('partial', True)} reads the {len(sections)} whole sections before it"
+                    f"{problem}; {argument('partial', True)} reads the {len(sections)} complete sections before it"
                 )
             warnings.warn(f"{problem}; only the {len(sections)} sections before it are read", DataWarning, stacklevel=6)
             break
@@ -101,27 +101,27 @@ def read_sections(file: BinaryIO, path: AnyPath, partial: bool) -> tuple[int, li
         at = end
     if not sections:
         kind = TruncatedFile if end is None or end > size else FileError
-        raise kind(f"{str(path)!r} has no whole section with a value for every ion, expected at least one")
+        raise kind(f"{str(path)!r} has no complete section with a value for every ion, expected at least one")
     return n, _distinct(sections, path)
 
 
 def _section(head, at, n, size, path):
-    """Read the header of a section; return it, or None with a warning if it cannot be read, and where it ends."""
+    """Read the header of a section; return the section, or None with a warning if unreadable, and its end."""
     (header_size,) = struct.unpack_from("<i", head, 4)
     relationship, record_type, kind, bits, record_size = struct.unpack_from("<3I2i", head, 80)
     name, unit = _text(head[12:76]), _text(head[100:132])
     records, length = struct.unpack_from("<2q", head, 132)
     where = f"{str(path)!r}, section {name!r} at byte {at}:"
     if header_size < _SECTION_SIZE:
-        raise FileError(f"{where} header size must be at least {_SECTION_SIZE}, got {header_size}")
+        raise FileError(f"{where} header size must be >= {_SECTION_SIZE}, got {header_size}")
     if length < 0:
-        raise FileError(f"{where} byte count must be at least 0, got {length}")
+        raise FileError(f"{where} byte count must be >= 0, got {length}")
     end = at + header_size + length
     problem = ""
     if relationship != 1:
-        problem = f"relationship {relationship} to the ions (1 is one to one)"
+        problem = f"relationship {relationship} to the ions (supported: 1, one to one)"
     elif record_type != 1:
-        problem = f"record type {record_type} (1 is fixed)"
+        problem = f"record type {record_type} (supported: 1, fixed)"
     elif kind == 4 and bits == 8 and record_size > 0:
         dtype, values = np.dtype(f"S{record_size}"), 1
     elif kind not in _KINDS or bits not in _BITS[_KINDS[kind]]:
@@ -131,17 +131,17 @@ def _section(head, at, n, size, path):
     else:
         dtype, values = np.dtype(f"<{_KINDS[kind]}{bits // 8}"), record_size // (bits // 8)
     if problem:
-        warnings.warn(f"{where} left out, it has {problem}", DataWarning, stacklevel=7)
+        warnings.warn(f"{where} skipped, because it has {problem}", DataWarning, stacklevel=7)
         return None, end
     if records != n:
-        raise FileError(f"{where} holds {records} records, expected one for each of the {n} ions")
+        raise FileError(f"{where} has {records} records, expected one for each of the {n} ions")
     if length < n * record_size:
-        raise FileError(f"{where} holds {length} bytes, expected {n} records of {record_size} bytes")
+        raise FileError(f"{where} has {length} bytes, expected {n} records of {record_size} bytes")
     return Section(name, unit, at + header_size, record_size, dtype, values), end
 
 
 def _skip_padding(file, path, at, size):
-    """Where the next section begins; the size of the file if there is none."""
+    """Position of the next section; the size of the file if there is none."""
     start = at
     while at < size:
         if at - start > _MOST_PADDING:
@@ -150,7 +150,7 @@ def _skip_padding(file, path, at, size):
         rest = block.lstrip(b"\0")
         at += len(block) - len(rest)
         if rest.startswith(_SECTION) or (len(rest) < 4 and at + len(rest) == size and _SECTION.startswith(rest)):
-            # a rest of less than four bytes is a section cut off, unless there is nothing
+            # fewer than four remaining bytes are a truncated section, none are the end of the file
             return at
         if rest and (len(rest) >= 4 or at + len(rest) == size):
             raise FileError(f"{str(path)!r}: expected a section ({_SECTION!r}) at byte {start}, got {rest[:4]!r}")
@@ -158,19 +158,19 @@ def _skip_padding(file, path, at, size):
 
 
 def _distinct(sections, path):
-    """Number the second and further sections of one name, with a warning."""
-    seen = set()
+    """Add a number to the names of further sections with the same name, with a warning."""
+    names = set()
     distinct = []
     for section in sections:
         name, count = section.name, 1
-        while name in seen:
+        while name in names:
             count += 1
             name = f"{section.name} ({count})"
         if count > 1:
             warnings.warn(
-                f"{str(path)!r}: a further section {section.name!r} is called {name!r}", DataWarning, stacklevel=7
+                f"{str(path)!r}: another section {section.name!r} is called {name!r}", DataWarning, stacklevel=7
             )
-        seen.add(name)
+        names.add(name)
         distinct.append(replace(section, name=name))
     return distinct
 

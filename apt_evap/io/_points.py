@@ -1,4 +1,4 @@
-"""Ions as points with data: what the formats for drawing share."""
+"""Ions as points with data, for the formats of visualisation programs."""
 
 import re
 import warnings
@@ -15,23 +15,24 @@ _NAMES = {"x": "detector_x", "y": "detector_y"}
 
 
 def points_and_data(path: AnyPath, hits: Hits) -> tuple[Booleans | slice, Floats, dict[str, NDArray[Any]]]:
-    """Positions, and the columns that go with them, of the ions to write.
+    """Positions and other columns of the ions to write.
 
     Parameters
     ----------
     path : str or path-like
         For messages.
     hits : Hits
-        Ions with positions; those whose positions are not finite are left out, with a warning that counts them.
+        Ions with positions. Ions without finite positions are left out, and a warning gives their number.
 
     Returns
     -------
     chosen : ndarray or slice
-        What selects the ions to write.
+        Selection of the ions to write.
     positions : ndarray, shape (n, 3)
         Positions [nm].
     data : dict of ndarray
-        The other columns by name, with the numbers of `extra`; detector coordinates are detector_x and detector_y.
+        Other columns by name, with the numeric columns of `extra`. Detector coordinates are called detector_x and
+        detector_y.
 
     Raises
     ------
@@ -40,13 +41,13 @@ def points_and_data(path: AnyPath, hits: Hits) -> tuple[Booleans | slice, Floats
     """
     (positions,) = hits.require("positions")
     finite = np.isfinite(positions).all(axis=1)
-    left = len(hits) - np.count_nonzero(finite)
-    reason = f"{left:,} of {len(hits):,} ions have positions that are not finite"
-    if left == len(hits):
-        raise ValueError(f"nothing to write to {str(path)!r}: {reason}")
-    if left:
-        warnings.warn(f"{str(path)!r} leaves out what has no place: {reason}", DataWarning, stacklevel=4)
-    chosen = finite if left else slice(None)
+    n_omitted = len(hits) - np.count_nonzero(finite)
+    reason = f"{n_omitted:,} of {len(hits):,} ions have positions that are not finite"
+    if n_omitted == len(hits):
+        raise ValueError(f"no ion to write to {str(path)!r}: {reason}")
+    if n_omitted:
+        warnings.warn(f"ions left out of {str(path)!r}: {reason}", DataWarning, stacklevel=4)
+    chosen = finite if n_omitted else slice(None)
     data = {_NAMES.get(name, name): getattr(hits, name) for name in hits.columns if name != "positions"}
     for name, values in hits.extra.items():
         if values.dtype.kind in "iuf":
@@ -55,7 +56,7 @@ def points_and_data(path: AnyPath, hits: Hits) -> tuple[Booleans | slice, Floats
 
 
 def _distinct(name, others):
-    """Make a word of letters, digits and underscores that is none of the others."""
+    """Return a word of letters, digits and underscores that differs from the others."""
     word = re.sub(r"[^0-9A-Za-z]+", "_", name).strip("_") or "column"
     word = "_" + word if word[0].isdigit() else word
     taken = {*others, "species", "pos"}

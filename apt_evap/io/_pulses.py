@@ -1,15 +1,15 @@
-"""Which ions share a pulse: the conventions of the formats, checked, and turned into pulse_id and multiplicity."""
+"""Pulses of the ions: checks of the conventions of the formats, and conversion to pulse_id and multiplicity."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apt_evap._common.types import Integers
 
-_BLOCK = 1 << 15  # rows that stay in the cache
+_BLOCK = 1 << 15  # rows that fit into the cache
 
 
 class PulseCheck:
-    """Whether a column holds n on the first ion of each pulse and 0 on the other n - 1, block by block."""
+    """Check, block by block, that a column has n for the first ion of each pulse and 0 for the other n - 1."""
 
     def __init__(self) -> None:
         self.rows = 0
@@ -20,7 +20,7 @@ class PulseCheck:
         self._example = ""
 
     def add(self, ions: NDArray[np.integer]) -> None:
-        """Go on with the next rows of the column."""
+        """Check the next rows of the column."""
         for start in range(0, len(ions), _BLOCK):
             self._add_block(ions[start : start + _BLOCK])
 
@@ -36,7 +36,7 @@ class PulseCheck:
         self.rows += len(ions)
 
     def _add_pulses(self, ions):
-        """Compare every pulse; ten times slower than `_consistent`, and knows which one is wrong."""
+        """Compare every pulse; ten times slower than `_consistent`, but finds the wrong pulse."""
         first = np.flatnonzero(ions)
         if len(first) == 0:
             return
@@ -54,10 +54,10 @@ class PulseCheck:
         self._last, self._announced = self.rows + int(first[-1]), int(announced[-1])
 
     def problem(self, cut: bool) -> str:
-        """Return what is wrong with the whole column, or ""; `cut` says that the end of the file is missing."""
+        """Return the problem of the whole column, or ""; `cut` if the end of the file is missing."""
         if self._last is None:
-            return "it is zero throughout"
-        # a file cut inside its last pulse still tells the size of it
+            return "it is zero for all ions"
+        # if a file is truncated in its last pulse, the size of this pulse is still known
         if not (cut and self._announced > self.rows - self._last):
             self._compare(self.rows - self._last)
         if self._first:
@@ -71,13 +71,13 @@ class PulseCheck:
     def _note(self, row, announced, size, count):
         if not self._wrong:
             self._example = (
-                f"row {row} announces {announced} ions in its pulse but the next pulse begins {size} rows later"
+                f"row {row} gives {announced} ions for its pulse but the next pulse begins {size} rows later"
             )
         self._wrong += count
 
 
 def _consistent(ions):
-    """Whether rows that begin with a pulse hold n on its first ion and 0 on the others; the last pulse may go on."""
+    """Whether rows that begin with a pulse have n for first ions and 0 for others; the last pulse may be incomplete."""
     several = np.flatnonzero(ions > 1)
     zeros = np.flatnonzero(ions == 0)
     followers = ions[several].astype(np.int64) - 1
@@ -87,16 +87,16 @@ def _consistent(ions):
         return False
     if (ions.dtype.kind == "i" and ions.min() < 0) or followers.sum() != len(zeros):
         return False
-    # few pulses hold several ions, so that where the zeros must be is told by these alone
+    # only pulses with several ions are needed to compute the places of the zeros, and these are few
     before = np.cumsum(followers) - followers
     return np.array_equal(np.repeat(several + 1 - before, followers) + np.arange(len(zeros)), zeros)
 
 
 def pulses_from_first(ions: NDArray[np.uint32], first_pulse: int = 0) -> tuple[Integers, NDArray[np.uint32]]:
-    """Pulse and multiplicity of every ion from n on the first ion of each pulse and 0 on the other n - 1.
+    """Pulse and multiplicity of every ion from n for the first ion of each pulse and 0 for the other n - 1.
 
-    The column begins with a pulse and was found consistent; the end of its last pulse may be missing. It becomes the
-    multiplicity in place.
+    The column must be consistent and begin with a pulse; the end of its last pulse may be missing. It is overwritten
+    with the multiplicity.
     """
     begins = ions != 0
     begins[0] = False
@@ -106,13 +106,13 @@ def pulses_from_first(ions: NDArray[np.uint32], first_pulse: int = 0) -> tuple[I
     several = ions[ions > 1]
     followers = np.flatnonzero(ions == 0)
     counts = several.astype(np.int64) - 1
-    counts[-1:] -= counts.sum() - len(followers)  # those of the last pulse that are missing
+    counts[-1:] -= counts.sum() - len(followers)  # missing ions of the last pulse
     ions[followers] = np.repeat(several, counts)
     return pulse_id, ions
 
 
 def first_from_equal(numbers: NDArray[np.integer]) -> NDArray[np.uint32]:
-    """Write n on the first ion of each run of equal numbers and 0 on the others."""
+    """Return n for the first of n consecutive equal numbers and 0 for the others."""
     ions = np.zeros(len(numbers), np.uint32)
     if len(numbers):
         first = np.flatnonzero(np.concatenate([[True], numbers[1:] != numbers[:-1]]))
@@ -121,7 +121,7 @@ def first_from_equal(numbers: NDArray[np.integer]) -> NDArray[np.uint32]:
 
 
 def first_from_every(multiplicity: NDArray[np.integer]) -> NDArray[np.uint32] | None:
-    """Turn n on every ion of a pulse into n on the first and 0 on the others; None where that cannot be."""
+    """Convert n for every ion of a pulse to n for the first and 0 for the others; None if this is not possible."""
     multiplicity = multiplicity.astype(np.int64)
     runs = first_from_equal(multiplicity)
     first = np.flatnonzero(runs)
@@ -133,6 +133,6 @@ def first_from_every(multiplicity: NDArray[np.integer]) -> NDArray[np.uint32] | 
 
 
 def whole_pulses(ions: NDArray[np.integer]) -> int:
-    """Count the rows in whole pulses, given rows that begin with a pulse (n on its first ion, 0 on the others)."""
+    """Number of rows in complete pulses, for rows that begin with a pulse (n for its first ion, 0 for the others)."""
     last = int(np.flatnonzero(ions)[-1])
     return len(ions) if len(ions) - last >= ions[last] else last

@@ -1,4 +1,4 @@
-"""Headerless files of 4-byte words in rows of one length: what .pos, .epos and .raw share."""
+"""Headerless files with rows of 4-byte words: common functions of .pos, .epos and .raw."""
 
 import os
 import warnings
@@ -22,7 +22,7 @@ _ORDERS = {"big": ">", "little": "<"}
 
 
 class Words:
-    """The rows of an open file: `n` whole ones, `cut` if the file ends in the middle of one more."""
+    """The rows of an open file: `n` complete rows; `cut` if the file ends in the middle of a further row."""
 
     def __init__(self, file: BinaryIO, path: AnyPath, words: int, order: str, n: int, cut: bool) -> None:
         self.n = n
@@ -32,24 +32,24 @@ class Words:
     def read(
         self, fields: Mapping[str, tuple[int, int, str]], start: int = 0, stop: int | None = None
     ) -> dict[str, NDArray[Any]]:
-        """Read columns, through a small buffer, into native arrays.
+        """Read columns through a small buffer into arrays of native byte order.
 
         Parameters
         ----------
         fields : dict
             First word, number of words and type ("f4" or "u4") of each column, by name.
         start, stop : int
-            Rows to read; all by default.
+            Range of rows; all by default.
 
         Returns
         -------
         dict of ndarray
-            Shape (rows,), or (rows, words) where a column has several words.
+            Shape (rows,), or (rows, words) for columns of several words.
 
         Raises
         ------
         TruncatedFile
-            If the file became shorter since it was opened.
+            If the file has become shorter since it was opened.
         """
         stop = self.n if stop is None else stop
         n = stop - start
@@ -59,31 +59,31 @@ class Words:
         for at in range(0, n, _CHUNK):
             rows = buffer[: min(_CHUNK, n - at)]
             if fill(self._file, rows) < rows.nbytes:
-                raise TruncatedFile(f"{str(self._path)!r} became shorter while it was read, expected {stop} ions")
+                raise TruncatedFile(f"{str(self._path)!r} became shorter during reading, expected {stop} ions")
             for name, (first, count, dtype) in fields.items():
                 column = columns[name][at : at + len(rows)].reshape(len(rows), count)
-                for word in range(count):  # a word at a time is faster than rows of three
+                for word in range(count):  # one word at a time is faster than rows of three
                     column[:, word] = rows.view(self._order + dtype)[:, first + word]
         return columns
 
     def survey(self, fields: dict[str, Any]) -> Iterator[dict[str, NDArray[Any]]]:
-        """Read the whole file in blocks of a size that stays in the cache."""
+        """Read the whole file in blocks that fit into the cache."""
         for start in range(0, self.n, _SURVEY):
             yield self.read(fields, start, min(start + _SURVEY, self.n))
 
     def blocks(self, fields: dict[str, Any], rows: int, keep: Callable[..., Any], ahead: int = 0) -> Iterator[Any]:
-        """Read blocks of at most `rows` ions that end with a pulse.
+        """Read blocks of at most `rows` ions in complete pulses.
 
         Parameters
         ----------
         fields : dict
             As for `read`.
         rows : int
-            Most ions of a block.
+            Maximum number of ions in a block.
         keep : callable
-            Takes the columns of a block, returns how many of its rows are in whole pulses.
+            Returns the number of rows in complete pulses for the columns of a block.
         ahead : int
-            Rows after a block that `keep` is shown too.
+            Number of rows after a block that are also passed to `keep`.
 
         Yields
         ------
@@ -93,11 +93,11 @@ class Words:
         while start < self.n:
             stop = min(start + rows, self.n)
             block = self.read(fields, start, min(stop + ahead, self.n))
-            kept = keep(block) if stop < self.n else stop - start
-            block = {name: values[:kept] for name, values in block.items()}
+            n = keep(block) if stop < self.n else stop - start
+            block = {name: values[:n] for name, values in block.items()}
             yield block
-            del block  # before the next one takes up memory, here and where it was taken
-            start += kept
+            del block  # frees the memory before the next block is read; the caller does the same
+            start += n
 
 
 @contextmanager
@@ -125,13 +125,13 @@ def open_words(
     order : {"big", "little"}
         Byte order of the format.
     floats : int
-        Number of words at the start of a row that are float32, by which the byte order is checked.
+        Number of words at the start of a row that are float32. The byte order is checked by their values.
     partial : bool
-        Read the whole ions of a file that ends in the middle of one.
+        Read the complete ions of a file that ends in the middle of an ion.
     byte_order : {None, "big", "little"}
-        None reads in the order of the format after a check that the file is in it.
+        None reads in the byte order of the format and checks it.
     rival : (str, int), optional
-        Name and row size of the format the file may be instead.
+        Name and row size of another format that the file may have.
 
     Yields
     ------
@@ -142,7 +142,7 @@ def open_words(
     FileError
         If the file is missing, unreadable, empty or in the wrong byte order.
     TruncatedFile
-        If the size is no multiple of `row_size` and `partial` is False.
+        If the size is not a multiple of `row_size` and `partial` is False.
     """
     check_switch(partial, "partial")
     if byte_order is not None:
@@ -156,11 +156,11 @@ def open_words(
         if tail and not partial:
             raise _wrong_size(path, size, row_size, kind, rival)
         if n == 0:
-            raise TruncatedFile(f"{str(path)!r} has {size} bytes, less than one ion of {kind} ({row_size} bytes)")
+            raise TruncatedFile(f"{str(path)!r} has {size} bytes, fewer than one ion of {kind} ({row_size} bytes)")
         if byte_order is None:
             rows = np.empty((min(n, _CHUNK), words), "u4")
             if fill(file, rows) < rows.nbytes:
-                raise TruncatedFile(f"{str(path)!r} became shorter while it was read, expected {size} bytes")
+                raise TruncatedFile(f"{str(path)!r} became shorter during reading, expected {size} bytes")
             _check_byte_order(path, rows[:, :floats], order)
         yield Words(file, path, words, _ORDERS[byte_order or order], n, bool(tail))
 
@@ -168,21 +168,21 @@ def open_words(
 def fill(file: Any, array: Any) -> int:
     """Read until `array` is full or the file ends; return the number of bytes."""
     target = memoryview(array).cast("B") if array.size else b""
-    done = 0
-    while done < len(target) and (got := file.readinto(target[done:])):
-        done += got
-    return done
+    at = 0
+    while at < len(target) and (n := file.readinto(target[at:])):
+        at += n
+    return at
 
 
 def check_columns(columns: str | Sequence[str] | None, available: Sequence[str], path: AnyPath) -> tuple[str, ...]:
-    """Return the names of the columns to read, or say which one the format does not have.
+    """Return the names of the columns to read.
 
     Parameters
     ----------
     columns : str or sequence of str, optional
-        What the user asked for; None is all.
+        Requested columns; None for all.
     available : sequence of str
-        What there is.
+        Columns of the file.
     path : str or path-like
         For the message.
 
@@ -193,7 +193,7 @@ def check_columns(columns: str | Sequence[str] | None, available: Sequence[str],
     Raises
     ------
     FileError
-        Naming the column and what there is.
+        Names an unavailable column and the available ones.
     """
     if columns is None:
         return tuple(available)
@@ -203,14 +203,14 @@ def check_columns(columns: str | Sequence[str] | None, available: Sequence[str],
         chosen = ()
     for name in chosen or (columns,):
         if name not in available:
-            raise FileError(f"{str(path)!r} has no column {short_text(name)}, expected some of {', '.join(available)}")
+            raise FileError(f"{str(path)!r} has no column {short_text(name)}, available are {', '.join(available)}")
     return chosen
 
 
 def choose_fields(
     columns: Any, available: Sequence[str], fields: dict[str, Any], path: AnyPath, also: dict[str, Any]
 ) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """Return the names of the columns to read, and the fields that takes.
+    """Return the names of the columns to read, and the required fields.
 
     Parameters
     ----------
@@ -219,7 +219,7 @@ def choose_fields(
     fields : dict
         All fields of the format by name, as for `Words.read`.
     also : dict
-        What else has to be read for a column, names by name.
+        Names of further fields needed for a column, by its name.
 
     Returns
     -------
@@ -232,13 +232,13 @@ def choose_fields(
 
 
 def check_any(chosen: Any, path: AnyPath) -> None:
-    """Complain if there is none of the columns asked for, a dict of name and array or None."""
+    """Raise an error if all requested columns, a dict of name and array or None, are absent."""
     if all(values is None for values in chosen.values()):
-        raise FileError(f"{str(path)!r} has nothing in {', '.join(chosen)}: absent or zero throughout")
+        raise FileError(f"{str(path)!r} has no data in {', '.join(chosen)}: absent, or zero for all ions")
 
 
 def choose(path: AnyPath, hits: Hits, columns: Any) -> Any:
-    """Choose the ions to write: those that hit and are finite, with a warning that counts the others.
+    """Select the ions to write: those that hit the detector and have finite values; warn with the number of others.
 
     Parameters
     ----------
@@ -252,12 +252,12 @@ def choose(path: AnyPath, hits: Hits, columns: Any) -> Any:
     Returns
     -------
     ndarray or slice
-        What selects the ions to write.
+        Selection of the ions to write.
 
     Raises
     ------
     ValueError
-        If no ion is left.
+        If there is no ion to write.
     """
     hit = np.ones(len(hits), bool) if hits.outcome is None else hits.outcome == Outcome.HIT
     finite = np.ones(len(hits), bool)
@@ -266,15 +266,16 @@ def choose(path: AnyPath, hits: Hits, columns: Any) -> Any:
             with np.errstate(over="ignore"):
                 good = np.isfinite(values.astype(np.float32, copy=False))
             finite &= good if good.ndim == 1 else good.all(axis=1)
-    missed, broken = np.count_nonzero(~hit), np.count_nonzero(hit & ~finite)
-    counted = (missed, "did not hit the detector"), (broken, "have values that are not finite")
-    reasons = " and ".join(f"{count:,} {what}" for count, what in counted if count)
-    if missed + broken == len(hits):
-        raise ValueError(f"nothing to write to {str(path)!r}: of {len(hits):,} ions {reasons}")
-    if missed + broken == 0:
+    n_missed, n_not_finite = np.count_nonzero(~hit), np.count_nonzero(hit & ~finite)
+    counts = (n_missed, "did not hit the detector"), (n_not_finite, "have values that are not finite")
+    reasons = " and ".join(f"{count:,} {what}" for count, what in counts if count)
+    n_omitted = n_missed + n_not_finite
+    if n_omitted == len(hits):
+        raise ValueError(f"no ion to write to {str(path)!r}: of {len(hits):,} ions {reasons}")
+    if n_omitted == 0:
         return slice(None)
     warnings.warn(
-        f"{str(path)!r} leaves out {missed + broken:,} of {len(hits):,} ions: {reasons}", DataWarning, stacklevel=4
+        f"{n_omitted:,} of {len(hits):,} ions left out of {str(path)!r}: {reasons}", DataWarning, stacklevel=4
     )
     return hit & finite
 
@@ -285,13 +286,13 @@ def write_words(path: AnyPath, columns: Any, row_size: int, chosen: Any) -> None
     Parameters
     ----------
     path : str or path-like
-        The file; an existing one is replaced once the new one is complete.
+        The file; an existing one is replaced when the new one is complete.
     columns : sequence of (int, ndarray or None, str)
         First word, values of shape (n,) or (n, words) and type ("f4" or "u4"); None is written as zeros.
     row_size : int
         Bytes per ion.
     chosen : ndarray or slice
-        Selects the ions to write.
+        Selection of the ions to write.
 
     Raises
     ------
@@ -311,32 +312,35 @@ def write_words(path: AnyPath, columns: Any, row_size: int, chosen: Any) -> None
 
 def _wrong_size(path, size, row_size, kind, rival):
     n, tail = divmod(size, row_size)
-    advice = f"{argument('partial', True)} reads the whole ones"
+    advice = f"{argument('partial', True)} reads the complete ions"
     if rival and size % rival[1] == 0:
-        # a copy cut at a block of the disk has a size that fits a .pos, too
+        # an incomplete copy often ends at a block of the disk, a size that also fits a .pos
         kind_too = rival[0].split()[-1]
         advice += (
-            f"; or it is probably {rival[0]}, whose {rival[1]} bytes fit ({argument('format', kind_too)} reads it so)"
+            f"; its size fits the {rival[1]} bytes per ion of {rival[0]} ({argument('format', kind_too)} reads it so)"
         )
     return TruncatedFile(
-        f"{str(path)!r} ends in the middle of an ion: {n} whole ions of {row_size} bytes as in {kind} and "
-        f"{tail} bytes more; {advice}"
+        f"{str(path)!r} ends in the middle of an ion: {n} complete ions of {row_size} bytes as in {kind} and "
+        f"{tail} further bytes; {advice}"
     )
 
 
 def _check_byte_order(path, words, order):
-    """Complain if the first rows look saner in the other byte order."""
+    """Raise an error if the values of the first rows are more plausible in the other byte order."""
     other = "little" if order == "big" else "big"
     if _absurd(words.view(_ORDERS[order] + "f4")) > _absurd(words.view(_ORDERS[other] + "f4")):
         raise FileError(
-            f"{str(path)!r} looks {other}-endian (as {order}-endian its first row is "
+            f"{str(path)!r} appears to be {other}-endian (as {order}-endian its first row is "
             f"{words.view(_ORDERS[order] + 'f4')[0].tolist()}), expected {order}-endian; "
-            f"{argument('byte_order', other)} reads it, {argument('byte_order', order)} reads it as it stands"
+            f"{argument('byte_order', other)} reads it; {argument('byte_order', order)} skips this check"
         )
 
 
 def _absurd(values):
-    """Count values that no position [nm], mass [Da], time [ns] or voltage [V] has: huge, denormal or not finite."""
+    """Number of values that are impossible for positions [nm], masses [Da], times [ns] and voltages [V].
+
+    These are very large, denormal, or not finite.
+    """
     with np.errstate(invalid="ignore"):
         size = np.abs(values.astype(np.float32))
         return np.count_nonzero(~(size <= 1e6) | ((size > 0) & (size < np.finfo(np.float32).tiny)))

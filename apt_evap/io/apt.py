@@ -1,7 +1,7 @@
-"""The .apt exchange format of CAMECA: a header, then sections of one column each, little-endian.
+"""The .apt exchange format of CAMECA: a header, then sections with one column each, little-endian.
 
-Larson et al., Local Electrode Atom Probe Tomography (Springer, 2013), and the layout of files as IVAS and AP Suite
-write them. Any section of fixed records, one to an ion, is read; the others are named in a warning.
+Larson et al., Local Electrode Atom Probe Tomography (Springer, 2013), and the layout of files of IVAS and AP Suite.
+All sections with one fixed record per ion are read; the others are named in a warning.
 """
 
 import math
@@ -21,7 +21,7 @@ from apt_evap.io._apt_sections import read_sections
 from apt_evap.io._pulses import PulseCheck, first_from_every, pulses_from_first, whole_pulses
 from apt_evap.io._records import check_columns, fill
 
-# sections, in small letters, that are columns of Hits: name, number of values per ion, unit
+# sections, in lower case, that are columns of Hits: name, number of values per ion, unit
 _KNOWN = {
     "tofc": ("time_of_flight", 1, "ns"),
     "mass": ("mass_to_charge", 1, "Da"),
@@ -44,7 +44,7 @@ _UNITS = {
 
 @dataclass
 class _Column:
-    """A section and where it goes: a name of Hits, or None for `extra`; factor to its unit; which of the values."""
+    """A section and its target: a column of Hits, or None for `extra`; conversion factor; index of the value."""
 
     section: object
     target: str | None
@@ -55,29 +55,31 @@ class _Column:
 def read_apt(path: AnyPath, *, columns: Sequence[str] | None = None, partial: bool = False) -> Hits:
     """Read an .apt file.
 
-    The sections tofc, Mass, XDet_mm and YDet_mm (or Detector Coordinates), Position and Multiplicity become columns
-    of `Hits`, in its units. All others, and one of these whose unit is not known, are in ``extra`` under their own
-    names, as they are in the file, and their units in ``units``. A second section of a name is called "name (2)".
+    The sections tofc, Mass, XDet_mm and YDet_mm (or Detector Coordinates), Position and Multiplicity are converted to
+    columns of `Hits`, in its units. All other sections, and those with an unknown unit, are stored unchanged in
+    ``extra`` under their own names, with their units in ``units``. A second section with the same name is called
+    "name (2)".
 
     Parameters
     ----------
     path : str or path-like
         The file.
     columns : sequence of str, optional
-        Columns of `Hits` and names of sections to read, so that only these take up memory; all by default.
+        Columns of `Hits` and names of sections to read; only these are kept in memory. All by default.
     partial : bool
-        Read the whole sections of a file that ends in the middle of one.
+        Read the complete sections of a file that ends in the middle of a section.
 
     Returns
     -------
     Hits
-        pulse_id and multiplicity come from Multiplicity, which may hold the ions of the pulse on every ion or on
-        the first one, with 0 on the others. If it fits neither it is in ``extra``, with a warning.
+        `pulse_id` and `multiplicity` are computed from Multiplicity, which may contain the number of ions of a pulse
+        for all its ions, or for the first ion only, with 0 for the others. Otherwise it is stored in ``extra``, with a
+        warning.
 
     Raises
     ------
     FileError
-        If the file is missing, unreadable, damaged or holds no ion, or has no such column.
+        If the file is missing, unreadable, damaged or contains no ion, or has no such column.
     TruncatedFile
         If it ends in the middle of a section and `partial` is False.
     """
@@ -89,9 +91,9 @@ def read_apt(path: AnyPath, *, columns: Sequence[str] | None = None, partial: bo
 def chunk_apt(
     path: AnyPath, rows: int, *, columns: Sequence[str] | None = None, partial: bool = False
 ) -> Iterator[Hits]:
-    """Read an .apt file in `Hits` of at most `rows` ions, one after the other, in whole pulses; else as `read_apt`.
+    """Read an .apt file in `Hits` of at most `rows` ions in complete pulses; otherwise as `read_apt`.
 
-    The multiplicity of all ions is held in memory, 4 bytes per ion. Without one, chunks are of `rows` ions.
+    The multiplicity of all ions is kept in memory (4 bytes per ion). Without multiplicity, chunks have `rows` ions.
 
     Yields
     ------
@@ -100,13 +102,13 @@ def chunk_apt(
     Raises
     ------
     ValueError
-        If `rows` is less than the ions of one pulse.
+        If `rows` is less than the number of ions of one pulse.
     """
     with _open(path, columns, partial, chunks=True) as (file, n, chosen, grouping):
         ions = _ions(file, path, grouping, n) if grouping else None
         if ions is not None and rows < ions.max():
             raise ValueError(
-                f"rows must be at least {ions.max()}, the ions of the largest pulse of {str(path)!r}, got {rows}"
+                f"rows must be >= {ions.max()}, the number of ions in the largest pulse of {str(path)!r}, got {rows}"
             )
         start = first_pulse = 0
         while start < n:
@@ -123,37 +125,38 @@ def chunk_apt(
 
 @contextmanager
 def _open(path, columns, partial, chunks=False):
-    """Open a file; yield it with the number of ions, the columns to read, and the section of multiplicities."""
+    """Open a file; yield it with the number of ions, the columns to read, and the multiplicity section."""
     with open_for_reading(path) as file:
         n, sections = read_sections(file, path, partial)
-        found = _assign(sections, path)
-        names = dict.fromkeys(column.target or column.section.name for column in found)
+        available = _assign(sections, path)
+        names = dict.fromkeys(column.target or column.section.name for column in available)
         if "multiplicity" in names:
             names["pulse_id"] = None
-        wanted = check_columns(columns, tuple(names), path)
+        requested = check_columns(columns, tuple(names), path)
         grouping = None
         chosen = []
-        for column in found:
-            grouped = column.target == "multiplicity"
-            if grouped and (chunks or {"multiplicity", "pulse_id"} & set(wanted)):
-                grouping = _Grouping(column.section, [name for name in ("multiplicity", "pulse_id") if name in wanted])
-            elif not grouped and (column.target or column.section.name) in wanted:
+        for column in available:
+            is_grouping = column.target == "multiplicity"
+            if is_grouping and (chunks or {"multiplicity", "pulse_id"} & set(requested)):
+                pulse_columns = [name for name in ("multiplicity", "pulse_id") if name in requested]
+                grouping = _Grouping(column.section, pulse_columns)
+            elif not is_grouping and (column.target or column.section.name) in requested:
                 chosen.append(column)
         yield file, n, chosen, grouping
 
 
 @dataclass
 class _Grouping:
-    """The section of multiplicities, and which of the columns made of it are wanted."""
+    """The multiplicity section, and the requested columns that are computed from it."""
 
     section: object
-    wanted: list
+    columns: list
 
 
 def _assign(sections, path):
-    """Say for every section where it goes."""
-    found = []
-    taken = set()
+    """Targets of all sections."""
+    assigned = []
+    targets = set()
     names = {section.name.casefold() for section in sections}
     for section in sections:
         name = section.name.casefold()
@@ -170,30 +173,30 @@ def _assign(sections, path):
             problem = f"values of type {section.dtype}"
         if problem:
             warnings.warn(
-                f"{str(path)!r}: section {section.name!r} has {problem}, so it is in extra and not {columns[0][0]}",
+                f"{str(path)!r}: section {section.name!r} has {problem}, so it is stored in extra, not {columns[0][0]}",
                 DataWarning,
                 stacklevel=5,
             )
-        if problem or not columns or taken & {target for target, _, _ in columns}:
-            found.append(_Column(section, None))
+        if problem or not columns or targets & {target for target, _, _ in columns}:
+            assigned.append(_Column(section, None))
             continue
         for index, ((target, values, _), factor) in enumerate(zip(columns, factors, strict=True)):
-            taken.add(target)
-            found.append(_Column(section, target, factor, index if values == 2 else None))
-    return found
+            targets.add(target)
+            assigned.append(_Column(section, target, factor, index if values == 2 else None))
+    return assigned
 
 
-def _factor(unit, wanted):
-    """What turns one unit into another; None if that cannot be said."""
-    if wanted is None:
+def _factor(unit, target):
+    """Conversion factor between two units; None if it is not known."""
+    if target is None:
         return 1.0
     dimension, power = _UNITS.get(unit, (None, 0))
-    wanted_dimension, wanted_power = _UNITS[wanted]
-    return 10.0 ** (power - wanted_power) if dimension == wanted_dimension else None
+    target_dimension, target_power = _UNITS[target]
+    return 10.0 ** (power - target_power) if dimension == target_dimension else None
 
 
 def _ions(file, path, grouping, n):
-    """Ions per pulse on the first ion of each and 0 on the others; None, with a warning, if unclear."""
+    """Ions per pulse for the first ion of each pulse and 0 for the others; None, with a warning, if inconsistent."""
     numbers = _values(file, path, grouping.section, 0, n)
     check = PulseCheck()
     check.add(numbers)
@@ -203,8 +206,8 @@ def _ions(file, path, grouping, n):
     ions = first_from_every(numbers)
     if ions is None:
         warnings.warn(
-            f"{str(path)!r} does not tell which ions share a pulse, so its Multiplicity is in extra: "
-            f"neither every ion nor the first one of each pulse holds the number of ions in it ({problem})",
+            f"{str(path)!r}: pulses unknown, so its Multiplicity is stored in extra: it does not contain the number of "
+            f"ions of each pulse, neither for all ions nor for the first ion only ({problem})",
             DataWarning,
             stacklevel=4,
         )
@@ -228,9 +231,9 @@ def _hits(file, path, chosen, grouping, ions, start, stop, first_pulse=0):
         columns[column.target] = part
     if grouping and ions is not None:
         pulse_id, multiplicity = pulses_from_first(ions, first_pulse)
-        made = {"pulse_id": pulse_id, "multiplicity": multiplicity}
-        columns.update({name: made[name] for name in grouping.wanted})
-    elif grouping and grouping.wanted:
+        by_name = {"pulse_id": pulse_id, "multiplicity": multiplicity}
+        columns.update({name: by_name[name] for name in grouping.columns})
+    elif grouping and grouping.columns:
         section = grouping.section
         extra[section.name], units[section.name] = _values(file, path, section, start, stop), section.unit
     return Hits(**columns, extra=extra, units=units, source=str(path))
@@ -243,5 +246,5 @@ def _values(file, path, section, start, stop):
     file.seek(section.data + start * section.record_size)
     if fill(file, values.view(np.uint8)) < math.prod(shape) * section.dtype.itemsize:
         size = os.fstat(file.fileno()).st_size
-        raise TruncatedFile(f"{str(path)!r} became shorter while it was read, it has {size} bytes now")
+        raise TruncatedFile(f"{str(path)!r} became shorter during reading, it now has {size} bytes")
     return values.astype(section.dtype.newbyteorder("="), copy=False)

@@ -1,7 +1,7 @@
 """The .epos format: a .pos with time of flight, voltages, detector and pulses, 44 bytes per ion, big-endian.
 
-Larson et al., Local Electrode Atom Probe Tomography (Springer, 2013), appendix A; voltages are in V and
-detector coordinates in mm in real files, against the units printed there.
+Larson et al., Local Electrode Atom Probe Tomography (Springer, 2013), appendix A. Real files contain voltages in V and
+detector coordinates in mm, in contrast to the units printed there.
 """
 
 import warnings
@@ -29,7 +29,7 @@ _FIELDS = {
     "ions": (10, 1, "u4"),
 }
 _COLUMNS = (*tuple(_FIELDS)[:-1], "pulse_id", "multiplicity")
-# what else has to be read to know whether a column is there, and its unit
+# further fields needed to find out whether a column is absent, and its unit
 _WITH = {"x": ("y",), "y": ("x",), "pulse_voltage": ("voltage",), "pulse_id": ("ions",), "multiplicity": ("ions",)}
 
 
@@ -38,33 +38,33 @@ def read_epos(
 ) -> Hits:
     """Read an .epos file.
 
-    A column of zeros counts as absent (None): positions, mass, time of flight, standing voltage, and detector
-    coordinates where both are zero. A pulse voltage of zero is kept where there is a standing voltage (laser
-    pulsing). Pulses since the last event are kept even if zero, and never used to group ions.
+    A column of zeros is treated as absent (None): positions, mass, time of flight, standing voltage, and detector
+    coordinates if both are zero. A pulse voltage of zero is read if there is a standing voltage (laser pulsing). The
+    column of pulses since the last event is read even if it is zero, and is not used to group ions.
 
     Parameters
     ----------
     path : str or path-like
         The file.
     columns : sequence of str, optional
-        Names of the columns of `Hits` to read, so that only these take up memory; all by default.
+        Names of the columns of `Hits` to read; only these are kept in memory. All by default.
     partial : bool
-        Read the whole ions of a file that ends in the middle of one.
+        Read the complete ions of a file that ends in the middle of an ion.
     byte_order : {None, "big", "little"}
-        None reads big-endian after a check that the file is.
+        None reads big-endian and checks the byte order.
 
     Returns
     -------
     Hits
-        pulse_id and multiplicity come from the last column alone; they are None, with a warning, if it
-        contradicts itself. Voltages below 100 throughout are taken for kV and turned into V.
+        `pulse_id` and `multiplicity` are computed from the last column alone. If it is inconsistent, they are None,
+        with a warning. If all voltages are below 100, they are interpreted as kV and converted to V.
 
     Raises
     ------
     FileError
         If the file is missing, unreadable, empty or in the wrong byte order, or has no such column.
     TruncatedFile
-        If the size is no multiple of 44 bytes and `partial` is False.
+        If the size is not a multiple of 44 bytes and `partial` is False.
     """
     chosen, fields = choose_fields(columns, _COLUMNS, _FIELDS, path, _WITH)
     with _open(path, partial, byte_order) as words:
@@ -83,10 +83,10 @@ def chunk_epos(
     partial: bool = False,
     byte_order: str | None = None,
 ) -> Iterator[Hits]:
-    """Read an .epos file in `Hits` of at most `rows` ions, one after the other, in whole pulses.
+    """Read an .epos file in `Hits` of at most `rows` ions in complete pulses; otherwise as `read_epos`.
 
-    The file is read twice: what is absent, the unit of the voltages and whether the pulses are consistent is
-    known only at its end. If they are not, chunks are of `rows` ions whatever the pulses. Otherwise as `read_epos`.
+    The file is read twice: only the complete file shows which columns are absent, the unit of the voltages, and
+    whether the pulses are consistent. If they are not, chunks have `rows` ions regardless of the pulses.
 
     Yields
     ------
@@ -95,7 +95,7 @@ def chunk_epos(
     Raises
     ------
     ValueError
-        If `rows` is less than the ions of one pulse.
+        If `rows` is less than the number of ions of one pulse.
     """
     chosen, fields = choose_fields(columns, _COLUMNS, _FIELDS, path, _WITH)
     fields = {**fields, "ions": _FIELDS["ions"]}
@@ -108,18 +108,18 @@ def chunk_epos(
 
         def too_few(largest):
             return ValueError(
-                f"rows must be at least {largest}, the ions of the largest pulse of {str(path)!r}, got {rows}"
+                f"rows must be >= {largest}, the number of ions in the largest pulse of {str(path)!r}, got {rows}"
             )
 
         def keep(block):
             if not survey.grouped:
                 return rows
-            kept = whole_pulses(block["ions"])
-            if kept == 0:
+            n = whole_pulses(block["ions"])
+            if n == 0:
                 raise too_few(block["ions"][0])
-            return kept
+            return n
 
-        # the last pulse of a truncated file may be announced larger than what is left of it
+        # the last pulse of a truncated file may have fewer rows than ions
         if survey.grouped and rows < survey.pulses.largest and not words.cut:
             raise too_few(survey.pulses.largest)
         first_pulse = 0
@@ -131,7 +131,7 @@ def chunk_epos(
 
 
 class _Survey:
-    """What only the whole file tells: columns of zeros, kilovolts, and whether the pulses are consistent."""
+    """Properties of the complete file: columns of zeros, unit of the voltages, consistency of the pulses."""
 
     def __init__(self) -> None:
         self.present = set()
@@ -141,19 +141,19 @@ class _Survey:
 
     @np.errstate(invalid="ignore")
     def add(self, block: Any) -> None:
-        """Go on with the next rows."""
+        """Include the next rows."""
         for name, values in block.items():
-            # mostly the first rows tell
+            # usually the first rows are sufficient
             if name not in self.present and (values[:64].any() or values.any()):
                 self.present.add(name)
             if name in ("voltage", "pulse_voltage"):
-                # fmax passes over NaN
+                # fmax ignores NaN
                 self.highest[name] = np.fmax(self.highest.get(name, np.nan), np.fmax.reduce(values))
         if "ions" in block:
             self.pulses.add(block["ions"])
 
     def end(self, cut: bool, path: AnyPath) -> Any:
-        """Conclude, and warn of pulses that contradict themselves."""
+        """Evaluate the complete file, and warn if the pulses are inconsistent."""
         if self.present & {"x", "y"}:
             self.present |= {"x", "y"}
         decisive = "voltage" if "voltage" in self.present else "pulse_voltage"
@@ -166,15 +166,15 @@ class _Survey:
             self.grouped = not problem
             if problem:
                 warnings.warn(
-                    f"{str(path)!r} does not tell which ions share a pulse, so pulse_id and multiplicity are None: "
-                    f"the ions-per-pulse column is not consistent, {problem}",
+                    f"{str(path)!r}: pulses unknown, so pulse_id and multiplicity are None: the column of ions per "
+                    f"pulse is inconsistent, {problem}",
                     DataWarning,
                     stacklevel=5,
                 )
 
 
 def _hits(block, survey, chosen, path, first_pulse=0):
-    """Make Hits of a block of whole pulses."""
+    """Hits of a block of complete pulses."""
     columns = {name: values for name, values in block.items() if name in survey.present}
     if survey.kilovolts:
         with np.errstate(over="ignore"):
@@ -182,9 +182,9 @@ def _hits(block, survey, chosen, path, first_pulse=0):
                 columns[name] = columns[name] * np.float32(1000)
     if survey.grouped and {"pulse_id", "multiplicity"} & set(chosen):
         columns["pulse_id"], columns["multiplicity"] = pulses_from_first(block["ions"], first_pulse)
-    wanted = {name: columns.get(name) for name in chosen}
-    check_any(wanted, path)
-    return Hits(**wanted, source=str(path))
+    requested = {name: columns.get(name) for name in chosen}
+    check_any(requested, path)
+    return Hits(**requested, source=str(path))
 
 
 def _open(path, partial, byte_order):
@@ -192,23 +192,23 @@ def _open(path, partial, byte_order):
 
 
 def write_epos(path: AnyPath, hits: Hits) -> None:
-    """Write an .epos file; a warning counts the ions left out.
+    """Write an .epos file.
 
-    Left out are ions that did not hit the detector and ions with a value that is not finite. Missing columns
-    are written as zeros. The number of ions per pulse is counted anew from pulse_id over the ions written, in
-    runs of equal pulse_id; simulated ions without pulse_id are one to a pulse.
+    Ions that did not hit the detector and ions with a value that is not finite are left out, and a warning gives their
+    number. Missing columns are written as zeros. The number of ions per pulse is recomputed for the written ions:
+    consecutive ions with the same `pulse_id` are one pulse. Each simulated ion without `pulse_id` is one pulse.
 
     Parameters
     ----------
     path : str or path-like
-        The file; an existing one is replaced once the new one is complete.
+        The file; an existing one is replaced when the new one is complete.
     hits : Hits
         The ions.
 
     Raises
     ------
     ValueError
-        If no ion is left to write.
+        If there is no ion to write.
     FileError
         If the file cannot be written.
     """

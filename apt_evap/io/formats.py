@@ -1,6 +1,6 @@
-"""Files of ions: one module per format, and `read` and `write` that choose among them.
+"""Reading and writing of ions in all formats; `read` and `write` select the format.
 
-A further format is one module with a reader (and a writer, if it can be written) and one line in `FORMATS`.
+A new format needs one module with a reader, a writer or both, and one line in `FORMATS`.
 """
 
 import inspect
@@ -28,7 +28,7 @@ __all__ = ["FORMATS", "FileError", "Format", "TruncatedFile", "chunks", "read", 
 
 @dataclass(frozen=True)
 class Format:
-    """A file format: its suffix (also its name), the bytes it begins with, its reader, its writer, its chunks."""
+    """A file format: suffix (also its name), first bytes, reader, writer, and reader in chunks."""
 
     suffix: str
     signature: bytes | None
@@ -38,7 +38,7 @@ class Format:
 
 
 def _read_run(path):
-    # a Run is loaded only on demand, so that reading a .pos does not import the simulation
+    # imported on demand, so that reading a .pos does not import the simulation
     from apt_evap.simulation.run import load
 
     return load(path)
@@ -57,31 +57,30 @@ FORMATS = (
 
 
 def read(path: AnyPath, *, format: str | None = None, columns: Sequence[str] | None = None, **options: Any) -> Any:
-    """Read a file of ions; its first bytes tell the format where they can, its suffix otherwise.
+    """Read a file of ions. The format is recognised by the first bytes if possible, otherwise by the suffix.
 
     Parameters
     ----------
     path : str or path-like
         The file: .pos, .epos, .apt, .raw, .h5 or .npz.
     format : str, optional
-        Suffix of the format to read it as, such as ".pos", whatever the file is called.
+        Suffix of the format, such as ".pos", for any name of the file.
     columns : sequence of str, optional
-        Names of the columns to read, so that only these take up memory; all by default. Not for .h5 and
-        .npz.
+        Names of the columns to read; only these are kept in memory. All by default. Not for .h5 and .npz.
     **options
-        Passed to the reader of the format: ``partial=True`` reads the whole ions of a truncated file (the whole
-        sections of an .apt), ``byte_order="little"`` a .pos or .epos written in the wrong byte order; those of
-        `read_map` for an .npz.
+        Options of the reader of the format: ``partial=True`` reads the complete ions of a truncated file (the complete
+        sections of an .apt), ``byte_order="little"`` a .pos or .epos in the wrong byte order; for an .npz the options
+        of `read_map`.
 
     Returns
     -------
     Hits
-        The ions; for a simulation's .h5 the `Run`, whose ``hits`` method gives them; for an .npz the `DetectorMap`.
+        The ions; for the .h5 of a simulation a `Run`, with the method `Run.hits`; for an .npz a `DetectorMap`.
 
     Raises
     ------
     FileError
-        If the file is missing, unreadable, empty or of unknown format, or an option or column does not exist for it.
+        If the file is missing, unreadable, empty or of unknown format, or if an option or column does not exist.
     TruncatedFile
         If it ends in the middle of an ion.
     """
@@ -92,67 +91,68 @@ def read(path: AnyPath, *, format: str | None = None, columns: Sequence[str] | N
 def chunks(
     path: AnyPath, rows: int, *, format: str | None = None, columns: Sequence[str] | None = None, **options: Any
 ) -> Iterator[Hits]:
-    """Read a file of ions that need not fit into memory, in whole pulses.
+    """Read a file of ions that is larger than the memory, in chunks of complete pulses.
 
-    The chunks joined are what `read` gives: pulse_id goes on from chunk to chunk, and what counts as absent is told by
-    the whole file.
+    All chunks together are the same as the result of `read`: `pulse_id` continues from chunk to chunk, and a column is
+    absent only if it is absent in the complete file.
 
     Parameters
     ----------
     path : str or path-like
         The file: .pos, .epos, .apt or .raw.
     rows : int
-        Most ions in a chunk; as many as the largest pulse has, at least.
+        Maximum number of ions in a chunk; not less than the number of ions in the largest pulse.
     format, columns, **options
         As for `read`.
 
     Returns
     -------
     iterator of Hits
-        The ions in the order of the file. Errors of the file are raised when the first chunk is asked for.
+        The ions in the order of the file. Errors of the file are raised when the first chunk is requested.
 
     Raises
     ------
     FileError
-        As `read` does, and for a format that is not read in chunks.
+        As for `read`, and for a format that cannot be read in chunks.
     ValueError
-        If `rows` is no whole number above 0, or less than the ions of one pulse.
+        If `rows` is not an integer >= 1, or less than the number of ions of one pulse.
     """
     rows = check_count(rows, "rows", at_least=1)
     chosen = _to_read(path, format)
     if chosen.chunks is None:
-        raise FileError(f"{str(path)!r} cannot be read in chunks: a {chosen.suffix} file is read whole")
+        raise FileError(f"{str(path)!r} cannot be read in chunks: the format {chosen.suffix} does not support it")
     return chosen.chunks(path, rows, **_options(path, chosen, chosen.chunks, columns, options))
 
 
 def write(path: AnyPath, hits: Hits, *, format: str | None = None, **options: Any) -> None:
-    """Write ions to a file whose suffix tells the format; a warning counts the ions left out.
+    """Write ions to a file; the suffix selects the format.
 
     Parameters
     ----------
     path : str or path-like
-        The file, .pos, .epos, .xyz or .vtp; an existing one is replaced once the new one is complete.
+        The file, .pos, .epos, .xyz or .vtp; an existing one is replaced when the new one is complete.
     hits : Hits
-        The ions. Left out are, of a .pos or .epos, those that missed the detector or have values that are not finite;
-        of an .xyz or .vtp, those whose positions are not finite.
+        The ions. A .pos or .epos does not contain ions that did not hit the detector or have values that are not
+        finite; an .xyz or .vtp does not contain ions whose positions are not finite. A warning gives the number of
+        ions left out.
     format : str, optional
-        Suffix of the format to write, such as ".pos", whatever the file is called.
+        Suffix of the format, such as ".pos", for any name of the file.
     **options
-        Passed to the writer of the format: ``species`` names the ions of an .xyz.
+        Options of the writer of the format: ``species`` gives the species of the ions in an .xyz.
 
     Raises
     ------
     FileError
         If the format is unknown or cannot be written, or the file cannot be written.
     ValueError
-        If a column the format cannot do without is missing, or no ion is left to write.
+        If a column that the format requires is missing, or there is no ion to write.
     """
     chosen = _by_suffix(path, format, "write")
     if chosen.write is None:
-        reason = "holds a Run (run.save)" if chosen.suffix == ".h5" else "is only read"
+        reason = "contains a Run (run.save)" if chosen.suffix == ".h5" else "can only be read"
         raise FileError(f"hits cannot be written to {str(path)!r}: a {chosen.suffix} file {reason}")
     if not isinstance(hits, Hits):
-        raise ValueError(f"hits must be Hits, such as run.hits(perturbation) gives, got {short_text(hits)}")
+        raise ValueError(f"hits must be Hits, such as run.hits(perturbation), got {short_text(hits)}")
     _check_options(path, chosen, "writing", _known(chosen.write, "hits"), options)
     chosen.write(path, hits, **options)
 
@@ -166,20 +166,20 @@ def _to_read(path, format):
         if chosen.read is None:
             known = _suffixes("read")
             raise FileError(
-                f"{str(path)!r} cannot be read, only written, by its suffix {chosen.suffix!r}, expected one of {known}"
+                f"{str(path)!r} cannot be read: suffix {chosen.suffix!r} can only be written, expected one of {known}"
             )
         if format is None and chosen.signature is not None:
             if not head:
                 raise FileError(f"{str(path)!r} is empty (0 bytes), expected a {chosen.suffix} file")
             raise FileError(
-                f"{str(path)!r} does not begin as a {chosen.suffix} file does, "
+                f"{str(path)!r} does not begin like a {chosen.suffix} file, "
                 f"expected {chosen.signature!r}, got {head[: len(chosen.signature)]!r}"
             )
     return chosen
 
 
 def _options(path, chosen, reader, columns, options):
-    """Options for the reader, checked."""
+    """Check the options of the reader and return them."""
     _check_options(path, chosen, "reading", [name for name in _known(reader, "rows") if name != "columns"], options)
     if columns is None:
         return options
@@ -217,5 +217,5 @@ def _by_suffix(path, format, doing):
     for candidate in FORMATS:
         if candidate.suffix == suffix.lower():
             return candidate
-    told = f"its suffix {suffix!r}" if format is None else argument("format", format)
-    raise FileError(f"the format of {str(path)!r} is not known from {told}, expected one of {_suffixes(doing)}")
+    source = f"suffix {suffix!r}" if format is None else argument("format", format)
+    raise FileError(f"unknown format of {str(path)!r} ({source}), expected one of {_suffixes(doing)}")

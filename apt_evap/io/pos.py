@@ -25,9 +25,9 @@ def read_pos(
     columns : sequence of str, optional
         Names of the columns to read, "positions" and "mass_to_charge"; all by default.
     partial : bool
-        Read the whole ions of a file that ends in the middle of one.
+        Read the complete ions of a file that ends in the middle of an ion.
     byte_order : {None, "big", "little"}
-        None reads big-endian after a check that the file is.
+        None reads big-endian and checks the byte order.
 
     Returns
     -------
@@ -39,7 +39,7 @@ def read_pos(
     FileError
         If the file is missing, unreadable, empty or in the wrong byte order, or has no such column.
     TruncatedFile
-        If the size is no multiple of 16 bytes and `partial` is False.
+        If the size is not a multiple of 16 bytes and `partial` is False.
     """
     fields = _chosen(columns, path)
     with _open(path, partial, byte_order) as words:
@@ -54,7 +54,7 @@ def chunk_pos(
     partial: bool = False,
     byte_order: str | None = None,
 ) -> Iterator[Hits]:
-    """Read a .pos file in `Hits` of at most `rows` ions, one after the other; otherwise as `read_pos`.
+    """Read a .pos file in `Hits` of at most `rows` ions; otherwise as `read_pos`.
 
     Yields
     ------
@@ -67,21 +67,22 @@ def chunk_pos(
 
 
 def write_pos(path: AnyPath, hits: Hits) -> None:
-    """Write a .pos file; a warning counts the ions left out.
+    """Write a .pos file.
 
-    Left out are ions that did not hit the detector and ions whose position or mass is not finite.
+    Ions that did not hit the detector and ions whose position or mass is not finite are left out, and a warning gives
+    their number.
 
     Parameters
     ----------
     path : str or path-like
-        The file; an existing one is replaced once the new one is complete.
+        The file; an existing one is replaced when the new one is complete.
     hits : Hits
-        Ions with positions; without mass_to_charge zeros are written.
+        Ions with positions; if there is no mass_to_charge, zeros are written.
 
     Raises
     ------
     ValueError
-        If there are no positions, or no ion is left to write.
+        If there are no positions, or no ion to write.
     FileError
         If the file cannot be written.
     """

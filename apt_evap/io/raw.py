@@ -1,4 +1,4 @@
-"""The .raw format of Stuttgart's atom probes: voltages, detector, time of flight and pulse, 32 bytes per ion.
+"""The .raw format of the atom probes of Stuttgart: voltages, detector, time of flight and pulse, 32 bytes per ion.
 
 Little-endian, no header: base, pulse and reflectron voltage [V], detector x, y [mm], time of flight [ns], all
 float32, then an epoch (int32) and the number of the pulse (uint32).
@@ -36,32 +36,32 @@ def read_raw(
 ) -> Hits:
     """Read a Stuttgart .raw file.
 
-    Neighbouring ions of equal pulse number share a pulse; the number may wrap around. A pulse number that is zero
-    throughout groups nothing.
+    Consecutive ions with the same pulse number belong to one pulse; the number may wrap around. If it is zero for all
+    ions, they are not grouped.
 
     Parameters
     ----------
     path : str or path-like
         The file.
     columns : sequence of str, optional
-        Names of the columns to read, so that only these take up memory; all by default.
+        Names of the columns to read; only these are kept in memory. All by default.
     partial : bool
-        Read the whole ions of a file that ends in the middle of one.
+        Read the complete ions of a file that ends in the middle of an ion.
     byte_order : {None, "big", "little"}
-        None reads little-endian after a check that the file is.
+        None reads little-endian and checks the byte order.
 
     Returns
     -------
     Hits
         With voltage, pulse_voltage [V], x, y [mm], time_of_flight [ns], pulse_id and multiplicity;
-        ``extra`` holds "reflectron_voltage" [V], "epoch" and "pulse_number".
+        ``extra`` contains "reflectron_voltage" [V], "epoch" and "pulse_number".
 
     Raises
     ------
     FileError
         If the file is missing, unreadable, empty or in the wrong byte order, or has no such column.
     TruncatedFile
-        If the size is no multiple of 32 bytes and `partial` is False.
+        If the size is not a multiple of 32 bytes and `partial` is False.
     """
     chosen, fields = choose_fields(columns, _COLUMNS, _FIELDS, path, _WITH)
     with _open(path, partial, byte_order) as words:
@@ -78,7 +78,7 @@ def chunk_raw(
     partial: bool = False,
     byte_order: str | None = None,
 ) -> Iterator[Hits]:
-    """Read a .raw file in `Hits` of at most `rows` ions, one after the other, in whole pulses; else as `read_raw`.
+    """Read a .raw file in `Hits` of at most `rows` ions in complete pulses; otherwise as `read_raw`.
 
     Yields
     ------
@@ -87,7 +87,7 @@ def chunk_raw(
     Raises
     ------
     ValueError
-        If `rows` is less than the ions of one pulse.
+        If `rows` is less than the number of ions of one pulse.
     """
     chosen, fields = choose_fields(columns, _COLUMNS, _FIELDS, path, _WITH)
     fields = {**fields, "pulse_number": _FIELDS["pulse_number"]}
@@ -100,40 +100,41 @@ def chunk_raw(
             borders = np.flatnonzero(numbers[1:] != numbers[:-1]) if grouped else [rows - 1]
             if len(borders) == 0:
                 raise ValueError(
-                    f"rows must be at least the ions of the largest pulse of {str(path)!r}, more than {rows} in pulse "
-                    f"{numbers[0]}, got {rows}"
+                    f"rows must be >= the number of ions in the largest pulse of {str(path)!r}, more than {rows} in "
+                    f"pulse {numbers[0]}, got {rows}"
                 )
             return int(borders[-1]) + 1
 
         first_pulse = 0
-        for block in words.blocks(fields, rows, keep, ahead=1):  # a row more tells whether the last pulse ends there
+        for block in words.blocks(fields, rows, keep, ahead=1):  # one more row, to see whether the last pulse ends
             yield _hits(block, grouped, chosen, path, first_pulse)
             first_pulse += np.count_nonzero(first_from_equal(block["pulse_number"]))
             del block
 
 
 def _grouped(blocks, path):
-    """Whether the pulse numbers tell anything; warn if they do not, or are out of order."""
-    found = False
-    falls = 0
+    """Whether ions can be grouped by the pulse numbers; warn if these are all zero or decrease."""
+    has_numbers = False
+    n_decreases = 0
     last = None
     for numbers in blocks:
-        found = found or numbers.any()
+        has_numbers = has_numbers or numbers.any()
         steps = numbers[1:].astype(np.int64) - numbers[:-1]
-        falls += np.count_nonzero((steps < 0) & (steps > -(1 << 31)))
+        n_decreases += np.count_nonzero((steps < 0) & (steps > -(1 << 31)))
         if last is not None:
-            falls += -(1 << 31) < int(numbers[0]) - last < 0
+            n_decreases += -(1 << 31) < int(numbers[0]) - last < 0
         last = int(numbers[-1])
-    if not found:
-        problem = "pulse_id and multiplicity are None: the pulse number is zero throughout"
-    elif falls:
-        problem = f"only neighbours of equal pulse number are grouped: the number falls at {falls} rows"
+    if not has_numbers:
+        problem = "pulses unknown, so pulse_id and multiplicity are None: the pulse number is zero for all ions"
+    elif n_decreases:
+        problem = (
+            "pulses uncertain, so only consecutive ions with the same pulse number are grouped: the number decreases "
+            f"at {n_decreases} rows"
+        )
     else:
         return True
-    warnings.warn(
-        f"{str(path)!r} does not tell for certain which ions share a pulse, so {problem}", DataWarning, stacklevel=4
-    )
-    return bool(found)
+    warnings.warn(f"{str(path)!r}: {problem}", DataWarning, stacklevel=4)
+    return bool(has_numbers)
 
 
 def _hits(block, grouped, chosen, path, first_pulse=0):
@@ -141,11 +142,11 @@ def _hits(block, grouped, chosen, path, first_pulse=0):
     if grouped and {"pulse_id", "multiplicity"} & set(chosen):
         ions = first_from_equal(block["pulse_number"])
         columns["pulse_id"], columns["multiplicity"] = pulses_from_first(ions, first_pulse)
-    wanted = {name: columns.get(name) for name in chosen}
-    check_any(wanted, path)
-    extra = {name: wanted.pop(name) for name in _EXTRA if name in wanted}
+    requested = {name: columns.get(name) for name in chosen}
+    check_any(requested, path)
+    extra = {name: requested.pop(name) for name in _EXTRA if name in requested}
     units = {"reflectron_voltage": "V"} if "reflectron_voltage" in extra else {}
-    return Hits(**wanted, extra=extra, units=units, source=str(path))
+    return Hits(**requested, extra=extra, units=units, source=str(path))
 
 
 def _open(path, partial, byte_order):

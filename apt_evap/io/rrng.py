@@ -1,7 +1,8 @@
 """The .rrng format: ranges of mass over charge state as INI text.
 
-Larson et al., Local Electrode Atom Probe Tomography (Springer, 2013), appendix A. Sections, lines and the parts of a
-line may come in any order, case and spacing; volume and colour may be missing; commas may stand for decimal points.
+Larson et al., Local Electrode Atom Probe Tomography (Springer, 2013), appendix A. The order of sections, lines and
+parts of a line, upper or lower case, and spaces do not matter. Volume and colour may be missing, and the decimal
+separator may be a comma.
 """
 
 import re
@@ -28,12 +29,12 @@ def read_ranges(path: AnyPath) -> Ranges:
     Returns
     -------
     Ranges
-        In the order of the file. A range is called by its ``Name``, or else by its elements, such as "CrO2".
+        In the order of the file. The name of a range is its ``Name`` or, if missing, its elements, such as "CrO2".
 
     Raises
     ------
     FileError
-        If the file is missing or unreadable, has no ranges, or a line cannot be understood.
+        If the file is missing or unreadable, has no ranges, or contains an invalid line.
     """
     data = read_small_file(path, _MOST, "the text of an .rrng file")
     if not data:
@@ -51,41 +52,41 @@ def read_ranges(path: AnyPath) -> Ranges:
     ]
     if not parts:
         raise FileError(f"{str(path)!r} has no lines Range1=... in a section [Ranges], expected at least one")
-    announced = [value for section, _, key, value in lines if section == "ranges" and key == "number"]
-    if announced and announced[0] != str(len(parts)):
+    numbers = [value for section, _, key, value in lines if section == "ranges" and key == "number"]
+    if numbers and numbers[0] != str(len(parts)):
         warnings.warn(
-            f"{str(path)!r} announces {announced[0]:.20} ranges and holds {len(parts)}", DataWarning, stacklevel=2
+            f"{str(path)!r} states {numbers[0]:.20} ranges but contains {len(parts)}", DataWarning, stacklevel=2
         )
     names, low, high, volume, colour, composition = zip(*parts, strict=True)
     return Ranges(names, np.array(low), np.array(high), np.array(volume), colour, composition, source=str(path))
 
 
 def _lines(data):
-    """(section, line number, key, value) of every assignment, section and key in small letters."""
+    """(section, line number, key, value) of every assignment, section and key in lower case."""
     try:
         text = data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
     except UnicodeDecodeError:
         text = data.decode("latin-1")
     section = ""
-    found = []
+    assignments = []
     for number, line in enumerate(text.splitlines(), 1):
         line = line.strip()
         if line.startswith("[") and "]" in line:
             section = line[1 : line.index("]")].strip().casefold()
         elif "=" in line and not line.startswith((";", "#")):
             key, _, value = line.partition("=")
-            found.append((section, number, key.strip().casefold(), value.strip()))
-    return found
+            assignments.append((section, number, key.strip().casefold(), value.strip()))
+    return assignments
 
 
 def _range(text, elements, where):
     """Read "13.8745 14.2410 Vol:0.02003 Si:1 Color:CCCCCC"."""
     bounds = []
     name, volume, colour, composition = "", np.nan, "", {}
-    # "Vol : 0.02" is "Vol:0.02", but the value may also be missing; a pattern for the first space of many before a
-    # colon would look at all of them again from each
-    joined = ":".join([part.rstrip() for part in text.split(":")])
-    for part in re.sub(r":\s+(?=[^\s:]+(\s|$))", ":", joined).split():
+    # "Vol : 0.02" is "Vol:0.02", but the value may also be missing; a pattern for spaces before a colon would need
+    # quadratic time for many spaces
+    compact = ":".join([part.rstrip() for part in text.split(":")])
+    for part in re.sub(r":\s+(?=[^\s:]+(\s|$))", ":", compact).split():
         key, colon, value = part.partition(":")
         word = key.casefold()
         if not colon:

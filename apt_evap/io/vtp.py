@@ -1,4 +1,4 @@
-"""The .vtp format of VTK and ParaView: points [nm] with data, as binary appended to XML."""
+"""The .vtp format of VTK and ParaView: points [nm] with data, XML with appended binary data."""
 
 import numpy as np
 
@@ -12,15 +12,15 @@ _TYPES = {"f": "Float", "i": "Int", "u": "UInt"}
 
 
 def write_vtp(path: AnyPath, hits: Hits) -> None:
-    """Write ions as points of VTK, one vertex each, with all other columns as data of the points.
+    """Write ions as VTK points with one vertex each, and all other columns as point data.
 
-    Positions are in nm, all other columns in the units of `Hits`. Left out are ions whose positions are not finite;
-    ions that missed the detector are written, with NaN where they have no value.
+    Positions are in nm, all other columns in the units of `Hits`. Ions whose positions are not finite are left out.
+    Ions that missed the detector are written, with NaN for missing values.
 
     Parameters
     ----------
     path : str or path-like
-        The file; an existing one is replaced once the new one is complete.
+        The file; an existing one is replaced when the new one is complete.
     hits : Hits
         Ions with positions.
 

@@ -1,4 +1,4 @@
-"""Extended XYZ, text that OVITO and ASE read: species and position [Angstrom] of every ion, and its other columns."""
+"""Extended XYZ, a text format of OVITO and ASE: species, position [Angstrom] and other columns of every ion."""
 
 from collections.abc import Sequence
 
@@ -16,19 +16,19 @@ _ANGSTROM_PER_NM = 10
 def write_xyz(path: AnyPath, hits: Hits, *, species: str | Sequence[str] = "X") -> None:
     """Write ions as extended XYZ.
 
-    Positions are in Angstrom, with five decimals; all other columns are in the units of `Hits`, float32 with nine and
-    float64 with seventeen digits at most, which is what brings them back. Whole numbers beyond 32 bits are declared
-    as real ones, for ASE has no others. Left out are ions whose positions are not
-    finite; ions that missed the detector are written.
+    Positions are in Angstrom, with five decimals. All other columns are in the units of `Hits`, with at most nine
+    digits for float32 and seventeen for float64, so that reading restores the exact values. Integers beyond 32 bits
+    are declared as real numbers, because ASE does not support them. Ions whose positions are not finite are left out.
+    Ions that missed the detector are written.
 
     Parameters
     ----------
     path : str or path-like
-        The file; an existing one is replaced once the new one is complete.
+        The file; an existing one is replaced when the new one is complete.
     hits : Hits
         Ions with positions.
     species : str or sequence of str
-        Species of all ions, or of each one, such as ``ranges.labels(hits)``. ASE wants chemical elements; "X" is none.
+        Species of all ions, or of each ion, such as ``ranges.labels(hits)``. ASE accepts only chemical elements and X.
 
     Raises
     ------
@@ -43,9 +43,9 @@ def write_xyz(path: AnyPath, hits: Hits, *, species: str | Sequence[str] = "X") 
     formats = ["%s", "%.5f", "%.5f", "%.5f"]
     for name, values in data.items():
         width = 1 if values.ndim == 1 else values.shape[1]
-        # the whole numbers of ASE have 32 bits
-        whole = values.dtype.kind in "iu" and -(2**31) <= values.min() and values.max() < 2**31
-        properties.append(f"{name}:{'I' if whole else 'R'}:{width}")
+        # integers of ASE have 32 bits
+        is_integer = values.dtype.kind in "iu" and -(2**31) <= values.min() and values.max() < 2**31
+        properties.append(f"{name}:{'I' if is_integer else 'R'}:{width}")
         formats += ["%d" if values.dtype.kind in "iu" else "%.17g" if values.dtype.itemsize > 4 else "%.9g"] * width
     row = " ".join(formats) + "\n"
     labels = labels[chosen] if labels.ndim else labels

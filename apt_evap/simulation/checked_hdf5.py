@@ -1,14 +1,14 @@
-"""HDF5 files with a checksum of every byte, compared before HDF5 reads any of them.
+"""HDF5 files with checksums of all bytes, compared before HDF5 reads any of them.
 
-HDF5 believes its own indices: one wrong bit there turns a column into zeros, moves it, or crashes the process. So the
-checksums follow the HDF5 file, where HDF5 and other programs do not look::
+HDF5 trusts its own indices: one wrong bit there may turn a column into zeros, displace it, or crash the process. The
+checksums are appended to the HDF5 file, where HDF5 and other programs ignore them::
 
-    HDF5 file | begin, size and CRC-32 of each block of rows | SHA-256 of all else, sizes, a mark
+    HDF5 file | begin, size and CRC-32 of each block of rows | SHA-256 of all other bytes, sizes, signature
 
-The SHA-256 covers whatever HDF5 interprets, and the CRC-32s of the rows. These are CRC-32s because they have to be as
-fast as the disk: measured on 87 MB, whose arrays are written in 0.16 s and read in 0.08 s, CRC-32 takes 0.05 s and
-SHA-256 0.09 s. Files of earlier versions have no checksums but the fletcher32 of HDF5; they are read as well, after
-checks of where each dataset lies.
+The SHA-256 covers all bytes that HDF5 interprets, and the CRC-32s of the rows. For the rows, CRC-32 is used because it
+is fast: measured for a file of 87 MB, whose arrays are written in 0.16 s and read in 0.08 s, CRC-32 takes 0.05 s and
+SHA-256 0.09 s. Files of earlier versions have only the fletcher32 checksums of HDF5. They are read after the place of
+each dataset in the file has been checked.
 """
 
 import hashlib
@@ -29,19 +29,19 @@ from apt_evap._common.files import FileError, check_path, open_for_reading, repl
 from apt_evap._common.types import AnyPath
 
 _BLOCK = np.dtype([("begin", "<u8"), ("size", "<u8"), ("crc", "<u4")])
-_TAIL = struct.Struct("<32sQQ16s")  # SHA-256, size of the HDF5 file, number of blocks, mark
-_MARK = b"apt_evap sums 1\n"
+_TAIL = struct.Struct("<32sQQ16s")  # SHA-256, size of the HDF5 file, number of blocks, signature
+_SIGNATURE = b"apt_evap sums 1\n"
 _NAME, _TEXT = "checksums", b"apt_evap: checksums of all bytes follow the HDF5 file"
-_BEGINNING = 1 << 16  # bytes that hold the first attribute
+_BEGINNING = 1 << 16  # bytes that contain the first attribute
 _STEP = 1 << 18  # bytes read at a time
-_FOREIGN = "data outside of the file are not read"
+_FOREIGN = "data outside the file are not read"
 
 
 # ---- writing -------------------------------------------------------------------------------------------------------
 
 
 class _Sink(io.RawIOBase):
-    """A file for HDF5, which crashes where writing fails: the first error is kept, to be raised when it is done."""
+    """A file for HDF5, which crashes if writing fails: the first error is stored, to be raised after closing."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file, self._place, self._end, self.error = file, 0, 0, None
@@ -78,14 +78,14 @@ class _Sink(io.RawIOBase):
 
 @contextmanager
 def write_checked(path: AnyPath, rows: int) -> Iterator[h5py.File]:
-    """Write an HDF5 file with checksums, whole or not at all.
+    """Write an HDF5 file with checksums, which is either complete or absent.
 
     Parameters
     ----------
     path : str or path-like
         The file to write or overwrite.
     rows : int
-        Rows of a dataset that share a checksum: what a damage costs.
+        Rows of a dataset with a common checksum. Any damage to them loses all of them.
 
     Yields
     ------
@@ -111,7 +111,7 @@ def write_checked(path: AnyPath, rows: int) -> Iterator[h5py.File]:
 
 
 def _append_sums(file, blocks):
-    """Append the checksums of an HDF5 file whose rows lie in some blocks."""
+    """Append the checksums of an HDF5 file, given the blocks of its rows."""
     size = file.seek(0, os.SEEK_END)
     outside, blocks["crc"] = _sums(file, size, blocks)
     table, sizes = blocks.tobytes(), _sizes(size, len(blocks))
@@ -121,12 +121,12 @@ def _append_sums(file, blocks):
 
 
 def _sizes(size, n):
-    """What follows the SHA-256 at the end of a file."""
-    return _TAIL.pack(b"", size, n, _MARK)[hashlib.sha256().digest_size :]
+    """The bytes after the SHA-256 at the end of a file."""
+    return _TAIL.pack(b"", size, n, _SIGNATURE)[hashlib.sha256().digest_size :]
 
 
 def _blocks_of(file, rows):
-    """Where the rows of all datasets lie, so many to a block, in the order of the file."""
+    """Blocks of at most `rows` rows of all datasets, in the order of the file."""
     blocks = []
 
     def note(name, item):
@@ -171,16 +171,16 @@ def _sums(file, size, blocks, with_data=True):
 
 @contextmanager
 def open_checked(path: AnyPath, *, with_data: bool = True, partial: bool = False) -> "Iterator[CheckedFile]":
-    """Open an HDF5 file once its checksums have been compared, or one of an earlier version, without any.
+    """Compare the checksums of an HDF5 file and open it; files of earlier versions have no checksums.
 
     Parameters
     ----------
     path : str or path-like
         The file.
     with_data : bool
-        Whether to compare the checksums of the rows, too; without, only those of what HDF5 interprets.
+        Whether to compare also the checksums of the rows; otherwise only that of the bytes that HDF5 interprets.
     partial : bool
-        Whether to go on if only rows are damaged.
+        Whether to accept a file with damaged rows.
 
     Yields
     ------
@@ -208,16 +208,16 @@ def open_checked(path: AnyPath, *, with_data: bool = True, partial: bool = False
 
 
 def first_line(error: Exception) -> str:
-    """What an error of HDF5 says, without the lines of its stack."""
+    """First line of an error message of HDF5, without its stack."""
     return (str(error) or type(error).__name__).splitlines()[0]
 
 
 class DamagedRows(FileError):
-    """A file of which only rows of datasets are damaged."""
+    """Error for a file in which only rows of datasets are damaged."""
 
 
 def has_checksums(path: AnyPath) -> bool:
-    """Whether a file ends as those of `write_checked` do; FileError if it cannot be read."""
+    """Whether a file ends like those of `write_checked`; FileError if it cannot be read."""
     with open_for_reading(path) as file:
         return _tail(file, os.fstat(file.fileno()).st_size) is not None
 
@@ -227,12 +227,12 @@ def _tail(file, size):
     if size < _TAIL.size:
         return None
     file.seek(size - _TAIL.size)
-    *numbers, mark = _TAIL.unpack(file.read(_TAIL.size))
-    return numbers if mark == _MARK else None
+    *numbers, signature = _TAIL.unpack(file.read(_TAIL.size))
+    return numbers if signature == _SIGNATURE else None
 
 
 def _compare(file, size, name, with_data):
-    """Blocks whose checksums do not match, (k, 2) with where they begin and end; None for a file without checksums."""
+    """Begin and end of the blocks whose checksums do not match, (k, 2); None for a file without checksums."""
     tail = _tail(file, size)
     if tail is None:
         file.seek(0)
@@ -262,16 +262,16 @@ def _without_checksums(name):
 
 
 class CheckedFile:
-    """An open HDF5 file of which nothing is read that does not lie in it as it should.
+    """An open HDF5 file. Only datasets with a valid place in the file are read.
 
     Parameters
     ----------
     file : h5py.File
         Open for reading.
     size : int
-        Its size [bytes].
+        Size of the file [bytes].
     damaged : ndarray of int64, shape (k, 2), or None
-        Where damaged rows begin and end; None if only HDF5 itself can tell.
+        Begin and end of the damaged rows; None for a file without checksums.
     """
 
     def __init__(self, file: h5py.File, size: int, damaged: NDArray[np.int64] | None) -> None:
@@ -296,25 +296,25 @@ class CheckedFile:
         return self._item(path).attrs
 
     def text(self, name: str, path: str = "") -> str:
-        """Text in an attribute of a group or dataset; KeyError if it is missing, ValueError if it is not text."""
+        """Text attribute of a group or dataset; KeyError if it is missing, ValueError if it is not a text."""
         value = self.attributes(path)[name]
         if isinstance(value, bytes):
             value = value.decode()
         if not isinstance(value, str):
-            raise ValueError(f"attribute {name!r} must be text, got {value!r:.60}")
+            raise ValueError(f"attribute {name!r} must be a text, got {value!r:.60}")
         return value
 
     def dataset(self, path: str, dtype: DTypeLike, shape: tuple[int | None, ...]) -> h5py.Dataset:
-        """Return a dataset once its type, its shape and where it lies in the file have been checked.
+        """Check the type, the shape and the place of a dataset, and return it.
 
         Parameters
         ----------
         path : str
-            Its name, with those of its groups.
+            Name of the dataset, with the names of its groups.
         dtype : dtype
-            What it must hold.
+            Expected type.
         shape : tuple
-            Expected shape; None is any length.
+            Expected shape; None stands for any length.
 
         Returns
         -------
@@ -323,17 +323,17 @@ class CheckedFile:
         Raises
         ------
         KeyError, ValueError
-            If it is missing, or not as expected.
+            If it is missing or not as expected.
         """
         item = self._item(path)
         if not isinstance(item, h5py.Dataset):
             raise ValueError(f"{path} is not a dataset")
         if item.dtype.newbyteorder("=") != np.dtype(dtype):
-            raise ValueError(f"{path} must hold {np.dtype(dtype)}, got {item.dtype}")
+            raise ValueError(f"{path} must contain {np.dtype(dtype)}, got {item.dtype}")
         fits = item.shape is not None and len(item.shape) == len(shape)
         if not fits or any(a != b for a, b in zip(item.shape, shape, strict=True) if b is not None):
-            wanted = ", ".join("any" if length is None else str(length) for length in shape)
-            raise ValueError(f"{path} must have shape ({wanted}), got {item.shape}")
+            expected = ", ".join("any" if length is None else str(length) for length in shape)
+            raise ValueError(f"{path} must have shape ({expected}), got {item.shape}")
         if math.prod(item.shape) * item.dtype.itemsize > self._size:  # nothing is compressed
             raise ValueError(f"{path} has shape {item.shape}, more than the {self._size} bytes of the file")
         if item.size:
@@ -352,7 +352,7 @@ class CheckedFile:
         return dataset[begin:end]
 
     def read(self, path: str, dtype: DTypeLike, shape: tuple[int | None, ...]) -> NDArray[Any]:
-        """Read a dataset whole: `dataset` and `rows`."""
+        """Read a complete dataset: `dataset` and `rows`."""
         return self.rows(self.dataset(path, dtype, shape))
 
     def _item(self, path):
@@ -369,25 +369,25 @@ class CheckedFile:
         return item
 
     def _check_place(self, dataset, path):
-        """Make sure that all of a dataset lies in this file, as this package writes it."""
+        """Check that a dataset lies completely in this file, in a layout that this package writes."""
         plist = dataset.id.get_create_plist()
         layout = plist.get_layout()
         if plist.get_external_count() or layout == h5py.h5d.VIRTUAL:
-            raise ValueError(f"{path} lies elsewhere: {_FOREIGN}")
+            raise ValueError(f"{path} is in another file: {_FOREIGN}")
         if layout == h5py.h5d.CONTIGUOUS:
             begin = dataset.id.get_offset()
-            whole = begin is not None and begin + dataset.nbytes <= self._size
+            complete = begin is not None and begin + dataset.nbytes <= self._size
         elif layout == h5py.h5d.CHUNKED:
-            whole = self._has_all_chunks(dataset, plist)
+            complete = self._has_all_chunks(dataset, plist)
         else:
-            whole = layout == h5py.h5d.COMPACT
-        if not whole:
-            raise ValueError(f"{path} is not whole")
+            complete = layout == h5py.h5d.COMPACT
+        if not complete:
+            raise ValueError(f"{path} is incomplete")
 
     def _has_all_chunks(self, dataset, plist):
         filters = [plist.get_filter(k)[0] for k in range(plist.get_nfilters())]
         if filters not in ([], [h5py.h5z.FILTER_FLETCHER32]):
-            raise ValueError(f"{dataset.name} is compressed or filtered, as no run is")
+            raise ValueError(f"{dataset.name} is compressed or filtered, unlike the datasets of a run")
         chunks = dataset.chunks
         size = math.prod(chunks) * dataset.dtype.itemsize + 4 * len(filters)
         if size > self._size:

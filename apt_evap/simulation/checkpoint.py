@@ -1,9 +1,9 @@
-"""Checkpoints: a run is kept in a folder beside its file while it goes on, so that nothing done is lost.
+"""Checkpoints: a run in progress is stored in a folder beside its file, so that no results are lost.
 
-The folder NAME.h5.unfinished holds the ions in parts, each a run file of its own, and the state of the emitter. Every
-file is written aside, flushed to the disk and renamed: it is there whole or not at all, whenever the process is killed.
-A part comes before the state that goes with it. Once the run has ended, NAME.h5 is written in the same way, and then
-the folder goes: renamed first, so that no half of it is taken for an unfinished run.
+The folder NAME.h5.unfinished contains the ions in parts, each a complete run file, and the state of the emitter. Every
+file is written under a temporary name, flushed to the disk and renamed. So it is either complete or absent, whenever
+the process is killed. A part is written before the state at its end. When the run has ended, NAME.h5 is written in the
+same way. Then the folder is removed: it is renamed first, so that its remains are never taken for an unfinished run.
 """
 
 import contextlib
@@ -34,35 +34,34 @@ from apt_evap.simulation.run_hdf5 import count_ions, described, is_run, plain, r
 
 try:
     import fcntl
-except ImportError:  # not on this system: two processes on one file are not noticed
+except ImportError:  # not on this system: two processes that write the same file are not detected
     fcntl = None
 
 
 STATE_NAME, WHOLE_NAME, LOCK_NAME = "state.h5", "whole.h5", "lock"
-_OWNER = "process "  # what a lock begins with
+_OWNER = "process "  # first word of a lock file
 _OPEN_LOCK = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-_TRIES = 1000  # times that other processes may take the folder away while this one locks it
+_TRIES = 1000  # how often other processes may remove the folder while this one locks it
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Where a run is kept while it goes on, and how often.
+    """Where and how often a run in progress is stored.
 
     Parameters
     ----------
     path : str or path-like
-        File of the run, .h5, written once it has ended; until then the run is in the folder of this name with
-        ".unfinished" after it.
+        File of the run, .h5, written when it has ended; until then the run is in a folder of this name with
+        ".unfinished" appended.
     minutes : float
-        Time between two checkpoints [min]; 0 for one after every batch of events.
+        Time between two checkpoints [min]; 0 for a checkpoint after every batch of events.
     ions : int, optional
-        Ions after which there is a checkpoint in any case.
+        Largest number of ions between two checkpoints, for any time between them.
     resume : bool
-        Whether to go on with what is there: an unfinished run, or the file of one that ended. If nothing is there, the
-        run begins.
+        Whether to continue an unfinished run, or the run in an existing file. If there is neither, a new run begins.
     overwrite : bool
-        Whether to begin anew over an unfinished run, over the file of one that was interrupted, is longer or has other
-        settings, and over a file that is no run.
+        Whether a new run may replace an unfinished run, the file of a run that was interrupted, is longer or has other
+        settings, or a file that is not a run.
     """
 
     path: str | os.PathLike
@@ -88,26 +87,26 @@ class Checkpoint:
         return target.with_name(target.name + ".unfinished")
 
     def ions_there(self) -> int:
-        """Ions of the unfinished run, or else of the file; 0 if there is neither."""
+        """Number of ions in the unfinished run, otherwise in the file; 0 if there is neither."""
         paths = part_paths(self.folder) or [path for path in (self.path,) if path.exists()]
         return sum(map(count_ions, paths))
 
 
 class Keeper:
-    """Keeps one run on the disk; locked against other processes from `open` to `close`.
+    """Storage of one run on the disk, locked against other processes until `close`.
 
     Parameters
     ----------
     checkpoint : Checkpoint
-        Where and how often.
+        Path and interval.
     settings : dict
-        Settings of the run that is about to go on or begin.
+        Settings of the run to continue or begin.
     perturbations : tuple
-        Flown in it.
+        Perturbations flown in the run.
     responses : bool
-        Whether it has responses.
+        Whether the run has responses.
     n_ions : int
-        Ions it is to have in the end.
+        Requested number of ions.
     """
 
     def __init__(
@@ -122,10 +121,10 @@ class Keeper:
         self._target = Path(os.path.realpath(checkpoint.path))
         self._lock, self._is_ours = None, False
         self._written_at, self._written_to = time.monotonic(), 0
-        self.done = None  # what is there already
-        self._in_file = False  # whether that is in the file only, and not yet in the folder
-        self.complete = False  # whether it is in the file, with nothing left to do
-        self._here = dict(
+        self.previous = None  # the ions so far of a resumed run
+        self._in_file = False  # whether these are in the file only, and not yet in the folder
+        self.complete = False  # whether all requested ions are in the file
+        self._setup = dict(
             _flat(plain(settings)), responses=responses, flown=[described(each) for each in perturbations]
         )
         try:
@@ -144,7 +143,7 @@ class Keeper:
     # ---- the lock --------------------------------------------------------------------------------------------------
 
     def _open(self):
-        # The lock may be on a folder that its last owner has just taken away: then once more.
+        # If the previous owner has just removed the locked folder, repeat.
         for _ in range(_TRIES):
             try:
                 self._make_folder()
@@ -168,13 +167,15 @@ class Keeper:
             finally:
                 if self._lock is None:
                     lock.close()
-        raise FileError(f"cannot write {str(self._folder)!r}: other processes take it away")
+        raise FileError(f"cannot write {str(self._folder)!r}: other processes keep removing it")
 
     def _sign(self, lock):
-        """Write into a lock whose it is, over what another process has written."""
+        """Write the owner into the lock file, in place of the previous owner."""
         lock.seek(0)
-        if (written := lock.read(100)) and not written.startswith(_OWNER):
-            raise FileError(f"{str(self._folder / LOCK_NAME)!r} is not a lock of a run: it reads {written!r:.40}")
+        if (owner := lock.read(100)) and not owner.startswith(_OWNER):
+            raise FileError(
+                f"{str(self._folder / LOCK_NAME)!r} is not the lock file of a run: it contains {owner!r:.40}"
+            )
         lock.seek(0)
         lock.truncate()
         lock.write(f"{_OWNER}{os.getpid()} on {socket.gethostname()}")
@@ -202,18 +203,18 @@ class Keeper:
                     f"{str(self._checkpoint.path)!r} is being written by {owner}; wait for it or choose another file"
                 ) from None
             warnings.warn(
-                f"no lock on {str(self._folder)!r} ({error.strerror}): make sure that no other process writes there",
+                f"cannot lock {str(self._folder)!r} ({error.strerror}): make sure that no other process writes to it",
                 RunWarning,
                 stacklevel=6,
             )
 
     @uninterrupted()
     def close(self) -> None:
-        """Let go of the files; a folder without ions is removed if this run has made it."""
+        """Release the lock; remove a folder without ions if this run has created it."""
         with contextlib.suppress(OSError):
             if self._lock is None:
                 if self._is_ours:
-                    self._folder.rmdir()  # made, and not locked yet; one that somebody else has locked is not empty
+                    self._folder.rmdir()  # created, but not locked yet; fails if another process has locked it
             elif self._folder.is_dir() and not part_paths(self._folder):
                 self._remove_folder()
         if self._lock is not None:
@@ -223,12 +224,12 @@ class Keeper:
     def _remove_folder(self):
         names = os.listdir(self._folder)
         if self._is_ours and all(map(_is_known, names)):
-            # renamed first: a folder with some of its files gone is not an unfinished run
-            gone = self._folder.with_name(f".{self._folder.name}.{secrets.token_hex(8)}.gone")
-            os.replace(self._folder, gone)
-            shutil.rmtree(gone, ignore_errors=True)
+            # rename first: a folder without some of its files is not an unfinished run
+            trash = self._folder.with_name(f".{self._folder.name}.{secrets.token_hex(8)}.gone")
+            os.replace(self._folder, trash)
+            shutil.rmtree(trash, ignore_errors=True)
             return
-        # somebody else's folder or files stay; the last part goes first, as what is left of a run is then a run
+        # a folder or files of others stay; the last part is removed first, so that the remaining parts are a run
         parts = [path.name for path in part_paths(self._folder)]
         for name in (WHOLE_NAME, STATE_NAME, *filter(is_unfinished, names), *reversed(parts), LOCK_NAME):
             (self._folder / name).unlink(missing_ok=True)
@@ -236,7 +237,7 @@ class Keeper:
     def _error(self, error):
         return FileError(f"cannot write {str(self._folder)!r}: {error.strerror or error}")
 
-    # ---- what is there ---------------------------------------------------------------------------------------------
+    # ---- existing files --------------------------------------------------------------------------------------------
 
     def _prepare(self, n_ions):
         checkpoint, folder = self._checkpoint, self._folder
@@ -245,136 +246,136 @@ class Keeper:
                 check_regular(os.stat(self._target))
             for rest in (*folder.glob(".*.part"), *folder.glob(WHOLE_NAME)):
                 rest.unlink()
-            gone = re.compile(rf"\.{re.escape(folder.name)}\.[0-9a-f]+\.gone")
+            trash = re.compile(rf"\.{re.escape(folder.name)}\.[0-9a-f]+\.gone")
             for entry in os.scandir(folder.parent):
-                if gone.fullmatch(entry.name) and entry.is_dir(follow_symlinks=False):
+                if trash.fullmatch(entry.name) and entry.is_dir(follow_symlinks=False):
                     shutil.rmtree(entry.path, ignore_errors=True)
         except OSError as error:
             raise self._error(error) from error
         parts = part_paths(folder)
         if checkpoint.resume:
             if parts or self._target.exists():
-                self._go_on(parts, n_ions)
+                self._resume(parts, n_ions)
             return
         if not checkpoint.overwrite:
-            self._refuse_a_loss(parts, n_ions)
+            self._refuse_loss(parts, n_ions)
         for path in (folder / STATE_NAME, *parts[::-1]):
             path.unlink(missing_ok=True)
 
-    def _go_on(self, parts, n_ions):
-        """Take up what is there."""
-        name, done = str(self._checkpoint.path), load(self._folder if parts else self._target)
-        if differing := self._differing(done):
-            raise FileError(f"the run in {name!r} cannot be resumed with other settings: {differing}")
-        if not np.array_equal(done.emissions.ions, done.emissions.ions[0] + np.arange(len(done))):
+    def _resume(self, parts, n_ions):
+        """Load the run to continue."""
+        name, run = str(self._checkpoint.path), load(self._folder if parts else self._target)
+        if differences := self._differences(run):
+            raise FileError(f"the run in {name!r} cannot be resumed with other settings: {differences}")
+        if not np.array_equal(run.emissions.ions, run.emissions.ions[0] + np.arange(len(run))):
             raise FileError(f"the run in {name!r} cannot be resumed: some of its ions are missing")
-        if len(done) > n_ions:
+        if len(run) > n_ions:
             raise FileError(
-                f"{argument('n_ions')} must be at least the {len(done):,} that are done already, got {n_ions:,}"
+                f"{argument('n_ions')} must be >= {len(run):,}, the number of ions of the run so far, got {n_ions:,}"
             )
-        if not parts and done.state is None:
-            raise FileError(f"the run in {name!r} cannot be resumed: the file holds no state")
-        self.done, self._in_file, self._written_to = done, not parts, len(done)
-        self.complete = not parts and not done.ended and len(done) == n_ions
+        if not parts and run.state is None:
+            raise FileError(f"the run in {name!r} cannot be resumed: the file contains no state")
+        self.previous, self._in_file, self._written_to = run, not parts, len(run)
+        self.complete = not parts and not run.ended and len(run) == n_ions
         if parts:
-            self.done = self._with_state(done)
+            self.previous = self._with_state(run)
 
-    def _refuse_a_loss(self, parts, n_ions):
-        """Refuse to begin anew over what this run would not give again."""
+    def _refuse_loss(self, parts, n_ions):
+        """Refuse to replace ions that the new run would not contain."""
         name, replaces = str(self._checkpoint.path), f"{argument('overwrite', True)} replaces it"
-        anew = f"{argument('resume', True)} goes on with it, {argument('overwrite', True)} begins anew"
+        choices = f"{argument('resume', True)} continues it, {replaces}"
         if parts:
             ions = sum(map(count_ions, parts))
             raise FileError(
-                f"{name!r} has an unfinished run of {ions:,} ions beside it, in {self._folder.name!r}: {anew}"
+                f"{name!r} has an unfinished run of {ions:,} ions beside it, in {self._folder.name!r}: {choices}"
             )
         if not self._target.exists():
             return
         if not is_run(self._target):
-            raise FileError(f"{name!r} exists and is no run: {replaces}")
+            raise FileError(f"{name!r} exists and is not a run: {replaces}")
         try:
-            done = load(self._target)
+            run = load(self._target)
         except FileError as error:
             raise FileError(f"{error}; {replaces}") from error
-        if differing := self._differing(done):
-            raise FileError(f"{name!r} holds a run with other settings ({differing}): {replaces}")
-        if done.ended not in (Ending.COMPLETE, Ending.EXHAUSTED):
-            raise FileError(f"{name!r} holds a run of {len(done):,} ions that is not complete ({done.ended}): {anew}")
-        if len(done) > n_ions:
+        if differences := self._differences(run):
+            raise FileError(f"{name!r} contains a run with other settings ({differences}): {replaces}")
+        if run.ended not in (Ending.COMPLETE, Ending.EXHAUSTED):
+            raise FileError(f"{name!r} contains an incomplete run of {len(run):,} ions ({run.ended}): {choices}")
+        if len(run) > n_ions:
             raise FileError(
-                f"{name!r} holds a run of {len(done):,} ions, more than the {n_ions:,} asked for: {replaces}"
+                f"{name!r} contains a run of {len(run):,} ions, more than the requested {n_ions:,}: {replaces}"
             )
 
     def _with_state(self, run):
-        """The unfinished run with the state beside its parts; without one its events begin at the first."""
+        """The unfinished run with the state beside its parts; without a state, all its events are recomputed."""
         path = self._folder / STATE_NAME
         try:
             if path.exists():
                 state, first_event = read_state(path)
-            else:  # killed after a part and before its state; a part that was a whole run has one of its own
+            else:  # killed after a part and before its state; a part that was a complete run contains a state
                 last = load(part_paths(self._folder)[-1])
                 state, first_event = last.state, last.first_event
         except FileError as error:
-            warnings.warn(f"{error}: all events are computed again", DataWarning, stacklevel=7)
+            warnings.warn(f"{error}: all events are recomputed", DataWarning, stacklevel=7)
             state, first_event = None, 0
         return replace(run, state=state, first_event=first_event)
 
-    def _differing(self, done):
-        """The settings in which a run differs from this one, in words; "" if there are none."""
-        here, there = (
-            self._here,
+    def _differences(self, run):
+        """Text on the settings in which a stored run differs from this one; "" if there are none."""
+        new, stored = (
+            self._setup,
             dict(
-                _flat(done.settings),
-                responses=done.responses is not None,
-                flown=[described(each) for each in done.perturbations],
+                _flat(run.settings),
+                responses=run.responses is not None,
+                flown=[described(each) for each in run.perturbations],
             ),
         )
-        differing = [
-            f"{key} is {there.get(key)!r:.60} there and {here.get(key)!r:.60} here"
-            for key in dict.fromkeys((*there, *here))
-            if there.get(key) != here.get(key)
+        differences = [
+            f"{key} is {stored.get(key)!r:.60} in the stored run, {new.get(key)!r:.60} in the new one"
+            for key in dict.fromkeys((*stored, *new))
+            if stored.get(key) != new.get(key)
         ]
-        return "; ".join(differing[:3]) + (f", and {len(differing) - 3} more" if len(differing) > 3 else "")
+        return "; ".join(differences[:3]) + (f", and {len(differences) - 3} more" if len(differences) > 3 else "")
 
     # ---- writing ---------------------------------------------------------------------------------------------------
 
     def due(self, ions: int) -> bool:
-        """Whether it is time for a checkpoint once the run has so many ions."""
+        """Whether a checkpoint is due after this number of ions."""
         new = ions - self._written_to
         often = self._checkpoint.ions is not None and new >= self._checkpoint.ions
         return new > 0 and (often or time.monotonic() - self._written_at >= 60 * self._checkpoint.minutes)
 
     @uninterrupted()
     def write(self, part: Run, state: EmitterState, first_event: int) -> bool:
-        """Write the next part of the run, then the state it ends in; if that fails, a warning says so.
+        """Write the next part of the run, then the state at its end; warn if this fails.
 
         Returns
         -------
         bool
-            Whether the part is on the disk; if not, it has to come again with the next one.
+            Whether the part is on the disk; if not, the next call must include it.
         """
-        self._written_at = time.monotonic()  # not at once again if it fails
-        written = False
+        self._written_at = time.monotonic()  # after a failure, wait before the next attempt
+        on_disk = False
         try:
             if self._in_file:
-                self._write_part(self.done)
-                write_state(self._folder / STATE_NAME, self.done.state, self.done.first_event)
+                self._write_part(self.previous)
+                write_state(self._folder / STATE_NAME, self.previous.state, self.previous.first_event)
                 self._in_file = False
             self._write_part(part)
             self._written_to += len(part)
-            written = True
-            if len(state.sites) <= first_event + self._written_to:  # else its ions are not on the disk yet
+            on_disk = True
+            if len(state.sites) <= first_event + self._written_to:  # otherwise its ions are not on the disk yet
                 write_state(self._folder / STATE_NAME, state, first_event)
         except FileError as error:
-            warnings.warn(f"no checkpoint: {error}; the run goes on and tries again", RunWarning, stacklevel=4)
-        return written
+            warnings.warn(f"no checkpoint: {error}; the run continues and will try again", RunWarning, stacklevel=4)
+        return on_disk
 
     def _write_part(self, part):
         part.save(self._folder / PART_NAME.format(int(part.emissions.ions[0])))
 
     @uninterrupted()
     def finish(self, run: Run) -> None:
-        """Write the file of the run and take the folder away."""
+        """Write the file of the run and remove the folder."""
         whole = self._folder / WHOLE_NAME
         run.save(whole)
         try:
@@ -390,7 +391,7 @@ def _open_lock(path, flags):
         status = os.fstat(descriptor)
         check_regular(status)
         if status.st_nlink > 1:
-            raise OSError(None, f"its {LOCK_NAME} is another file, too")
+            raise OSError(None, f"its {LOCK_NAME} has a second name (hard link)")
     except OSError:
         os.close(descriptor)
         raise
@@ -398,7 +399,7 @@ def _open_lock(path, flags):
 
 
 def _is_known(name):
-    """Whether a file of a folder is one that this module has written."""
+    """Whether a file has a name that this module uses."""
     return name in (STATE_NAME, WHOLE_NAME, LOCK_NAME) or _PART.fullmatch(name) is not None or is_unfinished(name)
 
 
@@ -406,7 +407,7 @@ _PART = re.compile(r"ions-[0-9]{12,}\.h5")
 
 
 def _flat(settings, before=""):
-    """Settings in one dict, the names of the tables before those of the keys."""
+    """Settings in one dict, with keys such as "table.key"."""
     flat = {}
     for key, value in settings.items():
         flat |= _flat(value, f"{before}{key}.") if isinstance(value, dict) else {f"{before}{key}": value}

@@ -85,19 +85,19 @@ class Monitor:
         Ions between two checks.
     first : int
         Number of the first ion.
-    done : sequence of Run
+    previous : sequence of Run
         Existing parts of the run.
     """
 
-    def __init__(self, settings: WatchSettings, interval: int, first: int = 0, done: "Sequence[Run]" = ()) -> None:
+    def __init__(self, settings: WatchSettings, interval: int, first: int = 0, previous: "Sequence[Run]" = ()) -> None:
         self._settings, self._interval = settings, interval
         self._rows = []  # complete checks that have not been taken yet
         self._open = None  # ions, RMS and largest residual of a check whose ions are not all counted
         self._since = []  # outcomes, flags and fields of the ions since the last check, batch by batch
         self._counted, self._warned = first, set()
-        self._last = max((int(part.history.ions[-1]) for part in done if len(part.history.ions)), default=first)
+        self._last = max((int(part.history.ions[-1]) for part in previous if len(part.history.ions)), default=first)
         self._latest = {}
-        for part in done:
+        for part in previous:
             self.count(part)
 
     def due(self, ions: int) -> bool:

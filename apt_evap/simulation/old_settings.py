@@ -1,4 +1,4 @@
-"""Settings of runs that earlier versions saved, as this version writes them."""
+"""Conversion of the settings in files of earlier versions."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -8,12 +8,12 @@ _RENAMED = {"flights": {"most_steps": "max_steps"}, "watch": {"share_bound": "fr
 
 
 def upgraded(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of a run under the names that they have today.
+    """Return the settings of a run with the names of this version.
 
     Parameters
     ----------
     settings : mapping
-        As a file has them; those of this version stay as they are.
+        Settings in a file; settings of this version are not changed.
 
     Returns
     -------

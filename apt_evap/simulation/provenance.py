@@ -1,7 +1,7 @@
-"""Where a run was computed: version, time, libraries and the kind of processor.
+"""Provenance of a run: version, time, libraries and type of processor.
 
-None of it is a setting: a run may be resumed elsewhere, with the same bits. The record helps to find the reason if
-they should ever differ.
+These are not settings: a run may be resumed on another machine, with the same bits. If the bits ever differ, this
+record helps to find the reason.
 """
 
 import datetime
@@ -18,7 +18,7 @@ from apt_evap._version import __version__
 
 
 def provenance_now() -> dict[str, Any]:
-    """Provenance of a run that is computed here and now, in the plain types of JSON."""
+    """Provenance of a run of this process at this time, in the plain types of JSON."""
     created = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     return {"version": __version__, "created": created, "systems": [dict(system())]}
 
@@ -39,7 +39,7 @@ def system() -> Mapping[str, str]:
 
 
 def joined(parts: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
-    """Provenance of a run whose parts have these: that of the first, with the systems of all."""
+    """Join the provenances of the parts of a run: that of the first part, with the systems of all parts."""
     first, *others = parts
     systems = list(first.get("systems", ()))
     for part in others:
@@ -48,12 +48,12 @@ def joined(parts: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _processor():
-    """Name of the processor, as the system tells it."""
+    """Name of the processor."""
     try:
         with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as file:
             for line in file:
                 if line.startswith("model name"):
                     return line.partition(":")[2].strip()
     except OSError:
-        pass  # not on this system
+        pass  # not a Linux system
     return platform.processor()

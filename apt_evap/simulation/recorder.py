@@ -1,4 +1,4 @@
-"""The recorder of a run: takes its parts as they come, watches them, keeps them, and joins them into one."""
+"""The recorder of a run: collects, monitors and stores the parts of a run, and joins them into one."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,29 +17,29 @@ from apt_evap.simulation.monitor import Monitor, WatchSettings
 from apt_evap.simulation.run import Run
 
 TOGETHER = 64
-"""Parts that are joined as they come: small arrays that stay between large ones that go keep the memory of these. Left
-one by one, 100,000 ions of R = 20 a took 540 bytes each, of which 144 are results; joined, 155."""
+"""Number of parts that are joined at a time. Many small arrays between large temporary ones fragment the memory.
+Measured for 100,000 ions of R = 20 a: 540 bytes per ion without joining, 155 with it, of which 144 are results."""
 
 
 class Recorder:
-    """The parts of a run, in memory and on the disk where a `Keeper` keeps them.
+    """The parts of a run, in memory and, with a `Keeper`, on the disk.
 
-    A context: whatever ends it, flights under way are waited for, and what has been done is kept and in `run`.
+    A context manager. At its end, even after an error, it waits for pending flights and stores the ions in `run`.
 
     Parameters
     ----------
     emitter : Emitter
-        The surface, whose state goes with the parts.
+        The surface, whose state is stored with the parts.
     settings : WatchSettings
-        How the run is monitored.
+        Monitoring of the run.
     n_ions : int
-        Ions the run is to have.
+        Requested number of ions.
     n_evaporated : int
-        Ions that have left by now, those before the run included.
+        Ions evaporated so far, including those before the run.
     progress : bool or callable, optional
         As in `Simulation.run`.
     keeper : Keeper or None
-        Where parts are kept, and what has been done before.
+        Storage of the parts, with the ions so far of a resumed run.
     """
 
     def __init__(
@@ -52,26 +52,26 @@ class Recorder:
         keeper: Keeper | None,
     ) -> None:
         self._emitter, self._n_ions, self._keeper = emitter, n_ions, keeper
-        self._kept = [keeper.done] if keeper and keeper.done else []
+        self._stored = [keeper.previous] if keeper and keeper.previous else []
         self._new, self._latest, self._flying = [], [], []
-        self._first_event = self._kept[0].first_event if self._kept else emitter.counts["events"]
+        self._first_event = self._stored[0].first_event if self._stored else emitter.counts["events"]
         self._started = len(self)
         interval = settings.interval or 10 * emitter.sweep_interval
-        self._monitor = Monitor(settings, interval, n_evaporated - len(self), self._kept)
+        self._monitor = Monitor(settings, interval, n_evaporated - len(self), self._stored)
         self._ending = Ending.COMPLETE
-        self._told = progress if callable(progress) else None
+        self._report = progress if callable(progress) else None
         self._bar = tqdm(
             total=n_ions,
             initial=len(self),
             unit=" ions",
             smoothing=0.1,
-            disable=True if self._told else None if progress is None else not progress,
+            disable=True if self._report else None if progress is None else not progress,
             mininterval=0.5,
         )
         self.run: Run | None = None
 
     def __len__(self) -> int:
-        return sum(map(len, (*self._kept, *self._new, *self._latest)))
+        return sum(map(len, (*self._stored, *self._new, *self._latest)))
 
     @property
     def missing(self) -> int:
@@ -88,9 +88,9 @@ class Recorder:
         part : callable
             Waits for the flights of the batch and returns them as a Run.
         ions : int
-            Ions that have left by now, those before the run included.
+            Ions evaporated so far, including those before the run.
         backlog : int
-            Batches whose flights may be under way.
+            Batches whose flights may be pending.
         """
         self._started += len(batch)
         self._flying.append(part)
@@ -102,10 +102,10 @@ class Recorder:
             self._monitor.look(self._emitter, ions)
         if self._keeper and self._keeper.due(self._started):
             self._land()
-            self._keep()
+            self._store()
 
     def interrupt(self) -> None:
-        """Say that the run is to end before its time."""
+        """Record that the run ends early."""
         if self._ending == Ending.COMPLETE and self.missing:
             self._ending = Ending.INTERRUPTED
 
@@ -118,8 +118,8 @@ class Recorder:
             self._monitor.count(part)
             self._bar.set_postfix(self._monitor.latest, refresh=False)
             self._bar.update(len(part))
-            if self._told:
-                self._told(len(self), self._n_ions)
+            if self._report:
+                self._report(len(self), self._n_ions)
 
     def _gather(self):
         if self._latest:
@@ -128,20 +128,20 @@ class Recorder:
 
     def _joined(self):
         self._gather()
-        # the history goes with the last part, as it is taken but once
+        # the history is added to the last part: `take` returns it only once
         if self._new:
             joined = Run.join(self._new)
             self._new = [replace(joined, history=History.join([joined.history, self._monitor.take()]))]
         return self._new
 
-    def _keep(self):
-        if self._keeper and len(self) > sum(map(len, self._kept)):
+    def _store(self):
+        if self._keeper and len(self) > sum(map(len, self._stored)):
             if self._keeper.write(self._joined()[0], self._emitter.state(), self._first_event):
-                self._kept += self._new
+                self._stored += self._new
                 self._new = []
 
     def _all(self, ended):
-        run = Run.join([*self._kept, *self._joined()])
+        run = Run.join([*self._stored, *self._joined()])
         return replace(run, state=self._emitter.state(), first_event=self._first_event, ended=str(ended))
 
     # ---- the context -----------------------------------------------------------------------------------------------
@@ -156,14 +156,14 @@ class Recorder:
             if error is None:
                 try:
                     self._land()
-                except Exception as late:  # in a flight that was still under way
+                except Exception as late:  # in a pending flight
                     self._fail(late)
                     raise
                 self._finish()
             elif isinstance(error, Exception):
                 self._fail(error)
-            else:  # the second Ctrl-C: what is in a checkpoint's run stays
-                self._keep()
+            else:  # the second Ctrl-C: write a last checkpoint
+                self._store()
         finally:
             self._bar.close()
 
@@ -176,15 +176,15 @@ class Recorder:
                 raise RunNotSaved(str(error), self.run) from error
 
     def _fail(self, error: Any) -> None:
-        """Keep what has been done and raise the error with it; one before the first ion stays as it is."""
+        """Store the ions so far and raise the error with them; an error before the first ion is not changed."""
         try:
             self._land()
-        except Exception:  # the same error, or one that follows from it: ions behind it are not done
+        except Exception:  # the same error, or one that follows from it: later ions are lost
             self._flying.clear()
         if not len(self):
             return
         self.run = self._all(f"{type(error).__name__}: {error}")
-        self._keep()
+        self._store()
         raise RunInterrupted(
-            f"{type(error).__name__}: {error}; the {len(self):,} ions done before are in the attribute `run`", self.run
+            f"{type(error).__name__}: {error}; the attribute `run` contains the {len(self):,} ions before it", self.run
         ) from error

@@ -1,4 +1,4 @@
-"""A run: the sequence of atoms that left, and where their ions land under any perturbation; saved in HDF5."""
+"""A run: the sequence of evaporated atoms and the hit positions of their ions for any perturbation; saved in HDF5."""
 
 import hashlib
 import json
@@ -29,7 +29,7 @@ from apt_evap.simulation.run_hdf5 import described, read_run, write_run
 
 @dataclass(frozen=True, eq=False)
 class Flown:
-    """What one perturbation gave in the run: stereographic directions (n, 2) and times of flight (n,) [ns]."""
+    """Results of the flights of one perturbation: stereographic directions (n, 2) and times of flight (n,) [ns]."""
 
     directions: np.ndarray
     times: np.ndarray
@@ -40,9 +40,9 @@ class Flown:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Run:
-    """Atoms in the order in which they left, with what is needed to say where their ions land.
+    """Sequence of evaporated atoms, with the data for the hit positions of their ions.
 
-    Made by `Simulation.run` and `load`.
+    Returned by `Simulation.run` and `load`.
 
     Parameters
     ----------
@@ -53,13 +53,13 @@ class Run:
     species : ndarray of int32, shape (n,)
         Index of each atom into `elements`.
     charges, fields : ndarray, shape (n,)
-        Charge [e] and field just outside [V/nm] of each atom before it left.
+        Charge [e] and field just outside [V/nm] of each atom before it evaporated.
     perturbations : tuple
-        The perturbations flown in the run, or what is known of them from a file.
+        Perturbations flown in the run; a user-defined one is its description if the run was loaded from a file.
     flown : tuple of Flown
-        What each of these gave.
+        Results of each of these perturbations.
     responses : Responses or None
-        Polynomials of every ion.
+        Response polynomials of every ion.
     seed : int
         Seed of the random numbers of the perturbations.
     voltage : float
@@ -67,21 +67,21 @@ class Run:
     detector : Detector
         The detector.
     response_settings : ResponseSettings
-        What the responses were made with.
+        Settings of the responses.
     elements : tuple of str
         Names of the species.
     settings : dict
-        Everything the run was made with, in plain types.
+        All settings of the run, in plain types.
     history : History
-        What was seen of the charges and the ions as the run went on.
+        Results of the checks during the run.
     state : EmitterState or None
-        What makes the surface again at the last relaxation of the run, from which it can be resumed.
+        State of the emitter at the last relaxation of the run, from which the run can be resumed.
     first_event : int
-        Atoms that had left the specimen before the first ion of the run.
+        Number of atoms that evaporated before the first ion of the run.
     ended : str
-        Why the run ended before its time; "" if it did not.
+        Reason if the run ended early; otherwise "".
     provenance : dict
-        Version, time, and under "systems" the processors and libraries that it was computed with.
+        Version, time, and under "systems" the processors and libraries of the computation.
     detached : ndarray of bool, shape (n,), optional
         Atoms that left because they had lost all chains of bonds to the body; by default none, as in files of earlier
         versions.
@@ -118,34 +118,34 @@ class Run:
     def __repr__(self) -> str:
         flown = ", ".join(_describe(perturbation) for perturbation in self.perturbations)
         responses = "" if self.responses is None else f"responses, {self.flagged.sum():,} of them flagged"
-        held = "; ".join(part for part in (responses, flown and f"flown: {flown}", self.ended) if part)
-        return f"<Run: {len(self):,} ions of {', '.join(self.elements)} at {self.voltage:g} V; {held}>"
+        details = "; ".join(part for part in (responses, flown and f"flown: {flown}", self.ended) if part)
+        return f"<Run: {len(self):,} ions of {', '.join(self.elements)} at {self.voltage:g} V; {details}>"
 
     @property
     def response_model(self) -> ResponseModel:
-        """The responses of the run: launches, fit and evaluation."""
+        """Launches, fit and evaluation of the responses."""
         return ResponseModel(self.response_settings, self.detector)
 
     @property
     def flagged(self) -> Booleans:
-        """Ions whose responses miss their own flights by more than the bound, or could not be fitted, bool (n,)."""
+        """Ions whose responses deviate from their own flights by more than the bound, or have no fit, bool (n,)."""
         if self.responses is None:
             return np.zeros(len(self), bool)
         return self.response_model.flagged(self.responses, self.emissions.can_roll)
 
     @property
     def first_perturbation(self) -> Any:
-        """The first one flown in the run; `Unperturbed` where there are only responses."""
+        """The first perturbation flown in the run; `Unperturbed` if there are only responses."""
         return self.perturbations[0] if self.flown else Unperturbed()
 
     def fingerprint(self) -> str:
-        """Hash of all results, by which runs can be compared.
+        """Hash of all results, to compare runs.
 
         Returns
         -------
         str
             SHA-256 over the names, types and values of the columns: emissions, sites, species, charges, fields, flown
-            perturbations and responses. The same settings give the same on every machine.
+            perturbations and responses. The same settings give the same hash on every machine.
         """
         columns = {name: getattr(self, name) for name in ("site", "species", "charges", "fields")}
         columns |= {f"emissions/{name}": getattr(self.emissions, name) for name in COLUMNS}
@@ -164,27 +164,28 @@ class Run:
         return hashed.hexdigest()
 
     def hits(self, perturbation: Perturbation, *, by_response: bool = False) -> Hits:
-        """Where the ions land under a perturbation.
+        """Hits of the ions for a perturbation.
 
-        One that was flown in the run is taken as flown; any other that launches along the surface (all built-in ones,
-        with any energies) follows from the responses. Every perturbation sees the same random numbers of an ion.
+        For a perturbation that was flown in the run, the results of these flights are used. Any other perturbation that
+        launches along the surface (all built-in ones, with any energies) is evaluated from the responses. Each ion has
+        the same random numbers for every perturbation.
 
         Parameters
         ----------
         perturbation : perturbation
-            How the ions start.
+            Initial conditions of the ions.
         by_response : bool
-            Whether to take the responses also for one that was flown, to compare them.
+            Whether to use the responses even for a perturbation that was flown, for comparison.
 
         Returns
         -------
         Hits
-            One row per ion, in the order in which the atoms left; `outcome` counts those that miss the detector.
+            One row per ion, in the sequence of evaporation; `outcome` is the outcome of each flight.
 
         Raises
         ------
         ValueError
-            If the perturbation was not flown and does not follow from responses.
+            If the perturbation was not flown and cannot be evaluated from the responses.
         """
         check_switch(by_response, "by_response")
         for flown_as, flown in zip(self.perturbations, self.flown, strict=True):
@@ -194,8 +195,8 @@ class Run:
         if not callable(getattr(perturbation, "tangential", None)):
             check_kind(perturbation, "perturbation", "launch", "a perturbation such as Unperturbed() or RollUp(0.2)")
             raise ValueError(
-                f"perturbation {short_text(perturbation)} was not flown in this run and does not say how it launches "
-                "along the surface; name it when the run starts: simulation.run(n, emissions=[...])"
+                f"perturbation {short_text(perturbation)} was not flown in this run and has no method `tangential`; "
+                "pass it to the simulation: simulation.run(n, emissions=[...])"
             )
         if self.responses is None:
             raise ValueError(f"this run has no responses and {short_text(perturbation)} was not flown in it")
@@ -224,12 +225,12 @@ class Run:
         )
 
     def seen_by(self, detector: Detector) -> "Run":
-        """Let another detector see the ions of this run: only where they are recorded changes.
+        """The same ions, recorded by another detector.
 
         Parameters
         ----------
         detector : Detector
-            Another distance, width or projection.
+            Detector with another distance, width or projection.
 
         Returns
         -------
@@ -238,7 +239,7 @@ class Run:
         return replace(self, detector=detector, settings=self.settings | {"detector": vars(detector)})
 
     def summary(self) -> dict[str, Any]:
-        """Counts of what happened, dict: ions, outcomes of the first perturbation, ions that cannot roll, flagged."""
+        """Counts, dict: ions, outcomes of the first perturbation, ions that cannot roll up, flagged ions."""
         first = self.first_perturbation
         counts = {outcome.name.lower(): count for outcome, count in self.hits(first).counts.items()}
         return {
@@ -255,7 +256,7 @@ class Run:
 
     @classmethod
     def join(cls, runs: "Sequence[Run]") -> "Run":
-        """Join the parts of one run, in their order, into one."""
+        """Join the parts of one run in their order."""
         first = runs[0]
         emissions = Emissions.join([run.emissions for run in runs])
         columns: dict[str, Any] = {
@@ -279,13 +280,13 @@ class Run:
         return replace(first, emissions=emissions, flown=flown, responses=responses, history=history, **columns)  # type: ignore[arg-type]
 
     def ended_by(self, reason: str) -> "Run":
-        """Return the same run with the reason why it ended before its time."""
+        """The same run with the reason of an early end."""
         return replace(self, ended=reason)
 
     # ---- files -----------------------------------------------------------------------------------------------------
 
     def save(self, path: AnyPath) -> None:
-        """Write the run to an HDF5 file, whole or not at all.
+        """Write the run to an HDF5 file. The file is either complete or absent.
 
         Parameters
         ----------
@@ -301,14 +302,14 @@ class Run:
 
 
 def load(path: AnyPath, *, partial: bool = False) -> Run:
-    """Read a run from an HDF5 file that `Run.save` wrote, or from the folder of one that is unfinished.
+    """Read a run from an HDF5 file of `Run.save`, or from the folder of an unfinished run.
 
     Parameters
     ----------
     path : str or path-like
         The file; or the folder beside it, whose name ends in ".unfinished" (see `Checkpoint`).
     partial : bool
-        Whether to read, of a damaged file or folder, the ions that are whole; a warning says how many are lost.
+        Whether to read the undamaged ions of a damaged file or folder; a warning gives the number of lost ions.
 
     Returns
     -------
@@ -341,16 +342,16 @@ def _load_parts(folder, partial):
             warnings.warn(f"{error}: its ions are lost", DataWarning, stacklevel=3)
             continue
         if parts and (name := _difference(parts[0], part)):
-            raise FileError(f"{str(path)!r} is of another run than {names[0]!r}: its {name} differ")
+            raise FileError(f"{str(path)!r} belongs to another run than {names[0]!r}: its {name} differ")
         parts.append(part)
         names.append(path.name)
     if not parts:
-        raise FileError(f"{str(folder)!r} holds no run: expected files {PART_NAME.format(0)!r} and so on")
+        raise FileError(f"{str(folder)!r} contains no run: expected files {PART_NAME.format(0)!r} and so on")
     return Run.join(parts).ended_by(Ending.UNFINISHED)
 
 
 def _difference(one, other):
-    """What two parts of one run differ in, though they should not; "" if in nothing."""
+    """Name of the first property that differs between two parts of one run; "" if there is none."""
     pairs = {
         "settings": (one.settings, other.settings),
         "elements": (one.elements, other.elements),

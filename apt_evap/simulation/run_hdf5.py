@@ -1,6 +1,6 @@
-"""The HDF5 file of a run: its layout, written whole or not at all, read whole or as far as it is undamaged.
+"""The HDF5 file of a run: layout, writing and reading, also of the undamaged ions in a damaged file.
 
-Groups and fields have the names of NeXus NXapm where it has one; see docs/formats.rst.
+Groups and fields have the names of NeXus NXapm if it defines one; see docs/formats.rst.
 """
 
 import json
@@ -35,8 +35,8 @@ from apt_evap.simulation.old_settings import upgraded
 
 FORMAT = "apt_evap run 2"
 _KIND = "apt_evap run "
-_LONGEST_TEXT = 60_000  # bytes: HDF5 takes 64 kB in an attribute
-ROWS = 4096  # ions whose part of a dataset has a checksum of its own: damage costs these ions
+_LONGEST_TEXT = 60_000  # bytes: HDF5 allows 64 kB in an attribute
+ROWS = 4096  # rows of a dataset with a common checksum: any damage to them loses these ions
 
 _ENTRY = "entry1"
 _ATOM_PROBE, _SIMULATION = f"{_ENTRY}/atom_probe", f"{_ENTRY}/simulation"
@@ -55,7 +55,7 @@ _UNITS = {
     "field": "V/nm",
 }
 _IONS = f"{_ATOM_PROBE}/evaporation_id"
-_KINDS = {  # datasets of a row for each ion: name, type, shape of a row
+_KINDS = {  # datasets with one row per ion: name, type, shape of a row
     "ions": (_IONS, np.int64, ()),
     "positions": (f"{_SIMULATION}/positions", np.float64, (3,)),
     "normals": (f"{_SIMULATION}/normals", np.float64, (3,)),
@@ -73,12 +73,12 @@ _STATE_ARRAYS = {
     "lonely": (np.int64, (None,)),
     "lonely_normals": (np.float64, (None, 3)),
 }
-_HISTORY = {"flagged": "marked"}  # names of columns in files that differ
+_HISTORY = {"flagged": "marked"}  # columns with other names in files
 _READ_ERRORS = (OSError, KeyError, IndexError, RuntimeError, TypeError, ValueError, AttributeError, OverflowError)
 
 
 def plain(settings: Any) -> Any:
-    """Settings as they come back from a file, in the plain types of JSON."""
+    """Settings in the plain types of JSON, as read from a file."""
     return json.loads(json.dumps(settings, default=_plain))
 
 
@@ -91,7 +91,7 @@ def _plain(value):
 
 
 def described(perturbation: Any) -> dict[str, Any]:
-    """What a file says of a perturbation, dict."""
+    """Description of a perturbation in a file, dict."""
     return perturbation if isinstance(perturbation, dict) else to_dict(perturbation)
 
 
@@ -99,16 +99,17 @@ def described(perturbation: Any) -> dict[str, Any]:
 
 
 def write_run(path: AnyPath, run: Any) -> None:
-    """Write a Run to a file, whole or not at all; FileError if it cannot be written."""
+    """Write a Run to a file, which is either complete or absent; FileError if it cannot be written."""
     with write_checked(path, ROWS) as file:
         _put_text(file, "format", FORMAT)
         _write(file, run)
 
 
 def _put_text(item, name, text):
-    """Text that is read back, of fixed length: in a damaged heap of texts of any length HDF5 hangs or crashes.
+    """Write a text of fixed length.
 
-    It did in 3 of 960 files changed at random; in none of 2,640 with these.
+    Texts of variable length lie in a heap, and HDF5 hangs or crashes if it is damaged. Measured with randomly changed
+    files: 3 of 960 with variable length, none of 2,640 with fixed length.
     """
     content = text.encode()
     if len(content) > _LONGEST_TEXT:
@@ -170,7 +171,7 @@ def _put_state(group, state, first_event):
 
 
 def write_state(path: AnyPath, state: Any, first_event: int) -> None:
-    """Write an EmitterState to a file of its own, whole or not at all."""
+    """Write an EmitterState to a separate file, which is either complete or absent."""
     with write_checked(path, ROWS) as file:
         _put_text(file, "format", FORMAT)
         _put_state(file, state, first_event)
@@ -180,26 +181,26 @@ def write_state(path: AnyPath, state: Any, first_event: int) -> None:
 
 
 def read_run(path: AnyPath, partial: bool = False) -> dict[str, Any]:
-    """What a file says of a Run, as the arguments of one; FileError if it is missing, damaged or not a run."""
-    hint = "" if partial else f"; {argument('partial', True)} reads the ions that are whole"
+    """Read the arguments of a Run from a file; FileError if it is missing, damaged or not a run."""
+    hint = "" if partial else f"; {argument('partial', True)} reads the undamaged ions"
     with _reading(path, hint, partial=partial) as file:
         return _read(file, partial)
 
 
 def read_state(path: AnyPath) -> tuple[EmitterState, int]:
-    """The EmitterState in a file of its own, and how many atoms had left before the first ion of its run."""
+    """Read an EmitterState from a separate file, and the number of atoms evaporated before the first ion of its run."""
     with _reading(path) as file:
         return _read_state(file, "")
 
 
 def count_ions(path: AnyPath) -> int:
-    """Ions of the run in a file; FileError as `read_run`."""
+    """Number of ions of the run in a file; FileError as `read_run`."""
     with _reading(path, with_data=False) as file:
         return len(file.dataset(_IONS, np.int64, (None,)))
 
 
 def is_run(path: AnyPath) -> bool:
-    """Whether a file is a run, damaged or not, in this format or another one."""
+    """Whether a file is a run, even if it is damaged or in another version of the format."""
     with suppress(OSError, RuntimeError, ValueError, KeyError):
         if has_checksums(path):
             return True
@@ -289,7 +290,7 @@ def _read(file, partial):
 
 
 def _columns(file, kinds, partial):
-    """Columns of the ions by name; of a damaged file, only the ions whose rows are whole in all of them."""
+    """Columns by name; for a damaged file, only the ions whose rows are undamaged in all columns."""
     n = len(file.dataset(_IONS, np.int64, (None,)))
     datasets = {name: file.dataset(path, dtype, (n, *shape)) for name, (path, dtype, shape) in kinds.items()}
     blocks, lost = [], 0
@@ -322,7 +323,7 @@ def _read_state(file, group):
     before = f"{group}/" if group else ""
     arrays = {name: file.read(before + name, dtype, shape) for name, (dtype, shape) in _STATE_ARRAYS.items()}
     numbers = dict(file.attributes(group))
-    for name in ("format", "checksums"):  # of a file of its own
+    for name in ("format", "checksums"):  # attributes of a separate file
         numbers.pop(name, None)
     own = {name: numbers.pop(name) for name in ("deepened", "tolerance", "opening_angle", "clipped", "unsettled")}
     first_event = check_count(int(numbers.pop("first_event")), "first_event")
@@ -339,7 +340,7 @@ def _read_state(file, group):
 
 
 def _known(description):
-    """The perturbation that `to_dict` described, or the description if it was one of a user's own."""
+    """The perturbation with this description of `to_dict`; for a user-defined one, the description."""
     try:
         return from_dict(description)
     except ValueError:

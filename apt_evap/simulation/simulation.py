@@ -201,7 +201,7 @@ class Simulation:
             self._running.release()
 
     def _run_alone(self, n_ions, emissions, responses, progress, batch_size, keeper):
-        self._catch_up(keeper.done if keeper else None)
+        self._catch_up(keeper.previous if keeper else None)
         self.emitter.hand_out_tree()  # atoms may have evaporated without flights before
         backlog = BACKLOG if self.n_threads > 1 else 0
         with (
@@ -217,37 +217,38 @@ class Simulation:
                     break
         return recorder.run
 
-    def _catch_up(self, done):
+    def _catch_up(self, previous):
         """Bring a new surface to the end of a resumed run, by its stored state and the events since then.
 
         Raises ValueError if atoms have already evaporated, or if the events differ from those of the run.
         """
-        if done is None:
+        if previous is None:
             return
         emitter = self.emitter
         if n_evaporated := emitter.counts["events"]:
             raise ValueError(f"resume needs a new Simulation, got one with {n_evaporated:,} evaporated atoms")
-        if done.state is not None:
+        if previous.state is not None:
             try:
-                emitter.restore(done.state)
+                emitter.restore(previous.state)
             except (ValueError, KeyError) as error:
                 raise FileError(f"the run cannot be resumed, its state does not fit: {error}") from error
-        ions = emitter.counts["events"] - done.first_event  # evaporated ions of the run; negative before its first ion
-        same = ions <= len(done)
-        for batch in emitter.advance(max(len(done) - ions, 0)):
+        # evaporated ions of the run; negative before its first ion
+        ions = emitter.counts["events"] - previous.first_event
+        same = ions <= len(previous)
+        for batch in emitter.advance(max(len(previous) - ions, 0)):
             stored = slice(max(ions, 0), max(ions + len(batch), 0))
             common = slice(len(batch) - (stored.stop - stored.start), None)
-            same = same and np.array_equal(batch.site[common], done.site[stored])
-            same = same and np.array_equal(batch.charges[common], done.charges[stored])
+            same = same and np.array_equal(batch.site[common], previous.site[stored])
+            same = same and np.array_equal(batch.charges[common], previous.charges[stored])
             ions += len(batch)
             if not same:
                 break
-        if not same or ions != len(done):
+        if not same or ions != len(previous):
             raise ValueError(
                 "the run cannot be resumed: its recomputed events differ; possible reasons are another version of the "
                 "program, another type of processor, or a surface changed by hand"
             )
-        self.n_evaporated = int(done.emissions.ions[-1]) + 1
+        self.n_evaporated = int(previous.emissions.ions[-1]) + 1
 
     # ---- one batch -------------------------------------------------------------------------------------------------
 

@@ -158,7 +158,7 @@ def test_arrays_by_name(folder, capsys):
         renamed = {"n": held["counts"], "a": held["x_edges_cm"], "b": held["y_edges_cm"]}
     np.savez("named.npz", **renamed)
     arguments = ["run.h5", "named.npz", *QUICK, *HERE, "--quiet"]
-    assert "named.npz' must hold one array to be the edges" in failed(capsys, *arguments)
+    assert "named.npz' must contain exactly one array for the edges" in failed(capsys, *arguments)
     assert main(["compare", *arguments, "--arrays", "n,a,b", "--unit", "cm"]) == 0
     assert json.loads(Path("named_study/study.json").read_text())["settings"]["measured_noise"] == "not known"
 
@@ -219,7 +219,7 @@ def test_a_doubtful_registration_is_told_once_and_kept(folder, capsys):
     assert main(["compare", "run.h5", "noise.npz", "-o", "noise", *QUICK]) == 0
     out, err = capsys.readouterr()
     assert err.count("the registration is doubtful") == 1
-    assert f"note: look at {Path('noise/registration.png')}; --registration sets" in err
+    assert f"note: check {Path('noise/registration.png')}; --registration sets" in err
     assert "roll-up, registration doubtful, best at" in out
     assert json.loads(Path("noise/study.json").read_text())["registration"]["doubtful"] is True
     assert main(["compare", "run.h5", "noise.npz", "-o", "given", *QUICK, *HERE]) == 0

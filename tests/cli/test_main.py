@@ -155,19 +155,21 @@ def test_a_run_is_made_longer_by_resume(folder, made, capsys):
     assert [name for name in one if one[name].tobytes() != two[name].tobytes()] == []
     assert load("small.h5").provenance["config"] == "small.toml"
     assert sorted(os.listdir()) == ["small.h5", "small.png", "small.toml"]
-    assert "seed is 1 there and 2 here" in failed(capsys, "run", "small.toml", "--resume", "--seed", "2", "--quiet")
-    assert "--ions must be at least the 60 that are done already, got 50" in failed(
+    assert "seed is 1 in the stored run, 2 in the new one" in failed(
+        capsys, "run", "small.toml", "--resume", "--seed", "2", "--quiet"
+    )
+    assert "--ions must be >= 60, the number of ions of the run so far, got 50" in failed(
         capsys, "run", "small.toml", "--resume", "--ions", "50", "--quiet"
     )
 
 
 @NO_PICTURES
-def test_an_unfinished_run_is_resumed_or_begun_anew_as_asked(folder, made, capsys):
+def test_an_unfinished_run_is_resumed_or_replaced_as_requested(folder, made, capsys):
     assert main(["run", "small.toml", "--ions", "25", "--quiet"]) == 0
     (folder / "small.h5.unfinished").mkdir()
     os.rename("small.h5", "small.h5.unfinished/ions-000000000000.h5")
     message = failed(capsys, "run", "small.toml", "--quiet")
-    assert "unfinished run of 25 ions" in message and "--resume goes on with it, --force begins anew" in message
+    assert "unfinished run of 25 ions" in message and "--resume continues it, --force replaces it" in message
     assert main(["info", "small.h5.unfinished"]) == 0
     told = capsys.readouterr().out
     assert "unfinished run of 25 ions" in told and "continue with the same command and --resume" in told
@@ -194,13 +196,16 @@ def test_a_second_run_overwrites_the_first_but_nobody_elses_files(folder, capsys
     assert created[0] < (folder / "small.h5").stat().st_mtime_ns
     assert created[1] < (folder / "small.png").stat().st_mtime_ns
 
-    with_seed = "small.h5' holds a run with other settings (seed is 1 there and 2 here): --force replaces it"
+    with_seed = (
+        "small.h5' contains a run with other settings (seed is 1 in the stored run, 2 in the new one): "
+        "--force replaces it"
+    )
     assert with_seed in failed(capsys, *quick, "--seed", "2")
-    assert "small.h5' holds a run of 5 ions, more than the 4 asked for: --force" in failed(
+    assert "small.h5' contains a run of 5 ions, more than the requested 4: --force" in failed(
         capsys, *quick, "--ions", "4"
     )
     load("small.h5").ended_by("interrupted").save("small.h5")
-    assert "a run of 5 ions that is not complete (interrupted): --resume goes on with it, --force begins anew" in (
+    assert "an incomplete run of 5 ions (interrupted): --resume continues it, --force replaces it" in (
         failed(capsys, *quick)
     )
     assert main([*quick, "--force"]) == 0
@@ -507,8 +512,8 @@ def test_info_of_measured_ions(measured, capsys):
 
 def test_info_of_what_cannot_be_read(measured, made, capsys):
     measured.write_bytes(measured.read_bytes()[:-10])
-    assert "ions.epos' ends in the middle of an ion: 3999 whole ions" in (text := failed(capsys, "info", measured))
-    assert "--partial reads the whole ones" in text
+    assert "ions.epos' ends in the middle of an ion: 3999 complete ions" in (text := failed(capsys, "info", measured))
+    assert "--partial reads the complete ions" in text
     assert main(["info", "ions.epos", "--partial", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["ions"] == 3999
     Path("cut.h5").write_bytes(made.read_bytes()[:5000])
@@ -516,7 +521,7 @@ def test_info_of_what_cannot_be_read(measured, made, capsys):
     Path("empty.epos").write_bytes(b"")
     assert "'empty.epos' is empty" in failed(capsys, "info", "empty.epos")
     assert "cannot read 'none.h5'" in failed(capsys, "info", "none.h5")
-    assert "small.toml' is not known from its suffix '.toml'" in failed(capsys, "info", "small.toml")
+    assert "unknown format of 'small.toml' (suffix '.toml')" in failed(capsys, "info", "small.toml")
 
 
 def test_warnings_of_readers_are_one_line(measured, capsys):
@@ -526,7 +531,7 @@ def test_warnings_of_readers_are_one_line(measured, capsys):
     assert main(["info", "ions.epos", "--json"]) == 0
     out, err = capsys.readouterr()
     assert "multi_hit_share" not in json.loads(out)
-    assert re.fullmatch(r"apt-evap: warning: 'ions.epos' does not tell which ions share a pulse[^\n]+\n", err)
+    assert re.fullmatch(r"apt-evap: warning: 'ions.epos': pulses unknown[^\n]+\n", err)
 
 
 # ---- maps in .npz files ----------------------------------------------------------------------------------------------

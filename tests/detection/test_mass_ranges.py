@@ -130,7 +130,7 @@ def test_what_is_no_rrng(save, tmp_path):
         read_ranges(save(""))
     with pytest.raises(FileError, match="No such file"):
         read_ranges(tmp_path / "none.rrng")
-    with pytest.warns(UserWarning, match="announces 3 ranges and holds 2"):
+    with pytest.warns(UserWarning, match="states 3 ranges but contains 2"):
         assert len(read_ranges(save(TIDY[: TIDY.index("Range3")]))) == 2
 
 

@@ -46,21 +46,24 @@ def test_names_and_unit_can_be_given(tmp_path):
     assert map.x_edges == pytest.approx(1e-3 * X)
     with pytest.raises(ae.FileError, match=r"map\.npz.*the unit of u must be one of mm, cm, m, um, got 'u'"):
         ae.read_map(tmp_path / "map.npz", **names)
-    with pytest.raises(ae.FileError, match=r"must hold an array 'w', it holds n int16\[10, 20\]"):
+    with pytest.raises(ae.FileError, match=r"must contain an array 'w', it contains n int16\[10, 20\]"):
         ae.read_map(tmp_path / "map.npz", unit="mm", **names | {"x_edges": "w"})
 
 
 @pytest.mark.parametrize(
     "arrays, words",
     [
-        ({}, "one array to be the values, it holds nothing"),
-        ({"a": COUNTS, "b": COUNTS, "x_edges_mm": X, "y_edges_mm": Y}, "one array to be the values, it holds a int16"),
-        ({"counts": COUNTS, "y_edges_mm": Y}, r"one array to be the edges in x \(x_edges_mm\)"),
+        ({}, "exactly one array for the values, it contains no array"),
+        (
+            {"a": COUNTS, "b": COUNTS, "x_edges_mm": X, "y_edges_mm": Y},
+            "exactly one array for the values, it contains a int16",
+        ),
+        ({"counts": COUNTS, "y_edges_mm": Y}, r"exactly one array for the edges in x \(x_edges_mm\)"),
         ({"counts": COUNTS, "x_edges_mm": X[:-1], "y_edges_mm": Y}, r"x_edges must have shape \(21,\), got \(20,\)"),
         ({"counts": -COUNTS, "x_edges_mm": X, "y_edges_mm": Y}, "must be >= 0, got -"),
         ({"counts": np.array([None]), "x_edges_mm": X}, "as an .npz file: Object arrays"),
-        ({"counts": COUNTS, "x_edges_mm": X.astype("U9"), "y_edges_mm": Y}, "x_edges_mm must hold numbers, got <U9"),
-        ({"counts": COUNTS, "x_edges_mm": X, "y_edges_mm": Y > 0}, "y_edges_mm must hold numbers, got bool"),
+        ({"counts": COUNTS, "x_edges_mm": X.astype("U9"), "y_edges_mm": Y}, "x_edges_mm must contain numbers, got <U9"),
+        ({"counts": COUNTS, "x_edges_mm": X, "y_edges_mm": Y > 0}, "y_edges_mm must contain numbers, got bool"),
         (
             {"counts": COUNTS + np.int64(2**62), "x_edges_mm": X, "y_edges_mm": Y},
             "add up to at most 9007199254740992, got 9.2",
@@ -95,7 +98,7 @@ def test_files_that_are_none(tmp_path):
     (tmp_path / "empty.npz").touch()
     np.save(tmp_path / "one.npy", COUNTS)
     for name in ("empty.npz", "one.npy"):
-        with pytest.raises(ae.FileError, match=f"{name}.*does not begin as an .npz file does"):
+        with pytest.raises(ae.FileError, match=f"{name}.*does not begin like an .npz file"):
             ae.read_map(tmp_path / name)
     with pytest.raises(ae.FileError, match="No such file"):
         ae.read_map(tmp_path / "none.npz")

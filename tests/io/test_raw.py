@@ -34,10 +34,10 @@ def test_the_pulse_number_may_wrap_around(save, recwarn):
 
 
 def test_pulse_numbers_that_tell_nothing(save):
-    with pytest.warns(UserWarning, match=r"a\.raw.*zero throughout"):
+    with pytest.warns(UserWarning, match=r"a\.raw.*zero for all ions"):
         hits = read(save(raw([0, 0, 0])[0]))
     assert hits.pulse_id is None and hits.multiplicity is None
-    with pytest.warns(UserWarning, match=r"a\.raw.*only neighbours.*falls at 1 rows"):
+    with pytest.warns(UserWarning, match=r"a\.raw.*only consecutive ions.*decreases at 1 rows"):
         assert read(save(raw([5, 6, 6, 5])[0])).pulse_id.tolist() == [0, 1, 1, 2]
 
 
@@ -45,11 +45,11 @@ def test_wrong_files(save):
     data, rows = raw([1, 2, 3])
     with pytest.raises(FileError, match=r"a\.raw.*empty"):
         read(save(b""))
-    with pytest.raises(TruncatedFile, match=r"a\.raw.* 2 whole ions of 32 bytes as in a \.raw and 31 bytes more"):
+    with pytest.raises(TruncatedFile, match=r"a\.raw.* 2 complete ions of 32 bytes as in a \.raw and 31 further bytes"):
         read(save(data[:-1]))
     assert len(read(save(data[:-1]), partial=True)) == 2
     swapped = rows.byteswap().tobytes()
-    with pytest.raises(FileError, match=r"looks big-endian .* expected little-endian; byte_order='big'"):
+    with pytest.raises(FileError, match=r"appears to be big-endian .* expected little-endian; byte_order='big'"):
         read(save(swapped))
     np.testing.assert_array_equal(read(save(swapped), byte_order="big").x, rows["x"])
 

@@ -163,7 +163,7 @@ def test_ions_without_a_place_are_left_out_and_counted(tmp_path, suffix):
         assert parse_xyz(path)["species"].tolist() == ["Si"] and parse_xyz(path)["ion"].tolist() == [0]
     else:
         assert parse_vtp(path)["PointData", "ion"].tolist() == [0]
-    with pytest.raises(ValueError, match="nothing to write"):
+    with pytest.raises(ValueError, match="no ion to write"):
         write(path, hits[1:])
     with pytest.raises(ValueError, match="no column 'positions'"):
         write(path, Hits(x=[1.0]))
@@ -184,7 +184,7 @@ def test_species_from_ranges(tmp_path):
 
 def test_what_cannot_be_written(tmp_path):
     for suffix in (".apt", ".raw"):
-        with pytest.raises(FileError, match=rf"a {suffix} file is only read"):
+        with pytest.raises(FileError, match=rf"a {suffix} file can only be read"):
             write(tmp_path / f"a{suffix}", full())
     with pytest.raises(ValueError, match=r"hits must be Hits.*run\.hits"):
         write(tmp_path / "a.xyz", 5)

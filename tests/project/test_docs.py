@@ -66,7 +66,7 @@ def test_blocks_are_found():
         assert page.read_text().count("code-block::") == len(python_blocks(page)), page.name
 
 
-@pytest.mark.filterwarnings("ignore:.*leaves out:UserWarning")
+@pytest.mark.filterwarnings("ignore:.*left out of:UserWarning")
 @pytest.mark.parametrize("path", [p for p in PAGES if python_blocks(p)], ids=lambda path: path.name)
 def test_python_blocks_run(path, folder, monkeypatch):
     """All blocks of a page, one after the other, as a reader would; those of the README run below."""
@@ -82,7 +82,7 @@ def run_blocks(path, monkeypatch):
         exec(compile(block, str(path), "exec"), page.__dict__)
 
 
-@pytest.mark.filterwarnings("ignore:.*leaves out:UserWarning")
+@pytest.mark.filterwarnings("ignore:.*left out of:UserWarning")
 def test_what_the_readme_makes(folder, monkeypatch):
     """Its blocks run, the files it names are written, and its own perturbation does what it says."""
     run_blocks(README, monkeypatch)
@@ -99,7 +99,7 @@ TUTORIALS = sorted(path.name for path in (ROOT / "examples").glob("tutorial_*.py
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:.*leaves out:UserWarning")
+@pytest.mark.filterwarnings("ignore:.*left out of:UserWarning")
 @pytest.mark.parametrize("name", TUTORIALS)
 def test_examples_run(name, folder, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", [name, "200"])

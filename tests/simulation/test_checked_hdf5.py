@@ -117,7 +117,7 @@ def test_damaged_rows_and_damaged_indices_differ(path, run):
         place = file[f"{SIMULATION}/fields"].id.get_offset()
     whole = path.read_bytes()
     changed(path, place)
-    refused(path, "its checksum does not match; partial=True reads the ions that are whole")
+    refused(path, "its checksum does not match; partial=True reads the undamaged ions")
     assert count_ions(path) == 60  # reads no rows
     with pytest.warns(ae.DataWarning, match="60 of 60 ions are lost"):
         assert len(ae.load(path, partial=True)) == 0
@@ -175,7 +175,7 @@ def with_dataset(path, name, values):
             lambda values: np.stack([values, values], axis=1),
             r"charges must have shape \(60\), got \(60, 2\)",
         ),
-        ("fields", lambda values: values.astype("S5"), r"fields must hold float64, got \|S5"),
+        ("fields", lambda values: values.astype("S5"), r"fields must contain float64, got \|S5"),
         ("species", lambda values: values + 9, "species must be 0 to 0, as there are 1 elements"),
         ("species", lambda values: values - 1, "species must be 0 to 0"),
         ("responses/site", lambda values: values[:, :, :5], r"site must have shape \(60, 3, 15\), got \(60, 3, 5\)"),
@@ -199,7 +199,7 @@ def test_external_storage_is_refused(old_path, tmp_path):
         del file[f"{SIMULATION}/charges"]
         place = [(str(tmp_path / "secret"), 0, 8 * 60)]
         file.create_dataset(f"{SIMULATION}/charges", (60,), "f8", external=place)
-    refused(old_path, "charges lies elsewhere: data outside of the file are not read")
+    refused(old_path, "charges is in another file: data outside the file are not read")
 
 
 def test_virtual_datasets_are_refused(old_path, tmp_path):
@@ -210,7 +210,7 @@ def test_virtual_datasets_are_refused(old_path, tmp_path):
     with h5py.File(old_path, "a") as file:
         del file[f"{SIMULATION}/charges"]
         file.create_virtual_dataset(f"{SIMULATION}/charges", layout)
-    refused(old_path, "charges lies elsewhere")
+    refused(old_path, "charges is in another file")
 
 
 @pytest.mark.parametrize("name", [f"{SIMULATION}/charges", SIMULATION, f"{SIMULATION}/state"])
@@ -224,7 +224,7 @@ def test_links_are_refused(old_path, tmp_path, name):
             else:
                 file.move(name, "elsewhere")
             file[name] = link
-        refused(old_path, "is a link: data outside of the file are not read")
+        refused(old_path, "is a link: data outside the file are not read")
 
 
 def test_the_size_is_asked_first(old_path):

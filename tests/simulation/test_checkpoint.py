@@ -254,7 +254,7 @@ def test_a_full_disk_loses_nothing(tmp_path):
     resource.setrlimit(resource.RLIMIT_FSIZE, (12_000, before[1]))
     try:
         with (
-            pytest.warns(UserWarning, match=r"no checkpoint: cannot write .*File too large; the run goes on"),
+            pytest.warns(UserWarning, match=r"no checkpoint: cannot write .*File too large; the run continues"),
             pytest.raises(ae.RunNotSaved, match=r"cannot write .*File too large") as caught,
         ):
             run_small(tmp_path / "run.h5")
@@ -280,7 +280,7 @@ def test_a_folder_that_is_not_there_is_refused_before_the_run(tmp_path):
 
 def test_a_file_of_somebody_else_is_not_overwritten(tmp_path):
     (tmp_path / "run.h5").write_text("my only copy")
-    with pytest.raises(ae.FileError, match=r"run\.h5' exists and is no run"):
+    with pytest.raises(ae.FileError, match=r"run\.h5' exists and is not a run"):
         run_small(tmp_path / "run.h5")
     assert (tmp_path / "run.h5").read_text() == "my only copy"
     assert [item.name for item in tmp_path.iterdir()] == ["run.h5"]
@@ -296,7 +296,7 @@ def test_one_process_at_a_time(tmp_path):
 
 @pytest.fixture
 def unfinished(tmp_path):
-    """A run of which 60 ions are done."""
+    """A run with 60 of its ions."""
     with pytest.raises(KeyboardInterrupt):
         interrupted(tmp_path / "run.h5", (70, 75))
     assert len(ae.load(tmp_path / "run.h5.unfinished")) == 60
@@ -304,7 +304,7 @@ def unfinished(tmp_path):
 
 
 def test_an_unfinished_run_is_not_thrown_away_unasked(unfinished):
-    with pytest.raises(ae.FileError, match=r"unfinished run of 60 ions beside it.*resume=True goes on"):
+    with pytest.raises(ae.FileError, match=r"unfinished run of 60 ions beside it.*resume=True continues it"):
         interrupted(unfinished, ())
     run = interrupted(unfinished, (), overwrite=True)
     assert len(run) == len(ae.load(unfinished)) == 90
@@ -314,11 +314,11 @@ def test_an_unfinished_run_is_not_thrown_away_unasked(unfinished):
 def test_other_settings_are_refused(unfinished):
     checkpoint = ae.Checkpoint(unfinished, resume=True)
     options = {"responses": False, "progress": False, "checkpoint": checkpoint}
-    with pytest.raises(ae.FileError, match=r"detector\.distance is 100\.0 there and 50\.0 here"):
+    with pytest.raises(ae.FileError, match=r"detector\.distance is 100\.0 in the stored run, 50\.0 in the new"):
         small(detector=ae.Detector(distance=50.0)).run(90, [Interrupting()], **options)
-    with pytest.raises(ae.FileError, match=r"flown is .*Interrupting.* there and .*RollUp.* here"):
+    with pytest.raises(ae.FileError, match=r"flown is .*Interrupting.* in the stored run, .*RollUp.* in the new"):
         small().run(90, [ae.RollUp(0.2)], **options)
-    with pytest.raises(ValueError, match="n_ions must be at least the 60 that are done already, got 50"):
+    with pytest.raises(ValueError, match="n_ions must be >= 60, the number of ions of the run so far, got 50"):
         small().run(50, [Interrupting()], **options)
     used = small()
     used.run(5, responses=False, progress=False)
@@ -330,11 +330,14 @@ def test_other_settings_are_refused(unfinished):
 @pytest.mark.parametrize(
     ("there", "message"),
     [
-        ({"n_ions": 90}, "holds a run of 90 ions, more than the 60 asked for: overwrite=True replaces it"),
-        ({"n_ions": 60, "voltage": 900.0}, r"other settings \(voltage is 900\.0 there and 1000\.0 here\): overwrite"),
+        ({"n_ions": 90}, "contains a run of 90 ions, more than the requested 60: overwrite=True replaces it"),
+        (
+            {"n_ions": 60, "voltage": 900.0},
+            r"other settings \(voltage is 900\.0 in the stored run, 1000\.0 in the new one\): overwrite",
+        ),
         (
             {"n_ions": 60, "ended": "interrupted"},
-            r"of 60 ions that is not complete \(interrupted\): resume=True goes on",
+            r"an incomplete run of 60 ions \(interrupted\): resume=True continues it",
         ),
     ],
 )
@@ -353,7 +356,7 @@ def test_a_run_that_would_not_come_out_again_is_not_replaced(tmp_path, there, me
 
 def test_a_refused_resume_leaves_nothing_behind(tmp_path):
     run_small(tmp_path / "run.h5", 90)
-    with pytest.raises(ae.FileError, match="n_ions must be at least the 90 that are done already, got 60"):
+    with pytest.raises(ae.FileError, match="n_ions must be >= 90, the number of ions of the run so far, got 60"):
         run_small(tmp_path / "run.h5", 60, resume=True)
     used = small()
     used.run(5, responses=False, progress=False)
@@ -371,7 +374,7 @@ def test_a_complete_run_is_not_written_again_by_resume(tmp_path):
     assert len(simulation.run(90, responses=False, progress=False, checkpoint=checkpoint)) == 90
     after = os.stat(tmp_path / "run.h5")
     assert (after.st_ino, after.st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
-    more = simulation.run(20, responses=False, progress=False)  # it goes on from there
+    more = simulation.run(20, responses=False, progress=False)  # continues with the next atoms
     assert more.emissions.ions[0] == 90
 
 
@@ -426,8 +429,8 @@ def planted(tmp_path):
     [
         (lambda lock: lock.symlink_to(lock.parents[1] / "victim.txt"), "Too many levels of symbolic links"),
         (lambda lock: lock.symlink_to("/nonexistent/x"), "Too many levels of symbolic links"),
-        (lambda lock: os.link(lock.parents[1] / "victim.txt", lock), "its lock is another file, too"),
-        (lambda lock: lock.write_text("precious"), "is not a lock of a run: it reads 'precious'"),
+        (lambda lock: os.link(lock.parents[1] / "victim.txt", lock), "its lock has a second name"),
+        (lambda lock: lock.write_text("precious"), "is not the lock file of a run: it contains 'precious'"),
         (lambda lock: lock.mkdir(), "Is a directory"),
         (os.mkfifo, "Not a regular file"),
     ],
@@ -467,7 +470,7 @@ def test_folders_and_files_of_others_stay(tmp_path, names):
     run_small(tmp_path / "run.h5")
     assert len(ae.load(tmp_path / "run.h5")) == 90
     assert sorted(item.name for item in folder.iterdir()) == sorted(names)
-    with pytest.raises(ae.FileError, match="more than the 30 asked for"):
+    with pytest.raises(ae.FileError, match="more than the requested 30"):
         run_small(tmp_path / "run.h5", 30)
     assert sorted(item.name for item in folder.iterdir()) == sorted(names)
 
@@ -501,7 +504,7 @@ def test_parts_of_two_runs_are_not_joined(unfinished, tmp_path):
         part.save(folder / "ions-000000000060.h5")
         for action in (lambda: ae.load(folder), lambda: interrupted(unfinished, (), resume=True)):
             with pytest.raises(
-                ae.FileError, match=rf"060\.h5' is of another run than 'ions-0+\.h5': its {what} differ"
+                ae.FileError, match=rf"060\.h5' belongs to another run than 'ions-0+\.h5': its {what} differ"
             ):
                 action()
 
@@ -511,7 +514,7 @@ def test_parts_of_two_runs_are_not_joined(unfinished, tmp_path):
     [
         ({"lonely": np.array([10**9]), "lonely_normals": np.eye(3)[:1]}, "lonely must be surface atoms"),
         ({"lonely": np.array([-1]), "lonely_normals": np.eye(3)[:1]}, "lonely must be surface atoms"),
-        ({"sites": np.array([10**9])}, "atoms to take away must be there"),
+        ({"sites": np.array([10**9])}, "atoms to remove must be in the specimen"),
         ({"charges": np.ones(3)}, "start must have the charges of"),
         ({"rule_state": {}}, "potential_point"),
         ({"rule_state": {"potential_point": np.zeros(4)}}, "reshape"),
@@ -584,7 +587,7 @@ def test_a_damaged_part_costs_its_ions_only(unfinished):
     if n == 60:
         with (
             pytest.warns(UserWarning, match="its ions are lost"),
-            pytest.raises(ae.FileError, match="holds no run"),
+            pytest.raises(ae.FileError, match="contains no run"),
         ):
             ae.load(folder, partial=True)
 
@@ -592,7 +595,7 @@ def test_a_damaged_part_costs_its_ions_only(unfinished):
 def test_a_damaged_state_is_made_again(unfinished):
     path = Path(f"{unfinished}.unfinished") / "state.h5"
     damage(path, "charges")
-    with pytest.warns(UserWarning, match=r"state\.h5.*all events are computed again"):
+    with pytest.warns(UserWarning, match=r"state\.h5.*all events are recomputed"):
         interrupted(unfinished, (), resume=True)
     interrupted(unfinished.with_name("whole.h5"), ())
     assert differing(unfinished, unfinished.with_name("whole.h5")) == []
@@ -612,7 +615,7 @@ def test_a_state_that_would_crash_hdf5_is_made_again(unfinished):
             run_hdf5.read_state(path)
     whole[0x6EB : 0x6EB + 47] = bytes(47)
     path.write_bytes(whole)
-    with pytest.warns(ae.DataWarning, match=r"state\.h5' is damaged.*all events are computed again"):
+    with pytest.warns(ae.DataWarning, match=r"state\.h5' is damaged.*all events are recomputed"):
         interrupted(unfinished, (), resume=True)
     interrupted(unfinished.with_name("whole.h5"), ())
     assert differing(unfinished, unfinished.with_name("whole.h5")) == []

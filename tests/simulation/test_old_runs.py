@@ -109,7 +109,7 @@ def test_a_damaged_old_run_costs_its_chunks_only(tmp_path):
     content = bytearray((tmp_path / "run.h5").read_bytes())
     content[place] ^= 1
     (tmp_path / "run.h5").write_bytes(content)
-    with pytest.raises(ae.FileError, match="partial=True reads the ions that are whole"):
+    with pytest.raises(ae.FileError, match="partial=True reads the undamaged ions"):
         ae.load(tmp_path / "run.h5")
     with pytest.warns(ae.DataWarning, match="60 of 60 ions are lost"):
         assert len(ae.load(tmp_path / "run.h5", partial=True)) == 0
@@ -123,7 +123,7 @@ def test_an_old_index_that_lost_a_chunk_is_noticed(saved, tmp_path):
         shape, dtype = values.shape, values.dtype
         del file[place]
         file.create_dataset(place, shape, dtype, chunks=shape, fletcher32=True)
-    with pytest.raises(ae.FileError, match=r"run\.h5' as a run: entry1/simulation/neighbours is not whole"):
+    with pytest.raises(ae.FileError, match=r"run\.h5' as a run: entry1/simulation/neighbours is incomplete"):
         ae.load(tmp_path / "run.h5")
 
 

@@ -395,7 +395,9 @@ class Breaking:
 
 
 def test_an_exception_keeps_what_is_done(small_tip):
-    with pytest.raises(ae.RunInterrupted, match="broken on purpose; the 100 ions done before are in") as caught:
+    with pytest.raises(
+        ae.RunInterrupted, match="broken on purpose; the attribute `run` contains the 100 ions"
+    ) as caught:
         ae.Simulation(small_tip, seed=1).run(200, [Breaking()], responses=False, progress=False, batch_size=50)
     assert len(caught.value.run) == 100
     assert caught.value.run.ended == "RuntimeError: broken on purpose"
