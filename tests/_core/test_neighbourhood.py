@@ -138,5 +138,5 @@ def test_any_arrangement(n, seed, radius, leave):
 def test_refusals():
     with pytest.raises(ValueError, match="at least one atom"):
         Neighbourhood(np.empty((0, 3)), 1.0, 0.1, np.empty(0, np.int8))
-    with pytest.raises(ValueError, match="at most 1024 atoms"):
+    with pytest.raises(ValueError, match="at most 1024 neighbours"):
         Neighbourhood(np.random.default_rng(0).random((2000, 3)), 5.0, 0.1, np.zeros(2000, np.int8))
