@@ -23,37 +23,30 @@ def sine_and_cosine(angles):
     return np.asarray(sine).reshape(shape)[()], np.asarray(cosine).reshape(shape)[()]
 
 
-def arctangent(numbers):
-    """Arctangent [rad] of numbers of any shape; relative errors below 1e-15."""
+cdef each(double (*function)(double) noexcept nogil, numbers):
+    # A function of each of the numbers, in their shape.
     cdef long i
     cdef const double[::1] values = np.ascontiguousarray(numbers, np.float64).reshape(-1)
-    cdef double[::1] angles = np.empty(values.shape[0])
+    cdef double[::1] results = np.empty(values.shape[0])
     with nogil:
         for i in range(values.shape[0]):
-            angles[i] = arc_tangent(values[i])
-    return np.asarray(angles).reshape(np.shape(numbers))[()]
+            results[i] = function(values[i])
+    return np.asarray(results).reshape(np.shape(numbers))[()]
+
+
+def arctangent(numbers):
+    """Arcus tangens [rad] of numbers of any shape; relative errors below 1e-15."""
+    return each(arc_tangent, numbers)
 
 
 def logarithm(numbers):
     """Natural logarithm of positive numbers of any shape; relative errors below 5e-16."""
-    cdef long i
-    cdef const double[::1] values = np.ascontiguousarray(numbers, np.float64).reshape(-1)
-    cdef double[::1] logarithms = np.empty(values.shape[0])
-    with nogil:
-        for i in range(values.shape[0]):
-            logarithms[i] = natural_logarithm(values[i])
-    return np.asarray(logarithms).reshape(np.shape(numbers))[()]
+    return each(natural_logarithm, numbers)
 
 
 def seventh_root_of_reciprocal(numbers):
-    """x^(-1/7) of positive numbers of any shape, for the step size of flights; relative errors below 2e-15."""
-    cdef long i
-    cdef const double[::1] values = np.ascontiguousarray(numbers, np.float64).reshape(-1)
-    cdef double[::1] roots = np.empty(values.shape[0])
-    with nogil:
-        for i in range(values.shape[0]):
-            roots[i] = inverse_seventh_root(values[i])
-    return np.asarray(roots).reshape(np.shape(numbers))[()]
+    """x^(-1/7) of positive numbers of any shape, for the steps of flights; relative errors below 2e-15."""
+    return each(inverse_seventh_root, numbers)
 
 
 def normal_quantile(probabilities):
@@ -61,10 +54,4 @@ def normal_quantile(probabilities):
 
     Relative errors are below 2e-15 (Wichura, Applied Statistics 37, 477, 1988, algorithm AS 241).
     """
-    cdef long i
-    cdef const double[::1] values = np.ascontiguousarray(probabilities, np.float64).reshape(-1)
-    cdef double[::1] quantiles = np.empty(values.shape[0])
-    with nogil:
-        for i in range(values.shape[0]):
-            quantiles[i] = quantile_of_normal(values[i])
-    return np.asarray(quantiles).reshape(np.shape(probabilities))[()]
+    return each(quantile_of_normal, probabilities)

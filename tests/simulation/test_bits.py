@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
+from apt_evap.config.simulation_file import read_config
 
 FINGERPRINT = "a5954cb09c169c5a20ec43b766af4c93e432459674bc02dc815433a8100670eb"
 PROGRAM = """
@@ -56,6 +57,14 @@ def test_a_run_has_the_same_bits_everywhere(variant):
     environment = os.environ | variant | {"PYTHONPATH": str(Path(ae.__file__).parents[1])}
     done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True, env=environment)
     assert done.stdout.strip() == FINGERPRINT
+
+
+@pytest.mark.slow
+def test_the_run_of_the_readme_has_the_fingerprint_in_the_documentation():
+    root = Path(__file__).parents[2]
+    config = read_config(root / "examples" / "ni111.toml")
+    run = config.simulation().run(config.n_ions, config.emissions, responses=config.responses, progress=False)
+    assert run.fingerprint() in (root / "docs" / "architecture.rst").read_text()
 
 
 def test_fingerprints_tell_runs_apart(small_tip, tmp_path):
