@@ -51,6 +51,7 @@ class BuildCore(build_ext):
             for extension in self.extensions:
                 extension.extra_compile_args = [*FLAGS, *openmp, *simd]
                 extension.extra_link_args = [*openmp]
+        self.parallel = self.parallel or os.cpu_count()
         super().build_extensions()
 
 

@@ -246,7 +246,7 @@ class Simulation:
         if not same or ions != len(previous):
             raise ValueError(
                 "the run cannot be resumed: its recomputed events differ; possible reasons are another version of the "
-                "program, another type of processor, or a surface changed by hand"
+                "program, a changed rule or law, or a surface changed by hand"
             )
         self.n_evaporated = int(previous.emissions.ions[-1]) + 1
 

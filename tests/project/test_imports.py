@@ -22,10 +22,10 @@ def loaded(code):
     """Names of the modules that a new Python has loaded after some code."""
     code = f"import sys, os\nbefore = os.dup(1); os.dup2(2, 1)\n{code}\nsys.stdout.flush(); os.dup2(before, 1)\n"
     done = subprocess.run(
-        [sys.executable, "-c", code + "print(*sys.modules)"],
+        [sys.executable, "-P", "-c", code + "print(*sys.modules)"],
         capture_output=True,
         text=True,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        env=os.environ | {"PYTHONPATH": str(Path(ae.__file__).parents[1])},
         check=True,
     )
     return set(done.stdout.split())

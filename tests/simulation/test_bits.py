@@ -55,7 +55,9 @@ def test_a_run_has_the_same_bits_everywhere(variant):
             pytest.skip("needs NumPy 2")
         variant = {"NPY_DISABLE_CPU_FEATURES": numpy_dispatch()}
     environment = os.environ | variant | {"PYTHONPATH": str(Path(ae.__file__).parents[1])}
-    done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True, env=environment)
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", PROGRAM], capture_output=True, text=True, check=True, env=environment
+    )
     assert done.stdout.strip() == FINGERPRINT
 
 
