@@ -62,10 +62,10 @@ from .registration.register import register as register
 from .registration.register import register_points as register_points
 from .simulation.checkpoint import Checkpoint as Checkpoint
 from .simulation.ending import Ending as Ending
-from .simulation.ending import RunInterrupted as RunInterrupted
-from .simulation.ending import RunNotSaved as RunNotSaved
 from .simulation.history import History as History
 from .simulation.monitor import WatchSettings as WatchSettings
+from .simulation.recorder import RunInterrupted as RunInterrupted
+from .simulation.recorder import RunNotSaved as RunNotSaved
 from .simulation.run import Run as Run
 from .simulation.run import load as load
 from .simulation.simulation import Simulation as Simulation

@@ -21,7 +21,7 @@ from apt_evap.simulation.run import Run, load
 from apt_evap.simulation.run_hdf5 import is_run
 
 _STUDY = "study.json"
-_MOST = 1 << 28  # bytes: a study contains three numbers for each point of its grid
+_MAX_BYTES = 1 << 28  # bytes: a study contains three numbers for each point of its grid
 OVERLAY = "registration.png"
 
 
@@ -77,7 +77,7 @@ def _registration(text):
         return Registration(*numbers)
     if Path(text).suffix.lower() != ".json":
         raise ValueError(f"--registration must be a .json file or ROTATION,SCALE,DX,DY[,mirror], got {text!r}")
-    written = read_small_file(text, _MOST, "a registration or a study")
+    written = read_small_file(text, _MAX_BYTES, "a registration or a study")
     try:
         content = json.loads(written)
         return Registration.from_dict(dict(content.get("registration", content)))
@@ -118,7 +118,7 @@ def _check_folder(folder, force):
 
 def _is_study(path):
     try:
-        return str(json.loads(read_small_file(path, _MOST, "a study")).get("made_by", "")).startswith("apt_evap")
+        return str(json.loads(read_small_file(path, _MAX_BYTES, "a study")).get("made_by", "")).startswith("apt_evap")
     except (ValueError, AttributeError, RecursionError):
         return False
 

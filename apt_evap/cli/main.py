@@ -61,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except (ValueError, OSError) as error:
             say("error", error)
         except RuntimeError as error:
-            from apt_evap.simulation.ending import RunInterrupted  # help must not wait for it
+            from apt_evap.simulation.recorder import RunInterrupted  # help must not wait for it
 
             if not isinstance(error, RunInterrupted):
                 raise

@@ -11,7 +11,8 @@ from apt_evap.cli._output import INTERRUPTED, say, tell, tell_json
 from apt_evap.cli.map import run_maps, summaries
 from apt_evap.config.simulation_file import read_config
 from apt_evap.simulation.checkpoint import Checkpoint
-from apt_evap.simulation.ending import Ending, RunInterrupted
+from apt_evap.simulation.ending import Ending
+from apt_evap.simulation.recorder import RunInterrupted
 from apt_evap.simulation.run_hdf5 import is_run
 
 SECONDS_BETWEEN_LINES = 60.0

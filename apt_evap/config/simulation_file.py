@@ -34,7 +34,7 @@ _KINDS = {
     "watch_settings": WatchSettings,
     "maps": MapSettings,
 }
-_MOST = 1 << 22  # bytes
+_MAX_BYTES = 1 << 22  # bytes
 _LENGTH = re.compile(r"\s*(\S+?)\s*(a|nm)\s*")
 
 
@@ -172,7 +172,7 @@ def read_config(path: str | Path) -> Config:
     check_path(path)
     if is_run(path):
         raise FileError(f"{str(path)!r} is a run: see apt-evap info")
-    content = read_small_file(path, _MOST, "a TOML file")
+    content = read_small_file(path, _MAX_BYTES, "a TOML file")
     path = Path(path)
     try:
         document = tomllib.loads(content.decode())

@@ -3,7 +3,7 @@
 import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 import numpy as np
 import scipy
@@ -14,10 +14,32 @@ from apt_evap._common.validation import check_array, check_kind, check_number, c
 from apt_evap._common.warnings import MapWarning
 from apt_evap.detection.binning import bin_edges, count, field_of_view, find_quantisations
 
-if TYPE_CHECKING:
-    from apt_evap.detection.hits import Hits
+_MAX_IONS = 2**53  # integers up to here are exact as float64, the type of sums and densities
 
-_MOST_IONS = 2**53  # integers up to here are exact as float64, the type of sums and densities
+
+class MapInput(Protocol):
+    """Interface of the ions that a map is made of; `Hits` has it, and makes maps itself."""
+
+    def require(self, *names: str) -> Any:
+        """Return columns, or refuse ions that do not have them (ValueError)."""
+        ...
+
+    def __len__(self) -> int: ...
+
+    @property
+    def detected(self) -> Any:
+        """Ions that hit the detector, bool (n,)."""
+        ...
+
+    @property
+    def extent(self) -> Any:
+        """Edges of the detector [mm], None if not known."""
+        ...
+
+    @property
+    def source(self) -> str:
+        """Origin of the ions."""
+        ...
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -60,7 +82,7 @@ class DetectorMap:
     @classmethod
     def from_hits(
         cls,
-        hits: "Hits",
+        hits: MapInput,
         bins: int = 256,
         extent: tuple[float, float, float, float] | None = None,
         quantum: str | tuple[float, float] | None = "auto",
@@ -202,8 +224,8 @@ class DetectorMap:
         values = np.where(finite, values, 0.0)
         ions = None
         if is_counts:
-            if (total := values.sum()) > _MOST_IONS:
-                raise ValueError(f"values that are counts must add up to at most {_MOST_IONS}, got {total:g}")
+            if (total := values.sum()) > _MAX_IONS:
+                raise ValueError(f"values that are counts must add up to at most {_MAX_IONS}, got {total:g}")
             values = check_array(values, "values", ("ny", "nx"), dtype=np.int64)
             ions = int(values[mask].sum())
         return cls(values, x_edges, y_edges, mask, is_counts, ions, source=source)

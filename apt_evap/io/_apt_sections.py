@@ -18,7 +18,7 @@ _SECTION = b"SEC\0"
 _HEADER_SIZE = 540
 _SECTION_SIZE = 148
 _PADDING = 1 << 16
-_MOST_PADDING = 1 << 24  # bytes; sections begin at multiples of 4 kB, so that more zeros than this are not padding
+_MAX_PADDING = 1 << 24  # bytes; sections begin at multiples of 4 kB, so that more zeros than this are not padding
 _KINDS = {1: "i", 2: "u", 3: "f"}
 _BITS = {"i": (8, 16, 32, 64), "u": (8, 16, 32, 64), "f": (16, 32, 64)}
 
@@ -144,7 +144,7 @@ def _skip_padding(file, path, at, size):
     """Position of the next section; the size of the file if there is none."""
     start = at
     while at < size:
-        if at - start > _MOST_PADDING:
+        if at - start > _MAX_PADDING:
             raise FileError(f"{str(path)!r}: expected a section ({_SECTION!r}) at byte {start}, got only zeros")
         block = _at(file, at, _PADDING)
         rest = block.lstrip(b"\0")

@@ -218,4 +218,4 @@ def _by_suffix(path, format, doing):
         if candidate.suffix == suffix.lower():
             return candidate
     source = f"suffix {suffix!r}" if format is None else argument("format", format)
-    raise FileError(f"unknown format of {str(path)!r} ({source}), expected one of {_suffixes(doing)}")
+    raise FileError(f"format of {str(path)!r} must be one of {_suffixes(doing)}, got {source}")

@@ -15,7 +15,7 @@ from apt_evap._common.types import AnyPath
 from apt_evap._common.warnings import DataWarning
 from apt_evap.detection.mass_ranges import Ranges
 
-_MOST = 1 << 22
+_MAX_BYTES = 1 << 22
 
 
 def read_ranges(path: AnyPath) -> Ranges:
@@ -36,7 +36,7 @@ def read_ranges(path: AnyPath) -> Ranges:
     FileError
         If the file is missing or unreadable, has no ranges, or contains an invalid line.
     """
-    data = read_small_file(path, _MOST, "the text of an .rrng file")
+    data = read_small_file(path, _MAX_BYTES, "the text of an .rrng file")
     if not data:
         raise FileError(f"{str(path)!r} is empty (0 bytes), expected the text of an .rrng file")
     lines = _lines(data)

@@ -11,7 +11,7 @@ from apt_evap._common.files import FileError
 from apt_evap._core.evaporation import EXHAUSTED, SWEEP_DUE
 from apt_evap.evaporation.emitter import Batch, Emitter
 from apt_evap.simulation.checkpoint import Keeper
-from apt_evap.simulation.ending import Ending, RunInterrupted, RunNotSaved
+from apt_evap.simulation.ending import Ending
 from apt_evap.simulation.history import History
 from apt_evap.simulation.monitor import Monitor, WatchSettings
 from apt_evap.simulation.run import Run
@@ -19,6 +19,38 @@ from apt_evap.simulation.run import Run
 TOGETHER = 64
 """Number of parts that are joined at a time. Many small arrays between large temporary ones fragment the memory.
 Measured for 100,000 ions of R = 20 a: 540 bytes per ion without joining, 155 with it, of which 144 are results."""
+
+
+class RunInterrupted(RuntimeError):
+    """Error that ended a run after its first ions; raised from the original error.
+
+    Parameters
+    ----------
+    message : str
+        Description of the error.
+    run : Run
+        The ions before the error.
+    """
+
+    def __init__(self, message: str, run: Run) -> None:
+        super().__init__(message)
+        self.run = run
+
+
+class RunNotSaved(FileError):
+    """Error for a completed run that cannot be written.
+
+    Parameters
+    ----------
+    message : str
+        Reason.
+    run : Run
+        The complete run.
+    """
+
+    def __init__(self, message: str, run: Run) -> None:
+        super().__init__(message)
+        self.run = run
 
 
 class Recorder:

@@ -145,7 +145,7 @@ class Run:
         -------
         str
             SHA-256 over the names, types and values of the columns: emissions, sites, species, charges, fields, flown
-            perturbations and responses. The same settings give the same hash on every machine.
+            perturbations and responses. By design it does not depend on the machine.
         """
         columns = {name: getattr(self, name) for name in ("site", "species", "charges", "fields")}
         columns |= {f"emissions/{name}": getattr(self.emissions, name) for name in COLUMNS}
@@ -160,7 +160,7 @@ class Run:
                 values[np.isnan(values)] = np.nan  # NaN has many bits, which depend on the processor
             values = values.astype(values.dtype.newbyteorder("<"), copy=False)
             hashed.update(f"{name} {values.dtype.str} {values.shape}\n".encode())
-            hashed.update(values.tobytes())
+            hashed.update(values.data)
         return hashed.hexdigest()
 
     def hits(self, perturbation: Perturbation, *, by_response: bool = False) -> Hits:

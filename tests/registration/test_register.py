@@ -137,14 +137,15 @@ def test_what_is_known_is_kept(low, simulated):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the registration is doubtful")
-def test_a_threefold_pole_with_mirrors_has_ties(run20):
+def test_a_threefold_pole_with_mirrors_has_ties(tip20):
     """fcc [111]: turned by 120 degrees it is the same, and mirrored and turned by 60; unmirrored is preferred."""
-    rolled = run20.hits(ROLLED)
+    # flights as exact as by default: how many of the five others are ties depends on the details of the map
+    run = ae.Simulation(tip20, voltage=1000.0, seed=1).run(15_000, (ROLLED,), responses=False, progress=False)
+    rolled = run.hits(ROLLED)
     true = ae.Registration(17.0, 0.5, (3.0, -2.0))
     early, late = rolled[:7500], true.hits(rolled[7500:])
     found = register(early, late, scales=(0.4, 0.6))
-    # how many of the five others count as ties depends on the noise of 7,500 ions
-    assert not found.mirror and any(tie.mirror for tie in found.ties)
+    assert not found.mirror and any(tie.mirror for tie in found.ties) and len(found.ties) >= 2
     for one in (found, *found.ties):
         equal = (one.rotation - (77 if one.mirror else 17) + 60) % 120 - 60
         assert abs(equal) < 1 and abs(one.scale / 0.5 - 1) < 0.04  # the tip gets blunter
