@@ -8,6 +8,7 @@ import scipy
 
 from apt_evap._core.elementary import (
     arctangent,
+    exponential,
     logarithm,
     normal_quantile,
     seventh_root_of_reciprocal,
@@ -36,6 +37,14 @@ def test_logarithm(rng):
     numbers = np.concatenate([rng.uniform(0, 2, 20_000), 10 ** rng.uniform(-300, 300, 20_000), [5e-324]])
     assert logarithm(numbers) == pytest.approx(np.log(numbers), rel=6e-16, abs=0)
     assert logarithm(1.0) == 0.0
+
+
+def test_exponential(rng):
+    numbers = np.concatenate([rng.uniform(-700, 700, 20_000), rng.uniform(-1, 1, 20_000), np.arange(-20.0, 21)])
+    assert exponential(numbers) == pytest.approx(np.exp(numbers), rel=4e-16, abs=0)
+    assert exponential([0.0, -np.inf, np.inf, -1e9, 1e9]).tolist() == [1.0, 0.0, np.inf, 0.0, np.inf]
+    assert np.isnan(exponential(np.nan))
+    assert exponential([-745.0, 709.7]) == pytest.approx([5e-324, np.exp(709.7)], rel=1e-12)
 
 
 def test_seventh_root_of_the_reciprocal(rng):
