@@ -32,6 +32,7 @@ from .detection.hits import Hits as Hits
 from .detection.hits import Outcome as Outcome
 from .detection.mass_ranges import Ranges as Ranges
 from .detection.projection import Projection as Projection
+from .detection.timing import Timing as Timing
 from .emission.emissions import Emissions as Emissions
 from .emission.emissions import Launches as Launches
 from .emission.energies import Fixed as Fixed
@@ -42,13 +43,20 @@ from .emission.perturbations import Combined as Combined
 from .emission.perturbations import LateralVelocity as LateralVelocity
 from .emission.perturbations import RollUp as RollUp
 from .emission.perturbations import Unperturbed as Unperturbed
+from .emission.post_ionisation import PostIonisation as PostIonisation
 from .emission.surface_frame import tangent_frame as tangent_frame
 from .energy_fit.fit_energies import fit_energies as fit_energies
 from .energy_fit.study import Study as Study
+from .evaporation.bonds import TUNGSTEN_TABLE as TUNGSTEN_TABLE
+from .evaporation.bonds import CoordinationTable as CoordinationTable
+from .evaporation.bonds import PairEnergies as PairEnergies
 from .evaporation.emitter import Emitter as Emitter
 from .evaporation.law import Extremal as Extremal
 from .evaporation.rule import Robin as Robin
 from .evaporation.settings import ChargeSettings as ChargeSettings
+from .evaporation.thermal import Arrhenius as Arrhenius
+from .evaporation.thermal import Laser as Laser
+from .evaporation.voltage import VoltageControl as VoltageControl
 from .flight.crew import FlightSettings as FlightSettings
 from .flight.response import Design as Design
 from .flight.response import ResponseSettings as ResponseSettings
@@ -62,6 +70,7 @@ from .registration.register import register as register
 from .registration.register import register_points as register_points
 from .simulation.checkpoint import Checkpoint as Checkpoint
 from .simulation.ending import Ending as Ending
+from .simulation.history import CapHistory as CapHistory
 from .simulation.history import History as History
 from .simulation.monitor import WatchSettings as WatchSettings
 from .simulation.recorder import RunInterrupted as RunInterrupted

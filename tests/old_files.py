@@ -13,8 +13,9 @@ def old_settings(settings):
     old["watch"]["share_bound"] = old["watch"].pop("fraction_bound")
     assert old["rule"] == {"name": "Robin", "tolerance": 1e-5, "window": 8}
     old["rule"] = "Robin"
-    assert old["law"] == {"name": "Extremal"}
+    assert old["law"] == {"name": "Extremal", "bonds": None}
     old["law"] = {"name": "Extremal", "repr": "Extremal()"}
+    assert old.pop("control") is old.pop("pulse_length") is None
     return old
 
 

@@ -1,11 +1,13 @@
 """Interface of a chooser for the sequence of events: the slot of the tree that evaporates next."""
 
 cdef class Chooser:
-    cdef double[::1] key                # (capacity,) of each slot; <= 0: cannot evaporate; call `update` after a change
+    cdef double[::1] key                # (capacity,) of each slot; -inf: empty; call `update` after a change
+    cdef bint draws                     # whether the choice depends on the random number
 
     cdef void update(self, const int* slots, long n) noexcept nogil
     cdef int choose(self, double u) noexcept nogil
     cdef double total(self) noexcept nogil
+    cdef double log_total(self) noexcept nogil
 
 
 cdef class Largest(Chooser):
@@ -16,3 +18,13 @@ cdef class Largest(Chooser):
 
     cdef bint better(self, int a, int b) noexcept nogil
     cdef void play(self, long node) noexcept nogil
+
+
+cdef class RateSum(Chooser):
+    cdef double[::1] value              # (2 leaves,) rate of a slot, or of both children: value 2^exponent
+    cdef long long[::1] exponent        # (2 leaves,)
+    cdef int[::1] rising                # (capacity,) nodes whose sum is recomputed
+    cdef long leaves
+
+    cdef void weigh(self, int slot) noexcept nogil
+    cdef void add(self, long node) noexcept nogil

@@ -18,10 +18,15 @@ cdef class Evaporation:
     cdef readonly long n_removed, since_relaxation
     cdef public long n_clipped          # negative charges that were set to 0
     cdef public long n_unsettled        # patches that did not converge
+    cdef public double voltage_factor   # voltage over that of the charges, for a law with a temperature
+    cdef public double rate             # wanted sum of rates [1/s]
+    cdef public double memory           # number of events over which the control averages
+    cdef readonly double rise           # logarithm of the rate by the control since the last relaxation
+    cdef readonly unsigned long long seed
     cdef bint has_support
     cdef int[::1] slot_of               # (n_atoms,) -1 for atoms not at the surface
     cdef double[:, ::1] normals         # (capacity, 3) by slot
-    cdef Chooser chooser                # selects the slot that evaporates next
+    cdef readonly Chooser chooser       # selects the slot that evaporates next
     cdef Hole hole                      # surroundings of an evaporating atom; its memory follows
     cdef int[::1] hole_slot
     cdef float[:, ::1] hole_float       # (3, room)
@@ -36,6 +41,8 @@ cdef class Evaporation:
     cdef void make_room(self, long room)
     cdef long strongest_neighbour(self, long atom) noexcept nogil
     cdef void join(self, int slot, double dx, double dy, double dz) noexcept nogil
+    cdef double wait(self, double u) noexcept nogil
+    cdef int surroundings(self, long atom) noexcept nogil
     cdef int judge(self, const int* slots, long n) except -1 nogil
     cdef int event(self, long atom, Journal journal) except -1 nogil
     cdef int expose(self, const int* fresh, int n_fresh, int gone, Journal journal) except -1 nogil

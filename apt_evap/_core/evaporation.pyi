@@ -3,6 +3,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apt_evap._core.chooser import Chooser
 from apt_evap._core.journal import Journal
 from apt_evap._core.law import LawKernel
 from apt_evap._core.neighbourhood import Neighbourhood
@@ -45,6 +46,7 @@ class Evaporation:
         patch_radius: float,
         update_radius: float,
         opening_angle: float,
+        seed: int = 0,
     ) -> None: ...
     @property
     def atoms(self) -> Neighbourhood: ...
@@ -72,6 +74,16 @@ class Evaporation:
     def n_removed(self) -> int: ...
     @property
     def since_relaxation(self) -> int: ...
+    voltage_factor: float
+    rate: float
+    memory: float
+    @property
+    def rise(self) -> float: ...
+    @property
+    def seed(self) -> int: ...
+    @property
+    def chooser(self) -> Chooser: ...
+    def rank(self, n_threads: int = 1) -> float: ...
     n_clipped: int
     n_unsettled: int
     @property
@@ -100,6 +112,8 @@ class Evaporation:
         normal: NDArray[np.float64],
         neighbour: NDArray[np.int64],
         detached: NDArray[np.int8],
+        wait: NDArray[np.float64],
+        rise: NDArray[np.float64],
     ) -> int: ...
     @property
     def next_slot(self) -> int: ...

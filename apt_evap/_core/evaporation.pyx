@@ -7,6 +7,7 @@ cost of an event does not depend on the size of the specimen.
 """
 
 from cython.parallel cimport prange
+from libc.math cimport INFINITY
 
 import numpy as np
 
@@ -18,6 +19,15 @@ from apt_evap._core.octree cimport Octree
 
 cdef extern from "kernels.h":
     const int GROUP, PATCH_LANES
+
+
+cdef extern from "elementary.h":
+    double natural_logarithm(double) noexcept nogil
+    double exponential_of(double) noexcept nogil
+
+
+cdef extern from "random_numbers.h":
+    double uniform_number(unsigned long long, unsigned long long, unsigned long long) noexcept nogil
 
 
 cdef enum:
@@ -68,15 +78,19 @@ cdef class Evaporation:
         [nm].
     opening_angle : float
         Opening angle of relaxations, and of fields at newly exposed atoms [rad].
+    seed : int
+        Seed of the random numbers of a stochastic law: the choice of event k depends on (seed, k) only.
     """
 
     def __init__(self, Neighbourhood atoms, ChargingRule rule, LawKernel law, double potential, double coulomb,
-                 double patch_radius, double update_radius, double opening_angle):
+                 double patch_radius, double update_radius, double opening_angle,
+                 unsigned long long seed=0):
         self.atoms, self.rule, self.law = atoms, rule, law
         self.potential, self.coulomb, self.bond_length = potential, coulomb, atoms.bond_length
         self.patch_radius, self.update_radius, self.opening_angle = patch_radius, update_radius, opening_angle
         self.n_removed = self.n_clipped = self.n_unsettled = 0
         self.since_relaxation = NOT_RELAXED
+        self.voltage_factor, self.seed, self.rate, self.memory, self.rise = 1.0, seed, 1.0, 1.0, 0.0
         self.has_support = bool(np.asarray(atoms.support).any())
         self.slot_of = np.full(atoms.n_atoms, -1, np.int32)
         self.make_room(ROOM)
@@ -135,8 +149,7 @@ cdef class Evaporation:
         """
         cdef long n, slot
         cdef int builders
-        cdef int[::1] slot_of = np.full(self.atoms.n_atoms, -1, np.int32), bonds
-        cdef double[::1] key, strength
+        cdef int[::1] slot_of = np.full(self.atoms.n_atoms, -1, np.int32)
         surface = self.atoms.surface
         if len(surface) == 0:
             raise ValueError("the specimen has no surface atoms")
@@ -160,16 +173,28 @@ cdef class Evaporation:
         outcome = self.rule.solve(tree, normals, lists, potential=self.potential, tolerance=tolerance,
                                   max_sweeps=max_sweeps, double_precision=double_precision, n_threads=n_threads)
         self.field_unit = self.rule.field_unit(self.coulomb)
-        self.law.begin(self.field_unit)
-        bonds, strength = np.empty(n, np.int32), self.rule.strengths(tree)
-        for slot in prange(n, nogil=True, schedule="static", num_threads=builders):
-            bonds[slot] = self.atoms.bonds[tree.atom[slot]]
-        key = np.full(capacity, -1.0)
-        self.law.keys(n, &strength[0], &tree.atom[0], &bonds[0], &key[0])
         self.tree, self.normals, self.slot_of = tree, normals, slot_of
-        self.chooser = self.law.chooser(tree, key)
+        self.rank(builders)
         self.since_relaxation = 0
         return outcome
+
+    def rank(self, int n_threads=1):
+        """Recompute the keys of all slots, such as after a change of the voltage.
+
+        Returns the natural logarithm of the sum of rates [1/s]; -inf for a law without rates. To be called directly
+        after `relax`.
+        """
+        cdef long n = self.tree.n_slots, slot
+        cdef int[::1] bonds = np.zeros(n, np.int32)
+        cdef double[::1] key = np.full(self.tree.capacity, -INFINITY), strength = self.rule.strengths(self.tree)
+        for slot in prange(n, nogil=True, schedule="static", num_threads=n_threads):
+            if self.tree.atom[slot] >= 0:
+                bonds[slot] = self.surroundings(self.tree.atom[slot])
+        self.law.begin(self.field_unit * self.voltage_factor)
+        self.law.keys(n, &strength[0], &self.tree.atom[0], &bonds[0], &key[0])
+        self.chooser = self.law.chooser(self.tree, key)
+        self.rise = 0.0
+        return self.chooser.log_total()
 
     def start_here(self, const long long[::1] surface, int n_threads=1):
         """Start values of a relaxation of the current surface; equal charges if it has none yet."""
@@ -214,6 +239,25 @@ cdef class Evaporation:
         self.atoms.normal(self.tree.atom[slot], &self.normals[slot, 0])
         self.patch.n = n + 1
 
+    cdef double wait(self, double u) noexcept nogil:
+        # Time to the next event [s]. While no event happens, the control lets the logarithm of the rates rise by
+        # 1 / memory in the mean time between events: K exp(rise + t rate / memory) integrates to -ln(u).
+        cdef double speed = self.rate / self.memory, excess, time
+        excess = natural_logarithm(-natural_logarithm(u) * speed) - self.chooser.log_total() - self.rise
+        if excess > 40.0:               # log(1 + exp(x)) = x to the last bit
+            time = excess
+        elif excess < -20.0:            # exp(x) (1 - exp(x) / 2), to the last bit
+            time = exponential_of(excess)
+            time -= 0.5 * time * time
+        else:
+            time = natural_logarithm(1.0 + exponential_of(excess))
+        self.rise += time
+        return time / speed
+
+    cdef int surroundings(self, long atom) noexcept nogil:
+        # What the law learns of the bonds of an atom: their number, or their code.
+        return self.atoms.bond_code[atom] if self.atoms.has_codes else self.atoms.bonds[atom]
+
     cdef int judge(self, const int* slots, long n) except -1 nogil:
         # New keys of slots whose fields or bonds have changed.
         cdef long i
@@ -222,7 +266,7 @@ cdef class Evaporation:
         for i in range(n):
             self.strength[i] = self.rule.strength(self.tree, slots[i])
             self.key_atom[i] = self.tree.atom[slots[i]]
-            self.key_bonds[i] = self.atoms.bonds[self.key_atom[i]]
+            self.key_bonds[i] = self.surroundings(self.key_atom[i])
         self.law.keys(n, &self.strength[0], &self.key_atom[0], &self.key_bonds[0], &self.key[0])
         for i in range(n):
             self.chooser.key[slots[i]] = self.key[i]
@@ -243,7 +287,7 @@ cdef class Evaporation:
         self.tree.take_out(gone)
         self.tree.refresh()
         self.slot_of[atom] = -1
-        self.chooser.key[gone] = -1.0
+        self.chooser.key[gone] = -INFINITY
         self.chooser.update(&gone, 1)
         n_fresh = self.atoms.remove(atom, fresh)
 
@@ -325,7 +369,7 @@ cdef class Evaporation:
 
     def evaporate(self, Journal journal, long max_events, long sweep_interval, long long[::1] atom,
                   double[::1] charge, double[::1] field, double[:, ::1] normal, long long[::1] neighbour,
-                  signed char[::1] detached):
+                  signed char[::1] detached, double[::1] wait, double[::1] rise):
         """Evaporate up to `max_events` atoms; stops early if a relaxation or deepening is needed, or no atom is left.
 
         Atoms that have lost all chains of bonds to the body leave at once, before the law selects the next atom.
@@ -338,10 +382,11 @@ cdef class Evaporation:
             Maximum number of events.
         sweep_interval : int
             Events after which a relaxation is due.
-        atom, charge, field, normal, neighbour, detached : ndarray, shapes (m,), (m,), (m,), (m, 3), (m,), (m,)
+        atom, charge, field, normal, neighbour, detached, wait, rise : ndarray, shape (m,), normal (m, 3)
             Filled, for each event, with the evaporated atom, its charge [e], the field just outside before evaporation
             [V/nm], its normal, its surface nearest neighbour with the highest charge (-1: none), and 1 for an atom that
-            left because it was detached.
+            left because it was detached, the time since the previous event [s] (0: a law without a time, or detached), and
+            the logarithm of the factor by which the control had increased the rates since the last relaxation.
 
         Returns
         -------
@@ -351,19 +396,28 @@ cdef class Evaporation:
         """
         cdef long n, leaving
         cdef int status = STATUS_DONE, best, axis
+        cdef double u = 0.5
         if journal.start.shape[0] <= max_events:
             raise ValueError(f"journal must have room for {max_events} events")
         with nogil:
             while journal.n_events < max_events:
                 n = journal.n_events
                 leaving = self.atoms.next_detached(&self.slot_of[0]) if self.atoms.n_waiting else -1
-                best = self.slot_of[leaving] if leaving >= 0 else self.chooser.choose(0.5)
+                if self.chooser.draws:
+                    u = uniform_number(self.seed, self.n_removed, 0)
+                best = self.slot_of[leaving] if leaving >= 0 else self.chooser.choose(u)
                 if self.since_relaxation < NOT_RELAXED and best < 0:
                     status = STATUS_EXHAUSTED
                     break
                 if self.since_relaxation >= sweep_interval or self.tree.n_slots + MAX_NEAR > self.tree.x.shape[0]:
                     status = STATUS_SWEEP_DUE
                     break
+                wait[n] = 0.0
+                if self.chooser.draws and leaving < 0:
+                    wait[n] = self.wait(uniform_number(self.seed, self.n_removed, 1))
+                rise[n] = self.rise
+                if self.chooser.draws and leaving < 0:
+                    self.rise -= 1.0 / self.memory   # every event lets the control lower the voltage
                 leaving = self.tree.atom[best]
                 detached[n] = self.atoms.detached[leaving]
                 if self.has_support and self.atoms.reaches_support(leaving):
@@ -381,7 +435,7 @@ cdef class Evaporation:
     @property
     def next_slot(self):
         """Slot of the next atom to evaporate (int); -1 if none can evaporate."""
-        return self.chooser.choose(0.5)
+        return self.chooser.choose(uniform_number(self.seed, self.n_removed, 0) if self.chooser.draws else 0.5)
 
     @property
     def slots(self):

@@ -5,6 +5,8 @@ from apt_evap._core.octree cimport Octree
 
 
 cdef class LawKernel:
+    cdef readonly object surroundings   # BondCodes if `key` needs the bonds by species; None: their number
+
     cdef double key(self, double strength, long long atom, int bonds) noexcept nogil
     cdef int keys(self, long n, const double* strength, const long long* atom, const int* bonds,
                   double* key) except -1 nogil
@@ -13,6 +15,17 @@ cdef class LawKernel:
 
 cdef class WeightedField(LawKernel):
     cdef const double[::1] weight       # (n_atoms,)
+    cdef const double[:, ::1] table     # (n_species, n_codes) weight by bonds; empty: does not depend on them
+    cdef const int[::1] species         # (n_atoms,) rows of the table
+    cdef bint by_bonds
+
+    cdef double ratio(self, double strength, long long atom, int bonds) noexcept nogil
+
+
+cdef class ThermalRate(WeightedField):
+    cdef const double[::1] stiffness    # (n_atoms,) sensitivity / kT
+    cdef double log_frequency, reach, unit
+    cdef int barrier
 
 
 cdef class PythonLaw(LawKernel):

@@ -1,9 +1,14 @@
 """Laws: the key of an atom from its field, index and bonds, and the chooser for these keys."""
 
+from libc.math cimport INFINITY, fabs, sqrt
+
 import numpy as np
 
-from apt_evap._core.chooser cimport Chooser, Largest
+from apt_evap._core.chooser cimport Chooser, Largest, RateSum
 from apt_evap._core.octree cimport Octree
+
+
+BARRIERS = ("linear", "image_hump", "parabolic", "quadratic")
 
 
 cdef class LawKernel:
@@ -18,7 +23,8 @@ cdef class LawKernel:
 
     cdef double key(self, double strength, long long atom, int bonds) noexcept nogil:
         # Key of one atom from the field just outside (in the unit set by `begin`), its index in the specimen and its
-        # number of nearest neighbours; <= 0 for an atom that cannot evaporate.
+        # number of nearest neighbours (with `surroundings`, their code); <= 0 for an atom that cannot evaporate, for
+        # rates -inf.
         return 0.0
 
     cdef int keys(self, long n, const double* strength, const long long* atom, const int* bonds,
@@ -48,14 +54,79 @@ cdef class WeightedField(LawKernel):
     ----------
     weight : ndarray, shape (n_atoms,)
         Weight, such as 1 / evaporation field [nm/V]; 0 for atoms that cannot evaporate.
+    surroundings : BondCodes, optional
+        How the bonds of an atom are encoded, if the evaporation field depends on them.
+    table : ndarray, shape (n_species, n_codes), optional
+        Factor of the weight for each species and code.
+    species : ndarray of int32, shape (n_atoms,), optional
+        Species of each atom, needed with a table.
     """
 
-    def __init__(self, const double[::1] weight):
-        self.weight = weight
+    def __init__(self, const double[::1] weight, surroundings=None, table=None, species=None):
+        self.weight, self.surroundings, self.by_bonds = weight, surroundings, table is not None
+        self.table = np.empty((0, 1)) if table is None else np.ascontiguousarray(table, np.float64)
+        self.species = np.empty(0, np.int32) if species is None else np.ascontiguousarray(species, np.int32)
+
+    cdef double ratio(self, double strength, long long atom, int bonds) noexcept nogil:
+        # all strengths have the same unit, which does not change the order
+        if self.by_bonds:
+            return strength * self.weight[atom] * self.table[self.species[atom], bonds]
+        return strength * self.weight[atom]
 
     cdef double key(self, double strength, long long atom, int bonds) noexcept nogil:
-        # all strengths have the same unit, which does not change the order
-        return strength * self.weight[atom]
+        return self.ratio(strength, atom, bonds)
+
+
+cdef class ThermalRate(WeightedField):
+    """Law with the key ln k = ln nu_0 - Q(x)/kT of the ratio x of field to evaporation field.
+
+    With C = -dQ/dx at the working point and s = C/kT, Q/kT is
+
+    - linear: s (1 - x)
+    - image_hump: 2 s (1 - sqrt(x)), with the slope C at x = 1
+    - parabolic: s^2 / (4 w) (1/x - 1)^2, with w = Q/kT at the working point
+    - quadratic: s^2 / (4 w) (1 - x)^2
+
+    The last two are continued antisymmetrically beyond x = 1, so that rates increase with the field throughout.
+
+    Parameters
+    ----------
+    weight, surroundings, table, species
+        As for `WeightedField`.
+    stiffness : ndarray, shape (n_atoms,)
+        s of each atom.
+    log_frequency : float
+        ln nu_0, nu_0 in 1/s.
+    barrier : str
+        One of `BARRIERS`.
+    reach : float
+        w.
+    """
+
+    def __init__(self, const double[::1] weight, const double[::1] stiffness, double log_frequency, barrier,
+                 double reach, surroundings=None, table=None, species=None):
+        WeightedField.__init__(self, weight, surroundings, table, species)
+        self.stiffness, self.log_frequency, self.reach = stiffness, log_frequency, reach
+        self.barrier = BARRIERS.index(barrier)
+        self.unit = 1.0
+
+    def begin(self, double field_unit):
+        """Set the field of strength 1 [V/nm]."""
+        self.unit = field_unit
+
+    cdef double key(self, double strength, long long atom, int bonds) noexcept nogil:
+        cdef double x = self.ratio(self.unit * strength, atom, bonds), s = self.stiffness[atom], missing
+        if not x > 0.0:
+            return -INFINITY
+        if self.barrier == 0:
+            return self.log_frequency - s * (1.0 - x)
+        if self.barrier == 1:
+            return self.log_frequency - 2.0 * s * (1.0 - sqrt(x))
+        missing = 1.0 / x - 1.0 if self.barrier == 2 else 1.0 - x
+        return self.log_frequency - s * s / (4.0 * self.reach) * missing * fabs(missing)
+
+    cdef Chooser chooser(self, Octree tree, double[::1] key):
+        return RateSum(tree, key)
 
 
 cdef class PythonLaw(LawKernel):

@@ -23,6 +23,11 @@ cdef class Neighbourhood:
     cdef int[::1] visited, piece_of, following, table   # search for parts without hold: atoms, their part, its next atom
     cdef int[::1] count                 # (n,) neighbours within the radius
     cdef signed char[::1] bonds         # (n,) number of nearest neighbours, closer than `bond_length`
+    cdef const int[::1] code            # (n,) what an atom adds to the code of its nearest neighbours
+    cdef const int[::1] far_code        # (n,) and to that of its second neighbours
+    cdef int[::1] bond_code             # (n,) sum of the codes of the remaining neighbours
+    cdef readonly double second_length  # [nm]: atoms closer than this, but no nearest neighbours, are second neighbours
+    cdef bint has_codes
     cdef double[:, ::1] offset          # (n, 3) sum of (neighbour - atom) over the neighbours [nm]
     cdef double[::1] low                # (3,) corner of the grid of cells [nm]
     cdef long[::1] shape                # (3,) cells along each axis
@@ -31,6 +36,7 @@ cdef class Neighbourhood:
 
     cdef int near(self, long atom, int* others) noexcept nogil
     cdef void gather(self, long atom) noexcept nogil
+    cdef int code_of(self, long atom, double s) noexcept nogil
     cdef bint judge(self, long atom) noexcept nogil
     cdef void normal(self, long atom, double* normal) noexcept nogil
     cdef int remove(self, long atom, int* fresh) noexcept nogil

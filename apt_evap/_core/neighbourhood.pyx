@@ -43,11 +43,14 @@ cdef class Neighbourhood:
         Neighbourhood of the first of these atoms: its removed, exposed and detached atoms remain so.
     anchored : ndarray of int8, shape (n,), optional
         1 for atoms that never evaporate; whatever is bonded to them has hold. By default the support atoms.
+    codes : (ndarray of int32, ndarray of int32, float), optional
+        What an atom adds to the bond code of its nearest and of its second neighbours, each of shape (n,), and the
+        distance of second neighbours [nm]. A law that depends on the species of the neighbours sees this code.
     """
 
     def __init__(self, const double[:, ::1] positions, double radius, double threshold, const signed char[::1] support,
                  double bond_length=0.0, int n_threads=1, Neighbourhood before=None,
-                 const signed char[::1] anchored=None):
+                 const signed char[::1] anchored=None, codes=None):
         cdef long n = positions.shape[0], i
         if n == 0:
             raise ValueError("a specimen must have at least one atom, got none")
@@ -67,6 +70,12 @@ cdef class Neighbourhood:
         self.count = np.zeros(n, np.int32)
         self.bonds = np.zeros(n, np.int8)
         self.offset = np.zeros((n, 3))
+        self.has_codes, self.second_length = codes is not None, 0.0
+        if codes is not None:
+            self.code, self.far_code, self.second_length = codes
+            if self.second_length > radius:
+                raise ValueError(f"second neighbours must be within {radius:g} nm, got {self.second_length:g} nm")
+            self.bond_code = np.zeros(n, np.int32)
         if before is not None:
             np.asarray(self.alive)[:before.n_atoms] = before.alive
             np.asarray(self.detached)[:before.n_atoms] = before.detached
@@ -129,6 +138,14 @@ cdef class Neighbourhood:
                 self.offset[atom, axis] += step
                 s += step * step
             self.bonds[atom] += s <= bond
+            if self.has_codes:
+                self.bond_code[atom] += self.code_of(others[i], s)
+
+    cdef int code_of(self, long atom, double s) noexcept nogil:
+        # What an atom adds to the code of an atom at this squared distance.
+        if s <= self.bond_length * self.bond_length:
+            return self.code[atom]
+        return self.far_code[atom] if s <= self.second_length * self.second_length else 0
 
     cdef bint judge(self, long atom) noexcept nogil:
         # Whether the atom is a surface atom by its neighbours; an isolated atom is.
@@ -162,6 +179,8 @@ cdef class Neighbourhood:
                 step = self.positions[atom, axis] - self.positions[other, axis]
                 self.offset[other, axis] -= step
                 s += step * step
+            if self.has_codes:
+                self.bond_code[other] -= self.code_of(atom, s)
             if s <= bond:
                 self.bonds[other] -= 1
                 if not self.detached[other]:
@@ -381,6 +400,11 @@ cdef class Neighbourhood:
     def bond_counts(self):
         """Number of nearest neighbours, closer than `bond_length`, shape (n,)."""
         return np.asarray(self.bonds).astype(np.int32)
+
+    @property
+    def bond_codes(self):
+        """Sum of the codes of the remaining neighbours, shape (n,)."""
+        return np.asarray(self.bond_code)
 
     @property
     def offsets(self):

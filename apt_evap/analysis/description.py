@@ -40,6 +40,11 @@ UNITS = {
     "charge_state": "e",
     "mass": "Da",
     "polarizability": "F m^2",
+    "voltages": "V",
+    "operating_field": "V/nm",
+    "duration": "s",
+    "pulse_length": "s",
+    "energy_scale": "eV/eV",
 }
 """Units in the result of `describe`, by key."""
 
@@ -98,6 +103,9 @@ def _of_run(run):
         "fingerprint": run.fingerprint(),
         "ended": run.ended or "as planned",
         "voltage": run.voltage,
+        "law": run.settings["law"],
+        "clock": _clock(run),
+        "real_units": _real_units(run),
         "seed": run.seed,
         "tip": _tip(run.settings["tip"]),
         "detector": {"distance": run.detector.distance, "width": run.detector.width},
@@ -110,6 +118,53 @@ def _of_run(run):
         "perturbations_flown": [str(each["repr"] if isinstance(each, dict) else each) for each in run.perturbations],
         "responses": responses,
     }
+
+
+def _clock(run):
+    """Voltages, duration and rate of a run with a temperature."""
+    if run.clock is None:
+        return None
+    seconds, pulse = float(run.clock.waits.sum()), run.settings.get("pulse_length")
+    rate = len(run) / seconds if seconds > 0 else 0.0
+    return {
+        "voltages": _extent(run.clock.voltages),
+        "duration": _plain(seconds),
+        "pulse_length": pulse and _plain(pulse),
+        ("ions_per_pulse" if pulse else "ions_per_second"): _plain(rate * (pulse or 1.0)),
+    }
+
+
+def _real_units(run):
+    """Operating point of a run in real units."""
+    if run.units is None:
+        return None
+    names = dict(enumerate(run.elements))
+    charges = {
+        f"{names[species]}{charge}+": int(((run.species == species) & (run.real.charges == charge)).sum())
+        for species in sorted(set(run.species.tolist()))
+        for charge in sorted(set(run.real.charges[run.species == species].tolist()))
+    }
+    units = run.units
+    return {
+        "voltages": _extent(run.voltages * units.voltage_ratio),
+        "operating_field": _plain(units.operating_field),
+        "field_reference": units.field_reference,
+        "field_at_atom_over_cap": units.field_ratio and _plain(units.field_ratio),
+        "energy_scale": _plain(np.median(1.0 / run.energy_scales)) if len(run) else None,
+        "flight_charges": charges,
+        "pulse_fraction": units.control.pulse_fraction,
+    }
+
+
+def real_units_line(run: Run) -> str:
+    """One line on a run in real units, str."""
+    real = _real_units(run)
+    low, high = real["voltages"] or (np.nan, np.nan)
+    charges = ", ".join(f"{count:,} {name}" for name, count in real["flight_charges"].items())
+    return (
+        f"real units: {low:,.4g} to {high:,.4g} V for {real['operating_field']:.3g} V/nm at the "
+        f"{real['field_reference']}; {charges}; 1 eV at {run.voltage:g} V is {real['energy_scale']:.3g} eV"
+    )
 
 
 def _tip(settings):

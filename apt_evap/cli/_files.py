@@ -50,6 +50,11 @@ def read(options: argparse.Namespace) -> Hits | Run | DetectorMap:
         raise
 
 
+def in_real_units(run: Run, options: argparse.Namespace) -> Run:
+    """The run, in real units if the options ask for them."""
+    return run if options.real_units is None else run.at_evaporation_field(options.real_units)
+
+
 _SELECTING = ("ions", "mass", "voltage", "circle", "ranges", "species")
 
 

@@ -35,19 +35,27 @@ def _lines(summary, indent=0, of_columns=False):
     }
     width = max(map(len, labels.values()), default=0)
     for key, value in summary.items():
-        if isinstance(value, dict) and value:
+        if isinstance(value, dict) and value and key != "law":
             yield f"{'':{indent}}{labels[key]}"
             yield from _lines(value, indent + 2, key == "columns")
         else:
             between = " to " if of_columns or key in _EXTENTS else " x " if key in _SIZES else "   "
-            text = _text(value, between)
+            text = _law_text(value) if key == "law" else _text(value, between)
             if key == "field_before_leaving":
                 text += f" at {summary['voltage']:g} V (only its ratio to the evaporation field matters)"
             yield f"{'':{indent}}{labels[key]:{width}}  {text}"
 
 
-_EXTENTS = ("field_before_leaving", "x", "y", "values")
+_EXTENTS = ("field_before_leaving", "x", "y", "values", "voltages")
 _SIZES = ("bins", "bin_size", "detector_extent", "detector_quantum")
+
+
+def _law_text(law):
+    """Name and parameters of a law."""
+    parameters = ", ".join(
+        f"{name}={_text(value)}" for name, value in law.items() if name != "name" and value is not None
+    )
+    return f"{law['name']}({parameters})"
 
 
 def _text(value, between="   "):

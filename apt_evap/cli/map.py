@@ -12,6 +12,7 @@ from apt_evap.cli._files import (
     check_columns,
     check_output,
     check_places,
+    in_real_units,
     is_picture,
     picture_path,
     read,
@@ -34,10 +35,12 @@ def execute(options: argparse.Namespace) -> int:
     check_output(picture, is_picture, options.force)
     content = read(options)
     if isinstance(content, Run):
+        content = in_real_units(content, options)
         maps = run_maps(content, _map_settings(content, options), lambda hits: select(hits, options))
-    elif options.perturbation:
+    elif options.perturbation or options.real_units:
         what = "a map" if isinstance(content, DetectorMap) else "measured ions"
-        raise ValueError(f"--perturbation needs a run (.h5), {options.file!r} contains {what}")
+        name = "--perturbation" if options.perturbation else "--real-units"
+        raise ValueError(f"{name} needs a run (.h5), {options.file!r} contains {what}")
     elif isinstance(content, DetectorMap):
         if options.bins is not None:
             raise ValueError(f"--bins is only for ions, {options.file!r} is a map: its bins are {_bins_of(content)}")

@@ -29,6 +29,8 @@ from a simulation to its map, and to the emission energies of a measured map:
   apt-evap info R5083.epos --json | jq .ions         also for measured files; --json for programs
   apt-evap map R5083.epos --bins 128                 map of measured ions
   apt-evap compare ni111.h5 R5083.epos -o study      fit the emission energies to the measured map
+  apt-evap export ni111.h5 --real-units -o ni111.epos
+                                                     ions as an instrument would write them
   apt-evap COMMAND --help                            all arguments of a command, with examples
 """
 
@@ -52,7 +54,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"apt-evap {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", dest="command", required=True)
-    for add in (_add_run, _add_map, _add_info, _add_compare):
+    for add in (_add_run, _add_map, _add_info, _add_compare, _add_export):
         add(commands)
     return parser
 
@@ -152,6 +154,7 @@ def _add_map(commands: Any) -> None:
         metavar="P",
         help="perturbation of the ions of a run; repeat it for maps side by side",
     )
+    _add_real_units(command)
     command.add_argument("--force", action="store_true", help="overwrite a file not made by apt-evap")
     _add_speech(command)
 
@@ -227,6 +230,26 @@ def _add_compare(commands: Any) -> None:
     reading.add_argument("--perturbation", metavar="P", help="perturbation of the ions of MEASURED if it is a run")
 
 
+def _add_export(commands: Any) -> None:
+    command = commands.add_parser(
+        "export",
+        help="write the ions of a run as .epos, .pos, .xyz or .vtp",
+        description="Write the ions of a run that hit the detector as a file of ions. In real units an .epos has the\n"
+        "voltages, times of flight, mass-to-charge ratios and pulses that an instrument could have written.",
+        epilog="example: apt-evap export ni111.h5 --real-units --perturbation RollUp:0.36,0.36 -o ni111.epos",
+        **_SHAPE,
+    )
+    command.add_argument("file", metavar="RUN.h5", help="a run")
+    command.add_argument("-o", "--output", metavar="FILE", help="default: the name of the run with .epos")
+    command.add_argument("--perturbation", metavar="P", help="as for map; default: the first one of the run")
+    _add_real_units(command)
+    command.add_argument("--temperature", type=_number("K"), metavar="K", help="adds energy deficits to the times")
+    command.add_argument("--jitter", type=_number("ns"), metavar="NS", help="error of the times; default: none")
+    _add_reading(command)
+    command.add_argument("--force", action="store_true", help="overwrite an existing file")
+    _add_speech(command)
+
+
 # ---- arguments of several commands -----------------------------------------------------------------------------------
 
 _FILE_HELP = "a run (.h5), measured ions (.epos, ...) or a map (.npz)"
@@ -250,6 +273,19 @@ def _add_reading(parser: argparse.ArgumentParser) -> Any:
     selection.add_argument("--ranges", metavar="FILE.rrng", help="ranges of mass, for --species")
     selection.add_argument("--species", metavar="NAME[,NAME]", help="ions in the ranges of these names, such as Si")
     return group
+
+
+def _add_real_units(command: argparse.ArgumentParser) -> None:
+    """Add the option for real units."""
+    command.add_argument(
+        "--real-units",
+        nargs="?",
+        const="cap",
+        choices=("cap", "site"),
+        metavar="REFERENCE",
+        help="true V, eV and ns: the evaporation field is reached by the mean of the cap (cap, the default) or by the "
+        "evaporating atom (site)",
+    )
 
 
 def _add_speech(command: argparse.ArgumentParser) -> None:

@@ -6,6 +6,7 @@ import time
 from dataclasses import replace
 
 from apt_evap._common.files import FileError, check_path
+from apt_evap.analysis.description import real_units_line
 from apt_evap.cli._files import check_output, is_picture, picture_path, save_picture
 from apt_evap.cli._output import INTERRUPTED, say, tell, tell_json
 from apt_evap.cli.map import run_maps, summaries
@@ -46,11 +47,13 @@ def execute(options: argparse.Namespace) -> int:
         tell(options, f"{output} is complete: nothing to do")
         tell_json(options, {"wrote": None, "picture": None, "maps": [], **_counts(run, seconds)})
         return 0
-    run = replace(run, provenance=run.provenance | provenance)
+    run = config.in_real_units(replace(run, provenance=run.provenance | provenance))
     run.save(output)
     new = "" if not n_previous else f", {len(run) - n_previous:,} of them new,"
     tell(options, f"{len(run):,} ions{new} in {seconds:.1f} s, {(len(run) - n_previous) / seconds:,.0f} ions/s")
     _tell_outcomes(options, config, run, output, n_ions)
+    if run.units is not None:
+        tell(options, real_units_line(run))
     tell(options, f"{'replaced' if replaced and not options.resume else 'wrote'} {output}")
     try:
         maps = run_maps(run, config.maps)

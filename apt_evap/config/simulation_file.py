@@ -11,14 +11,18 @@ from pathlib import Path
 from apt_evap._common.files import FileError, check_path, read_small_file
 from apt_evap._common.validation import check_count, check_kind, check_number, check_seed, check_switch, short_text
 from apt_evap.config.map_panels import MapSettings, read_maps
+from apt_evap.config.physics import read_control, read_law, read_real_units
 from apt_evap.config.tables import check_keys, check_table
 from apt_evap.detection.detector import Detector
 from apt_evap.emission.perturbations import Perturbation
+from apt_evap.evaporation.law import Law, check_law
 from apt_evap.evaporation.settings import ChargeSettings
-from apt_evap.evaporation.voltage import check_voltage
+from apt_evap.evaporation.voltage import VoltageControl, check_voltage
 from apt_evap.flight.crew import FlightSettings
 from apt_evap.flight.response import ResponseSettings
 from apt_evap.simulation.monitor import WatchSettings
+from apt_evap.simulation.real_units import check_flight_charges
+from apt_evap.simulation.run import Run
 from apt_evap.simulation.run_hdf5 import is_run
 from apt_evap.simulation.simulation import Simulation
 from apt_evap.specimen.materials import MATERIALS, Material, material
@@ -66,6 +70,12 @@ class Config:
         Maps of the run.
     output : str or None
         File name of the run.
+    law : law
+        Selects the next atom to evaporate.
+    control : VoltageControl or None
+        Rate, pulses and control of the voltage.
+    real_units : dict or None
+        Arguments of `Run.at_evaporation_field`; None: the run is saved at the simulated voltage.
 
     Raises
     ------
@@ -86,6 +96,9 @@ class Config:
     watch_settings: WatchSettings
     maps: MapSettings
     output: str | None
+    law: Law
+    control: VoltageControl | None
+    real_units: dict | None
 
     def __post_init__(self):
         for name, kind in _KINDS.items():
@@ -97,6 +110,7 @@ class Config:
         if self.output is not None and not (isinstance(self.output, str) and self.output):
             raise ValueError(f"output must be a file name such as 'run.h5', got {short_text(self.output)}")
         self.maps.check_detector(self.detector)
+        check_law(self.law)
 
     def __repr__(self) -> str:
         host, radius = self.tip["material"].name, self.tip["apex_radius"]
@@ -131,6 +145,10 @@ class Config:
         """
         with _located(self.path, "tip"):
             tip = Tip(**self.tip)
+        if self.real_units is not None:
+            with _located(self.path, "real_units"):
+                names = tuple(element.name for element in tip.elements)
+                check_flight_charges(self.real_units.get("flight_charges"), names)
         with _located(self.path):  # flights and tip or detector: no single table
             return Simulation(
                 tip,
@@ -142,7 +160,22 @@ class Config:
                 response_settings=self.response_settings,
                 watch_settings=self.watch_settings,
                 n_threads=n_threads,
+                law=self.law,
+                control=self.control,
             )
+
+    def in_real_units(self, run: Run) -> Run:
+        """The run as it is saved: in real units if the file has a table ``[real_units]``.
+
+        Raises
+        ------
+        FileError
+            If it cannot be converted; the message names the file.
+        """
+        if self.real_units is None:
+            return run
+        with _located(self.path, "real_units"):
+            return run.at_evaporation_field(**self.real_units)
 
 
 def read_config(path: str | Path) -> Config:
@@ -150,10 +183,10 @@ def read_config(path: str | Path) -> Config:
 
     The tables are ``[tip]`` (the arguments of `Tip`; lengths in nm or, as text, in lattice constants: "20 a"),
     ``[simulation]`` (ions, voltage, seed, responses), ``[detector]``, ``[charges]``, ``[flights]``, ``[responses]``,
-    ``[watch]`` (fields of `Detector`, `ChargeSettings`, `FlightSettings`, `ResponseSettings`, `WatchSettings`) and
-    ``[maps]`` (bins, smoothing and panels, each with a title and a perturbation as in
-    `apt_evap.perturbation.from_dict`). Only ``[tip]`` with a material and an apex_radius, and the ions in
-    ``[simulation]``, are required.
+    ``[watch]`` (fields of `Detector`, `ChargeSettings`, `FlightSettings`, `ResponseSettings`, `WatchSettings`),
+    ``[law]``, ``[control]``, ``[real_units]`` (see `apt_evap.config.physics`) and ``[maps]`` (bins, smoothing and
+    panels, each with a title and a perturbation as in `apt_evap.perturbation.from_dict`). Only ``[tip]`` with a
+    material and an apex_radius, and the ions in ``[simulation]``, are required.
 
     Parameters
     ----------
@@ -181,7 +214,19 @@ def read_config(path: str | Path) -> Config:
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise FileError(f"{str(path)!r} is not a TOML file: {error}") from error
     with _located(path):
-        tables = ("tip", "simulation", "detector", "charges", "flights", "responses", "watch", "maps")
+        tables = (
+            "tip",
+            "simulation",
+            "detector",
+            "charges",
+            "flights",
+            "responses",
+            "watch",
+            "law",
+            "control",
+            "real_units",
+            "maps",
+        )
         check_keys(document, ("output", *tables), ("tip", "simulation"))
         for name in tables:
             check_table(document.get(name, {}), f"[{name}]")
@@ -210,10 +255,16 @@ def read_config(path: str | Path) -> Config:
         with _located(path, name):
             check_keys(document.get(name, {}), known)
             sections.append(kind(**document.get(name, {})))
+    with _located(path, "law"):
+        law = read_law(document.get("law", {}))
+    with _located(path, "control"):
+        control = read_control(document.get("control", {}))
+    with _located(path, "real_units"):
+        real_units = read_real_units(document["real_units"]) if "real_units" in document else None
     with _located(path, "maps"):
         maps = read_maps(document.get("maps", {}))
         maps.check_detector(sections[0])  # type: ignore[arg-type]
-    return Config(path, tip, n_ions, responses, voltage, seed, *sections, maps, output)  # type: ignore[arg-type, call-arg]
+    return Config(path, tip, n_ions, responses, voltage, seed, *sections, maps, output, law, control, real_units)  # type: ignore[arg-type, call-arg]
 
 
 def _tip(table):

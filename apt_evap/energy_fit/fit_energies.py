@@ -190,6 +190,7 @@ def fit_energies(
         "registered": rounds or "given",
         "share_above_energy_limit": grid.share_above(run.response_settings.energy_limit),
         "run": {"ions": len(run), "provenance": run.provenance, **run.settings},
+        "real_units": real_units_of(run),
     }
     return Study(
         grid=grid,
@@ -210,6 +211,35 @@ def fit_energies(
         settings=search.comparison.settings,
         provenance=plain(provenance),
     )
+
+
+def real_units_of(run: Run) -> dict[str, Any] | None:
+    """Operating point of a run, and the factors from the energies of a study to real and simulated ones.
+
+    Parameters
+    ----------
+    run : Run
+        At its simulated voltage or in real units.
+
+    Returns
+    -------
+    dict or None
+        None if the fields of the cap, which real units need, are not in the run.
+    """
+    try:
+        real = run if run.units is not None else run.at_evaporation_field()
+    except ValueError:
+        return None
+    scale = float(np.median(real.energy_scales))  # simulated energy per real one
+    charges, counts = np.unique(real.flight_charges, return_counts=True)
+    return {
+        "real_per_study": 1.0 if run.units is not None else 1.0 / scale,
+        "simulated_per_study": scale if run.units is not None else 1.0,
+        "operating_field": real.units.operating_field,
+        "field_reference": real.units.field_reference,
+        "flight_charge": int(charges[counts.argmax()]),
+        "barrier_charge": int(np.median(real.emissions.charge_states)),
+    }
 
 
 def _replicas(measured, run):

@@ -72,8 +72,15 @@ class Optimum:
 
     def bounded(self, name: str) -> str:
         """Text of one of the numbers and its interval, str."""
-        value = f"{getattr(self, name):.3g}"
-        return f"{value} ({self.intervals[name][0]:.3g} to {self.intervals[name][1]:.3g})" if self.intervals else value
+        return self.scaled(name, 1.0)
+
+    def scaled(self, name: str, factor: float) -> str:
+        """Text of one of the numbers and its interval, times a factor, str."""
+        value = f"{getattr(self, name) * factor:.3g}"
+        if not self.intervals:
+            return value
+        low, high = (bound * factor for bound in self.intervals[name])
+        return f"{value} ({low:.3g} to {high:.3g})"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -149,6 +156,7 @@ class Study:
         results |= {name: getattr(self, name) and getattr(self, name)._asdict() for name in ("gain", "ceiling")}
         for group in ("baselines", "plain"):
             results[group] = {name: score._asdict() for name, score in getattr(self, group).items()}
+        results["real_energies"] = self.real_energies
         return plain(results | {"settings": asdict(self.settings) | self.provenance})
 
     def save(self, path: AnyPath) -> None:
@@ -179,13 +187,39 @@ class Study:
         between = f"{refined.bounded('mean')} eV, sigma/mean {refined.bounded('rsd')}"
         between += f", roll-up fraction {refined.bounded('rollup_fraction')}" if combined else ""
         doubtful = ", registration doubtful" if self.registration.doubtful else ""
-        run = self.provenance["run"]
-        radius = run["tip"].get("apex_radius")
-        scale = f" at {run['voltage']:g} V" + (f" and R = {radius:.3g} nm" if radius else "")
         return (
             f"<Study: {self.grid.mechanism}{doubtful}, best at {best.mean:g} eV, sigma/mean {best.rsd:g}{fraction}"
-            f"{edge}, SSIM {best.score}; {others};\n between points {between}; energies "
-            f"{refined.bounded('true_mean')} ± {refined.bounded('true_standard_deviation')} eV{scale}>"
+            f"{edge}, SSIM {best.score}; {others};\n between points {between}; {self._energies()}>"
+        )
+
+    @property
+    def real_energies(self) -> tuple[float, float] | None:
+        """Mean and standard deviation of the refined optimum in real units [eV]; None if these are not known.
+
+        Real units are those of `Run.at_evaporation_field`: of the run if it was converted, otherwise with its defaults.
+        """
+        real = self.provenance.get("real_units")
+        if real is None:
+            return None
+        factor = real["real_per_study"]
+        return self.refined.true_mean * factor, self.refined.true_standard_deviation * factor
+
+    def _energies(self):
+        """Text of the refined energies: in real units first, then at the simulated voltage."""
+        refined, run, real = self.refined, self.provenance["run"], self.provenance.get("real_units")
+        radius = run["tip"].get("apex_radius")
+        place = f" at {run['voltage']:g} V" + (f" and R = {radius:.3g} nm" if radius else "")
+
+        def text(factor):
+            mean, deviation = (refined.scaled(name, factor) for name in ("true_mean", "true_standard_deviation"))
+            return f"{mean} ± {deviation} eV"
+
+        if real is None:
+            return f"energies {text(1.0)}{place}"
+        field, charge = f"{real['operating_field']:.3g} V/nm", f"{real['flight_charge']}+"
+        return (
+            f"energies {text(real['real_per_study'])} at {field} and {charge}; "
+            f"simulated {text(real['simulated_per_study'])}{place}, {real['barrier_charge']}+"
         )
 
 

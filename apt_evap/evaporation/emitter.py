@@ -12,17 +12,18 @@ from numpy.typing import ArrayLike
 from apt_evap._common.describe import describe
 from apt_evap._common.threads import thread_count, usable_threads
 from apt_evap._common.types import Floats, Integers
-from apt_evap._common.validation import check_array, check_count, check_kind, check_number
+from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_seed
 from apt_evap._common.warnings import ChargesWarning
 from apt_evap._core.evaporation import DONE, EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, Evaporation, Start
 from apt_evap._core.journal import Journal
 from apt_evap._core.neighbourhood import Neighbourhood
 from apt_evap._core.octree import Octree
 from apt_evap.evaporation import rule as rules
-from apt_evap.evaporation.law import Extremal, Law, check_law, kernel_of
+from apt_evap.evaporation.cap import Cap, measure_cap
+from apt_evap.evaporation.law import Extremal, Law, check_law, has_temperature, kernel_of
 from apt_evap.evaporation.settings import ChargeSettings, check_angle
 from apt_evap.evaporation.state import EmitterState
-from apt_evap.evaporation.voltage import check_voltage
+from apt_evap.evaporation.voltage import RateControl, VoltageControl, check_voltage
 from apt_evap.specimen.ase_atoms import to_atoms
 from apt_evap.specimen.tip import Tip
 from apt_evap.units import COULOMB
@@ -59,6 +60,13 @@ class Batch:
         Copy of the tree before the first event, if it was rebuilt after the previous batch, or long ago.
     status : int
         DONE, SWEEP_DUE, EXHAUSTED or TOO_SHALLOW.
+    cap : Cap or None
+        The cap before the first event, if the surface was relaxed after the previous batch.
+    waits : ndarray or None
+        Time before each event [s], shape (n,); with pulses, time at the top of pulses. None for a law without a
+        temperature.
+    voltages : ndarray or None
+        Voltage of the control at each event [V], shape (n,); None without one.
     """
 
     site: np.ndarray
@@ -70,6 +78,9 @@ class Batch:
     journal: Journal
     tree: Octree | None
     status: int
+    cap: Cap | None = None
+    waits: np.ndarray | None = None
+    voltages: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.site)
@@ -96,6 +107,11 @@ class Emitter:
         Number of threads; by default the number of processors that this process may use.
     rule : charging rule, optional
         Distribution of the charge over the surface; by default `Robin`. Interface: `apt_evap.evaporation.rule.Rule`.
+    control : VoltageControl, optional
+        Control of the voltage for a law with a temperature, such as `Arrhenius`. Charges and fields of the emitter
+        remain those at `voltage`; the law sees them in proportion to `control_voltage`.
+    seed : int
+        Seed of the events of a law with a temperature.
 
     Raises
     ------
@@ -111,6 +127,8 @@ class Emitter:
         settings: ChargeSettings | None = None,
         n_threads: int | None = None,
         rule: rules.Rule | rules.CompiledRule | None = None,
+        control: VoltageControl | None = None,
+        seed: int = 0,
     ) -> None:
         self.tip = check_kind(tip, "tip", Tip, "a Tip")
         self.voltage = check_voltage(voltage)
@@ -121,17 +139,24 @@ class Emitter:
         self.rule = rules.Robin() if rule is None else rule
         rules.check_rule(self.rule)
         self.n_threads = thread_count(n_threads)
+        if control is not None:
+            check_kind(control, "control", VoltageControl, "a VoltageControl")
+        self._rate_control = RateControl.of(self.law, tip, control) if has_temperature(self.law) else None
+        kernel = self._kernel_of(tip)
         distance = tip.nearest_neighbour_distance
         self._core = Evaporation(
-            self._neighbourhood_of(tip),
+            self._neighbourhood_of(tip, kernel),
             rules.kernel_of(self.rule, tip),
-            kernel_of(self.law, tip),
+            kernel,
             self.voltage / COULOMB,
             COULOMB,
             self.settings.patch_radius * distance,
             self.settings.update_radius * distance,
             self.settings.opening_angle,
+            check_seed(seed),
         )
+        if self._rate_control:
+            self._rate_control.begin(self._core)
         self._sites, self._deepened = [], []  # evaporated atoms of each batch; numbers of events before each deepening
         if not tip.evaporable[self._core.atoms.surface].any():
             raise ValueError(f"{tip!r} has no evaporable surface atom")
@@ -142,7 +167,27 @@ class Emitter:
             )
         self.sweep_interval = self.settings.sweep_interval or max(100, len(self) // 300)
 
-    def _neighbourhood_of(self, tip, previous=None):
+    @property
+    def control(self) -> VoltageControl | None:
+        """Control of the voltage; None for a law without a temperature."""
+        return None if self._rate_control is None else self._rate_control.control
+
+    @property
+    def pulse_length(self) -> float | None:
+        """Time per pulse with the rate of its top [s]; None without pulses."""
+        return None if self._rate_control is None else self._rate_control.pulse_length or None
+
+    @property
+    def control_voltage(self) -> float:
+        """Voltage of the control [V]; without one, the applied voltage of the charges."""
+        if self._rate_control is None:
+            return self.voltage
+        return self.voltage * float(self._rate_control.voltage_factors(self._core, self._core.rise))
+
+    def _kernel_of(self, tip):
+        return kernel_of(self.law, tip, self.control)
+
+    def _neighbourhood_of(self, tip, kernel, previous=None):
         return Neighbourhood(
             tip.positions,
             tip.neighbour_radius,
@@ -152,6 +197,7 @@ class Emitter:
             usable_threads(self.n_threads),
             previous,
             (tip.support | ~tip.evaporable).view(np.int8),
+            kernel.surroundings,
         )
 
     def __len__(self) -> int:
@@ -206,6 +252,14 @@ class Emitter:
         the outer side of a charged surface.
         """
         return self._core.slot_fields[self._core.slots]
+
+    @property
+    def cap(self) -> Cap:
+        """Radius and mean field of the cap: see `Cap`."""
+        atoms = self.atoms
+        chosen = self.tip.evaporable[atoms]
+        evaporation_fields = self.tip.evaporation_fields[self.tip.species[atoms[chosen]]]
+        return measure_cap(self.positions[chosen], self.normals[chosen], self.fields[chosen], evaporation_fields)
 
     @property
     def bonds(self) -> Integers:
@@ -282,6 +336,8 @@ class Emitter:
     def _relax(self, tolerance, angle, start=None):
         counts = self.counts
         self._relaxed = (tolerance, angle, counts["clipped"], counts["unsettled"])
+        if self._rate_control and start is None:
+            self._rate_control.keep(self._core)
         outcome = self._core.relax(
             tolerance=tolerance,
             opening_angle=angle,
@@ -289,7 +345,9 @@ class Emitter:
             n_threads=usable_threads(self.n_threads),
             start=start,
         )
-        self._recorded = RECORD
+        self._recorded, self._is_new = RECORD, True
+        if self._rate_control:
+            self._rate_control.look(self._core, usable_threads(self.n_threads))
         if not outcome[1] < tolerance:
             warnings.warn(
                 f"charges did not converge in {outcome[0]} sweeps: largest relative change {outcome[1]:.1g} "
@@ -321,6 +379,7 @@ class Emitter:
             clipped=clipped,
             unsettled=unsettled,
             rule_state=start.rule_state,
+            voltage_factor=self._core.voltage_factor,
         )
 
     def restore(self, state: EmitterState) -> None:
@@ -348,12 +407,17 @@ class Emitter:
             raise ValueError("lonely must be surface atoms, each with a normal: the state is of another specimen")
         self._sites, self._deepened = [state.sites], list(state.deepened)
         self._core.n_clipped, self._core.n_unsettled = state.clipped, state.unsettled
+        self._core.voltage_factor = state.voltage_factor
         start = Start(len(state.sites), state.charges, state.lonely, state.lonely_normals, state.rule_state)
         self._relax(state.tolerance, state.opening_angle, start)
 
     def hand_out_tree(self) -> None:
         """Add a copy of the tree to the next batch, for flights that have not followed the earlier events."""
         self._recorded = RECORD
+
+    def hand_out_cap(self) -> None:
+        """Add the cap to the next batch, at the beginning of a run."""
+        self._is_new = True
 
     def deepen(self) -> None:
         """Extend the shell of the specimen, after `evaporate` reached its support atoms.
@@ -371,8 +435,8 @@ class Emitter:
 
     def _extend(self):
         tip = self.tip.deepened()
-        neighbourhood = self._neighbourhood_of(tip, self._core.atoms)
-        self._core.take_over(neighbourhood, kernel_of(self.law, tip))
+        kernel = self._kernel_of(tip)
+        self._core.take_over(self._neighbourhood_of(tip, kernel, self._core.atoms), kernel)
         self.tip = tip
 
     def evaporate(self, max_events: int) -> Batch:
@@ -396,9 +460,11 @@ class Emitter:
         journal = Journal(self.tip.positions, n)
         site, neighbour = np.empty(n, np.int64), np.empty(n, np.int64)
         charges, fields, normals, detached = np.empty(n), np.empty(n), np.empty((n, 3)), np.empty(n, np.int8)
+        waits, rise = np.empty(n), np.empty(n)
         tree = self._core.tree.copy() if self._recorded >= RECORD else None
+        cap, self._is_new = self.cap if self._is_new else None, False
         status = self._core.evaporate(
-            journal, n, self.sweep_interval, site, charges, fields, normals, neighbour, detached
+            journal, n, self.sweep_interval, site, charges, fields, normals, neighbour, detached, waits, rise
         )
         n = journal.n_events
         self._recorded = n if tree is not None else self._recorded + n
@@ -413,6 +479,11 @@ class Emitter:
             journal=journal,
             tree=tree,
             status=status,
+            cap=cap,
+            waits=waits[:n] if self._rate_control else None,
+            voltages=self.voltage * self._rate_control.voltage_factors(self._core, rise[:n])
+            if self._rate_control
+            else None,
         )
 
     def advance(

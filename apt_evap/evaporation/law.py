@@ -2,12 +2,14 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from apt_evap._common.types import Floats, Integers
 from apt_evap._core.law import LawKernel, PythonLaw, WeightedField
+from apt_evap.evaporation.bonds import BondField, bond_table, check_bonds
+from apt_evap.evaporation.voltage import VoltageControl
 from apt_evap.specimen.tip import Tip
 
 
@@ -46,14 +48,25 @@ class Extremal:
 
     Equal ratios are ordered by the index of the atom. This is the low-temperature limit of the Arrhenius rate nu_0
     exp(-C (1 - F/F_evap)/kT) (Vurpillot et al., 2013).
+
+    Parameters
+    ----------
+    bonds : BondField, optional
+        Evaporation field by the bonds of an atom; by default that of its species.
     """
+
+    bonds: BondField | None = None
+
+    def __post_init__(self):
+        check_bonds(self.bonds)
 
     def kernel(self, tip: Tip) -> LawKernel:
         """Return the compiled law for a specimen: F / F_evap, 0 for atoms that cannot evaporate."""
-        return WeightedField(np.where(tip.evaporable, 1.0 / tip.evaporation_fields[tip.species], 0.0))
+        weight = np.where(tip.evaporable, 1.0 / tip.evaporation_fields[tip.species], 0.0)
+        return WeightedField(weight, *(() if self.bonds is None else bond_table(self.bonds, tip)))
 
     def keys(self, tip: Tip, atoms: Integers, fields: Floats, bonds: Integers) -> Floats:
-        """Return the ratio of field to evaporation field of each atom: see `Law.keys`."""
+        """Return the ratio of field to evaporation field of the species of each atom: see `Law.keys`."""
         return np.where(tip.evaporable[atoms], fields / tip.evaporation_fields[tip.species[atoms]], 0.0)
 
 
@@ -63,7 +76,14 @@ def check_law(law: object) -> None:
         raise ValueError(f"law must be an evaporation law with a method keys, such as Extremal(), got {law!r:.80}")
 
 
-def kernel_of(law: Law, tip: Tip) -> LawKernel:
+def has_temperature(law: Any) -> bool:
+    """Whether the law is one of rates, whose events take time: its voltage is controlled."""
+    return callable(getattr(law, "working_point", None)) and getattr(law, "peak_temperature", 0.0) > 0
+
+
+def kernel_of(law: Any, tip: Tip, control: VoltageControl | None = None) -> LawKernel:
     """Return the compiled kernel of a law for a specimen; for a law in Python, a kernel that calls it."""
     make = getattr(law, "kernel", None)
-    return PythonLaw(law, tip) if make is None else make(tip)
+    if make is None:
+        return PythonLaw(law, tip)
+    return make(tip, control) if has_temperature(law) else make(tip)

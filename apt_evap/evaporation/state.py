@@ -30,6 +30,8 @@ class EmitterState:
         As in `Emitter.counts`.
     rule_state : dict
         Further state of the charging rule: for Robin the "potential_point" [nm], shape (3,).
+    voltage_factor : float
+        Voltage of the control divided by that of the charges, after the relaxation.
     """
 
     sites: np.ndarray
@@ -42,3 +44,4 @@ class EmitterState:
     clipped: int
     unsettled: int
     rule_state: dict[str, Any] = field(default_factory=dict)
+    voltage_factor: float = 1.0

@@ -1,10 +1,144 @@
-"""The applied voltage."""
+"""The applied voltage, and its control to a constant rate of evaporation."""
 
+import math
+from dataclasses import dataclass
 from typing import Any
 
-from apt_evap._common.validation import check_number
+from apt_evap._common.validation import check_count, check_number
+from apt_evap._core.elementary import exponential, logarithm
+
+_STEP = 1e-6  # relative, for the slope of the rate: 1e-3 of what changes the rate by a factor of e at 20 K
+_BISECTIONS = 60  # from six decades to the rounding of float64
 
 
 def check_voltage(voltage: Any) -> float:
     """Return the applied voltage [V], > 0 and <= 1 MV; ValueError otherwise."""
     return check_number(voltage, "voltage", above=0, at_most=1e6, unit="V")
+
+
+@dataclass(frozen=True)
+class VoltageControl:
+    """Voltage of an instrument: a constant rate of evaporation, with or without voltage pulses.
+
+    Parameters
+    ----------
+    rate : float
+        Ions per pulse; without pulses, ions per second. 0.002 to 0.05 ions per pulse are usual.
+    pulse_fraction : float
+        Height of the voltage pulse relative to the standing voltage, V_p / V_dc; 0.2 is usual. 0: no pulses.
+    pulse_width : float
+        Standard deviation of the Gaussian top of a pulse [ns].
+    pulse_frequency : float
+        Pulses per second [kHz].
+    memory : int
+        Number of ions over which the control averages the rate.
+
+    Raises
+    ------
+    ValueError
+        If a number is outside its range.
+
+    Notes
+    -----
+    The voltage V that the atoms see at the top of a pulse is V_dc + V_p. The control of a law with a temperature raises
+    the logarithm of all rates by 1/memory in the mean time between two ions, and lowers it by 1/memory with every ion:
+    the mean rate is the wanted one. This changes V by dlnV = dlnK s, with s = dlnV/dlnK of the sum of the rates.
+    """
+
+    rate: float = 0.01
+    pulse_fraction: float = 0.2
+    pulse_width: float = 0.5
+    pulse_frequency: float = 200.0
+    memory: int = 250
+
+    def __post_init__(self):
+        for name, value in {
+            "rate": check_number(self.rate, "rate", above=0, at_most=1e6),
+            "pulse_fraction": check_number(self.pulse_fraction, "pulse_fraction", at_least=0, at_most=1),
+            "pulse_width": check_number(self.pulse_width, "pulse_width", above=0, at_most=1e6, unit="ns"),
+            "pulse_frequency": check_number(self.pulse_frequency, "pulse_frequency", above=0, at_most=1e6, unit="kHz"),
+            "memory": check_count(self.memory, "memory", at_least=1, at_most=1_000_000),
+        }.items():
+            object.__setattr__(self, name, value)
+
+    def effective_width(self, softness: float) -> float:
+        r"""Time at the top of a pulse with the same number of events [s].
+
+        Parameters
+        ----------
+        softness : float
+            kT / (C x): relative change of the field that changes the rate by a factor of e, at the top of the pulse.
+
+        Returns
+        -------
+        float
+
+        Notes
+        -----
+        The field is :math:`F(t) = F_\mathrm{dc} (1 + p \exp(-t^2 / 2 s^2))`, so that to second order the rate is a
+        Gaussian, with the integral
+
+        .. math:: \tau = s \sqrt{2 \pi \, \frac{k T}{C x} \, \frac{1 + p}{p}}
+        """
+        p = self.pulse_fraction
+        return 1e-9 * self.pulse_width * math.sqrt(2.0 * math.pi * softness * (1.0 + p) / p)
+
+
+class RateControl:
+    """Control of the voltage of an emitter during its events, for a law with a temperature.
+
+    Parameters
+    ----------
+    control : VoltageControl
+        Wanted rate, and gain.
+    pulse_length : float
+        Time per pulse with the rate of its top [s]; 0 without pulses.
+    """
+
+    def __init__(self, control: VoltageControl, pulse_length: float) -> None:
+        self.control, self.pulse_length = control, pulse_length
+        self.rate = control.rate / (pulse_length or 1.0)
+        self._slope = math.nan  # dlnV/dlnK at the last relaxation
+
+    @classmethod
+    def of(cls, law: Any, tip: Any, control: VoltageControl | None) -> "RateControl":
+        """Return the control for a law on a specimen; by default the usual one of the law."""
+        control = law.default_control() if control is None else control
+        return cls(control, law.working_point(float(law.sensitivities(tip)[0]), control)[1])
+
+    def begin(self, core: Any) -> None:
+        """Pass the wanted rate to the events."""
+        core.rate, core.memory = self.rate, float(self.control.memory)
+
+    def voltage_factors(self, core: Any, rise: Any) -> Any:
+        """Voltage over that of the charges, from the logarithm of the factor of the rates since the relaxation."""
+        return core.voltage_factor * exponential(self._slope * rise)
+
+    def keep(self, core: Any) -> None:
+        """Before a relaxation: include the voltage changes since the last one in the factor."""
+        if not math.isnan(self._slope):
+            core.voltage_factor = float(self.voltage_factors(core, core.rise))
+
+    def look(self, core: Any, n_threads: int) -> None:
+        """Set the voltage of a new surface to the wanted rate, and determine the slope of its rate."""
+        factor = core.voltage_factor
+        if math.isnan(self._slope) and core.start.n_removed == 0:
+            factor = self._solve(core, n_threads)
+        logs = [self._log_rate(core, factor * part, n_threads) for part in (1.0 + _STEP, 1.0)]
+        self._slope = _STEP / max(logs[0] - logs[1], 1e-12)
+
+    def _solve(self, core, n_threads):
+        """Factor of the voltage at which the sum of the rates is the wanted one, by bisection."""
+        goal = float(logarithm(self.rate))
+        low, high = math.log(1e-3), math.log(1e3)
+        for _ in range(_BISECTIONS):
+            middle = 0.5 * (low + high)
+            if self._log_rate(core, float(exponential(middle)), n_threads) < goal:
+                low = middle
+            else:
+                high = middle
+        return float(exponential(0.5 * (low + high)))
+
+    def _log_rate(self, core, factor, n_threads):
+        core.voltage_factor = factor
+        return core.rank(n_threads)

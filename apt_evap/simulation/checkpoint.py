@@ -264,7 +264,7 @@ class Keeper:
 
     def _resume(self, parts, n_ions):
         """Load the run to continue."""
-        name, run = str(self._checkpoint.path), load(self._folder if parts else self._target)
+        name, run = str(self._checkpoint.path), load(self._folder if parts else self._target).simulated()
         if differences := self._differences(run):
             raise FileError(f"the run in {name!r} cannot be resumed with other settings: {differences}")
         if not np.array_equal(run.emissions.ions, run.emissions.ions[0] + np.arange(len(run))):

@@ -1,9 +1,11 @@
-"""The history of a run: its charges and ions at each check of the monitor."""
+"""The history of a run: charges and ions at each check of the monitor, and the cap at each relaxation."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
+
+from apt_evap.evaporation.cap import Cap
 
 
 class History(NamedTuple):
@@ -39,3 +41,41 @@ class History(NamedTuple):
     def join(cls, parts: "Iterable[History]") -> "History":
         """Join the parts of a history in their order."""
         return cls(*(np.concatenate(columns) for columns in zip(cls.empty(), *parts, strict=True)))
+
+
+class CapHistory(NamedTuple):
+    """The cap of the surface after each relaxation of the charges, at the simulated voltage.
+
+    Parameters
+    ----------
+    ions : ndarray of int64, shape (k,)
+        Number of evaporated ions at the relaxation.
+    fields : ndarray, shape (k,)
+        Mean field of the surface atoms within 45 degrees of the axis [V/nm].
+    ratios : ndarray, shape (k,)
+        Mean ratio of their fields to their evaporation fields.
+    radii : ndarray, shape (k,)
+        Radius of the sphere through these atoms [nm].
+    """
+
+    ions: np.ndarray
+    fields: np.ndarray
+    ratios: np.ndarray
+    radii: np.ndarray
+
+    @classmethod
+    def empty(cls) -> "CapHistory":
+        """History without a relaxation."""
+        return cls(np.empty(0, np.int64), *(np.empty(0) for _ in cls._fields[1:]))
+
+    @classmethod
+    def join(cls, parts: "Iterable[CapHistory]") -> "CapHistory":
+        """Join the parts of a history in their order."""
+        return cls(*(np.concatenate(columns) for columns in zip(cls.empty(), *parts, strict=True)))
+
+    @classmethod
+    def of(cls, ion: int, cap: Cap | None) -> "CapHistory":
+        """History of one relaxation before the ion with this number; without a cap, empty."""
+        if cap is None:
+            return cls.empty()
+        return cls(np.array([ion], np.int64), *(np.array([value]) for value in cap))

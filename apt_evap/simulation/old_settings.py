@@ -25,6 +25,8 @@ def upgraded(settings: Mapping[str, Any]) -> dict[str, Any]:
             new[table] = {names.get(key, key): value for key, value in new[table].items()}
     if new.get("rule") == "Robin":
         new["rule"] = dict(_ROBIN)
-    if new.get("law") == {"name": "Extremal", "repr": "Extremal()"}:
-        new["law"] = {"name": "Extremal"}
+    if new.get("law") in ({"name": "Extremal", "repr": "Extremal()"}, {"name": "Extremal"}):
+        new["law"] = {"name": "Extremal", "bonds": None}
+    new.setdefault("control", None)
+    new.setdefault("pulse_length", None)
     return new

@@ -3,27 +3,49 @@
 import hashlib
 import json
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from apt_evap._common.files import FileError, check_path
-from apt_evap._common.types import AnyPath, Booleans
-from apt_evap._common.validation import check_kind, check_switch, short_text
+from apt_evap._common.types import AnyPath, Booleans, Floats, Integers
+from apt_evap._common.validation import (
+    check_choice,
+    check_count,
+    check_kind,
+    check_number,
+    check_seed,
+    check_switch,
+    short_text,
+)
 from apt_evap._common.warnings import DataWarning
 from apt_evap.detection.detector import Detector
-from apt_evap.detection.hits import Hits
+from apt_evap.detection.hits import Hits, Outcome
+from apt_evap.detection.timing import Timing
 from apt_evap.emission.emissions import COLUMNS, Emissions
 from apt_evap.emission.ion_random import IonRandom
 from apt_evap.emission.perturbations import Perturbation, Unperturbed
+from apt_evap.emission.post_ionisation import PostIonisation
 from apt_evap.evaporation.state import EmitterState
+from apt_evap.evaporation.voltage import VoltageControl
 from apt_evap.flight.response import ResponseModel, Responses, ResponseSettings
 from apt_evap.simulation.ending import Ending
-from apt_evap.simulation.history import History
+from apt_evap.simulation.history import CapHistory, History
 from apt_evap.simulation.provenance import joined, provenance_now
+from apt_evap.simulation.real_units import (
+    REFERENCES,
+    RealColumns,
+    RealUnits,
+    check_flight_charges,
+    flight_charges_of,
+    isotopes_of,
+    pulses_of,
+    random_of,
+    real_voltages,
+)
 from apt_evap.simulation.run_hdf5 import described, read_run, write_run
 
 
@@ -36,6 +58,18 @@ class Flown:
 
     def __repr__(self) -> str:
         return f"<Flown: directions and times of {len(self.times):,} ions>"
+
+
+class Clock(NamedTuple):
+    """Course of a run with a temperature; each of shape (n,)."""
+
+    waits: np.ndarray
+    """Time before each event [s]; with pulses, time at the top of pulses."""
+    voltages: np.ndarray
+    """Voltage of the control at each event [V]."""
+
+    def __repr__(self) -> str:
+        return f"<Clock: {len(self.waits):,} events>"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -85,6 +119,14 @@ class Run:
     detached : ndarray of bool, shape (n,), optional
         Atoms that left because they had lost all chains of bonds to the body; by default none, as in files of earlier
         versions.
+    cap : CapHistory
+        The cap of the surface after each relaxation, at the simulated voltage.
+    clock : Clock or None
+        Time and voltage of each event, for a law with a temperature.
+    units : RealUnits or None
+        Operating point of a run in real units, see `at_evaporation_field`.
+    real : RealColumns or None
+        Its voltages, charges, masses and pulses.
     """
 
     emissions: Emissions
@@ -107,6 +149,10 @@ class Run:
     ended: str = ""
     provenance: dict = field(default_factory=provenance_now)
     detached: Any = None
+    cap: CapHistory = field(default_factory=CapHistory.empty)
+    clock: Clock | None = None
+    units: RealUnits | None = None
+    real: RealColumns | None = None
 
     def __post_init__(self):
         if self.detached is None:
@@ -119,7 +165,45 @@ class Run:
         flown = ", ".join(_describe(perturbation) for perturbation in self.perturbations)
         responses = "" if self.responses is None else f"responses, {self.flagged.sum():,} of them flagged"
         details = "; ".join(part for part in (responses, flown and f"flown: {flown}", self.ended) if part)
-        return f"<Run: {len(self):,} ions of {', '.join(self.elements)} at {self.voltage:g} V; {details}>"
+        where = f"{self.voltage:g} V"
+        if self.units is not None and len(self):
+            where = (
+                f"{_range(self.voltages)} V, {self.units.operating_field:.3g} V/nm at the {self.units.field_reference}"
+            )
+        return f"<Run: {len(self):,} ions of {', '.join(self.elements)} at {where}; {details}>"
+
+    @property
+    def evaporation_fields(self) -> Floats:
+        """Evaporation field of the species of each ion [V/nm], shape (n,)."""
+        tip = self.settings["tip"]
+        # in the order of the species; two of them may have the same name
+        materials = [tip["material"], *(each for each, _ in tip["solutes"])] if "material" in tip else tip["elements"]
+        return np.array([material["evaporation_field"] for material in materials])[self.species]
+
+    @property
+    def voltages(self) -> Floats:
+        """Voltage at each event [V], shape (n,): constant, that of the control, or in real units that of the model.
+
+        With voltage pulses it is the voltage at the top of the pulse.
+        """
+        if self.real is not None:
+            return self.real.voltages
+        return np.full(len(self), self.voltage) if self.clock is None else self.clock.voltages
+
+    @property
+    def flight_charges(self) -> Integers:
+        """Charge of each ion in flight [e], shape (n,); without real units that at the barrier."""
+        return self.emissions.charge_states if self.real is None else self.real.charges
+
+    @property
+    def energy_scales(self) -> Floats:
+        """Simulated energy per energy of this run, n V of the simulation over n V in flight, shape (n,).
+
+        1 without real units: energies are those at the simulated voltage and the charge at the barrier.
+        """
+        if self.real is None:
+            return np.ones(len(self))
+        return self.emissions.charge_states * self.voltage / (self.real.charges * self.real.voltages)
 
     @property
     def response_model(self) -> ResponseModel:
@@ -144,8 +228,9 @@ class Run:
         Returns
         -------
         str
-            SHA-256 over the names, types and values of the columns: emissions, sites, species, charges, fields, flown
-            perturbations and responses. By design it does not depend on the machine.
+            SHA-256 over the names, types and values of the columns: emissions, sites, species, charges, fields, times
+            and voltages of a control, flown perturbations and responses, but not the real units, which follow from
+            them. By design it does not depend on the machine.
         """
         columns = {name: getattr(self, name) for name in ("site", "species", "charges", "fields")}
         columns |= {f"emissions/{name}": getattr(self.emissions, name) for name in COLUMNS}
@@ -153,6 +238,8 @@ class Run:
             columns |= {f"flown/{number}/directions": flown.directions, f"flown/{number}/times": flown.times}
         if self.responses is not None:
             columns |= {f"responses/{name}": values for name, values in self.responses._asdict().items()}
+        if self.clock is not None:
+            columns |= {f"clock/{name}": values for name, values in self.clock._asdict().items()}
         hashed = hashlib.sha256()
         for name in sorted(columns):
             values = np.array(columns[name], order="C")
@@ -190,7 +277,8 @@ class Run:
         check_switch(by_response, "by_response")
         for flown_as, flown in zip(self.perturbations, self.flown, strict=True):
             known = flown_as == perturbation or flown_as == described(perturbation)  # by name and repr in a file
-            if known and not by_response:
+            # the energies of flights were those at the simulated voltage
+            if known and not by_response and (self.real is None or perturbation == Unperturbed()):
                 return self._hits(flown.directions, flown.times, perturbation)
         if not callable(getattr(perturbation, "tangential", None)):
             check_kind(perturbation, "perturbation", "launch", "a perturbation such as Unperturbed() or RollUp(0.2)")
@@ -202,27 +290,214 @@ class Run:
             raise ValueError(f"this run has no responses and {short_text(perturbation)} was not flown in it")
         emissions = self.emissions
         rolled, first, second = perturbation.tangential(emissions, IonRandom(self.seed, emissions.ions))  # type: ignore[attr-defined]
+        if self.real is not None:
+            slower = np.sqrt(self.energy_scales)
+            first, second = first * slower, second * slower
         landed = self.response_model.evaluate(self.responses, rolled, first, second, emissions.masses)
         return self._hits(*landed, perturbation)
 
     def _hits(self, directions, times, perturbation):
+        emissions, columns, units = self.emissions, {}, {"charge": "e", "field": "V/nm"}
+        if self.units is not None and self.real is not None:
+            # t is proportional to sqrt(m / (n V)) on the same path; the last V is that of the instrument
+            masses = self.real.masses / emissions.masses / self.units.voltage_ratio
+            times = times * np.sqrt(self.energy_scales * masses)
         x, y, times, outcome = self.detector.impacts(directions, times)
-        emissions = self.emissions
+        if self.real is None:
+            columns = {"voltage": self.voltages, "mass_to_charge": emissions.masses / emissions.charge_states}
+            extra = {"charge": self.charges, "field": self.fields}
+        else:
+            columns = self._measured(times, outcome)
+            times = columns.pop("time_of_flight")
+            scale = self.real.voltages / self.voltage
+            extra = {"charge": self.charges * scale, "field": self.fields * scale, "charge_state": self.real.charges}
+            units["charge_state"] = "e"
         return Hits(
             x=x,
             y=y,
             time_of_flight=times,
-            voltage=np.full(len(self), self.voltage),
-            mass_to_charge=emissions.masses / emissions.charge_states,
+            **columns,
             positions=emissions.positions,
             site=self.site,
             ion=emissions.ions,
             outcome=outcome,
-            extra={"charge": self.charges, "field": self.fields},
-            units={"charge": "e", "field": "V/nm"},
+            extra=extra,
+            units=units,
             source=f"simulation, {_describe(perturbation)}",
             extent=self.detector.extent,
         )
+
+    def _measured(self, times, outcome):
+        """Columns that an instrument would record: voltages, pulses, times with their errors, m/n from these."""
+        units, real = self.units, self.real
+        total = real.voltages * units.voltage_ratio
+        fraction = units.control.pulse_fraction
+        columns = {"voltage": total / (1.0 + fraction), "pulse_id": real.pulse_ids}
+        if fraction > 0:
+            columns["pulse_voltage"] = total - columns["voltage"]
+        columns["mass_to_charge"] = real.masses / real.charges
+        if units.timing is not None:
+            # an instrument is calibrated for its paths, so that m/n is the true one for an exact time
+            deficits, delays = units.timing.errors(random_of(units.seed, self.emissions.ions)[:, 3:])
+            with np.errstate(invalid="ignore"):
+                late = (times / np.sqrt(1.0 - deficits) + delays) / times
+            columns["mass_to_charge"] = columns["mass_to_charge"] * late * late
+            times = times * late
+        columns["time_of_flight"] = times
+        hit = np.flatnonzero(outcome == Outcome.HIT)
+        pulses, multiplicity = np.zeros(len(self), np.uint32), np.zeros(len(self), np.uint32)
+        if len(hit):
+            pulse = real.pulse_ids[hit]
+            pulses[hit] = np.diff(pulse, prepend=pulse[0])
+            first, counts = np.unique(pulse, return_counts=True)
+            multiplicity[hit] = counts[np.searchsorted(first, pulse)]
+        return columns | {"pulses": pulses, "multiplicity": multiplicity}
+
+    def at_evaporation_field(
+        self,
+        field_reference: str = "cap",
+        *,
+        operating_field: float | None = None,
+        flight_charges: int | Mapping[str, int] | PostIonisation | None = None,
+        control: VoltageControl | None = None,
+        timing: Timing | None = None,
+        smoothing: int = 250,
+        field_factor: float | None = None,
+        seed: int | None = None,
+    ) -> "Run":
+        r"""The same run in real units: at the voltages that bring it to its evaporation field.
+
+        Energies of perturbations are then true eV, `voltages` true V and times of flight true ns. Nothing is simulated
+        again.
+
+        Parameters
+        ----------
+        field_reference : {"cap", "site"}
+            "cap": the mean field of the cap is the operating field. Literature evaporation fields are such means, as
+            they are determined as V / (k_f R). "site": the field at the evaporating atom, which is 1.5 to 1.6 times
+            higher, is the operating field.
+        operating_field : float, optional
+            Operating field of the host [V/nm]. By default its evaporation field; for a law with a temperature, the
+            field to which the control led.
+        flight_charges : int or mapping or PostIonisation, optional
+            Charge of the ions in flight, for all ions or by element; `PostIonisation` draws it from the local field. By
+            default that of the main peak in usual spectra, such as 2 for Ni. It is not the charge at the barrier,
+            which defines the evaporation field.
+        control : VoltageControl, optional
+            Rate and pulses; by default those of the run, or `VoltageControl()`.
+        timing : Timing, optional
+            Errors of the times of flight, so that `Hits.mass_to_charge` is a spectrum; by default the times are exact.
+        smoothing : int
+            Number of ions over which the voltage is averaged, as by the control of an instrument.
+        field_factor : float, optional
+            k_f of the instrument, V = k_f F R, with the initial apex radius R. The reported voltages are then those of
+            the instrument, the ratio of both factors is constant. By default the voltages are those of the model, whose
+            field factor is smaller because it has no counter electrode.
+        seed : int, optional
+            Seed of isotopes, charges, pulses and times; by default that of the run.
+
+        Returns
+        -------
+        Run
+            With voltages, charges, isotopes and pulses of each ion in `real`, and the operating point in `units`.
+
+        Raises
+        ------
+        ValueError
+            If an argument is outside its range, or the run does not contain the fields of its cap.
+
+        Notes
+        -----
+        All fields are proportional to the voltage. With the field :math:`F_i` at the simulated voltage :math:`V`, the
+        ion i has the voltage
+
+        .. math:: V_i = V \, \frac{x \, F_\mathrm{evap}}{F_i}
+
+        with the operating field :math:`x F_\mathrm{evap}`, averaged over the last ions. The path depends on
+        :math:`E_\perp / (n V)` only, and the time of flight is proportional to :math:`\sqrt{m / (n V)}`.
+        """
+        check_choice(field_reference, "field_reference", REFERENCES)
+        smoothing = check_count(smoothing, "smoothing", at_least=1)
+        if control is None:
+            stored = self.settings.get("control")
+            control = VoltageControl(**stored) if stored else VoltageControl()
+        check_kind(control, "control", VoltageControl, "a VoltageControl")
+        if timing is not None:
+            check_kind(timing, "timing", Timing, "a Timing")
+        seed = self.seed if seed is None else check_seed(seed)
+        given_charges = check_flight_charges(flight_charges, self.elements)
+        if field_factor is not None:
+            field_factor = check_number(field_factor, "field_factor", above=0, at_most=100)
+        host_field = self._host_field()
+        goal = None
+        if operating_field is not None:
+            goal = check_number(operating_field, "operating_field", above=0, at_most=1000, unit="V/nm") / host_field
+        emissions = self.emissions
+        voltages, goal, field_ratio = real_voltages(
+            self.fields / self.evaporation_fields,
+            self.cap,
+            emissions.ions,
+            self.voltage,
+            None if self.clock is None else self.clock.voltages,
+            field_reference,
+            goal,
+            smoothing,
+        )
+        u = random_of(seed, emissions.ions)
+        # fields at the evaporations, about their mean, which is the operating field
+        local = self.fields * voltages / self.evaporation_fields
+        local = local / (local.mean() or 1.0) * goal if len(self) else local
+        real = RealColumns(
+            voltages=voltages,
+            charges=flight_charges_of(
+                given_charges,
+                self.elements,
+                self.species,
+                emissions.charge_states,
+                local * self.evaporation_fields,
+                u[:, 1],
+            ),
+            masses=isotopes_of(self.elements, self.species, emissions.masses, u[:, 0]),
+            pulse_ids=self._pulse_ids(control, local / goal, u[:, 2]),
+        )
+        units = RealUnits(
+            field_reference=field_reference,
+            operating_field=goal * host_field,
+            field_ratio=field_ratio,
+            smoothing=smoothing,
+            control=control,
+            timing=timing,
+            voltage_ratio=self._voltage_ratio(field_factor, voltages, goal * host_field),
+            seed=seed,
+        )
+        return replace(self, units=units, real=real)
+
+    def simulated(self) -> "Run":
+        """The same run without real units, at the simulated voltage."""
+        return self if self.units is None else replace(self, units=None, real=None)
+
+    def _host_field(self):
+        """Evaporation field of the first species [V/nm]."""
+        tip = self.settings["tip"]
+        return (tip["material"] if "material" in tip else tip["elements"][0])["evaporation_field"]
+
+    def _voltage_ratio(self, field_factor, voltages, operating_field):
+        """Voltage of an instrument with this field factor over that of the model."""
+        if field_factor is None:
+            return 1.0
+        radius = self.settings["tip"].get("apex_radius")
+        if radius is None or not len(self):
+            raise ValueError("field_factor needs the apex radius, which a tip made from positions does not have")
+        return field_factor * operating_field * radius / float(voltages[0])
+
+    def _pulse_ids(self, control, excess, u):
+        """Number of the pulse of each ion: from the clock, or drawn for the rate, or without pulses its own."""
+        pulse_length = self.settings.get("pulse_length")
+        if self.clock is not None and pulse_length:
+            return np.floor(np.cumsum(self.clock.waits) / pulse_length).astype(np.int64)
+        if self.clock is not None or control.pulse_fraction == 0:
+            return np.arange(len(self))
+        return pulses_of(excess, control.rate, u)
 
     def seen_by(self, detector: Detector) -> "Run":
         """The same ions, recorded by another detector.
@@ -277,6 +552,11 @@ class Run:
             )
         history = History.join([run.history for run in runs])
         columns["provenance"] = joined([run.provenance for run in runs])
+        columns["cap"] = CapHistory.join([run.cap for run in runs])
+        for name, kind in (("clock", Clock), ("real", RealColumns)):
+            if getattr(first, name) is not None:
+                parts = zip(*(getattr(run, name) for run in runs), strict=True)
+                columns[name] = kind(*map(np.concatenate, parts))
         return replace(first, emissions=emissions, flown=flown, responses=responses, history=history, **columns)  # type: ignore[arg-type]
 
     def ended_by(self, reason: str) -> "Run":
@@ -328,7 +608,9 @@ def load(path: AnyPath, *, partial: bool = False) -> Run:
 
 def _load_file(path, partial=False):
     arguments = read_run(path, partial)
-    return Run(**arguments | {"flown": tuple(Flown(*flown) for flown in arguments["flown"])})
+    arguments["flown"] = tuple(Flown(*flown) for flown in arguments["flown"])
+    arguments["clock"] = arguments["clock"] and Clock(*arguments["clock"])
+    return Run(**arguments)
 
 
 def _load_parts(folder, partial):
@@ -371,3 +653,9 @@ def part_paths(folder: Path) -> list[Path]:
 
 def _describe(perturbation):
     return perturbation.get("repr", json.dumps(perturbation)) if isinstance(perturbation, dict) else repr(perturbation)
+
+
+def _range(values):
+    """Smallest and largest number, or the only one."""
+    low, high = f"{values.min():.4g}", f"{values.max():.4g}"
+    return low if low == high else f"{low} to {high}"

@@ -30,8 +30,9 @@ from apt_evap.simulation.checked_hdf5 import (
     open_checked,
     write_checked,
 )
-from apt_evap.simulation.history import History
+from apt_evap.simulation.history import CapHistory, History
 from apt_evap.simulation.old_settings import upgraded
+from apt_evap.simulation.real_units import RealColumns, RealUnits
 
 FORMAT = "apt_evap run 2"
 _KIND = "apt_evap run "
@@ -53,6 +54,9 @@ _UNITS = {
     "times": "ns",
     "residuals": "mm",
     "field": "V/nm",
+    "radii": "nm",
+    "waits": "s",
+    "voltages": "V",
 }
 _IONS = f"{_ATOM_PROBE}/evaporation_id"
 _KINDS = {  # datasets with one row per ion: name, type, shape of a row
@@ -66,6 +70,17 @@ _KINDS = {  # datasets with one row per ion: name, type, shape of a row
     "species": (f"{_SIMULATION}/species", np.int32, ()),
     "charges": (f"{_SIMULATION}/charges", np.float64, ()),
     "fields": (f"{_SIMULATION}/fields", np.float64, ()),
+}
+# not in all files: datasets with one row per ion of `Run.clock` and `Run.real`
+_CLOCK = {name: (f"{_SIMULATION}/clock/{name}", np.float64, ()) for name in ("waits", "voltages")}
+_REAL = {
+    name: (f"{_SIMULATION}/real/{name}", kind, ())
+    for name, kind in (
+        ("voltages", np.float64),
+        ("charges", np.int32),
+        ("masses", np.float64),
+        ("pulse_ids", np.int64),
+    )
 }
 _STATE_ARRAYS = {
     "sites": (np.int64, (None,)),
@@ -155,6 +170,14 @@ def _write(file, run):
             _put(simulation, f"responses/{name}", values, _UNITS.get(name))
     for name, values in run.history._asdict().items():
         _put(simulation, f"history/{_HISTORY.get(name, name)}", values, _UNITS.get(name))
+    for name, values in run.cap._asdict().items():
+        _put(simulation, f"cap/{name}", values, _UNITS.get(name))
+    for group, columns in (("clock", run.clock), ("real", run.real)):
+        if columns is not None:
+            for name, values in columns._asdict().items():
+                _put(simulation, f"{group}/{name}", values, _UNITS.get(name))
+    if run.units is not None:
+        _put_text(simulation["real"], "units", json.dumps(run.units.to_dict(), default=_plain))
     if run.state is not None:
         _put_state(simulation.create_group("state"), run.state, run.first_event)
 
@@ -252,12 +275,22 @@ def _read(file, partial):
         kinds["responses residuals"] = f"{group}/residuals", np.float32, (2,)
     if _DETACHED[1][0] in file:
         kinds |= dict([_DETACHED])
+    optional = {"clock": _CLOCK, "real": _REAL}
+    optional = {group: names for group, names in optional.items() if f"{_SIMULATION}/{group}" in file}
+    for group, names in optional.items():
+        kinds |= {f"{group} {name}": kind for name, kind in names.items()}
     columns, lost = _columns(file, kinds, partial)
     if len(columns["ions"]) and not 0 <= columns["species"].min() <= columns["species"].max() < len(elements):
         raise ValueError(f"species must be 0 to {len(elements) - 1}, as there are {len(elements)} elements")
-    history, state, first_event = History.empty(), None, 0
+    groups = {group: [columns[f"{group} {name}"] for name in names] for group, names in optional.items()}
+    units = None
+    if "real" in groups:
+        units = RealUnits.from_dict(json.loads(file.text("units", f"{_SIMULATION}/real")))
+    history, cap, state, first_event = History.empty(), CapHistory.empty(), None, 0
     try:
-        history = _read_history(file)
+        history = History(*_read_table(file, "history", History._fields))
+        if f"{_SIMULATION}/cap" in file:
+            cap = CapHistory(*_read_table(file, "cap", CapHistory._fields))
         if f"{_SIMULATION}/state" in file and not lost:
             state, first_event = _read_state(file, f"{_SIMULATION}/state")
     except _READ_ERRORS:
@@ -282,6 +315,10 @@ def _read(file, partial):
         "elements": elements,
         "settings": settings,
         "history": history,
+        "cap": cap,
+        "clock": groups.get("clock"),
+        "units": units,
+        "real": RealColumns(*groups["real"]) if "real" in groups else None,
         "state": state,
         "first_event": first_event,
         "ended": f"damaged: {lost:,} ions are lost" if lost else file.text("ended"),
@@ -312,11 +349,11 @@ def _columns(file, kinds, partial):
     return dict(zip(datasets, joined, strict=True)), lost
 
 
-def _read_history(file):
-    group = f"{_SIMULATION}/history"
+def _read_table(file, group, names):
+    """Columns of a table with the number of ions in the first one."""
+    group = f"{_SIMULATION}/{group}"
     ions = file.read(f"{group}/ions", np.int64, (None,))
-    others = [file.read(f"{group}/{_HISTORY.get(name, name)}", float, (len(ions),)) for name in History._fields[1:]]
-    return History(ions, *others)
+    return ions, *(file.read(f"{group}/{_HISTORY.get(name, name)}", float, (len(ions),)) for name in names[1:])
 
 
 def _read_state(file, group):
@@ -326,6 +363,7 @@ def _read_state(file, group):
     for name in ("format", "checksums"):  # attributes of a separate file
         numbers.pop(name, None)
     own = {name: numbers.pop(name) for name in ("deepened", "tolerance", "opening_angle", "clipped", "unsettled")}
+    factor = check_number(float(numbers.pop("voltage_factor", 1.0)), "voltage_factor", above=0)
     first_event = check_count(int(numbers.pop("first_event")), "first_event")
     state = EmitterState(
         **arrays,
@@ -335,6 +373,7 @@ def _read_state(file, group):
         clipped=check_count(int(own["clipped"]), "clipped"),
         unsettled=check_count(int(own["unsettled"]), "unsettled"),
         rule_state=numbers,
+        voltage_factor=factor,
     )
     return state, first_event
 

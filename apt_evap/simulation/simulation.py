@@ -27,14 +27,15 @@ from apt_evap.evaporation.emitter import BATCH, Emitter
 from apt_evap.evaporation.law import Extremal, Law
 from apt_evap.evaporation.rule import CompiledRule, Rule
 from apt_evap.evaporation.settings import ChargeSettings
-from apt_evap.evaporation.voltage import check_voltage
+from apt_evap.evaporation.voltage import VoltageControl, check_voltage
 from apt_evap.flight.crew import FlightCrew, FlightSettings, check_reach
 from apt_evap.flight.landing import land
 from apt_evap.flight.response import ResponseModel, ResponseSettings
 from apt_evap.simulation.checkpoint import Checkpoint, Keeper
+from apt_evap.simulation.history import CapHistory
 from apt_evap.simulation.monitor import WatchSettings
 from apt_evap.simulation.recorder import Recorder
-from apt_evap.simulation.run import Flown, Run
+from apt_evap.simulation.run import Clock, Flown, Run
 from apt_evap.specimen.tip import Tip
 
 BACKLOG = 4  # batches whose flights may be pending during further events
@@ -68,6 +69,9 @@ class Simulation:
         Distribution of the charge over the surface; by default `Robin`.
     watch_settings : WatchSettings, optional
         Monitoring of the run.
+    control : VoltageControl, optional
+        Rate, pulses and control of the voltage, for a law with a temperature (by default a usual one), and for real
+        units. Flights are simulated at `voltage`, because their paths do not depend on it.
 
     Raises
     ------
@@ -88,6 +92,7 @@ class Simulation:
         n_threads: int | None = None,
         rule: Rule | CompiledRule | None = None,
         watch_settings: WatchSettings | None = None,
+        control: VoltageControl | None = None,
     ) -> None:
         self.voltage = check_voltage(voltage)
         self.seed = check_seed(seed)
@@ -103,7 +108,8 @@ class Simulation:
         check_kind(self.watch_settings, "watch_settings", WatchSettings, "WatchSettings")
         self.n_threads = thread_count(n_threads)
         check_reach(self.flight_settings, check_kind(tip, "tip", Tip, "a Tip"), self.detector)
-        self.emitter = Emitter(tip, self.voltage, self.law, charge_settings, self.n_threads, rule)
+        self.emitter = Emitter(tip, self.voltage, self.law, charge_settings, self.n_threads, rule, control, self.seed)
+        self.control = self.emitter.control or control
         check_copies(len(self.emitter), self.n_threads)
         self.settings = self._settings_of(tip)
         self.n_evaporated = 0
@@ -203,6 +209,8 @@ class Simulation:
     def _run_alone(self, n_ions, emissions, responses, progress, batch_size, keeper):
         self._catch_up(keeper.previous if keeper else None)
         self.emitter.hand_out_tree()  # atoms may have evaporated without flights before
+        if not (keeper and keeper.previous):
+            self.emitter.hand_out_cap()
         backlog = BACKLOG if self.n_threads > 1 else 0
         with (
             self._crew.at_work(),
@@ -254,8 +262,9 @@ class Simulation:
 
     def _start_flights(self, batch, emissions, responses):
         """Start the flights of a batch; return a function that waits for them and returns the batch as a Run."""
-        ions = np.arange(self.n_evaporated, self.n_evaporated + len(batch))
+        first_ion = self.n_evaporated
         self.n_evaporated += len(batch)
+        ions = np.arange(first_ion, self.n_evaporated)
         emission_batch = self._emissions(batch, ions)
         launches = [
             check_launches(perturbation, perturbation.launch(emission_batch, IonRandom(self.seed, ions)), len(batch))
@@ -292,6 +301,8 @@ class Simulation:
                 elements=tuple(element.name for element in self.tip.elements),
                 settings=self.settings,
                 detached=batch.detached,
+                cap=CapHistory.of(first_ion, batch.cap),
+                clock=None if batch.waits is None else Clock(batch.waits, batch.voltages),
             )
 
         return finish
@@ -339,4 +350,6 @@ class Simulation:
                 "rolled": vars(self.response_settings.rolled),
             },
             "watch": vars(self.watch_settings),
+            "control": None if self.control is None else vars(self.control),
+            "pulse_length": self.emitter.pulse_length,
         }

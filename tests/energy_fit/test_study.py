@@ -1,6 +1,7 @@
 """Searches for emission energies: what is compared is what `ssim` compares, and hidden energies are found again."""
 
 import json
+import re
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from scipy.stats import truncnorm
 import apt_evap as ae
 from apt_evap.emission.perturbations import Combined
 from apt_evap.energy_fit.comparison import Comparison
+from apt_evap.energy_fit.fit_energies import real_units_of
 from apt_evap.energy_fit.grid import EnergyGrid, maxima, spline_maxima
 from apt_evap.energy_fit.resampling import NOISE, Sampler
 from apt_evap.energy_fit.search import EnergySearch
@@ -341,10 +343,39 @@ def test_settings_are_recorded(twin, tmp_path):
     assert saved["registration"]["scale"] == 1
     # as files of before have them
     names = "smoothing flattening data_range allow_noise replicas resamples seed temperature"
-    names += " bins bin_size bins_compared measured measured_noise registered share_above_energy_limit run"
+    names += " bins bin_size bins_compared measured measured_noise registered share_above_energy_limit run real_units"
     assert list(saved["settings"]) == names.split()
     assert saved["settings"] | asdict(study.settings) == saved["settings"]
     assert study.settings.temperature == 50 and study.settings.flattening > 0
+
+
+def test_energies_are_reported_in_real_units_first(twin, run):
+    """The factor is n V of the flight over n V of the simulation."""
+    study, _, _ = twin
+    real = run.at_evaporation_field()
+    factor = float(np.median(2 * real.voltages / 1000.0))  # nickel flies as 2+
+    assert study.real_energies == pytest.approx(
+        (study.refined.true_mean * factor, study.refined.true_standard_deviation * factor), rel=1e-12
+    )
+    text = repr(study).rpartition("; energies ")[2]
+    assert re.fullmatch(r"[\d. (to)±]+ eV at 35 V/nm and 2\+; simulated [\d. (to)±]+ eV at 1000 V .*, 1\+>", text), text
+    assert f"{study.real_energies[0]:.3g}" in text.partition(" eV")[0]
+    assert real_units_of(real)["real_per_study"] == 1.0
+    assert real_units_of(real)["simulated_per_study"] == pytest.approx(1 / factor, rel=1e-12)
+    assert real_units_of(replace(run, cap=ae.CapHistory.empty())) is None
+
+
+def test_a_study_of_a_run_in_real_units_finds_real_energies(run):
+    """The same measured map: the energies of the grid are multiplied by the factor."""
+    real = run.at_evaporation_field(smoothing=100_000)
+    factor = float(np.median(1 / real.energy_scales))
+    measured = run.hits(ae.RollUp(ae.TruncatedNormal(0.2, 0.1))).map(64)
+    options = {"rsds": (0.5,), "registration": HERE, "replicas": 1, "resamples": 0, "progress": False}
+    one = ae.fit_energies(run, measured, means=(0.1, 0.2, 0.4), **options)
+    two = ae.fit_energies(real, measured, means=tuple(factor * np.array([0.1, 0.2, 0.4])), **options)
+    assert one.optimum.mean == 0.2 and two.optimum.mean == pytest.approx(0.2 * factor, rel=1e-12)
+    assert two.ssim == pytest.approx(one.ssim, abs=0.02)  # voltages differ by 1 % along the run
+    assert two.real_energies[0] == pytest.approx(two.refined.true_mean, rel=1e-12)
 
 
 def test_study_settings_are_checked():

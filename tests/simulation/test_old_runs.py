@@ -41,7 +41,8 @@ def test_settings_are_those_of_today():
 
 def test_settings_of_ones_own_stay():
     law = {"name": "Mine", "repr": "Mine()"}
-    assert upgraded({"law": law, "rule": "Mine", "seed": 1}) == {"law": law, "rule": "Mine", "seed": 1}
+    own = {"law": law, "rule": "Mine", "seed": 1}
+    assert upgraded(own) == own | {"control": None, "pulse_length": None}
 
 
 def test_an_old_run_is_loaded(saved, tmp_path):

@@ -1,0 +1,301 @@
+"""Evaporation field of an atom by its bonds: a table over coordination numbers, or pair energies between species."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from apt_evap._common.types import Floats, Integers
+from apt_evap._common.validation import check_count, check_number, short_text
+from apt_evap.specimen.tip import Tip
+
+_KITTEL = "Kittel, Introduction to Solid State Physics, 8th ed. (2005), ch. 3, table 1"
+COHESIVE_ENERGIES = {
+    "Al": 3.39,
+    "Si": 4.63,
+    "Ti": 4.85,
+    "Fe": 4.28,
+    "Ni": 4.44,
+    "Cu": 3.49,
+    "W": 8.90,
+    "Pt": 5.84,
+    "Au": 3.81,
+}
+f"""Cohesive energies [eV] ({_KITTEL})."""
+
+IONISATION_WORKS = {
+    "Al": 1.7,
+    "Si": 14.8,
+    "Ti": 11.8,
+    "Fe": 15.1,
+    "Ni": 2.5,
+    "Cu": 3.1,
+    "W": 36.6,
+    "Pt": 16.2,
+    "Au": 4.1,
+}
+"""Sum of the ionisation energies less n work functions [eV], for the charge n at the barrier in `MATERIALS`.
+
+From first, second and third ionisation energies (NIST Atomic Spectra Database) and polycrystalline work functions
+(Michaelson, J. Appl. Phys. 48, 4729, 1977).
+"""
+
+_COORDINATION = {"fcc": (12, 6), "hcp": (12, 6), "bcc": (8, 6), "sc": (6, 12), "diamond": (4, 12)}
+# [d_nn] between the second and the third neighbours
+_SECOND = {"fcc": 1.57, "hcp": 1.52, "bcc": 1.39, "sc": 1.57, "diamond": 1.77}
+_BITS = 4  # per count of neighbours: up to 15
+_MOST = 4  # counts: tables of 16^4 numbers
+
+
+class BondField(Protocol):
+    """Interface of an evaporation field by bonds.
+
+    A class of a user's own has the two attributes and the method `fields`; it is called once for all combinations of
+    bonds, not during the events.
+    """
+
+    by_species: bool
+    """Whether the species of the neighbours matter, or only their number."""
+    second_shell: bool
+    """Whether second neighbours are counted, too."""
+
+    def fields(self, tip: Tip, species: int, nearest: Integers, second: Integers) -> Floats:
+        """Evaporation field of atoms of one species with these bonds.
+
+        Parameters
+        ----------
+        tip : Tip
+            The specimen.
+        species : int
+            Index of the atom into its `elements`.
+        nearest, second : ndarray of int, shape (k, m)
+            Numbers of remaining nearest and second neighbours, of each species (m = number of species) or of all
+            (m = 1).
+
+        Returns
+        -------
+        ndarray, shape (k,)
+            [V/nm], > 0.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class CoordinationTable:
+    """Evaporation field by the number of remaining nearest neighbours.
+
+    Parameters
+    ----------
+    table : mapping
+        For each element a mapping of the number of nearest neighbours to the field [V/nm]. Numbers in between are
+        interpolated, beyond the ends the field is that of the end. Other elements keep their evaporation fields.
+
+    Raises
+    ------
+    ValueError
+        If a number or a field is outside its range.
+    """
+
+    table: Mapping[str, Mapping[int, float]] = field(hash=False)
+    by_species = False
+    second_shell = False
+
+    def __post_init__(self):
+        if not isinstance(self.table, Mapping) or not self.table:
+            raise ValueError(
+                f"table must be fields by element and number of bonds, such as {{'W': {{4: 57.0, 3: 47.0}}}}, got "
+                f"{short_text(self.table)}"
+            )
+        plain = {}
+        for name, fields in self.table.items():
+            if not isinstance(fields, Mapping) or not fields:
+                raise ValueError(f"table of {name} must be fields by number of bonds, got {short_text(fields)}")
+            plain[name] = {
+                check_count(n, f"bonds in the table of {name}", at_least=0, at_most=15): check_number(
+                    value, f"field in the table of {name}", above=0, at_most=1000, unit="V/nm"
+                )
+                for n, value in fields.items()
+            }
+        object.__setattr__(self, "table", plain)
+
+    def fields(self, tip: Tip, species: int, nearest: Integers, second: Integers) -> Floats:
+        """Evaporation fields [V/nm]: see `BondField.fields`."""
+        element = tip.elements[species]
+        if element.name not in self.table:
+            return np.full(len(nearest), element.evaporation_field)
+        numbers = sorted(self.table[element.name])
+        return np.interp(nearest[:, 0], numbers, [self.table[element.name][n] for n in numbers])
+
+
+TUNGSTEN_TABLE = CoordinationTable({"W": {n: 17.0 + 10.0 * n for n in range(1, 10)} | {0: 57.0}})
+"""Evaporation fields of tungsten by coordination in the program pyvaporate (Ashton et al., 2020): 10 V/nm a bond."""
+
+
+@dataclass(frozen=True)
+class PairEnergies:
+    r"""Evaporation field from pair energies of the remaining bonds, in the image-hump model.
+
+    Parameters
+    ----------
+    cohesive_energies : mapping, optional
+        Cohesive energy by element [eV]; by default `COHESIVE_ENERGIES`.
+    ionisation_works : mapping, optional
+        S = sum of the ionisation energies less n work functions, by element [eV], for the charge at the barrier; by
+        default `IONISATION_WORKS`.
+    ordering : mapping, optional
+        w > 0 for unlike bonds that are stronger than the mean of the like ones [eV], by pair, such as {"Al-Cu": 0.05};
+        0 by default.
+    second_weight : float
+        Energy of a bond to a second neighbour, relative to a nearest one. 0.5 is sensible for bcc, whose second
+        neighbours are only 15 % farther; 0 does not count them.
+
+    Raises
+    ------
+    ValueError
+        If a number is outside its range.
+
+    Notes
+    -----
+    .. math:: Λ_i = \sum_j ε(s_i, s_j), \quad ε_{AA} = \frac{2 E_A}{Z}, \quad ε_{AB} = \frac{ε_{AA} + ε_{BB}}{2} + w,
+        \quad F_i = F_\mathrm{evap} \left( \frac{Λ_i + S}{E_A + S} \right)^2
+
+    with the cohesive energy E_A and the coordination Z of the bulk (with the weighted second neighbours). An atom at a
+    kink of the pure metal has half of the bonds, so that its Λ is E_A, and its field the evaporation field.
+    """
+
+    cohesive_energies: Mapping[str, float] | None = field(default=None, hash=False)
+    ionisation_works: Mapping[str, float] | None = field(default=None, hash=False)
+    ordering: Mapping[str, float] | None = field(default=None, hash=False)
+    second_weight: float = 0.0
+    by_species = True
+
+    def __post_init__(self):
+        check_number(self.second_weight, "second_weight", at_least=0, at_most=1)
+        for name in ("cohesive_energies", "ionisation_works"):
+            given = getattr(self, name)
+            if given is not None:
+                if not isinstance(given, Mapping):
+                    raise ValueError(f"{name} must be numbers [eV] by element, got {short_text(given)}")
+                values = {
+                    key: check_number(value, f"{name} of {key}", above=0, unit="eV") for key, value in given.items()
+                }
+                object.__setattr__(self, name, values)
+        pairs = {}
+        if self.ordering is not None and not isinstance(self.ordering, Mapping):
+            raise ValueError(f"ordering must be energies [eV] by pair such as 'Al-Cu', got {short_text(self.ordering)}")
+        for pair, value in ({} if self.ordering is None else self.ordering).items():
+            if not isinstance(pair, str) or pair.count("-") != 1:
+                raise ValueError(f"ordering must be by pair such as 'Al-Cu', got {short_text(pair)}")
+            pairs[pair] = check_number(value, f"ordering of {pair}", at_least=-10, at_most=10, unit="eV")
+        object.__setattr__(self, "ordering", pairs)
+
+    @property
+    def second_shell(self) -> bool:
+        """Whether second neighbours are counted."""
+        return self.second_weight > 0
+
+    def _number(self, given, known, name, what):
+        values = known if given is None else {**known, **given}
+        if name not in values:
+            raise ValueError(f"{what} must have a value for {name}, got {', '.join(values)}")
+        return values[name]
+
+    def pair_energy(self, tip: Tip, first: int, second: int) -> float:
+        """Energy of a bond between two species [eV]."""
+        energies = []
+        for index in (first, second):
+            element = tip.elements[index]
+            near, far = _COORDINATION[tip.elements[0].structure]
+            cohesive = self._number(self.cohesive_energies, COHESIVE_ENERGIES, element.name, "cohesive_energies")
+            energies.append(2.0 * cohesive / (near + self.second_weight * far))
+        names = [tip.elements[index].name for index in (first, second)]
+        extra = self.ordering.get("-".join(names), self.ordering.get("-".join(names[::-1]), 0.0))  # type: ignore[union-attr]
+        return 0.5 * (energies[0] + energies[1]) + (extra if first != second else 0.0)
+
+    def energies(self, tip: Tip, species: int, nearest: Integers, second: Integers) -> Floats:
+        """Energy of the bonds of atoms of one species [eV], shape (k,); parameters as in `fields`."""
+        total = np.zeros(len(nearest))
+        for other in range(len(tip.elements)):
+            counts = nearest[:, other] + self.second_weight * second[:, other]
+            total = total + self.pair_energy(tip, species, other) * counts
+        return total
+
+    def fields(self, tip: Tip, species: int, nearest: Integers, second: Integers) -> Floats:
+        """Evaporation fields [V/nm]: see `BondField.fields`."""
+        element = tip.elements[species]
+        cohesive = self._number(self.cohesive_energies, COHESIVE_ENERGIES, element.name, "cohesive_energies")
+        work = self._number(self.ionisation_works, IONISATION_WORKS, element.name, "ionisation_works")
+        ratio = (self.energies(tip, species, nearest, second) + work) / (cohesive + work)
+        return element.evaporation_field * ratio * ratio
+
+
+def check_bonds(bonds: Any) -> None:
+    """Raise a ValueError unless `bonds` is None or an evaporation field by bonds."""
+    if bonds is not None and not (callable(getattr(bonds, "fields", None)) and not isinstance(bonds, type | Mapping)):
+        raise ValueError(
+            "bonds must be an evaporation field by bonds with a method fields, such as PairEnergies(), got "
+            f"{short_text(bonds)}"
+        )
+
+
+class BondCodes(NamedTuple):
+    """Code of the bonds of each atom: four bits for the number of neighbours of each kind."""
+
+    near: np.ndarray
+    """What an atom adds to the code of its nearest neighbours, int32 (n,)."""
+    far: np.ndarray
+    """What it adds to that of its second neighbours, int32 (n,)."""
+    second_length: float
+    """Atoms closer than this are second neighbours [nm]."""
+
+
+def bond_table(bonds: Any, tip: Tip) -> tuple[BondCodes, Floats, Integers]:
+    """Codes of the bonds of a specimen, and the factor of 1/field for every code.
+
+    Parameters
+    ----------
+    bonds : BondField
+        Evaporation field by bonds.
+    tip : Tip
+        The specimen.
+
+    Returns
+    -------
+    codes : BondCodes
+        What each atom adds to the codes of its neighbours.
+    table : ndarray, shape (n_species, 16^counts)
+        Evaporation field of the species divided by that with these bonds.
+    species : ndarray of int32, shape (n_atoms,)
+        Species of each atom.
+
+    Raises
+    ------
+    ValueError
+        If there are too many species, or a field is not a positive number.
+    """
+    n_kinds = len(tip.elements) if bonds.by_species else 1
+    n_counts = n_kinds * (2 if bonds.second_shell else 1)
+    if n_counts > _MOST:
+        raise ValueError(
+            f"bonds by species are possible for up to {_MOST} species (half with second neighbours), got {n_kinds}"
+        )
+    kinds = tip.species if bonds.by_species else np.zeros(len(tip), np.int32)
+    near = np.left_shift(np.int32(1), _BITS * kinds.astype(np.int32)).astype(np.int32)
+    far = np.left_shift(near, _BITS * n_kinds).astype(np.int32) if bonds.second_shell else np.zeros(len(tip), np.int32)
+    every = np.arange(1 << (_BITS * n_counts))
+    counts = np.stack([(every >> (_BITS * k)) & 15 for k in range(n_counts)], axis=1)
+    nearest = counts[:, :n_kinds]
+    second = counts[:, n_kinds:] if bonds.second_shell else np.zeros_like(nearest)
+    table = np.empty((len(tip.elements), len(every)))
+    for index, element in enumerate(tip.elements):
+        fields = np.asarray(bonds.fields(tip, index, nearest, second), dtype=np.float64)
+        if fields.shape != every.shape or not (np.isfinite(fields) & (fields > 0)).all():
+            raise ValueError(
+                f"fields of {type(bonds).__name__} must be {len(every)} numbers > 0 [V/nm] for {element.name}, got "
+                f"{short_text(fields)}"
+            )
+        table[index] = element.evaporation_field / fields
+    distance = tip.nearest_neighbour_distance
+    reach = min(_SECOND[tip.elements[0].structure] * distance, tip.neighbour_radius) if bonds.second_shell else 0.0
+    return BondCodes(near, far, reach), table, tip.species

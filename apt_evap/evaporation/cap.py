@@ -1,0 +1,80 @@
+"""The cap of an emitter: its radius, and its mean field, to which literature evaporation fields refer."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from apt_evap._common.small_matrices import lengths, matrix_product, products, pseudo_inverse
+from apt_evap._common.types import Floats
+from apt_evap._core.elementary import sine_and_cosine
+
+HALF_ANGLE = 45.0  # degrees from the axis: about what an instrument sees, and far from the shank
+_FEWEST = 12  # surface atoms: three times the unknowns of the sphere
+_ROUNDS = 3  # the selection of atoms depends on the centre; it changed by less than 1e-3 R after the second round
+
+
+class Cap(NamedTuple):
+    """The cap of a surface: the surface atoms within 45 degrees of the axis, seen from the centre of their sphere.
+
+    Parameters
+    ----------
+    field : float
+        Mean field just outside these atoms [V/nm].
+    ratio : float
+        Mean ratio of this field to the evaporation field of the atom.
+    radius : float
+        Radius of the sphere fitted to these atoms [nm].
+    """
+
+    field: float
+    ratio: float
+    radius: float
+
+
+NO_CAP = Cap(math.nan, math.nan, math.nan)
+"""Result of `measure_cap` for a surface with too few atoms around the axis."""
+
+
+def measure_cap(positions: Floats, normals: Floats, fields: Floats, evaporation_fields: Floats) -> Cap:
+    """Fit a sphere to the surface around the axis, and average the fields of its atoms.
+
+    Parameters
+    ----------
+    positions, normals : ndarray, shape (n, 3)
+        Surface atoms [nm] and their outward unit normals; the axis is +z.
+    fields, evaporation_fields : ndarray, shape (n,)
+        Field just outside each atom, and evaporation field of its species [V/nm].
+
+    Returns
+    -------
+    Cap
+        NaN if fewer than 12 atoms are around the axis.
+
+    Notes
+    -----
+    The sphere minimises the sum of (|r - c|^2 - R^2)^2, a linear problem for c and R^2 - |c|^2. It begins with atoms
+    whose normals are within 45 degrees of the axis.
+    """
+    cosine = float(sine_and_cosine(math.radians(HALF_ANGLE))[1])
+    chosen = normals[:, 2] >= cosine
+    radius = math.nan
+    for _ in range(_ROUNDS):
+        if np.count_nonzero(chosen) < _FEWEST:
+            return NO_CAP
+        centre, radius = _sphere(positions[chosen])
+        from_centre = positions - centre
+        chosen = from_centre[:, 2] >= cosine * lengths(from_centre)
+    field = float(np.mean(fields[chosen]))
+    return Cap(field, float(np.mean(fields[chosen] / evaporation_fields[chosen])), radius)
+
+
+def _sphere(points):
+    """Centre and radius of the algebraic least-squares sphere through points."""
+    middle = points.mean(axis=0)
+    shifted = points - middle
+    matrix = np.column_stack([2.0 * shifted, np.ones(len(shifted))])
+    right = products(shifted, shifted)
+    inverse = pseudo_inverse(matrix_product(matrix.T, matrix))
+    *centre, rest = matrix_product(inverse, matrix_product(matrix.T, right)).tolist()
+    return middle + centre, math.sqrt(max(rest + float(products(centre, centre)), 0.0))

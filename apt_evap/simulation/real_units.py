@@ -1,0 +1,279 @@
+"""A run in real units: voltages, charges and masses of its ions in flight, and the pulses in which they left.
+
+Charges, fields and potentials of a simulated surface are proportional to the applied voltage, and the path of an ion
+depends on E / (n V) only, with its start energy E along the surface and its charge n. So a run at any voltage is the
+same run at the voltage of an experiment, with scaled energies and times: no flight is repeated.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apt_evap._common.types import Floats, Integers
+from apt_evap._common.validation import check_choice, check_count, check_kind, check_number, check_seed, short_text
+from apt_evap._core.elementary import logarithm
+from apt_evap.detection.timing import Timing
+from apt_evap.emission.ion_random import IonRandom
+from apt_evap.emission.post_ionisation import FLIGHT_CHARGES, PostIonisation
+from apt_evap.evaporation.voltage import VoltageControl
+from apt_evap.simulation.history import CapHistory
+from apt_evap.specimen.isotopes import draw_isotopes
+
+REFERENCES = ("cap", "site")
+SAME_PULSE = 0.01  # an atom whose field exceeds the control level by 1 % leaves in the pulse of the one before
+_SEED_STEP = 0x5851F42D4C957F2D  # other random numbers than those of the perturbations
+_COLUMNS = 5  # random numbers per ion: isotope, charge, pulse, energy deficit, delay
+
+
+@dataclass(frozen=True)
+class RealUnits:
+    """Operating point and instrument of a run in real units; made by `Run.at_evaporation_field`.
+
+    Parameters
+    ----------
+    field_reference : {"cap", "site"}
+        What is at the operating field: the mean over the cap, or the evaporating atom.
+    operating_field : float
+        Operating field of the host [V/nm].
+    field_ratio : float or None
+        Field at the evaporating atoms divided by the mean field of the cap; None without a history of the cap.
+    smoothing : int
+        Number of ions over which the voltage is averaged.
+    control : VoltageControl
+        Rate and pulses.
+    timing : Timing or None
+        Errors of the times of flight.
+    voltage_ratio : float
+        Voltage of the instrument divided by that of the model, see `field_factor` in `Run.at_evaporation_field`.
+    seed : int
+        Seed of isotopes, charges, pulses and times.
+    """
+
+    field_reference: str
+    operating_field: float
+    field_ratio: float | None
+    smoothing: int
+    control: VoltageControl
+    timing: Timing | None
+    voltage_ratio: float
+    seed: int
+
+    def __post_init__(self):
+        check_choice(self.field_reference, "field_reference", REFERENCES)
+        check_number(self.operating_field, "operating_field", above=0, at_most=1000, unit="V/nm")
+        if self.field_ratio is not None:
+            check_number(self.field_ratio, "field_ratio", above=0)
+        check_count(self.smoothing, "smoothing", at_least=1)
+        check_kind(self.control, "control", VoltageControl, "a VoltageControl")
+        if self.timing is not None:
+            check_kind(self.timing, "timing", Timing, "a Timing or None")
+        check_number(self.voltage_ratio, "voltage_ratio", above=0)
+        check_seed(self.seed)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the settings in plain types, dict."""
+        timing = None if self.timing is None else vars(self.timing)
+        return vars(self) | {"control": vars(self.control), "timing": timing}
+
+    @classmethod
+    def from_dict(cls, settings: Mapping[str, Any]) -> "RealUnits":
+        """Rebuild the settings from the result of `to_dict`."""
+        timing = settings["timing"]
+        objects = {"control": VoltageControl(**settings["control"]), "timing": timing and Timing(**timing)}
+        return cls(**{**settings, **objects})
+
+
+class RealColumns(NamedTuple):
+    """Columns of a run in real units, each of shape (n,)."""
+
+    voltages: np.ndarray
+    """Voltage that accelerates each ion, V_dc + V_p [V], in the model."""
+    charges: np.ndarray
+    """Charge in flight [e], int32."""
+    masses: np.ndarray
+    """Mass of the isotope [Da]."""
+    pulse_ids: np.ndarray
+    """Number of the pulse, int64."""
+
+    def __repr__(self) -> str:
+        return f"<RealColumns: {len(self.voltages):,} ions>"
+
+
+def random_of(seed: int, ions: Integers) -> Floats:
+    """Random numbers of ions for isotope, charge, pulse, energy deficit and delay, shape (n, 5)."""
+    return IonRandom((seed + _SEED_STEP) % (1 << 64), ions).uniform(_COLUMNS)
+
+
+def trailing_mean(values: Floats, n: int) -> Floats:
+    """Mean of each value and its n - 1 predecessors; of all predecessors for the first ones."""
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    end = np.arange(1, len(values) + 1)
+    begin = np.maximum(end - n, 0)
+    return (total[end] - total[begin]) / (end - begin)
+
+
+def real_voltages(
+    site_ratios: Floats,
+    cap: CapHistory,
+    ions: Integers,
+    voltage: float,
+    controlled: Floats | None,
+    field_reference: str,
+    operating_ratio: float | None,
+    smoothing: int,
+) -> tuple[Floats, float, float | None]:
+    """Voltage of every ion such that the cap, or the evaporating atom, is at the operating field.
+
+    Parameters
+    ----------
+    site_ratios : ndarray, shape (n,)
+        Field of each atom before evaporation, over its evaporation field, at the simulated voltage.
+    cap : CapHistory
+        The cap after each relaxation.
+    ions : ndarray of int64, shape (n,)
+        Numbers of the ions.
+    voltage : float
+        Simulated voltage [V].
+    controlled : ndarray or None
+        Voltages of a `VoltageControl` during the run, shape (n,).
+    field_reference : {"cap", "site"}
+        See `RealUnits`.
+    operating_ratio : float or None
+        Operating field over evaporation field; None for 1, or for what the control of the run led to.
+    smoothing : int
+        Number of ions over which a voltage is averaged.
+
+    Returns
+    -------
+    voltages : ndarray, shape (n,)
+        [V].
+    operating_ratio : float
+        The operating field over the evaporation field.
+    field_ratio : float or None
+        Field at the evaporating atoms divided by the mean field of the cap; None without a history of the cap.
+
+    Raises
+    ------
+    ValueError
+        If the fields of the cap are not known.
+    """
+    known = np.isfinite(cap.ratios)
+    cap_ratios = np.full(len(ions), np.nan)
+    if known.any():
+        cap_ratios = np.interp(ions, cap.ions[known], cap.ratios[known])
+    elif field_reference == "cap":
+        raise ValueError(
+            "field_reference 'cap' needs the mean field of the cap, which this run does not contain: it was made by an "
+            "earlier version, or too few of its surface atoms are around the axis; use field_reference='site'"
+        )
+    field_ratio = float(np.mean(site_ratios / cap_ratios)) if known.any() and len(ions) else None
+    ratios = cap_ratios if field_reference == "cap" else site_ratios
+    if controlled is None:
+        goal = 1.0 if operating_ratio is None else operating_ratio
+        return trailing_mean(voltage * goal / ratios, smoothing), goal, field_ratio
+    reached = float(np.mean(site_ratios * controlled)) / voltage
+    goal = reached if operating_ratio is None else operating_ratio
+    scale = goal / (float(np.mean(ratios * controlled)) / voltage)
+    return trailing_mean(scale * controlled, smoothing), goal, field_ratio
+
+
+def check_flight_charges(flight_charges: Any, names: tuple[str, ...]) -> dict[str, int] | PostIonisation:
+    """Return charges in flight by element, or how they are drawn.
+
+    Parameters
+    ----------
+    flight_charges : None or int or mapping or PostIonisation
+        Usual charges of the elements (`FLIGHT_CHARGES`), one charge for all ions, charges by element, or charges drawn
+        from the local field.
+    names : tuple of str
+        Elements of the species.
+
+    Raises
+    ------
+    ValueError
+        If an element or a charge is unknown.
+    """
+    if isinstance(flight_charges, PostIonisation):
+        return flight_charges
+    if flight_charges is None:
+        return {name: FLIGHT_CHARGES[name] for name in names if name in FLIGHT_CHARGES}
+    if not isinstance(flight_charges, Mapping):
+        return dict.fromkeys(names, check_count(flight_charges, "flight_charges", at_least=1))
+    for name in flight_charges:
+        if name not in names:
+            raise ValueError(f"flight_charges must be of the elements {', '.join(names)}, got {short_text(name)}")
+    return {name: check_count(n, f"flight_charges of {name}", at_least=1) for name, n in flight_charges.items()}
+
+
+def flight_charges_of(
+    flight_charges: dict[str, int] | PostIonisation,
+    names: tuple[str, ...],
+    species: Integers,
+    barrier_charges: Integers,
+    fields: Floats,
+    u: Floats,
+) -> NDArray[np.int32]:
+    """Charge of each ion in flight, shape (n,).
+
+    Parameters
+    ----------
+    flight_charges : dict or PostIonisation
+        Result of `check_flight_charges`; other elements keep the charge at the barrier.
+    names : tuple of str
+        Elements of the species.
+    species : ndarray of int, shape (n,)
+        Species of each ion.
+    barrier_charges : ndarray of int, shape (n,)
+        Charge of each ion at the barrier [e].
+    fields : ndarray, shape (n,)
+        Field at each evaporation [V/nm].
+    u : ndarray, shape (n,)
+        Random numbers in (0, 1).
+    """
+    if isinstance(flight_charges, PostIonisation):
+        least = np.ones(len(names), np.int64)
+        least[species] = barrier_charges
+        return flight_charges.draw(names, species, least, fields, u)
+    charges = np.array(barrier_charges, np.int32)
+    for index, name in enumerate(names):
+        if name in flight_charges:
+            charges[species == index] = flight_charges[name]
+    return charges
+
+
+def pulses_of(excess: Floats, rate: float, u: Floats) -> Integers:
+    """Number of the pulse of each ion of a run without a clock, int64 of shape (n,).
+
+    Parameters
+    ----------
+    excess : ndarray, shape (n,)
+        Field of each atom before evaporation, relative to the level of the control.
+    rate : float
+        Ions per pulse.
+    u : ndarray, shape (n,)
+        Random numbers in (0, 1).
+
+    Returns
+    -------
+    ndarray
+        An atom that exceeds the level by 1 % leaves in the pulse of the one before, because it was there already. All
+        others wait a geometric number of pulses.
+    """
+    n = len(excess)
+    if n == 0:
+        return np.empty(0, np.int64)
+    same = excess > 1.0 + SAME_PULSE
+    same[0] = False
+    probability = min(rate * np.count_nonzero(~same) / n, 0.999999)
+    waits = np.ceil(logarithm(u) / logarithm(1.0 - probability))
+    return np.cumsum(np.where(same, 0.0, np.maximum(waits, 1.0))).astype(np.int64)
+
+
+def isotopes_of(names: tuple[str, ...], species: Integers, masses: Floats, u: Floats) -> Floats:
+    """Mass of the isotope of each ion [Da], shape (n,); the mass of the run for elements without a table."""
+    by_species = np.ones(len(names))
+    by_species[species] = masses
+    return draw_isotopes(names, species, by_species, u)
