@@ -13,6 +13,8 @@ from .analysis.apex import field_factor as field_factor
 from .analysis.apex import fit_caps as fit_caps
 from .analysis.apex import image_compression as image_compression
 from .analysis.apex import run_field_factor as run_field_factor
+from .analysis.charge_states import charge_state_ratio_course as charge_state_ratio_course
+from .analysis.charge_states import charge_state_ratio_map as charge_state_ratio_map
 from .analysis.profiles import Rectangle as Rectangle
 from .analysis.profiles import azimuthal_profile as azimuthal_profile
 from .analysis.profiles import compare_profiles as compare_profiles

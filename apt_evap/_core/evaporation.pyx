@@ -181,17 +181,19 @@ cdef class Evaporation:
     def rank(self, int n_threads=1):
         """Recompute the keys of all slots, such as after a change of the voltage.
 
-        Returns the natural logarithm of the sum of rates [1/s]; -inf for a law without rates. To be called directly
-        after `relax`.
+        Returns the natural logarithm of the sum of rates [1/s]; -inf for a law without rates.
         """
         cdef long n = self.tree.n_slots, slot
         cdef int[::1] bonds = np.zeros(n, np.int32)
+        cdef long long[::1] atom = np.maximum(self.tree.atoms[:n], 0)   # empty slots get a key, which is removed below
         cdef double[::1] key = np.full(self.tree.capacity, -INFINITY), strength = self.rule.strengths(self.tree)
         for slot in prange(n, nogil=True, schedule="static", num_threads=n_threads):
-            if self.tree.atom[slot] >= 0:
-                bonds[slot] = self.surroundings(self.tree.atom[slot])
+            bonds[slot] = self.surroundings(atom[slot])
         self.law.begin(self.field_unit * self.voltage_factor)
-        self.law.keys(n, &strength[0], &self.tree.atom[0], &bonds[0], &key[0])
+        self.law.keys(n, &strength[0], &atom[0], &bonds[0], &key[0])
+        for slot in range(n):
+            if self.tree.atom[slot] < 0:
+                key[slot] = -INFINITY
         self.chooser = self.law.chooser(self.tree, key)
         self.rise = 0.0
         return self.chooser.log_total()
@@ -431,6 +433,11 @@ cdef class Evaporation:
                 neighbour[n] = self.strongest_neighbour(leaving)
                 self.event(leaving, journal)
         return status
+
+    @property
+    def log_rate(self):
+        """Natural logarithm of the sum of the rates [1/s] at `voltage_factor`; -inf for a law without rates."""
+        return self.chooser.log_total()
 
     @property
     def next_slot(self):

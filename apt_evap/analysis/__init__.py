@@ -1,1 +1,1 @@
-"""Analysis of maps and runs: profiles, widths of zone lines, similarity, the apex, tracks of single ions."""
+"""Analysis of maps and runs: profiles, zone lines, similarity, charge states, the apex, tracks of single ions."""

@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from apt_evap.energy_fit.search import EnergySearch, register_repeatedly
 from apt_evap.energy_fit.settings import StudySettings
 from apt_evap.energy_fit.study import Score, Study, plain
 from apt_evap.registration.register import Registration
+from apt_evap.simulation.real_units import RealUnits
 from apt_evap.simulation.run import Run
 
 BINS = 128
@@ -230,13 +231,14 @@ def real_units_of(run: Run) -> dict[str, Any] | None:
         real = run if run.units is not None else run.at_evaporation_field()
     except ValueError:
         return None
+    units = cast(RealUnits, real.units)
     scale = float(np.median(real.energy_scales))  # simulated energy per real one
     charges, counts = np.unique(real.flight_charges, return_counts=True)
     return {
         "real_per_study": 1.0 if run.units is not None else 1.0 / scale,
         "simulated_per_study": scale if run.units is not None else 1.0,
-        "operating_field": real.units.operating_field,
-        "field_reference": real.units.field_reference,
+        "operating_field": units.operating_field,
+        "field_reference": units.field_reference,
         "flight_charge": int(charges[counts.argmax()]),
         "barrier_charge": int(np.median(real.emissions.charge_states)),
     }

@@ -156,7 +156,7 @@ class Study:
         results |= {name: getattr(self, name) and getattr(self, name)._asdict() for name in ("gain", "ceiling")}
         for group in ("baselines", "plain"):
             results[group] = {name: score._asdict() for name, score in getattr(self, group).items()}
-        results["real_energies"] = self.real_energies
+        results |= {"real_energies": self.real_energies}
         return plain(results | {"settings": asdict(self.settings) | self.provenance})
 
     def save(self, path: AnyPath) -> None:

@@ -337,7 +337,7 @@ class Emitter:
         counts = self.counts
         self._relaxed = (tolerance, angle, counts["clipped"], counts["unsettled"])
         if self._rate_control and start is None:
-            self._rate_control.keep(self._core)
+            self._rate_control.keep(self._core, usable_threads(self.n_threads))
         outcome = self._core.relax(
             tolerance=tolerance,
             opening_angle=angle,
@@ -347,7 +347,7 @@ class Emitter:
         )
         self._recorded, self._is_new = RECORD, True
         if self._rate_control:
-            self._rate_control.look(self._core, usable_threads(self.n_threads))
+            self._rate_control.look(self._core, usable_threads(self.n_threads), restored=start is not None)
         if not outcome[1] < tolerance:
             warnings.warn(
                 f"charges did not converge in {outcome[0]} sweeps: largest relative change {outcome[1]:.1g} "

@@ -8,6 +8,9 @@ from apt_evap._common.validation import check_count, check_number
 from apt_evap._core.elementary import exponential, logarithm
 
 _STEP = 1e-6  # relative, for the slope of the rate: 1e-3 of what changes the rate by a factor of e at 20 K
+_LARGEST_STEP = 0.05  # relative change of the voltage in one step of Newton's method
+_ITERATIONS = 8  # of Newton's method; 1 to 3 suffice but on the first layers of an ideal tip
+_CLOSE = 1e-3  # of the logarithm of the rate: far below its changes by single events
 _BISECTIONS = 60  # from six decades to the rounding of float64
 
 
@@ -114,18 +117,44 @@ class RateControl:
         """Voltage over that of the charges, from the logarithm of the factor of the rates since the relaxation."""
         return core.voltage_factor * exponential(self._slope * rise)
 
-    def keep(self, core: Any) -> None:
-        """Before a relaxation: include the voltage changes since the last one in the factor."""
-        if not math.isnan(self._slope):
-            core.voltage_factor = float(self.voltage_factors(core, core.rise))
+    def keep(self, core: Any, n_threads: int) -> None:
+        """Before a relaxation: include the changes of the voltage since the last one in its factor.
 
-    def look(self, core: Any, n_threads: int) -> None:
-        """Set the voltage of a new surface to the wanted rate, and determine the slope of its rate."""
+        The first guess of the factor is linear in the logarithm of the rate; it is then corrected.
+        """
+        if math.isnan(self._slope):
+            return
+        goal = core.log_rate + core.rise
+        factor = float(self.voltage_factors(core, core.rise))
+        for _ in range(_ITERATIONS):
+            logs = self._logs(core, factor, n_threads)
+            if not (math.isfinite(goal) and abs(goal - logs[1]) > _CLOSE):
+                break
+            step = _STEP / max(logs[0] - logs[1], 1e-12) * (goal - logs[1])
+            factor *= float(exponential(min(max(step, -_LARGEST_STEP), _LARGEST_STEP)))
+        core.voltage_factor = factor
+
+    def look(self, core: Any, n_threads: int, restored: bool = False) -> None:
+        """After a relaxation: determine the slope of the rate; on a new surface, set the wanted rate.
+
+        Parameters
+        ----------
+        core : Evaporation
+            The surface.
+        n_threads : int
+            Number of threads.
+        restored : bool
+            Whether the voltage factor is known also for a new surface.
+        """
         factor = core.voltage_factor
-        if math.isnan(self._slope) and core.start.n_removed == 0:
+        if math.isnan(self._slope) and not restored and core.start.n_removed == 0:
             factor = self._solve(core, n_threads)
-        logs = [self._log_rate(core, factor * part, n_threads) for part in (1.0 + _STEP, 1.0)]
+        logs = self._logs(core, factor, n_threads)
         self._slope = _STEP / max(logs[0] - logs[1], 1e-12)
+
+    def _logs(self, core, factor, n_threads):
+        """Logarithm of the rate at a slightly higher voltage, and at this one, which remains set."""
+        return [self._log_rate(core, factor * part, n_threads) for part in (1.0 + _STEP, 1.0)]
 
     def _solve(self, core, n_threads):
         """Factor of the voltage at which the sum of the rates is the wanted one, by bisection."""

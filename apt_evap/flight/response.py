@@ -248,7 +248,13 @@ class ResponseModel:
         return Responses(site, rolled, np.stack(residuals, axis=1).astype(np.float32))
 
     def evaluate(
-        self, responses: Responses, rolled: Booleans, first: Floats, second: Floats, masses: Floats
+        self,
+        responses: Responses,
+        rolled: Booleans,
+        first: Floats,
+        second: Floats,
+        masses: Floats,
+        energy_scale: float = 1.0,
     ) -> tuple[Floats, Floats]:
         """Directions and times of flight of ions launched along the surface.
 
@@ -262,6 +268,8 @@ class ResponseModel:
             Velocities along t1 and t2 of `tangent_frame` [nm/ns].
         masses : ndarray, shape (n,)
             Masses [Da].
+        energy_scale : float
+            Simulated energy per energy of the user, for the warning.
 
         Returns
         -------
@@ -276,12 +284,13 @@ class ResponseModel:
             If launch energies exceed the energy limit: those hits are extrapolated.
         """
         velocities = self.settings.reduced(np.column_stack([first, second]), masses)
+        limit = self.settings.energy_limit / energy_scale
         faster = int(np.count_nonzero(squared_lengths(velocities) > 1.0001))
         if faster:
             warnings.warn(
                 f"{faster:,} of {len(velocities):,} ions launch above the energy limit of the responses "
-                f"({self.settings.energy_limit:g} eV): their hits are extrapolated; run with a larger energy_limit "
-                "(ResponseSettings, or [responses] in a settings file)",
+                f"({limit:.3g} eV): their hits are extrapolated; run with a larger energy_limit (ResponseSettings, or "
+                "[responses] in a settings file)",
                 ResponseWarning,
                 stacklevel=3,
             )

@@ -1,7 +1,9 @@
 # The pictures: read by type checkers, and by the lazy loader in __init__.py.
 from ._figure import add_colorbar as add_colorbar
 from ._figure import new_figure as new_figure
+from .charge_states import charge_states as charge_states
 from .histories import history as history
+from .histories import voltage_curve as voltage_curve
 from .maps import color_limits as color_limits
 from .maps import common_limits as common_limits
 from .maps import describe as describe
@@ -16,5 +18,6 @@ from .responses import ion_colors as ion_colors
 from .responses import response as response
 from .specimens import mark_atoms as mark_atoms
 from .specimens import specimen as specimen
+from .spectra import spectrum as spectrum
 from .study import side_by_side as side_by_side
 from .study import ssim_matrix as ssim_matrix

@@ -8,13 +8,16 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
 
 OUTSIDE = "0.88"
 """Colour outside the detector."""
+_LOG_STEPS = ((1,), (1, 2, 5), (1, 1.5, 2, 3, 4, 5, 7))  # ticks per decade: the first of them with three ticks is used
 
 
 def add_colorbar(
@@ -47,6 +50,41 @@ def set_title(ax: Axes, title: str | None, **options: Any) -> None:
     """Set a title without math syntax: a file name may contain dollar signs, and bytes that are not text."""
     if title:
         ax.set_title(re.sub("[\ud800-\udfff]", "\N{REPLACEMENT CHARACTER}", title), parse_math=False, **options)
+
+
+def ion_label(element: str, charge: int, mass_number: int | None = None) -> str:
+    """Return the label of an ion with its charge, such as Ni with a raised 2+, and of an isotope with its number."""
+    element = element.replace("$", r"\$")
+    sign = "{+}" if charge == 1 else f"{charge}{{+}}"  # braces: no space, as of a sum
+    return ("" if mass_number is None else f"$^{{{mass_number}}}$") + f"{element}$^{{{sign}}}$"
+
+
+def set_log_ticks(axis: Axis, least_range: float = 1.0) -> None:
+    """Set the ticks of a logarithmic axis to round numbers, at least three.
+
+    Parameters
+    ----------
+    axis : matplotlib.axis.Axis
+        A logarithmic axis with its data.
+    least_range : float
+        Widen the axis to a range of at least this factor.
+    """
+    low, high = axis.get_view_interval()
+    wider = np.sqrt(least_range * low / high)
+    if wider > 1:
+        low, high = low / wider, high * wider
+        axis.set_view_interval(low, high, ignore=True)
+    powers = 10.0 ** np.arange(np.floor(np.log10(low)), np.log10(high))
+    locator: Any = MaxNLocator(4)
+    for steps in _LOG_STEPS:
+        ticks = np.outer(powers, steps).ravel()
+        ticks = ticks[(ticks >= low) & (ticks <= high)]
+        if len(ticks) > 2:
+            locator = FixedLocator(ticks, nbins=8)
+            break
+    axis.set_major_locator(locator)
+    axis.set_major_formatter(lambda value, _: f"{value:g}")
+    axis.set_minor_locator(NullLocator())
 
 
 class _Layout(ConstrainedLayoutEngine):

@@ -290,10 +290,11 @@ class Run:
             raise ValueError(f"this run has no responses and {short_text(perturbation)} was not flown in it")
         emissions = self.emissions
         rolled, first, second = perturbation.tangential(emissions, IonRandom(self.seed, emissions.ions))  # type: ignore[attr-defined]
-        if self.real is not None:
-            slower = np.sqrt(self.energy_scales)
-            first, second = first * slower, second * slower
-        landed = self.response_model.evaluate(self.responses, rolled, first, second, emissions.masses)
+        scale = 1.0
+        if self.real is not None and len(self):
+            scales = self.energy_scales
+            first, second, scale = first * np.sqrt(scales), second * np.sqrt(scales), float(np.median(scales))
+        landed = self.response_model.evaluate(self.responses, rolled, first, second, emissions.masses, scale)
         return self._hits(*landed, perturbation)
 
     def _hits(self, directions, times, perturbation):

@@ -204,6 +204,8 @@ CASES = [
         },
     ),
     (ae.PostIonisation, {}, {"field_scale": POSITIVE}),
+    (ae.charge_state_ratio_map, {"element": "Ni"}, {"hits": [*OBJECT, None]}),
+    (ae.charge_state_ratio_course, {"element": "Ni"}, {"hits": [*OBJECT, None]}),
     (
         ae.Timing,
         {},

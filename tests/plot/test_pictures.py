@@ -13,8 +13,10 @@ from matplotlib.colors import to_rgba
 
 import apt_evap as ae
 from apt_evap import plot
+from apt_evap.analysis.charge_states import charge_state_ratio_map, course_of_charges, ion_charges
 from apt_evap.analysis.profiles import Profile
 from apt_evap.analysis.voltage_history import course, evaporation_voltages
+from apt_evap.plot._figure import set_log_ticks
 
 
 @pytest.fixture(scope="module")
@@ -31,6 +33,12 @@ def run(small_tip):
 def label_of_bar(ax):
     """Label of the colour bar of a picture, the last axes of its figure."""
     return ax.figure.axes[-1].get_ylabel()
+
+
+def assert_nothing_cut_off(figure):
+    figure.draw_without_rendering()
+    boxes = [ax.get_tightbbox().transformed(figure.transFigure.inverted()) for ax in figure.axes]
+    assert min(box.min.min() for box in boxes) > 0 and max(box.max.max() for box in boxes) < 1
 
 
 def discs_of(ax):
@@ -58,9 +66,7 @@ def test_nothing_of_a_map_is_cut_off(half, title, height):
     (ax,) = axes = plot.detector_maps([map], [title])
     alone = plot.detector_map(map, title=title)
     for figure in (ax.figure, alone.figure):
-        figure.draw_without_rendering()
-        boxes = [each.get_tightbbox().transformed(figure.transFigure.inverted()) for each in figure.axes]
-        assert min(box.min.min() for box in boxes) > 0 and max(box.max.max() for box in boxes) < 1
+        assert_nothing_cut_off(figure)
     assert len(axes) == 1
 
 
@@ -202,6 +208,218 @@ def test_history_of_a_measurement():
         plot.history(ae.Hits(x=[0.0], y=[0.0]))
     with pytest.raises(ValueError, match="axes must be 1 for"):
         plot.history(ae.Hits(voltage=voltage), [ax, ax])
+
+
+# ---- voltage, rate and charges -------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def real(run):
+    """The run in real units, with ions of two charges."""
+    return run.at_evaporation_field(timing=ae.Timing(temperature=50.0), flight_charges=ae.PostIonisation(0.7))
+
+
+def labels_of(axes):
+    return [" ".join(ax.get_ylabel().split()) for ax in axes]
+
+
+def test_voltage_curve_of_a_run(real, tmp_path):
+    axes = plot.voltage_curve(real, points=10)
+    assert_nothing_cut_off(axes[0].figure)
+    axes[0].figure.savefig(tmp_path / "a.png")
+    labels = ["voltage with pulse [V]", "field at the cap [V/nm]", "ions per pulse", "Ni$^{2{+}}$ / Ni$^{{+}}$"]
+    assert labels_of(axes) == labels and axes[-1].get_xlabel() == "ions"
+    voltage, cap, rate, ratio = axes
+    np.testing.assert_array_equal(voltage.lines[0].get_ydata(), course(real.voltages, 10).median)
+    ions, fields = cap.lines[0].get_data()
+    assert ions.tolist() == real.cap.ions[real.cap.ions < 250].tolist()
+    np.testing.assert_allclose(fields, (real.cap.fields / 1000)[: len(ions)] * real.voltages[ions])
+    assert cap.lines[1].get_ydata()[0] == 35.0  # the operating field
+    pulses = np.diff(real.real.pulse_ids[[124, 249]], prepend=0)
+    np.testing.assert_allclose(rate.patches[0].get_data().values, 125 / pulses)
+    assert rate.lines[0].get_ydata()[0] == 0.01
+    expected = course_of_charges(real.flight_charges, "Ni")
+    np.testing.assert_array_equal(ratio.lines[0].get_ydata(), expected.ratio)
+
+
+def test_voltages_of_an_instrument(run):
+    real = run.at_evaporation_field(field_factor=3.3)  # a single charge, 2: no panel of a ratio
+    axes = plot.voltage_curve(real, points=5)
+    assert labels_of(axes) == ["voltage with pulse [V]", "field at the cap [V/nm]", "ions per pulse"]
+    total = real.voltages * real.units.voltage_ratio
+    np.testing.assert_allclose(axes[0].lines[0].get_ydata(), course(total, 5).median)
+
+
+def test_voltage_curve_of_a_run_with_a_temperature(small_tip):
+    run = ae.Simulation(small_tip, seed=2, law=ae.Arrhenius(50.0)).run(220, responses=False, progress=False)
+    axes = plot.voltage_curve(run, points=2)
+    assert labels_of(axes) == ["voltage with pulse [V]", "field at the cap [V/nm]", "ions per pulse"]
+    np.testing.assert_array_equal(axes[0].lines[0].get_ydata(), course(run.clock.voltages, 2).median)
+    pulses = run.clock.waits.reshape(2, 110).sum(axis=1) / run.settings["pulse_length"]
+    np.testing.assert_allclose(axes[2].patches[0].get_data().values, 110 / pulses)
+
+
+def test_voltage_curve_of_ions(real):
+    hits = real.hits(ae.Unperturbed())
+    axes = plot.voltage_curve(hits, points=4)
+    assert labels_of(axes) == ["standing voltage [V]", "ions per pulse", "ions 2+ / 1+"]
+    np.testing.assert_allclose(axes[0].lines[0].get_ydata(), course(real.voltages / 1.2, 4).median)
+    expected = hits.detected[125:].sum() / hits.pulses[125:].sum()
+    assert axes[1].patches[0].get_data().values[-1] == pytest.approx(expected)
+    ranges = ae.Ranges(["Ni", "Ni"], [28.9, 57.8], [32.2, 64.4])
+    measured = ae.Hits(voltage=hits.voltage, mass_to_charge=hits.mass_to_charge)
+    axes = plot.voltage_curve(measured, element="Ni", ranges=ranges)
+    assert labels_of(axes) == ["voltage [V]", "Ni$^{2{+}}$ / Ni$^{{+}}$"]
+    expected = course_of_charges(ion_charges(measured, "Ni", ranges), "Ni")
+    np.testing.assert_array_equal(axes[1].lines[0].get_ydata(), expected.ratio)
+
+
+def test_voltage_curves_that_cannot_be_drawn(run, real):
+    with pytest.raises(ValueError, match=r"constant: use the run in real units, run.at_evaporation_field\(\), or"):
+        plot.voltage_curve(run)
+    with pytest.raises(ValueError, match="axes must be 4 for <Run"):
+        plot.voltage_curve(real, [plot.new_figure((3, 2)).subplots()])
+    with pytest.raises(ValueError, match="ranges need the element"):
+        plot.voltage_curve(ae.Hits(voltage=[1.0]), ranges=ae.Ranges(["Ni"], [28.9], [32.2]))
+    with pytest.raises(ValueError, match="no column 'voltage'"):
+        plot.voltage_curve(ae.Hits(x=[0.0], y=[0.0]))
+    with pytest.raises(ValueError, match="run must be a Run or Hits"):
+        plot.voltage_curve(3)
+    with pytest.raises(ValueError, match="a curve needs ions, got <Hits: 0 ions"):
+        plot.voltage_curve(ae.Hits(voltage=[]))
+    with pytest.raises(ValueError, match="element must be one of Ni, got 'Fe'"):
+        plot.voltage_curve(real, element="Fe")
+
+
+@pytest.mark.parametrize("low, high", [(0.9, 1.1), (0.5, 4.5), (0.7, 30.0), (1e-4, 0.5), (2.0, 3e7)])
+def test_logarithmic_axes_have_round_numbers(low, high):
+    ax = plot.new_figure((4, 2)).subplots()
+    ax.plot([0, 1], [low, high])
+    ax.set_yscale("log")
+    set_log_ticks(ax.yaxis, 1.5)
+    ax.figure.draw_without_rendering()
+    bottom, top = ax.get_ylim()
+    ticks = [tick for tick in ax.get_yticks() if bottom <= tick <= top]
+    assert bottom <= low < high <= top and top / bottom > 1.4999
+    assert 3 <= len(ticks) <= 9
+    assert all(float(f"{tick:.2e}") == pytest.approx(tick, rel=1e-9) for tick in ticks)
+
+
+# ---- spectrum ------------------------------------------------------------------------------------------------------
+
+
+def test_spectrum_of_a_run(real, tmp_path):
+    ax = plot.spectrum(real)
+    assert_nothing_cut_off(ax.figure)
+    ax.figure.savefig(tmp_path / "a.png")
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("mass-to-charge ratio [Da]", "ions per 0.02 Da")
+    hits = real.hits(ae.Unperturbed())
+    mass = hits.mass_to_charge[hits.detected]
+    values, edges, _ = ax.patches[0].get_data()
+    np.testing.assert_array_equal(np.where(values > 0.5, values, 0), np.histogram(mass, edges)[0])
+    low, high = ax.get_xlim()
+    assert low < mass.min() and mass.max() < high
+    texts = {text.get_text() for text in ax.texts}
+    assert {"$^{58}$Ni$^{2{+}}$", "$^{60}$Ni$^{2{+}}$", "$^{58}$Ni$^{{+}}$"} <= texts
+    assert all("Ni" in text for text in texts)
+
+
+def test_spectra_compared(real):
+    hits = real.hits(ae.Unperturbed())
+    ax = plot.spectrum([hits, hits[:100]], ["all", "first"], bin_width=0.5, limits=(20, 70))
+    assert [text.get_text() for text in ax.get_legend().get_texts()] == ["all", "first"]
+    assert ax.get_ylabel() == "fraction of the ions [1/Da]" and not ax.texts  # hits do not know their elements
+    for patch in (ax.patches[0], ax.patches[2]):  # the second is the filled area of the first
+        values, edges, floor = patch.get_data()
+        assert 0.5 * values[values > floor].sum() == pytest.approx(1)
+        np.testing.assert_allclose(edges, np.arange(20, 70.1, 0.5))
+
+
+def test_isotopes_are_labelled_where_there_are_peaks():
+    rng = np.random.default_rng(1)
+    peaks = np.repeat([13.99, 14.49, 18.0], [5000, 300, 200]) + rng.normal(0, 0.01, 5500)
+    hits = ae.Hits(mass_to_charge=np.concatenate([peaks, rng.uniform(10, 300, 400)]))
+    ax = plot.spectrum(hits, elements=["Si", "Cr"], limits=(10, 30))
+    # at 18 Da is 54Cr3+, but no 52Cr3+: it is not chromium
+    assert {text.get_text() for text in ax.texts} == {"$^{28}$Si$^{2{+}}$", "$^{29}$Si$^{2{+}}$"}
+    assert not plot.spectrum(hits, limits=(10, 30)).texts
+    low, high = plot.spectrum(hits).get_xlim()
+    assert 12 < low < 14 and 18 < high < 20  # without the background
+
+
+def test_spectra_that_cannot_be_drawn(run, real):
+    hits = real.hits(ae.Unperturbed())
+    for ions, options, message in (
+        (run, {}, "needs a run in real units"),
+        ([], {}, "spectrum needs ions, with one label each, got 0 and 0"),
+        ([hits], {"labels": ["a", "b"]}, "got 1 and 2"),
+        (hits, {"bin_width": 0.0}, "bin_width must be"),
+        (hits, {"limits": (30, 20)}, "limits must be 0 <= low < high"),
+        (hits, {"bin_width": 1e-9}, "with at most 1,000,000 bins"),
+        (hits, {"elements": ["Xx"]}, "elements must be one of"),
+        (ae.Hits(mass_to_charge=[np.nan]), {}, "needs detected ions, got none"),
+        (ae.Hits(x=[0.0], y=[0.0]), {}, "no column 'mass_to_charge'"),
+        (3, {}, "ions must be a sequence of runs or hits"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            plot.spectrum(ions, **options)
+
+
+# ---- charge states -------------------------------------------------------------------------------------------------
+
+
+def charged(n, slope, seed, half=30.0):
+    """Ions of Ni in a field that rises along x."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(-half, half, (2, n))
+    fields = 24.4 * (1 + slope * x / half)
+    charges = ae.PostIonisation().draw(["Ni"], np.zeros(n, int), [1], fields, rng.random(n))
+    return ae.Hits(x=x, y=y, extra={"charge_state": charges})
+
+
+@pytest.fixture(scope="module")
+def ratios():
+    first = charge_state_ratio_map(charged(20_000, 0.02, 1), "Ni", 1)
+    return first, charge_state_ratio_map(charged(20_000, 0.01, 2), "Ni", 1, like=first)
+
+
+def test_charge_states_side_by_side(ratios, tmp_path):
+    for quantity, label in (("ratio", ""), ("field", "field from ")):
+        axes = plot.charge_states(*ratios, quantity=quantity)
+        assert_nothing_cut_off(axes[0].figure)
+        axes[0].figure.savefig(tmp_path / "a.png")
+        assert [ax.get_title() for ax in axes] == ["simulated", "measured"]
+        unit = " [V/nm]" if quantity == "field" else ""
+        assert label_of_bar(axes[0]) == f"{label}Ni$^{{2{{+}}}}$ / Ni$^{{{{+}}}}${unit}"
+        assert axes[0].images[0].norm is axes[1].images[0].norm
+        for ax, map in zip(axes, ratios, strict=True):
+            np.testing.assert_array_equal(ax.images[0].get_array().filled(np.nan), getattr(map, quantity))
+        values = np.concatenate([getattr(map, quantity)[np.isfinite(map.ratio)] for map in ratios])
+        assert axes[0].images[0].get_clim() == pytest.approx(tuple(np.percentile(values, [1, 99])))
+        assert axes[0].get_xlim() == axes[1].get_xlim() and axes[0].get_ylim() == axes[1].get_ylim()
+        assert f"ratio {ratios[1].total:.3g}" in axes[1].texts[0].get_text()
+
+
+def test_charge_states_of_a_single_map(ratios):
+    figure = plot.new_figure((5, 4))
+    (ax,) = plot.charge_states(ratios[0], axes=[figure.subplots()], titles=["a$b"], limits=(0.5, 2.0))
+    assert ax.figure is figure and ax.get_title() == "a$b" and ax.images[0].get_clim() == (0.5, 2.0)
+    assert plot.charge_states(ratios[0])[0].get_title() == ""
+
+
+def test_charge_states_that_cannot_be_drawn(ratios):
+    other = charge_state_ratio_map(charged(1000, 0.0, 3), "Co", 1)
+    with pytest.raises(ValueError, match=r"same element and charges, got Ni2\+/Ni1\+ and Co2\+/Co1\+"):
+        plot.charge_states(ratios[0], other)
+    for options, message in (
+        ({"quantity": "fields"}, "quantity must be one of ratio, field"),
+        ({"titles": ["a", "b"]}, "axes and titles must be 1, one per map, got 1 and 2"),
+        ({"limits": (2, 1)}, "limits must be low < high"),
+        ({"limits": (0, 1)}, "and > 0 for ratios"),
+        ({"measured": 3}, "measured must be a ChargeStateMap"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            plot.charge_states(ratios[0], **options)
 
 
 # ---- response ------------------------------------------------------------------------------------------------------

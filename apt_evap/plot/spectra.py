@@ -1,0 +1,200 @@
+"""Mass spectra, with labels at the isotopes."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from apt_evap._common.validation import check_array, check_choice, check_kind, check_number, check_sequence
+from apt_evap.detection.hits import Hits
+from apt_evap.plot._figure import ion_label, new_figure
+from apt_evap.simulation.run import Run
+from apt_evap.specimen.isotopes import ISOTOPES
+
+_MOST_BINS = 1_000_000
+_MARGIN = 0.04  # of the range of masses, on both sides
+_OCCUPIED = 1e-3  # of the ions in 1 Da at the ends of the default range; background is less
+_WIDTH_OF_LABEL = 0.018  # of the axes: a rotated label in a figure of the default size
+_SHARP, _SURROUNDINGS = 0.05, 2.0  # half width of a peak, and of the spectrum around it [Da]
+_TAIL = 0.004  # of the mass, by which energy deficits may shift the top of a peak
+_SIGNIFICANT = 5.0  # standard deviations of a peak above the ions around it
+_FEWEST = 4.0  # expected ions of an isotope with a label
+_LOW = 1.5  # a peak is too low for a label if another one behind the label is this many times higher
+_HIGHEST_CHARGE = 4
+
+
+def spectrum(
+    ions: Run | Hits | Sequence[Run | Hits],
+    labels: Sequence[str] | None = None,
+    ax: Axes | None = None,
+    *,
+    bin_width: float = 0.02,
+    limits: tuple[float, float] | None = None,
+    elements: Sequence[str] | None = None,
+) -> Axes:
+    """Draw one or more mass spectra with a logarithmic scale, and label the isotopes.
+
+    Parameters
+    ----------
+    ions : Run or Hits or sequence of them
+        Detected ions with mass_to_charge. A run has to be in real units (`Run.at_evaporation_field`); the hits of its
+        first perturbation are drawn.
+    labels : sequence of str, optional
+        One label each.
+    ax : matplotlib.axes.Axes, optional
+        Where to draw; a new figure by default.
+    bin_width : float
+        Width of a bin [Da].
+    limits : tuple of float, optional
+        Lowest and highest mass-to-charge ratio [Da]; by default from the first to the last interval of 1 Da with
+        more than 0.1 % of the ions.
+    elements : sequence of str, optional
+        Elements of `ISOTOPES` to label: peaks of their isotopes with a charge for which the most abundant isotope has a
+        peak. By default those of the runs; () for none.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        Several spectra are drawn as fractions of the ions per Da, because their numbers of ions differ.
+
+    Raises
+    ------
+    ValueError
+        If there are no ions with mass_to_charge, a run is not in real units, an element is unknown, there are too many
+        bins, or the number of labels differs.
+    """
+    spectra = [ions] if isinstance(ions, Run | Hits) else list(check_sequence(ions, "ions", "runs or hits"))
+    labels = [None] * len(spectra) if labels is None else list(labels)
+    if not spectra or len(labels) != len(spectra):
+        raise ValueError(f"spectrum needs ions, with one label each, got {len(spectra)} and {len(labels)}")
+    if elements is None:
+        names = [name for each in spectra if isinstance(each, Run) for name in each.elements]
+        elements = [name for name in dict.fromkeys(names) if name in ISOTOPES]
+    else:
+        elements = [check_choice(name, "elements", ISOTOPES) for name in elements]
+    masses = [_masses(each) for each in spectra]
+    bin_width = check_number(bin_width, "bin_width", above=0, unit="Da")
+    low, high = _default_limits(masses) if limits is None else check_array(limits, "limits", (2,)).tolist()
+    if not 0 <= low < high or (high - low) / bin_width > _MOST_BINS:
+        raise ValueError(
+            f"limits must be 0 <= low < high [Da] with at most {_MOST_BINS:,} bins of {bin_width:g} Da, got {low:g} to "
+            f"{high:g}"
+        )
+    edges = bin_width * np.arange(np.floor(low / bin_width), np.ceil(high / bin_width) + 1)
+    counts = [np.histogram(mass, edges)[0] for mass in masses]
+    scales = [1.0] if len(masses) == 1 else [1 / (bin_width * len(mass)) for mass in masses]
+    if ax is None:
+        ax = new_figure((8.0, 4.0)).subplots()
+    heights = [scale * count for scale, count in zip(scales, counts, strict=True)]
+    floor = min(scales) / 2  # half an ion: the base of the lines on a logarithmic scale
+    for index, (height, label) in enumerate(zip(heights, labels, strict=True)):
+        values = np.maximum(height, floor)
+        ax.stairs(values, edges, baseline=floor, color=f"C{index}", linewidth=0.7, label=label, alpha=0.9, zorder=2)
+        if index == 0:
+            ax.stairs(values, edges, baseline=floor, color="C0", fill=True, alpha=0.2, linewidth=0, zorder=1)
+    ylabel = f"ions per {bin_width:g} Da" if len(masses) == 1 else "fraction of the ions [1/Da]"
+    top = max(height.max() for height in heights)
+    labelled = _label_isotopes(ax, elements, edges, counts, heights, (low, high))
+    # space above the peaks for their labels, and for the legend
+    decades = np.log10(max(top / floor, 10))
+    space = (0.28 if labelled else 0.06) + (0.1 if any(labels) else 0.0)
+    ax.set(yscale="log", xlim=(low, high), ylim=(floor, floor * 10 ** (decades * (1 + space))))
+    ax.set(xlabel="mass-to-charge ratio [Da]", ylabel=ylabel)
+    ax.grid(alpha=0.3)
+    ax.set_axisbelow(True)
+    if any(labels):
+        ax.legend(loc="upper center", frameon=False, fontsize="small", ncols=min(len(labels), 3))
+    return ax
+
+
+def _masses(ions):
+    """Mass-to-charge ratios of the detected ions [Da]."""
+    if isinstance(ions, Run):
+        if ions.real is None:
+            raise ValueError(f"a spectrum needs a run in real units, run.at_evaporation_field(), got {ions!r}")
+        ions = ions.hits(ions.first_perturbation)
+    (mass,) = check_kind(ions, "ions", Hits, "a Run or Hits").require("mass_to_charge")
+    mass = mass[ions.detected & np.isfinite(mass)]
+    if not len(mass):
+        raise ValueError(f"a spectrum needs detected ions, got none of {ions!r}")
+    return mass.astype(np.float64)
+
+
+def _default_limits(masses):
+    lows, highs = [], []
+    for mass in masses:
+        intervals, counts = np.unique(np.floor(mass), return_counts=True)
+        empty = intervals[-1] - intervals[0] + 1 - len(intervals)
+        background = np.median(np.pad(counts, (0, int(empty)))) if empty < len(intervals) else 0.0
+        threshold = max(_OCCUPIED * len(mass), background + _SIGNIFICANT * np.sqrt(background))
+        occupied = intervals[counts >= threshold]
+        chosen = mass[(mass >= occupied[0]) & (mass < occupied[-1] + 1)] if len(occupied) else mass
+        lows.append(chosen.min())
+        highs.append(chosen.max())
+    low, high = float(min(lows)), float(max(highs))
+    margin = max(_MARGIN * (high - low), 0.5)
+    return max(low - margin, 0.0), high + margin
+
+
+def _label_isotopes(ax, elements, edges, counts, heights, limits):
+    """Write the isotopes above their peaks where there is space: the most abundant of each charge, then the others."""
+    highest = np.max(heights, axis=0)
+    width = _WIDTH_OF_LABEL * (limits[1] - limits[0])
+    places, mains, others = [], [], []
+    for element in elements:
+        for charge in range(1, _HIGHEST_CHARGE + 1):
+            isotopes = [
+                (highest[_bins_of_peak(edges, mass / charge)].max(), mass / charge, (element, charge, mass))
+                for mass, _ in _visible_isotopes(element, charge, counts, edges)
+            ]
+            mains += isotopes[:1]
+            others += isotopes[1:]
+    labelled = set()
+    for group in (mains, others):
+        for top, place, (element, charge, mass) in sorted(group, reverse=True):
+            crowded = any(abs(place - other) < width for other in places)
+            behind = highest[_bins_between(edges, place - 0.6 * width, place + 0.6 * width)].max(initial=top)
+            if crowded or (group is others and ((element, charge) not in labelled or behind > _LOW * top)):
+                continue
+            places.append(place)
+            labelled.add((element, charge))
+            ax.annotate(
+                ion_label(element, charge, round(mass)), (place, behind), xytext=(2, 4), textcoords="offset points",
+                rotation=90, ha="center", va="bottom", fontsize="small", annotation_clip=True,
+            )  # fmt: skip
+    return bool(places)
+
+
+def _visible_isotopes(element, charge, counts, edges):
+    """Isotopes, the most abundant first, if this has a peak, and others that have the expected ions in a spectrum."""
+    isotopes = sorted(ISOTOPES[element], key=lambda isotope: -isotope[1])
+    visible = set()
+    for count in counts:
+        main = _ions_of_peak(count, edges, isotopes[0][0] / charge)
+        for isotope in isotopes if main > 0 else ():
+            expected = main * isotope[1] / isotopes[0][1]
+            number = count[_bins_of_peak(edges, isotope[0] / charge)].sum()
+            if expected >= _FEWEST and number > expected / 2:
+                visible.add(isotope)
+    return [isotope for isotope in isotopes if isotope in visible and edges[0] < isotope[0] / charge < edges[-1]]
+
+
+def _ions_of_peak(count, edges, mass):
+    """Number of ions of a peak above the background, 0 if there is no peak."""
+    near, around = _bins_of_peak(edges, mass), _bins_between(edges, mass - _SURROUNDINGS, mass + _SURROUNDINGS)
+    width = near.stop - near.start
+    if width < 1 or around.stop - around.start < width:
+        return 0.0
+    # a quarter of as many bins elsewhere are between peaks
+    background = np.percentile(np.convolve(count[around], np.ones(width), "valid"), 25)
+    above = count[near].sum() - background
+    return float(above) if above > _SIGNIFICANT * np.sqrt(background + 1) else 0.0
+
+
+def _bins_of_peak(edges, mass):
+    return _bins_between(edges, mass - _SHARP, (1 + _TAIL) * mass + _SHARP)
+
+
+def _bins_between(edges, low, high):
+    first, last = np.searchsorted(edges, [low, high], side="right")
+    return slice(max(int(first) - 1, 0), min(int(last), len(edges) - 1))
