@@ -275,6 +275,7 @@ def charge_state_ratio_course(
     ValueError
         If the charges are not known, there are no two neighbouring charges, or an argument is outside its range.
     """
+    check_kind(hits, "hits", Hits, "Hits")
     charges = np.where(hits.detected, ion_charges(hits, element, ranges), 0)
     return course_of_charges(charges, element, charge, sections=sections, least=least)
 

@@ -150,14 +150,15 @@ class Study:
 
     def to_dict(self) -> dict[str, Any]:
         """Return results and settings in plain types, NaN as None, dict."""
-        results = {"made_by": f"apt_evap {__version__}", "grid": asdict(self.grid)}
+        results: dict[str, Any] = {"made_by": f"apt_evap {__version__}", "grid": asdict(self.grid)}
         results |= {name: getattr(self, name) for name in ("ssim", "errors", "shares", "gain_share")}
         results |= {name: getattr(self, name).to_dict() for name in ("optimum", "refined", "registration")}
         results |= {name: getattr(self, name) and getattr(self, name)._asdict() for name in ("gain", "ceiling")}
         for group in ("baselines", "plain"):
             results[group] = {name: score._asdict() for name, score in getattr(self, group).items()}
-        results |= {"real_energies": self.real_energies}
-        return plain(results | {"settings": asdict(self.settings) | self.provenance})
+        return plain(
+            results | {"real_energies": self.real_energies, "settings": asdict(self.settings) | self.provenance}
+        )
 
     def save(self, path: AnyPath) -> None:
         """Write results and settings to a JSON file; the file is replaced only when complete.
