@@ -32,6 +32,7 @@ from .detection.detector import Detector as Detector
 from .detection.detector_map import DetectorMap as DetectorMap
 from .detection.hits import Hits as Hits
 from .detection.hits import Outcome as Outcome
+from .detection.instrument import Instrument as Instrument
 from .detection.mass_ranges import Ranges as Ranges
 from .detection.projection import Projection as Projection
 from .detection.timing import Timing as Timing
@@ -67,6 +68,12 @@ from .io.formats import read as read
 from .io.formats import write as write
 from .io.npz import read_map as read_map
 from .io.rrng import read_ranges as read_ranges
+from .reconstruction.calibration import DistributionMap as DistributionMap
+from .reconstruction.calibration import compression_from_poles as compression_from_poles
+from .reconstruction.calibration import distribution_map as distribution_map
+from .reconstruction.errors import ReconstructionErrors as ReconstructionErrors
+from .reconstruction.reconstruct import Reconstruction as Reconstruction
+from .reconstruction.reconstruct import reconstruct as reconstruct
 from .registration.register import Registration as Registration
 from .registration.register import register as register
 from .registration.register import register_points as register_points

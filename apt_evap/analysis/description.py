@@ -126,9 +126,10 @@ def _clock(run):
         return None
     seconds, pulse = float(run.clock.waits.sum()), run.settings.get("pulse_length")
     rate = len(run) / seconds if seconds > 0 else 0.0
+    duration = seconds if not pulse else seconds / pulse / (1e3 * run.settings["control"]["pulse_frequency"])
     return {
         "voltages": _extent(run.clock.voltages),
-        "duration": _plain(seconds),
+        "duration": _plain(duration),
         "pulse_length": pulse and _plain(pulse),
         ("ions_per_pulse" if pulse else "ions_per_second"): _plain(rate * (pulse or 1.0)),
     }

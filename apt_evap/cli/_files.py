@@ -51,8 +51,10 @@ def read(options: argparse.Namespace) -> Hits | Run | DetectorMap:
 
 
 def in_real_units(run: Run, options: argparse.Namespace) -> Run:
-    """The run, in real units if the options ask for them."""
-    return run if options.real_units is None else run.at_evaporation_field(options.real_units)
+    """The run, in real units if the options ask for them; a run that already is keeps its own."""
+    if options.real_units is None or (run.units is not None and run.units.field_reference == options.real_units):
+        return run
+    return run.at_evaporation_field(options.real_units)
 
 
 _SELECTING = ("ions", "mass", "voltage", "circle", "ranges", "species")

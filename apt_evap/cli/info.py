@@ -53,9 +53,13 @@ _SIZES = ("bins", "bin_size", "detector_extent", "detector_quantum")
 def _law_text(law):
     """Name and parameters of a law."""
     parameters = ", ".join(
-        f"{name}={_text(value)}" for name, value in law.items() if name != "name" and value is not None
+        f"{name}={_parameter_text(value)}" for name, value in law.items() if name != "name" and value is not None
     )
     return f"{law['name']}({parameters})"
+
+
+def _parameter_text(value):
+    return _law_text(value) if isinstance(value, dict) and "name" in value else _text(value)
 
 
 def _text(value, between="   "):

@@ -9,6 +9,7 @@ from apt_evap._version import __version__
 from apt_evap.cli._output import put
 from apt_evap.detection.limits import MAX_BINS
 from apt_evap.energy_fit.defaults import MEANS, MECHANISMS, ROLLUP_FRACTIONS, RSDS
+from apt_evap.reconstruction.choices import PROJECTIONS, PROTOCOLS
 
 EXIT_CODES = """\
 exit codes:
@@ -31,6 +32,8 @@ from a simulation to its map, and to the emission energies of a measured map:
   apt-evap compare ni111.h5 R5083.epos -o study      fit the emission energies to the measured map
   apt-evap export ni111.h5 --real-units -o ni111.epos
                                                      ions as an instrument would write them
+  apt-evap reconstruct R5083.epos --element Si --distance 90 -o R5083.pos
+                                                     positions in the specimen from the hits
   apt-evap COMMAND --help                            all arguments of a command, with examples
 """
 
@@ -54,7 +57,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"apt-evap {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", dest="command", required=True)
-    for add in (_add_run, _add_map, _add_info, _add_compare, _add_export):
+    for add in (_add_run, _add_map, _add_info, _add_compare, _add_export, _add_reconstruct):
         add(commands)
     return parser
 
@@ -245,6 +248,47 @@ def _add_export(commands: Any) -> None:
     _add_real_units(command)
     command.add_argument("--temperature", type=_number("K"), metavar="K", help="adds energy deficits to the times")
     command.add_argument("--jitter", type=_number("ns"), metavar="NS", help="error of the times; default: none")
+    _add_reading(command)
+    command.add_argument("--force", action="store_true", help="overwrite an existing file")
+    _add_speech(command)
+
+
+def _add_reconstruct(commands: Any) -> None:
+    command = commands.add_parser(
+        "reconstruct",
+        help="reconstruct the positions of ions from their hits",
+        description="Reconstruct the positions of ions in the specimen from their hits and their sequence, and write\n"
+        "them as .pos, .epos, .xyz or .vtp. A run has its flight length; its true sites give the errors.",
+        epilog="example:\n"
+        "  apt-evap reconstruct R5083.epos --element Si --distance 90 --efficiency 0.57 -o R5083.pos\n"
+        "  apt-evap reconstruct ni111.h5 --real-units --element Ni --field-factor 1.4 --compression 1.13\n"
+        "  apt-evap reconstruct R5083.epos --atomic-volume 0.02 --distance 90 --radius shank --initial-radius 30 \\\n"
+        "      --shank-angle 5",
+        **_SHAPE,
+    )
+    command.add_argument("file", metavar="FILE", help="measured ions (.epos, ...) or a run (.h5)")
+    command.add_argument("-o", "--output", metavar="OUT", help="default: FILE_reconstructed.pos in this folder")
+    constants = command.add_argument_group("constants")
+    constants.add_argument("--protocol", choices=PROTOCOLS, default="cap", help="depth increment; default: cap")
+    constants.add_argument("--projection", choices=PROJECTIONS, default="bas", help="angle on the cap; default: bas")
+    constants.add_argument("--distance", type=float, metavar="MM", help="flight length; default: that of the run")
+    constants.add_argument("--detector-radius", type=float, metavar="MM", help="default: that of the outermost ion")
+    constants.add_argument("--compression", type=float, default=1.5, metavar="XI", help="image compression; default: 1.5")
+    constants.add_argument("--efficiency", type=float, default=1.0, metavar="ETA", help="of the detector; default: 1")
+    constants.add_argument("--element", metavar="NAME", help="material that gives the atomic volume and the field")
+    constants.add_argument("--atomic-volume", type=float, metavar="NM3", help="default: that of the element")
+    constants.add_argument(
+        "--radius", default="voltage", metavar="R", help="voltage, shank, or a constant radius [nm]; default: voltage"
+    )
+    constants.add_argument("--field-factor", type=float, default=3.3, metavar="KF", help="default: 3.3")
+    constants.add_argument("--evaporation-field", type=float, metavar="F", help="[V/nm]; default: that of the element")
+    constants.add_argument(
+        "--smoothing", type=_integer(1), default=1, metavar="N", help="ions in the mean of the voltage; default: 1"
+    )
+    constants.add_argument("--initial-radius", type=float, metavar="NM", help="for --radius shank")
+    constants.add_argument("--shank-angle", type=float, metavar="DEGREES", help="for --radius shank; half the opening")
+    command.add_argument("--perturbation", metavar="P", help="of a run, as for map; default: the first one of the run")
+    _add_real_units(command)
     _add_reading(command)
     command.add_argument("--force", action="store_true", help="overwrite an existing file")
     _add_speech(command)

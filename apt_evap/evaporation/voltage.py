@@ -26,13 +26,14 @@ class VoltageControl:
     Parameters
     ----------
     rate : float
-        Ions per pulse; without pulses, ions per second. 0.002 to 0.05 ions per pulse are usual.
+        Ions per pulse, of the voltage or of a laser; without pulses, ions per second. 0.002 to 0.05 ions per pulse are
+        usual.
     pulse_fraction : float
         Height of the voltage pulse relative to the standing voltage, V_p / V_dc; 0.2 is usual. 0: no pulses.
     pulse_width : float
         Standard deviation of the Gaussian top of a pulse [ns].
     pulse_frequency : float
-        Pulses per second [kHz].
+        Pulses per second [kHz]; only for the duration of a measurement.
     memory : int
         Number of ions over which the control averages the rate.
 

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from apt_evap._common.validation import (
 from apt_evap._common.warnings import DataWarning
 from apt_evap.detection.detector import Detector
 from apt_evap.detection.hits import Hits, Outcome
+from apt_evap.detection.instrument import Instrument
 from apt_evap.detection.timing import Timing
 from apt_evap.emission.emissions import COLUMNS, Emissions
 from apt_evap.emission.ion_random import IonRandom
@@ -500,19 +501,62 @@ class Run:
             return np.arange(len(self))
         return pulses_of(excess, control.rate, u)
 
-    def seen_by(self, detector: Detector) -> "Run":
-        """The same ions, recorded by another detector.
+    @overload
+    def seen_by(self, detector: Detector) -> "Run": ...
+
+    @overload
+    def seen_by(
+        self, detector: Instrument, perturbation: Perturbation | None = None, *, seed: int | None = None
+    ) -> Hits: ...
+
+    def seen_by(
+        self,
+        detector: Detector | Instrument,
+        perturbation: Perturbation | None = None,
+        *,
+        seed: int | None = None,
+    ) -> "Run | Hits":
+        """The same ions on another detector, or the ions that an instrument records.
 
         Parameters
         ----------
-        detector : Detector
-            Detector with another distance, width or projection.
+        detector : Detector or Instrument
+            Detector with another distance, width or projection. Or the instrument that records the ions of a run in
+            real units.
+        perturbation : perturbation, optional
+            Initial conditions of the ions that an instrument records; by default the first perturbation flown in the
+            run, or `Unperturbed`.
+        seed : int, optional
+            Seed of the random numbers of an instrument; by default that of the run.
 
         Returns
         -------
-        Run
+        Run or Hits
+            For a detector the same run. For an instrument the recorded ions: what the instrument writes, and the truth:
+            `site`, `ion`, `positions`, and in `extra` the species, the charge in flight, and charge and field before
+            evaporation.
+
+        Raises
+        ------
+        ValueError
+            If the run is not in real units, which an instrument needs, or an argument is wrong.
         """
-        return replace(self, detector=detector, settings=self.settings | {"detector": vars(detector)})
+        if not isinstance(detector, Instrument):
+            check_kind(detector, "detector", Detector, "a Detector or an Instrument")
+            if perturbation is not None or seed is not None:
+                raise ValueError("perturbation and seed are for an Instrument, got a Detector")
+            return replace(self, detector=detector, settings=self.settings | {"detector": vars(detector)})
+        if self.units is None:
+            raise ValueError(
+                "this run is not in real units, so it has no voltages, times and pulses that an instrument could "
+                "record: use run.at_evaporation_field().seen_by(instrument)"
+            )
+        # errors of the times of an instrument replace those of the run
+        units = self.units if detector.timing is None else replace(self.units, timing=None)
+        plane = replace(self, units=units, detector=replace(self.detector, projection="plane"))
+        hits = plane.hits(self.first_perturbation if perturbation is None else perturbation)
+        hits = replace(hits, extra=hits.extra | {"species": self.species})
+        return detector.hits(hits, self.detector.distance, seed=self.seed if seed is None else check_seed(seed))
 
     def summary(self) -> dict[str, Any]:
         """Counts, dict: ions, outcomes of the first perturbation, ions that cannot roll up, flagged ions."""

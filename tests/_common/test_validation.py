@@ -81,6 +81,7 @@ def ready():
     return {
         "simulation": simulation,
         "run": run,
+        "real": run.at_evaporation_field("site"),
         "emitter": simulation.emitter,
         "tracks": bound["lateral_tracks"],
         "fit_energies": bound["fit_energies"],
@@ -214,6 +215,27 @@ CASES = [
             "temperature": [value for value in POSITIVE if value is not None],
             "sensitivity": POSITIVE,
         },
+    ),
+    (
+        ae.Instrument,
+        {},
+        {
+            "distance": [*POSITIVE, 1e9],
+            "field_of_view": [*POSITIVE, 1e9],
+            "projection": WORD,
+            "efficiency": [*POSITIVE, 1.1],
+            **dict.fromkeys(("dead_time", "dead_zone", "resolution"), [*NUMBER, -0.1]),
+            "quantisation": [value for value in VECTOR if value is not None] + [(0.0, 1.0), (1.0, -1.0)],
+            "timing": [*OBJECT, dict],
+            "flight_path": [value for value in POSITIVE if value is not None],
+        },
+    ),
+    (ae.Instrument.preset, {"name": "straight, 100 mm"}, {"name": WORD, "efficiency": [*POSITIVE, 1.1]}),
+    (ae.Instrument().record, {}, {"hits": [*OBJECT, None]}),
+    (
+        ae.Instrument().hits,
+        {"hits": ae.Hits(**HITS, time_of_flight=[1.0, 2.0], pulse_id=[0, 1])},
+        {"hits": [*OBJECT, None], "distance": [value for value in POSITIVE if value is not None], "seed": SEED},
     ),
     (ae.Extremal, {}, {"bonds": [*OBJECT, ae.PairEnergies]}),
     (ae.Robin, {}, {"tolerance": [*POSITIVE, 2.0], "window": [*COUNT, 100]}),
@@ -420,6 +442,60 @@ CASES = [
         {"polarizability": 1e-40, "voltage": 1e3, "field_factor": 3.0, "radius": 10.0, "step": 0.3},
         {"polarizability": POSITIVE, "voltage": NUMBER, "field_factor": POSITIVE, "radius": POSITIVE, "step": NUMBER},
     ),
+    (
+        ae.reconstruct,
+        {"hits": hits, "atomic_volume": 0.011, "distance": 100.0, "evaporation_field": 35.0},
+        {
+            "hits": [*OBJECT, None],
+            **dict.fromkeys(("atomic_volume", "distance", "evaporation_field", "field_factor", "compression"), POSITIVE),
+            "efficiency": [*POSITIVE, 1.1],
+            "protocol": WORD,
+            "projection": WORD,
+            "radius": [*POSITIVE, "no such", [1.0, NAN, 1.0], [1.0, 0.0, 1.0]],
+            "detector_radius": [value for value in POSITIVE if value is not None] + [0.1],
+            "area": [value for value in POSITIVE if value is not None],
+            "smoothing": [*COUNT, 0],
+            "initial_radius": [10.0],  # not for the voltage
+            "shank_angle": [3.0],
+        },
+    ),
+    (
+        ae.reconstruct,
+        {"hits": hits, "atomic_volume": 0.011, "distance": 9.0, "radius": "shank"}
+        | {"initial_radius": 30.0, "shank_angle": 5.0},
+        {"initial_radius": POSITIVE, "shank_angle": [*NUMBER, -1.0, 45], "evaporation_field": [30.0]},
+    ),
+    (
+        ae.Reconstruction.errors,
+        {"self": ae.reconstruct(hits, atomic_volume=0.011, distance=100.0, radius=30.0), "truth": np.eye(3)},
+        {
+            "truth": [None, *VECTOR[1:], np.zeros((2, 3))],
+            "fit": [None, 3, "shift", ["scale"], [3], NAN],
+        },
+    ),
+    (
+        ae.compression_from_poles,
+        {"crystal_angles": [54.7, 35.3], "observed_angles": [35.0, 22.0]},
+        {
+            "crystal_angles": [None, "x", 3, [], [NAN, 1.0], [0.0, 1.0], [200.0, 1.0]],
+            "observed_angles": [None, "x", 3, [1.0], [NAN, 1.0], [-1.0, 1.0]],
+        },
+    ),
+    (
+        ae.distribution_map,
+        {"positions": np.indices((3, 3, 3)).reshape(3, -1).T * 0.2},
+        {
+            "positions": [*VECTOR, np.zeros((1, 3)), np.zeros((4, 2))],
+            "axis": [None, "x", 1j, 3, -1, 0.5, NAN, (0, 0, 0), (1.0, NAN, 0), (1, 1), object()],
+            "lateral": POSITIVE,
+            "reach": POSITIVE,
+            "bins": [*COUNT, 3],
+            "centre": [value for value in VECTOR if value is not None],
+            "radius": [value for value in POSITIVE if value is not None],
+            "max_pairs": [*COUNT, 0],
+            "seed": COUNT,
+        },
+    ),
     (ae.load, {}, {"path": [None, 3, NAN, [], "a\0b", "none.h5"]}),
     (ae.read, {}, {"path": [None, 3, NAN, [], "a\0b", "none.epos"]}),
     (ae.read_ranges, {}, {"path": [None, 3, NAN, [], "a\0b", "none.rrng"]}),
@@ -471,6 +547,12 @@ NEEDS_A_RUN = [
             "field_factor": [value for value in POSITIVE if value is not None],
             "seed": [value for value in SEED if value is not None],
         },
+    ),
+    ("run.seen_by", {}, {"detector": [*OBJECT, None]}),
+    (
+        "real.seen_by",
+        {"detector": ae.Instrument()},
+        {"perturbation": OBJECT, "seed": [value for value in SEED if value is not None]},
     ),
     (ae.fit_caps, {"windows": 1}, {"run": [*OBJECT, None]}),
     (ae.image_compression, {}, {"run": [*OBJECT, None]}),
@@ -564,6 +646,7 @@ def test_every_public_name_with_arguments_is_in_the_table():
     taken = {"Unperturbed", "TUNGSTEN_TABLE"}  # no arguments
     taken |= {"Ending", "RunInterrupted", "RunNotSaved"}  # made by the package
     taken |= {"FileError", "TruncatedFile", "Outcome", "Run", "plot", "__version__"}  # made by the package
+    taken |= {"Reconstruction", "ReconstructionErrors", "DistributionMap"}  # made by the package
     taken |= {"chunks", "Study", "ZoneLine", "History", "CapHistory", "Batch"}  # in test_chunks; made by the package
     taken |= {name for name in ae.__all__ if name.endswith("Warning")}
     missing = {name for name in ae.__all__ if name not in taken and getattr(ae, name) not in tried}

@@ -85,7 +85,7 @@ def test_times_voltages_and_masses_belong_together(real):
     assert total == pytest.approx(real.voltages, rel=1e-12)
     path = np.sqrt(100.0**2 + hits.x**2 + hits.y**2) * 1e6
     time = FLIGHT_TIME / np.sqrt(2.0) * path * np.sqrt(hits.mass_to_charge / total)
-    # an ion starts at the nuclei, where the potential of the others is below V by about F d = 7 V of 180 V: 2 % of t
+    # an ion starts at the nuclei, where the potential of the others is below V by 4 to 7 V of 180 V: 2 % of t
     assert hits.time_of_flight[detected] == pytest.approx(time[detected], rel=0.03)
     assert (hits.time_of_flight[detected] > time[detected]).all()
     masses = hits.mass_to_charge * hits.extra["charge_state"]
