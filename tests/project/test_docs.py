@@ -278,6 +278,8 @@ def parameters(documented):
     """Names of the parameters to describe; an error and an enumeration have none of their own."""
     if isinstance(documented, type) and issubclass(documented, Exception | enum.Enum):
         return []
+    if not callable(documented):  # a table, such as TUNGSTEN_TABLE
+        return []
     return [name for name in inspect.signature(documented).parameters if name != "self"]
 
 
