@@ -22,6 +22,9 @@ from .analysis.profiles import radial_profile as radial_profile
 from .analysis.profiles import zone_line_profile as zone_line_profile
 from .analysis.response_tracks import lateral_tracks as lateral_tracks
 from .analysis.response_tracks import rollup_tracks as rollup_tracks
+from .analysis.rings import Ring as Ring
+from .analysis.rings import radial_densities as radial_densities
+from .analysis.rings import ring_statistics as ring_statistics
 from .analysis.similarity import half_ceiling as half_ceiling
 from .analysis.similarity import ssim as ssim
 from .analysis.zone_line import ZoneLine as ZoneLine

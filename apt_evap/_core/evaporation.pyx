@@ -399,6 +399,7 @@ cdef class Evaporation:
         cdef long n, leaving
         cdef int status = STATUS_DONE, best, axis
         cdef double u = 0.5
+        cdef bint drawn
         if journal.start.shape[0] <= max_events:
             raise ValueError(f"journal must have room for {max_events} events")
         with nogil:
@@ -414,17 +415,16 @@ cdef class Evaporation:
                 if self.since_relaxation >= sweep_interval or self.tree.n_slots + MAX_NEAR > self.tree.x.shape[0]:
                     status = STATUS_SWEEP_DUE
                     break
-                wait[n] = 0.0
-                if self.chooser.draws and leaving < 0:
-                    wait[n] = self.wait(uniform_number(self.seed, self.n_removed, 1))
-                rise[n] = self.rise
-                if self.chooser.draws and leaving < 0:
-                    self.rise -= 1.0 / self.memory   # every event lets the control lower the voltage
+                drawn = self.chooser.draws and leaving < 0
                 leaving = self.tree.atom[best]
                 detached[n] = self.atoms.detached[leaving]
                 if self.has_support and self.atoms.reaches_support(leaving):
                     status = STATUS_TOO_SHALLOW
                     break
+                wait[n] = self.wait(uniform_number(self.seed, self.n_removed, 1)) if drawn else 0.0
+                rise[n] = self.rise
+                if drawn:
+                    self.rise -= 1.0 / self.memory   # every event lets the control lower the voltage
                 atom[n] = leaving
                 charge[n] = self.tree.q[best]
                 field[n] = self.field_unit * self.rule.strength(self.tree, best)

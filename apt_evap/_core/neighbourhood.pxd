@@ -3,6 +3,7 @@
 cdef enum:
     MAX_NEAR = 1024    # largest number of atoms within the radius of an atom; a dense metal has 54
     MAX_BONDS = 64     # nearest neighbours of a removed atom that are checked for their hold; fcc has 12
+    MAX_CODED = 15     # neighbours of one kind that four bits of a code can count
     MAX_PIECE = 2048   # atoms visited to decide which part has lost its hold; larger parts count as the body
 
 
@@ -27,7 +28,7 @@ cdef class Neighbourhood:
     cdef const int[::1] far_code        # (n,) and to that of its second neighbours
     cdef int[::1] bond_code             # (n,) sum of the codes of the remaining neighbours
     cdef readonly double second_length  # [nm]: atoms closer than this, but no nearest neighbours, are second neighbours
-    cdef bint has_codes
+    cdef bint has_codes, too_many
     cdef double[:, ::1] offset          # (n, 3) sum of (neighbour - atom) over the neighbours [nm]
     cdef double[::1] low                # (3,) corner of the grid of cells [nm]
     cdef long[::1] shape                # (3,) cells along each axis

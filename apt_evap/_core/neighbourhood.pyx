@@ -70,7 +70,7 @@ cdef class Neighbourhood:
         self.count = np.zeros(n, np.int32)
         self.bonds = np.zeros(n, np.int8)
         self.offset = np.zeros((n, 3))
-        self.has_codes, self.second_length = codes is not None, 0.0
+        self.has_codes, self.second_length, self.too_many = codes is not None, 0.0, False
         if codes is not None:
             self.code, self.far_code, self.second_length = codes
             if self.second_length > radius:
@@ -99,6 +99,8 @@ cdef class Neighbourhood:
             self.exposed[i] = self.alive[i] and self.judge(i)
         if before is not None:
             np.asarray(self.exposed)[:before.n_atoms] |= before.exposed
+        if self.has_codes and self.too_many:
+            raise ValueError(f"bonds by species need at most {MAX_CODED} nearest and second neighbours of each atom")
         if np.asarray(self.count).min() < 0:
             raise ValueError(f"radius must include at most {MAX_NEAR} neighbours of each atom, got {radius!r} nm")
 
@@ -129,7 +131,7 @@ cdef class Neighbourhood:
         cdef int[MAX_NEAR] others
         cdef int n = self.near(atom, others), i
         cdef double step, s, bond = self.bond_length * self.bond_length
-        cdef int axis
+        cdef int axis, n_near = 0, n_far = 0
         self.count[atom] = n
         for i in range(n):
             s = 0.0
@@ -138,8 +140,12 @@ cdef class Neighbourhood:
                 self.offset[atom, axis] += step
                 s += step * step
             self.bonds[atom] += s <= bond
+            n_near += s <= bond
             if self.has_codes:
                 self.bond_code[atom] += self.code_of(others[i], s)
+                n_far += bond < s <= self.second_length * self.second_length
+        if n_near > MAX_CODED or n_far > MAX_CODED:
+            self.too_many = True    # the same value from all threads
 
     cdef int code_of(self, long atom, double s) noexcept nogil:
         # What an atom adds to the code of an atom at this squared distance.

@@ -273,7 +273,9 @@ def _add_reconstruct(commands: Any) -> None:
     constants.add_argument("--projection", choices=PROJECTIONS, default="bas", help="angle on the cap; default: bas")
     constants.add_argument("--distance", type=float, metavar="MM", help="flight length; default: that of the run")
     constants.add_argument("--detector-radius", type=float, metavar="MM", help="default: that of the outermost ion")
-    constants.add_argument("--compression", type=float, default=1.5, metavar="XI", help="image compression; default: 1.5")
+    constants.add_argument(
+        "--compression", type=float, default=1.5, metavar="XI", help="image compression; default: 1.5"
+    )
     constants.add_argument("--efficiency", type=float, default=1.0, metavar="ETA", help="of the detector; default: 1")
     constants.add_argument("--element", metavar="NAME", help="material that gives the atomic volume and the field")
     constants.add_argument("--atomic-volume", type=float, metavar="NM3", help="default: that of the element")

@@ -45,6 +45,7 @@ _COORDINATION = {"fcc": (12, 6), "hcp": (12, 6), "bcc": (8, 6), "sc": (6, 12), "
 # [d_nn] between the second and the third neighbours
 _SECOND = {"fcc": 1.57, "hcp": 1.52, "bcc": 1.39, "sc": 1.57, "diamond": 1.77}
 _BITS = 4  # per count of neighbours: up to 15
+_LEAST = 0.1  # of the energy at a kink: repulsive bonds cannot lower the field below 1 %
 _MOST = 4  # counts: tables of 16^4 numbers
 
 
@@ -227,15 +228,19 @@ class PairEnergies:
         cohesive = self._number(self.cohesive_energies, COHESIVE_ENERGIES, element.name, "cohesive_energies")
         work = self._number(self.ionisation_works, IONISATION_WORKS, element.name, "ionisation_works")
         ratio = (self.energies(tip, species, nearest, second) + work) / (cohesive + work)
+        ratio = np.maximum(ratio, _LEAST)
         return element.evaporation_field * ratio * ratio
 
 
 def check_bonds(bonds: Any) -> None:
     """Raise a ValueError unless `bonds` is None or an evaporation field by bonds."""
-    if bonds is not None and not (callable(getattr(bonds, "fields", None)) and not isinstance(bonds, type | Mapping)):
+    if bonds is None:
+        return
+    complete = all(hasattr(bonds, name) for name in ("fields", "by_species", "second_shell"))
+    if not complete or isinstance(bonds, type | Mapping) or not callable(bonds.fields):
         raise ValueError(
-            "bonds must be an evaporation field by bonds with a method fields, such as PairEnergies(), got "
-            f"{short_text(bonds)}"
+            "bonds must be an evaporation field by bonds with by_species, second_shell and a method fields, such as "
+            f"PairEnergies(), got {short_text(bonds)}"
         )
 
 

@@ -20,9 +20,9 @@ class Cap(NamedTuple):
     Parameters
     ----------
     field : float
-        Mean field just outside these atoms [V/nm].
+        Mean field just outside these atoms [V/nm], weighted with their charges.
     ratio : float
-        Mean ratio of this field to the evaporation field of the atom.
+        Mean ratio of this field to the evaporation field of the atom, with the same weights.
     radius : float
         Radius of the sphere fitted to these atoms [nm].
     """
@@ -53,6 +53,10 @@ def measure_cap(positions: Floats, normals: Floats, fields: Floats, evaporation_
 
     Notes
     -----
+    The mean with the charges as weights is V/R for a sphere: the field F is twice that of the other charges, and the
+    sum of q r.E over all charges is their energy Q V/2 (virial theorem). Measured on spheres of fcc atoms: 2.2, 1.0 and
+    0.5 % less at R = 12, 24 and 40 a. A mean without weights is 13 % less: it counts atoms below steps fully.
+
     The sphere minimises the sum of (|r - c|^2 - R^2)^2, a linear problem for c and R^2 - |c|^2. It begins with atoms
     whose normals are within 45 degrees of the axis.
     """
@@ -65,8 +69,9 @@ def measure_cap(positions: Floats, normals: Floats, fields: Floats, evaporation_
         centre, radius = _sphere(positions[chosen])
         from_centre = positions - centre
         chosen = from_centre[:, 2] >= cosine * lengths(from_centre)
-    field = float(np.mean(fields[chosen]))
-    return Cap(field, float(np.mean(fields[chosen] / evaporation_fields[chosen])), radius)
+    fields = fields[chosen]
+    weights = fields / fields.sum()  # fields are proportional to charges
+    return Cap(float((weights * fields).sum()), float((weights * fields / evaporation_fields[chosen]).sum()), radius)
 
 
 def _sphere(points):

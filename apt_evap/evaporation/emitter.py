@@ -33,6 +33,8 @@ BATCH = 256  # events per batch; results do not depend on it
 
 __all__ = ["BATCH", "DONE", "EXHAUSTED", "SWEEP_DUE", "TOO_SHALLOW", "Batch", "Emitter"]
 
+_SEED_STEP = 0x9FB21C651E98DF25  # events have other random numbers than the ions of the same seed
+
 _MAX_EVENTS = 10_000_000  # per call: 720 MB of results
 
 
@@ -153,7 +155,7 @@ class Emitter:
             self.settings.patch_radius * distance,
             self.settings.update_radius * distance,
             self.settings.opening_angle,
-            check_seed(seed),
+            (check_seed(seed) + _SEED_STEP) % (1 << 64),
         )
         if self._rate_control:
             self._rate_control.begin(self._core)

@@ -121,8 +121,10 @@ class Arrhenius:
     ============  =========================  ===============================================================
 
     At the working point Q_op = kT ln(nu_0 t N / n) for n ions in the time t from about N = 100 atoms that may leave
-    next. Close to it all forms give the same sequence, because only C/kT matters. The linear form was measured as tails
-    of mass peaks (Field evaporation energy loss spectroscopy, Communications Physics 6, 2023).
+    next. The slope of the last two is -C to first order in Q_op/C. The order depends on dlnk/dlnF there, which is (C -
+    Q_op)/kT for the linear form, and (C - Q_op/2)/kT, (C + 2 Q_op)/kT and (C - 2 Q_op)/kT for the others. The linear
+    form was measured as tails of mass peaks (Field evaporation energy loss spectroscopy, Communications Physics 6,
+    2023).
 
     The sequence is drawn by the residence-time algorithm: the next atom i has the probability k_i / sum(k), and its
     time is exponential with the rate sum(k), which `VoltageControl` steers. Random numbers depend on the seed and the
@@ -148,6 +150,7 @@ class Arrhenius:
         check_choice(self.barrier, "barrier", BARRIERS)
         if self.laser is not None:
             check_kind(self.laser, "laser", Laser, "a Laser or None")
+            check_number(self.temperature, "temperature", above=0, unit="K", why="the far side stays at it")
         check_bonds(self.bonds)
 
     @property

@@ -6,11 +6,13 @@ from typing import Any
 
 from apt_evap._common.validation import check_count, check_number
 from apt_evap._core.elementary import exponential, logarithm
+from apt_evap.units import BOLTZMANN
 
 _STEP = 1e-6  # relative, for the slope of the rate: 1e-3 of what changes the rate by a factor of e at 20 K
 _LARGEST_STEP = 0.05  # relative change of the voltage in one step of Newton's method
 _ITERATIONS = 8  # of Newton's method; 1 to 3 suffice but on the first layers of an ideal tip
 _CLOSE = 1e-3  # of the logarithm of the rate: far below its changes by single events
+_LARGEST_SLOPE = 3.0  # [kT/(C x)]: barriers without a slope at x = 1 have none for an atom that is about to leave there
 _BISECTIONS = 60  # from six decades to the rounding of float64
 
 
@@ -97,10 +99,13 @@ class RateControl:
         Wanted rate, and gain.
     pulse_length : float
         Time per pulse with the rate of its top [s]; 0 without pulses.
+    softness : float
+        kT / (C x) at the working point.
     """
 
-    def __init__(self, control: VoltageControl, pulse_length: float) -> None:
+    def __init__(self, control: VoltageControl, pulse_length: float, softness: float) -> None:
         self.control, self.pulse_length = control, pulse_length
+        self._largest_slope = _LARGEST_SLOPE * softness
         self.rate = control.rate / (pulse_length or 1.0)
         self._slope = math.nan  # dlnV/dlnK at the last relaxation
 
@@ -108,7 +113,10 @@ class RateControl:
     def of(cls, law: Any, tip: Any, control: VoltageControl | None) -> "RateControl":
         """Return the control for a law on a specimen; by default the usual one of the law."""
         control = law.default_control() if control is None else control
-        return cls(control, law.working_point(float(law.sensitivities(tip)[0]), control)[1])
+        sensitivity = float(law.sensitivities(tip)[0])
+        barrier, pulse_length = law.working_point(sensitivity, control)
+        thermal = BOLTZMANN * law.peak_temperature / sensitivity
+        return cls(control, pulse_length, thermal / max(1.0 - barrier * thermal, 0.3))
 
     def begin(self, core: Any) -> None:
         """Pass the wanted rate to the events."""
@@ -151,7 +159,7 @@ class RateControl:
         if math.isnan(self._slope) and not restored and core.start.n_removed == 0:
             factor = self._solve(core, n_threads)
         logs = self._logs(core, factor, n_threads)
-        self._slope = _STEP / max(logs[0] - logs[1], 1e-12)
+        self._slope = min(_STEP / max(logs[0] - logs[1], 1e-12), self._largest_slope)
 
     def _logs(self, core, factor, n_threads):
         """Logarithm of the rate at a slightly higher voltage, and at this one, which remains set."""
@@ -167,7 +175,12 @@ class RateControl:
                 low = middle
             else:
                 high = middle
-        return float(exponential(0.5 * (low + high)))
+        if abs(self._log_rate(core, float(exponential(middle)), n_threads) - goal) > 0.1:
+            raise ValueError(
+                f"no voltage gives the rate of {self.control.rate:g} of the control: at this temperature atoms leave "
+                "faster or slower at any field; choose another rate, temperature or barrier"
+            )
+        return float(exponential(middle))
 
     def _log_rate(self, core, factor, n_threads):
         core.voltage_factor = factor

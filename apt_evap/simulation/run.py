@@ -545,7 +545,7 @@ class Run:
             check_kind(detector, "detector", Detector, "a Detector or an Instrument")
             if perturbation is not None or seed is not None:
                 raise ValueError("perturbation and seed are for an Instrument, got a Detector")
-            return replace(self, detector=detector, settings=self.settings | {"detector": vars(detector)})
+            return self._at_distance(detector.distance / self.detector.distance, detector)
         if self.units is None:
             raise ValueError(
                 "this run is not in real units, so it has no voltages, times and pulses that an instrument could "
@@ -557,6 +557,17 @@ class Run:
         hits = plane.hits(self.first_perturbation if perturbation is None else perturbation)
         hits = replace(hits, extra=hits.extra | {"species": self.species})
         return detector.hits(hits, self.detector.distance, seed=self.seed if seed is None else check_seed(seed))
+
+    def _at_distance(self, ratio, detector):
+        """The run on a detector at `ratio` times the distance: outside the field, the time is proportional to it."""
+        flown, responses = self.flown, self.responses
+        if ratio != 1.0:
+            flown = tuple(Flown(each.directions, each.times * ratio) for each in flown)
+            if responses is not None:
+                factors = np.array([1.0, 1.0, ratio], np.float32)[:, None]  # directions and time
+                responses = Responses(responses.site * factors, responses.rolled * factors, responses.residuals * ratio)
+        settings = self.settings | {"detector": vars(detector)}
+        return replace(self, detector=detector, settings=settings, flown=flown, responses=responses)
 
     def summary(self) -> dict[str, Any]:
         """Counts, dict: ions, outcomes of the first perturbation, ions that cannot roll up, flagged ions."""

@@ -205,6 +205,23 @@ CASES = [
         },
     ),
     (ae.PostIonisation, {}, {"field_scale": POSITIVE}),
+    (
+        ae.ring_statistics,
+        {"map": grid, "projection": ae.Projection(10.0, centre=(10.0, 10.0))},
+        {
+            "map": [*OBJECT, None],
+            "projection": [*OBJECT, None],
+            "pole": [*VECTOR, (0, 0, 0)],
+            "rings": [3, [(1.0,)], [(5.0, 2.0)], [(0.0, 99.0)], [(NAN, 3.0)]],
+            "fold": [*COUNT, 0, 7],
+            "sectors": [*COUNT, 0, 1, 10**6],
+        },
+    ),
+    (
+        ae.radial_densities,
+        {"map": grid, "projection": ae.Projection(10.0, centre=(10.0, 10.0))},
+        {"map": [*OBJECT, None], "projection": [*OBJECT, None], "radii": [3, "x", [1.0], [2.0, 1.0], [NAN, 1.0]]},
+    ),
     (ae.charge_state_ratio_map, {"element": "Ni"}, {"hits": [*OBJECT, None]}),
     (ae.charge_state_ratio_course, {"element": "Ni"}, {"hits": [*OBJECT, None]}),
     (
@@ -224,7 +241,7 @@ CASES = [
             "field_of_view": [*POSITIVE, 1e9],
             "projection": WORD,
             "efficiency": [*POSITIVE, 1.1],
-            **dict.fromkeys(("dead_time", "dead_zone", "resolution"), [*NUMBER, -0.1]),
+            **{name: [*NUMBER, -0.1] for name in ("dead_time", "dead_zone", "resolution")},
             "quantisation": [value for value in VECTOR if value is not None] + [(0.0, 1.0), (1.0, -1.0)],
             "timing": [*OBJECT, dict],
             "flight_path": [value for value in POSITIVE if value is not None],
@@ -447,7 +464,8 @@ CASES = [
         {"hits": hits, "atomic_volume": 0.011, "distance": 100.0, "evaporation_field": 35.0},
         {
             "hits": [*OBJECT, None],
-            **dict.fromkeys(("atomic_volume", "distance", "evaporation_field", "field_factor", "compression"), POSITIVE),
+            **dict.fromkeys(("atomic_volume", "distance", "evaporation_field"), POSITIVE),
+            **dict.fromkeys(("field_factor", "compression"), POSITIVE),
             "efficiency": [*POSITIVE, 1.1],
             "protocol": WORD,
             "projection": WORD,
@@ -647,7 +665,7 @@ def test_every_public_name_with_arguments_is_in_the_table():
     taken |= {"Ending", "RunInterrupted", "RunNotSaved"}  # made by the package
     taken |= {"FileError", "TruncatedFile", "Outcome", "Run", "plot", "__version__"}  # made by the package
     taken |= {"Reconstruction", "ReconstructionErrors", "DistributionMap"}  # made by the package
-    taken |= {"chunks", "Study", "ZoneLine", "History", "CapHistory", "Batch"}  # in test_chunks; made by the package
+    taken |= {"chunks", "Study", "ZoneLine", "History", "CapHistory", "Batch", "Ring"}  # in test_chunks; made by the package
     taken |= {name for name in ae.__all__ if name.endswith("Warning")}
     missing = {name for name in ae.__all__ if name not in taken and getattr(ae, name) not in tried}
     assert not missing

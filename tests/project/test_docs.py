@@ -201,6 +201,13 @@ def test_figure_7_evaporates_to_one_depth(folder, monkeypatch):
     assert [len(ae.load(folder / f"figure7_R{radius}a.h5")) for radius in (6, 4)] == [54, 16]
 
 
+def test_temperatures_are_compared(folder, monkeypatch, capsys):
+    run_figure("temperature.py", monkeypatch, "--radius", "8", "--ions", "1500", "--temperatures", "300")
+    lines = capsys.readouterr().out.splitlines()
+    assert [line[:18] for line in lines[-2:]] == ["300 K, unperturbed", "300 K, roll-up    "]
+    assert len(re.findall(r"\d\.\d\d ± \d\.\d\d", lines[-1])) == 3
+
+
 def test_commands_of_the_readme():
     """Its first command runs a file that is there; its second installs all that pytest is told to use."""
     (name,) = re.findall(r"^ +pip install \. && apt-evap run (\S+)$", README.read_text(), re.MULTILINE)

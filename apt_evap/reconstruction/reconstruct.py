@@ -1,0 +1,362 @@
+"""Reconstruction: positions of the ions in the specimen from their hits and their sequence.
+
+Every ion leaves the surface of a spherical cap that recedes along the axis. Its angle on the cap follows from its
+distance from the centre of the detector, and its depth from the volume of all ions before it.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from apt_evap._common.types import AnyPath, Floats
+from apt_evap._common.validation import (
+    check_array,
+    check_choice,
+    check_count,
+    check_kind,
+    check_number,
+    short_text,
+)
+from apt_evap.detection.hits import Hits
+from apt_evap.io.formats import write
+from apt_evap.reconstruction.choices import PROJECTIONS, PROTOCOLS
+from apt_evap.reconstruction.errors import FREE, ReconstructionErrors, errors_of, true_sites
+from apt_evap.simulation.run import Run
+
+_RIGHT_ANGLE = math.pi / 2
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Reconstruction:
+    """Reconstructed ions, in the order of the hits.
+
+    Parameters
+    ----------
+    positions : ndarray
+        x, y and depth z [nm], shape (n, 3). The depth increases during the measurement. It is 0 at the apex of the
+        first ion.
+    hits : Hits
+        The ions: those that hit the detector within its radius.
+    radii : ndarray
+        Radius of the cap at the evaporation of each ion [nm], shape (n,).
+    settings : mapping
+        Protocol, projection and constants of the reconstruction.
+    """
+
+    positions: Floats
+    hits: Hits
+    radii: Floats
+    settings: Mapping[str, Any]
+
+    @property
+    def angles(self) -> Floats:
+        """Polar angle of each ion on the cap [degrees], shape (n,)."""
+        lateral = np.hypot(self.positions[:, 0], self.positions[:, 1])
+        return np.degrees(np.arcsin(np.minimum(lateral / self.radii, 1.0)))
+
+    @property
+    def depths(self) -> Floats:
+        """Depth of the apex at the evaporation of each ion [nm], shape (n,)."""
+        x, y, z = self.positions.T
+        return z - self.radii + np.sqrt(np.maximum(self.radii**2 - x * x - y * y, 0.0))
+
+    def to_hits(self) -> Hits:
+        """The ions with the reconstructed positions in place of others.
+
+        Returns
+        -------
+        Hits
+        """
+        return replace(self.hits, positions=self.positions)
+
+    def write(self, path: AnyPath, **options: Any) -> None:
+        """Write the reconstructed ions to a file.
+
+        Parameters
+        ----------
+        path : str or path-like
+            The file, .pos, .epos, .xyz or .vtp.
+        **options
+            As for `write`.
+        """
+        write(path, self.to_hits(), **options)
+
+    def errors(self, truth: "Run | ArrayLike | None" = None, fit: Sequence[str] = FREE) -> ReconstructionErrors:
+        """Errors of the positions, compared with the true sites of the ions.
+
+        Parameters
+        ----------
+        truth : Run or array_like, optional
+            The run that the hits belong to, or the sites of the ions [nm], shape (n, 3), with z along the axis of the
+            specimen and out of it. By default the positions of simulated hits, which are their sites.
+        fit : sequence of str
+            Free constants that are fitted by least squares before the comparison: "shift", "rotation" about the axis,
+            "lateral_scale" and "depth_scale".
+
+        Returns
+        -------
+        ReconstructionErrors
+
+        Raises
+        ------
+        ValueError
+            If there are no true sites, or too few ions.
+        """
+        return errors_of(self.positions, self.angles, true_sites(self.hits, truth), fit)
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def __repr__(self) -> str:
+        extents = " x ".join(f"{extent:.1f}" for extent in np.ptp(self.positions, axis=0))
+        low, high = self.radii.min(), self.radii.max()
+        radius = f"R {low:.1f} nm" if low == high else f"R {low:.1f} to {high:.1f} nm"
+        constants = self.settings
+        names = ("field_factor", "evaporation_field", "initial_radius", "shank_angle", "compression", "efficiency")
+        listed = ", ".join(f"{name} {constants[name]:g}" for name in names if constants.get(name) is not None)
+        protocol = f"{constants['protocol']}, {constants['projection']}, {radius} ({constants['radius']})"
+        return f"<Reconstruction: {len(self):,} ions, {extents} nm, {protocol}; {listed}>"
+
+
+def reconstruct(
+    hits: Hits,
+    *,
+    atomic_volume: float,
+    distance: float,
+    protocol: str = "cap",
+    projection: str = "bas",
+    radius: str | float | ArrayLike = "voltage",
+    evaporation_field: float | None = None,
+    field_factor: float = 3.3,
+    compression: float = 1.5,
+    efficiency: float = 1.0,
+    detector_radius: float | None = None,
+    area: float | None = None,
+    initial_radius: float | None = None,
+    shank_angle: float | None = None,
+    smoothing: int = 1,
+) -> Reconstruction:
+    r"""Reconstruct the positions of ions from their hits.
+
+    Parameters
+    ----------
+    hits : Hits
+        Ions in the sequence of evaporation, simulated or measured. Ions that did not hit the detector are left out.
+    atomic_volume : float
+        Mean volume per ion in the specimen [nm^3].
+    distance : float
+        Flight length [mm]; of an instrument with a reflectron the virtual one.
+    protocol : str
+        Depth increment: "cap", exact for a spherical cap, or "bas", with the area of the detector.
+    projection : str
+        Angle on the cap: "bas", "equidistant" or "compressed", see the notes.
+    radius : str, float or array_like
+        Radius of the cap: "voltage", from the voltage of each ion; "shank", from the volume and the angle of the shank;
+        or radii [nm], a number or one for each of the hits.
+    evaporation_field : float, optional
+        F [V/nm], for ``radius="voltage"``.
+    field_factor : float
+        k_f in V = k_f F R, for ``radius="voltage"``.
+    compression : float
+        Image compression xi.
+    efficiency : float
+        Fraction of the ions that the detector detects.
+    detector_radius : float, optional
+        Radius of the circular field of view [mm]. Ions outside it are left out. By default the largest distance of an
+        ion from the centre.
+    area : float, optional
+        Area of the detector [mm^2] in place of `detector_radius`, for a detector that is not circular. No ion is left
+        out.
+    initial_radius : float, optional
+        Radius of the cap at the first ion [nm], for ``radius="shank"``.
+    shank_angle : float, optional
+        Half the opening angle of the shank [degrees], for ``radius="shank"``.
+    smoothing : int
+        Number of ions, up to each ion, over which the voltage is averaged.
+
+    Returns
+    -------
+    Reconstruction
+
+    Raises
+    ------
+    ValueError
+        If a constant that the choices need is missing, an argument is out of range, a column is missing, or no ion hit
+        the detector.
+
+    Notes
+    -----
+    The voltage of an ion is the sum of the standing voltage and the voltage pulse, if there is one: it leaves at the
+    top of the pulse. For field factors of the standing voltage alone, use `dataclasses.replace` with
+    ``pulse_voltage=None``.
+
+    With the distance rho of an ion from the centre of the detector, the flight length L and
+    :math:`\tan\theta' = \rho/L`, the angle on the cap is
+
+    * bas: :math:`\theta = \theta' + \arcsin((\xi-1)\sin\theta')`, a projection from a point behind the centre of the
+      cap;
+    * equidistant: :math:`\theta = \xi\rho/L` (De Geuser and Gault, Microsc. Microanal. 23, 238 (2017));
+    * compressed: :math:`\theta = \xi\theta'`, as in `Projection` and `image_compression`.
+
+    The position is :math:`R\sin\theta` from the axis, at the depth :math:`z + R(1-\cos\theta)`, where z is the depth
+    of the apex. With the volume Omega of an atom, the efficiency eta and the angle :math:`\theta_m` at the rim of the
+    field of view, the volume of the ions equals the volume that the cap sweeps:
+
+    .. math:: \Omega/\eta = \pi R^2 \, [\sin^2\theta_m \, dz - (1-\cos\theta_m)^2 \, dR]   \quad \text{(cap)}
+
+    with the mean of :math:`R^2` between both ions. Bas et al., Appl. Surf. Sci. 87/88, 298 (1995) and Gault et al.,
+    Ultramicroscopy 111, 448 (2011) use the area A of the detector:
+    :math:`\Omega/\eta = A \xi^2 R^2 dz / L^2`. On a shank of half angle alpha,
+    :math:`dR = dz \sin\alpha/(1-\sin\alpha)`.
+    """
+    check_kind(hits, "hits", Hits, "Hits, such as read(path) or run.hits(perturbation)")
+    check_choice(protocol, "protocol", PROTOCOLS)
+    check_choice(projection, "projection", PROJECTIONS)
+    volume = check_number(atomic_volume, "atomic_volume", above=0, unit="nm^3")
+    distance = check_number(distance, "distance", above=0, unit="mm")
+    compression = check_number(compression, "compression", above=0)
+    efficiency = check_number(efficiency, "efficiency", above=0, at_most=1)
+    if detector_radius is not None and area is not None:
+        raise ValueError(f"detector_radius and area exclude each other, got {detector_radius} mm and {area} mm^2")
+    needs: dict[str, dict[str, Any]] = {
+        "voltage": {"evaporation_field": evaporation_field},
+        "shank": {"initial_radius": initial_radius, "shank_angle": shank_angle},
+    }
+    mode = check_choice(radius, "radius", tuple(needs)) if isinstance(radius, str) else "given"
+    radii = _given_radii(radius, len(hits)) if mode == "given" else np.empty(0)
+    for wanted, constants in needs.items():
+        for name, value in constants.items():
+            if wanted == mode and value is None:
+                raise ValueError(f'radius="{mode}" needs {" and ".join(constants)}, got {name}=None')
+            if wanted != mode and value is not None:
+                raise ValueError(f'{name} is for radius="{wanted}", got {name}={short_text(value)} and {mode} radii')
+
+    x, y = (column.astype(np.float64) for column in hits.require("x", "y"))
+    rho = np.hypot(x, y)
+    chosen = hits.detected
+    if detector_radius is not None:
+        detector_radius = check_number(detector_radius, "detector_radius", above=0, unit="mm")
+        with np.errstate(invalid="ignore"):
+            chosen &= rho <= detector_radius
+    if not chosen.any():
+        where = "" if detector_radius is None else f" within the detector_radius, got {detector_radius:g} mm"
+        raise ValueError(f"nothing to reconstruct: none of the {len(hits):,} ions hit the detector{where}")
+    selection = hits if chosen.all() else hits[chosen]
+    x, y, rho = x[chosen], y[chosen], rho[chosen]
+    if area is not None:
+        rim = math.sqrt(check_number(area, "area", above=0, unit="mm^2") / math.pi)
+    else:
+        rim = float(rho.max()) if detector_radius is None else detector_radius
+    if rim == 0:
+        raise ValueError("all ions hit the centre of the detector: detector_radius or area is needed, got neither")
+    angles = _cap_angles(rho / distance, projection, compression)
+    rim_angle = float(_cap_angles(np.array(rim / distance), projection, compression))
+    widest = max(rim_angle, float(angles.max()))
+    if not widest < _RIGHT_ANGLE:
+        raise ValueError(
+            f"all angles on the cap must be < 90 degrees, got {math.degrees(widest):.0f} degrees at the rim: "
+            "reduce detector_radius or compression"
+        )
+
+    if protocol == "bas":
+        swept, widening = math.pi * (compression * rim / distance) ** 2, 0.0
+    else:
+        swept, widening = math.pi * math.sin(rim_angle) ** 2, math.pi * (1 - math.cos(rim_angle)) ** 2
+    per_ion = volume / efficiency
+    if mode == "voltage":
+        field = check_number(evaporation_field, "evaporation_field", above=0, unit="V/nm")
+        field_factor = check_number(field_factor, "field_factor", above=0)
+        radii = _trailing_mean(_voltages(selection), check_count(smoothing, "smoothing", at_least=1))
+        radii /= field_factor * field
+    elif mode == "shank":
+        start = check_number(initial_radius, "initial_radius", above=0, unit="nm")
+        sine = math.sin(math.radians(check_number(shank_angle, "shank_angle", at_least=0, below=45, unit="degrees")))
+        slope = sine / (1 - sine)
+        net = swept - slope * widening
+        if net <= 0:
+            raise ValueError(
+                f"the shank must be narrower than the field of view of {math.degrees(rim_angle):.0f} degrees, "
+                f"got shank_angle={shank_angle:g}"
+            )
+        radii = np.cbrt(start**3 + 3 * slope * per_ion / net * np.arange(len(selection)))
+    else:
+        radii = radii[chosen]
+
+    sine_over_rho = np.divide(np.sin(angles), rho, out=np.zeros_like(rho), where=rho > 0)
+    positions = np.empty((len(selection), 3))
+    positions[:, 0] = radii * sine_over_rho * x
+    positions[:, 1] = radii * sine_over_rho * y
+    positions[:, 2] = _apex_depths(radii, per_ion, swept, widening) + radii * (2 * np.sin(angles / 2) ** 2)
+    settings = {
+        "protocol": protocol,
+        "projection": projection,
+        "radius": mode,
+        "compression": compression,
+        "efficiency": efficiency,
+        "atomic_volume": volume,
+        "distance": distance,
+        "field_of_view": rim,
+    }
+    settings |= {name: float(value) for name, value in needs.get(mode, {}).items()}
+    if mode == "voltage":
+        settings |= {"field_factor": field_factor, "smoothing": smoothing}
+    return Reconstruction(positions, selection, radii, MappingProxyType(settings))
+
+
+def _cap_angles(ratios, projection, compression):
+    """Angles on the cap [rad] for distances on the detector divided by the flight length."""
+    if projection == "equidistant":
+        return compression * ratios
+    straight = np.arctan(ratios)
+    if projection == "compressed":
+        return compression * straight
+    sine = (compression - 1) * np.sin(straight)
+    return straight + np.arcsin(np.clip(sine, -1.0, 1.0)) + np.where(np.abs(sine) > 1, _RIGHT_ANGLE, 0.0)
+
+
+def _voltages(hits):
+    """Standing voltage plus pulse of each ion [V]."""
+    (voltages,) = hits.require("voltage")
+    voltages = voltages.astype(np.float64)
+    if hits.pulse_voltage is not None:
+        voltages += hits.pulse_voltage
+    wrong = np.flatnonzero(~(np.isfinite(voltages) & (voltages > 0)))
+    if len(wrong):
+        raise ValueError(
+            f"the voltage of every ion must be finite and > 0, got {voltages[wrong[0]]:g} V for ion {wrong[0]}"
+        )
+    return voltages
+
+
+def _trailing_mean(values, n):
+    """Mean over the last n values up to each one, over fewer at the beginning."""
+    if n == 1:
+        return values
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    last = np.arange(1, len(values) + 1)
+    first = np.maximum(last - n, 0)
+    return (sums[last] - sums[first]) / (last - first)
+
+
+def _given_radii(radius, n):
+    """Validated radii of the user, shape (n,)."""
+    radii = np.full(n, check_number(radius, "radius", above=0, unit="nm")) if np.ndim(radius) == 0 else None
+    if radii is None:
+        radii = check_array(radius, "radius", (n,))
+        if radii.min() <= 0:
+            raise ValueError(f"radius must be > 0 nm, got {radii.min():g}")
+    return radii
+
+
+def _apex_depths(radii, volume, swept, widening):
+    """Depth of the apex at each ion [nm]: volume = <R^2> (swept dz - widening dR) between two ions."""
+    before, after = radii[:-1], radii[1:]
+    squares = (before * before + before * after + after * after) / 3  # exact for dR proportional to dz
+    depths = np.zeros(len(radii))
+    np.cumsum((volume / squares + widening * (after - before)) / swept, out=depths[1:])
+    return depths

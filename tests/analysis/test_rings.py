@@ -1,0 +1,111 @@
+"""Rings about a pole: known contrasts are found, noise and gradients are not."""
+
+import numpy as np
+import pytest
+
+import apt_evap as ae
+
+PLANE = ae.Projection(100.0, compression=1.0)
+POLE = np.array([0.3, -0.1, 1.0])
+
+
+def hits_of(directions):
+    return ae.Hits(**dict(zip("xy", PLANE.places(directions).T, strict=True)))
+
+
+def about(pole, angle, azimuth):
+    """Directions at an angle and an azimuth [rad] about a pole, counted as by the statistic."""
+    pole = pole / np.linalg.norm(pole)
+    first = np.eye(3)[np.abs(pole).argmin()]
+    first = first - pole * (first @ pole)
+    first /= np.linalg.norm(first)
+    second = np.cross(pole, first)
+    return np.cos(angle)[:, None] * pole + np.sin(angle)[:, None] * (
+        np.cos(azimuth)[:, None] * first + np.sin(azimuth)[:, None] * second
+    )
+
+
+def simulated(rng, n, amplitude, fold=3, gradient=0.0, pole=POLE):
+    """Directions of uniform density times 1 + a cos(fold azimuth) within 30 degrees, and a gradient."""
+    angle = np.arccos(rng.uniform(np.cos(np.radians(30)), 1, 3 * n))
+    azimuth = rng.uniform(0, 2 * np.pi, 3 * n)
+    density = (1 + amplitude * np.cos(fold * azimuth)) * (1 + gradient * np.cos(azimuth - 0.3))
+    keep = rng.uniform(0, (1 + amplitude) * (1 + gradient), 3 * n) < density
+    return about(pole, angle[keep][:n], azimuth[keep][:n])
+
+
+def counted(directions, bins=300):
+    half = 110.0
+    return hits_of(directions).map(
+        bins, extent=(-half, half, -half, half), quantum=None, mask=np.ones((bins, bins), bool)
+    )
+
+
+@pytest.mark.parametrize("gradient", [0.0, 0.5])
+def test_the_contrast_of_a_cosine_is_found(rng, gradient):
+    map = counted(simulated(rng, 300_000, 0.4, gradient=gradient))
+    for ring in ae.ring_statistics(map, PLANE, POLE, fold=3):
+        # a / sqrt(2), less 1 % by the width of a sector; a product with a gradient adds cos(2 a), cos(4 a): 0.1 a
+        expected = 0.4 / np.sqrt(2)
+        assert ring.contrast == pytest.approx(expected, abs=3 * ring.error + 0.012 + 0.1 * 0.4 * gradient)
+        assert ring.error < 0.02
+        assert ring.minimum == pytest.approx(0.6, abs=0.1) and ring.maximum == pytest.approx(1.4, abs=0.1)
+
+
+def test_noise_is_no_contrast(rng):
+    """200 maps without lines: the contrast is 0 within its error, where the uncorrected one is 0.14."""
+    found, raw = [], []
+    for _ in range(20):
+        (ring,) = ae.ring_statistics(counted(simulated(rng, 30_000, 0.0)), PLANE, POLE, [(9, 14)], fold=3)
+        found.append(ring.contrast)
+        raw.append(np.std(ring.profile))
+    n = ring.ions / 24
+    assert np.mean(raw) == pytest.approx(np.sqrt(1 / n), rel=0.15)  # 20 standard deviations of 24 values
+    assert np.mean(np.square(found)) < 0.5 / n  # half of the squared noise, as negative variances count as 0
+
+
+def test_the_error_is_that_of_new_counts(rng):
+    rings = [
+        ae.ring_statistics(counted(simulated(rng, 40_000, 0.5)), PLANE, POLE, [(9, 20)], fold=3)[0] for _ in range(25)
+    ]
+    scatter = np.std([ring.contrast for ring in rings], ddof=1)
+    assert np.mean([ring.error for ring in rings]) == pytest.approx(scatter, rel=0.5)  # 25 values: 14 %
+
+
+def test_densities_and_counts_agree(rng):
+    map = counted(simulated(rng, 200_000, 0.3))
+    x, y = np.meshgrid(*map.centres)
+    density = ae.DetectorMap.from_array(map.values.astype(float) * 0.37 + 0.0, map.x_edges, map.y_edges)
+    one, two = (ae.ring_statistics(each, PLANE, POLE, [(5, 14)], fold=3)[0] for each in (map, density))
+    # densities weigh the bins by their solid angle, counts do not; bins of 0.7 mm vary by 3 % within a sector
+    assert two.profile == pytest.approx(one.profile, abs=0.03)
+    assert np.isnan(two.error) and np.isnan(two.ions) and x.shape == y.shape
+
+
+def test_symmetric_sectors_are_averaged(rng):
+    """A line in one of three symmetric places keeps a third of its height."""
+    directions = np.concatenate(
+        [simulated(rng, 200_000, 0.0), about(POLE, np.radians(rng.uniform(9, 14, 3000)), np.full(3000, 2.6))]
+    )
+    once, thrice = (ae.ring_statistics(counted(directions), PLANE, POLE, [(9, 14)], fold=fold)[0] for fold in (1, 3))
+    assert len(once.profile) == 72 and len(thrice.profile) == 24
+    assert thrice.maximum - 1 == pytest.approx((once.maximum - 1) / 3, rel=0.25)
+
+
+def test_radial_densities(rng):
+    """Twice the density within 3 degrees."""
+    inside = about(POLE, np.arccos(rng.uniform(np.cos(np.radians(3)), 1, 4000)), rng.uniform(0, 2 * np.pi, 4000))
+    area = 1 - np.cos(np.radians([3, 30]))
+    uniform = simulated(rng, int(4000 * area[1] / area[0]), 0.0)
+    map = counted(np.concatenate([uniform, inside]), bins=500)
+    found = ae.radial_densities(map, PLANE, POLE, (0, 2, 3.5, 6))
+    mean = 1 + area[0] / (1 - np.cos(np.radians(16)))
+    assert found[0] == pytest.approx(2 / mean, rel=0.06)  # 1,800 ions: 2.4 %
+    assert found[2] == pytest.approx(1 / mean, rel=0.06)
+    assert 1 / mean < found[1] < 2 / mean
+
+
+def test_rings_off_the_map_are_refused(rng):
+    map = counted(simulated(rng, 1000, 0.0))
+    with pytest.raises(ValueError, match="70 to 80 degrees has too few bins"):
+        ae.ring_statistics(map, PLANE, POLE, [(70, 80)])

@@ -1,0 +1,242 @@
+"""Reconstruction of hits whose cap is known: closed forms, volumes, thinning, and files."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import apt_evap as ae
+
+DISTANCE = 90.0  # mm
+RIM = 38.0  # mm
+VOLUME = 0.0166  # nm^3 per atom, of aluminium
+XI, FIELD, FACTOR = 1.6, 19.0, 3.3
+KNOWN = {"atomic_volume": VOLUME, "distance": DISTANCE, "compression": XI, "detector_radius": RIM}
+SHANK = KNOWN | {"radius": "shank", "initial_radius": 30.0, "shank_angle": 6.0}
+SLOPE = math.sin(math.radians(6.0)) / (1 - math.sin(math.radians(6.0)))
+
+
+def angle_of(rho, projection="bas"):
+    """Angle on the cap by the geometry of each projection, of a point by a ray from behind the centre."""
+    if projection == "equidistant":
+        return XI * rho / DISTANCE
+    straight = np.arctan2(rho, DISTANCE)
+    if projection == "compressed":
+        return XI * straight
+    # intersection of the ray from (0, -(xi - 1)) with the circle of radius 1 about (0, 0)
+    sine, cosine = np.sin(straight), np.cos(straight)
+    along = (XI - 1) * cosine + np.sqrt(1 - ((XI - 1) * sine) ** 2)
+    return np.arctan2(along * sine, along * cosine - (XI - 1))
+
+
+def hit_of(theta, projection="bas"):
+    """Distance on the detector [mm], the inverse of `angle_of`."""
+    if projection == "equidistant":
+        return DISTANCE * theta / XI
+    if projection == "compressed":
+        return DISTANCE * np.tan(theta / XI)
+    return DISTANCE * np.sin(theta) / (XI - 1 + np.cos(theta))
+
+
+def cap_points(rng, n, rim_angle, slope=0.0):
+    """Angles on a receding cap, as dense as it recedes there: cos(theta) - slope (1 - cos(theta)); and azimuths."""
+    cosine = np.linspace(1, math.cos(rim_angle), 2001)
+    swept = (1 - cosine**2) - slope * (1 - cosine) ** 2
+    return np.arccos(np.interp(rng.random(n) * swept[-1], swept, cosine)), 2 * np.pi * rng.random(n)
+
+
+def hits_of(theta, azimuth, projection="bas", **columns):
+    rho = hit_of(theta, projection)
+    return ae.Hits(x=rho * np.cos(azimuth), y=rho * np.sin(azimuth), **columns)
+
+
+@pytest.fixture
+def cone(rng):
+    """Hits of 40,000 ions of a cone of 6 degrees."""
+    return hits_of(*cap_points(rng, 40_000, float(angle_of(RIM)), SLOPE))
+
+
+@pytest.mark.parametrize("projection", ["bas", "equidistant", "compressed"])
+def test_a_perfect_projector_is_inverted(rng, projection):
+    radius, n = 30.0, 5000
+    rim = float(angle_of(RIM, projection))
+    theta, azimuth = cap_points(rng, n, rim)
+    # a cap of constant radius sweeps the cross-section of its rim
+    depth = np.arange(n) * VOLUME / (math.pi * (radius * math.sin(rim)) ** 2)
+    x, y = (radius * np.sin(theta) * part(azimuth) for part in (np.cos, np.sin))
+    sites = np.column_stack([x, y, depth + radius * (1 - np.cos(theta))])
+    hits = hits_of(theta, azimuth, projection)
+    result = ae.reconstruct(hits, **KNOWN, projection=projection, radius=radius)
+    assert np.abs(result.positions - sites).max() < 1e-9 * radius  # rounding; seen: 1e-14 R
+    assert np.degrees(theta) == pytest.approx(result.angles, abs=1e-5)  # arcsin near 90 degrees loses half the digits
+    assert depth == pytest.approx(result.depths, abs=1e-9)
+    errors = result.errors(sites * [1, 1, -1])
+    assert max(errors.lateral_rms, errors.depth_rms) < 1e-9 * radius
+    wrong = ae.reconstruct(hits, **KNOWN | {"compression": 1.5}, projection=projection, radius=radius)
+    assert wrong.errors(sites * [1, 1, -1], fit=()).lateral_rms > 0.01 * radius
+
+
+def test_the_volume_of_the_ions_is_that_of_the_cap(cone):
+    result = ae.reconstruct(cone, **SHANK, efficiency=0.1)
+    rim, last = float(angle_of(RIM)), result.radii[-1]
+    # the rim moves along a cone: frustum between the two rims, plus the cap above the first, minus that above the last
+    rims = [radius * math.sin(rim) for radius in (30.0, last)]
+    height = result.depths[-1] + (last - 30.0) * (1 - math.cos(rim))
+    frustum = math.pi / 3 * height * (rims[0] ** 2 + rims[0] * rims[1] + rims[1] ** 2)
+    caps = [math.pi / 3 * radius**3 * (1 - math.cos(rim)) ** 2 * (2 + math.cos(rim)) for radius in (30.0, last)]
+    assert frustum + caps[0] - caps[1] == pytest.approx((len(cone) - 1) * VOLUME / 0.1, rel=1e-9)  # rounding
+    # and the ions fill it evenly: a box inside has its share, with the scatter of a count
+    x, y, z = result.positions.T
+    box = (np.abs(x) < 8) & (np.abs(y) < 8) & (z > 3) & (z < 5)
+    expected = 16 * 16 * 2 * 0.1 / VOLUME
+    assert result.depths[-1] > 5 and (30 - math.sqrt(30**2 - 2 * 8**2)) < 3
+    assert np.count_nonzero(box) == pytest.approx(expected, abs=4 * math.sqrt(expected))
+
+
+def test_the_plane_area_makes_the_depth_too_small(cone):
+    """With a constant radius, by the ratio of both areas: (xi tan(theta') / sin(theta))^2."""
+    exact, plane = (
+        ae.reconstruct(cone, **KNOWN, radius=30.0, protocol=protocol).depths[-1] for protocol in ("cap", "bas")
+    )
+    ratio = (XI * RIM / DISTANCE / math.sin(float(angle_of(RIM)))) ** 2
+    assert exact / plane == pytest.approx(ratio, rel=1e-9)
+    assert ratio > 1.1
+    by_area = ae.reconstruct(cone, **KNOWN | {"detector_radius": None}, area=math.pi * RIM**2, radius=30.0)
+    assert by_area.depths[-1] == pytest.approx(exact, rel=1e-9)
+
+
+def test_bas_is_the_formula_of_the_papers(cone):
+    """dz = Omega L^2 k_f^2 F^2 / (eta A xi^2 V^2), with voltages that rise slowly."""
+    voltage = np.linspace(2000.0, 2500.0, len(cone))
+    hits = ae.Hits(x=cone.x, y=cone.y, voltage=voltage)
+    result = ae.reconstruct(hits, **KNOWN, protocol="bas", evaporation_field=FIELD, efficiency=0.57)
+    area = math.pi * RIM**2
+    steps = VOLUME * (DISTANCE * FACTOR * FIELD) ** 2 / (0.57 * area * (XI * voltage) ** 2)
+    # the mean of two neighbouring R^2 here, the first one there: a relative dR / R of 6e-6
+    assert result.depths[-1] == pytest.approx(steps[:-1].sum(), rel=2e-5)
+    assert result.radii == pytest.approx(voltage / (FACTOR * FIELD))
+
+
+def test_an_efficiency_changes_the_depth_only(cone):
+    whole = ae.reconstruct(cone, **KNOWN, radius=30.0)
+    scaled = ae.reconstruct(cone, **KNOWN, radius=30.0, efficiency=0.4)
+    assert np.array_equal(scaled.positions[:, :2], whole.positions[:, :2])
+    assert scaled.depths * 0.4 == pytest.approx(whole.depths, abs=1e-9)
+    third = ae.reconstruct(cone[::3], **KNOWN, radius=30.0, efficiency=1 / 3)
+    assert third.positions == pytest.approx(whole.positions[::3], abs=1e-9)
+
+
+def test_a_random_third_of_the_ions(cone, rng):
+    whole = ae.reconstruct(cone, **SHANK)
+    chosen = rng.random(len(cone)) < 1 / 3
+    third = ae.reconstruct(cone[chosen], **SHANK, efficiency=1 / 3)
+    # the number of ions before each is a binomial count: at most sqrt(n (1 - eta) / eta) ions of the depth, four times
+    scatter = 4 * math.sqrt(len(cone) * 2) * whole.depths[-1] / len(cone)
+    assert np.abs(third.depths - whole.depths[chosen]).max() < scatter
+    assert np.abs(third.radii / whole.radii[chosen] - 1).max() < SLOPE * scatter / 30
+
+
+@pytest.mark.parametrize("protocol", ["cap", "bas"])
+def test_the_voltage_of_a_cone_gives_the_shank(cone, protocol):
+    shank = ae.reconstruct(cone, **SHANK, protocol=protocol)
+    # the same cone ion by ion, the volume of a thin slice at a time
+    rim = float(angle_of(RIM))
+    area = math.sin(rim) ** 2 - SLOPE * (1 - math.cos(rim)) ** 2
+    area = math.pi * (area if protocol == "cap" else (XI * RIM / DISTANCE) ** 2)
+    radii = [30.0]
+    for _ in range(len(cone) - 1):
+        radii.append(radii[-1] + SLOPE * VOLUME / (area * radii[-1] ** 2))
+    voltages = FACTOR * FIELD * np.array(radii)
+    hits = ae.Hits(x=cone.x, y=cone.y, voltage=voltages / 1.2, pulse_voltage=voltages / 6)
+    by_voltage = ae.reconstruct(hits, **KNOWN, evaporation_field=FIELD, protocol=protocol)
+    # thin slices are exact to dR / R per ion: 1e-6; 0.5 % of the depth is what a reconstruction needs
+    assert by_voltage.radii == pytest.approx(shank.radii, rel=1e-5)
+    assert by_voltage.depths[-1] == pytest.approx(shank.depths[-1], rel=1e-5)
+    assert np.abs(by_voltage.positions - shank.positions).max() < 0.005 * shank.depths[-1]
+    assert shank.radii[-1] - shank.radii[0] == pytest.approx(SLOPE * shank.depths[-1])
+
+
+def test_radii_of_the_user_and_the_mean_of_the_voltage(cone):
+    cone = cone[:3000]
+    radii = np.linspace(30.0, 31.0, len(cone))
+    given = ae.reconstruct(cone, **KNOWN, radius=radii)
+    hits = ae.Hits(x=cone.x, y=cone.y, voltage=FACTOR * FIELD * radii)
+    assert ae.reconstruct(hits, **KNOWN, evaporation_field=FIELD).positions == pytest.approx(given.positions)
+    smoothed = ae.reconstruct(hits, **KNOWN, evaporation_field=FIELD, smoothing=101).radii
+    assert smoothed[1000:] == pytest.approx(radii[950:-50])  # the mean of a line over 101 is 50 ions late
+    assert smoothed[2] == pytest.approx(radii[:3].mean())
+
+
+def test_ions_outside_and_ions_that_missed_are_left_out(cone):
+    cone = cone[:1000]
+    outcome = np.zeros(1000, int)
+    outcome[5] = 1
+    hits = ae.Hits(x=cone.x, y=cone.y, ion=np.arange(1000), outcome=outcome)
+    result = ae.reconstruct(hits, **KNOWN | {"detector_radius": 20.0}, radius=np.linspace(30, 31, 1000))
+    inside = np.hypot(cone.x, cone.y) <= 20
+    inside[5] = False
+    assert np.array_equal(result.hits.ion, np.flatnonzero(inside))
+    assert np.array_equal(result.radii, np.linspace(30, 31, 1000)[inside])
+
+
+def test_the_centre_and_a_wide_field_of_view():
+    hits = ae.Hits(x=[0.0, 3.0], y=[0.0, 4.0])
+    result = ae.reconstruct(hits, atomic_volume=VOLUME, distance=DISTANCE, radius=30.0)
+    assert np.array_equal(result.positions[0], [0, 0, 0])
+    assert result.settings["field_of_view"] == 5.0
+    for compression, distance in ((1.5, 2.0), (8.0, 5.0)):
+        with pytest.raises(ValueError, match="all angles on the cap must be < 90 degrees, got"):
+            ae.reconstruct(hits, atomic_volume=VOLUME, distance=distance, compression=compression, radius=30.0)
+    with pytest.raises(ValueError, match="detector_radius or area is needed"):
+        ae.reconstruct(hits[:1], atomic_volume=VOLUME, distance=DISTANCE, radius=30.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({}, 'radius="voltage" needs evaporation_field, got evaporation_field=None'),
+        ({"radius": "shank", "shank_angle": 3.0}, 'radius="shank" needs initial_radius and shank_angle, got init'),
+        (
+            {"radius": 30.0, "shank_angle": 3.0},
+            'shank_angle is for radius="shank", got shank_angle=3.0 and given radii',
+        ),
+        ({"evaporation_field": FIELD}, "has no column 'voltage'"),
+        ({"radius": 30.0, "area": 50.0}, "detector_radius and area exclude each other, got 38.0 mm and 50.0 mm^2"),
+        (
+            {"distance": 35.0, "radius": "shank", "initial_radius": 9.0, "shank_angle": 44.0},
+            "the shank must be narrower than the field",
+        ),
+    ],
+)
+def test_choices_that_do_not_fit_together(cone, options, sentence):
+    with pytest.raises(ValueError, match=sentence.replace("(", r"\(").replace("^", r"\^")):
+        ae.reconstruct(cone[:100], **KNOWN | options)
+
+
+def test_voltages_that_are_none(cone):
+    hits = ae.Hits(x=cone.x[:3], y=cone.y[:3], voltage=[2e3, 0.0, 2e3], pulse_voltage=[4e2, 0.0, 4e2])
+    with pytest.raises(ValueError, match="the voltage of every ion must be finite and > 0, got 0 V for ion 1"):
+        ae.reconstruct(hits, **KNOWN, evaporation_field=FIELD)
+
+
+def test_files_of_a_reconstruction(cone, tmp_path):
+    cone = cone[:500]
+    hits = ae.Hits(x=cone.x, y=cone.y, mass_to_charge=np.full(500, 27.0), positions=np.zeros((500, 3)))
+    hits = replace(hits, pulse_id=np.arange(500))
+    result = ae.reconstruct(hits, **SHANK)
+    assert not result.hits.positions.any()
+    assert np.array_equal(result.to_hits().positions, result.positions)
+    for suffix in (".pos", ".epos"):
+        result.write(tmp_path / f"a{suffix}")
+        ions = ae.read(tmp_path / f"a{suffix}")
+        assert np.array_equal(ions.positions, result.positions.astype(np.float32))
+        assert (ions.mass_to_charge == 27.0).all()
+    result.write(tmp_path / "a.xyz", species="Al")
+    result.write(tmp_path / "a.vtp")
+    assert (tmp_path / "a.xyz").read_text().startswith("500\n")
+    assert repr(result).startswith("<Reconstruction: 500 ions, ") and "cap, bas, R 30.0 to 30.0 nm (shank)" in repr(
+        result
+    )
+    with pytest.raises(TypeError):
+        result.settings["efficiency"] = 2.0
