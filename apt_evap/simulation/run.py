@@ -376,7 +376,7 @@ class Run:
         ----------
         field_reference : {"cap", "site"}
             "cap": the mean field of the cap is the operating field. Literature evaporation fields are such means, as
-            they are determined as V / (k_f R). "site": the field at the evaporating atom, which is 1.5 to 1.6 times
+            they are determined as V / (k_f R). "site": the field at the evaporating atom, which is about 1.4 times
             higher, is the operating field.
         operating_field : float, optional
             Operating field of the host [V/nm]. By default its evaporation field; for a law with a temperature, the

@@ -1,7 +1,5 @@
 """Evaporation at a temperature: rates, the sequence drawn from them, its times, and the control of the voltage."""
 
-import warnings
-
 import numpy as np
 import pytest
 from scipy import stats
