@@ -106,7 +106,8 @@ def test_the_example_is_the_simulation_of_the_readme():
     assert (config.n_ions, config.voltage, config.seed, config.output) == (15_000, 1000.0, 1, "ni111.h5")
     assert config.detector == Detector(100.0, 300.0) and config.responses and config.emissions == ()
     drawn = [panel.perturbation for panel in config.maps.panels]
-    assert drawn == [Unperturbed(), RollUp(TruncatedNormal(0.155, 0.155))]
+    assert drawn == [Unperturbed(), RollUp(TruncatedNormal(0.1, 0.1))]
+    assert config.real_units["field_reference"] == "cap" and config.real_units["flight_charges"] == {"Ni": 2}
 
 
 def test_a_file_builds_the_same_simulation_as_python(tmp_path):
