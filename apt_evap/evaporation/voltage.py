@@ -96,7 +96,7 @@ class RateControl:
     Parameters
     ----------
     control : VoltageControl
-        Wanted rate, and gain.
+        Wanted rate, and memory.
     pulse_length : float
         Time per pulse with the rate of its top [s]; 0 without pulses.
     softness : float

@@ -306,7 +306,9 @@ class Run:
             times = times * np.sqrt(self.energy_scales * masses)
         x, y, times, outcome = self.detector.impacts(directions, times)
         if self.real is None:
-            columns = {"voltage": self.voltages, "mass_to_charge": emissions.masses / emissions.charge_states}
+            # of the flights, also if a control had another one for the events
+            columns = {"voltage": np.full(len(self), self.voltage)}
+            columns["mass_to_charge"] = emissions.masses / emissions.charge_states
             extra = {"charge": self.charges, "field": self.fields}
         else:
             columns = self._measured(times, outcome)
@@ -415,7 +417,8 @@ class Run:
 
         .. math:: V_i = V \, \frac{x \, F_\mathrm{evap}}{F_i}
 
-        with the operating field :math:`x F_\mathrm{evap}`, averaged over the last ions. The path depends on
+        with the operating field :math:`x F_\mathrm{evap}`, averaged over the last ions. Evaporation fields are those of
+        the species, also for a law with bonds. The path depends on
         :math:`E_\perp / (n V)` only, and the time of flight is proportional to :math:`\sqrt{m / (n V)}`.
         """
         check_choice(field_reference, "field_reference", REFERENCES)
