@@ -264,3 +264,16 @@ def test_another_distance_changes_the_times(tip12):
         assert two.time_of_flight == pytest.approx(one.time_of_flight, rel=1e-5, nan_ok=True)
         assert two.x == pytest.approx(one.x, abs=1e-3, nan_ok=True)
     assert moved.responses.residuals == pytest.approx(near.responses.residuals, abs=1e-5)
+
+
+def test_hits_carry_the_voltage_of_their_flights(tip12):
+    """The control of a temperature has its own voltage for the events; the ions of a run as simulated fly at 1000 V."""
+    run = ae.Simulation(tip12, seed=3, n_threads=1, law=ae.Arrhenius(80.0)).run(
+        60, [ae.Unperturbed()], responses=False, progress=False
+    )
+    assert (run.hits(ae.Unperturbed()).voltage == 1000.0).all() and (run.voltages < 200).all()
+    real = run.at_evaporation_field("site", smoothing=1)
+    assert real.voltages == pytest.approx(run.voltages, rel=1e-12)
+    hits, total = real.hits(ae.Unperturbed()), real.voltages
+    slower = run.hits(ae.Unperturbed()).time_of_flight * np.sqrt(1000.0 / (2 * total) * real.real.masses / 58.693)
+    assert hits.time_of_flight == pytest.approx(slower, rel=1e-12, nan_ok=True)
