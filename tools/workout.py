@@ -24,6 +24,12 @@ emitter.deepen()
 emitter.relax(tolerance=1e-7)  # in double precision
 batch = emitter.evaporate(3)
 
+# rates, their sums and the bonds of the neighbours, under a control of the voltage
+law = ae.Arrhenius(80.0, bonds=ae.PairEnergies(second_weight=0.5))
+warm = ae.Simulation(tip, seed=1, n_threads=n_threads, charge_settings=settings, law=law)
+warm = warm.run(ions, responses=False, progress=False)
+assert np.isfinite(warm.clock.waits).all()
+
 # sums with the octree and over all atoms, on several threads
 points = emitter.positions + 0.5 * emitter.normals
 field, potential = emitter.field_at(points), emitter.potential_at(points)
