@@ -233,20 +233,25 @@ def test_the_voltage_is_proportional_to_the_radius(nickel, factor):
 
 @pytest.mark.slow
 def test_the_voltage_follows_the_radius_of_a_cone(nickel):
-    """Evaporation of a cone: V/R is constant within 1 % once the first layers are gone; measured: 49.6 +- 0.2."""
+    """Evaporation of a cone: V = k_f F R within 1 %, once the first layers are gone.
+
+    The specimen in free space becomes shorter, so k_f changes: the table of the theory page has its dependence on the
+    length of the shank. Measured: within 0.6 %; without that, V/R falls by 2 %.
+    """
     size = 10 * nickel.a
     tip = ae.Tip(nickel, size, axis=(1, 1, 1), shank_angle=12.0, shank_length=3 * size, offset_seed=3)
-    caps, ions = [], 0
-    for batch in ae.Emitter(tip).advance(12_000):
+    emitter, rows, ions = ae.Emitter(tip), [], 0
+    for batch in emitter.advance(12_000):
         if batch.cap is not None:
-            caps.append((ions, *batch.cap))
+            rows.append((ions, batch.cap.ratio, batch.cap.radius, emitter.positions[:, 2].max()))
         ions += len(batch)
-    ion, _, ratio, radius = np.array(caps).T
-    late = ion > 6000
-    sections = np.array_split(np.flatnonzero(late), 5)
-    slopes = [np.mean(1.0 / ratio[part]) / np.mean(radius[part]) for part in sections]
-    assert np.ptp(slopes) / np.mean(slopes) < 0.02
-    assert radius[late][-5:].mean() > 1.15 * radius[:5].mean()
+    ion, ratio, radius, top = np.array(rows).T
+    length = (top - radius + 3 * size) / radius  # from the foot to the centre of the cap, in radii
+    factor = np.interp(length, [0.5, 1, 2, 3, 5], [1.20, 1.24, 1.30, 1.35, 1.41])
+    sections = np.array_split(np.flatnonzero(ion > 6000), 5)
+    constants = np.array([np.mean(1 / ratio[part]) / np.mean(factor[part] * radius[part]) for part in sections])
+    assert constants == pytest.approx(constants.mean(), rel=0.01)
+    assert radius[sections[-1]].mean() > 1.15 * radius[:5].mean()
 
 
 def test_another_distance_changes_the_times(tip12):
