@@ -36,10 +36,7 @@ def evaporation_fields(run: Run) -> Floats:
     ndarray
         [V/nm], shape (n,).
     """
-    tip = check_kind(run, "run", Run, "a Run").settings["tip"]
-    # in the order of the species; two of them may have the same name
-    materials = [tip["material"], *(solute for solute, _ in tip["solutes"])] if "material" in tip else tip["elements"]
-    return np.array([material["evaporation_field"] for material in materials])[run.species]
+    return check_kind(run, "run", Run, "a Run").evaporation_fields
 
 
 def evaporation_voltages(run: Run) -> Floats:

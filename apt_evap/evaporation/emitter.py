@@ -258,10 +258,13 @@ class Emitter:
     @property
     def cap(self) -> Cap:
         """Radius and mean field of the cap: see `Cap`."""
-        atoms = self.atoms
-        chosen = self.tip.evaporable[atoms]
-        evaporation_fields = self.tip.evaporation_fields[self.tip.species[atoms[chosen]]]
-        return measure_cap(self.positions[chosen], self.normals[chosen], self.fields[chosen], evaporation_fields)
+        core = self._core
+        slots = core.slots
+        slots = slots[self.tip.evaporable[core.tree.atoms[slots]]]
+        evaporation_fields = self.tip.evaporation_fields[self.tip.species[core.tree.atoms[slots]]]
+        return measure_cap(
+            core.tree.positions[slots], core.slot_normals[slots], core.slot_fields[slots], evaporation_fields
+        )
 
     @property
     def bonds(self) -> Integers:

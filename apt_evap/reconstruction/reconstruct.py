@@ -26,6 +26,7 @@ from apt_evap.detection.hits import Hits
 from apt_evap.io.formats import write
 from apt_evap.reconstruction.choices import PROJECTIONS, PROTOCOLS
 from apt_evap.reconstruction.errors import FREE, ReconstructionErrors, errors_of, true_sites
+from apt_evap.simulation.real_units import trailing_mean
 from apt_evap.simulation.run import Run
 
 _RIGHT_ANGLE = math.pi / 2
@@ -271,7 +272,7 @@ def reconstruct(
     if mode == "voltage":
         field = check_number(evaporation_field, "evaporation_field", above=0, unit="V/nm")
         field_factor = check_number(field_factor, "field_factor", above=0)
-        radii = _trailing_mean(_voltages(selection), check_count(smoothing, "smoothing", at_least=1))
+        radii = trailing_mean(_voltages(selection), check_count(smoothing, "smoothing", at_least=1))
         radii /= field_factor * field
     elif mode == "shank":
         start = check_number(initial_radius, "initial_radius", above=0, unit="nm")
@@ -331,16 +332,6 @@ def _voltages(hits):
             f"the voltage of every ion must be finite and > 0, got {voltages[wrong[0]]:g} V for ion {wrong[0]}"
         )
     return voltages
-
-
-def _trailing_mean(values, n):
-    """Mean over the last n values up to each one, over fewer at the beginning."""
-    if n == 1:
-        return values
-    sums = np.concatenate([[0.0], np.cumsum(values)])
-    last = np.arange(1, len(values) + 1)
-    first = np.maximum(last - n, 0)
-    return (sums[last] - sums[first]) / (last - first)
 
 
 def _given_radii(radius, n):

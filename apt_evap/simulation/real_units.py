@@ -109,6 +109,8 @@ def random_of(seed: int, ions: Integers) -> Floats:
 
 def trailing_mean(values: Floats, n: int) -> Floats:
     """Mean of each value and its n - 1 predecessors; of all predecessors for the first ones."""
+    if n == 1:
+        return values
     total = np.concatenate([[0.0], np.cumsum(values)])
     end = np.arange(1, len(values) + 1)
     begin = np.maximum(end - n, 0)
