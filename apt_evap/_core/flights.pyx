@@ -14,9 +14,12 @@ from libc.stdlib cimport free, malloc
 
 import numpy as np
 
+from apt_evap._core.far_field cimport SAMPLES, FarField
 from apt_evap._core.journal cimport Journal
 from apt_evap._core.octree cimport Octree
-from apt_evap._core.sources cimport Sources, sources_field, sources_free, sources_init
+from apt_evap._core.sources cimport (
+    SingleSources, Sources, single_field, single_free, sources_field, sources_free, sources_init,
+)
 
 cdef extern from "elementary.h":
     double inverse_seventh_root(double) noexcept nogil
@@ -33,10 +36,13 @@ cdef extern from *:
 
 cdef enum:
     STAGES = 9
+    FEWEST = 6           # flights of a bundle from which an expansion of the field costs less than sums for each flight
     ION_LEFT = 0
     ION_NEVER_LEFT = 1   # also the value during the flight
 
 LEFT, NEVER_LEFT = ION_LEFT, ION_NEVER_LEFT
+
+cdef double FAR = 4.5  # distance in radii of the ball of a step from which sources are expanded
 
 cdef double[9] NODE = [0.0, 1 / 20.0, 1 / 10.0, 3 / 10.0, 1 / 2.0, 7 / 10.0, 9 / 10.0, 1.0, 1.0]
 cdef double[81] STAGE = [
@@ -82,7 +88,8 @@ cdef class Flights:
     reach : float
         Distance at which a flight ends; the ion then continues in a straight line [nm].
     opening_angle : float
-        Largest full angle of a cell that replaces its atoms [rad]; 0 sums over all atoms.
+        Largest full angle of a cell that replaces its atoms [rad]; the sums are then in single precision, relative to a
+        point near the ions. 0 sums over all atoms in double precision.
     tolerance : float
         Error of a step, of the position relative to the path and of the velocity.
     max_steps : int
@@ -92,17 +99,23 @@ cdef class Flights:
     cdef Octree tree
     cdef long n_replayed
     cdef Sources sources
+    cdef SingleSources near, far
+    cdef FarField far_field
+    cdef bint expanded
     cdef double coulomb, length, reach, opening_angle, tolerance
     cdef double[3] centre
     cdef long max_steps
     cdef long room
     cdef double* work          # (STAGES + 3, room, 3): accelerations, then position, velocity, trial position
+    cdef long* flying          # (room,) flights that have not ended
     cdef readonly long n_steps, n_evaluations, n_pairs
 
     def __cinit__(self, *args, **kwargs):
         self.work = NULL
+        self.flying = NULL
         self.room = 0
         sources_init(&self.sources)
+        self.near.atoms = self.near.cells = self.far.atoms = self.far.cells = NULL
 
     def __init__(self, Octree tree, *, double coulomb, double length, centre, double reach, double opening_angle,
                  double tolerance, long max_steps):
@@ -110,11 +123,15 @@ cdef class Flights:
         self.opening_angle, self.tolerance, self.max_steps = opening_angle, tolerance, max_steps
         self.centre[0], self.centre[1], self.centre[2] = centre
         self.n_steps = self.n_evaluations = self.n_pairs = 0
+        self.far_field = FarField((0.0, 0.0, 0.0), 1.0)
         self.begin(tree)
 
     def __dealloc__(self):
         sources_free(&self.sources)
+        single_free(&self.near)
+        single_free(&self.far)
         free(self.work)
+        free(self.flying)
 
     def begin(self, Octree tree):
         """Copy the surface before the first event of a journal."""
@@ -184,9 +201,11 @@ cdef class Flights:
         cdef int stage, k, axis
         if m > self.room:
             free(self.work)
+            free(self.flying)
             self.room = m
             self.work = <double*>malloc((STAGES + 3) * 3 * m * sizeof(double))
-            if self.work == NULL:
+            self.flying = <long*>malloc(m * sizeof(long))
+            if self.work == NULL or self.flying == NULL:
                 with gil:
                     raise MemoryError
         a, x = self.work, self.work + STAGES * 3 * m
@@ -208,8 +227,7 @@ cdef class Flights:
         for steps in range(self.max_steps):
             dt = min(dt, self.time_to_reach(m, x, v, outcome))
             self.gather(m, x, v, a, outcome, dt)
-            self.evaluate(m, x, a, outcome)
-            for stage in range(1, STAGES):
+            for stage in range(1, STAGES):   # the last stage of a step is the first of the next one
                 for i in range(m):
                     if outcome[i] == ION_NEVER_LEFT:
                         for axis in range(3):
@@ -302,6 +320,8 @@ cdef class Flights:
                     double dt) except -1 nogil:
         # Collects the sources for a ball that contains all flights until the end of the step.
         cdef double cx = 0.0, cy = 0.0, cz = 0.0, radius = 0.0, dx, dy, dz
+        cdef double[3] origin, point
+        cdef double[3 * SAMPLES] samples
         cdef long i, n = 0
         for i in range(m):
             if outcome[i] == ION_NEVER_LEFT:
@@ -320,17 +340,41 @@ cdef class Flights:
                 dy += dt * (v[3 * i + 1] + 0.5 * dt * a[3 * i + 1])
                 dz += dt * (v[3 * i + 2] + 0.5 * dt * a[3 * i + 2])
                 radius = max(radius, dx * dx + dy * dy + dz * dz)
-        self.tree.collect(cx, cy, cz, sqrt(radius), self.opening_angle, &self.sources)
+        radius = sqrt(radius)
+        if self.opening_angle == 0.0:
+            self.tree.collect(cx, cy, cz, radius, self.opening_angle, &self.sources)
+            return 0
+        self.expanded = n >= FEWEST and radius > 1e-3 * self.length
+        origin[0], origin[1], origin[2] = cx, cy, cz
+        self.tree.collect_single(origin, radius, self.opening_angle, FAR * radius if self.expanded else INFINITY,
+                                 &self.sources, &self.near, &self.far)
+        if self.expanded:
+            self.far_field.centre[0], self.far_field.centre[1], self.far_field.centre[2] = cx, cy, cz
+            self.far_field.radius = 1.05 * radius   # a stage may lie a little outside
+            for i in range(SAMPLES):
+                self.far_field.point(i, point)
+                single_field(&self.far, point[0], point[1], point[2], samples + 3 * i)
+            self.far_field.expand(samples)
+            self.n_pairs += SAMPLES * (self.far.n_atoms + self.far.n_cells)
         return 0
 
     cdef void evaluate(self, long m, const double* x, double* a, const signed char* outcome) noexcept nogil:
         # Accelerations [V/nm] of the unfinished flights.
-        cdef long i
+        cdef long i, n = 0
         cdef int axis
         for i in range(m):
             if outcome[i] == ION_NEVER_LEFT:
-                sources_field(&self.sources, x[3 * i], x[3 * i + 1], x[3 * i + 2], a + 3 * i)
-                for axis in range(3):
-                    a[3 * i + axis] *= self.coulomb
-                self.n_evaluations += 1
-                self.n_pairs += self.sources.n_atoms + self.sources.n_cells
+                if self.opening_angle > 0.0:
+                    single_field(&self.near, x[3 * i], x[3 * i + 1], x[3 * i + 2], a + 3 * i)
+                    self.n_pairs += self.near.n_atoms + self.near.n_cells
+                else:
+                    sources_field(&self.sources, x[3 * i], x[3 * i + 1], x[3 * i + 2], a + 3 * i)
+                    self.n_pairs += self.sources.n_atoms + self.sources.n_cells
+                self.flying[n] = i
+                n += 1
+        if self.opening_angle > 0.0 and self.expanded:
+            self.far_field.add(n, x, self.flying, a)
+        for i in range(n):
+            for axis in range(3):
+                a[3 * self.flying[i] + axis] *= self.coulomb
+        self.n_evaluations += n

@@ -1,6 +1,6 @@
 """The octree's memory, for the other compiled modules."""
 
-from apt_evap._core.sources cimport Sources
+from apt_evap._core.sources cimport SingleSources, Sources
 
 
 cdef class Octree:
@@ -29,10 +29,13 @@ cdef class Octree:
     cdef long put_in(self, long long atom, double px, double py, double pz, int leaf) noexcept nogil
     cdef void refresh(self) noexcept nogil
     cdef void moments(self, long node) noexcept nogil
+    cdef int walk(self, double cx, double cy, double cz, double radius, double opening_angle,
+                  Sources* sources) except -1 nogil
     cdef int collect(self, double cx, double cy, double cz, double radius, double opening_angle,
                      Sources* sources) except -1 nogil
+    cdef int collect_single(self, const double* centre, double radius, double opening_angle, double far_radius,
+                            Sources* sources, SingleSources* near, SingleSources* far) except -1 nogil
     cdef long within(self, double px, double py, double pz, double radius, int* slots, long most) noexcept nogil
     cdef void mark(self, long node) noexcept nogil
-    cdef void add_atom(self, long k, Sources* sources) noexcept nogil
     cdef int field_at(self, double px, double py, double pz, double opening_angle, double* field) except -1 nogil
     cdef double potential_at(self, double px, double py, double pz, double opening_angle) except? -1 nogil

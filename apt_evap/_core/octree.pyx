@@ -10,7 +10,8 @@ from cython.parallel cimport prange
 from libc.math cimport sqrt
 
 from apt_evap._core.sources cimport (
-    CELL, LANES, Sources, sources_field, sources_free, sources_grow, sources_init, sources_potential,
+    CELL, LANES, SAME_PLACE, SingleSources, Sources, single_pad, single_room, sources_field, sources_free, sources_grow,
+    sources_init, sources_potential,
 )
 
 import numpy as np
@@ -238,22 +239,20 @@ cdef class Octree:
 
     # ---- walks -----------------------------------------------------------------------------------------------------
 
-    cdef int collect(self, double cx, double cy, double cz, double radius, double opening_angle,
-                     Sources* sources) except -1 nogil:
-        # Collects all sources for the targets in a ball: a cell if its ball appears under less than the opening angle
-        # from every point of the ball of the targets, otherwise its atoms.
-        cdef long node = 0, k, stride, m
-        cdef double dx, dy, dz, distance, factor = 2.0 / opening_angle if opening_angle > 0.0 else 1e30
+    cdef int walk(self, double cx, double cy, double cz, double radius, double opening_angle,
+                  Sources* sources) except -1 nogil:
+        # Lists the sources for the targets in a ball: a cell if its ball appears under less than the opening angle from
+        # every point of the ball of the targets, otherwise its atoms.
+        cdef long node = 0, k
+        cdef double dx, dy, dz, apart, factor = 2.0 / opening_angle if opening_angle > 0.0 else 1e30
         sources.n_atoms = sources.n_cells = 0
         while node < self.n_nodes:
+            if sources.n_cells + LANES >= sources.capacity:
+                sources_grow(sources)
             dx, dy, dz = cx - self.ball[node, 0], cy - self.ball[node, 1], cz - self.ball[node, 2]
-            distance = sqrt(dx * dx + dy * dy + dz * dz)
-            if self.ball[node, 3] * factor + radius < distance:
-                if sources.n_cells + LANES >= sources.capacity:
-                    sources_grow(sources)
-                stride = sources.capacity
-                for m in range(CELL):
-                    sources.cells[m * stride + sources.n_cells] = self.cells[node, m]
+            apart = self.ball[node, 3] * factor + radius
+            if apart * apart < dx * dx + dy * dy + dz * dz:
+                sources.cell[sources.n_cells] = <int>node
                 sources.n_cells += 1
                 node = self.skip[node]
             elif self.skip[node] == node + 1:
@@ -262,26 +261,71 @@ cdef class Octree:
                     if sources.n_atoms >= sources.capacity:
                         sources_grow(sources)
                     if self.atom[k] >= 0:
-                        self.add_atom(k, sources)
+                        sources.atom[sources.n_atoms] = <int>k
+                        sources.n_atoms += 1
                     k = self.following(node, k)
                 node += 1
             else:
                 node += 1
+        return 0
+
+    cdef int collect(self, double cx, double cy, double cz, double radius, double opening_angle,
+                     Sources* sources) except -1 nogil:
+        # Copies the sources of a walk into columns.
+        cdef long k, m, stride
+        cdef int slot
+        self.walk(cx, cy, cz, radius, opening_angle, sources)
         stride = sources.capacity
+        for k in range(sources.n_atoms):
+            slot = sources.atom[k]
+            sources.atoms[k] = self.x[slot]
+            sources.atoms[stride + k] = self.y[slot]
+            sources.atoms[2 * stride + k] = self.z[slot]
+            sources.atoms[3 * stride + k] = self.q[slot]
+        for k in range(sources.n_cells):
+            for m in range(CELL):
+                sources.cells[m * stride + k] = self.cells[sources.cell[k], m]
         while sources.n_cells % LANES:
             for m in range(CELL):
                 sources.cells[m * stride + sources.n_cells] = 0.0
-            sources.cells[sources.n_cells] = cx + 1e6   # an empty cell, distant from every target
+            sources.cells[sources.n_cells] = cx + 4.0 * radius + 1e4   # an empty cell, distant from every target
             sources.n_cells += 1
         return 0
 
-    cdef inline void add_atom(self, long k, Sources* sources) noexcept nogil:
-        cdef long stride = sources.capacity, m = sources.n_atoms
-        sources.atoms[m] = self.x[k]
-        sources.atoms[stride + m] = self.y[k]
-        sources.atoms[2 * stride + m] = self.z[k]
-        sources.atoms[3 * stride + m] = self.q[k]
-        sources.n_atoms = m + 1
+    cdef int collect_single(self, const double* centre, double radius, double opening_angle, double far_radius,
+                            Sources* sources, SingleSources* near, SingleSources* far) except -1 nogil:
+        # Copies the sources of a walk in single precision, relative to the centre: those within a radius, and the others.
+        cdef SingleSources* part
+        cdef double dx, dy, dz
+        cdef const double* cell
+        cdef long k, at
+        cdef int slot, m
+        self.walk(centre[0], centre[1], centre[2], radius, opening_angle, sources)
+        single_room(near, sources.capacity, centre)
+        single_room(far, sources.capacity, centre)
+        for k in range(sources.n_atoms):
+            slot = sources.atom[k]
+            dx, dy, dz = self.x[slot] - centre[0], self.y[slot] - centre[1], self.z[slot] - centre[2]
+            part = near if dx * dx + dy * dy + dz * dz <= far_radius * far_radius else far
+            at = part.n_atoms
+            part.atoms[at], part.atoms[part.capacity + at] = <float>dx, <float>dy
+            part.atoms[2 * part.capacity + at], part.atoms[3 * part.capacity + at] = <float>dz, <float>self.q[slot]
+            part.n_atoms = at + 1
+        for k in range(sources.n_cells):
+            cell = &self.cells[sources.cell[k], 0]
+            dx, dy, dz = cell[0] - centre[0], cell[1] - centre[1], cell[2] - centre[2]
+            if dx * dx + dy * dy + dz * dz <= SAME_PLACE:
+                continue   # a leaf of one atom, which was removed
+            part = near if dx * dx + dy * dy + dz * dz <= far_radius * far_radius else far
+            at = part.n_cells
+            part.cells[at], part.cells[part.capacity + at] = <float>dx, <float>dy
+            part.cells[2 * part.capacity + at] = <float>dz
+            for m in range(3, CELL):
+                part.cells[m * part.capacity + at] = <float>cell[m]
+            part.n_cells = at + 1
+        single_pad(near)
+        single_pad(far)
+        return 0
 
     cdef long within(self, double px, double py, double pz, double radius, int* slots, long most) noexcept nogil:
         # Slots of the atoms within a radius, in the order of the tree; lists up to `most` of them, returns their

@@ -2,10 +2,14 @@
 
 cdef extern from "kernels.h":
     const int CELL
-    const int LANES
+    const int LANES, SINGLE_LANES
+    const double SAME_PLACE
     void point_atoms(long, const double*, const double*, const double*, const double*,
                      double, double, double, double*) noexcept nogil
     void point_cells(long, long, const double*, double, double, double, double*) noexcept nogil
+    void point_atoms_single(long, const float*, const float*, const float*, const float*,
+                            float, float, float, double*) noexcept nogil
+    void point_cells_single(long, long, const float*, float, float, float, double*) noexcept nogil
 
 
 cdef struct Sources:
@@ -13,12 +17,28 @@ cdef struct Sources:
     long n_atoms
     long n_cells
     long capacity        # of each column
+    int* atom            # (capacity,) slots
+    int* cell            # (capacity,) nodes
     double* atoms        # (4, capacity): x y z q
     double* cells        # (CELL, capacity)
+
+
+cdef struct SingleSources:
+    # The same sources in single precision, relative to a point near the targets.
+    double[3] origin
+    long n_atoms         # multiples of SINGLE_LANES, padded with sources without charge
+    long n_cells
+    long capacity
+    float* atoms
+    float* cells
 
 
 cdef int sources_init(Sources* sources) except -1 nogil
 cdef int sources_grow(Sources* sources) except -1 nogil
 cdef void sources_free(Sources* sources) noexcept nogil
 cdef void sources_field(const Sources* sources, double px, double py, double pz, double* field) noexcept nogil
+cdef int single_room(SingleSources* single, long capacity, const double* origin) except -1 nogil
+cdef void single_pad(SingleSources* single) noexcept nogil
+cdef void single_free(SingleSources* single) noexcept nogil
+cdef void single_field(const SingleSources* single, double px, double py, double pz, double* field) noexcept nogil
 cdef double sources_potential(const Sources* sources, double px, double py, double pz) noexcept nogil

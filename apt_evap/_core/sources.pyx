@@ -9,7 +9,9 @@ cdef int sources_init(Sources* sources) except -1 nogil:
     sources.capacity = 4096
     sources.atoms = <double*>malloc(4 * sources.capacity * sizeof(double))
     sources.cells = <double*>malloc(CELL * sources.capacity * sizeof(double))
-    if sources.atoms == NULL or sources.cells == NULL:
+    sources.atom = <int*>malloc(sources.capacity * sizeof(int))
+    sources.cell = <int*>malloc(sources.capacity * sizeof(int))
+    if sources.atoms == NULL or sources.cells == NULL or sources.atom == NULL or sources.cell == NULL:
         with gil:
             raise MemoryError
     return 0
@@ -18,24 +20,24 @@ cdef int sources_init(Sources* sources) except -1 nogil:
 cdef void sources_free(Sources* sources) noexcept nogil:
     free(sources.atoms)
     free(sources.cells)
+    free(sources.atom)
+    free(sources.cell)
     sources.atoms = sources.cells = NULL
+    sources.atom = sources.cell = NULL
 
 
 cdef int sources_grow(Sources* sources) except -1 nogil:
-    # The stride of the columns changes: they are moved to the new memory layout, the last column first.
-    cdef long old = sources.capacity, column, k
-    sources.capacity = 2 * old
-    sources.atoms = <double*>realloc(sources.atoms, 8 * old * sizeof(double))
-    sources.cells = <double*>realloc(sources.cells, 2 * CELL * old * sizeof(double))
-    if sources.atoms == NULL or sources.cells == NULL:
+    # Twice the room; the lists are kept, the columns are not.
+    sources.capacity *= 2
+    sources.atom = <int*>realloc(sources.atom, sources.capacity * sizeof(int))
+    sources.cell = <int*>realloc(sources.cell, sources.capacity * sizeof(int))
+    free(sources.atoms)
+    free(sources.cells)
+    sources.atoms = <double*>malloc(4 * sources.capacity * sizeof(double))
+    sources.cells = <double*>malloc(CELL * sources.capacity * sizeof(double))
+    if sources.atoms == NULL or sources.cells == NULL or sources.atom == NULL or sources.cell == NULL:
         with gil:
             raise MemoryError
-    for column in range(3, 0, -1):
-        for k in range(old - 1, -1, -1):
-            sources.atoms[column * 2 * old + k] = sources.atoms[column * old + k]
-    for column in range(CELL - 1, 0, -1):
-        for k in range(old - 1, -1, -1):
-            sources.cells[column * 2 * old + k] = sources.cells[column * old + k]
     return 0
 
 
@@ -67,3 +69,49 @@ cdef double sources_potential(const Sources* sources, double px, double py, doub
             c[5 * stride] * dx * dy + c[6 * stride] * dx * dz + c[8 * stride] * dy * dz)
         total += sqrt(w2) * (c[3 * stride] + 0.5 * s * w2 * w2)
     return total
+
+
+cdef int single_room(SingleSources* single, long capacity, const double* origin) except -1 nogil:
+    # Removes all sources; room for this many, and for padding. The memory must be NULL at the first call.
+    cdef int axis
+    if single.atoms == NULL or single.capacity < capacity + SINGLE_LANES:
+        single_free(single)
+        single.capacity = capacity + SINGLE_LANES
+        single.atoms = <float*>malloc(4 * single.capacity * sizeof(float))
+        single.cells = <float*>malloc(CELL * single.capacity * sizeof(float))
+        if single.atoms == NULL or single.cells == NULL:
+            with gil:
+                raise MemoryError
+    for axis in range(3):
+        single.origin[axis] = origin[axis]
+    single.n_atoms = single.n_cells = 0
+    return 0
+
+
+cdef void single_pad(SingleSources* single) noexcept nogil:
+    # Sources without charge, up to a multiple of SINGLE_LANES.
+    cdef int axis
+    while single.n_atoms % SINGLE_LANES:
+        for axis in range(4):
+            single.atoms[axis * single.capacity + single.n_atoms] = 1e4 if axis == 0 else 0.0
+        single.n_atoms += 1
+    while single.n_cells % SINGLE_LANES:
+        for axis in range(CELL):
+            single.cells[axis * single.capacity + single.n_cells] = 1e4 if axis == 0 else 0.0
+        single.n_cells += 1
+
+
+cdef void single_free(SingleSources* single) noexcept nogil:
+    free(single.atoms)
+    free(single.cells)
+    single.atoms = single.cells = NULL
+
+
+cdef void single_field(const SingleSources* single, double px, double py, double pz, double* field) noexcept nogil:
+    # Field [e/nm^2] at one point, as `sources_field`.
+    cdef const float* a = single.atoms
+    cdef long stride = single.capacity
+    cdef float x = <float>(px - single.origin[0]), y = <float>(py - single.origin[1]), z = <float>(pz - single.origin[2])
+    field[0] = field[1] = field[2] = 0.0
+    point_atoms_single(single.n_atoms, a, a + stride, a + 2 * stride, a + 3 * stride, x, y, z, field)
+    point_cells_single(single.n_cells, stride, single.cells, x, y, z, field)

@@ -14,7 +14,7 @@ import pytest
 import apt_evap as ae
 from apt_evap.config.simulation_file import read_config
 
-FINGERPRINT = "a5954cb09c169c5a20ec43b766af4c93e432459674bc02dc815433a8100670eb"
+FINGERPRINT = "4efc28fb6e8fe3a8272a351cc3bfcd80a432c16644bcf1c41323950bfe3274be"
 PROGRAM = """
 import warnings
 

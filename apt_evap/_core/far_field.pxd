@@ -1,0 +1,18 @@
+"""Expansion of a field about a ball, for the other compiled modules."""
+
+cdef enum:
+    ORDER = 6                                        # of the potential
+    SAMPLES = 24                                     # points at which the field is summed
+    MONOMIALS = ORDER * (ORDER + 1) * (ORDER + 2) // 6   # of each component of the field, up to degree ORDER - 1
+
+
+cdef class FarField:
+    cdef const double[:, ::1] matrix          # (3 SAMPLES, 3 MONOMIALS)
+    cdef const double[:, ::1] directions      # (SAMPLES, 3)
+    cdef float[3 * MONOMIALS] coefficients
+    cdef double[3] centre
+    cdef double radius
+
+    cdef void point(self, int sample, double* position) noexcept nogil
+    cdef void expand(self, const double* field) noexcept nogil
+    cdef void add(self, long n, const double* positions, const long* which, double* field) noexcept nogil

@@ -1,0 +1,182 @@
+"""Expansion of the field of distant charges about a ball of targets.
+
+The potential of charges outside a ball is harmonic inside. Up to an order, the expansion in harmonic polynomials is
+fitted to the field at points on the surface of the ball (least squares, with a fixed matrix). It then replaces the sums
+over the charges at any number of points inside: a local expansion as in fast multipole methods (Greengard and Rokhlin,
+J. Comput. Phys. 73, 325, 1987), but from sums of any kind of source. The error of a charge at the distance kappa radii
+from the centre decreases as kappa**-ORDER.
+
+Harmonic polynomials of degree l are the real and imaginary parts of (n . r)**l with n = (cos f, sin f, i), for l + 1
+and l values of f.
+"""
+
+import functools
+
+import numpy as np
+
+import apt_evap._core.elementary as elementary
+
+cdef extern from "kernels.h":
+    const int SINGLE_LANES
+    void polynomial_field(int, const float*, const float*, const float*, const float*,
+                          float*, float*, float*) noexcept nogil
+
+N_SAMPLES, POTENTIAL_ORDER = SAMPLES, ORDER
+
+
+def _directions():
+    """Points on the unit sphere along a spiral, shape (SAMPLES, 3)."""
+    number = np.arange(SAMPLES) + 0.5
+    z = 1.0 - 2.0 * number / SAMPLES
+    sine, cosine = elementary.sine_and_cosine(np.pi * (1.0 + np.sqrt(5.0)) * number)
+    radius = np.sqrt(1.0 - z * z)
+    return np.stack([radius * cosine, radius * sine, z], axis=1)
+
+
+def exponents():
+    """Exponents of x, y and z in the order of the coefficients, shape (MONOMIALS, 3)."""
+    return np.array([(i, j, k) for i in range(ORDER) for j in range(ORDER - i) for k in range(ORDER - i - j)])
+
+
+def _basis():
+    """Fields of the harmonic polynomials as coefficients of monomials, shape (harmonics, MONOMIALS, 3)."""
+    place = {tuple(each): number for number, each in enumerate(exponents().tolist())}
+    fields = []
+    for degree in range(1, ORDER + 1):
+        for count, imaginary in ((degree + 1, 0), (degree, 1)):
+            sines, cosines = elementary.sine_and_cosine(np.pi * np.arange(count) / count)
+            for sine, cosine in zip(sines, cosines):
+                # (n . r)**(degree - 1) n, multiplied out
+                power = {(0, 0, 0): (1.0, 0.0)}
+                for _ in range(degree - 1):
+                    new = {}
+                    for (i, j, k), (re, im) in power.items():
+                        for key, add in (
+                            ((i + 1, j, k), (re * cosine, im * cosine)),
+                            ((i, j + 1, k), (re * sine, im * sine)),
+                            ((i, j, k + 1), (-im, re)),
+                        ):
+                            old = new.get(key, (0.0, 0.0))
+                            new[key] = old[0] + add[0], old[1] + add[1]
+                    power = new
+                field = np.zeros((MONOMIALS, 3))
+                for key, (re, im) in power.items():
+                    parts = (re * cosine, im * cosine), (re * sine, im * sine), (-im, re)
+                    field[place[key]] = [part[imaginary] for part in parts]
+                fields.append(field)
+    return np.array(fields)
+
+
+def _product(first, second):
+    """Matrix product in a fixed order of summation: that of BLAS depends on the processor."""
+    return (first[:, None, :] * second.T).sum(axis=-1)
+
+
+def _inverse(matrix):
+    """Pseudo-inverse of a well-conditioned matrix (m, n) with independent columns, by modified Gram-Schmidt; (n, m)."""
+    columns = np.array(matrix.T)   # each column is a row here
+    n = len(columns)
+    upper, inverse = np.zeros((n, n)), np.zeros_like(columns)
+    for k in range(n):
+        upper[k, k] = np.sqrt((columns[k] * columns[k]).sum())
+        columns[k] /= upper[k, k]
+        upper[k, k + 1:] = (columns[k + 1:] * columns[k]).sum(axis=1)
+        columns[k + 1:] -= upper[k, k + 1:, None] * columns[k]
+    for k in range(n - 1, -1, -1):   # upper . inverse = orthogonal columns
+        inverse[k] = (columns[k] - (upper[k, k + 1:, None] * inverse[k + 1:]).sum(axis=0)) / upper[k, k]
+    return inverse
+
+
+@functools.lru_cache
+def _matrix():
+    """Coefficients of the field from its values at the samples, shape (3 SAMPLES, 3 MONOMIALS)."""
+    powers, directions = exponents(), _directions()
+    values = np.ones((SAMPLES, MONOMIALS))
+    for axis in range(3):
+        power = np.ones(SAMPLES)
+        for exponent in range(ORDER):
+            values[:, powers[:, axis] == exponent] *= power[:, None]
+            power = power * directions[:, axis]
+    basis = _basis()
+    by_component = [_product(values, basis[:, :, axis].T) for axis in range(3)]   # (SAMPLES, harmonics)
+    inverse = _inverse(np.stack(by_component, axis=1).reshape(3 * SAMPLES, -1))   # (harmonics, 3 SAMPLES)
+    by_component = [_product(inverse.T, basis[:, :, axis]) for axis in range(3)]  # (3 SAMPLES, MONOMIALS)
+    return np.ascontiguousarray(np.concatenate(by_component, axis=1))
+
+
+cdef class FarField:
+    """Expansion of a field about a ball.
+
+    Parameters
+    ----------
+    centre : array_like, shape (3,)
+        Centre of the ball [nm].
+    radius : float
+        Its radius [nm].
+    """
+
+    def __init__(self, centre, double radius):
+        self.matrix, self.directions = _matrix(), _directions()
+        self.centre[0], self.centre[1], self.centre[2] = centre
+        self.radius = radius
+
+    cdef void point(self, int sample, double* position) noexcept nogil:
+        # One of the points at which `expand` needs the field.
+        cdef int axis
+        for axis in range(3):
+            position[axis] = self.centre[axis] + self.radius * self.directions[sample, axis]
+
+    cdef void expand(self, const double* field) noexcept nogil:
+        # From the field at the samples, (SAMPLES, 3).
+        cdef double[3 * MONOMIALS] total
+        cdef const double* row
+        cdef double value
+        cdef int i, j
+        for j in range(3 * MONOMIALS):
+            total[j] = 0.0
+        for i in range(3 * SAMPLES):
+            row, value = &self.matrix[i, 0], field[i]
+            for j in range(3 * MONOMIALS):
+                total[j] += row[j] * value
+        for j in range(3 * MONOMIALS):
+            self.coefficients[j] = <float>total[j]
+
+    cdef void add(self, long n, const double* positions, const long* which, double* field) noexcept nogil:
+        # Adds the field at the points (., 3) with the indices `which`.
+        cdef float[16] x, y, z, ex, ey, ez
+        cdef double scale = 1.0 / self.radius
+        cdef long first = 0, lane, m, i
+        while first < n:
+            m = min(<long>SINGLE_LANES, n - first)
+            for lane in range(SINGLE_LANES):
+                i = 3 * which[first + min(lane, m - 1)]
+                x[lane] = <float>((positions[i] - self.centre[0]) * scale)
+                y[lane] = <float>((positions[i + 1] - self.centre[1]) * scale)
+                z[lane] = <float>((positions[i + 2] - self.centre[2]) * scale)
+            polynomial_field(ORDER - 1, self.coefficients, x, y, z, ex, ey, ez)
+            for lane in range(m):
+                i = 3 * which[first + lane]
+                field[i] += ex[lane]
+                field[i + 1] += ey[lane]
+                field[i + 2] += ez[lane]
+            first += SINGLE_LANES
+
+    @property
+    def samples(self):
+        """Points at which `fit` needs the field [nm], shape (SAMPLES, 3)."""
+        return np.array(self.centre) + self.radius * np.asarray(self.directions)
+
+    def fit(self, const double[:, ::1] field):
+        """Expand the field that has these values at the samples, shape (SAMPLES, 3)."""
+        if field.shape[0] != SAMPLES or field.shape[1] != 3:
+            raise ValueError(f"field must have shape ({SAMPLES}, 3), got {(field.shape[0], field.shape[1])}")
+        self.expand(&field[0, 0])
+
+    def fields(self, const double[:, ::1] positions):
+        """Field at points in the ball [nm], shape (n, 3)."""
+        cdef long n = positions.shape[0]
+        cdef double[:, ::1] field = np.zeros((n, 3))
+        cdef long[::1] which = np.arange(n)
+        if n:
+            self.add(n, &positions[0, 0], &which[0], &field[0, 0])
+        return np.asarray(field)
