@@ -45,12 +45,14 @@ from .emission.energies import Fixed as Fixed
 from .emission.energies import Thermal as Thermal
 from .emission.energies import TruncatedNormal as TruncatedNormal
 from .emission.ion_random import IonRandom as IonRandom
+from .emission.perturbations import ChargeRatio as ChargeRatio
 from .emission.perturbations import Combined as Combined
 from .emission.perturbations import LateralVelocity as LateralVelocity
 from .emission.perturbations import RollUp as RollUp
 from .emission.perturbations import Unperturbed as Unperturbed
 from .emission.post_ionisation import PostIonisation as PostIonisation
 from .emission.surface_frame import tangent_frame as tangent_frame
+from .emission.surface_frame import target_shares as target_shares
 from .energy_fit.fit_energies import fit_energies as fit_energies
 from .energy_fit.study import Study as Study
 from .evaporation.bonds import TUNGSTEN_TABLE as TUNGSTEN_TABLE
@@ -64,7 +66,8 @@ from .evaporation.thermal import Arrhenius as Arrhenius
 from .evaporation.thermal import Laser as Laser
 from .evaporation.voltage import VoltageControl as VoltageControl
 from .flight.crew import FlightSettings as FlightSettings
-from .flight.response import Design as Design
+from .flight.designs import Design as Design
+from .flight.designs import WideDesign as WideDesign
 from .flight.response import ResponseSettings as ResponseSettings
 from .io.formats import chunks as chunks
 from .io.formats import read as read

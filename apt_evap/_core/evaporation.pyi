@@ -111,6 +111,7 @@ class Evaporation:
         field: NDArray[np.float64],
         normal: NDArray[np.float64],
         neighbour: NDArray[np.int64],
+        neighbour_charge: NDArray[np.float64],
         detached: NDArray[np.int8],
         wait: NDArray[np.float64],
         rise: NDArray[np.float64],

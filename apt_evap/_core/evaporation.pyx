@@ -34,6 +34,7 @@ cdef enum:
     NOT_RELAXED = 1 << 30   # number of events since the last relaxation before the first one
     FEW = 16384             # number of surface atoms up to which one thread is faster than several
     ROOM = 4096             # initial number of slots within the update radius; 18 d_nn of fcc contain about 1,000
+    TARGETS = 3   # neighbours onto which an atom may roll
     STATUS_DONE = 0
     STATUS_SWEEP_DUE = 1
     STATUS_EXHAUSTED = 2
@@ -215,12 +216,15 @@ cdef class Evaporation:
 
     # ---- one event -------------------------------------------------------------------------------------------------
 
-    cdef long strongest_neighbour(self, long atom) noexcept nogil:
-        # The surface nearest neighbour with the highest charge; -1 if there is none.
+    cdef void strongest_neighbours(self, long atom, long long* neighbour, double* charge) noexcept nogil:
+        # The TARGETS surface nearest neighbours with the highest charges, in falling order; -1 if there are fewer.
         cdef int[MAX_NEAR] others
-        cdef int n = self.atoms.near(atom, others), i
-        cdef long best = -1, other
-        cdef double dx, dy, dz
+        cdef int n = self.atoms.near(atom, others), i, k, m
+        cdef long other
+        cdef double dx, dy, dz, q
+        for k in range(TARGETS):
+            neighbour[k] = -1
+            charge[k] = 0.0
         for i in range(n):
             other = others[i]
             dx = self.atoms.positions[other, 0] - self.atoms.positions[atom, 0]
@@ -228,10 +232,13 @@ cdef class Evaporation:
             dz = self.atoms.positions[other, 2] - self.atoms.positions[atom, 2]
             if self.slot_of[other] < 0 or dx * dx + dy * dy + dz * dz > self.bond_length * self.bond_length:
                 continue
-            if best < 0 or self.tree.q[self.slot_of[other]] > self.tree.q[self.slot_of[best]] or (
-                    self.tree.q[self.slot_of[other]] == self.tree.q[self.slot_of[best]] and other < best):
-                best = other
-        return best
+            q = self.tree.q[self.slot_of[other]]
+            for k in range(TARGETS):
+                if neighbour[k] < 0 or q > charge[k] or (q == charge[k] and other < neighbour[k]):
+                    for m in range(TARGETS - 1, k, -1):
+                        neighbour[m], charge[m] = neighbour[m - 1], charge[m - 1]
+                    neighbour[k], charge[k] = other, q
+                    break
 
     cdef void join(self, int slot, double dx, double dy, double dz) noexcept nogil:
         # Add a slot at (dx, dy, dz) from the hole to the patch; its normal may have changed.
@@ -370,8 +377,8 @@ cdef class Evaporation:
         return 0
 
     def evaporate(self, Journal journal, long max_events, long sweep_interval, long long[::1] atom,
-                  double[::1] charge, double[::1] field, double[:, ::1] normal, long long[::1] neighbour,
-                  signed char[::1] detached, double[::1] wait, double[::1] rise):
+                  double[::1] charge, double[::1] field, double[:, ::1] normal, long long[:, ::1] neighbour,
+                  double[:, ::1] neighbour_charge, signed char[::1] detached, double[::1] wait, double[::1] rise):
         """Evaporate up to `max_events` atoms; stops early if a relaxation or deepening is needed, or no atom is left.
 
         Atoms that have lost all chains of bonds to the body leave at once, before the law selects the next atom.
@@ -384,10 +391,10 @@ cdef class Evaporation:
             Maximum number of events.
         sweep_interval : int
             Events after which a relaxation is due.
-        atom, charge, field, normal, neighbour, detached, wait, rise : ndarray, shape (m,), normal (m, 3)
+        atom, charge, field, normal, neighbour, neighbour_charge, detached, wait, rise : ndarray, shape (m,) or (m, 3)
             Filled, for each event, with the evaporated atom, its charge [e], the field just outside before evaporation
-            [V/nm], its normal, its surface nearest neighbour with the highest charge (-1: none), and 1 for an atom that
-            left because it was detached, the time since the previous event [s] (0: a law without a time, or detached), and
+            [V/nm], its normal, its three surface nearest neighbours with the highest charges (-1: fewer), their charges
+            [e], and 1 for an atom that left because it was detached, the time since the previous event [s] (0: a law without a time, or detached), and
             the logarithm of the factor by which the control had increased the rates since the last relaxation.
 
         Returns
@@ -430,7 +437,7 @@ cdef class Evaporation:
                 field[n] = self.field_unit * self.rule.strength(self.tree, best)
                 for axis in range(3):
                     normal[n, axis] = self.normals[best, axis]
-                neighbour[n] = self.strongest_neighbour(leaving)
+                self.strongest_neighbours(leaving, &neighbour[n, 0], &neighbour_charge[n, 0])
                 self.event(leaving, journal)
         return status
 

@@ -1,41 +1,49 @@
-"""Fit and evaluation of polynomials of two velocities, for the responses of ions; sums in a fixed order.
+"""Fit and evaluation of polynomials, for the responses of ions; sums in a fixed order.
 
-The (d + 1)(d + 2)/2 monomials up to degree d are u^(t - j) v^j for t = 0 ... d and j = 0 ... t.
+A monomial is a product of powers of the variables, and is given by its exponents.
 """
 
 import numpy as np
 
 cdef enum:
     MAX_DEGREE = 12
-    MAX_MONOMIALS = (MAX_DEGREE + 1) * (MAX_DEGREE + 2) // 2
+    MAX_VARIABLES = 8
+    MAX_MONOMIALS = 512
 
 HIGHEST_DEGREE = MAX_DEGREE
 
 
-cdef int fill(int degree, double u, double v, double* monomial) noexcept nogil:
-    # All monomials of one velocity; returns their number.
-    cdef double power_u[MAX_DEGREE + 1]
-    cdef double power_v[MAX_DEGREE + 1]
-    cdef int total, j, n = 0
-    power_u[0] = power_v[0] = 1.0
-    for j in range(degree):
-        power_u[j + 1], power_v[j + 1] = power_u[j] * u, power_v[j] * v
-    for total in range(degree + 1):
-        for j in range(total + 1):
-            monomial[n] = power_u[total - j] * power_v[j]
-            n += 1
-    return n
+cdef void fill(const signed char[:, ::1] exponents, const double* variables, double* monomial) noexcept nogil:
+    # All monomials at one point.
+    cdef double power[MAX_VARIABLES * (MAX_DEGREE + 1)]
+    cdef long c, v, d, n_variables = exponents.shape[1]
+    for v in range(n_variables):
+        power[v * (MAX_DEGREE + 1)] = 1.0
+        for d in range(MAX_DEGREE):
+            power[v * (MAX_DEGREE + 1) + d + 1] = power[v * (MAX_DEGREE + 1) + d] * variables[v]
+    for c in range(exponents.shape[0]):
+        monomial[c] = power[exponents[c, 0]]
+        for v in range(1, n_variables):
+            monomial[c] *= power[v * (MAX_DEGREE + 1) + exponents[c, v]]
 
 
-def monomials(int degree, const double[:, ::1] velocities):
-    """Monomials of velocities, shape (n, 2) -> (n, monomials)."""
+def _check(exponents):
+    if exponents.shape[0] > MAX_MONOMIALS or not 1 <= exponents.shape[1] <= MAX_VARIABLES \
+            or np.min(exponents) < 0 or np.max(exponents) > MAX_DEGREE:
+        raise ValueError(
+            f"exponents must be 0 to {MAX_DEGREE}, at most {MAX_MONOMIALS} of {MAX_VARIABLES} variables, got shape "
+            f"{exponents.shape}"
+        )
+
+
+def monomials(const signed char[:, ::1] exponents, const double[:, ::1] variables):
+    """Monomials at points, shapes (c, v) and (n, v) -> (n, c)."""
     cdef long i
-    cdef double[:, ::1] values = np.empty((velocities.shape[0], (degree + 1) * (degree + 2) // 2))
-    if not 0 <= degree <= MAX_DEGREE:
-        raise ValueError(f"degree must be 0 to {MAX_DEGREE}, got {degree}")
+    cdef double[:, ::1] values = np.empty((variables.shape[0], exponents.shape[0]))
+    _check(np.asarray(exponents))
     with nogil:
-        for i in range(velocities.shape[0]):
-            fill(degree, velocities[i, 0], velocities[i, 1], &values[i, 0])
+        for i in range(variables.shape[0]):
+            fill(exponents, &variables[i, 0], &values[i, 0])
     return np.asarray(values)
 
 
@@ -96,17 +104,17 @@ def misfits(const double[:, ::1] matrix, const double[:, :, ::1] coefficients, c
     return np.asarray(sums)
 
 
-def evaluate(int degree, const float[:, :, ::1] coefficients, const double[:, ::1] velocities):
-    """Values of the polynomials of n ions, each at its own velocity.
+def evaluate(const signed char[:, ::1] exponents, const float[:, :, ::1] coefficients, const double[:, ::1] variables):
+    """Values of the polynomials of n ions, each at its own point.
 
     Parameters
     ----------
-    degree : int
-        Degree, at most 12.
+    exponents : ndarray of int8, shape (c, v)
+        Exponents of the monomials.
     coefficients : ndarray of float32, shape (n, 3, c)
         Coefficients of the three quantities of each ion.
-    velocities : ndarray, shape (n, 2)
-        Velocities.
+    variables : ndarray, shape (n, v)
+        Points.
 
     Returns
     -------
@@ -114,18 +122,19 @@ def evaluate(int degree, const float[:, :, ::1] coefficients, const double[:, ::
     """
     cdef double monomial[MAX_MONOMIALS]
     cdef double total
-    cdef long i, n = velocities.shape[0]
-    cdef int k, c, m = (degree + 1) * (degree + 2) // 2
+    cdef long i, n = variables.shape[0]
+    cdef int k, c, m = <int>exponents.shape[0]
     cdef double[:, ::1] values = np.empty((n, 3))
-    if not 0 <= degree <= MAX_DEGREE or coefficients.shape[0] != n or coefficients.shape[1] != 3 \
-            or coefficients.shape[2] != m:
+    _check(np.asarray(exponents))
+    if coefficients.shape[0] != n or coefficients.shape[1] != 3 or coefficients.shape[2] != m \
+            or variables.shape[1] != exponents.shape[1]:
         raise ValueError(
-            f"coefficients of degree {degree} must have shape ({n}, 3, {m}), got "
+            f"coefficients of {m} monomials of {n} ions must have shape ({n}, 3, {m}), got "
             f"{(coefficients.shape[0], coefficients.shape[1], coefficients.shape[2])}"
         )
     with nogil:
         for i in range(n):
-            fill(degree, velocities[i, 0], velocities[i, 1], monomial)
+            fill(exponents, &variables[i, 0], monomial)
             for k in range(3):
                 total = 0.0
                 for c in range(m):

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from apt_evap._common.validation import check_array, check_kind
+from apt_evap.emission.emissions import TangentialLaunches
 from apt_evap.emission.surface_frame import rollup_direction
 from apt_evap.flight.response import Responses
 from apt_evap.simulation.run import Run
@@ -106,6 +107,7 @@ def _places(run, ions, velocities, rolled):
     responses = Responses(*(part[repeats] for part in run.responses))
     first, second = velocities.reshape(-1, 2).T
     starts = np.full(len(repeats), rolled)
-    ends = run.response_model.evaluate(responses, starts, first, second, run.emissions.masses[repeats])
+    launches = TangentialLaunches(starts, first, second)
+    ends = run.response_model.evaluate(responses, launches, run.emissions.masses[repeats])
     x, y, *_ = run.detector.impacts(*ends)
     return x.reshape(shape), y.reshape(shape)

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from apt_evap._common.validation import check_array, check_number
 from apt_evap.units import FLIGHT_TIME
 
 COLUMNS = ("positions", "normals", "neighbours", "charge_states", "masses", "ions")
+TARGET_COLUMNS = ("targets", "charge_ratios")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -31,6 +32,11 @@ class Emissions:
         Number of the ion in the sequence of evaporation, shape (n,).
     nearest_neighbour_distance : float
         [nm].
+    targets : array_like, optional
+        Positions of the three surface nearest neighbours with the highest charges, in falling order [nm], shape
+        (n, 3, 3); NaN if there are fewer. The first are the `neighbours`.
+    charge_ratios : array_like, optional
+        Their charges over that of the atom, shape (n, 3); NaN if there are fewer.
 
     Raises
     ------
@@ -45,6 +51,8 @@ class Emissions:
     masses: np.ndarray
     ions: np.ndarray
     nearest_neighbour_distance: float
+    targets: Any = None
+    charge_ratios: Any = None
 
     def __post_init__(self):
         positions = check_array(self.positions, "positions", ("n", 3))
@@ -59,6 +67,11 @@ class Emissions:
             "ions": check_array(self.ions, "ions", (n,), dtype=np.int64),
             "nearest_neighbour_distance": distance,
         }
+        if (self.targets is None) != (self.charge_ratios is None):
+            raise ValueError("targets and charge_ratios must be given together, got one of them")
+        if self.targets is not None:
+            values["targets"] = check_array(self.targets, "targets", (n, 3, 3), finite=False)
+            values["charge_ratios"] = check_array(self.charge_ratios, "charge_ratios", (n, 3), finite=False)
         deviation = np.abs(np.linalg.norm(values["normals"], axis=1) - 1)
         if n and deviation.max() > 1e-6:
             raise ValueError(f"normals must have length 1, got one that deviates by {deviation.max():.2g}")
@@ -73,14 +86,19 @@ class Emissions:
 
     def __getitem__(self, selection: Any) -> "Emissions":
         """Return selected atoms as `Emissions`; takes a slice, a mask or indices."""
-        columns = {name: getattr(self, name)[selection] for name in COLUMNS}
+        columns = {name: getattr(self, name)[selection] for name in self.columns}
         return Emissions(**columns, nearest_neighbour_distance=self.nearest_neighbour_distance)
 
     @classmethod
     def join(cls, parts: "Sequence[Emissions]") -> "Emissions":
         """Join batches in their order."""
-        columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS}
+        columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in parts[0].columns}
         return cls(**columns, nearest_neighbour_distance=parts[0].nearest_neighbour_distance)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the arrays with one row per atom."""
+        return COLUMNS if self.targets is None else COLUMNS + TARGET_COLUMNS
 
     @property
     def can_roll(self) -> Booleans:
@@ -95,6 +113,21 @@ class Emissions:
     def __repr__(self) -> str:
         lonely = np.count_nonzero(np.isnan(self.neighbours).any(axis=1))
         return f"<Emissions: {len(self):,} atoms, {lonely:,} of them without a neighbour to roll onto>"
+
+
+class TangentialLaunches(NamedTuple):
+    """Launches of n ions along the surface."""
+
+    rolled: Booleans
+    """Whether each ion rolled up, shape (n,)."""
+    first: Floats
+    """Velocities along t1 of `tangent_frame` [nm/ns], shape (n,)."""
+    second: Floats
+    """Velocities along t2, shape (n,)."""
+    shares: Floats | None = None
+    """Shares of the three targets in the place of the roll-up, shape (n, 3), sum 1; by default the first only."""
+    heights: Floats | None = None
+    """Heights of the launches above the usual start [nm], shape (n,); by default 0."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

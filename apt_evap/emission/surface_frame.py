@@ -6,6 +6,7 @@ from numpy.typing import ArrayLike
 from apt_evap._common.small_matrices import products
 from apt_evap._common.types import Booleans, Floats
 from apt_evap._common.validation import check_array
+from apt_evap._core.elementary import exponential
 from apt_evap.emission.emissions import Emissions, Launches
 
 
@@ -38,13 +39,15 @@ def tangent_frame(normals: ArrayLike) -> tuple[Floats, Floats]:
     return first, np.stack([b, sign + y * y * a, -y], axis=1)
 
 
-def rollup_direction(emissions: Emissions) -> tuple[Booleans, Floats, Floats]:
+def rollup_direction(emissions: Emissions, shares: Floats | None = None) -> tuple[Booleans, Floats, Floats]:
     """Ions that can roll up, and the direction of their roll-up.
 
     Parameters
     ----------
     emissions : Emissions
         A batch of n.
+    shares : ndarray, shape (n, 3), optional
+        Shares of the targets, see `target_shares`; by default the strongest one only.
 
     Returns
     -------
@@ -54,7 +57,8 @@ def rollup_direction(emissions: Emissions) -> tuple[Booleans, Floats, Floats]:
         is no neighbour, or if it lies along the normal.
     """
     rolled = np.isfinite(emissions.neighbours).all(axis=1)
-    step = np.where(rolled[:, None], emissions.neighbours - emissions.positions, 0.0)
+    places = emissions.neighbours if shares is None else _mean_targets(emissions, shares[:, None])[:, 0]
+    step = np.where(rolled[:, None], places - emissions.positions, 0.0)
     # the lift d n of the rolled-up position is along the normal and drops out
     along = [products(step, tangent) for tangent in tangent_frame(emissions.normals)]
     length = np.sqrt(along[0] * along[0] + along[1] * along[1])
@@ -79,6 +83,77 @@ def rolled_positions(emissions: Emissions) -> Floats:
     return emissions.neighbours + emissions.nearest_neighbour_distance * emissions.normals
 
 
+def target_shares(emissions: Emissions, sharpness: float) -> Floats:
+    r"""Shares of the three strongest surface nearest neighbours in the place onto which an atom rolls.
+
+    Parameters
+    ----------
+    emissions : Emissions
+        A batch of n, with its targets.
+    sharpness : float
+        :math:`\tau`; 0 for the strongest neighbour only.
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+        0 for missing neighbours; the first is 1 for an atom without any.
+
+    Raises
+    ------
+    ValueError
+        If the emissions have no targets.
+
+    Notes
+    -----
+    .. math:: w_j \propto \exp\left(\frac{q_j / q_1 - 1}{\tau}\right)
+
+    with the charges :math:`q_j` of the neighbours in falling order. Where two of them are nearly equal, an atom moves
+    onto the bridge or hollow between them.
+    """
+    n = len(emissions)
+    shares = np.zeros((n, 3))
+    shares[:, 0] = 1.0
+    if sharpness == 0.0 or n == 0:
+        return shares
+    if emissions.charge_ratios is None:
+        raise ValueError(
+            "a sharpness > 0 needs the targets of the roll-up, which this run does not have: run with "
+            "response_settings=ResponseSettings.wide()"
+        )
+    ratios = emissions.charge_ratios
+    there = np.isfinite(ratios[:, 1:])
+    relative = np.where(there, ratios[:, 1:], 0.0) / np.where(ratios[:, :1] > 0, ratios[:, :1], 1.0)
+    shares[:, 1:] = np.where(there, exponential(np.ascontiguousarray((relative - 1.0) / sharpness)), 0.0)
+    return shares / (shares[:, 0] + shares[:, 1] + shares[:, 2])[:, None]
+
+
+def _mean_targets(emissions, shares):
+    """Weighted means of the targets, shares (n or 1, m, 3) -> (n, m, 3); a missing target is replaced by the first."""
+    targets = np.where(np.isfinite(emissions.targets), emissions.targets, emissions.neighbours[:, None])
+    mean = shares[..., 0, None] * targets[:, None, 0]
+    for k in (1, 2):
+        mean = mean + shares[..., k, None] * targets[:, None, k]
+    return mean
+
+
+def shared_positions(emissions: Emissions, shares: Floats) -> Floats:
+    """Positions one nearest neighbour distance above weighted means of the targets.
+
+    Parameters
+    ----------
+    emissions : Emissions
+        A batch of n, with its targets.
+    shares : ndarray, shape (n or 1, m, 3)
+        Shares of the targets.
+
+    Returns
+    -------
+    ndarray, shape (n, m, 3)
+        Positions [nm]; NaN for an ion without a neighbour.
+    """
+    return _mean_targets(emissions, shares) + (emissions.nearest_neighbour_distance * emissions.normals)[:, None]
+
+
 def along_surface(normals: ArrayLike, first: Floats, second: Floats) -> Floats:
     """Vectors along the surface from their components in the tangent frame.
 
@@ -99,7 +174,14 @@ def along_surface(normals: ArrayLike, first: Floats, second: Floats) -> Floats:
     return first[..., None] * frame[0] + second[..., None] * frame[1]
 
 
-def launch_tangentially(emissions: Emissions, rolled: Booleans, first: Floats, second: Floats) -> Launches:
+def launch_tangentially(
+    emissions: Emissions,
+    rolled: Booleans,
+    first: Floats,
+    second: Floats,
+    shares: Floats | None = None,
+    heights: Floats | None = None,
+) -> Launches:
     """Launches with velocities along the surface.
 
     Parameters
@@ -110,13 +192,19 @@ def launch_tangentially(emissions: Emissions, rolled: Booleans, first: Floats, s
         Whether an ion starts at its rolled-up position, see `rolled_positions`, or at its site, shape (n,).
     first, second : array_like
         Velocity along t1 and t2 of `tangent_frame` [nm/ns], shape (n,).
+    shares, heights : ndarray, optional
+        As in `TangentialLaunches`.
 
     Returns
     -------
     Launches
     """
+    up = rolled_positions(emissions) if shares is None else shared_positions(emissions, shares[:, None])[:, 0]
+    positions = np.where(np.asarray(rolled)[:, None], up, emissions.positions)
+    if heights is not None:
+        positions = positions + np.asarray(heights)[:, None] * emissions.normals
     return Launches(
-        positions=np.where(np.asarray(rolled)[:, None], rolled_positions(emissions), emissions.positions),
+        positions=positions,
         velocities=along_surface(emissions.normals, np.asarray(first), np.asarray(second)),
         rolled=rolled,
     )

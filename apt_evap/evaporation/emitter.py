@@ -52,8 +52,11 @@ class Batch:
         Field just outside the surface before evaporation [V/nm].
     normals : ndarray, shape (n, 3)
         Outward unit normal.
-    neighbour : ndarray of int64, shape (n,)
-        Index of the surface nearest neighbour with the highest charge; -1 if there was none.
+    targets : ndarray of int64, shape (n, 3)
+        Indices of the three surface nearest neighbours with the highest charges, in falling order; -1 if there are
+        fewer. An atom may roll onto them.
+    target_charges : ndarray, shape (n, 3)
+        Their charges [e]; 0 if there are fewer.
     detached : ndarray of bool, shape (n,)
         Atoms that left because they had lost all chains of bonds to the body.
     journal : Journal
@@ -75,7 +78,8 @@ class Batch:
     charges: np.ndarray
     fields: np.ndarray
     normals: np.ndarray
-    neighbour: np.ndarray
+    targets: np.ndarray
+    target_charges: np.ndarray
     detached: np.ndarray
     journal: Journal
     tree: Octree | None
@@ -463,13 +467,24 @@ class Emitter:
         """
         n = check_count(max_events, "max_events", at_least=1, at_most=_MAX_EVENTS)
         journal = Journal(self.tip.positions, n)
-        site, neighbour = np.empty(n, np.int64), np.empty(n, np.int64)
+        site, targets, target_charges = np.empty(n, np.int64), np.empty((n, 3), np.int64), np.empty((n, 3))
         charges, fields, normals, detached = np.empty(n), np.empty(n), np.empty((n, 3)), np.empty(n, np.int8)
         waits, rise = np.empty(n), np.empty(n)
         tree = self._core.tree.copy() if self._recorded >= RECORD else None
         cap, self._is_new = self.cap if self._is_new else None, False
         status = self._core.evaporate(
-            journal, n, self.sweep_interval, site, charges, fields, normals, neighbour, detached, waits, rise
+            journal,
+            n,
+            self.sweep_interval,
+            site,
+            charges,
+            fields,
+            normals,
+            targets,
+            target_charges,
+            detached,
+            waits,
+            rise,
         )
         n = journal.n_events
         self._recorded = n if tree is not None else self._recorded + n
@@ -479,7 +494,8 @@ class Emitter:
             charges=charges[:n],
             fields=fields[:n],
             normals=normals[:n],
-            neighbour=neighbour[:n],
+            targets=targets[:n],
+            target_charges=target_charges[:n],
             detached=detached[:n].view(bool),
             journal=journal,
             tree=tree,

@@ -2,7 +2,8 @@
 
 The detector position of an ion is a smooth function of its two tangential launch velocities. A few flights determine
 one polynomial for launches from the site, and another for launches from the rolled-up position. Together they give the
-hits of any perturbation along the surface, without further flights.
+hits of any perturbation along the surface, without further flights. Wide responses (`ResponseSettings.wide`) are also
+polynomials of the place between several targets of the roll-up, and of the height of the launch.
 
 The fitted quantities are the stereographic direction (see `Detector.directions`), and the time of flight times the
 cosine of the polar angle. They are smoother than the detector position, which diverges for ions that fly parallel to
@@ -10,127 +11,35 @@ the detector.
 """
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from apt_evap._common.small_matrices import pseudo_inverse, squared_lengths
+from apt_evap._common.small_matrices import squared_lengths
 from apt_evap._common.types import Booleans, Floats
-from apt_evap._common.validation import check_count, check_kind, check_number, check_sequence, short_text
+from apt_evap._common.validation import check_kind, check_number
 from apt_evap._common.warnings import ResponseWarning
-from apt_evap._core import polynomials
-from apt_evap._core.elementary import sine_and_cosine
 from apt_evap.detection.detector import Detector
-from apt_evap.emission.emissions import Emissions
+from apt_evap.emission.emissions import Emissions, TangentialLaunches
 from apt_evap.emission.energies import HIGHEST_ENERGY
-from apt_evap.emission.surface_frame import along_surface, rolled_positions
+from apt_evap.emission.surface_frame import along_surface, rolled_positions, shared_positions
+from apt_evap.flight.designs import (
+    FIRST_VELOCITY,
+    HEIGHT,
+    SECOND,
+    SECOND_VELOCITY,
+    THIRD,
+    VARIABLES,
+    Design,
+    WideDesign,
+)
 from apt_evap.flight.landing import Ends, land
 from apt_evap.units import FLIGHT_TIME
 
-_MAX_LAUNCHES = 1000
-
-
-@dataclass(frozen=True)
-class Design:
-    """Launches that determine a polynomial.
-
-    Parameters
-    ----------
-    degree : int
-        Total degree of the polynomial in the two velocities.
-    rings : tuple of (float, int)
-        Radius in units of the largest velocity, and number of launches, of each ring; every second ring is rotated by
-        half a step.
-
-    Raises
-    ------
-    ValueError
-        If the launches do not determine the polynomial.
-    """
-
-    degree: int
-    rings: tuple
-
-    def __post_init__(self):
-        check_count(self.degree, "degree", at_most=polynomials.HIGHEST_DEGREE)
-        rings = [_ring(ring) for ring in check_sequence(self.rings, "rings", "(radius, launches)")]
-        if not rings:
-            raise ValueError("rings must contain at least one (radius, launches), got none")
-        object.__setattr__(self, "rings", tuple(rings))
-        matrix = self.monomials(self.velocities)
-        if np.linalg.matrix_rank(matrix) < matrix.shape[1]:
-            raise ValueError(
-                f"rings must determine the {matrix.shape[1]} coefficients of degree {self.degree}, got {self.rings}"
-            )
-
-    @property
-    def velocities(self) -> Floats:
-        """Launches in units of the largest velocity, shape (m, 2)."""
-        rings = []
-        for index, (radius, count) in enumerate(self.rings):
-            angles = 2 * np.pi * (np.arange(count) + 0.5 * (index % 2)) / count
-            sine, cosine = sine_and_cosine(angles)
-            rings.append(radius * np.stack([cosine, sine], axis=1))
-        return np.concatenate(rings)
-
-    def monomials(self, velocities: ArrayLike) -> Floats:
-        """Monomials u^i v^j, i + j <= degree, of velocities (u, v) of shape (n, 2); shape (n, coefficients)."""
-        return polynomials.monomials(self.degree, np.ascontiguousarray(velocities, np.float64))
-
-    def fit(self, values: Floats) -> tuple[NDArray[np.float32], Floats]:
-        """Least squares fit.
-
-        Parameters
-        ----------
-        values : ndarray, shape (n, m, 3)
-            Three quantities of the m launches of each of n ions.
-
-        Returns
-        -------
-        coefficients : ndarray of float32, shape (n, 3, coefficients)
-            Coefficients of the three quantities.
-        residual : ndarray, shape (n,)
-            Root mean square residual of the first two quantities over the launches, per degree of freedom. Infinite if
-            some launches are NaN (the coefficients are then the minimum norm solution for the others); NaN if all are.
-        """
-        matrix, inverse = _matrices(self)
-        values = np.ascontiguousarray(values, np.float64)
-        coefficients = polynomials.fit(inverse, values)
-        freedom = max(1, len(matrix) - matrix.shape[1])
-        residual = np.sqrt(polynomials.misfits(matrix, coefficients, values) / freedom)
-        # the time may be infinite at a finite direction: a launch that never reaches the plane of the detector
-        for ion in np.flatnonzero(~(np.isfinite(residual) & np.isfinite(values).all(axis=(1, 2)))):
-            good = np.isfinite(values[ion]).all(axis=1)
-            if good.any():
-                coefficients[ion] = polynomials.fit(pseudo_inverse(matrix[good]), values[ion, good][None])[0]
-                residual[ion] = np.inf
-        return np.ascontiguousarray(coefficients, np.float32), residual
-
-    def evaluate(self, coefficients: NDArray[np.float32], velocities: Floats) -> Floats:
-        """Values of the polynomials of n ions, each at its own velocity; shape (n, 3)."""
-        return polynomials.evaluate(
-            self.degree, np.ascontiguousarray(coefficients, np.float32), np.ascontiguousarray(velocities, np.float64)
-        )
-
-
-@lru_cache
-def _matrices(design):
-    """Monomials of the launches of a design, and their pseudo-inverse."""
-    matrix = design.monomials(design.velocities)
-    return matrix, pseudo_inverse(matrix)
-
-
-def _ring(ring):
-    """Validated radius and number of launches of a ring."""
-    pair = check_sequence(ring, "rings", "(radius, launches)")
-    if len(pair) != 2:
-        raise ValueError(f"rings must be pairs (radius, launches), got {short_text(ring)}")
-    radius = check_number(pair[0], "radius of a ring in rings", at_least=0)
-    return radius, check_count(pair[1], "launches of a ring in rings", at_least=1, at_most=_MAX_LAUNCHES)
+_SITE, _ROLLED = Design(4, ((0.0, 1), (0.55, 7), (1.0, 9))), Design(3, ((0.0, 1), (0.6, 5), (1.0, 7)))
 
 
 @dataclass(frozen=True)
@@ -144,28 +53,96 @@ class ResponseSettings:
     site, rolled : Design
         Launches from the site and from the rolled-up position. Measured on Ni[111], R = 80 a, 300 ions: median
         deviation from flights at random energies up to 1.5 eV 0.008 mm and 0.0016 mm on a detector at 100 mm.
+        Both are `Design`, or both `WideDesign`, see `wide`.
     bound : float
         Residual of a fit on the detector above which an ion is flagged [mm].
+    height : float
+        Largest launch height of wide designs [nm]; 0 for others.
     """
 
     energy_limit: float = 1.5
-    site: Design = Design(4, ((0.0, 1), (0.55, 7), (1.0, 9)))
-    rolled: Design = Design(3, ((0.0, 1), (0.6, 5), (1.0, 7)))
+    site: Design | WideDesign = _SITE
+    rolled: Design | WideDesign = _ROLLED
     bound: float = 0.2
+    height: float = 0.0
 
     def __post_init__(self):
         check_number(self.energy_limit, "energy_limit", above=0, at_most=HIGHEST_ENERGY, unit="eV")
         check_number(self.bound, "bound", above=0, unit="mm")
         for name in ("site", "rolled"):
-            check_kind(getattr(self, name), name, Design, "a Design")
+            check_kind(getattr(self, name), name, (Design, WideDesign), "a Design")
+        if isinstance(self.site, WideDesign) != isinstance(self.rolled, WideDesign):
+            raise ValueError(f"site and rolled must both be a Design or both a WideDesign, got {self.site!r:.60}")
+        check_number(self.height, "height", at_least=0, at_most=1.0, unit="nm")
+        if self.is_wide and not (self.height > 0 and self.rolled.place > 0 == self.site.place):  # type: ignore[union-attr]
+            raise ValueError(
+                "wide designs need a height > 0 nm, and a place of degree 0 for site and > 0 for rolled, got "
+                f"{self.height:g} nm, {self.site.place} and {self.rolled.place}"  # type: ignore[union-attr]
+            )
+        if not self.is_wide and self.height > 0:
+            raise ValueError(f"height needs wide designs (ResponseSettings.wide), got {self.height:g} nm")
+
+    @classmethod
+    def wide(cls, height: float = 0.2, energy_limit: float = 1.5, bound: float = 0.2) -> "ResponseSettings":
+        """Settings whose responses also serve other targets of the roll-up and other launch heights.
+
+        A run then serves any `sharpness`, `probability` and `height` of the perturbations in post-processing.
+
+        Parameters
+        ----------
+        height : float
+            Largest launch height [nm].
+        energy_limit, bound : float
+            As in `ResponseSettings`.
+
+        Returns
+        -------
+        ResponseSettings
+        """
+        return cls(energy_limit, WideDesign(0, 4, 3, 4), WideDesign(3, 2, 2, 3), bound, height)
+
+    @classmethod
+    def from_dict(cls, settings: Mapping[str, Any]) -> "ResponseSettings":
+        """The settings of a file, see `to_dict`."""
+        designs = {
+            name: (WideDesign if "place" in settings[name] else Design)(**settings[name]) for name in ("site", "rolled")
+        }
+        return cls(settings["energy_limit"], designs["site"], designs["rolled"], settings["bound"], settings["height"])
+
+    def to_dict(self) -> dict[str, Any]:
+        """All settings in plain types, dict."""
+        return vars(self) | {name: vars(getattr(self, name)) for name in ("site", "rolled")}
+
+    @property
+    def is_wide(self) -> bool:
+        """Whether the responses serve several targets of the roll-up and launch heights."""
+        return isinstance(self.rolled, WideDesign)
+
+    def variables(self, launches: TangentialLaunches, masses: ArrayLike) -> Floats:
+        """Variables of the designs for n launches, shape (n, 5); ValueError if the responses do not serve them."""
+        n = len(launches.rolled)
+        variables = np.zeros((n, len(VARIABLES)))
+        velocities = self.reduced(np.column_stack([launches.first, launches.second]), masses)
+        variables[:, FIRST_VELOCITY], variables[:, SECOND_VELOCITY] = velocities.T
+        if launches.shares is not None:
+            variables[:, SECOND], variables[:, THIRD] = launches.shares[:, 1], launches.shares[:, 2]
+        if launches.heights is not None:
+            variables[:, HEIGHT] = launches.heights / (self.height or 1.0)
+        if not self.is_wide and variables[:, [SECOND, THIRD, HEIGHT]].any():
+            raise ValueError(
+                "the responses of this run serve launches from the site and above the strongest neighbour only, got "
+                "shares of other neighbours or a height: run with response_settings=ResponseSettings.wide()"
+            )
+        if n and variables[:, HEIGHT].max() > 1.0 + 1e-9:
+            raise ValueError(
+                f"the responses of this run serve heights up to {self.height:g} nm, got {launches.heights.max():g} nm: "  # type: ignore[union-attr]
+                "run with ResponseSettings.wide(height=...)"
+            )
+        return variables
 
     def reduced(self, velocities: Floats, masses: ArrayLike) -> Floats:
         """Launch velocities [nm/ns], shape (n, 2), in units of the largest velocity of the designs."""
         return velocities * (FLIGHT_TIME * np.sqrt(np.asarray(masses) / (2.0 * self.energy_limit)))[:, None]
-
-    def launched(self, velocities: Floats, charge_states: ArrayLike) -> Floats:
-        """Velocities of the designs [sqrt(V)] for ions with these charge states [e]; shape (n, m, 2)."""
-        return np.sqrt(2.0 * self.energy_limit / np.asarray(charge_states))[:, None, None] * velocities
 
 
 class Responses(NamedTuple):
@@ -211,12 +188,25 @@ class ResponseModel:
         list of (ndarray, ndarray)
             Positions [nm] and velocities [sqrt(V)] of each design, shape (n, m, 3); NaN for ions that cannot roll up.
         """
+        settings, n = self.settings, len(emissions)
+        fastest = np.sqrt(2.0 * settings.energy_limit / emissions.charge_states)[:, None]
         groups = []
-        starts = emissions.positions, rolled_positions(emissions)
-        for design, start in zip((self.settings.site, self.settings.rolled), starts, strict=True):
-            speeds = self.settings.launched(design.velocities, emissions.charge_states)
-            velocities = along_surface(emissions.normals, speeds[..., 0], speeds[..., 1])
-            groups.append((np.broadcast_to(start[:, None], velocities.shape), velocities))
+        for design, from_site in ((settings.site, True), (settings.rolled, False)):
+            launches = np.zeros((len(design.launches), len(VARIABLES)))
+            launches[:, list(design.columns)] = design.launches
+            if from_site:
+                starts = np.broadcast_to(emissions.positions[:, None], (n, len(launches), 3))
+            elif settings.is_wide:
+                second, third = launches[:, SECOND], launches[:, THIRD]
+                starts = shared_positions(emissions, np.stack([1.0 - second - third, second, third], axis=1)[None])
+            else:
+                starts = np.broadcast_to(rolled_positions(emissions)[:, None], (n, len(launches), 3))
+            if settings.is_wide:
+                starts = starts + (settings.height * launches[:, HEIGHT])[:, None] * emissions.normals[:, None]
+            velocities = along_surface(
+                emissions.normals, fastest * launches[:, FIRST_VELOCITY], fastest * launches[:, SECOND_VELOCITY]
+            )
+            groups.append((starts, velocities))
         return groups
 
     def fit(self, ends: Sequence[Ends], slowness: Floats, apex: float) -> Responses:
@@ -250,9 +240,7 @@ class ResponseModel:
     def evaluate(
         self,
         responses: Responses,
-        rolled: Booleans,
-        first: Floats,
-        second: Floats,
+        launches: TangentialLaunches,
         masses: Floats,
         energy_scale: float = 1.0,
     ) -> tuple[Floats, Floats]:
@@ -262,10 +250,8 @@ class ResponseModel:
         ----------
         responses : Responses
             Responses of n ions.
-        rolled : ndarray of bool, shape (n,)
-            Whether an ion rolled up.
-        first, second : ndarray, shape (n,)
-            Velocities along t1 and t2 of `tangent_frame` [nm/ns].
+        launches : TangentialLaunches
+            Launches of these ions.
         masses : ndarray, shape (n,)
             Masses [Da].
         energy_scale : float
@@ -278,12 +264,18 @@ class ResponseModel:
         times : ndarray, shape (n,)
             Times of flight [ns].
 
+        Raises
+        ------
+        ValueError
+            If the responses do not serve the launches.
+
         Warns
         -----
         ResponseWarning
             If launch energies exceed the energy limit: those hits are extrapolated.
         """
-        velocities = self.settings.reduced(np.column_stack([first, second]), masses)
+        variables = self.settings.variables(launches, masses)
+        velocities = variables[:, [FIRST_VELOCITY, SECOND_VELOCITY]]
         limit = self.settings.energy_limit / energy_scale
         faster = int(np.count_nonzero(squared_lengths(velocities) > 1.0001))
         if faster:
@@ -296,11 +288,11 @@ class ResponseModel:
             )
         values = np.empty((len(velocities), 3))
         for design, coefficients, mask in (
-            (self.settings.site, responses.site, ~rolled),
-            (self.settings.rolled, responses.rolled, rolled),
+            (self.settings.site, responses.site, ~launches.rolled),
+            (self.settings.rolled, responses.rolled, launches.rolled),
         ):
             ions = slice(None) if mask.all() else mask
-            values[ions] = design.evaluate(coefficients[ions], velocities[ions])
+            values[ions] = design.evaluate(coefficients[ions], variables[ions][:, list(design.columns)])
         return directions_and_times(values)
 
     def flagged(self, responses: Responses, can_roll: Booleans) -> Booleans:

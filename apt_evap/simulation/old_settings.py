@@ -27,6 +27,8 @@ def upgraded(settings: Mapping[str, Any]) -> dict[str, Any]:
         new["rule"] = dict(_ROBIN)
     if new.get("law") in ({"name": "Extremal", "repr": "Extremal()"}, {"name": "Extremal"}):
         new["law"] = {"name": "Extremal", "bonds": None}
+    if "responses" in new:
+        new["responses"] = {"height": 0.0} | dict(new["responses"])
     new.setdefault("control", None)
     new.setdefault("pulse_length", None)
     return new

@@ -26,7 +26,7 @@ from apt_evap.detection.detector import Detector
 from apt_evap.detection.hits import Hits, Outcome
 from apt_evap.detection.instrument import Instrument
 from apt_evap.detection.timing import Timing
-from apt_evap.emission.emissions import COLUMNS, Emissions
+from apt_evap.emission.emissions import Emissions, TangentialLaunches
 from apt_evap.emission.ion_random import IonRandom
 from apt_evap.emission.perturbations import Perturbation, Unperturbed
 from apt_evap.emission.post_ionisation import PostIonisation
@@ -234,7 +234,7 @@ class Run:
             them. By design it does not depend on the machine.
         """
         columns = {name: getattr(self, name) for name in ("site", "species", "charges", "fields")}
-        columns |= {f"emissions/{name}": getattr(self.emissions, name) for name in COLUMNS}
+        columns |= {f"emissions/{name}": getattr(self.emissions, name) for name in self.emissions.columns}
         for number, flown in enumerate(self.flown):
             columns |= {f"flown/{number}/directions": flown.directions, f"flown/{number}/times": flown.times}
         if self.responses is not None:
@@ -290,12 +290,13 @@ class Run:
         if self.responses is None:
             raise ValueError(f"this run has no responses and {short_text(perturbation)} was not flown in it")
         emissions = self.emissions
-        rolled, first, second = perturbation.tangential(emissions, IonRandom(self.seed, emissions.ions))  # type: ignore[attr-defined]
+        launches = TangentialLaunches(*perturbation.tangential(emissions, IonRandom(self.seed, emissions.ions)))  # type: ignore[attr-defined]
         scale = 1.0
         if self.real is not None and len(self):
             scales = self.energy_scales
-            first, second, scale = first * np.sqrt(scales), second * np.sqrt(scales), float(np.median(scales))
-        landed = self.response_model.evaluate(self.responses, rolled, first, second, emissions.masses, scale)
+            scale, factors = float(np.median(scales)), np.sqrt(scales)
+            launches = launches._replace(first=launches.first * factors, second=launches.second * factors)
+        landed = self.response_model.evaluate(self.responses, launches, emissions.masses, scale)
         return self._hits(*landed, perturbation)
 
     def _hits(self, directions, times, perturbation):

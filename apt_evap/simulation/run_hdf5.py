@@ -21,7 +21,7 @@ from apt_evap.emission.emissions import Emissions
 from apt_evap.emission.perturbations import from_dict, to_dict
 from apt_evap.evaporation.state import EmitterState
 from apt_evap.evaporation.voltage import check_voltage
-from apt_evap.flight.response import Design, Responses, ResponseSettings
+from apt_evap.flight.response import Responses, ResponseSettings
 from apt_evap.simulation.checked_hdf5 import (
     CheckedFile,
     DamagedRows,
@@ -47,6 +47,7 @@ _DETACHED = "detached", (f"{_SIMULATION}/detached", np.int8, ())  # not in files
 _UNITS = {
     "positions": "nm",
     "neighbours": "nm",
+    "targets": "nm",
     "charge_states": "e",
     "masses": "Da",
     "charges": "e",
@@ -70,6 +71,11 @@ _KINDS = {  # datasets with one row per ion: name, type, shape of a row
     "species": (f"{_SIMULATION}/species", np.int32, ()),
     "charges": (f"{_SIMULATION}/charges", np.float64, ()),
     "fields": (f"{_SIMULATION}/fields", np.float64, ()),
+}
+# only with wide responses
+_TARGETS = {
+    "targets": (f"{_SIMULATION}/targets", np.float64, (3, 3)),
+    "charge_ratios": (f"{_SIMULATION}/charge_ratios", np.float64, (3,)),
 }
 # not in all files: datasets with one row per ion of `Run.clock` and `Run.real`
 _CLOCK = {name: (f"{_SIMULATION}/clock/{name}", np.float64, ()) for name in ("waits", "voltages")}
@@ -155,8 +161,9 @@ def _write(file, run):
     _put_text(hits, "perturbation", json.dumps(described(run.first_perturbation)))
     _put(probe, "voltage_and_bowl/raw_tof", first.time_of_flight, "ns")
     _put(probe, "mass_to_charge_conversion/mass_to_charge", first.mass_to_charge, "Da")
-    for name in _EMISSIONS:
-        _put(simulation, name, getattr(run.emissions, name))
+    for name in run.emissions.columns:
+        if name != "ions":
+            _put(simulation, name, getattr(run.emissions, name))
     for name in _COLUMNS:
         _put(simulation, name, getattr(run, name))
     _put(simulation, "detached", run.detached.astype(np.int8))
@@ -254,13 +261,7 @@ def _reading(path, hint="", with_data=True, partial=False):
 def _read(file, partial):
     settings = upgraded(json.loads(file.text("settings")))
     elements = tuple(json.loads(file.text("elements")))
-    designs = settings["responses"]
-    response_settings = ResponseSettings(
-        energy_limit=designs["energy_limit"],
-        bound=designs["bound"],
-        site=Design(**designs["site"]),
-        rolled=Design(**designs["rolled"]),
-    )
+    response_settings = ResponseSettings.from_dict(settings["responses"])
     perturbations, kinds = [], dict(_KINDS)
     while (group := f"{_SIMULATION}/flown/{len(perturbations)}") in file:
         kinds[f"{len(perturbations)} directions"] = f"{group}/directions", np.float64, (2,)
@@ -270,9 +271,10 @@ def _read(file, partial):
     has_responses = group in file
     if has_responses:
         for name, design in (("site", response_settings.site), ("rolled", response_settings.rolled)):
-            n_coefficients = design.monomials(np.zeros((1, 2))).shape[1]
-            kinds[f"responses {name}"] = f"{group}/{name}", np.float32, (3, n_coefficients)
+            kinds[f"responses {name}"] = f"{group}/{name}", np.float32, (3, len(design.exponents))
         kinds["responses residuals"] = f"{group}/residuals", np.float32, (2,)
+    targets = {name: kind for name, kind in _TARGETS.items() if kind[0] in file}
+    kinds |= targets
     if _DETACHED[1][0] in file:
         kinds |= dict([_DETACHED])
     optional = {"clock": _CLOCK, "real": _REAL}
@@ -298,7 +300,7 @@ def _read(file, partial):
             raise
     return {
         "emissions": Emissions(
-            **{name: columns[name] for name in ("ions", *_EMISSIONS)},
+            **{name: columns[name] for name in ("ions", *_EMISSIONS, *targets)},
             nearest_neighbour_distance=float(file.attributes()["nearest_neighbour_distance"]),
         ),
         **{name: columns[name] for name in _COLUMNS},

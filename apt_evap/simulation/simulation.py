@@ -310,15 +310,21 @@ class Simulation:
     def _emissions(self, batch, ions):
         species = self.tip.species[batch.site]
         positions = self.tip.positions
-        neighbours = np.where((batch.neighbour >= 0)[:, None], positions[batch.neighbour], np.nan)
+        targets = np.where((batch.targets >= 0)[..., None], positions[batch.targets], np.nan)
+        columns = {}
+        if self.response_settings.is_wide:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                ratios = batch.target_charges / batch.charges[:, None]
+            columns = {"targets": targets, "charge_ratios": np.where(batch.targets >= 0, ratios, np.nan)}
         return Emissions(
             positions=positions[batch.site],
             normals=batch.normals,
-            neighbours=neighbours,
+            neighbours=np.ascontiguousarray(targets[:, 0]),
             charge_states=self.tip.charge_states[species],
             masses=self.tip.masses[species],
             ions=ions,
             nearest_neighbour_distance=self.tip.nearest_neighbour_distance,
+            **columns,
         )
 
     def _check_atoms(self, n_ions):
@@ -343,12 +349,7 @@ class Simulation:
             "rule": describe(self.emitter.rule),
             "charges": vars(self.emitter.settings),
             "flights": vars(self.flight_settings),
-            "responses": {
-                "energy_limit": self.response_settings.energy_limit,
-                "bound": self.response_settings.bound,
-                "site": vars(self.response_settings.site),
-                "rolled": vars(self.response_settings.rolled),
-            },
+            "responses": self.response_settings.to_dict(),
             "watch": vars(self.watch_settings),
             "control": None if self.control is None else vars(self.control),
             "pulse_length": self.emitter.pulse_length,

@@ -114,9 +114,9 @@ def check_choices(emitter, events):
         near = (distance > 0) & (distance < 1.2 * tip.nearest_neighbour_distance)
         if near.any():
             strongest = near & (charges == charges[near].max())
-            assert batch.neighbour[0] == atoms[strongest].min()
+            assert batch.targets[0, 0] == atoms[strongest].min()
         else:
-            assert batch.neighbour[0] == -1
+            assert (batch.targets[0] == -1).all()
 
 
 def test_extremal_choice(tip12):

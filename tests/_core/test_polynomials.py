@@ -6,21 +6,26 @@ import pytest
 from apt_evap._core import polynomials
 
 
+def exponents_of(degree):
+    """Exponents of two variables up to a total degree."""
+    return np.array([(total - j, j) for total in range(degree + 1) for j in range(total + 1)], np.int8)
+
+
 @pytest.mark.parametrize("degree", [0, 1, 4, polynomials.HIGHEST_DEGREE])
 def test_monomials_and_values(degree, rng):
     velocities = rng.normal(size=(7, 2))
     u, v = velocities.T
     columns = [u ** (total - j) * v**j for total in range(degree + 1) for j in range(total + 1)]
     expected = np.stack(columns, axis=1)
-    assert polynomials.monomials(degree, velocities) == pytest.approx(expected, rel=1e-14)
+    assert polynomials.monomials(exponents_of(degree), velocities) == pytest.approx(expected, rel=1e-14)
     coefficients = rng.normal(size=(7, 3, expected.shape[1])).astype(np.float32)
-    values = polynomials.evaluate(degree, coefficients, velocities)
+    values = polynomials.evaluate(exponents_of(degree), coefficients, velocities)
     scale = np.abs(coefficients[:, :, None] * expected[:, None, None]).sum(axis=(2, 3))
     assert np.abs(values - np.einsum("nkc,nc->nk", coefficients, expected)).max() <= 1e-14 * scale.max()
 
 
 def test_fits_and_misfits(rng):
-    matrix = polynomials.monomials(2, rng.normal(size=(11, 2)))
+    matrix = polynomials.monomials(exponents_of(2), rng.normal(size=(11, 2)))
     values = rng.normal(size=(5, 11, 3))
     inverse = np.ascontiguousarray(np.linalg.pinv(matrix))
     coefficients = polynomials.fit(inverse, values)
@@ -30,9 +35,26 @@ def test_fits_and_misfits(rng):
     assert polynomials.misfits(matrix, coefficients, values) == pytest.approx(squares, rel=1e-12)
 
 
+def test_five_variables(rng):
+    exponents = rng.integers(0, 4, size=(30, 5)).astype(np.int8)
+    points = rng.normal(size=(6, 5))
+    expected = np.prod(points[:, None] ** exponents, axis=2)
+    assert polynomials.monomials(exponents, points) == pytest.approx(expected, rel=1e-13)
+    coefficients = rng.normal(size=(6, 3, 30)).astype(np.float32)
+    scale = np.abs(coefficients).max() * np.abs(expected).sum(axis=1).max()
+    values = polynomials.evaluate(exponents, coefficients, points)
+    assert np.abs(values - np.einsum("nkc,nc->nk", coefficients, expected)).max() <= 1e-13 * scale
+
+
 @pytest.mark.parametrize(
-    ("degree", "shape"), [(1, (2, 3, 4)), (1, (3, 3, 3)), (1, (2, 2, 3)), (13, (2, 3, 105)), (-1, (2, 3, 0))]
+    ("degree", "shape"), [(1, (2, 3, 4)), (1, (3, 3, 3)), (1, (2, 2, 3)), (12, (2, 3, 90)), (0, (2, 3, 0))]
 )
 def test_shapes_that_do_not_fit_are_refused(degree, shape):
     with pytest.raises(ValueError, match="must have shape"):
-        polynomials.evaluate(degree, np.zeros(shape, np.float32), np.zeros((2, 2)))
+        polynomials.evaluate(exponents_of(degree), np.zeros(shape, np.float32), np.zeros((2, 2)))
+
+
+@pytest.mark.parametrize("exponent", [-1, 13])
+def test_exponents_out_of_range_are_refused(exponent):
+    with pytest.raises(ValueError, match="exponents must be 0 to 12"):
+        polynomials.monomials(np.array([[exponent, 0]], np.int8), np.zeros((2, 2)))

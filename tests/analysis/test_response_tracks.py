@@ -39,7 +39,9 @@ def test_tracks_are_where_flights_land(run):
         good &= hits.detected
     ions = np.flatnonzero(good)
     assert len(ions) > 30
-    _, first, second = ae.LateralVelocity(ENERGY).tangential(run.emissions, ae.IonRandom(run.seed, run.emissions.ions))
+    _, first, second, *_ = ae.LateralVelocity(ENERGY).tangential(
+        run.emissions, ae.IonRandom(run.seed, run.emissions.ions)
+    )
     np.testing.assert_allclose(np.hypot(first, second), speed_from_energy(ENERGY, run.emissions.masses))
     azimuths = np.degrees(np.arctan2(second, first))
     lateral = [ae.lateral_tracks(run, [ion], [ENERGY], [azimuths[ion]]) for ion in ions]

@@ -28,13 +28,13 @@ FLOWN = (
 @pytest.mark.parametrize("name", ["site", "rolled"])
 def test_designs_fix_their_polynomials(name):
     design = getattr(ae.ResponseSettings(), name)
-    matrix = design.monomials(design.velocities)
+    matrix = design.monomials(design.launches)
     coefficients = (design.degree + 1) * (design.degree + 2) // 2
     assert matrix.shape == (sum(count for _, count in design.rings), coefficients)
     assert np.linalg.matrix_rank(matrix) == coefficients
     assert len(matrix) > coefficients  # some are left over, to tell a bad fit
     assert np.linalg.cond(matrix) < 100  # errors of the flights are not blown up
-    assert np.hypot(*design.velocities.T).max() == pytest.approx(1.0)
+    assert np.hypot(*design.launches.T).max() == pytest.approx(1.0)
 
 
 def test_a_design_that_fixes_nothing_is_refused():
@@ -53,7 +53,7 @@ def test_a_design_that_fixes_nothing_is_refused():
 def test_polynomials_are_found_again(degree, coefficients, seed):
     design = ae.Design(degree, ((0.0, 1), (0.5, 11), (1.0, 13)))
     coefficients = coefficients[:, :, : (degree + 1) * (degree + 2) // 2]
-    values = np.einsum("mc,nkc->nmk", design.monomials(design.velocities), coefficients)
+    values = np.einsum("mc,nkc->nmk", design.monomials(design.launches), coefficients)
     fitted, residual = design.fit(values)
     # coefficients are kept in float32: half of 2^-23 of 1, and twice that by the 15 columns of the fit
     assert np.abs(fitted - coefficients).max() < 2e-7
@@ -71,7 +71,7 @@ def test_polynomials_are_found_again(degree, coefficients, seed):
 
 def test_the_residual_is_that_of_the_fit():
     design = ae.Design(1, ((0.0, 1), (1.0, 8)))
-    u, v = design.velocities.T
+    u, v = design.launches.T
     values = np.stack([u * u - v * v, 2 * u * v, u], axis=1)[None]  # the first two are none of 1, u, v
     _, residual = design.fit(values)
     assert residual[0] == pytest.approx(np.sqrt(8 / (9 - 3)))  # eight launches off by 1, nine less three free
@@ -184,7 +184,7 @@ def test_a_launch_that_never_meets_the_plane_leaves_no_infinite_time():
     """Ions at a wide angle meet an equidistant detector though one of their launches flies away from its plane."""
     design = ae.Design(1, ((0.0, 1), (1.0, 4)))
     values = np.zeros((2, 5, 3))
-    values[:, :, 0] = design.velocities[:, 0]
+    values[:, :, 0] = design.launches[:, 0]
     values[:, :, 2] = 100.0
     values[1, 2, 2] = np.inf
     coefficients, residual = design.fit(values)

@@ -117,7 +117,7 @@ def test_one_that_says_its_velocities_along_the_surface_is_not_refused(run):
         """Lateral velocities of twice the energy: follows from the responses like any built-in one."""
 
         def tangential(self, emissions, random):
-            rolled, first, second = ae.LateralVelocity(ENERGY).tangential(emissions, random)
+            rolled, first, second, *_ = ae.LateralVelocity(ENERGY).tangential(emissions, random)
             return rolled, np.sqrt(2) * first, np.sqrt(2) * second
 
     double = ae.TruncatedNormal(0.31, 0.31)  # which has twice the quantiles
