@@ -249,7 +249,7 @@ def read_config(path: str | Path) -> Config:
         ("detector", Detector, _field_names(Detector)),
         ("charges", ChargeSettings, _field_names(ChargeSettings)),
         ("flights", FlightSettings, _field_names(FlightSettings)),
-        ("responses", ResponseSettings, ("energy_limit", "bound")),
+        ("responses", _responses, ("energy_limit", "bound", "wide", "height")),
         ("watch", WatchSettings, _field_names(WatchSettings)),
     ):
         with _located(path, name):
@@ -265,6 +265,13 @@ def read_config(path: str | Path) -> Config:
         maps = read_maps(document.get("maps", {}))
         maps.check_detector(sections[0])  # type: ignore[arg-type]
     return Config(path, tip, n_ions, responses, voltage, seed, *sections, maps, output, law, control, real_units)  # type: ignore[arg-type, call-arg]
+
+
+def _responses(wide=False, **settings):
+    """Settings of the responses from the table [responses]."""
+    if not isinstance(wide, bool):
+        raise ValueError(f"wide must be true or false, got {short_text(wide)}")
+    return ResponseSettings.wide(**settings) if wide else ResponseSettings(**settings)
 
 
 def _tip(table):

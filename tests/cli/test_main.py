@@ -463,7 +463,7 @@ def test_map_errors(measured, made, capsys):
         capsys, "map", "ions.epos", "--perturbation", "Unperturbed"
     )
     assert "did you mean 'RollUp'" in failed(capsys, "map", made, "--perturbation", "Rollup:0.1")
-    assert "RollUp needs energy, got no parameters; an example is RollUp:0.155,0.155" in failed(
+    assert "got no parameters; an example is RollUp:0.155,0.155" in failed(
         capsys, "map", made, "--perturbation", "RollUp"
     )
     assert "argument --bins: must be an integer from 1 to 16384, got '0'" in failed(capsys, "map", made, "--bins", "0")
