@@ -93,9 +93,20 @@ from .simulation.recorder import RunNotSaved as RunNotSaved
 from .simulation.run import Run as Run
 from .simulation.run import load as load
 from .simulation.simulation import Simulation as Simulation
+from .specimen.alloy import Segregation as Segregation
 from .specimen.materials import Material as Material
 from .specimen.materials import material as material
 from .specimen.materials import polarization_energy as polarization_energy
+from .specimen.ordered import Basis as Basis
+from .specimen.ordered import Order as Order
+from .specimen.phases import Phase as Phase
+from .specimen.regions import CoreShell as CoreShell
+from .specimen.regions import Cylinder as Cylinder
+from .specimen.regions import Ellipsoid as Ellipsoid
+from .specimen.regions import HalfSpace as HalfSpace
+from .specimen.regions import Layer as Layer
+from .specimen.regions import Sphere as Sphere
+from .specimen.regions import Union as Union
 from .specimen.tip import Tip as Tip
 
 __version__: str

@@ -13,7 +13,7 @@ cdef class Evaporation:
     cdef readonly Octree tree
     cdef readonly ChargingRule rule
     cdef readonly LawKernel law
-    cdef readonly double potential, coulomb, field_unit, patch_radius, update_radius, bond_length, opening_angle
+    cdef readonly double potential, coulomb, field_unit, patch_radius, update_radius, opening_angle
     cdef readonly object start          # start values of the last relaxation
     cdef readonly long n_removed, since_relaxation
     cdef public long n_clipped          # negative charges that were set to 0

@@ -87,7 +87,7 @@ cdef class Evaporation:
                  double patch_radius, double update_radius, double opening_angle,
                  unsigned long long seed=0):
         self.atoms, self.rule, self.law = atoms, rule, law
-        self.potential, self.coulomb, self.bond_length = potential, coulomb, atoms.bond_length
+        self.potential, self.coulomb = potential, coulomb
         self.patch_radius, self.update_radius, self.opening_angle = patch_radius, update_radius, opening_angle
         self.n_removed = self.n_clipped = self.n_unsettled = 0
         self.since_relaxation = NOT_RELAXED
@@ -176,7 +176,7 @@ cdef class Evaporation:
         self.field_unit = self.rule.field_unit(self.coulomb)
         self.tree, self.normals, self.slot_of = tree, normals, slot_of
         self.rank(builders)
-        self.since_relaxation = 0
+        self.since_relaxation, self.atoms.opened = 0, False
         return outcome
 
     def rank(self, int n_threads=1):
@@ -221,16 +221,13 @@ cdef class Evaporation:
         cdef int[MAX_NEAR] others
         cdef int n = self.atoms.near(atom, others), i, k, m
         cdef long other
-        cdef double dx, dy, dz, q
+        cdef double q
         for k in range(TARGETS):
             neighbour[k] = -1
             charge[k] = 0.0
         for i in range(n):
             other = others[i]
-            dx = self.atoms.positions[other, 0] - self.atoms.positions[atom, 0]
-            dy = self.atoms.positions[other, 1] - self.atoms.positions[atom, 1]
-            dz = self.atoms.positions[other, 2] - self.atoms.positions[atom, 2]
-            if self.slot_of[other] < 0 or dx * dx + dy * dy + dz * dz > self.bond_length * self.bond_length:
+            if self.slot_of[other] < 0 or not self.atoms.bonded(atom, other):
                 continue
             q = self.tree.q[self.slot_of[other]]
             for k in range(TARGETS):
@@ -419,7 +416,7 @@ cdef class Evaporation:
                 if self.since_relaxation < NOT_RELAXED and best < 0:
                     status = STATUS_EXHAUSTED
                     break
-                if self.since_relaxation >= sweep_interval or self.tree.n_slots + MAX_NEAR > self.tree.x.shape[0]:
+                if self.since_relaxation >= sweep_interval or self.atoms.opened or self.tree.n_slots + MAX_NEAR > self.tree.x.shape[0]:
                     status = STATUS_SWEEP_DUE
                     break
                 drawn = self.chooser.draws and leaving < 0

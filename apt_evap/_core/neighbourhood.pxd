@@ -9,21 +9,28 @@ cdef enum:
 
 cdef class Neighbourhood:
     cdef readonly long n_atoms
-    cdef readonly double radius         # of the neighbourhood; also the edge of a cell of the grid [nm]
-    cdef readonly double threshold
-    cdef readonly double bond_length    # [nm]
+    cdef readonly double radius         # largest radius of a neighbourhood; also the edge of a cell of the grid [nm]
+    cdef bint has_kinds                 # whether atoms of several kinds differ in the distances below
+    cdef const signed char[::1] kind    # (n,) kind of each atom; one element if there is only one kind
+    cdef double[::1] reach              # (kinds,) squared radius of the neighbourhood [nm^2]
+    cdef double[::1] threshold          # (kinds,) [nm]
+    cdef double[:, ::1] bond            # (kinds, kinds) squared length below which atoms are nearest neighbours [nm^2]
     cdef const double[:, ::1] positions # (n, 3) nm, array of the caller
     cdef signed char[::1] alive                # (n,)
     cdef const signed char[::1] support              # (n,) atoms that never become surface atoms
     cdef const signed char[::1] anchored       # (n,) atoms that never evaporate: whatever is bonded to them has hold
     cdef signed char[::1] exposed              # (n,) surface atoms
     cdef signed char[::1] detached             # (n,) atoms without a chain of bonds to the body
+    cdef signed char[::1] hidden               # (n,) walls of closed voids: surface atoms when the void opens; or empty
+    cdef long n_hidden
+    cdef bint opened                    # whether walls were exposed that have no slot yet
+    cdef int[::1] stack                 # of a search among the hidden atoms, or among all atoms
     cdef readonly long n_detached              # detached atoms removed so far
     cdef int[::1] waiting               # detached atoms in the order in which they leave
     cdef long n_waiting
     cdef int[::1] visited, piece_of, following, table   # search for parts without hold: atoms, their part, its next atom
     cdef int[::1] count                 # (n,) neighbours within the radius
-    cdef signed char[::1] bonds         # (n,) number of nearest neighbours, closer than `bond_length`
+    cdef signed char[::1] bonds         # (n,) number of nearest neighbours, closer than the bond length
     cdef const int[::1] code            # (n,) what an atom adds to the code of its nearest neighbours
     cdef const int[::1] far_code        # (n,) and to that of its second neighbours
     cdef int[::1] bond_code             # (n,) sum of the codes of the remaining neighbours
@@ -35,12 +42,16 @@ cdef class Neighbourhood:
     cdef int[::1] start                 # (cells + 1,) begin of the atoms of each cell in `order`
     cdef int[::1] order                 # (n,) atoms cell by cell
 
+    cdef int kind_of(self, long atom) noexcept nogil
     cdef int near(self, long atom, int* others) noexcept nogil
+    cdef int within(self, long atom, double reach, int* others) noexcept nogil
     cdef void gather(self, long atom) noexcept nogil
-    cdef int code_of(self, long atom, double s) noexcept nogil
+    cdef int code_of(self, long atom, double s, double bond) noexcept nogil
     cdef bint judge(self, long atom) noexcept nogil
     cdef void normal(self, long atom, double* normal) noexcept nogil
     cdef int remove(self, long atom, int* fresh) noexcept nogil
+    cdef long open_from(self, long atom) noexcept nogil
+    cdef void hold_from(self, signed char[::1] held) noexcept nogil
     cdef bint bonded(self, long first, long second) noexcept nogil
     cdef void release(self, const int* nearest, int n) noexcept nogil
     cdef long visit(self, int atom, int piece, long n, long* known) noexcept nogil

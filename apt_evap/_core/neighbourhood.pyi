@@ -5,14 +5,16 @@ class Neighbourhood:
     def __init__(
         self,
         positions: NDArray[np.float64],
-        radius: float,
-        threshold: float,
+        radius: float | NDArray[np.float64],
+        threshold: float | NDArray[np.float64],
         support: NDArray[np.int8],
-        bond_length: float = 0.0,
+        bond_length: float | NDArray[np.float64] = 0.0,
         n_threads: int = 1,
         before: Neighbourhood | None = None,
         anchored: NDArray[np.int8] | None = None,
         codes: tuple[NDArray[np.int32], NDArray[np.int32], float] | None = None,
+        kinds: NDArray[np.int8] | None = None,
+        outer: NDArray[np.int8] | None = None,
     ) -> None: ...
     @property
     def n_detached(self) -> int: ...
@@ -22,8 +24,6 @@ class Neighbourhood:
     def n_atoms(self) -> int: ...
     @property
     def radius(self) -> float: ...
-    @property
-    def threshold(self) -> float: ...
     def remove_atom(self, atom: int) -> NDArray[np.int32]: ...
     def remove_atoms(self, atoms: NDArray[np.int64]) -> None: ...
     @property
@@ -32,8 +32,6 @@ class Neighbourhood:
     def normals_of(self, atoms: ArrayLike, n_threads: int = 1) -> NDArray[np.float64]: ...
     @property
     def counts(self) -> NDArray[np.int32]: ...
-    @property
-    def bond_length(self) -> float: ...
     @property
     def bond_counts(self) -> NDArray[np.int32]: ...
     @property

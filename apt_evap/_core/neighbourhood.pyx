@@ -4,6 +4,8 @@ For atom i at p_i with the mean c_i of all other atoms within a radius, d_i = |p
 a threshold, its outward normal is (p_i - c_i)/d_i (Rolland et al., Microsc. Microanal. 21, 1649, 2015). An exposed atom
 stays exposed until it evaporates.
 
+The walls of a closed void are in no field, and are no surface atoms before it opens.
+
 Atoms without a chain of nearest neighbour bonds to the body are detached. Only the removal of an atom can detach others,
 and each part that it cuts off contains one of its nearest neighbours: the search starts there.
 """
@@ -29,14 +31,15 @@ cdef class Neighbourhood:
     ----------
     positions : ndarray, shape (n, 3)
         All atoms [nm].
-    radius : float
-        Radius of the neighbourhood [nm].
-    threshold : float
+    radius : float or ndarray, shape (kinds,)
+        Radius of the neighbourhood [nm], of each kind of atoms.
+    threshold : float or ndarray, shape (kinds,)
         Distance from the mean position of the neighbourhood above which an atom is a surface atom [nm].
     support : ndarray of int8, shape (n,)
         1 for atoms that complete the neighbourhoods of others but are never surface atoms.
-    bond_length : float
-        Atoms closer than this are nearest neighbours [nm]; not larger than the radius.
+    bond_length : float or ndarray, shape (kinds,)
+        Atoms closer than this are nearest neighbours [nm]; not larger than the radius. Between two kinds, the mean of
+        theirs.
     n_threads : int
         Number of threads.
     before : Neighbourhood, optional
@@ -46,16 +49,28 @@ cdef class Neighbourhood:
     codes : (ndarray of int32, ndarray of int32, float), optional
         What an atom adds to the bond code of its nearest and of its second neighbours, each of shape (n,), and the
         distance of second neighbours [nm]. A law that depends on the species of the neighbours sees this code.
+    kinds : ndarray of int8, shape (n,), optional
+        Kind of each atom, if there are several.
+    outer : ndarray of int8, shape (n,), optional
+        1 for atoms near the outer surface of a specimen with voids or gaps. Other atoms with incomplete neighbourhoods
+        are walls of voids, and atoms without a chain of bonds to an anchored atom are detached from the beginning.
+        By default there are no voids.
     """
 
-    def __init__(self, const double[:, ::1] positions, double radius, double threshold, const signed char[::1] support,
-                 double bond_length=0.0, int n_threads=1, Neighbourhood before=None,
-                 const signed char[::1] anchored=None, codes=None):
+    def __init__(self, const double[:, ::1] positions, radius, threshold, const signed char[::1] support,
+                 bond_length=0.0, int n_threads=1, Neighbourhood before=None,
+                 const signed char[::1] anchored=None, codes=None, const signed char[::1] kinds=None,
+                 const signed char[::1] outer=None):
         cdef long n = positions.shape[0], i
         if n == 0:
             raise ValueError("a specimen must have at least one atom, got none")
         self.n_atoms = n
-        self.radius, self.threshold, self.bond_length = radius, threshold, bond_length
+        radii, bond_lengths = np.atleast_1d(np.float64(radius)), np.atleast_1d(np.float64(bond_length))
+        self.radius, self.reach, self.threshold = radii.max(), radii * radii, np.atleast_1d(np.float64(threshold))
+        bond_lengths = 0.5 * (bond_lengths[:, None] + bond_lengths)
+        self.bond = bond_lengths * bond_lengths
+        self.has_kinds = kinds is not None
+        self.kind = np.zeros(1, np.int8) if kinds is None else kinds
         if n >= 2**31:
             raise ValueError(f"a specimen must have fewer than 2**31 atoms, got {n}")
         self.positions, self.support = positions, support
@@ -73,8 +88,8 @@ cdef class Neighbourhood:
         self.has_codes, self.second_length, self.too_many = codes is not None, 0.0, False
         if codes is not None:
             self.code, self.far_code, self.second_length = codes
-            if self.second_length > radius:
-                raise ValueError(f"second neighbours must be within {radius:g} nm, got {self.second_length:g} nm")
+            if self.second_length > self.radius:
+                raise ValueError(f"second neighbours must be within {self.radius:g} nm, got {self.second_length:g} nm")
             self.bond_code = np.zeros(n, np.int32)
         if before is not None:
             np.asarray(self.alive)[:before.n_atoms] = before.alive
@@ -83,12 +98,12 @@ cdef class Neighbourhood:
         where = np.asarray(positions)
         low = where.min(axis=0)
         self.low = low
-        shape = np.floor((where.max(axis=0) - low) / radius).astype(np.int64) + 1
+        shape = np.floor((where.max(axis=0) - low) / self.radius).astype(np.int64) + 1
         self.shape = shape
         flat = np.zeros(n, np.int64)
         for axis in range(3):   # one axis at a time: complete temporary arrays would dominate the peak memory
             flat *= shape[axis]
-            flat += np.floor((where[:, axis] - low[axis]) / radius).astype(np.int64)
+            flat += np.floor((where[:, axis] - low[axis]) / self.radius).astype(np.int64)
         self.order = np.argsort(flat, kind="stable").astype(np.int32)
         start = np.zeros(shape.prod() + 1, np.int32)
         np.cumsum(np.bincount(flat, minlength=shape.prod()), out=start[1:])
@@ -99,15 +114,90 @@ cdef class Neighbourhood:
             self.exposed[i] = self.alive[i] and self.judge(i)
         if before is not None:
             np.asarray(self.exposed)[:before.n_atoms] |= before.exposed
+        self.n_hidden, self.opened = 0, False
+        if outer is not None:
+            self.find_voids(outer, before)
         if self.has_codes and self.too_many:
             raise ValueError(f"bonds by species need at most {MAX_CODED} nearest and second neighbours of each atom")
         if np.asarray(self.count).min() < 0:
-            raise ValueError(f"radius must include at most {MAX_NEAR} neighbours of each atom, got {radius!r} nm")
+            raise ValueError(f"radius must include at most {MAX_NEAR} neighbours of each atom, got {self.radius!r} nm")
+
+    def find_voids(self, const signed char[::1] outer, Neighbourhood before=None):
+        """Hide the walls of closed voids, and detach atoms without hold."""
+        cdef long i, n_old = 0 if before is None else before.n_atoms
+        hidden = np.asarray(self.exposed).view(bool) & ~np.asarray(outer).view(bool)
+        if before is not None:
+            hidden[:n_old] &= ~np.asarray(before.exposed).view(bool)
+        np.asarray(self.exposed)[hidden] = 0
+        self.hidden, self.n_hidden = hidden.view(np.int8), np.count_nonzero(hidden)
+        self.stack = np.empty(self.n_hidden, np.int32)
+        for i in self.surface if self.n_hidden else ():
+            self.open_from(i)
+        self.opened = False
+        if not np.any(self.anchored):
+            return
+        self.stack = np.empty(self.n_atoms, np.int32)
+        held = np.zeros(self.n_atoms, np.int8)
+        self.hold_from(held)
+        for i in np.flatnonzero(~(held | ~np.asarray(self.alive).view(bool) | np.asarray(self.detached)).view(bool)):
+            self.detach(i)
+        self.stack = np.empty(self.n_hidden, np.int32)
+
+    cdef long open_from(self, long atom) noexcept nogil:
+        # Exposes the walls of the void next to an exposed atom; returns the number of their atoms.
+        cdef int[MAX_NEAR] others
+        cdef long n = 0, n_opened = 0
+        cdef int m, k
+        while True:
+            m = self.near(atom, others)
+            for k in range(m):
+                if self.hidden[others[k]]:
+                    self.hidden[others[k]] = 0
+                    self.exposed[others[k]] = 1
+                    self.stack[n] = others[k]
+                    n += 1
+                    n_opened += 1
+            if n == 0:
+                break
+            n -= 1
+            atom = self.stack[n]
+        self.n_hidden -= n_opened
+        if n_opened:
+            self.opened = True
+        return n_opened
+
+    cdef void hold_from(self, signed char[::1] held) noexcept nogil:
+        # Marks all atoms with a chain of bonds to an anchored atom.
+        cdef int[MAX_NEAR] others
+        cdef long i, n = 0
+        cdef int m, k
+        for i in range(self.n_atoms):
+            if self.anchored[i] and self.alive[i] and not held[i]:
+                held[i] = 1
+                self.stack[n] = <int>i
+                n += 1
+        while n:
+            n -= 1
+            i = self.stack[n]
+            m = self.near(i, others)
+            for k in range(m):
+                if not held[others[k]] and self.bonded(i, others[k]):
+                    held[others[k]] = 1
+                    self.stack[n] = others[k]
+                    n += 1
+
+    cdef int kind_of(self, long atom) noexcept nogil:
+        # Kind of an atom.
+        return self.kind[atom] if self.has_kinds else 0
 
     cdef int near(self, long atom, int* others) noexcept nogil:
-        # The remaining atoms within the radius of an atom, in the order of the cells; -1: more than MAX_NEAR.
+        # The remaining atoms within the largest radius of an atom, in the order of the cells; -1: more than MAX_NEAR.
+        return self.within(atom, self.radius * self.radius, others)
+
+    cdef int within(self, long atom, double reach, int* others) noexcept nogil:
+        # The remaining atoms within a squared distance, not larger than the largest radius; otherwise as `near`.
         cdef double px = self.positions[atom, 0], py = self.positions[atom, 1], pz = self.positions[atom, 2]
-        cdef double dx, dy, dz, reach = self.radius * self.radius
+        cdef double dx, dy, dz
         cdef long ci = <long>floor((px - self.low[0]) / self.radius), cj = <long>floor((py - self.low[1]) / self.radius)
         cdef long ck = <long>floor((pz - self.low[2]) / self.radius), i, j, m, row
         cdef int other, n = 0
@@ -129,8 +219,8 @@ cdef class Neighbourhood:
     cdef void gather(self, long atom) noexcept nogil:
         # Count, bonds and sum of offsets of the neighbours; a count of -1 means too many.
         cdef int[MAX_NEAR] others
-        cdef int n = self.near(atom, others), i
-        cdef double step, s, bond = self.bond_length * self.bond_length
+        cdef int own = self.kind_of(atom), n = self.within(atom, self.reach[own], others), i
+        cdef double step, s, bond = self.bond[own, own]
         cdef int axis, n_near = 0, n_far = 0
         self.count[atom] = n
         for i in range(n):
@@ -139,17 +229,19 @@ cdef class Neighbourhood:
                 step = self.positions[others[i], axis] - self.positions[atom, axis]
                 self.offset[atom, axis] += step
                 s += step * step
+            if self.has_kinds:
+                bond = self.bond[own, self.kind[others[i]]]
             self.bonds[atom] += s <= bond
             n_near += s <= bond
             if self.has_codes:
-                self.bond_code[atom] += self.code_of(others[i], s)
+                self.bond_code[atom] += self.code_of(others[i], s, bond)
                 n_far += bond < s <= self.second_length * self.second_length
         if n_near > MAX_CODED or n_far > MAX_CODED:
             self.too_many = True    # the same value from all threads
 
-    cdef int code_of(self, long atom, double s) noexcept nogil:
-        # What an atom adds to the code of an atom at this squared distance.
-        if s <= self.bond_length * self.bond_length:
+    cdef int code_of(self, long atom, double s, double bond) noexcept nogil:
+        # What an atom adds to the code of an atom at this squared distance, with this squared bond length.
+        if s <= bond:
             return self.code[atom]
         return self.far_code[atom] if s <= self.second_length * self.second_length else 0
 
@@ -158,7 +250,8 @@ cdef class Neighbourhood:
         cdef double sx = self.offset[atom, 0], sy = self.offset[atom, 1], sz = self.offset[atom, 2]
         if self.support[atom]:
             return False
-        return self.count[atom] == 0 or sqrt(sx * sx + sy * sy + sz * sz) > self.threshold * self.count[atom]
+        return self.count[atom] == 0 or sqrt(sx * sx + sy * sy + sz * sz) > (
+            self.threshold[self.kind_of(atom)] * self.count[atom])
 
     cdef void normal(self, long atom, double* normal) noexcept nogil:
         # Outward unit normal; an atom with zero offset keeps its last normal.
@@ -171,22 +264,31 @@ cdef class Neighbourhood:
         # Removes an atom and updates the normals around it; lists the newly exposed atoms and returns their number.
         cdef int[MAX_NEAR] others
         cdef int[MAX_BONDS] nearest
-        cdef int n = self.near(atom, others), i, other, n_fresh = 0, n_nearest = 0
-        cdef double step, s, bond = self.bond_length * self.bond_length
+        cdef int n = self.near(atom, others), i, other, n_fresh = 0, n_nearest = 0, own = self.kind_of(atom), kind
+        cdef double step, s, bond = self.bond[own, own]
         cdef int axis
         self.alive[atom] = 0
         self.exposed[atom] = 0
         self.n_detached += self.detached[atom]
         for i in range(n):
             other = others[i]
-            self.count[other] -= 1
             s = 0.0
+            if self.has_kinds:
+                kind = self.kind[other]
+                bond = self.bond[own, kind]
+                for axis in range(3):
+                    step = self.positions[atom, axis] - self.positions[other, axis]
+                    s += step * step
+                if s > self.reach[kind]:   # outside the neighbourhood of the other one
+                    continue
+                s = 0.0
+            self.count[other] -= 1
             for axis in range(3):
                 step = self.positions[atom, axis] - self.positions[other, axis]
                 self.offset[other, axis] -= step
                 s += step * step
             if self.has_codes:
-                self.bond_code[other] -= self.code_of(atom, s)
+                self.bond_code[other] -= self.code_of(atom, s, bond)
             if s <= bond:
                 self.bonds[other] -= 1
                 if not self.detached[other]:
@@ -195,6 +297,10 @@ cdef class Neighbourhood:
                     n_nearest += 1
             if self.judge(other) and not self.exposed[other]:
                 self.exposed[other] = 1
+                if self.n_hidden and self.hidden[other]:
+                    self.hidden[other] = 0
+                    self.n_hidden -= 1
+                    self.open_from(other)
                 fresh[n_fresh] = other
                 n_fresh += 1
         if 1 < n_nearest <= MAX_BONDS:
@@ -210,7 +316,7 @@ cdef class Neighbourhood:
         for axis in range(3):
             step = self.positions[first, axis] - self.positions[second, axis]
             s += step * step
-        return s <= self.bond_length * self.bond_length
+        return s <= self.bond[self.kind_of(first), self.kind_of(second)]
 
     cdef void release(self, const int* nearest, int n) noexcept nogil:
         # Detaches the parts of the specimen that lost their hold when a common neighbour of these atoms was removed. All
@@ -404,7 +510,7 @@ cdef class Neighbourhood:
 
     @property
     def bond_counts(self):
-        """Number of nearest neighbours, closer than `bond_length`, shape (n,)."""
+        """Number of nearest neighbours, closer than the bond length, shape (n,)."""
         return np.asarray(self.bonds).astype(np.int32)
 
     @property

@@ -110,7 +110,8 @@ def _of_run(run):
         "tip": _tip(run.settings["tip"]),
         "detector": {"distance": run.detector.distance, "width": run.detector.width},
         "ions": len(run),
-        "species": {name: int((run.species == index).sum()) for index, name in enumerate(run.elements)},
+        "species": _counts(run.elements, run.species),
+        "phases": _counts(run.phase_names, run.phase),
         "field_before_leaving": _extent(run.fields),
         "outcomes": {key: summary[key] for key in ("perturbation", "hit", "missed", "never_left")},
         "without_neighbour_to_roll_onto": summary["without_neighbour"],
@@ -118,6 +119,14 @@ def _of_run(run):
         "perturbations_flown": [str(each["repr"] if isinstance(each, dict) else each) for each in run.perturbations],
         "responses": responses,
     }
+
+
+def _counts(names, indices):
+    """Number of ions by name; several species may have the same one."""
+    counts = dict.fromkeys(names, 0)
+    for index, name in enumerate(names):
+        counts[name] += int((indices == index).sum())
+    return counts
 
 
 def _clock(run):
@@ -140,11 +149,11 @@ def _real_units(run):
     if run.units is None:
         return None
     names = dict(enumerate(run.elements))
-    charges = {
-        f"{names[species]}{charge}+": int(((run.species == species) & (run.real.charges == charge)).sum())
-        for species in sorted(set(run.species.tolist()))
-        for charge in sorted(set(run.real.charges[run.species == species].tolist()))
-    }
+    charges: dict[str, int] = {}
+    for species in sorted(set(run.species.tolist())):
+        for charge in sorted(set(run.real.charges[run.species == species].tolist())):
+            ion = f"{names[species]}{charge}+"
+            charges[ion] = charges.get(ion, 0) + int(((run.species == species) & (run.real.charges == charge)).sum())
     units = run.units
     return {
         "voltages": _extent(run.voltages * units.voltage_ratio),
@@ -176,6 +185,8 @@ def _tip(settings):
         contents["material"] = {key: value for key, value in host if value is not None and key != "sources"}
     if "solutes" in contents:
         contents["solutes"] = {solute["name"]: fraction for solute, fraction in contents["solutes"]}
+    if "phases" in contents:
+        contents["phases"] = [phase["name"] for phase in contents["phases"]]
     if "elements" in contents:
         contents["elements"] = [element["name"] for element in contents["elements"]]
     return contents

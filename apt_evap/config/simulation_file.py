@@ -11,6 +11,7 @@ from pathlib import Path
 from apt_evap._common.files import FileError, check_path, read_small_file
 from apt_evap._common.validation import check_count, check_kind, check_number, check_seed, check_switch, short_text
 from apt_evap.config.map_panels import MapSettings, read_maps
+from apt_evap.config.phases import read_phases
 from apt_evap.config.physics import read_control, read_law, read_real_units
 from apt_evap.config.tables import check_keys, check_table
 from apt_evap.detection.detector import Detector
@@ -26,6 +27,7 @@ from apt_evap.simulation.run import Run
 from apt_evap.simulation.run_hdf5 import is_run
 from apt_evap.simulation.simulation import Simulation
 from apt_evap.specimen.materials import MATERIALS, Material, material
+from apt_evap.specimen.phases import check_phases
 from apt_evap.specimen.tip import Tip
 
 _KINDS = {
@@ -113,7 +115,7 @@ class Config:
         check_law(self.law)
 
     def __repr__(self) -> str:
-        host, radius = self.tip["material"].name, self.tip["apex_radius"]
+        host, radius = _host(self.tip).name, self.tip["apex_radius"]
         panels = ", ".join(panel.title for panel in self.maps.panels)
         return (
             f"<Config {str(self.path)!r}: {self.n_ions:,} ions of {host}, apex radius {radius:.4g} nm; maps: {panels}>"
@@ -184,7 +186,8 @@ def read_config(path: str | Path) -> Config:
     The tables are ``[tip]`` (the arguments of `Tip`; lengths in nm or, as text, in lattice constants: "20 a"),
     ``[simulation]`` (ions, voltage, seed, responses), ``[detector]``, ``[charges]``, ``[flights]``, ``[responses]``,
     ``[watch]`` (fields of `Detector`, `ChargeSettings`, `FlightSettings`, `ResponseSettings`, `WatchSettings`),
-    ``[law]``, ``[control]``, ``[real_units]`` (see `apt_evap.config.physics`) and ``[maps]`` (bins, smoothing and
+    ``[[phases]]`` (see `apt_evap.config.phases`; instead of a material in ``[tip]``), ``[law]``, ``[control]``,
+    ``[real_units]`` (see `apt_evap.config.physics`) and ``[maps]`` (bins, smoothing and
     panels, each with a title and a perturbation as in `apt_evap.perturbation.from_dict`). Only ``[tip]`` with a
     material and an apex_radius, and the ions in ``[simulation]``, are required.
 
@@ -227,14 +230,18 @@ def read_config(path: str | Path) -> Config:
             "real_units",
             "maps",
         )
-        check_keys(document, ("output", *tables), ("tip", "simulation"))
+        check_keys(document, ("output", "phases", *tables), ("tip", "simulation"))
         for name in tables:
             check_table(document.get(name, {}), f"[{name}]")
         output = document.get("output")
         if output is not None and not (isinstance(output, str) and output):
             raise ValueError(f"output must be a file name such as 'run.h5', got {short_text(output)}")
+    phases = None
+    if "phases" in document:
+        with _located(path, "phases"):
+            phases = check_phases(read_phases(document["phases"], _material))
     with _located(path, "tip"):
-        tip = _tip(document["tip"])
+        tip = _tip(document["tip"], phases)
     with _located(path, "simulation"):
         simulation = document["simulation"]
         check_keys(simulation, ("ions", "voltage", "seed", "responses"), ("ions",))
@@ -274,11 +281,13 @@ def _responses(wide=False, **settings):
     return ResponseSettings.wide(**settings) if wide else ResponseSettings(**settings)
 
 
-def _tip(table):
-    """Arguments of `Tip` from the table [tip]."""
-    known = tuple(inspect.signature(Tip).parameters)
-    check_keys(table, known, ("material", "apex_radius"))
-    host = table["material"]
+def _host(tip):
+    """Material, or that of the matrix."""
+    return tip["phases"][0].material if "phases" in tip else tip["material"]
+
+
+def _material(host):
+    """Material from its name or its table."""
     if isinstance(host, Mapping):
         check_keys(host, _field_names(Material), ("name",))
         changes = {key: value for key, value in host.items() if key != "name"}
@@ -287,11 +296,23 @@ def _tip(table):
         else:
             check_keys(host, _field_names(Material), ("structure", "a", "evaporation_field", "charge_state", "mass"))
             host = Material(host["name"], **changes)
-    elif isinstance(host, str):
-        host = material(host)
+        return host
+    if isinstance(host, str):
+        return material(host)
+    raise ValueError(f"material must be a name such as 'Ni' or a table, got {short_text(host)}")
+
+
+def _tip(table, phases):
+    """Arguments of `Tip` from the table [tip], and the phases if there are any."""
+    known = tuple(name for name in inspect.signature(Tip).parameters if name != "phases")
+    if phases is None:
+        check_keys(table, known, ("material", "apex_radius"))
+        settings = dict(table, material=_material(table["material"]))
     else:
-        raise ValueError(f"material must be a name such as 'Ni' or a table, got {short_text(host)}")
-    settings = dict(table, material=host)
+        known = tuple(name for name in known if name not in ("material", "solutes"))
+        check_keys(table, known, ("apex_radius",))
+        settings = dict(table, phases=phases)
+    host = _host(settings)
     for name in ("apex_radius", "shank_length", "depth"):
         if name in settings:
             settings[name] = _length(settings[name], name, host.a)

@@ -90,6 +90,8 @@ class Orientation:
     def from_settings(cls, settings: Mapping[str, Any]) -> "Orientation":
         """Make the orientation of a tip from its settings: `Tip.settings`, or ``Run.settings["tip"]``.
 
+        With several phases it is that of the matrix.
+
         Raises
         ------
         ValueError
@@ -97,7 +99,11 @@ class Orientation:
         """
         if "axis" not in settings:
             raise ValueError(f"settings must contain the axis of a crystal, got {', '.join(settings)}")
-        return cls(Material(**settings["material"]), tuple(settings["axis"]), settings["rotation"])
+        if "phases" not in settings:
+            return cls(Material(**settings["material"]), tuple(settings["axis"]), settings["rotation"])
+        matrix = settings["phases"][0]
+        axis, rotation = (settings[name] if matrix[name] is None else matrix[name] for name in ("axis", "rotation"))
+        return cls(Material(**matrix["material"]), tuple(axis), rotation)
 
     def directions(self, crystal_directions: ArrayLike) -> Floats:
         """Rotate vectors from the frame of the crystal to the frame of the specimen, both of shape (n, 3)."""

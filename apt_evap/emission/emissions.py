@@ -31,12 +31,14 @@ class Emissions:
     ions : array_like of int
         Number of the ion in the sequence of evaporation, shape (n,).
     nearest_neighbour_distance : float
-        [nm].
+        [nm], of the matrix.
     targets : array_like, optional
         Positions of the three surface nearest neighbours with the highest charges, in falling order [nm], shape
         (n, 3, 3); NaN if there are fewer. The first are the `neighbours`.
     charge_ratios : array_like, optional
         Their charges over that of the atom, shape (n, 3); NaN if there are fewer.
+    rollup_distances : array_like, optional
+        Distance of each rolled-up ion from its neighbour [nm], shape (n,); by default `nearest_neighbour_distance`.
 
     Raises
     ------
@@ -53,6 +55,7 @@ class Emissions:
     nearest_neighbour_distance: float
     targets: Any = None
     charge_ratios: Any = None
+    rollup_distances: np.ndarray | None = None
 
     def __post_init__(self):
         positions = check_array(self.positions, "positions", ("n", 3))
@@ -72,11 +75,17 @@ class Emissions:
         if self.targets is not None:
             values["targets"] = check_array(self.targets, "targets", (n, 3, 3), finite=False)
             values["charge_ratios"] = check_array(self.charge_ratios, "charge_ratios", (n, 3), finite=False)
+        if self.rollup_distances is not None:
+            values["rollup_distances"] = check_array(self.rollup_distances, "rollup_distances", (n,))
         deviation = np.abs(np.linalg.norm(values["normals"], axis=1) - 1)
         if n and deviation.max() > 1e-6:
             raise ValueError(f"normals must have length 1, got one that deviates by {deviation.max():.2g}")
-        for name, least in (("charge_states", 1), ("masses", np.finfo(np.float64).tiny)):
-            if n and values[name].min() < least:
+        for name, least in (
+            ("charge_states", 1),
+            ("masses", np.finfo(np.float64).tiny),
+            ("rollup_distances", np.finfo(np.float64).tiny),
+        ):
+            if n and name in values and values[name].min() < least:
                 raise ValueError(f"{name} must be > 0, got {values[name].min()}")
         for name, value in values.items():
             object.__setattr__(self, name, value)
@@ -98,7 +107,8 @@ class Emissions:
     @property
     def columns(self) -> tuple[str, ...]:
         """Names of the arrays with one row per atom."""
-        return COLUMNS if self.targets is None else COLUMNS + TARGET_COLUMNS
+        optional = (*TARGET_COLUMNS, "rollup_distances")
+        return COLUMNS + tuple(name for name in optional if getattr(self, name) is not None)
 
     @property
     def can_roll(self) -> Booleans:

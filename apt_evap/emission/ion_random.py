@@ -3,20 +3,10 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
+from apt_evap._common.counter_random import GAMMA, mix, open_interval
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_count, check_seed
 from apt_evap._core.elementary import normal_quantile
-
-_GAMMA = np.uint64(0x9E3779B97F4A7C15)
-_FIRST = np.uint64(0xBF58476D1CE4E5B9)
-_SECOND = np.uint64(0x94D049BB133111EB)
-
-
-def _mix(z):
-    """Finalizer of SplitMix64, on an array of uint64."""
-    z = (z ^ (z >> np.uint64(30))) * _FIRST
-    z = (z ^ (z >> np.uint64(27))) * _SECOND
-    return z ^ (z >> np.uint64(31))
 
 
 class IonRandom:
@@ -45,8 +35,8 @@ class IonRandom:
     def __init__(self, seed: int, ions: ArrayLike) -> None:
         self.seed = check_seed(seed)
         ions = check_array(ions, "ions", ("n",), dtype=np.int64).view(np.uint64)
-        start = _mix(np.array([self.seed], dtype=np.uint64) + _GAMMA)
-        self._state = _mix(start + (ions + np.uint64(1)) * _GAMMA)
+        start = mix(np.array([self.seed], dtype=np.uint64) + GAMMA)
+        self._state = mix(start + (ions + np.uint64(1)) * GAMMA)
         self._column = 0
 
     def __repr__(self) -> str:
@@ -56,9 +46,8 @@ class IonRandom:
         """Return the next uniform numbers in (0, 1), shape (n, columns)."""
         first = self._column + 1
         self._column += check_count(columns, "columns", at_least=1)
-        steps = np.arange(first, self._column + 1, dtype=np.uint64) * _GAMMA
-        bits = _mix(self._state[:, None] + steps) >> np.uint64(12)
-        return (bits + 0.5) * 2.0**-52
+        steps = np.arange(first, self._column + 1, dtype=np.uint64) * GAMMA
+        return open_interval(mix(self._state[:, None] + steps))
 
     def normal(self, columns: int = 1) -> Floats:
         """Return the next normal numbers of mean 0 and variance 1, shape (n, columns)."""

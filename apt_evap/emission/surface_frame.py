@@ -70,6 +70,8 @@ def rollup_direction(emissions: Emissions, shares: Floats | None = None) -> tupl
 def rolled_positions(emissions: Emissions) -> Floats:
     """Positions p_r = s + d n, one nearest neighbour distance d above the neighbour s that each ion rolls onto.
 
+    Between two phases, d is the mean of their distances.
+
     Parameters
     ----------
     emissions : Emissions
@@ -80,7 +82,10 @@ def rolled_positions(emissions: Emissions) -> Floats:
     ndarray, shape (n, 3)
         Positions [nm]; NaN for an ion without a neighbour.
     """
-    return emissions.neighbours + emissions.nearest_neighbour_distance * emissions.normals
+    distances = emissions.rollup_distances
+    if distances is None:
+        return emissions.neighbours + emissions.nearest_neighbour_distance * emissions.normals
+    return emissions.neighbours + distances[:, None] * emissions.normals
 
 
 def target_shares(emissions: Emissions, sharpness: float) -> Floats:
@@ -151,7 +156,10 @@ def shared_positions(emissions: Emissions, shares: Floats) -> Floats:
     ndarray, shape (n, m, 3)
         Positions [nm]; NaN for an ion without a neighbour.
     """
-    return _mean_targets(emissions, shares) + (emissions.nearest_neighbour_distance * emissions.normals)[:, None]
+    distances = emissions.rollup_distances
+    if distances is None:
+        return _mean_targets(emissions, shares) + (emissions.nearest_neighbour_distance * emissions.normals)[:, None]
+    return _mean_targets(emissions, shares) + (distances[:, None] * emissions.normals)[:, None]
 
 
 def along_surface(normals: ArrayLike, first: Floats, second: Floats) -> Floats:

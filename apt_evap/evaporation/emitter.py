@@ -194,16 +194,28 @@ class Emitter:
         return kernel_of(self.law, tip, self.control)
 
     def _neighbourhood_of(self, tip, kernel, previous=None):
+        names = ("neighbour_radius", "surface_threshold", "bond_length")
+        if len(set(tip.criteria)) == 1:
+            radius, threshold, bond_length = (getattr(tip.criterion, name) for name in names)
+            kinds = None
+        else:
+            radius, threshold, bond_length = (
+                np.array([getattr(criterion, name) for criterion in tip.criteria]) for name in names
+            )
+            kinds = tip.phase
+        outer = tip.outer
         return Neighbourhood(
             tip.positions,
-            tip.neighbour_radius,
-            tip.surface_threshold,
+            radius,
+            threshold,
             tip.support.view(np.int8),
-            tip.bond_length,
+            bond_length,
             usable_threads(self.n_threads),
             previous,
             (tip.support | ~tip.evaporable).view(np.int8),
             kernel.surroundings,
+            kinds,
+            None if outer is None else outer.view(np.int8),
         )
 
     def __len__(self) -> int:

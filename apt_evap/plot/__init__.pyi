@@ -16,6 +16,7 @@ from .profiles import profile_comparison as profile_comparison
 from .profiles import rectangles as rectangles
 from .responses import ion_colors as ion_colors
 from .responses import response as response
+from .specimens import cut as cut
 from .specimens import mark_atoms as mark_atoms
 from .specimens import specimen as specimen
 from .spectra import spectrum as spectrum

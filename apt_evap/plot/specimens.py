@@ -1,16 +1,21 @@
-"""Surface atoms of a specimen, seen from any direction."""
+"""Surface atoms of a specimen, seen from any direction, and slices of a specimen."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
+from matplotlib.colors import to_rgba
+from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike
 
-from apt_evap._common.validation import check_array, check_number
+from apt_evap._common.validation import check_array, check_choice, check_number
 from apt_evap.evaporation.emitter import Emitter
 from apt_evap.plot._figure import add_colorbar, new_figure, set_title
+from apt_evap.specimen.tip import Tip
 
+_SMALL = 0.75  # diameter of a disc [d_nn], so that atoms in the second plane are visible
 COLORED_BY = {"fields": "field [V/nm]", "charges": "charge [e]"}
 
 
@@ -106,6 +111,112 @@ def _discs(ax, places, diameter, **colors):
     )  # fmt: skip
     ax.add_collection(discs, autolim=False)
     return discs
+
+
+def cut(
+    tip: Tip,
+    color: str = "phase",
+    ax: Axes | None = None,
+    *,
+    point: ArrayLike = (0.0, 0.0, 0.0),
+    normal: ArrayLike = (0.0, 1.0, 0.0),
+    thickness: float | None = None,
+    left: ArrayLike | None = None,
+    colors: Mapping[str, Any] | None = None,
+    legend: bool = True,
+    title: str | None = None,
+) -> Axes:
+    """Draw the atoms of a thin slice of a specimen, coloured by phase or by species; rare species on top.
+
+    Parameters
+    ----------
+    tip : Tip
+        The specimen, or a shell of it.
+    color : {"phase", "species"}
+        What the colours show.
+    ax : matplotlib.axes.Axes, optional
+        Where to draw; a new figure by default.
+    point : array_like
+        A point in the middle of the slice [nm], shape (3,).
+    normal : array_like
+        Normal of the slice, shape (3,). By default the slice contains the axis of the tip, with x to the right and z
+        upwards; (0, 0, 1) is a slice across the axis, seen from above.
+    thickness : float, optional
+        Thickness of the slice [nm]; by default two nearest neighbour distances of the matrix.
+    left : array_like of bool, optional
+        Atoms that are left in the specimen, shape (n,); by default all.
+    colors : mapping, optional
+        Colours by name of the phase or of the element; by default those of matplotlib's "tab10".
+    legend : bool
+        Whether to draw a legend with the names.
+    title : str, optional
+        Title above the picture.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+
+    Raises
+    ------
+    ValueError
+        If `color` is another word, or no atom is in the slice.
+    """
+    check_choice(color, "color", ("phase", "species"))
+    point = check_array(point, "point", (3,))
+    across = check_array(normal, "normal", (3,))
+    length = float(np.linalg.norm(across))
+    if length == 0:
+        raise ValueError(f"normal must not be zero, got {normal!r}")
+    across = across / length
+    diameter = tip.nearest_neighbour_distance
+    thickness = 2 * diameter if thickness is None else check_number(thickness, "thickness", above=0, unit="nm")
+    inside = np.abs((tip.positions - point) @ across) <= 0.5 * thickness
+    if left is not None:
+        inside &= check_array(left, "left", (len(tip),), dtype=bool)
+    atoms = np.flatnonzero(inside)
+    if not len(atoms):
+        raise ValueError(f"no atom is in the slice of {thickness:g} nm at {point.tolist()}")
+    # z upwards if the slice contains it, otherwise x to the right
+    up = np.array([0.0, 0.0, 1.0]) - across[2] * across
+    if np.linalg.norm(up) < 1e-6:
+        up = np.array([0.0, np.sign(across[2]), 0.0])
+    up = up / np.linalg.norm(up)
+    right = np.cross(across, -up) if abs(across[2]) < 1 - 1e-6 else np.array([1.0, 0.0, 0.0])
+    if right[np.argmax(np.abs(right))] < 0:
+        right = -right
+    places = np.column_stack([tip.positions[atoms] @ right, tip.positions[atoms] @ up])
+    names = tip.phase_names if color == "phase" else tuple(element.name for element in tip.elements)
+    numbers = tip.phase[atoms] if color == "phase" else tip.species[atoms]
+    towards = (tip.positions[atoms] - point) @ np.cross(right, up)
+    # rare species are drawn over frequent ones, and front atoms over back atoms
+    counts = np.bincount(numbers, minlength=len(names)) if color == "species" else np.zeros(len(names))
+    order = np.lexsort((towards, -counts[numbers]))
+    distinct = list(dict.fromkeys(names))  # species of one element may differ in their evaporation fields
+    palette = {name: f"C{number % 10}" for number, name in enumerate(distinct)} | dict(colors or {})
+    low, high = places.min(axis=0) - diameter, places.max(axis=0) + diameter
+    if ax is None:
+        width, height = (high - low) * (4.5 / max(high - low))
+        figure = new_figure((width + 1.6, height + 0.7))
+        figure.set_layout_engine("compressed")  # for axes with a fixed aspect ratio
+        ax = figure.subplots()
+    shades = np.array([to_rgba(palette[name]) for name in names])[numbers[order]]
+    _discs(ax, places[order], diameter if color == "phase" else _SMALL * diameter, facecolors=shades)
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+    ax.set(xlabel=f"{_direction(right)} [nm]", ylabel=f"{_direction(up)} [nm]")
+    set_title(ax, title)
+    if legend:
+        shown = [name for name in distinct if any(names[number] == name for number in np.unique(numbers))]
+        handles = [Line2D([], [], marker="o", linestyle="", color=palette[name], label=name) for name in shown]
+        ax.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, handletextpad=0.2)
+    return ax
+
+
+def _direction(vector):
+    """Name of an axis, or "along (x, y, z)"."""
+    for name, unit in zip("xyz", np.eye(3), strict=True):
+        if np.allclose(vector, unit):
+            return name
+    return "along (" + ", ".join(f"{component:.2g}" for component in vector) + ")"
 
 
 def mark_atoms(

@@ -120,6 +120,8 @@ class Run:
     detached : ndarray of bool, shape (n,), optional
         Atoms that left because they had lost all chains of bonds to the body; by default none, as in files of earlier
         versions.
+    phase : ndarray of int8, shape (n,), optional
+        Index of the phase of each atom into `phase_names`; by default 0.
     cap : CapHistory
         The cap of the surface after each relaxation, at the simulated voltage.
     clock : Clock or None
@@ -150,6 +152,7 @@ class Run:
     ended: str = ""
     provenance: dict = field(default_factory=provenance_now)
     detached: Any = None
+    phase: Any = None
     cap: CapHistory = field(default_factory=CapHistory.empty)
     clock: Clock | None = None
     units: RealUnits | None = None
@@ -158,6 +161,8 @@ class Run:
     def __post_init__(self):
         if self.detached is None:
             object.__setattr__(self, "detached", np.zeros(len(self.site), bool))
+        if self.phase is None:
+            object.__setattr__(self, "phase", np.zeros(len(self.site), np.int8))
 
     def __len__(self) -> int:
         return len(self.site)
@@ -174,11 +179,16 @@ class Run:
         return f"<Run: {len(self):,} ions of {', '.join(self.elements)} at {where}; {details}>"
 
     @property
+    def phase_names(self) -> tuple[str, ...]:
+        """Names of the phases of the specimen; ("matrix",) if there is only one."""
+        return tuple(phase["name"] for phase in self.settings["tip"].get("phases", ())) or ("matrix",)
+
+    @property
     def evaporation_fields(self) -> Floats:
         """Evaporation field of the species of each ion [V/nm], shape (n,)."""
         tip = self.settings["tip"]
         # in the order of the species; two of them may have the same name
-        materials = [tip["material"], *(each for each, _ in tip["solutes"])] if "material" in tip else tip["elements"]
+        materials = tip.get("elements") or [tip["material"], *(each for each, _ in tip["solutes"])]
         return np.array([material["evaporation_field"] for material in materials])[self.species]
 
     @property
@@ -537,8 +547,8 @@ class Run:
         -------
         Run or Hits
             For a detector the same run. For an instrument the recorded ions: what the instrument writes, and the truth:
-            `site`, `ion`, `positions`, and in `extra` the species, the charge in flight, and charge and field before
-            evaporation.
+            `site`, `ion`, `positions`, and in `extra` the species, the phase if there are several, the charge in
+            flight, and charge and field before evaporation.
 
         Raises
         ------
@@ -559,7 +569,10 @@ class Run:
         units = self.units if detector.timing is None else replace(self.units, timing=None)
         plane = replace(self, units=units, detector=replace(self.detector, projection="plane"))
         hits = plane.hits(self.first_perturbation if perturbation is None else perturbation)
-        hits = replace(hits, extra=hits.extra | {"species": self.species})
+        truth = {"species": self.species}
+        if len(self.phase_names) > 1:
+            truth["phase"] = self.phase
+        hits = replace(hits, extra=hits.extra | truth)
         return detector.hits(hits, self.detector.distance, seed=self.seed if seed is None else check_seed(seed))
 
     def _at_distance(self, ratio, detector):
@@ -596,7 +609,7 @@ class Run:
         emissions = Emissions.join([run.emissions for run in runs])
         columns: dict[str, Any] = {
             name: np.concatenate([getattr(run, name) for run in runs])
-            for name in ("site", "species", "charges", "fields", "detached")
+            for name in ("site", "species", "charges", "fields", "detached", "phase")
         }
         flown = tuple(
             Flown(

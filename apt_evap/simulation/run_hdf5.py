@@ -44,7 +44,10 @@ _ATOM_PROBE, _SIMULATION = f"{_ENTRY}/atom_probe", f"{_ENTRY}/simulation"
 _EMISSIONS = ("positions", "normals", "neighbours", "charge_states", "masses")
 _COLUMNS = ("site", "species", "charges", "fields")
 _DETACHED = "detached", (f"{_SIMULATION}/detached", np.int8, ())  # not in files of earlier versions
+_PHASE = "phase", (f"{_SIMULATION}/phase", np.int8, ())  # only with several phases
+_ROLLUP = "rollup_distances", (f"{_SIMULATION}/rollup_distances", np.float64, ())  # only if the phases differ in it
 _UNITS = {
+    "rollup_distances": "nm",
     "positions": "nm",
     "neighbours": "nm",
     "targets": "nm",
@@ -167,6 +170,8 @@ def _write(file, run):
     for name in _COLUMNS:
         _put(simulation, name, getattr(run, name))
     _put(simulation, "detached", run.detached.astype(np.int8))
+    if len(run.phase_names) > 1:
+        _put(simulation, "phase", run.phase)
     for index, (perturbation, flown) in enumerate(zip(run.perturbations, run.flown, strict=True)):
         group = simulation.create_group(f"flown/{index}")
         _put_text(group, "perturbation", json.dumps(described(perturbation)))
@@ -275,8 +280,7 @@ def _read(file, partial):
         kinds["responses residuals"] = f"{group}/residuals", np.float32, (2,)
     targets = {name: kind for name, kind in _TARGETS.items() if kind[0] in file}
     kinds |= targets
-    if _DETACHED[1][0] in file:
-        kinds |= dict([_DETACHED])
+    kinds |= {name: kind for name, kind in (_DETACHED, _PHASE, _ROLLUP) if kind[0] in file}
     optional = {"clock": _CLOCK, "real": _REAL}
     optional = {group: names for group, names in optional.items() if f"{_SIMULATION}/{group}" in file}
     for group, names in optional.items():
@@ -284,6 +288,10 @@ def _read(file, partial):
     columns, lost = _columns(file, kinds, partial)
     if len(columns["ions"]) and not 0 <= columns["species"].min() <= columns["species"].max() < len(elements):
         raise ValueError(f"species must be 0 to {len(elements) - 1}, as there are {len(elements)} elements")
+    n_phases = len(settings["tip"].get("phases", ())) or 1
+    phase = columns.get("phase", np.zeros(1, np.int8))
+    if len(phase) and not 0 <= phase.min() <= phase.max() < n_phases:
+        raise ValueError(f"phase must be 0 to {n_phases - 1}, as there are {n_phases} phases")
     groups = {group: [columns[f"{group} {name}"] for name in names] for group, names in optional.items()}
     units = None
     if "real" in groups:
@@ -302,9 +310,11 @@ def _read(file, partial):
         "emissions": Emissions(
             **{name: columns[name] for name in ("ions", *_EMISSIONS, *targets)},
             nearest_neighbour_distance=float(file.attributes()["nearest_neighbour_distance"]),
+            rollup_distances=columns.get("rollup_distances"),
         ),
         **{name: columns[name] for name in _COLUMNS},
         "detached": columns["detached"].astype(bool) if "detached" in columns else None,
+        "phase": columns.get("phase"),
         "perturbations": tuple(perturbations),
         "flown": tuple((columns[f"{k} directions"], columns[f"{k} times"]) for k in range(len(perturbations))),
         "responses": Responses(*(columns[f"responses {name}"] for name in Responses._fields))

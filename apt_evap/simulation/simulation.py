@@ -301,6 +301,7 @@ class Simulation:
                 elements=tuple(element.name for element in self.tip.elements),
                 settings=self.settings,
                 detached=batch.detached,
+                phase=self.tip.phase_at(batch.site),
                 cap=CapHistory.of(first_ion, batch.cap),
                 clock=None if batch.waits is None else Clock(batch.waits, batch.voltages),
             )
@@ -325,7 +326,17 @@ class Simulation:
             ions=ions,
             nearest_neighbour_distance=self.tip.nearest_neighbour_distance,
             **columns,
+            rollup_distances=self._rollup_distances(batch),
         )
+
+    def _rollup_distances(self, batch):
+        """Mean nearest neighbour distance of the phases of each ion and of its neighbour; None if all are equal."""
+        distances = np.array([criterion.nearest_neighbour_distance for criterion in self.tip.criteria])
+        if (distances == distances[0]).all():
+            return None
+        own = self.tip.phase_at(batch.site)
+        other = np.where(batch.targets[:, 0] >= 0, self.tip.phase_at(batch.targets[:, 0]), own)
+        return 0.5 * (distances[own] + distances[other])
 
     def _check_atoms(self, n_ions):
         """Warn if there are fewer evaporable atoms than requested ions."""

@@ -5,10 +5,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from apt_evap._common.small_matrices import lengths, matrix_product, products
-from apt_evap._common.types import Floats
+from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_array, check_choice, check_number, short_text
 from apt_evap._core.elementary import sine_and_cosine
 
@@ -226,7 +226,38 @@ def lattice_points_in(
     tolerance: float = 0.0,
     block: int = _BLOCK,
 ) -> Floats:
-    """Lattice points inside a shape, or in a shell below its surface.
+    """Lattice points inside a shape, or in a shell below its surface: the positions of `lattice_sites_in`.
+
+    Parameters
+    ----------
+    structure, a, c, orientation, origin, signed_distance, bounds, depth, tolerance, block
+        As for `lattice_sites_in`.
+
+    Returns
+    -------
+    ndarray
+        Positions [nm], shape (n, 3).
+    """
+    return lattice_sites_in(
+        structure, a, c, orientation, origin, signed_distance, bounds, depth=depth, tolerance=tolerance, block=block
+    )[0]
+
+
+def lattice_sites_in(
+    structure: str,
+    a: float,
+    c: float | None,
+    orientation: ArrayLike,
+    origin: ArrayLike,
+    signed_distance: Callable[[Floats], Floats],
+    bounds: ArrayLike,
+    *,
+    depth: Callable[[Floats], Floats] | None = None,
+    tolerance: float = 0.0,
+    block: int = _BLOCK,
+    label: Callable[[Floats, Integers, int], NDArray[np.int32]] | None = None,
+) -> tuple[Floats, NDArray[np.int32]]:
+    """Sites of a lattice inside a shape, or in a shell below its surface, with a label for each of them.
 
     Space is divided into blocks of cells. The signed distance at the centre of a block excludes most blocks; the points
     of the others are tested. Points are ordered by their cell (first, second, third index), then by the site in the
@@ -252,11 +283,16 @@ def lattice_points_in(
         Points at most this far outside count as inside [nm], to include points on the surface in spite of rounding.
     block : int
         Cells per edge of a block.
+    label : callable, optional
+        Takes points (n, 3) [nm], their cells (3, n) and the number of the site in the cell; returns a label >= 0 for
+        each point, or a negative number for a site without an atom: int (n,).
 
     Returns
     -------
-    ndarray
-        Positions [nm], shape (n, 3).
+    positions : ndarray, shape (n, 3)
+        [nm].
+    labels : ndarray of int32, shape (n,)
+        Empty without `label`.
     """
     edges = cell_lengths(structure, a, c)
     orientation = check_array(orientation, "orientation", (3, 3))
@@ -288,14 +324,21 @@ def lattice_points_in(
             for site, fraction in enumerate(basis):
                 points = _to_specimen((cell + fraction[:, None]) * edges[:, None], orientation, origin)
                 mask = inside(points, tolerance)
+                points, labels = points[mask], None
+                if label is not None:
+                    labels = label(points, cell[:, mask], site)
+                    mask[mask] = occupied = labels >= 0
+                    points, labels = points[occupied], labels[occupied].astype(np.int32)
                 i, j, k = cell[:, mask] - (first * block)[:, None]
-                yield ((i * count[1] * block + j) * count[2] * block + k) * len(basis) + site, points[mask]
+                yield ((i * count[1] * block + j) * count[2] * block + k) * len(basis) + site, points, labels
 
     step = max(1, _CHUNK // block**3)
-    layers = []
+    layers, all_labels = [np.empty((0, 3))], [np.empty(0, np.int32)]
     for layer in range(count[0]):
         pieces = list(slab(layer))
         if pieces:
-            order = np.argsort(np.concatenate([keys for keys, _ in pieces]))
-            layers.append(np.concatenate([points for _, points in pieces])[order])
-    return np.ascontiguousarray(np.concatenate(layers)) if layers else np.empty((0, 3))
+            order = np.argsort(np.concatenate([keys for keys, _, _ in pieces]))
+            layers.append(np.concatenate([points for _, points, _ in pieces])[order])
+            if label is not None:
+                all_labels.append(np.concatenate([labels for _, _, labels in pieces])[order])  # type: ignore[arg-type]
+    return np.ascontiguousarray(np.concatenate(layers)), np.concatenate(all_labels)

@@ -2,15 +2,16 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from apt_evap._common.memory import check_memory
-from apt_evap._common.small_matrices import lengths, matrix_product
-from apt_evap._common.types import Floats
+from apt_evap._common.small_matrices import lengths
+from apt_evap._common.types import Booleans, Floats
 from apt_evap._common.validation import (
     check_array,
     check_kind,
@@ -21,8 +22,9 @@ from apt_evap._common.validation import (
     short_text,
 )
 from apt_evap.specimen import ase_atoms, lattice
-from apt_evap.specimen.alloy import check_solutes, draw_species
+from apt_evap.specimen.alloy import check_solutes
 from apt_evap.specimen.materials import Material, as_material
+from apt_evap.specimen.phases import Arrangement, Phase, check_phases, phase_from_settings
 from apt_evap.specimen.shape import TaperedCap
 from apt_evap.specimen.shell import Shell
 from apt_evap.specimen.surface_criterion import SurfaceCriterion
@@ -31,7 +33,19 @@ _ROUNDING = 1e-6  # [d_nn]: sites on the surface are all included, in spite of r
 _LAYER = 0.74  # thickness of the layer of surface atoms [d_nn]: for fcc, 0.48 a^2 of the surface per atom
 _WIDEST = 10  # largest neighbourhood [d_nn]: 6,000 atoms each; larger ones do not fit into memory
 _MAX_CELLS = 5e8  # neighbourhoods in the bounding box of all atoms: 2 GB for the neighbour grid
+_CLOSEST = 0.7  # [d_nn]: of two atoms of different lattices that are closer, one is left out
 _SAMPLE = 10_000  # atoms whose nearest neighbour distance is measured
+_SHAPE_SETTINGS = (
+    "apex_radius",
+    "axis",
+    "shank_angle",
+    "shank_length",
+    "base",
+    "rotation",
+    "origin",
+    "offset_seed",
+    "seed",
+)
 
 
 class Tip:
@@ -42,8 +56,8 @@ class Tip:
 
     Parameters
     ----------
-    material : Material or str
-        The crystal; a str is looked up by `material`.
+    material : Material or str, optional
+        The crystal; a str is looked up by `material`. Or `phases`.
     apex_radius : float
         Radius R of the cap [nm].
     axis : sequence of float
@@ -68,7 +82,12 @@ class Tip:
     solutes : mapping, optional
         Substitutional solutes of a random alloy: atomic fraction by element (str or Material).
     seed : int, optional
-        Seed of the random alloy, needed with `solutes`.
+        Seed of the random alloy, needed with `solutes`, and of solutes and vacancies of phases. The atom on a site
+        depends on the seed and the site only: a deeper shell is the same alloy.
+    phases : sequence of Phase, optional
+        Phases instead of `material` and `solutes`, the matrix first. Where several are, the last one is. Of two atoms
+        of different lattices that are closer than 0.7 nearest neighbour distances, that of the earlier phase is left
+        out.
 
     Attributes
     ----------
@@ -80,8 +99,12 @@ class Tip:
         Index into `elements`, shape (n,).
     evaporable, support : ndarray of bool
         Whether an atom can evaporate; whether it only completes the neighbourhoods of others, shape (n,).
-    criterion : SurfaceCriterion
-        Distances that define surface atoms and nearest neighbours.
+    phases : tuple of Phase
+        The phases; for a tip of one material a single phase "matrix", empty for a tip made from positions.
+    phase : ndarray of int8
+        Index of each atom into `phases`, shape (n,); 0 for a tip made from positions.
+    criteria : tuple of SurfaceCriterion
+        Distances that define surface atoms and nearest neighbours, of each phase.
     evaporation_fields, charge_states, masses : ndarray
         Of each species [V/nm], [e], [Da].
     apex : float
@@ -99,9 +122,9 @@ class Tip:
 
     def __init__(
         self,
-        material: Material | str,
-        apex_radius: float,
-        axis: Sequence[int] = (0, 0, 1),
+        material: Material | str | None = None,
+        apex_radius: float | None = None,
+        axis: Sequence[float] = (0, 0, 1),
         shank_angle: float = 1.5,
         shank_length: float | None = None,
         base: str = "rounded",
@@ -111,44 +134,49 @@ class Tip:
         depth: float | None = None,
         solutes: Mapping[Material, float] | Mapping[str, float] | None = None,
         seed: int | None = None,
+        phases: Sequence[Phase] | None = None,
     ) -> None:
-        host = as_material(material)
-        d = host.nearest_neighbour_distance
+        if (material is None) == (phases is None):
+            raise ValueError(
+                f"material or phases must be given, not both, got {short_text(material)} and {short_text(phases)}"
+            )
+        self.phases: tuple[Phase, ...]
+        if phases is None:
+            fractions = check_solutes(solutes, profiles=False)
+            self.phases = (Phase("matrix", as_material(material), solutes=fractions),)  # type: ignore[arg-type]
+            if self.phases[0].material in fractions:
+                raise ValueError(f"solutes must differ from the material, got {self.phases[0].material.name}")
+        else:
+            if solutes is not None:
+                raise ValueError(f"solutes must be those of a phase if there are phases, got {short_text(solutes)}")
+            self.phases = check_phases(phases)
+        if seed is not None or any(phase.is_random for phase in self.phases):
+            check_seed(seed, "seed (of the random sites of the solutes)")
+        host = self.phases[0].material
+        d = max(phase.material.nearest_neighbour_distance for phase in self.phases)
         radius = check_number(apex_radius, "apex_radius", at_least=3 * d, unit="nm", why="3 neighbour distances")
         length = 2 * radius if shank_length is None else shank_length
         shape = TaperedCap(radius, length, shank_angle, base)
         origin = check_array(origin, "origin", (3,))
-        self.criterion = SurfaceCriterion.of(host.structure, d)
+        offset = None
+        if offset_seed is not None:
+            offset = np.random.default_rng(check_seed(offset_seed, "offset_seed")).random(3)
+        arrangement = Arrangement(self.phases, axis, rotation, origin, offset, seed)
+        self.criteria = arrangement.criteria
         if depth is not None:
             depth = check_number(depth, "depth", above=self.neighbour_radius, unit="nm")
         self._shell = Shell(shape, depth, self.neighbour_radius)
-        fractions = check_solutes(solutes, seed)
-        orientation = lattice.rotation_to_axis(host, axis, rotation)
-        density = lattice.atom_density(host.structure, host.a, host.c)
+        density = max(lattice.atom_density(each.structure, each.a, each.c) for each in arrangement.lattices)
         check_memory(self._shell.volume() * density, shape.volume(_LAYER * d) * density)
 
-        shift = origin
-        if offset_seed is not None:
-            part = np.random.default_rng(check_seed(offset_seed, "offset_seed")).random(3)
-            shift = origin + matrix_product(orientation, part * lattice.cell_lengths(host.structure, host.a, host.c))
-        self.positions = lattice.lattice_points_in(
-            host.structure,
-            host.a,
-            host.c,
-            orientation,
-            shift,
-            shape.signed_distance,
-            shape.bounds,
-            depth=None if depth is None else self._shell.depth_at,
-            tolerance=_ROUNDING * d,
-        )
+        self.positions, species, self._phase = self._atoms(arrangement)
+        self._has_gaps = len(arrangement.lattices) > 1 or any(phase.vacancies for phase in self.phases)
         self._set_flags()
-        self._set_elements((host, *fractions), draw_species(len(self), fractions, seed))
+        self._set_elements(arrangement.elements, species)
         self.apex = radius
         self.potential_point = np.zeros(3)
         whole = all(float(index).is_integer() for index in axis)
-        self.settings = {
-            "material": asdict(host),
+        common = {
             "apex_radius": radius,
             "axis": [int(index) if whole else float(index) for index in axis],
             "shank_angle": shape.shank_angle,
@@ -158,9 +186,66 @@ class Tip:
             "origin": origin.tolist(),
             "offset_seed": None if offset_seed is None else int(offset_seed),
             "depth": depth,
-            "solutes": [[asdict(solute), fraction] for solute, fraction in fractions.items()],
             "seed": None if seed is None else int(seed),
         }
+        if phases is None:
+            alloy = [[asdict(solute), fraction] for solute, fraction in self.phases[0].solutes.items()]
+            self.settings = {"material": asdict(host), **common, "solutes": alloy}
+        else:
+            self.settings = {
+                **common,
+                "phases": [phase.settings() for phase in self.phases],
+                "elements": [asdict(element) for element in self.elements],
+            }
+
+    def _atoms(self, arrangement):
+        """Positions, species and phases of all atoms; no phases (None) if there is one only."""
+        shape, depth = self._shell.shape, self._shell.depth
+        d, lattices = self.nearest_neighbour_distance, arrangement.lattices
+        # atoms below the shell can displace others in it
+        margin = 0.0 if len(lattices) == 1 else self.neighbour_radius
+        positions, labels = [], []
+        for number, each in enumerate(lattices):
+            points, label = lattice.lattice_sites_in(
+                *each,
+                shape.signed_distance,
+                shape.bounds,
+                depth=None if depth is None else lambda points: self._shell.depth_at(points) + margin,
+                tolerance=_ROUNDING * d,
+                label=None if arrangement.is_pure else partial(arrangement.labels, number),
+            )
+            positions.append(points)
+            labels.append(label)
+        n_species = len(arrangement.elements)
+        if len(lattices) == 1:
+            places, label = positions[0], labels[0]
+        else:
+            kept = self._without_overlap(positions, [each // n_species for each in labels])
+            if depth is not None:
+                rounding = _ROUNDING * d
+                for points, keep in zip(positions, kept, strict=True):
+                    keep &= shape.signed_distance(points) >= -(self._shell.depth_at(points) + rounding)
+            places = np.concatenate([points[keep] for points, keep in zip(positions, kept, strict=True)])
+            label = np.concatenate([each[keep] for each, keep in zip(labels, kept, strict=True)])
+        if arrangement.is_pure:
+            return places, np.zeros(len(places), dtype=np.int32), None
+        phase = (label // n_species).astype(np.int8) if len(self.phases) > 1 else None
+        return places, label % n_species, phase
+
+    def _without_overlap(self, positions, phases):
+        """Which atoms of each lattice remain: without those too close to an atom of a later phase on another one."""
+        distances = np.array([each.nearest_neighbour_distance for each in self.criteria])
+        trees = [scipy.spatial.cKDTree(points) for points in positions]
+        kept = [np.ones(len(points), dtype=bool) for points in positions]
+        for first in range(len(trees)):
+            for second in range(first):
+                reach = _CLOSEST * float(distances.max())
+                near = trees[first].sparse_distance_matrix(trees[second], reach, output_type="ndarray")
+                one, other = phases[first][near["i"]], phases[second][near["j"]]
+                close = near["v"] < _CLOSEST * 0.5 * (distances[one] + distances[other])
+                kept[first][near["i"][close & (one < other)]] = False
+                kept[second][near["j"][close & (other < one)]] = False
+        return kept
 
     @classmethod
     def from_positions(
@@ -202,7 +287,7 @@ class Tip:
             If shapes disagree, if an index has no element, or if two atoms are at the same place.
         """
         tip = cls.__new__(cls)
-        tip._shell = None  # type: ignore[assignment]
+        tip._shell, tip._phase, tip._has_gaps, tip.phases = None, None, False, ()  # type: ignore[assignment]
         tip.positions = check_array(positions, "positions", ("n", 3))
         n = len(tip.positions)
         if n < 2:
@@ -223,15 +308,16 @@ class Tip:
         if not distances.min() > 0 or neighbours.query_pairs(1e-3 * float(np.median(distances))):
             raise ValueError("positions must be distinct, got two atoms at the same place")
         distance = float(np.median(distances))
-        tip.criterion = SurfaceCriterion.of(tip.elements[0].structure, distance)
+        criterion = SurfaceCriterion.of(tip.elements[0].structure, distance)
         if neighbour_radius is not None:
             radius = check_number(neighbour_radius, "neighbour_radius", above=0, at_most=_WIDEST * distance, unit="nm")
-            tip.criterion = replace(tip.criterion, neighbour_radius=radius)
+            criterion = replace(criterion, neighbour_radius=radius)
         if surface_threshold is not None:
             threshold = check_number(
-                surface_threshold, "surface_threshold", above=0, at_most=tip.neighbour_radius, unit="nm"
+                surface_threshold, "surface_threshold", above=0, at_most=criterion.neighbour_radius, unit="nm"
             )
-            tip.criterion = replace(tip.criterion, surface_threshold=threshold)
+            criterion = replace(criterion, surface_threshold=threshold)
+        tip.criteria = (criterion,)
         low, high = tip.positions.min(axis=0), tip.positions.max(axis=0)
         span = high - low
         if np.prod(span / tip.neighbour_radius + 1) > _MAX_CELLS:
@@ -298,43 +384,70 @@ class Tip:
             If a setting is unknown or the tip was made from positions.
         """
         settings = dict(check_kind(settings, "settings", Mapping, "the settings of a tip"))
+        if "phases" in settings:
+            settings.pop("elements", None)
         if "apex_radius" not in settings:
             raise ValueError(
                 "settings must contain 'apex_radius' (a tip made from positions cannot be rebuilt), "
                 f"got {', '.join(settings)}"
             )
         try:
-            settings["material"] = Material(**settings["material"])
-            settings["solutes"] = {Material(**solute): fraction for solute, fraction in settings.get("solutes") or ()}
+            if "phases" in settings:
+                settings["phases"] = [phase_from_settings(phase) for phase in settings["phases"]]
+            else:
+                settings["material"] = Material(**settings["material"])
+                solutes = settings.get("solutes") or ()
+                settings["solutes"] = {Material(**solute): fraction for solute, fraction in solutes}
             return cls(**settings)
         except (KeyError, TypeError) as error:
             raise ValueError(f"settings must be those of a tip, got {short_text(settings)}: {error}") from error
 
     @property
+    def criterion(self) -> SurfaceCriterion:
+        """Distances that define surface atoms and nearest neighbours in the matrix."""
+        return self.criteria[0]
+
+    @property
+    def phase(self) -> NDArray[np.int8]:
+        """Index of each atom into `phases`, int8 (n,)."""
+        return np.zeros(len(self), dtype=np.int8) if self._phase is None else self._phase
+
+    def phase_at(self, atoms: NDArray[np.integer]) -> NDArray[np.int8]:
+        """Index into `phases` of chosen atoms, int8 (m,)."""
+        return np.zeros(len(atoms), dtype=np.int8) if self._phase is None else self._phase[atoms]
+
+    @property
+    def phase_names(self) -> tuple[str, ...]:
+        """Names of the phases, ("matrix",) for a tip made from positions."""
+        return tuple(phase.name for phase in self.phases) or ("matrix",)
+
+    @property
     def nearest_neighbour_distance(self) -> float:
-        """Nearest neighbour distance d_nn [nm]."""
+        """Nearest neighbour distance d_nn of the matrix [nm]."""
         return self.criterion.nearest_neighbour_distance
 
     @property
     def neighbour_radius(self) -> float:
-        """Radius of the neighbourhood whose mean position identifies surface atoms [nm]."""
-        return self.criterion.neighbour_radius
+        """Largest radius of the neighbourhood whose mean position identifies surface atoms, of all phases [nm]."""
+        return max(criterion.neighbour_radius for criterion in self.criteria)
 
     @property
     def surface_threshold(self) -> float:
-        """Smallest distance of a surface atom from the mean of its neighbourhood [nm]."""
+        """Smallest distance of a surface atom from the mean of its neighbourhood, in the matrix [nm]."""
         return self.criterion.surface_threshold
 
     @property
     def bond_length(self) -> float:
-        """Atoms closer than this are nearest neighbours [nm]."""
+        """Atoms of the matrix closer than this are nearest neighbours [nm]."""
         return self.criterion.bond_length
 
     def __len__(self) -> int:
         return len(self.positions)
 
     def __repr__(self) -> str:
-        names = "-".join(element.name for element in self.elements)
+        names = "-".join(dict.fromkeys(element.name for element in self.elements))
+        if len(self.phases) > 1:
+            names += f" in {len(self.phases)} phases"
         if self._shell is None:
             return f"<Tip: {len(self):,} atoms of {names} from positions>"
         shape, depth = self._shell.shape, self._shell.depth
@@ -351,7 +464,7 @@ class Tip:
         n_evaporable = int(np.count_nonzero(self.evaporable))
         if self._shell is None or self._shell.depth is None:
             return n_evaporable
-        host, shape = self.elements[0], self._shell.shape
+        host, shape = self.phases[0].material, self._shell.shape
         volume = shape.volume_above(-shape.shank_length / 2)
         return max(n_evaporable, round(volume * lattice.atom_density(host.structure, host.a, host.c)))
 
@@ -366,6 +479,13 @@ class Tip:
         if self._shell is None:
             raise ValueError("a tip made from positions has no shape, and so no signed distance")
         return self._shell.shape.signed_distance(check_array(points, "points", ("n", 3)))
+
+    @property
+    def outer(self) -> Booleans | None:
+        """Whether atoms are near the surface of the shape, bool (n,); None for a tip without voids and interfaces."""
+        if not self._has_gaps or self._shell is None:
+            return None
+        return self._shell.shape.signed_distance(self.positions) >= -self.neighbour_radius
 
     def deepened(self, by: float | None = None) -> "Tip":
         """Return this tip with a thicker shell.
@@ -388,11 +508,17 @@ class Tip:
         if self._shell is None or self._shell.depth is None:
             raise ValueError(f"{self!r} is not a shell that can be deepened: it contains all atoms")
         by = 2 * self.neighbour_radius if by is None else check_number(by, "by", above=0, unit="nm")
-        deeper = Tip.from_settings({**self.settings, "depth": self._shell.depth + by})
+        settings = {key: self.settings[key] for key in _SHAPE_SETTINGS} | {"depth": self._shell.depth + by}
+        if "phases" in self.settings:
+            deeper = Tip(phases=self.phases, **settings)
+        else:
+            deeper = Tip(self.phases[0].material, solutes=self.phases[0].solutes, **settings)
         rounding = 2 * _ROUNDING * self.nearest_neighbour_distance
         below = self._shell.below(deeper.positions, rounding)
         deeper.positions = np.concatenate([self.positions, deeper.positions[below]])
         deeper.species = np.concatenate([self.species, deeper.species[below]])
+        if self._phase is not None:
+            deeper._phase = np.concatenate([self._phase, deeper.phase[below]])
         deeper._set_flags()
         return deeper
 

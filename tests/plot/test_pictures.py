@@ -172,6 +172,31 @@ def test_specimen_by_numbers_of_ones_own(emitter):
         plot.specimen(emitter, elevation=100)
 
 
+def test_a_slice_shows_the_atoms_of_each_phase(tmp_path):
+    ball = ae.Phase("ball", "Cu", region=ae.Sphere((0, 0, 1), 1.0))
+    gamma = ae.Phase("matrix", "Ni", order=ae.Order("L1_2", "Al"))
+    tip = ae.Tip(phases=[gamma, ball], apex_radius=2.5, shank_length=2.0)
+    for color, names in (("phase", ["matrix", "ball"]), ("species", ["Ni", "Al", "Cu"])):
+        ax = plot.cut(tip, color, thickness=0.4, colors={"ball": "red", "Cu": "red"})
+        (discs,) = [c for c in ax.collections if isinstance(c, EllipseCollection)]
+        inside = np.abs(tip.positions[:, 1]) <= 0.2
+        assert len(discs.get_offsets()) == inside.sum()
+        red = (discs.get_facecolors() == to_rgba("red")).all(axis=1)
+        assert red.sum() == (inside & (tip.phase == 1)).sum() > 0
+        drawn = {tuple(place) for place in np.round(discs.get_offsets()[red], 9)}
+        assert drawn == {tuple(place) for place in np.round(tip.positions[inside & (tip.phase == 1)][:, [0, 2]], 9)}
+        assert [text.get_text() for text in ax.get_legend().get_texts()] == names
+        assert (ax.get_xlabel(), ax.get_ylabel()) == ("x [nm]", "z [nm]")
+        assert_nothing_cut_off(ax.figure)
+    above = plot.cut(tip, normal=(0, 0, 1), point=(0, 0, 1), left=tip.phase == 1, legend=False)
+    assert (above.get_xlabel(), above.get_ylabel()) == ("x [nm]", "y [nm]") and above.get_legend() is None
+    assert plot.cut(tip, normal=(1, 0, 0)).get_xlabel() == "y [nm]"
+    with pytest.raises(ValueError, match="no atom is in the slice"):
+        plot.cut(tip, point=(0, 99, 0))
+    with pytest.raises(ValueError, match="color must be one of phase, species"):
+        plot.cut(tip, "fields")
+
+
 def test_marks_are_around_the_atoms(emitter):
     ax = plot.specimen(emitter, elevation=30, azimuth=-60)
     atoms = np.argsort(-emitter.normals[:, 2], kind="stable")[[0, 7]]  # they face upwards, so are drawn
