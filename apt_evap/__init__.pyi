@@ -15,6 +15,9 @@ from .analysis.apex import image_compression as image_compression
 from .analysis.apex import run_field_factor as run_field_factor
 from .analysis.charge_states import charge_state_ratio_course as charge_state_ratio_course
 from .analysis.charge_states import charge_state_ratio_map as charge_state_ratio_map
+from .analysis.field_ion_image import FieldIonImage as FieldIonImage
+from .analysis.field_ion_image import ImagingGas as ImagingGas
+from .analysis.field_ion_image import field_ion_image as field_ion_image
 from .analysis.profiles import Rectangle as Rectangle
 from .analysis.profiles import azimuthal_profile as azimuthal_profile
 from .analysis.profiles import compare_profiles as compare_profiles
@@ -78,6 +81,10 @@ from .reconstruction.calibration import DistributionMap as DistributionMap
 from .reconstruction.calibration import compression_from_poles as compression_from_poles
 from .reconstruction.calibration import distribution_map as distribution_map
 from .reconstruction.errors import ReconstructionErrors as ReconstructionErrors
+from .reconstruction.origins import OriginTable as OriginTable
+from .reconstruction.origins import origin_table as origin_table
+from .reconstruction.precipitate import PrecipitateErrors as PrecipitateErrors
+from .reconstruction.precipitate import precipitate_errors as precipitate_errors
 from .reconstruction.reconstruct import Reconstruction as Reconstruction
 from .reconstruction.reconstruct import reconstruct as reconstruct
 from .registration.register import Registration as Registration

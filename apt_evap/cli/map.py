@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from apt_evap.analysis.field_ion_image import field_ion_image
 from apt_evap.cli._files import (
     check_columns,
     check_output,
@@ -27,6 +28,9 @@ from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.perturbations import Unperturbed
 from apt_evap.simulation.run import Run
+from apt_evap.simulation.surface import surface_after
+
+_IMAGE_BINS = 512  # along a side of a field-ion image: a spot at R = 7 nm is 3 bins wide
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -34,7 +38,9 @@ def execute(options: argparse.Namespace) -> int:
     picture = picture_path(options.output or f"{Path(options.file).stem}_map.png")
     check_output(picture, is_picture, options.force)
     content = read(options)
-    if isinstance(content, Run):
+    if options.field_ion is not None:
+        maps = _field_ion_map(content, options)
+    elif isinstance(content, Run):
         content = in_real_units(content, options)
         maps = run_maps(content, _map_settings(content, options), lambda hits: select(hits, options))
     elif options.perturbation or options.real_units:
@@ -57,6 +63,21 @@ def execute(options: argparse.Namespace) -> int:
     tell(options, f"wrote {picture}")
     tell_json(options, {"wrote": str(picture), "file": options.file, "maps": summaries(*maps)})
     return 0
+
+
+def _field_ion_map(content, options):
+    """Field-ion image of the surface at the end of a run, and its title."""
+    if not isinstance(content, Run):
+        raise ValueError(f"--field-ion needs a run (.h5), got {options.file!r}")
+    for name in ("perturbation", "real_units"):
+        if getattr(options, name) is not None:
+            raise ValueError(f"--field-ion and --{name.replace('_', '-')} exclude each other")
+    if selects(options):
+        raise ValueError("--field-ion shows a surface: it excludes a selection of ions")
+    image = field_ion_image(surface_after(content), options.field_ion, detector=content.detector)
+    tell(options, f"{image!r}")
+    map = image.map(options.bins or _IMAGE_BINS)
+    return [map if options.smooth is None else map.smoothed(options.smooth)], [f"field-ion image, {options.field_ion}"]
 
 
 def summaries(maps: Any, titles: Sequence[str]) -> list[dict[str, Any]]:

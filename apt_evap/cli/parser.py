@@ -6,10 +6,11 @@ from math import inf, isfinite
 from typing import Any, NoReturn
 
 from apt_evap._version import __version__
+from apt_evap.analysis.gas_names import GASES
 from apt_evap.cli._output import put
 from apt_evap.detection.limits import MAX_BINS
 from apt_evap.energy_fit.defaults import MEANS, MECHANISMS, ROLLUP_FRACTIONS, RSDS
-from apt_evap.reconstruction.choices import PROJECTIONS, PROTOCOLS
+from apt_evap.reconstruction.choices import FRAMES, PROJECTIONS, PROTOCOLS
 
 EXIT_CODES = """\
 exit codes:
@@ -135,7 +136,8 @@ def _add_map(commands: Any) -> None:
         epilog="example:\n"
         "  apt-evap map R5083.epos --bins 128\n"
         "  apt-evap map R5083.epos --ranges R5083.rrng --species Si --voltage 4000, --circle 15 -o silicon.png\n"
-        "  apt-evap map ni111.h5 --perturbation Unperturbed --perturbation RollUp:0.3,0.1 -o energies.png\n\n"
+        "  apt-evap map ni111.h5 --perturbation Unperturbed --perturbation RollUp:0.3,0.1 -o energies.png\n"
+        "  apt-evap map ni111.h5 --field-ion Ne -o image.png\n\n"
         "a perturbation is NAME, NAME:NUMBERS or a TOML table:\n"
         "  Unperturbed              RollUp:0.2 (eV, all ions)    RollUp:0.155,0.155 (mean, standard deviation)\n"
         "  LateralVelocity:0.3,0.1  Combined:0.155,0.155,0.75 (the last number is the roll-up fraction)\n"
@@ -156,6 +158,14 @@ def _add_map(commands: Any) -> None:
         action="append",
         metavar="P",
         help="perturbation of the ions of a run; repeat it for maps side by side",
+    )
+    command.add_argument(
+        "--field-ion",
+        nargs="?",
+        const="Ne",
+        choices=GASES,
+        metavar="GAS",
+        help="field-ion image of the surface at the end of a run, in He, Ne, Ar or H2; default: Ne",
     )
     _add_real_units(command)
     command.add_argument("--force", action="store_true", help="overwrite a file not made by apt-evap")
@@ -268,6 +278,9 @@ def _add_reconstruct(commands: Any) -> None:
     )
     command.add_argument("file", metavar="FILE", help="measured ions (.epos, ...) or a run (.h5)")
     command.add_argument("-o", "--output", metavar="OUT", help="default: FILE_reconstructed.pos in this folder")
+    command.add_argument(
+        "--frame", choices=FRAMES, default="depth", help="z is the depth, or goes out of the specimen; default: depth"
+    )
     constants = command.add_argument_group("constants")
     constants.add_argument("--protocol", choices=PROTOCOLS, default="cap", help="depth increment; default: cap")
     constants.add_argument("--projection", choices=PROJECTIONS, default="bas", help="angle on the cap; default: bas")
@@ -287,6 +300,7 @@ def _add_reconstruct(commands: Any) -> None:
     constants.add_argument(
         "--smoothing", type=_integer(1), default=1, metavar="N", help="ions in the mean of the voltage; default: 1"
     )
+    constants.add_argument("--origins", metavar="TABLE.npz", help="correct lateral positions by a table of origins")
     constants.add_argument("--initial-radius", type=float, metavar="NM", help="for --radius shank")
     constants.add_argument("--shank-angle", type=float, metavar="DEGREES", help="for --radius shank; half the opening")
     command.add_argument("--perturbation", metavar="P", help="of a run, as for map; default: the first one of the run")

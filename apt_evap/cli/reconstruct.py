@@ -9,6 +9,7 @@ from apt_evap.cli._files import in_real_units, read, select
 from apt_evap.cli._output import tell, tell_json
 from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.detection.hits import Hits
+from apt_evap.reconstruction.origins import OriginTable
 from apt_evap.reconstruction.reconstruct import reconstruct
 from apt_evap.simulation.run import Run
 from apt_evap.specimen.lattice import atom_density
@@ -29,7 +30,7 @@ def execute(options: argparse.Namespace) -> int:
             f"{options.file!r} has no voltages: --radius shank, or a radius [nm], needs none, got --radius voltage"
         )
     reconstruction = reconstruct(select(hits, options), distance=distance, **settings)
-    reconstruction.write(output)
+    reconstruction.write(output, frame=options.frame)
     tell(options, f"{reconstruction!r}")
     result = {"wrote": str(output), "file": options.file, "ions": len(reconstruction)}
     result["settings"] = dict(reconstruction.settings)
@@ -68,6 +69,7 @@ def _constants(options):
     settings = {name: getattr(options, name) for name in names}
     settings |= {name: getattr(options, name) for name in ("initial_radius", "shank_angle", "evaporation_field")}
     settings["radius"] = _radius(options.radius)
+    settings["origins"] = None if options.origins is None else OriginTable.load(options.origins)
     settings["atomic_volume"] = options.atomic_volume
     if options.element is not None:
         element = material(options.element)

@@ -299,6 +299,11 @@ class Emitter:
         return to_atoms(self.positions, self.tip.elements, self.tip.species[self.atoms], **arrays)
 
     @property
+    def tree(self) -> Octree:
+        """Copy of the octree of the charges, for flights in the present field."""
+        return self._core.tree.copy()
+
+    @property
     def area_per_atom(self) -> float:
         """Area s per surface atom at the last relaxation [nm^2]."""
         return self._core.rule.area

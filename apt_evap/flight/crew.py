@@ -13,9 +13,10 @@ import numpy as np
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_count, check_number
 from apt_evap._core.flights import LEFT, Flights
+from apt_evap._core.journal import Journal
 from apt_evap._core.octree import Octree
 from apt_evap.detection.detector import Detector
-from apt_evap.evaporation.emitter import Batch
+from apt_evap.evaporation.emitter import Batch, Emitter
 from apt_evap.flight.landing import Ends
 from apt_evap.specimen.tip import Tip
 from apt_evap.units import COULOMB, NM_PER_MM
@@ -99,15 +100,7 @@ class FlightCrew:
         self._own = threading.local()  # per thread: its flights, the record and the number of journals they followed
         self._halt, self._go = np.zeros(1, np.int64), threading.Event()
         self._go.set()
-        self._options = {
-            "coulomb": COULOMB,
-            "length": tip.nearest_neighbour_distance,
-            "centre": (0.0, 0.0, tip.apex),
-            "reach": settings.reach * tip.nearest_neighbour_distance,
-            "opening_angle": settings.opening_angle,
-            "tolerance": settings.tolerance,
-            "max_steps": settings.max_steps,
-        }
+        self._options = _options(tip, settings)
 
     @contextmanager
     def at_work(self) -> Iterator[Any]:
@@ -201,3 +194,51 @@ class FlightCrew:
             own.flights.follow(record.journals[own.followed])
             own.followed += 1
         return own.flights
+
+
+def fly_at_rest(emitter: Emitter, positions: Floats, settings: FlightSettings) -> Ends:
+    """Fly ions that start at rest in the present field of an emitter, which does not change.
+
+    Parameters
+    ----------
+    emitter : Emitter
+        The charged surface.
+    positions : ndarray, shape (n, 3)
+        Start of each ion [nm].
+    settings : FlightSettings
+        Accuracy and end of the flights.
+
+    Returns
+    -------
+    Ends
+        One launch of each of n ions.
+    """
+    n, tree = len(positions), emitter.tree
+    end, outcome, counter = np.empty((n, 7)), np.empty(n, np.int8), np.zeros(1, np.int64)
+    event = np.full(n, -1, np.int64)  # before the first event of the journal: nothing is replayed
+    start, halt = np.arange(n + 1), np.zeros(1, np.int64)
+    places, velocities = np.ascontiguousarray(positions), np.zeros((n, 3))
+    journal = Journal(emitter.tip.positions, 1)
+
+    def fly():
+        flights = Flights(tree, **_options(emitter.tip, settings))
+        flights.fly(journal, event, start, places, velocities, end, outcome, counter, halt)
+
+    with ThreadPoolExecutor(emitter.n_threads) as pool:
+        for helper in [pool.submit(fly) for _ in range(emitter.n_threads)]:
+            helper.result()
+    end = end[:, None]
+    return Ends(end[..., :3], end[..., 3:6], end[..., 6], (outcome == LEFT)[:, None])
+
+
+def _options(tip, settings):
+    """Arguments of `Flights`."""
+    return {
+        "coulomb": COULOMB,
+        "length": tip.nearest_neighbour_distance,
+        "centre": (0.0, 0.0, tip.apex),
+        "reach": settings.reach * tip.nearest_neighbour_distance,
+        "opening_angle": settings.opening_angle,
+        "tolerance": settings.tolerance,
+        "max_steps": settings.max_steps,
+    }

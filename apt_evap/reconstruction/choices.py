@@ -5,3 +5,6 @@ PROTOCOLS = ("cap", "bas")
 
 PROJECTIONS = ("bas", "equidistant", "compressed")
 """Relations between the distance on the detector and the angle on the cap."""
+
+FRAMES = ("depth", "specimen")
+"""Direction of z: the depth, or out of the specimen."""

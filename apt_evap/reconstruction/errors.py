@@ -7,15 +7,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from apt_evap._common.types import Floats, Integers
-from apt_evap._common.validation import check_array, check_choice, check_sequence
+from apt_evap._common.validation import check_array, check_choice, check_count, check_number, check_sequence, short_text
 from apt_evap.detection.hits import Hits
 from apt_evap.simulation.run import Run
 
-FREE = ("shift", "rotation", "lateral_scale", "depth_scale")
+CONSTANTS = ("shift", "rotation", "lateral_scale", "depth_scale", "radius", "compression")
 """Constants that can be fitted before positions are compared with sites."""
+FREE = ("shift", "rotation", "depth_scale", "radius", "compression")
+"""Those that are fitted by default."""
+LINEAR = CONSTANTS[:4]
+"""Those that move positions linearly."""
+NEAR_POLES = (0.0, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0)
+"""Edges of the distance from the nearest pole [degrees]."""
 
 _RING = 5.0  # width of a ring of angles [degrees]
 _DEPTH_BINS = 10
@@ -24,7 +30,7 @@ _LEAST_IONS = 10  # fewest ions for the correlation in a cylinder
 
 
 class ErrorBins(NamedTuple):
-    """Errors in bins of the angle or of the depth."""
+    """Errors in bins of the angle, of the depth, or of the distance from a pole."""
 
     edges: Floats
     """Edges of the bins [degrees] or [nm], shape (n + 1,)."""
@@ -36,11 +42,58 @@ class ErrorBins(NamedTuple):
     """RMS of the depth error in each bin [nm], shape (n,); NaN without ions."""
 
 
+class GroupErrors(NamedTuple):
+    """Errors of groups of ions, such as species or phases; each of the k groups has one row."""
+
+    groups: Integers
+    """Number of each group, shape (k,)."""
+    ions: Integers
+    """Number of ions, shape (k,)."""
+    shift: Floats
+    """Mean residual [nm], shape (k, 3)."""
+    lateral: Floats
+    """RMS of the lateral error [nm], shape (k,)."""
+    depth: Floats
+    """RMS of the depth error [nm], shape (k,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorField:
+    """Mean residual and scatter in cells of the angle on the cap and of the depth.
+
+    Parameters
+    ----------
+    angle_edges, depth_edges : ndarray
+        Edges of the n angles [degrees] and of the m depths [nm], shapes (n + 1,) and (m + 1,).
+    ions : ndarray of int, shape (n, m)
+        Number of ions in each cell.
+    radial, azimuthal, depth : ndarray, shape (n, m)
+        Mean residual [nm]: away from the axis, counter-clockwise about it, and along it out of the specimen; NaN
+        without ions.
+    lateral_scatter, depth_scatter : ndarray, shape (n, m)
+        RMS deviation from these means [nm], across the axis and along it; NaN without ions.
+    """
+
+    angle_edges: Floats = field(repr=False)
+    depth_edges: Floats = field(repr=False)
+    ions: Integers = field(repr=False)
+    radial: Floats = field(repr=False)
+    azimuthal: Floats = field(repr=False)
+    depth: Floats = field(repr=False)
+    lateral_scatter: Floats = field(repr=False)
+    depth_scatter: Floats = field(repr=False)
+
+    def __repr__(self) -> str:
+        n, m = self.ions.shape
+        return f"<ErrorField: {self.ions.sum():,} ions in {n} x {m} cells of angle and depth>"
+
+
 @dataclass(frozen=True, eq=False)
 class ReconstructionErrors:
     """Fitted constants, and residuals of the fitted positions from the true sites.
 
-    The fitted position of an ion at x, y and depth z is (lateral_scale Rot(rotation) (x, y), -depth_scale z) + shift.
+    The fitted position of an ion at x, y, at the depth h below an apex at the depth z, is (lateral_scale Rot(rotation)
+    (x, y), -(depth_scale z + h)) + shift, with x, y, z and h for the fitted radius and compression.
 
     Parameters
     ----------
@@ -49,7 +102,7 @@ class ReconstructionErrors:
     rotation : float
         Rotation about the axis [degrees].
     lateral_scale, depth_scale : float
-        Factor of x and y, and of the depth.
+        Factor of x and y, and of the depth of the apex.
     residuals : ndarray
         Fitted position minus true site [nm], shape (n, 3).
     lateral_rms : float
@@ -63,6 +116,16 @@ class ReconstructionErrors:
         Number of these cylinders.
     by_angle, by_depth : ErrorBins
         Errors in rings of 5 degrees on the cap, and in ten bins of the reconstructed depth.
+    directions : ndarray
+        Unit vector from the centre of the cap to each ion, in the frame of the specimen, shape (n, 3).
+    depths : ndarray
+        Reconstructed depth of each ion [nm], shape (n,).
+    radius_factor : float
+        Factor of the radii of the cap.
+    compression : float
+        Image compression; NaN if it was not part of the comparison.
+    by_group : GroupErrors or None
+        Errors of groups of ions, such as species or phases.
     """
 
     shift: Floats = field(repr=False)
@@ -76,33 +139,102 @@ class ReconstructionErrors:
     cylinders: int
     by_angle: ErrorBins = field(repr=False)
     by_depth: ErrorBins = field(repr=False)
+    directions: Floats = field(repr=False)
+    depths: Floats = field(repr=False)
+    radius_factor: float = 1.0
+    compression: float = math.nan
+    by_group: GroupErrors | None = field(default=None, repr=False)
+
+    def by_poles(self, poles: ArrayLike, edges: ArrayLike = NEAR_POLES) -> ErrorBins:
+        """Errors in bins of the distance from the nearest pole.
+
+        Parameters
+        ----------
+        poles : array_like
+            Directions in the frame of the specimen, of any length, shape (m, 3).
+        edges : array_like
+            Edges of the bins [degrees], increasing, shape (n + 1,). Ions beyond the last edge are left out.
+
+        Returns
+        -------
+        ErrorBins
+
+        Raises
+        ------
+        ValueError
+            If there is no pole, a direction is zero, or the edges do not increase.
+        """
+        normals = check_array(poles, "poles", ("m", 3))
+        lengths = np.linalg.norm(normals, axis=1)
+        if not len(normals) or not lengths.all():
+            raise ValueError(f"poles must be directions, got {short_text(poles)}")
+        bounds = check_array(edges, "edges", ("n",))
+        if len(bounds) < 2 or not (np.diff(bounds) > 0).all():
+            raise ValueError(f"edges must be at least two increasing numbers [degrees], got {short_text(edges)}")
+        # by the chord: the arc cosine has no digits near a pole
+        chords, _ = scipy.spatial.cKDTree(normals / lengths[:, None]).query(self.directions)
+        distances = np.degrees(2 * np.arcsin(np.minimum(chords / 2, 1.0)))
+        inside = (distances >= bounds[0]) & (distances <= bounds[-1])
+        return _binned(distances[inside], bounds, _squares(self.residuals[inside]))
+
+    def residual_field(self, angle_width: float = 1.0, depth_bins: int = _DEPTH_BINS) -> ErrorField:
+        """Mean residual and scatter in cells of the angle on the cap and of the depth.
+
+        Parameters
+        ----------
+        angle_width : float
+            Width of the bins of the angle [degrees].
+        depth_bins : int
+            Number of bins of the reconstructed depth.
+
+        Returns
+        -------
+        ErrorField
+        """
+        width = check_number(angle_width, "angle_width", above=0, at_most=90, unit="degrees")
+        depth_bins = check_count(depth_bins, "depth_bins", at_least=1, at_most=10_000)
+        angles = _polar(self.directions)
+        angle_edges = width * np.arange(max(1, math.ceil(float(angles.max()) / width)) + 1)
+        depth_edges = np.linspace(self.depths.min(), self.depths.max(), depth_bins + 1)
+        cells = _bins_of(angles, angle_edges) * depth_bins + _bins_of(self.depths, depth_edges)
+        shape = len(angle_edges) - 1, depth_bins
+        ions = np.bincount(cells, minlength=shape[0] * depth_bins)
+        away = _unit(self.directions[:, 0] + 1j * self.directions[:, 1])
+        lateral = (self.residuals[:, 0] + 1j * self.residuals[:, 1]) * away.conj()
+        parts = lateral.real, lateral.imag, self.residuals[:, 2]
+        with np.errstate(invalid="ignore"):
+            means = [np.bincount(cells, part, len(ions)) / ions for part in parts]
+            variances = [
+                np.bincount(cells, (part - mean[cells]) ** 2, len(ions)) / ions
+                for part, mean in zip(parts, means, strict=True)
+            ]
+        scatter = np.sqrt(variances[0] + variances[1]), np.sqrt(variances[2])
+        tables = [values.reshape(shape) for values in (ions, *means, *scatter)]
+        return ErrorField(angle_edges, depth_edges, *tables)
 
     def to_dict(self) -> dict[str, Any]:
-        """All but the residuals as numbers and lists, None for NaN, for JSON.
+        """All but the arrays with a row per ion as numbers and lists, None for NaN, for JSON.
 
         Returns
         -------
         dict
         """
-        names = ("rotation", "lateral_scale", "depth_scale", "lateral_rms", "depth_rms", "order_correlation")
+        names: tuple[str, ...] = ("rotation", "lateral_scale", "depth_scale", "radius_factor", "compression")
+        names += ("lateral_rms", "depth_rms", "order_correlation")
         content: dict[str, Any] = {"shift": _plain(self.shift)}
         content |= {name: _plain([getattr(self, name)])[0] for name in names}
         content["cylinders"] = self.cylinders
         for name in ("by_angle", "by_depth"):
             content[name] = {part: _plain(values) for part, values in getattr(self, name)._asdict().items()}
+        if self.by_group is not None:
+            content["by_group"] = {part: _plain(values) for part, values in self.by_group._asdict().items()}
         return content
 
 
 def true_sites(hits: Hits, truth: "Run | ArrayLike | None") -> Floats:
     """Sites of reconstructed ions [nm], shape (n, 3); `truth` as for `Reconstruction.errors`."""
     if isinstance(truth, Run):
-        (numbers,) = hits.require("ion")
-        known = truth.emissions.ions
-        order = np.argsort(known)
-        place = np.minimum(np.searchsorted(known, numbers, sorter=order), len(known) - 1) if len(known) else numbers
-        if not len(known) or not np.array_equal(known[order[place]], numbers):
-            raise ValueError(f"truth must be the run of these hits, got {truth!r} without some of their ions")
-        return truth.emissions.positions[order[place]]
+        return truth.emissions.positions[rows_of(hits, truth)]
     if truth is None:
         if hits.outcome is None or hits.positions is None:
             raise ValueError("truth is needed for hits that were not simulated: sites of shape (n, 3), got None")
@@ -110,8 +242,51 @@ def true_sites(hits: Hits, truth: "Run | ArrayLike | None") -> Floats:
     return check_array(truth, "truth", (len(hits), 3))
 
 
-def errors_of(positions: Floats, angles: Floats, truth: Floats, fit: Sequence[str] = FREE) -> ReconstructionErrors:
-    """Fit the free constants and compare positions with sites.
+def rows_of(hits: Hits, run: Run) -> Integers:
+    """Row of each hit in its run, shape (n,)."""
+    (numbers,) = hits.require("ion")
+    known = run.emissions.ions
+    order = np.argsort(known)
+    place = np.minimum(np.searchsorted(known, numbers, sorter=order), len(known) - 1) if len(known) else numbers
+    if not len(known) or not np.array_equal(known[order[place]], numbers):
+        raise ValueError(f"truth must be the run of these hits, got {run!r} without some of their ions")
+    return order[place]
+
+
+def per_ion(values: ArrayLike, name: str, hits: Hits, truth: "Run | ArrayLike | None", dtype: type) -> NDArray[Any]:
+    """Validated values of each hit, shape (n,), given for the hits or for all ions of the run."""
+    n = len(values) if np.iterable(values) and not isinstance(values, str) else 0  # type: ignore[arg-type]
+    if isinstance(truth, Run) and n == len(truth) != len(hits):
+        return check_array(values, name, (n,), dtype=dtype)[rows_of(hits, truth)]
+    return check_array(values, name, (len(hits),), dtype=dtype)
+
+
+def groups_of(
+    hits: Hits, truth: "Run | ArrayLike | None", groups: ArrayLike | None, name: str = "groups"
+) -> Integers | None:
+    """Group of each hit, shape (n,); by default the species, if it is known."""
+    if groups is not None:
+        return per_ion(groups, name, hits, truth, np.int64)
+    if isinstance(truth, Run):
+        return truth.species[rows_of(hits, truth)].astype(np.int64)
+    species = hits.extra.get("species")
+    return None if species is None or species.dtype.kind not in "iu" else species.astype(np.int64)
+
+
+def free_constants(fit: Sequence[str]) -> set[str]:
+    """Validated names of constants."""
+    return {check_choice(name, "fit", CONSTANTS) for name in check_sequence(fit, "fit", "names of free constants")}
+
+
+def errors_of(
+    positions: Floats,
+    angles: Floats,
+    truth: Floats,
+    fit: Sequence[str] = LINEAR,
+    groups: Integers | None = None,
+    below: Floats | float = 0.0,
+) -> ReconstructionErrors:
+    """Fit the linear constants and compare positions with sites.
 
     Parameters
     ----------
@@ -122,30 +297,32 @@ def errors_of(positions: Floats, angles: Floats, truth: Floats, fit: Sequence[st
     truth : ndarray
         Sites [nm], shape (n, 3), with z out of the specimen.
     fit : sequence of str
-        Constants that are fitted, of `FREE`.
+        Constants that are fitted, of `LINEAR`; others are ignored.
+    groups : ndarray of int, optional
+        Group of each ion, shape (n,).
+    below : ndarray or float
+        Depth of each ion below the apex [nm], shape (n,), which the factor of the depth leaves as it is.
 
     Returns
     -------
     ReconstructionErrors
     """
-    free = {check_choice(name, "fit", FREE) for name in check_sequence(fit, "fit", "names of free constants")}
+    free = free_constants(fit)
     n = len(positions)
     if n < 3:
         raise ValueError(f"errors need at least 3 ions, got {n}")
-    lateral, x_shift, y_shift = _lateral_fit(positions, truth, free)
-    depth, z_shift = _depth_fit(positions[:, 2], truth[:, 2], free)
-    turned = lateral * (positions[:, 0] + 1j * positions[:, 1])
-    fitted = np.column_stack([turned.real + x_shift, turned.imag + y_shift, z_shift - depth * positions[:, 2]])
+    fitted, (lateral, depth, shift) = moved(positions, below, truth, free)
     residuals = fitted - truth
-    squares = np.column_stack([(residuals[:, :2] ** 2).sum(axis=1), residuals[:, 2] ** 2])
+    squares = _squares(residuals)
     rings = _RING * np.arange(max(1, math.ceil(angles.max() / _RING)) + 1)
     layers = np.linspace(positions[:, 2].min(), positions[:, 2].max(), _DEPTH_BINS + 1)
     correlation, cylinders = _order_correlation(positions, truth)
     across, along = np.sqrt(squares.mean(axis=0))
     # a lateral scale without rotation can be negative: the sign is then part of the scale
     rotation = math.degrees(math.atan2(lateral.imag, lateral.real)) if "rotation" in free else 0.0
+    out = np.sin(np.radians(angles)) * _unit(lateral * (positions[:, 0] + 1j * positions[:, 1]))
     return ReconstructionErrors(
-        shift=np.array([x_shift, y_shift, z_shift]),
+        shift=shift,
         rotation=rotation,
         lateral_scale=abs(lateral) if "rotation" in free else lateral.real,
         depth_scale=depth,
@@ -156,7 +333,22 @@ def errors_of(positions: Floats, angles: Floats, truth: Floats, fit: Sequence[st
         cylinders=cylinders,
         by_angle=_binned(angles, rings, squares),
         by_depth=_binned(positions[:, 2], layers, squares),
+        directions=np.column_stack([out.real, out.imag, np.cos(np.radians(angles))]),
+        depths=positions[:, 2],
+        by_group=None if groups is None else _grouped(groups, residuals),
     )
+
+
+def moved(
+    positions: Floats, below: Floats | float, truth: Floats, free: set[str]
+) -> tuple[Floats, tuple[complex, float, Floats]]:
+    """Positions moved onto the sites by the free linear constants, and these: complex factor, of the depth, shift."""
+    lateral, x_shift, y_shift = _lateral_fit(positions, truth, free)
+    apex = positions[:, 2] - below
+    depth, z_shift = _depth_fit(apex, truth[:, 2] + below, free)
+    turned = lateral * (positions[:, 0] + 1j * positions[:, 1])
+    fitted = np.column_stack([turned.real + x_shift, turned.imag + y_shift, z_shift - depth * apex - below])
+    return fitted, (lateral, depth, np.array([x_shift, y_shift, z_shift]))
 
 
 def _lateral_fit(positions, truth, free):
@@ -187,26 +379,73 @@ def _order_correlation(positions, truth):
     offset = truth[:, :2] - (cells + 0.5) * _CYLINDER
     inside = np.flatnonzero((offset**2).sum(axis=1) <= (_CYLINDER / 2) ** 2)
     _, labels, counts = np.unique(cells[inside], axis=0, return_inverse=True, return_counts=True)
-    members = np.split(inside[np.argsort(labels.ravel(), kind="stable")], np.cumsum(counts)[:-1])
-    correlations, weights = [], []
-    for ions in members:
-        depths = -truth[ions, 2], positions[ions, 2]
-        if len(ions) >= _LEAST_IONS and all(np.ptp(values) > 0 for values in depths):
-            correlations.append(scipy.stats.spearmanr(*depths).statistic)
-            weights.append(len(ions))
-    if not weights:
+    labels = labels.ravel()
+    first, second = (
+        _ranks(depths, labels, counts) - (counts[labels] + 1) / 2
+        for depths in (-truth[inside, 2], positions[inside, 2])
+    )
+    n = len(counts)
+    moments = [np.bincount(labels, part, n) for part in (first * second, first**2, second**2)]
+    known = (counts >= _LEAST_IONS) & (moments[1] > 0) & (moments[2] > 0)
+    if not known.any():
         return math.nan, 0
-    return float(np.average(correlations, weights=weights)), len(weights)
+    product, *squares = (part[known] for part in moments)
+    correlations = product / np.sqrt(squares[0] * squares[1])
+    return float(np.average(correlations, weights=counts[known])), int(np.count_nonzero(known))
+
+
+def _ranks(values, labels, counts):
+    """Rank of each value within its group, from 1; equal values have their mean rank."""
+    order = np.lexsort((values, labels))
+    groups, ordered = labels[order], values[order]
+    starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    ranks = np.arange(1, len(values) + 1) - starts[groups]
+    new = np.ones(len(values), bool)
+    new[1:] = (groups[1:] != groups[:-1]) | (ordered[1:] != ordered[:-1])
+    runs = np.cumsum(new) - 1
+    means = np.bincount(runs, ranks) / np.bincount(runs) if len(values) else np.empty(0)
+    found = np.empty(len(values))
+    found[order] = means[runs]
+    return found
+
+
+def _squares(residuals):
+    """Squares of the residual across the axis and along it, shape (n, 2)."""
+    return np.column_stack([(residuals[:, :2] ** 2).sum(axis=1), residuals[:, 2] ** 2])
+
+
+def _polar(directions):
+    """Angles from the axis [degrees]."""
+    return np.degrees(np.arctan2(np.hypot(directions[:, 0], directions[:, 1]), directions[:, 2]))
+
+
+def _unit(places):
+    """Complex numbers of length 1; 1 for 0."""
+    lengths = np.abs(places)
+    return np.divide(places, lengths, out=np.ones_like(places), where=lengths > 0)
+
+
+def _bins_of(values, edges):
+    """Number of the bin of each value; the last edge is included."""
+    return np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
 
 
 def _binned(values, edges, squares):
-    """Root of the mean squares in bins; the last edge is included."""
-    n = len(edges) - 1
-    bins = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, n - 1)
+    """Root of the mean squares in bins."""
+    bins, n = _bins_of(values, edges), len(edges) - 1
     ions = np.bincount(bins, minlength=n)
     with np.errstate(invalid="ignore"):
         lateral, depth = (np.sqrt(np.bincount(bins, part, minlength=n) / ions) for part in squares.T)
     return ErrorBins(edges, ions, lateral, depth)
+
+
+def _grouped(groups, residuals):
+    """Mean and RMS of the residuals of each group."""
+    numbers, place, ions = np.unique(groups, return_inverse=True, return_counts=True)
+    place = place.ravel()
+    shift = np.column_stack([np.bincount(place, part) / ions for part in residuals.T])
+    lateral, depth = (np.sqrt(np.bincount(place, part) / ions) for part in _squares(residuals).T)
+    return GroupErrors(numbers, ions, shift, lateral, depth)
 
 
 def _plain(values):

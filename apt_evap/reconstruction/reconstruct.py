@@ -11,6 +11,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
 
 from apt_evap._common.types import AnyPath, Floats
@@ -24,12 +25,24 @@ from apt_evap._common.validation import (
 )
 from apt_evap.detection.hits import Hits
 from apt_evap.io.formats import write
-from apt_evap.reconstruction.choices import PROJECTIONS, PROTOCOLS
-from apt_evap.reconstruction.errors import FREE, ReconstructionErrors, errors_of, true_sites
+from apt_evap.reconstruction.choices import FRAMES, PROJECTIONS, PROTOCOLS
+from apt_evap.reconstruction.density import CapDensity, density_of
+from apt_evap.reconstruction.errors import (
+    FREE,
+    ReconstructionErrors,
+    errors_of,
+    free_constants,
+    groups_of,
+    moved,
+    true_sites,
+)
+from apt_evap.reconstruction.origins import OriginTable
 from apt_evap.simulation.real_units import trailing_mean
 from apt_evap.simulation.run import Run
 
 _RIGHT_ANGLE = math.pi / 2
+_WIDEST = math.radians(89.0)  # rim of the field of view, at the largest compression that is fitted
+_FIT_IONS = 100_000  # of which radius and compression are fitted: errors of 1e-3 of those of an ion
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -40,54 +53,78 @@ class Reconstruction:
     ----------
     positions : ndarray
         x, y and depth z [nm], shape (n, 3). The depth increases during the measurement. It is 0 at the apex of the
-        first ion.
+        first ion. The z axis of a specimen points the other way, so this frame is its mirror image: see
+        `specimen_positions`.
     hits : Hits
         The ions: those that hit the detector within its radius.
     radii : ndarray
         Radius of the cap at the evaporation of each ion [nm], shape (n,).
     settings : mapping
         Protocol, projection and constants of the reconstruction.
+    shifts : ndarray or None
+        Correction of x / R and y / R of each ion by a table of origins, shape (n, 2).
+    covariances : ndarray or None
+        Covariance of x and y of each ion by this table [nm^2], shape (n, 2, 2).
     """
 
     positions: Floats
     hits: Hits
     radii: Floats
     settings: Mapping[str, Any]
+    shifts: Floats | None = None
+    covariances: Floats | None = None
+
+    @property
+    def specimen_positions(self) -> Floats:
+        """x, y and z [nm], shape (n, 3), with z out of the specimen: a right-handed frame, for crystal directions."""
+        return self.positions * (1.0, 1.0, -1.0)
 
     @property
     def angles(self) -> Floats:
         """Polar angle of each ion on the cap [degrees], shape (n,)."""
-        lateral = np.hypot(self.positions[:, 0], self.positions[:, 1])
-        return np.degrees(np.arcsin(np.minimum(lateral / self.radii, 1.0)))
+        return _angles(self.positions, self.radii)
 
     @property
     def depths(self) -> Floats:
         """Depth of the apex at the evaporation of each ion [nm], shape (n,)."""
-        x, y, z = self.positions.T
-        return z - self.radii + np.sqrt(np.maximum(self.radii**2 - x * x - y * y, 0.0))
+        return self.positions[:, 2] - _below(self.positions, self.radii)
 
-    def to_hits(self) -> Hits:
+    def to_hits(self, frame: str = "depth") -> Hits:
         """The ions with the reconstructed positions in place of others.
+
+        Parameters
+        ----------
+        frame : str
+            "depth": z is the depth, as in `positions`. "specimen": z goes out of the specimen, as in
+            `specimen_positions`.
 
         Returns
         -------
         Hits
         """
-        return replace(self.hits, positions=self.positions)
+        chosen = check_choice(frame, "frame", FRAMES)
+        return replace(self.hits, positions=self.positions if chosen == "depth" else self.specimen_positions)
 
-    def write(self, path: AnyPath, **options: Any) -> None:
+    def write(self, path: AnyPath, frame: str = "depth", **options: Any) -> None:
         """Write the reconstructed ions to a file.
 
         Parameters
         ----------
         path : str or path-like
             The file, .pos, .epos, .xyz or .vtp.
+        frame : str
+            "depth" or "specimen", as for `to_hits`.
         **options
             As for `write`.
         """
-        write(path, self.to_hits(), **options)
+        write(path, self.to_hits(frame), **options)
 
-    def errors(self, truth: "Run | ArrayLike | None" = None, fit: Sequence[str] = FREE) -> ReconstructionErrors:
+    def errors(
+        self,
+        truth: "Run | ArrayLike | None" = None,
+        fit: Sequence[str] = FREE,
+        groups: ArrayLike | None = None,
+    ) -> ReconstructionErrors:
         """Errors of the positions, compared with the true sites of the ions.
 
         Parameters
@@ -97,7 +134,10 @@ class Reconstruction:
             specimen and out of it. By default the positions of simulated hits, which are their sites.
         fit : sequence of str
             Free constants that are fitted by least squares before the comparison: "shift", "rotation" about the axis,
-            "lateral_scale" and "depth_scale".
+            "depth_scale", "radius" (one factor of all radii), "compression"; also "lateral_scale".
+        groups : array_like of int, optional
+            Group of each ion, such as its phase: one number for each of the reconstructed ions, or for each ion of the
+            run. By default the species, if it is known.
 
         Returns
         -------
@@ -107,8 +147,84 @@ class Reconstruction:
         ------
         ValueError
             If there are no true sites, or too few ions.
+
+        Notes
+        -----
+        Radius and compression are found by a search, the other constants by linear least squares at each of its steps.
+        The radii are those of this reconstruction, times the factor; corrections by a table of origins stay the same.
+        Of more than 100,000 ions the search uses part.
         """
-        return errors_of(self.positions, self.angles, true_sites(self.hits, truth), fit)
+        sites, group = true_sites(self.hits, truth), groups_of(self.hits, truth, groups)
+        free = free_constants(fit)
+        linear = tuple(free - {"radius", "compression"})
+        if len(self) < 3 or not free & {"radius", "compression"}:
+            errors = errors_of(self.positions, self.angles, sites, linear, group, _below(self.positions, self.radii))
+            return replace(errors, compression=self.settings["compression"])
+        factor, compression = self._fitted(sites, free)
+        radii = factor * self.radii
+        positions = _placed(self.hits, radii, {**self.settings, "compression": compression}, self.shifts)
+        errors = errors_of(positions, _angles(positions, radii), sites, linear, group, _below(positions, radii))
+        return replace(errors, radius_factor=factor, compression=compression)
+
+    def _fitted(self, sites, free):
+        """Factor of the radii and compression by least squares, all linear constants fitted for each pair."""
+        known = self.settings["compression"]
+        names = sorted(free & {"radius", "compression"})
+        every = slice(None, None, -(-len(self) // _FIT_IONS))
+
+        def constants(logarithms):
+            factors = dict(zip(names, np.exp(logarithms), strict=True))
+            return float(factors.get("radius", 1.0)), known * float(factors.get("compression", 1.0))
+
+        def residuals(logarithms):
+            factor, compression = constants(logarithms)
+            settings = {**self.settings, "compression": compression}
+            positions = _placed(self.hits, factor * self.radii, settings, self.shifts)[every]
+            below = _below(positions, factor * self.radii[every])
+            return (moved(positions, below, sites[every], free)[0] - sites[every]).ravel()
+
+        low, high = np.full(len(names), -math.log(2.0)), np.full(len(names), math.log(2.0))
+        if "compression" in names:
+            high[names.index("compression")] = math.log(self._largest_compression() / known)
+        start = np.zeros(len(names))
+        fitted = scipy.optimize.least_squares(residuals, start, bounds=(low, high), xtol=1e-10, ftol=1e-10)
+        return constants(fitted.x)
+
+    def _largest_compression(self):
+        """Twice the compression; less if the angle at the rim would exceed 89 degrees."""
+        known, projection = self.settings["compression"], self.settings["projection"]
+        rim = max(float(np.hypot(self.hits.x, self.hits.y).max()), self.settings["field_of_view"])
+
+        def excess(compression):
+            return float(_cap_angles(np.array(rim / self.settings["distance"]), projection, compression)) - _WIDEST
+
+        if excess(2 * known) <= 0:
+            return 2 * known
+        if excess(known) >= 0:
+            return known * (1 + 1e-6)
+        return float(scipy.optimize.brentq(excess, known, 2 * known))
+
+    def density_map(self, bins: int = 32) -> CapDensity:
+        """Number of ions per area of the cap over its expectation.
+
+        Parameters
+        ----------
+        bins : int
+            Number of bins along the diameter of the field of view.
+
+        Returns
+        -------
+        CapDensity
+        """
+        depths = self.depths
+        swept = float(depths[-1] - depths[0])
+        widening = float(self.radii[-1] - self.radii[0]) / swept if swept > 0 else 0.0
+        rim = _cap_angles(
+            np.array(self.settings["field_of_view"] / self.settings["distance"]),
+            self.settings["projection"],
+            self.settings["compression"],
+        )
+        return density_of(self.positions[:, :2] / self.radii[:, None], math.sin(float(rim)), widening, bins)
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -141,6 +257,7 @@ def reconstruct(
     initial_radius: float | None = None,
     shank_angle: float | None = None,
     smoothing: int = 1,
+    origins: OriginTable | None = None,
 ) -> Reconstruction:
     r"""Reconstruct the positions of ions from their hits.
 
@@ -179,6 +296,9 @@ def reconstruct(
         Half the opening angle of the shank [degrees], for ``radius="shank"``.
     smoothing : int
         Number of ions, up to each ion, over which the voltage is averaged.
+    origins : OriginTable, optional
+        Table of where the ions of simulated hits came from. Lateral positions are corrected by it, and get covariances.
+        The hits must have the axes of the simulated specimen.
 
     Returns
     -------
@@ -216,7 +336,14 @@ def reconstruct(
     :math:`dR = dz \sin\alpha/(1-\sin\alpha)`.
     """
     check_kind(hits, "hits", Hits, "Hits, such as read(path) or run.hits(perturbation)")
+    if protocol == "geiser":
+        raise ValueError(
+            'protocol must be "cap" or "bas", got "geiser": public descriptions of wide-angle increments are that of '
+            '"cap", and no different one was found'
+        )
     check_choice(protocol, "protocol", PROTOCOLS)
+    if origins is not None:
+        check_kind(origins, "origins", OriginTable, "an OriginTable, such as origin_table(runs)")
     check_choice(projection, "projection", PROJECTIONS)
     volume = check_number(atomic_volume, "atomic_volume", above=0, unit="nm^3")
     distance = check_number(distance, "distance", above=0, unit="mm")
@@ -255,19 +382,26 @@ def reconstruct(
         rim = float(rho.max()) if detector_radius is None else detector_radius
     if rim == 0:
         raise ValueError("all ions hit the centre of the detector: detector_radius or area is needed, got neither")
-    angles = _cap_angles(rho / distance, projection, compression)
     rim_angle = float(_cap_angles(np.array(rim / distance), projection, compression))
-    widest = max(rim_angle, float(angles.max()))
+    widest = max(rim_angle, float(_cap_angles(rho.max() / distance, projection, compression)))
     if not widest < _RIGHT_ANGLE:
         raise ValueError(
             f"all angles on the cap must be < 90 degrees, got {math.degrees(widest):.0f} degrees at the rim: "
             "reduce detector_radius or compression"
         )
 
-    if protocol == "bas":
-        swept, widening = math.pi * (compression * rim / distance) ** 2, 0.0
-    else:
-        swept, widening = math.pi * math.sin(rim_angle) ** 2, math.pi * (1 - math.cos(rim_angle)) ** 2
+    settings: dict[str, Any] = {
+        "protocol": protocol,
+        "projection": projection,
+        "radius": mode,
+        "compression": compression,
+        "efficiency": efficiency,
+        "atomic_volume": volume,
+        "distance": distance,
+        "field_of_view": rim,
+    }
+    settings |= {name: float(value) for name, value in needs.get(mode, {}).items()}
+    swept, widening = _cross_sections(settings)
     per_ion = volume / efficiency
     if mode == "voltage":
         field = check_number(evaporation_field, "evaporation_field", above=0, unit="V/nm")
@@ -288,25 +422,56 @@ def reconstruct(
     else:
         radii = radii[chosen]
 
-    sine_over_rho = np.divide(np.sin(angles), rho, out=np.zeros_like(rho), where=rho > 0)
-    positions = np.empty((len(selection), 3))
-    positions[:, 0] = radii * sine_over_rho * x
-    positions[:, 1] = radii * sine_over_rho * y
-    positions[:, 2] = _apex_depths(radii, per_ion, swept, widening) + radii * (2 * np.sin(angles / 2) ** 2)
-    settings = {
-        "protocol": protocol,
-        "projection": projection,
-        "radius": mode,
-        "compression": compression,
-        "efficiency": efficiency,
-        "atomic_volume": volume,
-        "distance": distance,
-        "field_of_view": rim,
-    }
-    settings |= {name: float(value) for name, value in needs.get(mode, {}).items()}
     if mode == "voltage":
         settings |= {"field_factor": field_factor, "smoothing": smoothing}
-    return Reconstruction(positions, selection, radii, MappingProxyType(settings))
+    shifts = covariances = None
+    if origins is not None:
+        shifts, covariances = origins.shifts_at(_on_cap(selection, settings)[0])
+        covariances *= (radii * radii)[:, None, None]
+    positions = _placed(selection, radii, settings, shifts)
+    return Reconstruction(positions, selection, radii, MappingProxyType(settings), shifts, covariances)
+
+
+def _on_cap(hits, settings):
+    """Place of each ion, x / R and y / R, shape (n, 2), and its angle on the cap [rad]."""
+    x, y = (column.astype(np.float64) for column in hits.require("x", "y"))
+    rho = np.hypot(x, y)
+    angles = _cap_angles(rho / settings["distance"], settings["projection"], settings["compression"])
+    sine_over_rho = np.divide(np.sin(angles), rho, out=np.zeros_like(rho), where=rho > 0)
+    return np.column_stack([sine_over_rho * x, sine_over_rho * y]), angles
+
+
+def _placed(hits, radii, settings, shifts=None):
+    """Positions [nm] of ions on caps of known radii; `shifts` of x / R and y / R are added."""
+    places, angles = _on_cap(hits, settings)
+    below = 2 * np.sin(angles / 2) ** 2
+    if shifts is not None:
+        places = places + shifts
+        squares = np.minimum((places**2).sum(axis=1), 1.0)
+        below = squares / (1 + np.sqrt(1 - squares))
+    swept, widening = _cross_sections(settings)
+    depths = _apex_depths(radii, settings["atomic_volume"] / settings["efficiency"], swept, widening)
+    return np.column_stack([radii[:, None] * places, depths + radii * below])
+
+
+def _cross_sections(settings):
+    """Areas in units of R^2 that the cap sweeps by its recession, and loses by its widening."""
+    ratio = np.array(settings["field_of_view"] / settings["distance"])
+    if settings["protocol"] == "bas":
+        return math.pi * float(settings["compression"] * ratio) ** 2, 0.0
+    rim = float(_cap_angles(ratio, settings["projection"], settings["compression"]))
+    return math.pi * math.sin(rim) ** 2, math.pi * (1 - math.cos(rim)) ** 2
+
+
+def _below(positions, radii):
+    """Depth below the apex of ions on the cap [nm]."""
+    squares = (positions[:, :2] ** 2).sum(axis=1)
+    return squares / (radii + np.sqrt(np.maximum(radii * radii - squares, 0.0)))
+
+
+def _angles(positions, radii):
+    """Polar angles on the cap [degrees]."""
+    return np.degrees(np.arcsin(np.minimum(np.hypot(positions[:, 0], positions[:, 1]) / radii, 1.0)))
 
 
 def _cap_angles(ratios, projection, compression):

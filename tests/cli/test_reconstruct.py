@@ -34,6 +34,12 @@ def test_measured_ions(measured, nickel, capsys):
     expected = ae.reconstruct(measured, **known, evaporation_field=35.0)
     assert ae.read("ni_reconstructed.pos").positions == pytest.approx(expected.positions, rel=1e-6, abs=1e-5)  # float32
     assert main(command) == 2 and "'ni_reconstructed.pos' exists: --force" in capsys.readouterr().err
+    # a table without shifts changes nothing but the direction of z
+    places = np.random.default_rng(1).random((500, 2)) * 2 - 1
+    ae.OriginTable(places, np.zeros((500, 2))).save("table.npz")
+    corrected = ["--compression", "1.6", "--origins", "table.npz", "--frame", "specimen", "-o", "corrected.pos"]
+    assert main([*command, *corrected]) == 0 and capsys.readouterr()
+    assert ae.read("corrected.pos").positions == pytest.approx(expected.specimen_positions, rel=1e-6, abs=1e-5)
     shank = ["--radius", "shank", "--initial-radius", "30", "--shank-angle", "5", "--protocol", "bas", "--json"]
     assert main([*command, *shank, "--projection", "equidistant", "--ions", "0,500", "-o", "shank.epos"]) == 0
     result = json.loads(capsys.readouterr().out)

@@ -180,6 +180,53 @@ def test_ions_outside_and_ions_that_missed_are_left_out(cone):
     assert np.array_equal(result.radii, np.linspace(30, 31, 1000)[inside])
 
 
+def test_the_frame_with_the_depth_is_a_mirror_image(rng):
+    radius, n = 30.0, 500
+    theta, azimuth = cap_points(rng, n, float(angle_of(RIM)))
+    directions = np.column_stack([np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth), np.cos(theta)])
+    result = ae.reconstruct(hits_of(theta, azimuth), **KNOWN, radius=radius)
+    sites = radius * directions - result.depths[:, None] * [0, 0, 1]  # z out of the specimen
+    assert np.abs(result.specimen_positions + np.array([0, 0, radius]) - sites).max() < 1e-9 * radius
+    # no rotation brings the positions with the depth onto the sites
+    for positions, handed in ((result.specimen_positions, 1), (result.positions, -1)):
+        moments = (positions - positions.mean(axis=0)).T @ (sites - sites.mean(axis=0))
+        assert np.sign(np.linalg.det(moments)) == handed
+    # a crystal direction that is tilted from the axis shows its planes in the frame of the specimen alone
+    a = 0.4
+    grid = a * np.stack(np.meshgrid(*[np.arange(-8, 9)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    tilt = math.radians(20)
+    turn = np.array([[math.cos(tilt), 0, math.sin(tilt)], [0, 1, 0], [-math.sin(tilt), 0, math.cos(tilt)]])
+    crystal = replace(result, positions=grid @ turn.T * [1, 1, -1])
+    assert ae.distribution_map(crystal.specimen_positions, turn[:, 2], lateral=0.2).spacing == pytest.approx(
+        a, rel=1e-3
+    )
+    assert abs(ae.distribution_map(crystal.positions, turn[:, 2], lateral=0.2).spacing / a - 1) > 0.1
+
+
+def test_the_density_of_the_cap(cone, rng):
+    result = ae.reconstruct(cone, **SHANK)
+    found = result.density_map(24)
+    inside = np.isfinite(found.values)
+    deviations = (found.ions - found.expected)[inside] / np.sqrt(found.expected[inside])
+    # Poisson counts of 100 ions in 350 cells: variance 1, with a standard deviation of sqrt(2 / 350), four times
+    assert np.var(deviations) == pytest.approx(1, abs=0.3) and found.contrast < 0.05
+    # the expectation of a needle without a shank is even; that of this cone is not
+    assert np.nanmax(found.expected) / np.nanmin(found.expected) > 1.01
+    # a quarter is detected with half the efficiency
+    x, y = cone.x, cone.y
+    kept = ~((x > 0) & (y > 0)) | (rng.random(len(x)) < 0.5)
+    dark = ae.reconstruct(cone[kept], **SHANK).density_map(24)
+    half = len(dark.edges) // 2
+    assert np.nanmean(dark.values[half:, half:]) / np.nanmean(dark.values[:half, :half]) == pytest.approx(0.5, abs=0.05)
+    # of mean 7/8: deviations of 1/7 in three quarters and 3/7 in one
+    assert dark.contrast == pytest.approx(math.sqrt(3) / 7, abs=0.03)
+
+
+def test_the_wide_angle_protocol_is_that_of_the_cap(cone):
+    with pytest.raises(ValueError, match='public descriptions of wide-angle increments are that of "cap"'):
+        ae.reconstruct(cone, **SHANK, protocol="geiser")
+
+
 def test_the_centre_and_a_wide_field_of_view():
     hits = ae.Hits(x=[0.0, 3.0], y=[0.0, 4.0])
     result = ae.reconstruct(hits, atomic_volume=VOLUME, distance=DISTANCE, radius=30.0)
@@ -232,6 +279,9 @@ def test_files_of_a_reconstruction(cone, tmp_path):
         ions = ae.read(tmp_path / f"a{suffix}")
         assert np.array_equal(ions.positions, result.positions.astype(np.float32))
         assert (ions.mass_to_charge == 27.0).all()
+    result.write(tmp_path / "out.pos", frame="specimen")
+    outwards = ae.read(tmp_path / "out.pos").positions
+    assert np.array_equal(outwards, result.specimen_positions.astype(np.float32)) and outwards[:, 2].max() <= 0
     result.write(tmp_path / "a.xyz", species="Al")
     result.write(tmp_path / "a.vtp")
     assert (tmp_path / "a.xyz").read_text().startswith("500\n")

@@ -1,0 +1,49 @@
+"""The surface of the specimen at the end of a run."""
+
+import dataclasses
+
+from apt_evap._common.validation import check_kind
+from apt_evap.evaporation import rule as rules
+from apt_evap.evaporation.emitter import Emitter
+from apt_evap.evaporation.settings import ChargeSettings
+from apt_evap.simulation.run import Run
+from apt_evap.specimen.tip import Tip
+
+
+def surface_after(run: Run, n_threads: int | None = None) -> Emitter:
+    """Rebuild the surface of the specimen after the last relaxation of a run.
+
+    Parameters
+    ----------
+    run : Run
+        A run or a part of one, also from a file.
+    n_threads : int, optional
+        Number of threads of the emitter.
+
+    Returns
+    -------
+    Emitter
+        With the law `Extremal`: only its charges are those of the run. The ions after the last relaxation are still on
+        the surface.
+
+    Raises
+    ------
+    ValueError
+        If the run has no state, its specimen was made from positions, or its charging rule is not one of this package.
+    """
+    check_kind(run, "run", Run, "a Run")
+    if run.state is None:
+        raise ValueError(f"{run!r} does not contain the state of its surface")
+    described = dict(run.settings["rule"])
+    rule = getattr(rules, str(described.pop("name")), None)
+    if not dataclasses.is_dataclass(rule):
+        raise ValueError(f"the charging rule must be one of this package, got {run.settings['rule']}")
+    emitter = Emitter(
+        Tip.from_settings(run.settings["tip"]),
+        run.voltage,
+        settings=ChargeSettings(**run.settings["charges"]),
+        n_threads=n_threads,
+        rule=rule(**described),  # type: ignore[operator]
+    )
+    emitter.restore(run.state)
+    return emitter
