@@ -74,9 +74,10 @@ from .flight.designs import WideDesign as WideDesign
 from .flight.response import ResponseSettings as ResponseSettings
 from .io.formats import chunks as chunks
 from .io.formats import read as read
+from .io.formats import read_ranges as read_ranges
 from .io.formats import write as write
 from .io.npz import read_map as read_map
-from .io.rrng import read_ranges as read_ranges
+from .io.specimens import read_tip as read_tip
 from .reconstruction.calibration import DistributionMap as DistributionMap
 from .reconstruction.calibration import compression_from_poles as compression_from_poles
 from .reconstruction.calibration import distribution_map as distribution_map

@@ -2,6 +2,7 @@
 
 import struct
 
+import h5py
 import numpy as np
 
 
@@ -115,3 +116,135 @@ def pos(n, seed=8):
 def ions_of(sizes):
     """The last column of an .epos for pulses of these sizes."""
     return np.concatenate([[size] + [0] * (size - 1) for size in sizes])
+
+
+RNG = """3 4
+Chromium
+Cr 1.00 0.50 0.00
+Silicon
+Si 0.80 0.80 0.80
+Oxygen
+O 0,0 0,0 1,0
+--------------- Cr Si O
+. 25.9 26.3 1 0 0
+. 13.8 14.2 0 1 0
+. 67.5 68.4 1 0 1
+. 83.5 84.4 1 0 2
+
+--- polyatomic extension
+1 1
+CrO2
+CrO2 0.00 1.00 0.00
+------- CrO2
+. 83.5 84.4 1
+"""
+ENV = """# Rev 2.0 : Environment file
+Rev_2.0
+
+# Number of elements / Number of mass ranges
+3 3
+# List of Element and Color components
+Mn	0.0	0.5	1.0
+Mn2O	0.0	0.0	0.0
+Hyd	1.0	0.0	0.0
+# Definition of  Mass ranges
+Mn	27,33	27,95	11.66	1.0
+Mn2O	62.85	63.13	20.0	1.0
+Hyd	0.93	3.18	11.66	1.0
+# Atom probe definition
+# Flight length (m)
+0.1005
+"""
+
+
+def pyccapt_instrument(path, n=8, **changes):
+    """A file as the control module of PyCCAPT writes it, and its columns."""
+    rng = np.random.default_rng(9)
+    columns = {
+        "x": rng.uniform(-3, 3, n),
+        "y": rng.uniform(-3, 3, n),
+        "t": rng.uniform(300, 900, n),
+        "high_voltage": rng.uniform(3e3, 5e3, n),
+        "voltage_pulse": rng.uniform(300, 500, n),
+        "laser_pulse": np.zeros(n),
+        "start_counter": np.arange(n, dtype="u8") // 2 + 100,
+    } | changes
+    with h5py.File(path, "w") as file:
+        file["apt/temperature"] = np.full(3, 50.0)
+        for name, values in columns.items():
+            if values is not None:
+                file[f"dld/{name}"] = values
+        file["tdc/channel"] = np.zeros(4 * n, "u4")
+    return columns
+
+
+def pyccapt_calibrated(path, columns):
+    """The columns as pandas writes a DataFrame with this name: blocks of columns of the same type."""
+    kinds = {}
+    for name, values in columns.items():
+        kinds.setdefault(np.asarray(values).dtype.str, []).append(name)
+    with h5py.File(path, "w") as file:
+        n = len(next(iter(columns.values())))
+        file.create_group("df").attrs["pandas_type"] = np.bytes_(b"frame")
+        file["df/axis0"], file["df/axis1"] = np.array([name.encode() for name in columns]), np.arange(n)
+        for k, names in enumerate(kinds.values()):
+            file[f"df/block{k}_items"] = np.array([name.encode() for name in names])
+            file[f"df/block{k}_values"] = np.stack([columns[name] for name in names], axis=1)
+
+
+TAPSIM_COLUMNS = ["index", "id", "number", "voltage", "startX", "startY", "startZ", "stopX", "stopY", "stopZ", "tof"]
+TAPSIM_COLUMNS += ["probability", "potentialBefore", "fieldBeforeX", "fieldBeforeY", "fieldBeforeZ", "potentialAfter"]
+TAPSIM_COLUMNS += ["fieldAfterX", "fieldAfterY", "fieldAfterZ", "normalX", "normalY", "normalZ"]
+TAPSIM_COLUMNS += ["apexX", "apexY", "apexZ"]
+
+
+def tapsim_table(n=5, binary=False):
+    """A result table of TAPSim, and its rows in the units of the table."""
+    rng = np.random.default_rng(10)
+    rows = rng.uniform(-1, 1, (n, 26)).astype("f4")
+    rows[:, 0], rows[:, 1], rows[:, 2] = np.arange(n), 10, 7 + np.arange(n)
+    rows[:, 3], rows[:, 4:7], rows[:, 10] = 1000, rows[:, 4:7] * 1e-8, 4e-7
+    kind = "BINARY" if binary else "ASCII"
+    lines = ["TAPSIM RESULTS DATA", "VERSION 1.0", *(f"# {name} [1]" for name in TAPSIM_COLUMNS), kind, ""]
+    if binary:
+        data = b"".join(struct.pack("<IhI23f", *map(int, row[:3]), *row[3:]) for row in rows)
+    else:
+        cells = [[*(str(int(value)) for value in row[:3]), *(f"{value:.8e}" for value in row[3:])] for row in rows]
+        data = "".join("\t".join(row) + "\n" for row in cells).encode()
+    return "\n".join(lines).encode() + data, rows
+
+
+def tapsim_nodes(positions, ids, binary=False, numbers=None, potentials=None):
+    """A node file of TAPSim with these positions [m]."""
+    flags = f"{int(numbers is not None)} {int(potentials is not None)}"
+    head = f"{'BINARY' if binary else 'ASCII'} {len(ids)} {flags}\n".encode()
+    more = [(values, kind) for values, kind in ((numbers, "I"), (potentials, "f")) if values is not None]
+    rows = []
+    for k, (place, number) in enumerate(zip(positions, ids, strict=True)):
+        values = [*place, number, *(values[k] for values, _ in more)]
+        if binary:
+            rows.append(struct.pack("<3fh" + "".join(kind for _, kind in more), *values))
+        else:
+            rows.append(("\t".join(map(str, values)) + "\n").encode())
+    return head + b"".join(rows)
+
+
+def lammps_dump(positions, types, columns="id type x y z", bounds=((0, 10), (0, 20), (0, 30)), frames=1, tilt=""):
+    """A text dump of LAMMPS; the first two columns are the number and the type of each atom."""
+    text = ""
+    for frame in range(frames):
+        text += f"ITEM: TIMESTEP\n{frame}\nITEM: NUMBER OF ATOMS\n{len(types)}\nITEM: BOX BOUNDS {tilt}pp pp pp\n"
+        text += "".join(" ".join(map(str, row)) + "\n" for row in bounds) + f"ITEM: ATOMS {columns}\n"
+        for k, (place, kind) in enumerate(zip(positions, types, strict=True), 1):
+            text += f"{k} {kind} " + " ".join(repr(float(value) + frame) for value in place) + "\n"
+    return text
+
+
+def lammps_data(positions, types, style="atomic", comment=True, more="", labels=""):
+    """A data file of LAMMPS."""
+    text = f"a specimen\n\n{len(types)} atoms\n3 atom types\n0 10 xlo xhi\n0 20 ylo yhi\n0 30 zlo zhi\n\nMasses\n\n"
+    text += f"1 26.98 # Al\n2 63.55\n3 1.0\n\n{labels}Atoms{f'  # {style}' if comment else ''}\n\n"
+    before = {"atomic": "{k} {t}", "charge": "{k} {t} 0.5", "molecular": "{k} 1 {t}", "full": "{k} 1 {t} 0.5"}[style]
+    for k, (place, kind) in enumerate(zip(positions, types, strict=True), 1):
+        text += before.format(k=k, t=kind) + " " + " ".join(repr(float(value)) for value in place) + more + "\n"
+    return text + "\nVelocities\n\n1 0 0 0\n"

@@ -1,4 +1,4 @@
-"""Runs as earlier versions saved them: chunks with checksums of HDF5, names of settings that were changed since."""
+"""Runs as earlier versions saved them: format 2, and chunks with checksums of HDF5 and older names of settings."""
 
 import json
 
@@ -19,11 +19,26 @@ def old_settings(settings):
     return old
 
 
+NEW_IONS, OLD_IONS = "entry1/atom_probe/hit_spatial_filtering/evaporation_id", "entry1/atom_probe/evaporation_id"
+ONLY_NEW = (
+    "entry1/definition",
+    "entry1/start_time",
+    "entry1/operation_mode",
+    "entry1/specimen",
+    "entry1/laboratory_reference_frame",
+    "entry1/atom_probe/hit_spatial_filtering",
+)
+
+
 def make_old(path, rows=4096):
     """Rewrite the file of a run, or of a state, as an earlier version would have written it."""
     items = {}
 
     def note(name, item):
+        if name == NEW_IONS:
+            name = OLD_IONS
+        elif name.startswith(ONLY_NEW) or name.rpartition("/")[2] in ("program1", "program", "config"):
+            return
         items[name] = (item[()] if isinstance(item, h5py.Dataset) else None, list(texts_and_numbers(item)))
 
     with h5py.File(path, "r") as file:
@@ -37,6 +52,10 @@ def make_old(path, rows=4096):
                 chunks = (min(len(values), rows), *values.shape[1:]) if values.size else None
                 item = file.create_dataset(name, data=values, chunks=chunks, fletcher32=chunks is not None)
             for key, value in attributes:
+                if key == "NX_class" and name != "entry1":
+                    continue
+                if key == "format":
+                    value = b"apt_evap run 2"
                 if key == "settings":
                     value = json.dumps(old_settings(json.loads(value))).encode()
                 if key == "provenance":

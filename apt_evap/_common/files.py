@@ -90,13 +90,14 @@ def read_small_file(path: AnyPath, at_most: int, what: str) -> bytes:
     FileError
         If it is larger, or cannot be read.
     """
-    data = b""
+    parts, size = [], 0
     with open_for_reading(path) as file:
-        while len(data) <= at_most and (more := file.read(1 << 20)):
-            data += more
-    if len(data) > at_most:
+        while size <= at_most and (more := file.read(1 << 20)):
+            parts.append(more)
+            size += len(more)
+    if size > at_most:
         raise FileError(f"{str(path)!r} has more than {at_most} bytes, expected {what}")
-    return data
+    return b"".join(parts)
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from apt_evap._version import __version__
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.io.formats import read as read_file
-from apt_evap.io.rrng import read_ranges
+from apt_evap.io.formats import read_ranges
 from apt_evap.simulation.run import Run, load
 
 _MARK = f"apt_evap {__version__}"

@@ -1,4 +1,4 @@
-"""`apt-evap export`: write the ions of a run as a file of ions."""
+"""`apt-evap export`: write the ions of a run or of a measurement as a file of ions."""
 
 import argparse
 from dataclasses import replace
@@ -8,6 +8,7 @@ from apt_evap._common.files import FileError, check_path
 from apt_evap.cli._files import in_real_units, read, select
 from apt_evap.cli._output import tell, tell_json
 from apt_evap.config.perturbation_text import read_perturbation
+from apt_evap.detection.hits import Hits
 from apt_evap.detection.timing import Timing
 from apt_evap.io.formats import write
 from apt_evap.simulation.run import Run
@@ -18,23 +19,46 @@ def execute(options: argparse.Namespace) -> int:
     output = check_path(options.output or f"{Path(options.file).stem}.epos")
     if output.exists() and not options.force:
         raise FileError(f"{str(output)!r} exists: --force overwrites it")
-    run = read(options)
-    if not isinstance(run, Run):
-        raise ValueError(f"export needs a run (.h5), {options.file!r} contains other data")
-    run = in_real_units(run, options)
-    if options.temperature is not None or options.jitter is not None:
-        run = _with_errors(run, options)
-    perturbation = run.first_perturbation
-    if options.perturbation is not None:
-        perturbation = read_perturbation(options.perturbation)
-    hits = select(run.hits(perturbation), options)
+    content = read(options)
+    hits = select(_ions(content, options), options)
     detected = hits[hits.detected]
     if not len(detected):
         raise ValueError(f"none of the {len(hits):,} ions of {options.file!r} hit the detector: nothing to write")
-    write(output, detected)
+    write(output, detected, **_writing(output, content, options))
     tell(options, f"wrote {len(detected):,} ions to {output}")
     tell_json(options, {"wrote": str(output), "file": options.file, "ions": len(detected)})
     return 0
+
+
+def _ions(content, options):
+    """Ions of a run for the options, or measured ones."""
+    if isinstance(content, Run):
+        run = in_real_units(content, options)
+        if options.temperature is not None or options.jitter is not None:
+            run = _with_errors(run, options)
+        perturbation = run.first_perturbation
+        if options.perturbation is not None:
+            perturbation = read_perturbation(options.perturbation)
+        return run.hits(perturbation)
+    if not isinstance(content, Hits):
+        raise ValueError(f"export needs a run or ions, {options.file!r} contains a map")
+    for name in ("real_units", "perturbation", "temperature", "jitter"):
+        if getattr(options, name) is not None:
+            raise ValueError(f"--{name.replace('_', '-')} needs a run (.h5), {options.file!r} contains measured ions")
+    return content
+
+
+def _writing(output, content, options):
+    """Options of the writer: an .nxs has the elements of the specimen."""
+    if output.suffix.lower() != ".nxs":
+        if options.elements is not None:
+            raise ValueError(f"--elements is for an .nxs file, got {str(output)!r}")
+        return {}
+    if options.elements is not None:
+        return {"elements": options.elements.split(",")}
+    if not isinstance(content, Run):
+        raise ValueError(f"--elements is missing, such as Si,O: NXapm requires the elements for {str(output)!r}")
+    return {"elements": content.elements}
 
 
 def _with_errors(run, options):

@@ -246,14 +246,17 @@ def _add_compare(commands: Any) -> None:
 def _add_export(commands: Any) -> None:
     command = commands.add_parser(
         "export",
-        help="write the ions of a run as .epos, .pos, .xyz or .vtp",
-        description="Write the ions of a run that hit the detector as a file of ions. In real units an .epos has the\n"
-        "voltages, times of flight, mass-to-charge ratios and pulses that an instrument could have written.",
-        epilog="example: apt-evap export ni111.h5 --real-units --perturbation RollUp:0.36,0.36 -o ni111.epos",
+        help="write ions as .epos, .pos, .nxs, .csv, .tapsim, .xyz or .vtp",
+        description="Write the ions that hit the detector, of a run or of a measurement, as a file of ions. The\n"
+        "suffix of FILE selects the format. In real units an .epos has the voltages, times of flight, mass-to-charge\n"
+        "ratios and pulses that an instrument could have written.",
+        epilog="example: apt-evap export ni111.h5 --real-units --perturbation RollUp:0.36,0.36 -o ni111.epos\n"
+        "         apt-evap export R5083.epos -o R5083.nxs --elements Si,O",
         **_SHAPE,
     )
-    command.add_argument("file", metavar="RUN.h5", help="a run")
-    command.add_argument("-o", "--output", metavar="FILE", help="default: the name of the run with .epos")
+    command.add_argument("file", metavar="IONS", help="a run (.h5) or measured ions (.epos, ...)")
+    command.add_argument("-o", "--output", metavar="FILE", help="default: the name of IONS with .epos")
+    command.add_argument("--elements", metavar="NAME,...", help="of the specimen, for .nxs; default: those of the run")
     command.add_argument("--perturbation", metavar="P", help="as for map; default: the first one of the run")
     _add_real_units(command)
     command.add_argument("--temperature", type=_number("K"), metavar="K", help="adds energy deficits to the times")
@@ -330,7 +333,7 @@ def _add_reading(parser: argparse.ArgumentParser) -> Any:
         "--ions", type=_bounds, metavar="FIRST,LAST", help="in the order of the file, from 0; LAST is not included"
     )
     selection.add_argument("--circle", type=_circle, metavar="R[,X,Y]", help="radius and centre on the detector [mm]")
-    selection.add_argument("--ranges", metavar="FILE.rrng", help="ranges of mass, for --species")
+    selection.add_argument("--ranges", metavar="FILE.rrng", help="or .rng, .env: ranges of mass, for --species")
     selection.add_argument("--species", metavar="NAME[,NAME]", help="ions in the ranges of these names, such as Si")
     return group
 

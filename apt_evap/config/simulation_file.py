@@ -21,6 +21,7 @@ from apt_evap.evaporation.settings import ChargeSettings
 from apt_evap.evaporation.voltage import VoltageControl, check_voltage
 from apt_evap.flight.crew import FlightSettings
 from apt_evap.flight.response import ResponseSettings
+from apt_evap.io.specimens import read_tip
 from apt_evap.simulation.monitor import WatchSettings
 from apt_evap.simulation.real_units import check_flight_charges
 from apt_evap.simulation.run import Run
@@ -53,7 +54,7 @@ class Config:
     path : Path
         The file.
     tip : dict
-        Arguments of `Tip`.
+        Arguments of `Tip`, or of `read_tip` if there is a "path".
     n_ions : int
         Number of atoms to evaporate.
     responses : bool
@@ -115,11 +116,12 @@ class Config:
         check_law(self.law)
 
     def __repr__(self) -> str:
-        host, radius = _host(self.tip).name, self.tip["apex_radius"]
         panels = ", ".join(panel.title for panel in self.maps.panels)
-        return (
-            f"<Config {str(self.path)!r}: {self.n_ions:,} ions of {host}, apex radius {radius:.4g} nm; maps: {panels}>"
-        )
+        if "path" in self.tip:
+            specimen = f"from {str(self.tip['path'])!r}"
+        else:
+            specimen = f"of {_host(self.tip).name}, apex radius {self.tip['apex_radius']:.4g} nm"
+        return f"<Config {str(self.path)!r}: {self.n_ions:,} ions {specimen}; maps: {panels}>"
 
     @property
     def emissions(self) -> tuple[Perturbation, ...]:
@@ -146,7 +148,7 @@ class Config:
             If the specimen is impossible, or the flights do not fit the specimen; the message names the file.
         """
         with _located(self.path, "tip"):
-            tip = Tip(**self.tip)
+            tip = read_tip(**self.tip) if "path" in self.tip else Tip(**self.tip)
         if self.real_units is not None:
             with _located(self.path, "real_units"):
                 names = tuple(element.name for element in tip.elements)
@@ -183,13 +185,14 @@ class Config:
 def read_config(path: str | Path) -> Config:
     """Read a simulation from a TOML file.
 
-    The tables are ``[tip]`` (the arguments of `Tip`; lengths in nm or, as text, in lattice constants: "20 a"),
+    The tables are ``[tip]`` (the arguments of `Tip`; lengths in nm or, as text, in lattice constants: "20 a"; or a
+    ``file``, relative to the folder of the settings, with ``types`` and further arguments of `read_tip`),
     ``[simulation]`` (ions, voltage, seed, responses), ``[detector]``, ``[charges]``, ``[flights]``, ``[responses]``,
     ``[watch]`` (fields of `Detector`, `ChargeSettings`, `FlightSettings`, `ResponseSettings`, `WatchSettings`),
     ``[[phases]]`` (see `apt_evap.config.phases`; instead of a material in ``[tip]``), ``[law]``, ``[control]``,
     ``[real_units]`` (see `apt_evap.config.physics`) and ``[maps]`` (bins, smoothing and
     panels, each with a title and a perturbation as in `apt_evap.perturbation.from_dict`). Only ``[tip]`` with a
-    material and an apex_radius, and the ions in ``[simulation]``, are required.
+    material and an apex_radius, or with a file, and the ions in ``[simulation]``, are required.
 
     Parameters
     ----------
@@ -241,7 +244,9 @@ def read_config(path: str | Path) -> Config:
         with _located(path, "phases"):
             phases = check_phases(read_phases(document["phases"], _material))
     with _located(path, "tip"):
-        tip = _tip(document["tip"], phases)
+        if phases is not None and "file" in document["tip"]:
+            raise ValueError("a specimen from a file has no [[phases]], got both")
+        tip = _tip_from_file(document["tip"], path) if "file" in document["tip"] else _tip(document["tip"], phases)
     with _located(path, "simulation"):
         simulation = document["simulation"]
         check_keys(simulation, ("ions", "voltage", "seed", "responses"), ("ions",))
@@ -286,22 +291,6 @@ def _host(tip):
     return tip["phases"][0].material if "phases" in tip else tip["material"]
 
 
-def _material(host):
-    """Material from its name or its table."""
-    if isinstance(host, Mapping):
-        check_keys(host, _field_names(Material), ("name",))
-        changes = {key: value for key, value in host.items() if key != "name"}
-        if host["name"] in list(MATERIALS):
-            host = material(**host)
-        else:
-            check_keys(host, _field_names(Material), ("structure", "a", "evaporation_field", "charge_state", "mass"))
-            host = Material(host["name"], **changes)
-        return host
-    if isinstance(host, str):
-        return material(host)
-    raise ValueError(f"material must be a name such as 'Ni' or a table, got {short_text(host)}")
-
-
 def _tip(table, phases):
     """Arguments of `Tip` from the table [tip], and the phases if there are any."""
     known = tuple(name for name in inspect.signature(Tip).parameters if name != "phases")
@@ -321,6 +310,44 @@ def _tip(table, phases):
     if "solutes" in settings:
         check_table(settings["solutes"], "solutes")
     return settings
+
+
+def _material(host, name="material"):
+    """Material from its name or a table."""
+    if isinstance(host, Mapping):
+        check_keys(host, _field_names(Material), ("name",))
+        changes = {key: value for key, value in host.items() if key != "name"}
+        if host["name"] in list(MATERIALS):
+            return material(**host)
+        check_keys(host, _field_names(Material), ("structure", "a", "evaporation_field", "charge_state", "mass"))
+        return Material(host["name"], **changes)
+    if isinstance(host, str):
+        return material(host)
+    raise ValueError(f"{name} must be a name such as 'Ni' or a table, got {short_text(host)}")
+
+
+_FILE_KEYS = (
+    "file",
+    "types",
+    "format",
+    "units",
+    "frame",
+    "style",
+    "neighbour_radius",
+    "surface_threshold",
+    "potential_point",
+)
+
+
+def _tip_from_file(table, path):
+    """Arguments of `read_tip` from the table [tip]."""
+    check_keys(table, _FILE_KEYS)
+    settings = {key: value for key, value in table.items() if key != "file"}
+    if not (isinstance(table["file"], str) and table["file"]):
+        raise ValueError(f"file must be a file name such as 'tip.lmp', got {short_text(table['file'])}")
+    check_table(settings.get("types", {}), "types")
+    settings["types"] = {key: _material(value, f"types.{key}") for key, value in settings.get("types", {}).items()}
+    return {"path": path.parent / table["file"], **settings}
 
 
 def _length(value, name, a):

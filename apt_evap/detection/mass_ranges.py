@@ -136,6 +136,28 @@ class Ranges:
         """Name of the species of every ion, `outside` for an ion in no range, array of str of shape (n,)."""
         return np.array([*self.species_names, check_kind(outside, "outside", str, "text")])[self.species(hits)]
 
+    def count_atoms(self, hits: Hits) -> dict[str, int]:
+        """Number of atoms of each element; a molecular ion such as CrO2 counts with all its atoms.
+
+        Parameters
+        ----------
+        hits : Hits
+            Ions with mass_to_charge.
+
+        Returns
+        -------
+        dict of str to int
+            By element, in the order of the ranges. Ions in no range, or in a range without a composition, are not
+            counted.
+        """
+        ions = np.bincount(self.index(hits) + 1, minlength=len(self) + 1)[1:]
+        assert self.composition is not None
+        atoms: dict[str, int] = {}
+        for n, composition in zip(ions.tolist(), self.composition, strict=True):
+            for element, each in composition.items():
+                atoms[element] = atoms.get(element, 0) + n * each
+        return atoms
+
     def select(self, hits: Hits, *names: str) -> Hits:
         """Select the ions of one or more species.
 

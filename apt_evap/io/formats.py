@@ -13,17 +13,23 @@ from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_count, check_kind, short_text
 from apt_evap._common.wording import argument
 from apt_evap.detection.hits import Hits
+from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.io._apt_sections import SIGNATURE
 from apt_evap.io.apt import chunk_apt, read_apt
+from apt_evap.io.csv import write_csv
+from apt_evap.io.env import read_env
 from apt_evap.io.epos import chunk_epos, read_epos, write_epos
 from apt_evap.io.npz import read_map
 from apt_evap.io.pos import chunk_pos, read_pos, write_pos
 from apt_evap.io.raw import chunk_raw, read_raw
-from apt_evap.io.rrng import read_ranges
+from apt_evap.io.rng import read_rng
+from apt_evap.io.rrng import read_rrng
+from apt_evap.io.tapsim import SIGNATURE as TAPSIM
+from apt_evap.io.tapsim import read_tapsim, write_tapsim
 from apt_evap.io.vtp import write_vtp
 from apt_evap.io.xyz import write_xyz
 
-__all__ = ["FORMATS", "FileError", "Format", "TruncatedFile", "chunks", "read", "read_ranges", "write"]
+__all__ = ["FORMATS", "RANGE_FORMATS", "FileError", "Format", "TruncatedFile", "chunks", "read", "read_ranges", "write"]
 
 
 @dataclass(frozen=True)
@@ -37,15 +43,31 @@ class Format:
     chunks: Callable | None = None
 
 
-def _read_run(path):
-    # imported on demand, so that reading a .pos does not import the simulation
-    from apt_evap.simulation.run import load
-
-    return load(path)
+# imported on demand, so that other formats do not import HDF5
 
 
+def _read_hdf5(path, *, columns=None, partial=False):
+    from apt_evap.io.hdf5 import read_hdf5
+
+    return read_hdf5(path, columns=columns, partial=partial)
+
+
+def _read_nxapm(path, *, columns=None):
+    from apt_evap.io.nxapm import read_nxapm
+
+    return read_nxapm(path, columns=columns)
+
+
+def _write_nxapm(path, hits, *, elements=(), start_time=None):
+    from apt_evap.io.nxapm import write_nxapm
+
+    write_nxapm(path, hits, elements=elements, start_time=start_time)
+
+
+_HDF5 = b"\x89HDF\r\n\x1a\n"
 FORMATS = (
-    Format(".h5", b"\x89HDF\r\n\x1a\n", _read_run),
+    Format(".h5", _HDF5, _read_hdf5),
+    Format(".nxs", _HDF5, _read_nxapm, _write_nxapm),
     Format(".epos", None, read_epos, write_epos, chunk_epos),
     Format(".pos", None, read_pos, write_pos, chunk_pos),
     Format(".apt", SIGNATURE, read_apt, None, chunk_apt),
@@ -53,7 +75,12 @@ FORMATS = (
     Format(".npz", b"PK", read_map),
     Format(".xyz", None, None, write_xyz),
     Format(".vtp", None, None, write_vtp),
+    Format(".csv", None, None, write_csv),
+    Format(".tapsim", TAPSIM, read_tapsim, write_tapsim),
 )
+
+RANGE_FORMATS = {".rrng": read_rrng, ".rng": read_rng, ".env": read_env}
+"""Readers of files of mass ranges, by suffix."""
 
 
 def read(path: AnyPath, *, format: str | None = None, columns: Sequence[str] | None = None, **options: Any) -> Any:
@@ -62,15 +89,15 @@ def read(path: AnyPath, *, format: str | None = None, columns: Sequence[str] | N
     Parameters
     ----------
     path : str or path-like
-        The file: .pos, .epos, .apt, .raw, .h5 or .npz.
+        The file: .pos, .epos, .apt, .raw, .nxs, .h5 (a run, NXapm or PyCCAPT), .npz, or a result table of TAPSim.
     format : str, optional
         Suffix of the format, such as ".pos", for any name of the file.
     columns : sequence of str, optional
-        Names of the columns to read; only these are kept in memory. All by default. Not for .h5 and .npz.
+        Names of the columns to read; only these are kept in memory. All by default. Not for a run, an .npz and TAPSim.
     **options
         Options of the reader of the format: ``partial=True`` reads the complete ions of a truncated file (the complete
-        sections of an .apt), ``byte_order="little"`` a .pos or .epos in the wrong byte order; for an .npz the options
-        of `read_map`.
+        sections of an .apt, the undamaged ions of a run), ``byte_order="little"`` a .pos or .epos in the wrong byte
+        order; for an .npz the options of `read_map`.
 
     Returns
     -------
@@ -130,15 +157,17 @@ def write(path: AnyPath, hits: Hits, *, format: str | None = None, **options: An
     Parameters
     ----------
     path : str or path-like
-        The file, .pos, .epos, .xyz or .vtp; an existing one is replaced when the new one is complete.
+        The file, .pos, .epos, .nxs, .tapsim, .csv, .xyz or .vtp; an existing one is replaced when the new one is
+        complete.
     hits : Hits
         The ions. A .pos or .epos does not contain ions that did not hit the detector or have values that are not
         finite; an .xyz or .vtp does not contain ions whose positions are not finite. A warning gives the number of
-        ions left out.
+        ions left out. The other formats contain all ions.
     format : str, optional
         Suffix of the format, such as ".pos", for any name of the file.
     **options
-        Options of the writer of the format: ``species`` gives the species of the ions in an .xyz.
+        Options of the writer of the format: ``species`` gives the species of the ions in an .xyz, ``elements`` (needed)
+        and ``start_time`` are for an .nxs, ``binary=True`` for a .tapsim.
 
     Raises
     ------
@@ -155,6 +184,36 @@ def write(path: AnyPath, hits: Hits, *, format: str | None = None, **options: An
         raise ValueError(f"hits must be Hits, such as run.hits(perturbation), got {short_text(hits)}")
     _check_options(path, chosen, "writing", _known(chosen.write, "hits"), options)
     chosen.write(path, hits, **options)
+
+
+def read_ranges(path: AnyPath, *, format: str | None = None) -> Ranges:
+    """Read a file of mass ranges; the suffix selects the format.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file: .rrng, .rng or .env. A file with another suffix is read as .rrng.
+    format : str, optional
+        Suffix of the format, such as ".rng", for any name of the file.
+
+    Returns
+    -------
+    Ranges
+        In the order of the file.
+
+    Raises
+    ------
+    FileError
+        If the file is missing or unreadable, has no ranges, or contains an invalid line, or the format is unknown.
+    """
+    suffix = check_path(path).suffix.lower()
+    if format is not None:
+        suffix = "." + check_kind(format, "format", str, "a suffix such as '.rng'").lower().lstrip(".")
+        if suffix not in RANGE_FORMATS:
+            raise FileError(
+                f"format of {str(path)!r} must be one of {', '.join(RANGE_FORMATS)}, got {argument('format', format)}"
+            )
+    return RANGE_FORMATS.get(suffix, read_rrng)(path)
 
 
 def _to_read(path, format):

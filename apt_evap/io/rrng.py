@@ -10,15 +10,14 @@ import warnings
 
 import numpy as np
 
-from apt_evap._common.files import FileError, read_small_file
+from apt_evap._common.files import FileError
 from apt_evap._common.types import AnyPath
 from apt_evap._common.warnings import DataWarning
 from apt_evap.detection.mass_ranges import Ranges
+from apt_evap.io._texts import formula, number, read_text
 
-_MAX_BYTES = 1 << 22
 
-
-def read_ranges(path: AnyPath) -> Ranges:
+def read_rrng(path: AnyPath) -> Ranges:
     """Read the mass ranges of an .rrng file.
 
     Parameters
@@ -36,18 +35,15 @@ def read_ranges(path: AnyPath) -> Ranges:
     FileError
         If the file is missing or unreadable, has no ranges, or contains an invalid line.
     """
-    data = read_small_file(path, _MAX_BYTES, "the text of an .rrng file")
-    if not data:
-        raise FileError(f"{str(path)!r} is empty (0 bytes), expected the text of an .rrng file")
-    lines = _lines(data)
+    lines = _lines(read_text(path, "the text of an .rrng file"))
     elements = {}
     for section, _, key, value in lines:
         if section == "ions" and re.fullmatch(r"ion\s*[0-9]+", key) and value:
             element = value.split()[0]
             elements.setdefault(element.casefold(), element)
     parts = [
-        _range(value, elements, f"{str(path)!r}, line {number}")
-        for section, number, key, value in lines
+        _range(value, elements, f"{str(path)!r}, line {at}")
+        for section, at, key, value in lines
         if section == "ranges" and re.fullmatch(r"range\s*[0-9]+", key)
     ]
     if not parts:
@@ -61,21 +57,17 @@ def read_ranges(path: AnyPath) -> Ranges:
     return Ranges(names, np.array(low), np.array(high), np.array(volume), colour, composition, source=str(path))
 
 
-def _lines(data):
+def _lines(text):
     """(section, line number, key, value) of every assignment, section and key in lower case."""
-    try:
-        text = data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
-    except UnicodeDecodeError:
-        text = data.decode("latin-1")
     section = ""
     assignments = []
-    for number, line in enumerate(text.splitlines(), 1):
+    for at, line in enumerate(text.splitlines(), 1):
         line = line.strip()
         if line.startswith("[") and "]" in line:
             section = line[1 : line.index("]")].strip().casefold()
         elif "=" in line and not line.startswith((";", "#")):
             key, _, value = line.partition("=")
-            assignments.append((section, number, key.strip().casefold(), value.strip()))
+            assignments.append((section, at, key.strip().casefold(), value.strip()))
     return assignments
 
 
@@ -90,9 +82,9 @@ def _range(text, elements, where):
         key, colon, value = part.partition(":")
         word = key.casefold()
         if not colon:
-            bounds.append(_number(part, "a bound [Da]", where))
+            bounds.append(number(part, "a bound [Da]", where))
         elif word == "vol":
-            volume = _number(value, "a volume [nm^3]", where) if value else np.nan
+            volume = number(value, "a volume [nm^3]", where) if value else np.nan
         elif word in ("color", "colour"):
             colour = "#" + value.upper() if re.fullmatch(r"#?[0-9A-Fa-f]{6}", value) else ""
             colour = colour.replace("##", "#")
@@ -106,17 +98,6 @@ def _range(text, elements, where):
     if len(bounds) != 2 or not bounds[0] < bounds[1]:
         raise FileError(f"{where}: expected two bounds [Da], the lower one first, got {bounds!s:.60} in {text!r:.60}")
     composition = {element: count for element, count in composition.items() if count}
-    formula = "".join(element + (str(count) if count > 1 else "") for element, count in composition.items())
-    if not (name or formula):
+    if not (name or composition):
         raise FileError(f"{where}: expected an element such as Si:1, or Name:..., got {text!r:.60}")
-    return name or formula, *bounds, volume, colour, composition
-
-
-def _number(text, what, where):
-    try:
-        number = float(text.replace(",", ".")) if re.fullmatch(r"[-+0-9.,eE]+", text) else np.nan
-    except ValueError:
-        number = np.nan
-    if not np.isfinite(number):
-        raise FileError(f"{where}: expected {what}, got {text!r:.60}")
-    return number
+    return name or formula(composition), *bounds, volume, colour, composition

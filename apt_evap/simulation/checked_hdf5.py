@@ -44,7 +44,9 @@ class _Sink(io.RawIOBase):
     """A file for HDF5, which crashes if writing fails: the first error is stored, to be raised after closing."""
 
     def __init__(self, file: BinaryIO) -> None:
-        self._file, self._place, self._end, self.error = file, 0, 0, None
+        self._file: Any = file
+        self._place, self._end = 0, 0
+        self.error: OSError | None = None
 
     def _do(self, method, *arguments):
         if self.error is None:
@@ -66,6 +68,19 @@ class _Sink(io.RawIOBase):
         self._place += len(data)
         self._end = max(self._end, self._place)
         return len(data)
+
+    def readinto(self, buffer: Any) -> int:
+        """Read what was written, which HDF5 needs for texts of variable length; zeros after an error."""
+        view = memoryview(buffer).cast("B")
+        view[:] = bytes(len(view))
+        try:
+            if self.error is None:
+                self._file.flush()
+                self._file.readinto(view)
+        except OSError as error:
+            self.error = error
+        self._place += len(view)
+        return len(view)
 
     def truncate(self, size: int | None = None) -> int:
         self._do("truncate", size)
@@ -130,7 +145,7 @@ def _blocks_of(file, rows):
     blocks = []
 
     def note(name, item):
-        if isinstance(item, h5py.Dataset) and item.id.get_offset() is not None:
+        if isinstance(item, h5py.Dataset) and item.shape and item.id.get_offset() is not None:
             begin, width = item.id.get_offset(), item.nbytes // len(item)
             for row in range(0, len(item), rows):
                 blocks.append((begin + row * width, min(rows, len(item) - row) * width, 0))
@@ -304,17 +319,17 @@ class CheckedFile:
             raise ValueError(f"attribute {name!r} must be a text, got {value!r:.60}")
         return value
 
-    def dataset(self, path: str, dtype: DTypeLike, shape: tuple[int | None, ...]) -> h5py.Dataset:
+    def dataset(self, path: str, dtype: DTypeLike | None, shape: tuple[int | None, ...] | None) -> h5py.Dataset:
         """Check the type, the shape and the place of a dataset, and return it.
 
         Parameters
         ----------
         path : str
             Name of the dataset, with the names of its groups.
-        dtype : dtype
-            Expected type.
-        shape : tuple
-            Expected shape; None stands for any length.
+        dtype : dtype or None
+            Expected type; None for any.
+        shape : tuple or None
+            Expected shape; None stands for any length, or for any shape.
 
         Returns
         -------
@@ -328,8 +343,9 @@ class CheckedFile:
         item = self._item(path)
         if not isinstance(item, h5py.Dataset):
             raise ValueError(f"{path} is not a dataset")
-        if item.dtype.newbyteorder("=") != np.dtype(dtype):
+        if dtype is not None and item.dtype.newbyteorder("=") != np.dtype(dtype):
             raise ValueError(f"{path} must contain {np.dtype(dtype)}, got {item.dtype}")
+        shape = (None,) * len(item.shape or ()) if shape is None else shape
         fits = item.shape is not None and len(item.shape) == len(shape)
         if not fits or any(a != b for a, b in zip(item.shape, shape, strict=True) if b is not None):
             expected = ", ".join("any" if length is None else str(length) for length in shape)
@@ -387,7 +403,7 @@ class CheckedFile:
     def _has_all_chunks(self, dataset, plist):
         filters = [plist.get_filter(k)[0] for k in range(plist.get_nfilters())]
         if filters not in ([], [h5py.h5z.FILTER_FLETCHER32]):
-            raise ValueError(f"{dataset.name} is compressed or filtered, unlike the datasets of a run")
+            raise ValueError(f"{dataset.name} is compressed or filtered: h5repack -f NONE writes a copy that is not")
         chunks = dataset.chunks
         size = math.prod(chunks) * dataset.dtype.itemsize + 4 * len(filters)
         if size > self._size:

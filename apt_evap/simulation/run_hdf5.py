@@ -1,6 +1,6 @@
 """The HDF5 file of a run: layout, writing and reading, also of the undamaged ions in a damaged file.
 
-Groups and fields have the names of NeXus NXapm if it defines one; see docs/formats.rst.
+Groups and fields have the names of NeXus NXapm if it defines one; see `apt_evap.simulation.nexus` and docs/formats.rst.
 """
 
 import json
@@ -31,16 +31,18 @@ from apt_evap.simulation.checked_hdf5 import (
     write_checked,
 )
 from apt_evap.simulation.history import CapHistory, History
+from apt_evap.simulation.nexus import ATOM_PROBE, ENTRY, IONS, put_field, put_group, put_nxapm, put_text
 from apt_evap.simulation.old_settings import upgraded
+from apt_evap.simulation.provenance import provenance_now
 from apt_evap.simulation.real_units import RealColumns, RealUnits
 
-FORMAT = "apt_evap run 2"
+FORMAT = "apt_evap run 3"
 _KIND = "apt_evap run "
-_LONGEST_TEXT = 60_000  # bytes: HDF5 allows 64 kB in an attribute
+_READABLE = ("apt_evap run 2", FORMAT)  # 2: evaporation_id in another group, and not a complete NXapm file
 ROWS = 4096  # rows of a dataset with a common checksum: any damage to them loses these ions
 
-_ENTRY = "entry1"
-_ATOM_PROBE, _SIMULATION = f"{_ENTRY}/atom_probe", f"{_ENTRY}/simulation"
+_SIMULATION = f"{ENTRY}/simulation"
+_OWN = "NXcollection"
 _EMISSIONS = ("positions", "normals", "neighbours", "charge_states", "masses")
 _COLUMNS = ("site", "species", "charges", "fields")
 _DETACHED = "detached", (f"{_SIMULATION}/detached", np.int8, ())  # not in files of earlier versions
@@ -62,9 +64,8 @@ _UNITS = {
     "waits": "s",
     "voltages": "V",
 }
-_IONS = f"{_ATOM_PROBE}/evaporation_id"
-_KINDS = {  # datasets with one row per ion: name, type, shape of a row
-    "ions": (_IONS, np.int64, ()),
+_OLD_IONS = f"{ATOM_PROBE}/evaporation_id"
+_KINDS = {  # datasets with one row per ion, besides the ions: name, type, shape of a row
     "positions": (f"{_SIMULATION}/positions", np.float64, (3,)),
     "normals": (f"{_SIMULATION}/normals", np.float64, (3,)),
     "neighbours": (f"{_SIMULATION}/neighbours", np.float64, (3,)),
@@ -125,45 +126,40 @@ def described(perturbation: Any) -> dict[str, Any]:
 def write_run(path: AnyPath, run: Any) -> None:
     """Write a Run to a file, which is either complete or absent; FileError if it cannot be written."""
     with write_checked(path, ROWS) as file:
-        _put_text(file, "format", FORMAT)
+        put_text(file, "format", FORMAT)
         _write(file, run)
 
 
-def _put_text(item, name, text):
-    """Write a text of fixed length.
-
-    Texts of variable length lie in a heap, and HDF5 hangs or crashes if it is damaged. Measured with randomly changed
-    files: 3 of 960 with variable length, none of 2,640 with fixed length.
-    """
-    content = text.encode()
-    if len(content) > _LONGEST_TEXT:
-        item.attrs[name] = text
-    else:
-        item.attrs.create(name, content, dtype=h5py.string_dtype("utf-8", max(1, len(content))))
-
-
-def _put(group, name, values, units=None):
-    values = np.asarray(values)
-    dataset = group.create_dataset(name, data=values)
-    if units := units or _UNITS.get(name):
-        dataset.attrs["units"] = units
-    return dataset
+def _put(group, name, values):
+    *folders, name = name.split("/")
+    for folder in folders:
+        group = group[folder] if folder in group else put_group(group, folder, _OWN)
+    put_field(group, name, values, _UNITS.get(name))
 
 
 def _write(file, run):
-    _put_text(file, "provenance", json.dumps(run.provenance))
-    _put_text(file, "settings", json.dumps(run.settings, default=_plain))
-    _put_text(file, "elements", json.dumps(run.elements))
-    _put_text(file, "ended", run.ended)
+    put_text(file, "provenance", json.dumps(run.provenance))
+    put_text(file, "settings", json.dumps(run.settings, default=_plain))
+    put_text(file, "elements", json.dumps(run.elements))
+    put_text(file, "ended", run.ended)
     file.attrs["nearest_neighbour_distance"] = run.emissions.nearest_neighbour_distance
-    file.create_group(_ENTRY).attrs["NX_class"] = "NXentry"
-    probe, simulation = file.create_group(_ATOM_PROBE), file.create_group(_SIMULATION)
-    first = run.hits(run.first_perturbation)
-    _put(probe, "evaporation_id", run.emissions.ions)
-    hits = _put(probe, "hit_finding/hit_positions", np.column_stack([first.x, first.y]), "mm")
-    _put_text(hits, "perturbation", json.dumps(described(run.first_perturbation)))
-    _put(probe, "voltage_and_bowl/raw_tof", first.time_of_flight, "ns")
-    _put(probe, "mass_to_charge_conversion/mass_to_charge", first.mass_to_charge, "Da")
+    first, tip = run.hits(run.first_perturbation), run.settings["tip"]
+    provenance = {**provenance_now(), **run.provenance}
+    put_nxapm(
+        file,
+        ions=run.emissions.ions,
+        hits=np.column_stack([first.x, first.y]),
+        times=first.time_of_flight,
+        masses=first.mass_to_charge,
+        elements=run.elements,
+        start_time=provenance["created"],
+        version=provenance["version"],
+        is_simulation=True,
+        radius=tip.get("apex_radius"),
+        shank_angle=tip.get("shank_angle"),
+    )
+    simulation = put_group(file, _SIMULATION, _OWN)
+    put_text(simulation, "perturbation", json.dumps(described(run.first_perturbation)))
     for name in run.emissions.columns:
         if name != "ions":
             _put(simulation, name, getattr(run.emissions, name))
@@ -173,25 +169,24 @@ def _write(file, run):
     if len(run.phase_names) > 1:
         _put(simulation, "phase", run.phase)
     for index, (perturbation, flown) in enumerate(zip(run.perturbations, run.flown, strict=True)):
-        group = simulation.create_group(f"flown/{index}")
-        _put_text(group, "perturbation", json.dumps(described(perturbation)))
-        _put(group, "directions", flown.directions)
-        _put(group, "times", flown.times)
+        _put(simulation, f"flown/{index}/directions", flown.directions)
+        _put(simulation, f"flown/{index}/times", flown.times)
+        put_text(simulation[f"flown/{index}"], "perturbation", json.dumps(described(perturbation)))
     if run.responses is not None:
         for name, values in run.responses._asdict().items():
-            _put(simulation, f"responses/{name}", values, _UNITS.get(name))
+            _put(simulation, f"responses/{name}", values)
     for name, values in run.history._asdict().items():
-        _put(simulation, f"history/{_HISTORY.get(name, name)}", values, _UNITS.get(name))
+        _put(simulation, f"history/{_HISTORY.get(name, name)}", values)
     for name, values in run.cap._asdict().items():
-        _put(simulation, f"cap/{name}", values, _UNITS.get(name))
+        _put(simulation, f"cap/{name}", values)
     for group, columns in (("clock", run.clock), ("real", run.real)):
         if columns is not None:
             for name, values in columns._asdict().items():
-                _put(simulation, f"{group}/{name}", values, _UNITS.get(name))
+                _put(simulation, f"{group}/{name}", values)
     if run.units is not None:
-        _put_text(simulation["real"], "units", json.dumps(run.units.to_dict(), default=_plain))
+        put_text(simulation["real"], "units", json.dumps(run.units.to_dict(), default=_plain))
     if run.state is not None:
-        _put_state(simulation.create_group("state"), run.state, run.first_event)
+        _put_state(put_group(simulation, "state", _OWN), run.state, run.first_event)
 
 
 def _put_state(group, state, first_event):
@@ -208,7 +203,7 @@ def _put_state(group, state, first_event):
 def write_state(path: AnyPath, state: Any, first_event: int) -> None:
     """Write an EmitterState to a separate file, which is either complete or absent."""
     with write_checked(path, ROWS) as file:
-        _put_text(file, "format", FORMAT)
+        put_text(file, "format", FORMAT)
         _put_state(file, state, first_event)
 
 
@@ -231,14 +226,18 @@ def read_state(path: AnyPath) -> tuple[EmitterState, int]:
 def count_ions(path: AnyPath) -> int:
     """Number of ions of the run in a file; FileError as `read_run`."""
     with _reading(path, with_data=False) as file:
-        return len(file.dataset(_IONS, np.int64, (None,)))
+        return len(file.dataset(_ions_of(file), np.int64, (None,)))
 
 
 def is_run(path: AnyPath) -> bool:
     """Whether a file is a run, even if it is damaged or in another version of the format."""
     with suppress(OSError, RuntimeError, ValueError, KeyError):
         if has_checksums(path):
-            return True
+            try:
+                with open_checked(path, with_data=False) as file:
+                    return "format" in file.attributes() and file.text("format").startswith(_KIND)
+            except FileError:
+                return True
         with h5py.File(path, "r", locking=False) as file:
             return CheckedFile(file, 0, None).text("format").startswith(_KIND)
     return False
@@ -252,8 +251,9 @@ def _reading(path, hint="", with_data=True, partial=False):
             kind = file.text("format") if "format" in file.attributes() else "another file"
             if not kind.startswith(_KIND):
                 raise FileError(f"{name!r} is not a run: expected {FORMAT!r}, got {kind!r}")
-            if kind != FORMAT:
-                raise FileError(f"{name!r} is a run in another format, {kind!r}; this version reads {FORMAT!r}")
+            if kind not in _READABLE:
+                readable = " and ".join(map(repr, _READABLE))
+                raise FileError(f"{name!r} is a run in another format, {kind!r}; this version reads {readable}")
             yield file
     except DamagedRows as error:
         raise FileError(f"{error}{hint}") from error
@@ -267,7 +267,7 @@ def _read(file, partial):
     settings = upgraded(json.loads(file.text("settings")))
     elements = tuple(json.loads(file.text("elements")))
     response_settings = ResponseSettings.from_dict(settings["responses"])
-    perturbations, kinds = [], dict(_KINDS)
+    perturbations, kinds = [], {"ions": (_ions_of(file), np.int64, ()), **_KINDS}
     while (group := f"{_SIMULATION}/flown/{len(perturbations)}") in file:
         kinds[f"{len(perturbations)} directions"] = f"{group}/directions", np.float64, (2,)
         kinds[f"{len(perturbations)} times"] = f"{group}/times", np.float64, ()
@@ -338,9 +338,14 @@ def _read(file, partial):
     }
 
 
+def _ions_of(file):
+    """Name of the dataset of the ions, which depends on the version of the format."""
+    return _OLD_IONS if file.text("format") == _READABLE[0] else IONS
+
+
 def _columns(file, kinds, partial):
     """Columns by name; for a damaged file, only the ions whose rows are undamaged in all columns."""
-    n = len(file.dataset(_IONS, np.int64, (None,)))
+    n = len(file.dataset(kinds["ions"][0], np.int64, (None,)))
     datasets = {name: file.dataset(path, dtype, (n, *shape)) for name, (path, dtype, shape) in kinds.items()}
     blocks, lost = [], 0
     step = ROWS if partial else max(n, 1)
@@ -371,9 +376,9 @@ def _read_table(file, group, names):
 def _read_state(file, group):
     before = f"{group}/" if group else ""
     arrays = {name: file.read(before + name, dtype, shape) for name, (dtype, shape) in _STATE_ARRAYS.items()}
-    numbers = dict(file.attributes(group))
-    for name in ("format", "checksums"):  # attributes of a separate file
-        numbers.pop(name, None)
+    attributes = file.attributes(group)
+    # not those of a separate file, or the class of the group, a text of variable length (see `put_text`)
+    numbers = {name: attributes[name] for name in attributes if name not in ("format", "checksums", "NX_class")}
     own = {name: numbers.pop(name) for name in ("deepened", "tolerance", "opening_angle", "clipped", "unsettled")}
     factor = check_number(float(numbers.pop("voltage_factor", 1.0)), "voltage_factor", above=0)
     first_event = check_count(int(numbers.pop("first_event")), "first_event")

@@ -101,7 +101,8 @@ def test_ions_are_exported_as_an_instrument_would_write_them(made, tmp_path, mon
     assert 28 < np.median(ions.mass_to_charge) < 31
     assert main(command) == 2 and "ni.epos' exists: --force" in capsys.readouterr().err
     assert main([*command, "--force"]) == 0
-    assert main(["export", "ni.epos", "-o", "other.epos"]) == 2 and "needs a run" in capsys.readouterr().err
+    assert main(["export", "ni.epos", "-o", "other.epos", "--perturbation", "Unperturbed"]) == 2
+    assert "--perturbation needs a run (.h5), 'ni.epos' contains measured ions" in capsys.readouterr().err
     assert main(["export", str(made / "cold.h5"), "-o", "x.pos", "--jitter", "0.1"]) == 2
     assert "add --real-units" in capsys.readouterr().err
 

@@ -20,6 +20,7 @@ from apt_evap.emission.energies import Fixed, Thermal, TruncatedNormal
 from apt_evap.emission.perturbations import Combined, LateralVelocity, RollUp, Unperturbed
 from apt_evap.evaporation.settings import ChargeSettings
 from apt_evap.flight.crew import FlightSettings
+from apt_evap.io.tapsim_nodes import write_nodes
 from apt_evap.simulation.simulation import Simulation
 from apt_evap.specimen.materials import material
 from apt_evap.specimen.tip import Tip
@@ -402,3 +403,33 @@ def test_the_tables_commented_out_in_the_example_are_the_defaults(tmp_path):
     for kind in (ChargeSettings, FlightSettings):
         for item in fields(kind):
             assert f"# {item.name} = " in "\n".join(lines[begin:end])
+
+
+def test_a_specimen_from_a_file(tmp_path):
+    tip = Tip("Al", apex_radius=1.5, shank_length=1.5, solutes={"Cu": 0.2}, seed=1)
+    write_nodes(tmp_path / "nodes.txt", tip)
+    text = """
+    [tip]
+    file = "nodes.txt"
+    types = {10 = "Al", 20 = {name = "Cu", evaporation_field = 28.0}}
+    potential_point = [0.0, 0.0, 0.0]
+    [simulation]
+    ions = 10
+    """
+    (tmp_path / "a.toml").write_text(text)
+    config = read_config(tmp_path / "a.toml")
+    assert "10 ions from " in repr(config) and "nodes.txt" in repr(config)
+    simulation = config.simulation(n_threads=1)
+    assert np.allclose(simulation.tip.positions, tip.positions, rtol=0, atol=1e-7)  # [nm] digits in the file
+    assert simulation.tip.evaporation_fields.tolist() == [19.0, 28.0]
+    assert len(simulation.run(10, responses=False, progress=False)) == 10
+    for old, new, message in (
+        ('10 = "Al", ', "", r"\[tip\]: .*types without a name.* got none for 10"),
+        ("nodes.txt", "none.txt", r"\[tip\]: cannot read .*none\.txt"),
+        ('"Al"', "5", r"\[tip\]: types\.10 must be a name such as 'Ni' or a table, got 5"),
+        ("potential_point", "apex_radius", r"\[tip\]: no key is named 'apex_radius'"),
+        ('"nodes.txt"', "5", r"\[tip\]: file must be a file name such as 'tip\.lmp', got 5"),
+    ):
+        (tmp_path / "a.toml").write_text(text.replace(old, new))
+        with pytest.raises(FileError, match=message):
+            read_config(tmp_path / "a.toml").simulation(n_threads=1)

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from apt_evap._common.files import FileError
 from apt_evap.detection.hits import Hits, Outcome
 from apt_evap.detection.mass_ranges import Ranges
-from apt_evap.io.formats import read
-from apt_evap.io.rrng import read_ranges
+from apt_evap.io.formats import read, read_ranges
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 

@@ -11,17 +11,32 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from ion_files import epos, ions_of, pos, raw, usual_apt
+from ion_files import (
+    ENV,
+    RNG,
+    epos,
+    ions_of,
+    lammps_data,
+    lammps_dump,
+    pos,
+    pyccapt_calibrated,
+    pyccapt_instrument,
+    raw,
+    tapsim_nodes,
+    tapsim_table,
+    usual_apt,
+)
 
 import apt_evap as ae
 from apt_evap._common.files import FileError
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.mass_ranges import Ranges
-from apt_evap.io.formats import FORMATS, chunks, read
-from apt_evap.io.rrng import read_ranges
+from apt_evap.io.formats import FORMATS, RANGE_FORMATS, chunks, read, read_ranges, write
+from apt_evap.io.tapsim import SIGNATURE as TAPSIM
 from apt_evap.simulation.run_hdf5 import FORMAT
 
 SILICON = Path(__file__).parents[3] / "shared" / "data" / "Si.epos"
+CHUNKED = {entry.suffix for entry in FORMATS if entry.chunks}
 READ = tuple(entry.suffix for entry in FORMATS if entry.read and entry.suffix != ".npz")  # maps: test_npz.py
 RANGES = b"[Ions]\nNumber=2\nIon1=Si\nIon2=O\n[Ranges]\nNumber=2\nRange1=13,5 14.2 Vol:0.02 Si:1 Color:CCCCCC\n"
 RANGES += b"Range2 = 15.8 16.5 Name:oxide Si:1 O:2\n"
@@ -36,6 +51,9 @@ def samples():
         ".raw": raw(np.repeat(np.arange(6) + 4, sizes))[0],
         ".apt": usual_apt(10, ions_of(sizes))[0],
         ".rrng": RANGES,
+        ".rng": RNG.encode(),
+        ".env": ENV.encode(),
+        ".tapsim": tapsim_table(4)[0],
         ".h5": b"\x89HDF\r\n\x1a\n" + bytes(300),
     }
 
@@ -59,11 +77,14 @@ def told(task, path):
 
 def check(path, **options):
     """Read a file in every way; what is given is of one piece."""
-    if path.suffix == ".rrng":
+    if path.suffix in RANGE_FORMATS:
         ranges = told(lambda: read_ranges(path), path)
         assert ranges is None or (isinstance(ranges, Ranges) and len(ranges) == len(ranges.low))
         return ranges
     whole = told(lambda: read(path, **options), path)
+    if path.suffix not in CHUNKED or path.read_bytes().startswith(TAPSIM):
+        assert whole is None or (isinstance(whole, Hits) and len(whole) > 0)
+        return whole
     parts = told(lambda: list(chunks(path, 1000, **options)), path)
     if whole is None or parts is None:
         assert whole is None and parts is None
@@ -91,17 +112,17 @@ def test_the_samples_are_good(tmp_path, suffix):
 @pytest.mark.parametrize("partial", [False, True])
 def test_cut_anywhere(tmp_path, suffix, partial):
     data = SAMPLES[suffix]
-    options = {"partial": True} if partial and suffix not in (".h5", ".rrng") else {}
+    options = {"partial": True} if partial and suffix not in (".h5", *RANGE_FORMATS) else {}
     for size in range(0, len(data), 1 if len(data) < 600 else 7):
         check(save(tmp_path, data[:size], suffix), **options)
 
 
-@given(suffix=st.sampled_from([*READ, ".rrng"]), data=st.binary(max_size=400))
+@given(suffix=st.sampled_from([*READ, *RANGE_FORMATS]), data=st.binary(max_size=400))
 def test_random_bytes(tmp_path, suffix, data):
     check(save(tmp_path, data, suffix))
 
 
-@given(suffix=st.sampled_from([*READ, ".rrng"]), of=st.sampled_from(sorted(SAMPLES)), swapped=st.booleans())
+@given(suffix=st.sampled_from([*READ, *RANGE_FORMATS]), of=st.sampled_from(sorted(SAMPLES)), swapped=st.booleans())
 def test_renamed_and_swapped(tmp_path, suffix, of, swapped):
     data = SAMPLES[of]
     if swapped:
@@ -111,7 +132,7 @@ def test_renamed_and_swapped(tmp_path, suffix, of, swapped):
 
 
 @given(
-    suffix=st.sampled_from([".epos", ".pos", ".raw", ".apt", ".rrng"]),
+    suffix=st.sampled_from([".epos", ".pos", ".raw", ".apt", ".tapsim", *RANGE_FORMATS]),
     changes=st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), min_size=1, max_size=8),
     partial=st.booleans(),
 )
@@ -119,7 +140,7 @@ def test_changed_bytes(tmp_path, suffix, changes, partial):
     data = bytearray(SAMPLES[suffix])
     for place, value in changes:
         data[int(place * len(data))] = value
-    check(save(tmp_path, data, suffix), **({"partial": partial} if suffix != ".rrng" else {}))
+    check(save(tmp_path, data, suffix), **({"partial": partial} if suffix not in RANGE_FORMATS else {}))
 
 
 @given(
@@ -148,6 +169,41 @@ def test_texts_like_ranges(tmp_path, lines):
     check(save(tmp_path, text.encode(), ".rrng"))
 
 
+@given(
+    suffix=st.sampled_from([".rng", ".env"]),
+    lines=st.lists(st.text(st.sampled_from("01239. ,-\t#CrO\u00b2\u0660eE\x00\x85"), max_size=30), max_size=12),
+)
+def test_texts_like_tables_of_ranges(tmp_path, suffix, lines):
+    check(save(tmp_path, "\n".join(["1 1", *lines]).encode(), suffix))
+
+
+PLACES = np.random.default_rng(1).uniform(1, 9, (8, 3))
+SPECIMENS = {
+    "dump": lammps_dump(PLACES, [1] * 8, frames=2).encode(),
+    "scaled dump": lammps_dump(PLACES / 10, [1] * 8, "id type xs ys zs").encode(),
+    "data": lammps_data(PLACES, [1] * 8, "full").encode(),
+    "nodes": tapsim_nodes(PLACES * 1e-10, [10] * 7 + [0], numbers=range(8)),
+    "binary nodes": tapsim_nodes(PLACES * 1e-10, [10] * 7 + [0], binary=True),
+}
+
+
+@given(
+    name=st.sampled_from(sorted(SPECIMENS)),
+    changes=st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), max_size=6),
+    size=st.floats(0, 1),
+)
+def test_changed_specimens(tmp_path, name, changes, size):
+    """Not read by ASE, whose readers are its own: the beginning stays, or the format is given."""
+    data = bytearray(SPECIMENS[name])
+    for place, value in changes:
+        data[int(place * len(data))] = value
+    format = "tapsim" if "nodes" in name else "lammps-dump" if "dump" in name else "lammps-data"
+    path = save(tmp_path, data[: int(size * len(data))], ".txt")
+    types = {10 if "nodes" in name else 1: "Al"}
+    tip = told(lambda: ae.read_tip(path, types, format=format), path)
+    assert tip is None or len(tip) >= 2
+
+
 @pytest.mark.parametrize("member", ["none", "format only"])
 def test_hdf5_that_is_no_run(tmp_path, member):
     path = tmp_path / "some.h5"
@@ -161,7 +217,7 @@ DAMAGE = """
 import random, sys, warnings
 import apt_evap as ae
 warnings.simplefilter("ignore")
-whole = open("run.h5", "rb").read()
+whole = open(sys.argv[1], "rb").read()
 for case in range(120):
     draw, data = random.Random(case), bytearray(whole)
     if case % 3 == 0:
@@ -174,20 +230,30 @@ for case in range(120):
         data[start : start + 512] = bytes(len(data[start : start + 512]))
     open("damaged.h5", "wb").write(data)
     try:
-        run = ae.load("damaged.h5") if case % 2 else ae.read("damaged.h5")
+        run = ae.load("damaged.h5") if case % 2 and sys.argv[1] == "run.h5" else ae.read("damaged.h5")
     except ae.FileError as error:
         assert "damaged.h5" in str(error) and chr(10) not in str(error), error
     else:
-        assert len(run) == 40 and len(run.hits(ae.Unperturbed())) == 40
+        assert len(run) == 40 and (sys.argv[1] != "run.h5" or len(run.hits(ae.Unperturbed())) == 40)
     print(case)
 """
 
 
-def test_damaged_runs_are_read_or_refused(tmp_path, small_tip):
+@pytest.mark.parametrize("name", ["run.h5", "ions.nxs", "instrument.h5", "calibrated.h5"])
+def test_damaged_hdf5_is_read_or_refused(tmp_path, small_tip, name):
     """In a process of its own: HDF5 might take it down."""
-    ae.Simulation(small_tip, n_threads=1).run(40, progress=False).save(tmp_path / "run.h5")
+    if name == "run.h5":
+        ae.Simulation(small_tip, n_threads=1).run(40, progress=False).save(tmp_path / name)
+    elif name == "ions.nxs":
+        write(tmp_path / name, Hits(x=np.arange(40.0), y=np.ones(40), extra={"a": np.arange(40)}), elements=["Si"])
+    elif name == "instrument.h5":
+        pyccapt_instrument(tmp_path / name, 40)
+    else:
+        pyccapt_calibrated(
+            tmp_path / name, {"x_det (cm)": np.arange(40.0), "y_det (cm)": np.ones(40), "n": np.ones(40, int)}
+        )
     done = subprocess.run(
-        [sys.executable, "-c", DAMAGE],
+        [sys.executable, "-c", DAMAGE, name],
         cwd=tmp_path,
         capture_output=True,
         text=True,

@@ -1,5 +1,6 @@
 """Extended XYZ and .vtp, read back by what their descriptions say."""
 
+import csv
 import re
 import warnings
 import xml.etree.ElementTree as ElementTree
@@ -120,6 +121,40 @@ def test_vtp_holds_every_column(tmp_path):
         assert values.dtype == getattr(hits, of).dtype
     np.testing.assert_array_equal(parts.pop(("PointData", "pair")), hits.extra["pair"])
     assert {name for _, name in parts} == {"a_b", "a_b_2"}
+
+
+def test_csv_holds_every_column(tmp_path):
+    hits = full()
+    hits.units["a b"] = "V"
+    hits.extra["a,b"], hits.extra["text"] = np.array([True, False, True]), np.array(["a,b", 'c"d', "e"])
+    write(tmp_path / "a.csv", hits)
+    with open(tmp_path / "a.csv", newline="", encoding="utf-8") as file:
+        titles, *rows = csv.reader(file)
+    columns = dict(zip(titles, zip(*rows, strict=True), strict=True))
+    assert len(columns) == len(titles)
+    for k, axis in enumerate("xyz"):
+        np.testing.assert_array_equal(np.array(columns.pop(f"position_{axis} [nm]"), "f4"), hits.positions[:, k])
+    for title, of in (("x [mm]", "x"), ("y [mm]", "y"), ("mass_to_charge [Da]", "mass_to_charge")):
+        values = getattr(hits, of)
+        np.testing.assert_array_equal(np.array(columns.pop(title), float).astype(values.dtype), values)
+    for name in ("pulses", "pulse_id", "site", "outcome"):
+        assert [int(cell) for cell in columns.pop(name)] == getattr(hits, name).tolist()
+    assert [float(cell) for cell in columns.pop("pair_0")] == [0, 2, 4] and columns.pop("pair_1") == ("1", "3", "5")
+    assert columns.pop("a b [V]") == ("4", "5", "6") and columns.pop("a-b") == ("1", "2", "3")
+    assert columns.pop("a,b") == ("1", "0", "1") and columns.pop("text") == ("a,b", 'c"d', "e")
+    assert columns == {}
+    with pytest.raises(FileError, match=r"a\.csv.* cannot be read"):
+        read(tmp_path / "a.csv")
+
+
+@given(values=arrays("f8", 5, elements=st.floats(allow_nan=True, allow_infinity=True)), single=st.booleans())
+def test_numbers_of_a_csv_come_back(tmp_path, values, single):
+    with np.errstate(over="ignore"):
+        values = values.astype("f4") if single else values
+    write(tmp_path / "a.csv", Hits(x=values))
+    lines = (tmp_path / "a.csv").read_bytes().split(b"\r\n")
+    assert lines[0] == b"x [mm]" and lines[-1] == b""
+    np.testing.assert_array_equal(np.array(lines[1:-1], float).astype(values.dtype), values)
 
 
 @given(positions=arrays("f4", st.tuples(st.integers(1, 9), st.just(3)), elements=st.floats(-1e4, 1e4, width=32)))

@@ -105,7 +105,7 @@ def test_a_file_that_another_program_changed(path):
 
 def test_other_programs_read_it(path, run):
     with h5py.File(path) as file:
-        assert file.attrs["format"] == b"apt_evap run 2"
+        assert file.attrs["format"] == b"apt_evap run 3"
         assert np.array_equal(file[f"{SIMULATION}/fields"], run.fields)
         assert np.array_equal(file[f"{SIMULATION}/history/marked"], run.history.flagged)
     assert path.read_bytes()[:8] == b"\x89HDF\r\n\x1a\n"

@@ -1,0 +1,187 @@
+"""NeXus NXapm: ions in an HDF5 file with the groups and fields of this standard for atom probe data.
+
+Columns for which NXapm has no name are in the group ``entry1/ions`` (NXcollection). See `apt_evap.simulation.nexus`.
+"""
+
+import datetime
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import h5py
+import numpy as np
+
+from apt_evap._common.files import FileError, check_path
+from apt_evap._common.types import AnyPath
+from apt_evap._common.validation import check_kind, check_sequence, short_text
+from apt_evap._version import __version__
+from apt_evap.detection.hits import Hits
+from apt_evap.io._records import check_columns
+from apt_evap.io._texts import ELEMENTS
+from apt_evap.simulation.checked_hdf5 import CheckedFile, first_line, open_checked, write_checked
+from apt_evap.simulation.nexus import (
+    ENTRY,
+    HITS,
+    IONS,
+    MASSES,
+    MULTIPLICITY,
+    TIMES,
+    put_field,
+    put_group,
+    put_nxapm,
+    put_text,
+)
+
+FORMAT = "apt_evap ions 1"
+_OWN = f"{ENTRY}/ions"
+_ROWS = 4096  # rows with a common checksum
+_NAMED = {"time_of_flight": TIMES, "mass_to_charge": MASSES, "multiplicity": MULTIPLICITY, "ion": IONS}
+_READ_ERRORS = (OSError, KeyError, IndexError, RuntimeError, TypeError, ValueError, AttributeError, OverflowError)
+_UNITS = {"x": "mm", "y": "mm", "voltage": "V", "pulse_voltage": "V", "positions": "nm"}
+
+
+def write_nxapm(path: AnyPath, hits: Hits, *, elements: Sequence[str], start_time: str | None = None) -> None:
+    """Write ions as NXapm.
+
+    All ions and all numeric columns are written, those of `extra`, too. `read` returns the same arrays.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file; an existing one is replaced when the new one is complete.
+    hits : Hits
+        The ions.
+    elements : sequence of str
+        Chemical symbols of the elements in the specimen, which NXapm requires, such as ``("Si", "O")``.
+    start_time : str, optional
+        Start of the measurement in ISO 8601 with the offset from UTC, such as "2026-05-04T09:30:00+02:00", which NXapm
+        requires. By default the time of writing.
+
+    Raises
+    ------
+    ValueError
+        If an element is not a chemical symbol, or the time has another format.
+    FileError
+        If the file cannot be written.
+    """
+    elements = check_sequence(elements, "elements", "chemical symbols, such as ('Si', 'O')")
+    for element in elements or (None,):
+        if element not in ELEMENTS:
+            raise ValueError(f"elements must be chemical symbols, such as ('Si', 'O'), got {short_text(element)}")
+    names = [name for name in hits.columns if name not in _NAMED]
+    positions = None
+    if hits.x is not None and hits.y is not None and hits.x.dtype == hits.y.dtype:
+        positions = np.column_stack([hits.x, hits.y])
+        names = [name for name in names if name not in ("x", "y")]
+    with write_checked(path, _ROWS) as file:
+        put_nxapm(
+            file,
+            ions=np.arange(len(hits)) if hits.ion is None else hits.ion,
+            hits=positions,
+            times=hits.time_of_flight,
+            masses=hits.mass_to_charge,
+            multiplicity=hits.multiplicity,
+            elements=elements,
+            start_time=_time(start_time),
+            version=__version__,
+            is_simulation=hits.outcome is not None or hits.site is not None,
+        )
+        own = put_group(file, _OWN, "NXcollection")
+        put_text(own, "format", FORMAT)
+        put_text(own, "columns", json.dumps(hits.columns))
+        put_text(own, "source", hits.source or "unknown")
+        if hits.extent is not None:
+            own.attrs["extent"] = hits.extent
+        for name in names:
+            put_field(own, name, getattr(hits, name), _UNITS.get(name))
+        numeric = {name: values for name, values in hits.extra.items() if values.dtype.kind in "biuf"}
+        for index, (name, values) in enumerate(numeric.items()):
+            dataset = put_field(own, f"extra_{index}", values, hits.units.get(name))
+            put_text(dataset, "name", name)
+
+
+def _time(text):
+    if text is None:
+        return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    try:
+        time = datetime.datetime.fromisoformat(check_kind(text, "start_time", str, "a time in ISO 8601"))
+        if time.tzinfo is None:
+            raise ValueError("no offset")
+    except ValueError as error:
+        raise ValueError(
+            f"start_time must be in ISO 8601 with the offset from UTC, such as '2026-05-04T09:30:00+02:00', got "
+            f"{short_text(text)}"
+        ) from error
+    return text
+
+
+def read_nxapm(path: AnyPath, *, columns: Sequence[str] | None = None) -> Hits:
+    """Read the ions of an NXapm file that was written by `write_nxapm`.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file.
+    columns : sequence of str, optional
+        Names of the columns to read; only these are kept in memory. All by default.
+
+    Returns
+    -------
+    Hits
+
+    Raises
+    ------
+    FileError
+        If the file is missing, unreadable, damaged or not such a file, or has no such column.
+    """
+    name = str(check_path(path))
+    try:
+        with open_checked(path) as file:
+            if _OWN not in file or file.text("format", _OWN) != FORMAT:
+                raise FileError(f"{name!r} is not an NXapm file of this package: it has no group {_OWN!r}")
+            return _read(file, name, columns)
+    except FileError:
+        raise
+    except _READ_ERRORS as error:
+        raise FileError(f"cannot read {name!r} as NXapm: {first_line(error)}") from error
+
+
+def has_ions(file: h5py.File) -> bool:
+    """Whether an open HDF5 file has the ions of `write_nxapm`."""
+    return _OWN in file
+
+
+def _read(file: CheckedFile, path: str, columns: Sequence[str] | None) -> Hits:
+    own = file.attributes(_OWN)
+    stored = json.loads(file.text("columns", _OWN))
+    extra, units, index = {}, {}, 0
+    while (dataset := f"{_OWN}/extra_{index}") in file:
+        extra[file.text("name", dataset)] = dataset
+        if "units" in file.attributes(dataset):
+            units[file.text("name", dataset)] = file.text("units", dataset)
+        index += 1
+    chosen = check_columns(columns, (*stored, *extra), path)
+    values: dict[str, Any] = {}
+    if HITS in file and {"x", "y"} & set(chosen):
+        values = dict(zip(("x", "y"), numbers(file, HITS).T, strict=True))
+        values = {name: column for name, column in values.items() if name in chosen}
+    for name in stored:
+        if name in chosen and name not in values:
+            values[name] = numbers(file, _NAMED.get(name, f"{_OWN}/{name}"))
+    source = file.text("source", _OWN)
+    return Hits(
+        **values,
+        extra={name: numbers(file, dataset) for name, dataset in extra.items() if name in chosen},
+        units={name: unit for name, unit in units.items() if name in chosen},
+        source=path if source == "unknown" else source,
+        extent=tuple(float(value) for value in own["extent"]) if "extent" in own else None,  # type: ignore[arg-type]
+    )
+
+
+def numbers(file: CheckedFile, path: str) -> Any:
+    """Read a complete dataset of numbers of any type, with one or more values per row, in native byte order."""
+    item = file.dataset(path, None, None)
+    if item.dtype.kind not in "biuf" or not item.shape:
+        raise ValueError(f"{path} must contain numbers, got {item.dtype} of shape {item.shape}")
+    values = file.rows(item)
+    return values.astype(values.dtype.newbyteorder("="), copy=False)

@@ -1,0 +1,171 @@
+"""HDF5 files of PyCCAPT, the software of the OXCART atom probe: the instrument's own, and those of its calibration.
+
+The instrument writes one dataset for each column into the group ``dld``: detector coordinates in cm, times in ns. The
+calibration writes a DataFrame of pandas with the name ``df``, whose columns have names such as "x_det (cm)".
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from apt_evap._common.files import FileError, check_path
+from apt_evap._common.types import AnyPath
+from apt_evap.detection.hits import Hits
+from apt_evap.io._pulses import first_from_equal, pulses_from_first
+from apt_evap.io._records import check_any, check_columns
+from apt_evap.io.nxapm import numbers
+from apt_evap.simulation.checked_hdf5 import CheckedFile, first_line, open_checked
+
+_MM_PER_CM = 10.0
+_MAX_BLOCKS = 100
+_READ_ERRORS = (OSError, KeyError, IndexError, RuntimeError, TypeError, ValueError, AttributeError, OverflowError)
+# names in the group dld, of the newest version first, and factors to the units of `Hits`
+_INSTRUMENT = {
+    "x": (("x",), _MM_PER_CM),
+    "y": (("y",), _MM_PER_CM),
+    "time_of_flight": (("t",), 1.0),
+    "voltage": (("high_voltage",), 1.0),
+    "pulse_voltage": (("voltage_pulse", "pulse_voltage", "pulse"), 1.0),
+    "laser_pulse": (("laser_pulse", "laser_intensity"), 1.0),
+    "start_counter": (("start_counter",), 1.0),
+}
+_CALIBRATED = {
+    "x": (("x_det (cm)",), _MM_PER_CM),
+    "y": (("y_det (cm)",), _MM_PER_CM),
+    "time_of_flight": (("t (ns)",), 1.0),
+    "voltage": (("high_voltage (V)", "high-voltage (V)"), 1.0),
+    "pulse_voltage": (("pulse_v (V)", "pulse"), 1.0),
+    "mass_to_charge": (("mc_c (Da)", "mc (Da)"), 1.0),
+    "position_x": (("x (nm)",), 1.0),
+    "position_y": (("y (nm)",), 1.0),
+    "position_z": (("z (nm)",), 1.0),
+    "laser_pulse": (("pulse_l (pJ)",), 1.0),
+    "calibrated_time_of_flight": (("t_c (ns)",), 1.0),
+    "uncalibrated_mass_to_charge": (("mc_uc (Da)",), 1.0),
+    "start_counter": (("start_counter",), 1.0),
+}
+_POSITIONS = ("position_x", "position_y", "position_z")
+_EXTRA = {
+    "laser_pulse": "pJ",
+    "calibrated_time_of_flight": "ns",
+    "uncalibrated_mass_to_charge": "Da",
+    "start_counter": "",
+}
+_KEPT = ("x", "y", "pulse_voltage")  # columns that may be zero for all ions
+
+
+def read_pyccapt(path: AnyPath, *, columns: Sequence[str] | None = None) -> Hits:
+    """Read an HDF5 file of PyCCAPT, of the instrument or of the calibration.
+
+    Consecutive ions with the same start counter belong to one pulse. Other columns of zeros are treated as absent. In
+    files of early versions the column ``pulse`` is the pulse voltage or the power of the laser, read as a voltage.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file.
+    columns : sequence of str, optional
+        Names of the columns to return. All by default.
+
+    Returns
+    -------
+    Hits
+        With x, y [mm], time_of_flight [ns], voltage, pulse_voltage [V], pulse_id and multiplicity; after a calibration
+        also mass_to_charge [Da] and positions [nm]. ``extra`` contains "start_counter", "laser_pulse" [pJ],
+        "calibrated_time_of_flight" [ns] and "uncalibrated_mass_to_charge" [Da] if they exist.
+
+    Raises
+    ------
+    FileError
+        If the file is missing, unreadable or not such a file, or has no such column.
+    """
+    name = str(check_path(path))
+    try:
+        with open_checked(path) as file:
+            if "dld" in file:
+                found = _instrument(file)
+            elif "df" in file:
+                found = _calibrated(file, name)
+            else:
+                raise FileError(f"{name!r} is not a file of PyCCAPT: it has neither a group 'dld' nor a group 'df'")
+        return _hits(found, name, columns)
+    except FileError:
+        raise
+    except _READ_ERRORS as error:
+        raise FileError(f"cannot read {name!r} as a file of PyCCAPT: {first_line(error)}") from error
+
+
+def _instrument(file):
+    """Columns in the group dld."""
+    found = {}
+    for column, (names, factor) in _INSTRUMENT.items():
+        stored = next((f"dld/{name}" for name in names if f"dld/{name}" in file), None)
+        if stored is not None:
+            found[column] = _scaled(_one_column(numbers(file, stored), stored), factor)
+    return found
+
+
+def _one_column(values, name):
+    if values.ndim > 1 and values.shape[1:] != (1,):
+        raise ValueError(f"{name} must have one value per ion, got shape {values.shape}")
+    return values.reshape(len(values))
+
+
+def _calibrated(file, path):
+    """Columns of the DataFrame df, which pandas stores as blocks of columns of the same type."""
+    wanted = {name: (column, factor) for column, (names, factor) in _CALIBRATED.items() for name in reversed(names)}
+    known, found = [], {}
+    for index in range(_MAX_BLOCKS):
+        if f"df/block{index}_items" not in file:
+            break
+        items = file.dataset(f"df/block{index}_items", None, None)
+        if items.dtype.kind != "S" or len(items.shape) != 1:
+            raise ValueError(f"df/block{index}_items must contain the names of columns")
+        names = [name.decode("utf-8", "replace") for name in file.rows(items).tolist()]
+        known += names
+        if not any(name in wanted for name in names):
+            continue  # a block of texts or lists
+        values = numbers(file, f"df/block{index}_values")
+        if values.ndim != 2 or values.shape[1] != len(names):
+            raise ValueError(f"df/block{index}_values must have {len(names)} columns, got shape {values.shape}")
+        found |= {name: values[:, k] for k, name in enumerate(names) if name in wanted}
+    if "mc_low" in known:
+        raise FileError(f"{path!r} contains the mass ranges of PyCCAPT, expected its ions")
+    columns = {}
+    for column, (names, factor) in _CALIBRATED.items():
+        # the first name that is not zero for all ions: columns of steps that were not done yet are zero
+        stored = [found[name] for name in names if name in found]
+        if stored:
+            columns[column] = _scaled(next((values for values in stored if values.any()), stored[0]), factor)
+    return columns
+
+
+def _scaled(values, factor):
+    return values * factor if factor != 1.0 else np.ascontiguousarray(values)
+
+
+def _hits(found, path, columns):
+    if "x" not in found or "y" not in found:
+        raise FileError(
+            f"{path!r} has no detector coordinates of PyCCAPT (x and y of dld, or x_det (cm) and y_det (cm))"
+        )
+    lengths = {name: len(values) for name, values in found.items()}
+    if len(set(lengths.values())) > 1:
+        raise FileError(f"{path!r}: columns of PyCCAPT must have equal lengths, got {lengths}")
+    found = {name: values for name, values in found.items() if name in _KEPT or values.any()}
+    if all(name in found for name in _POSITIONS):
+        found["positions"] = np.column_stack([found.pop(name) for name in _POSITIONS])
+    found = {name: values for name, values in found.items() if name not in _POSITIONS}
+    if "start_counter" in found and len(found["x"]):
+        found["pulse_id"], found["multiplicity"] = pulses_from_first(first_from_equal(found["start_counter"]))
+    chosen = check_columns(columns, tuple(found), path)
+    requested = {name: found[name] for name in chosen}
+    check_any(requested, path)
+    extra = {name: requested.pop(name) for name in _EXTRA if name in requested}
+    units = {name: _EXTRA[name] for name in extra if _EXTRA[name]}
+    return Hits(**requested, extra=extra, units=units, source=path)
+
+
+def is_pyccapt(file: CheckedFile) -> bool:
+    """Whether an open HDF5 file has the groups of PyCCAPT."""
+    return "dld" in file or "df" in file

@@ -1,0 +1,236 @@
+"""Node files of TAPSim: the points of a specimen and their types, as text or binary; and its file of the types.
+
+Oberdorfer, Eich and Schmitz, Ultramicroscopy 128, 55 (2013). A header ``ASCII`` or ``BINARY``, the number of nodes, and
+whether numbers and potentials follow. Each node has a position [m], the id of its type and perhaps a number and a
+potential [V]. Binary nodes are float32, int16, uint32 and float32 without padding, in the byte order of the machine,
+here little-endian.
+"""
+
+import re
+
+import numpy as np
+
+from apt_evap._common.files import FileError, TruncatedFile, open_for_reading, read_small_file, replace_file
+from apt_evap._common.types import AnyPath
+from apt_evap._common.validation import check_kind, check_number, check_switch
+from apt_evap.evaporation.thermal import Arrhenius
+from apt_evap.io.lammps import Atoms
+from apt_evap.specimen.tip import Tip
+
+_MAX_BYTES = 1 << 32
+_NM_PER_M = 1e9
+_HEADER = re.compile(rb"(?:#[^\n]*\n|\r?\n)*(ASCII|BINARY)[ \t]+([0-9]{1,10})[ \t]+([01])[ \t]+([01])[ \t]*\r?\n")
+_BOUNDARIES = {0: "Vacuum", 1: "Top", 2: "Bottom", 3: "Sides"}
+_FIRST_ID = 10
+_EPSILON = 1e6  # of a metal, in the examples of TAPSim
+_ROW = "%.8e\t%.8e\t%.8e\t%d\n"
+_SPECIMEN, _CHUNK = 1000.0, 1 << 14
+
+
+def is_nodes(path: AnyPath) -> bool:
+    """Whether a file begins like a node file of TAPSim."""
+    with open_for_reading(path) as file:
+        return _HEADER.match(file.read(1 << 12)) is not None
+
+
+def read_nodes(path: AnyPath) -> Atoms:
+    """Read the atoms of a node file of TAPSim.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file.
+
+    Returns
+    -------
+    Atoms
+        Without the nodes of the vacuum and the boundaries (ids 0 to 3); the name of a type is its id.
+
+    Raises
+    ------
+    FileError
+        If the file is missing, unreadable or not such a file, or has no atoms.
+    TruncatedFile
+        If it ends before its last node.
+    """
+    data = read_small_file(path, _MAX_BYTES, "a node file of TAPSim")
+    match = _HEADER.match(data[: 1 << 12])
+    if match is None:
+        raise FileError(f"{str(path)!r} does not begin like a node file of TAPSim, such as b'ASCII 1000 0 0'")
+    n, columns = int(match[2]), [match[3] == b"1", match[4] == b"1"]
+    positions, ids = (_text if match[1] == b"ASCII" else _binary)(data, match.end(), n, columns, path)
+    if not np.isfinite(positions).all():
+        raise FileError(f"{str(path)!r} has nodes whose positions are not finite")
+    if len(ids) and ids.min() < 0:
+        raise FileError(f"{str(path)!r} has nodes with the invalid id {ids.min()}")
+    atoms = ids > max(_BOUNDARIES)
+    if not atoms.any():
+        raise FileError(f"{str(path)!r} has no atoms among its {n} nodes: all ids are 0 to {max(_BOUNDARIES)}")
+    return Atoms(positions[atoms] * _NM_PER_M, [str(each) for each in ids[atoms].tolist()])
+
+
+def _truncated(path, n, found):
+    return TruncatedFile(f"{str(path)!r} states {n} nodes but ends after {found}")
+
+
+def _text(data, start, n, columns, path):
+    width = 4 + sum(columns)
+    lines = [line for line in data[start:].splitlines() if line.strip() and not line.startswith(b"#")]
+    if len(lines) < n:
+        raise _truncated(path, n, len(lines))
+    rows = [line.split() for line in lines[:n]]
+    try:
+        if any(len(row) < width for row in rows):
+            raise ValueError("too few values")
+        positions = np.array([row[:3] for row in rows], float).reshape(-1, 3)
+        ids = np.array([int(row[3]) for row in rows], np.int64)
+    except (ValueError, OverflowError) as error:
+        wrong = next((row for row in rows if len(row) < width), rows[0])
+        raise FileError(
+            f"{str(path)!r}: expected {width} numbers for each node, the fourth one an integer, such as in "
+            f"{b' '.join(wrong)[:60]!r}"
+        ) from error
+    return positions, ids
+
+
+def _binary(data, start, n, columns, path):
+    kinds = [("position", "<f4", 3), ("id", "<i2")]
+    kinds += [each for each, there in zip((("number", "<u4"), ("potential", "<f4")), columns, strict=True) if there]
+    row = np.dtype(kinds)  # type: ignore[arg-type]
+    if len(data) - start < n * row.itemsize:
+        raise _truncated(path, n, (len(data) - start) // row.itemsize)
+    nodes = np.frombuffer(data, row, n, start)
+    return nodes["position"].astype(float), nodes["id"].astype(np.int64)
+
+
+def write_nodes(path: AnyPath, tip: Tip, *, binary: bool = False) -> None:
+    """Write the atoms of a specimen as a node file of TAPSim.
+
+    The file has the atoms only; ``meshgen`` of TAPSim adds the vacuum and the boundaries. The ids are 10, 20, ... in
+    the order of the elements of the tip, as in the file of `write_types`.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file; an existing one is replaced when the new one is complete.
+    tip : Tip
+        The specimen, with all its atoms (without ``depth``).
+    binary : bool
+        Write binary nodes (float32) instead of text.
+
+    Raises
+    ------
+    ValueError
+        If the tip is a shell.
+    FileError
+        If the file cannot be written.
+    """
+    check_kind(tip, "tip", Tip, "a Tip")
+    check_switch(binary, "binary")
+    if tip.support.any():
+        raise ValueError("tip must be a complete specimen, got a shell: make it without depth")
+    positions, ids = tip.positions / _NM_PER_M, _FIRST_ID * (tip.species.astype(np.int64) + 1)
+    with replace_file(path) as file:
+        file.write(f"{'BINARY' if binary else 'ASCII'} {len(tip)} 0 0\n".encode())
+        for start in range(0, len(tip), _CHUNK):
+            part = slice(start, start + _CHUNK)
+            if binary:
+                rows = np.zeros(len(ids[part]), np.dtype([("position", "<f4", 3), ("id", "<i2")]))
+                rows["position"], rows["id"] = positions[part], ids[part]
+                file.write(rows.tobytes())
+            else:
+                columns = (*positions[part].T.tolist(), ids[part].tolist())
+                file.write("".join([_ROW % values for values in zip(*columns, strict=True)]).encode())
+
+
+def write_types(path: AnyPath, tip: Tip, *, law: Arrhenius | None = None, voltage: float = _SPECIMEN) -> None:
+    """Write the types of the nodes of a specimen, the configuration of TAPSim.
+
+    In TAPSim the barrier is half the activation energy times (1 - field / evaporation field). The activation energies
+    written are therefore twice the sensitivities C of the law. TAPSim's field is that of its own mesh at the node, and
+    not relative to the largest one, so that probabilities of the two programs differ.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file; an existing one is replaced when the new one is complete.
+    tip : Tip
+        The specimen.
+    law : Arrhenius, optional
+        Temperature and sensitivities. By default a temperature of 0 and energies of 1 eV.
+    voltage : float
+        Potential of the specimen [V].
+
+    Raises
+    ------
+    ValueError
+        If an argument is invalid.
+    FileError
+        If the file cannot be written.
+    """
+    check_kind(tip, "tip", Tip, "a Tip")
+    check_number(voltage, "voltage", above=0, unit="V")
+    temperature, energies = 0.0, np.ones(len(tip.elements))
+    if law is not None:
+        check_kind(law, "law", Arrhenius, "an Arrhenius")
+        temperature, energies = law.peak_temperature, 2 * law.sensitivities(tip)
+    blocks = [
+        _block(
+            number,
+            name,
+            potential=voltage if name == "Bottom" else 0.0,
+            neumann=name == "Bottom",
+            dirichlet=name in ("Top", "Sides"),
+        )
+        for number, name in _BOUNDARIES.items()
+    ]
+    for k, (element, energy) in enumerate(zip(tip.elements, energies, strict=True)):
+        blocks.append(
+            _block(
+                _FIRST_ID * (k + 1),
+                "_".join(element.name.split()),
+                epsilon=_EPSILON,
+                removable=True,
+                dirichlet=True,
+                potential=voltage,
+                mass=element.mass,
+                charge=element.charge_state,
+                field=element.evaporation_field * 1e9,
+                energy=float(energy),
+            )
+        )
+    with replace_file(path) as file:
+        file.write("\n".join(["ASCII", "", f"TEMPERATURE = {temperature:.8g}", "", *blocks]).encode())
+
+
+def _block(
+    number,
+    name,
+    *,
+    epsilon=1.0,
+    removable=False,
+    neumann=False,
+    dirichlet=False,
+    potential=0.0,
+    mass=0.0,
+    charge=0,
+    field=0.0,
+    energy=0.0,
+):
+    values = {
+        "ID": number,
+        "NAME": name,
+        "CHARGE_DENSITY": 0.0,
+        "DIELECTRICITY": epsilon,
+        "REMOVABLE": int(removable),
+        "NEUMANN_BOUNDARY": int(neumann),
+        "DIRICHLET_BOUNDARY": int(dirichlet),
+        "POTENTIAL": potential,
+        "MASS": mass,
+        "EVAPORATION_CHARGE_STATE": charge,
+        "EVAPORATION_FIELD_STRENGTH": field,
+        "EVAPORATION_ACTIVATION_ENERGY": energy,
+    }
+    return "".join(
+        f"{key} = {value if isinstance(value, (int, str)) else format(value, '.8g')}\n" for key, value in values.items()
+    )

@@ -1,0 +1,73 @@
+"""Files of other programs in the shell: read by every command, and written by export."""
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+from ion_files import RNG, pyccapt_instrument, tapsim_table
+
+import apt_evap as ae
+from apt_evap.cli.main import main
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    pyccapt_instrument("oxcart.h5", 400)
+    (tmp_path / "results").write_bytes(tapsim_table(30)[0])
+    (tmp_path / "a.rng").write_text(RNG)
+    rng = np.random.default_rng(1)
+    ions = ae.Hits(x=rng.normal(size=200), y=rng.normal(size=200), mass_to_charge=np.repeat([26.0, 14.0], 100))
+    ae.write("ions.nxs", ions, elements=["Cr", "Si"])
+    return tmp_path
+
+
+@pytest.mark.parametrize(("name", "ions"), [("oxcart.h5", 400), ("results", 30), ("ions.nxs", 200)])
+def test_info_and_map(folder, name, ions, capsys, blank_pictures):
+    assert main(["info", name, "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["ions"] == ions and "x" in summary["columns"]
+    assert main(["map", name, "--bins", "10", "-o", "map.png"]) == 0 and (folder / "map.png").exists()
+
+
+def test_ranges(folder, capsys):
+    assert main(["info", "ions.nxs", "--ranges", "a.rng", "--species", "Cr", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["ions"] == 100
+
+
+def test_measured_ions_in_other_formats(folder, capsys):
+    assert main(["export", "oxcart.h5", "-o", "oxcart.epos"]) == 0
+    here, there = ae.read("oxcart.h5"), ae.read("oxcart.epos")
+    np.testing.assert_array_equal(there.x, here.x.astype("f4"))
+    assert there.multiplicity.tolist() == here.multiplicity.tolist()
+    assert main(["export", "oxcart.h5", "-o", "oxcart.nxs", "--elements", "Al,Cu"]) == 0
+    np.testing.assert_array_equal(ae.read("oxcart.nxs").x, here.x)
+    with h5py.File("oxcart.nxs") as file:
+        assert file["entry1/specimen/atom_types"].asstr()[()] == "Al, Cu"
+    assert main(["export", "oxcart.h5", "-o", "oxcart.csv", "--ions", "0,10"]) == 0
+    assert len((folder / "oxcart.csv").read_text().splitlines()) == 11
+    assert main(["export", "results", "-o", "again.tapsim"]) == 0 and len(ae.read("again.tapsim")) == 30
+    capsys.readouterr()
+    for command, message in (
+        (["oxcart.h5", "-o", "b.nxs"], "--elements is missing, such as Si,O"),
+        (["oxcart.h5", "-o", "b.epos", "--elements", "Al"], "--elements is for an .nxs file, got 'b.epos'"),
+        (["oxcart.h5", "-o", "b.nxs", "--elements", "al"], "elements must be chemical symbols"),
+        (["oxcart.h5", "-o", "b.epos", "--jitter", "1"], "--jitter needs a run (.h5), 'oxcart.h5' contains measured"),
+    ):
+        assert main(["export", *command]) == 2 and message in capsys.readouterr().err
+        assert not list(folder.glob("b.*"))
+
+
+def test_a_run_as_nxapm(folder, small_tip):
+    run = ae.Simulation(small_tip, seed=1).run(40, progress=False)
+    run.save("run.h5")
+    assert main(["export", "run.h5", "-o", "run.nxs"]) == 0
+    hits = run.hits(ae.Unperturbed())
+    np.testing.assert_array_equal(ae.read("run.nxs").x, hits[hits.detected].x)
+
+
+def test_reconstruct_an_instrument_file(folder):
+    command = ["reconstruct", "oxcart.h5", "--element", "Al", "--distance", "110", "-o", "rec.pos", "--quiet"]
+    assert main(command) == 0
+    assert len(ae.read("rec.pos")) == 400

@@ -1,0 +1,108 @@
+"""HDF5 files of PyCCAPT, of the instrument and of the calibration."""
+
+import h5py
+import numpy as np
+import pytest
+from ion_files import pyccapt_calibrated, pyccapt_instrument
+
+from apt_evap._common.files import FileError
+from apt_evap.io.formats import read
+
+
+def test_every_column_of_the_instrument(tmp_path):
+    columns = pyccapt_instrument(tmp_path / "a.h5")
+    hits = read(tmp_path / "a.h5")
+    np.testing.assert_array_equal(hits.x, 10 * columns["x"])  # cm
+    np.testing.assert_array_equal(hits.y, 10 * columns["y"])
+    for name, of in (("time_of_flight", "t"), ("voltage", "high_voltage"), ("pulse_voltage", "voltage_pulse")):
+        np.testing.assert_array_equal(getattr(hits, name), columns[of])
+    assert hits.pulse_id.tolist() == [0, 0, 1, 1, 2, 2, 3, 3] and (hits.multiplicity == 2).all()
+    assert list(hits.extra) == ["start_counter"] and hits.extra["start_counter"][0] == 100  # no laser
+    assert hits.mass_to_charge is None and hits.positions is None and hits.source.endswith("a.h5")
+    assert hits.map(bins=8).counts.sum() == 8
+    some = read(tmp_path / "a.h5", columns=("x", "multiplicity"))
+    assert some.columns == ("x", "multiplicity") and some.extra == {}
+
+
+def test_names_and_shapes_of_other_versions(tmp_path):
+    n = 8
+    changes = {"voltage_pulse": None, "pulse": np.full((n, 1), 7.0), "laser_pulse": None}
+    changes |= {"laser_intensity": np.full(n, 3.0), "start_counter": np.zeros(n, "u8"), "x": np.ones((n, 1), "f4")}
+    pyccapt_instrument(tmp_path / "a.h5", **changes)
+    hits = read(tmp_path / "a.h5")
+    assert (
+        (hits.pulse_voltage == 7).all()
+        and (hits.extra["laser_pulse"] == 3).all()
+        and hits.units == {"laser_pulse": "pJ"}
+    )
+    assert hits.pulse_id is None and hits.multiplicity is None
+    assert hits.x.dtype == np.float32 and (hits.x == 10).all()
+
+
+CALIBRATED = {
+    "x (nm)": np.arange(4.0),
+    "y (nm)": np.arange(4.0) + 1,
+    "z (nm)": np.arange(4.0) + 2,
+    "mc (Da)": np.arange(4.0) + 20,
+    "mc_uc (Da)": np.arange(4.0) + 21,
+    "high_voltage (V)": np.full(4, 4e3),
+    "pulse_v (V)": np.full(4, 800.0),
+    "pulse_l (pJ)": np.zeros(4),
+    "t (ns)": np.full(4, 500.0),
+    "t_c (ns)": np.zeros(4),
+    "x_det (cm)": np.arange(4.0) - 2,
+    "y_det (cm)": np.arange(4.0) - 1,
+    "multi": np.ones(4, int),
+    "start_counter": np.array([5, 6, 6, 8]),
+}
+
+
+def test_every_column_of_a_calibration(tmp_path):
+    pyccapt_calibrated(tmp_path / "a.h5", CALIBRATED)
+    hits = read(tmp_path / "a.h5")
+    assert hits.x.tolist() == [-20, -10, 0, 10] and hits.y.tolist() == [-10, 0, 10, 20]
+    assert hits.positions.tolist() == [[k, k + 1, k + 2] for k in range(4)]
+    assert hits.mass_to_charge.tolist() == [20, 21, 22, 23]
+    assert (hits.voltage == 4000).all() and (hits.pulse_voltage == 800).all() and (hits.time_of_flight == 500).all()
+    assert hits.pulse_id.tolist() == [0, 1, 1, 2] and hits.multiplicity.tolist() == [1, 2, 2, 1]
+    assert set(hits.extra) == {"uncalibrated_mass_to_charge", "start_counter"}
+
+
+def test_columns_of_steps_that_were_not_done_are_absent(tmp_path):
+    zero = dict.fromkeys(("x (nm)", "y (nm)", "z (nm)", "mc (Da)", "mc_uc (Da)"), np.zeros(4))
+    pyccapt_calibrated(tmp_path / "a.h5", CALIBRATED | zero)
+    hits = read(tmp_path / "a.h5")
+    assert hits.positions is None and hits.mass_to_charge is None and hits.x is not None
+    pyccapt_calibrated(tmp_path / "a.h5", CALIBRATED | {"mc_c (Da)": np.full(4, 27.0)})
+    assert (read(tmp_path / "a.h5").mass_to_charge == 27).all()  # earlier versions: mc was not calibrated
+
+
+def test_refusals(tmp_path):
+    path = tmp_path / "a.h5"
+
+    def refused(message):
+        with pytest.raises(FileError, match=rf"a\.h5'.*{message}"):
+            read(path)
+
+    pyccapt_instrument(path, x=None)
+    refused("has no detector coordinates of PyCCAPT")
+    pyccapt_instrument(path, y=np.zeros(3))
+    refused("columns of PyCCAPT must have equal lengths")
+    pyccapt_instrument(path, x=np.zeros((8, 2)))
+    refused("dld/x must have one value per ion")
+    pyccapt_instrument(path, x=np.full(8, b"text"))
+    refused(r"dld/x must contain numbers, got \|S4")
+    pyccapt_instrument(path, x=np.empty(0), y=np.empty(0), t=None, high_voltage=None, start_counter=None,
+                       voltage_pulse=None, laser_pulse=None)  # fmt: skip
+    assert len(read(path)) == 0
+    pyccapt_calibrated(path, {"mc_low": np.ones(3), "mc (Da)": np.ones(3)})
+    refused("contains the mass ranges of PyCCAPT, expected its ions")
+    pyccapt_instrument(path)
+    with h5py.File(path, "a") as file:
+        del file["dld/x"]
+        file.create_dataset("dld/x", data=np.zeros(8), chunks=(8,), compression="gzip")
+    refused("dld/x is compressed or filtered: h5repack -f NONE writes a copy that is not")
+    with h5py.File(path, "a") as file:
+        del file["dld/x"]
+        file["dld/x"] = h5py.ExternalLink("other.h5", "x")
+    refused("dld/x is a link: data outside the file are not read")

@@ -1,0 +1,122 @@
+"""Range files .rng and .env, with molecular ions, beside .rrng (tests/detection/test_mass_ranges.py)."""
+
+import numpy as np
+import pytest
+from ion_files import ENV, RNG
+
+from apt_evap._common.files import FileError
+from apt_evap._common.warnings import DataWarning
+from apt_evap.detection.hits import Hits
+from apt_evap.detection.mass_ranges import Ranges
+from apt_evap.io.formats import read_ranges
+
+
+@pytest.fixture
+def save(tmp_path):
+    def save(text, name="a.rng"):
+        (tmp_path / name).write_text(text)
+        return tmp_path / name
+
+    return save
+
+
+def test_every_value_of_an_rng(save):
+    ranges = read_ranges(save(RNG))
+    assert ranges.names == ("Cr", "Si", "CrO", "CrO2")
+    assert ranges.low.tolist() == [25.9, 13.8, 67.5, 83.5] and ranges.high.tolist() == [26.3, 14.2, 68.4, 84.4]
+    assert ranges.composition == ({"Cr": 1}, {"Si": 1}, {"Cr": 1, "O": 1}, {"Cr": 1, "O": 2})
+    # of the element, none for a molecular ion, and that of the extension
+    assert ranges.colour == ("#FF8000", "#CCCCCC", "", "#00FF00")
+    assert np.isnan(ranges.volume).all() and ranges.source.endswith("a.rng")
+
+
+def test_the_extension_may_be_missing_or_have_its_own_ranges(save):
+    table, extension = RNG.split("--- polyatomic extension\n")
+    assert read_ranges(save(table)).names == ("Cr", "Si", "CrO", "CrO2")
+    own = table + "--- polyatomic extension\n" + extension.replace("83.5 84.4", "99.5 100.4")
+    ranges = read_ranges(save(own))
+    assert ranges.names[-2:] == ("CrO2", "CrO2") and ranges.high[-1] == 100.4
+    assert ranges.composition[-1] == {"Cr": 1, "O": 2}
+
+
+def test_a_column_that_is_a_molecule_or_no_element(save):
+    text = RNG.split("\n\n")[0].replace("Si 0.80", "SiO2 0.80").replace(" Cr Si O", " Cr SiO2 U235")
+    ranges = read_ranges(save(text))
+    assert ranges.names[1] == "SiO2" and ranges.composition[1] == {"Si": 1, "O": 2}
+    assert ranges.composition[2] == {"Cr": 1, "U235": 1}
+
+
+def test_decimal_commas_comments_and_windows(save):
+    text = "# a comment\n" + RNG.replace("25.9 26.3", "25,9 26,3").replace("\n", "\r\n")
+    assert read_ranges(save(text)).low[0] == 25.9
+
+
+def test_rng_that_is_odd(save):
+    with pytest.warns(DataWarning, match=r"a\.rng' states 5 ranges but contains 4"):
+        assert len(read_ranges(save(RNG.replace("3 4", "3 5", 1)))) == 4
+    with pytest.warns(DataWarning, match="1 ranges have no species and are left out"):
+        assert len(read_ranges(save(RNG.replace(". 13.8 14.2 0 1 0", ". 13.8 14.2 0 0 0")))) == 3
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("3 4", "3 4 5", "line 1: expected the numbers of species and of ranges, got '3 4 5'"),
+        ("3 4", "3 many", "line 1: expected the numbers of species and of ranges, got 'many'"),
+        ("3 4", "90 4", "expected 90 species and then a line of dashes"),
+        ("Cr 1.00 0.50", "Cr red 0.50", "line 3: expected a part of a colour from 0 to 1, got 'red'"),
+        ("Cr 1.00 0.50 0.00", "Cr", "line 3: expected a species and its colour, got 'Cr'"),
+        ("--------------- Cr", "Cr", "line 8: expected a line of dashes"),
+        ("- Cr Si O", "- Cr Si", "line 8: expected 3 species after the dashes, got 2"),
+        ("25.9 26.3 1 0 0", "25.9 26.3 1 0", "line 9: expected two bounds and 3 numbers of atoms, got 4 values"),
+        ("25.9 26.3", "26.3 25.9", "line 9: expected two bounds .Da., the lower one first, got 26.3 and 25.9"),
+        ("25.9 26.3", "nan 26.3", "line 9: expected a bound .Da., got 'nan'"),
+        ("25.9 26.3 1", "25.9 26.3 -1", "line 9: expected a number of atoms, got '-1'"),
+        ("1 1\nCrO2\n", "", "line 15: expected the numbers of species and of ranges"),
+    ],
+)
+def test_rng_that_is_wrong(save, old, new, message):
+    with pytest.raises(FileError, match=rf"a\.rng'.*{message}"):
+        read_ranges(save(RNG.replace(old, new, 1)))
+
+
+def test_every_value_of_an_env(save):
+    ranges = read_ranges(save(ENV, "a.env"))
+    assert ranges.names == ("Mn", "Mn2O", "Hyd")
+    assert ranges.low.tolist() == [27.33, 62.85, 0.93] and ranges.high.tolist() == [27.95, 63.13, 3.18]
+    # Angstrom^3 to nm^3: one rounding
+    assert ranges.volume == pytest.approx([0.01166, 0.02, 0.01166], rel=1e-15)
+    assert ranges.colour == ("#0080FF", "#000000", "#FF0000")
+    assert ranges.composition == ({"Mn": 1}, {"Mn": 2, "O": 1}, {})
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("3 3\n", "\n", "no line with the numbers of species and of ranges"),
+        ("3 3\n", "3 0\n", r"line 5: expected 3 species and 0 ranges \(at least one\)"),
+        ("3 3\n", "3 90\n", "line 5: expected 3 species and 90 ranges"),
+        ("Mn\t0.0\t0.5\t1.0", "Mn\t0.0", "line 7: expected a species and its colour"),
+        ("27,33\t27,95", "27,95\t27,33", "line 11: expected two bounds"),
+        ("27,33\t27,95\t11.66\t1.0", "27,33", "line 11: expected a species and two bounds"),
+        ("11.66", "large", "line 11: expected a volume"),
+    ],
+)
+def test_env_that_is_wrong(save, old, new, message):
+    with pytest.raises(FileError, match=rf"a\.env'.*{message}"):
+        read_ranges(save(ENV.replace(old, new, 1), "a.env"))
+
+
+def test_the_format_may_be_given(save):
+    assert read_ranges(save(RNG, "ranges.txt"), format="rng").names[0] == "Cr"
+    with pytest.raises(FileError, match=r"must be one of \.rrng, \.rng, \.env, got format='pos'"):
+        read_ranges(save(RNG), format="pos")
+    with pytest.raises(FileError, match="no lines Range1"):
+        read_ranges(save(RNG, "a.rrng"))
+
+
+def test_a_molecular_ion_counts_with_all_its_atoms(save):
+    ranges = read_ranges(save(RNG))
+    hits = Hits(mass_to_charge=[26.0, 84.0, 84.1, 68.0, 1.0, np.nan])
+    assert ranges.count_atoms(hits) == {"Cr": 4, "Si": 0, "O": 5}
+    assert Ranges(["A"], [1.0], [2.0]).count_atoms(hits) == {}
