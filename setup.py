@@ -11,8 +11,10 @@ from pathlib import Path
 from Cython.Build import cythonize
 from setuptools import Extension, setup
 from setuptools.command.build_ext import build_ext
+from setuptools.command.build_py import build_py
 
 MODULES = sorted(path.stem for path in Path("apt_evap/_core").glob("*.pyx"))
+ABI3 = bool(os.environ.get("APT_EVAP_ABI3"))  # use only Python's stable ABI: one wheel for all versions from 3.11
 BOUNDS = bool(os.environ.get("APT_EVAP_BOUNDS"))  # check every index: slow, for tools/sanitize.sh
 DIRECTIVES = {
     "language_level": 3,
@@ -34,6 +36,20 @@ def compiles(compiler, flags):
         )
         command = [*compiler, str(source), "-o", str(Path(folder, "probe")), *flags]
         return subprocess.run(command, capture_output=True, check=False).returncode == 0
+
+
+class BuildPython(build_py):
+    """Adds the examples, which are beside the package in the repository and inside it in a wheel."""
+
+    def run(self):
+        """Copy the settings files and scripts; an editable installation finds them where they are."""
+        super().run()
+        if not self.editable_mode:
+            target = Path(self.build_lib, "apt_evap", "examples")
+            self.mkpath(str(target))
+            for path in sorted(Path("examples").iterdir()):
+                if path.suffix in (".py", ".toml"):
+                    self.copy_file(str(path), str(target))
 
 
 class BuildCore(build_ext):
@@ -61,6 +77,8 @@ extensions = [
         [f"apt_evap/_core/{name}.pyx"],
         depends=[f"apt_evap/_core/{header}.h" for header in ("kernels", "kernels_group", "elementary")],
         include_dirs=["apt_evap/_core"],
+        py_limited_api=ABI3,
+        define_macros=[("Py_LIMITED_API", "0x030b0000")] if ABI3 else [],
         libraries=[] if platform.system() == "Windows" else ["m"],
     )
     for name in MODULES
@@ -72,5 +90,6 @@ setup(
         compiler_directives=DIRECTIVES,
         quiet="-q" in sys.argv,
     ),
-    cmdclass={"build_ext": BuildCore},
+    cmdclass={"build_ext": BuildCore, "build_py": BuildPython},
+    options={"bdist_wheel": {"py_limited_api": "cp311"}} if ABI3 else {},
 )

@@ -1,5 +1,6 @@
 # The public names of the package: read by type checkers, and by the lazy loader in __init__.py.
 from . import plot as plot
+from . import report as report
 from ._common.files import FileError as FileError
 from ._common.files import TruncatedFile as TruncatedFile
 from ._common.warnings import AptWarning as AptWarning

@@ -33,6 +33,9 @@ for module in modules:
     wrong += [f"the wheel lacks {stub}"] if stub not in wheel else []
     compiled = any(name.startswith(start) and name.endswith((".so", ".pyd")) for name in wheel)
     wrong += [] if compiled else [f"the wheel lacks the compiled {module}"]
+examples = {name for name in archive if name.startswith("examples/") and name.endswith((".py", ".toml"))}
+wrong += [f"the wheel lacks {name}" for name in examples if f"apt_evap/{name}" not in wheel]
+wrong += [] if examples else ["the archive lacks the examples"]
 wrong += [f"the wheel has {name}" for name in wheel if name.endswith((".pyx", ".pxd", ".c", ".h"))]
 wrong += [f"the wheel has {name}" for name in wheel if not name.startswith(("apt_evap/", "apt_evap-"))]
 if not modules or wrong:

@@ -3,6 +3,7 @@
 import argparse
 import csv
 import json
+import shlex
 import shutil
 import tempfile
 from pathlib import Path
@@ -11,22 +12,31 @@ import numpy as np
 
 from apt_evap import plot
 from apt_evap._common.files import FileError, check_path, read_small_file, replace_file
+from apt_evap._common.warnings import RegistrationWarning
 from apt_evap.cli._files import check_columns, check_output, check_places, read, select
 from apt_evap.cli._output import put, say
 from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.energy_fit.fit_energies import fit_energies
 from apt_evap.registration.register import Registration
+from apt_evap.report.origin import recorded_warnings
+from apt_evap.report.study import write_study
 from apt_evap.simulation.run import Run, load
 from apt_evap.simulation.run_hdf5 import is_run
 
 _STUDY = "study.json"
 _MAX_BYTES = 1 << 28  # bytes: a study contains three numbers for each point of its grid
-OVERLAY = "registration.png"
+_TABLE = "ssim.csv"
+OVERLAY, REPORT = "registration.png", "report.html"
 
 
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
+    with recorded_warnings() as messages:
+        return _compare(options, messages)
+
+
+def _compare(options, messages):
     folder = check_path(options.output or f"{Path(options.file).stem}_study")
     _check_folder(folder, options.force)
     registration = None if options.registration is None else _registration(options.registration)
@@ -51,7 +61,7 @@ def execute(options: argparse.Namespace) -> int:
         progress=False if options.quiet else None,
         **{name: getattr(options, name) for name in ("means", "rsds", "rollup_fractions") if getattr(options, name)},
     )
-    _write(study, run, folder)
+    _write(study, run, folder, options, messages)
     if study.registration.doubtful:
         say("note", f"check {folder / OVERLAY}; --registration sets a known registration")
     if not options.quiet:
@@ -123,21 +133,35 @@ def _is_study(path):
         return False
 
 
-def _write(study, run, folder):
+def _write(study, run, folder, options, messages):
     """Write all files to a temporary folder, and move them when they are complete."""
+    figures = {name: draw(study, run) for name, draw in _FIGURES.items()}
     try:
         with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as temporary:
-            for name, write in FILES.items():
-                write(study, run, Path(temporary) / name)
+            written = Path(temporary)
+            study.save(written / _STUDY)
+            _write_table(study, written / _TABLE)
+            for name, figure in figures.items():
+                figure.savefig(written / name)
+            write_study(
+                study,
+                written / REPORT,
+                title=f"{Path(options.file).name}: emission energies from {Path(options.run).name}",
+                figures={_CAPTIONS[name]: figure for name, figure in figures.items() if name in _CAPTIONS},
+                files=[options.run, options.file],
+                command=shlex.join(["apt-evap", *options.arguments]),
+                # the report tells a doubtful registration by itself
+                warnings=[str(each) for each in messages if not isinstance(each, RegistrationWarning)],
+            )
             folder.mkdir(exist_ok=True)
             for name in FILES:
-                with replace_file(folder / name) as file, open(Path(temporary) / name, "rb") as written:
-                    shutil.copyfileobj(written, file)
+                with replace_file(folder / name) as file, open(written / name, "rb") as source:
+                    shutil.copyfileobj(source, file)
     except OSError as error:
         raise FileError(f"cannot write to {str(folder)!r}: {error.strerror or error}") from error
 
 
-def _write_table(study, run, path):
+def _write_table(study, path):
     with open(path, "w", newline="") as file:
         table = csv.writer(file)
         table.writerow(["rollup_fraction", "rsd", "mean_eV", "ssim", "error", "share_of_resamples"])
@@ -147,15 +171,17 @@ def _write_table(study, run, path):
             table.writerow([f"{value:.6g}" for value in (*energies, *values)])
 
 
-def _write_overlay(study, run, path):
-    ax = plot.overlay(run.hits(study.optimum.perturbation), study.measured, study.registration)
-    ax.figure.savefig(path)
+def _overlay(study, run):
+    return plot.overlay(run.hits(study.optimum.perturbation), study.measured, study.registration).figure
 
 
-FILES = {
-    _STUDY: lambda study, run, path: study.save(path),
-    "ssim.csv": _write_table,
-    "ssim.png": lambda study, run, path: plot.ssim_matrix(study)[0].figure.savefig(path),
-    "maps.png": lambda study, run, path: plot.side_by_side(study)[0].figure.savefig(path),
-    OVERLAY: _write_overlay,
+_FIGURES = {
+    "ssim.png": lambda study, run: plot.ssim_matrix(study)[0].figure,
+    "maps.png": lambda study, run: plot.side_by_side(study)[0].figure,
+    OVERLAY: _overlay,
 }
+_CAPTIONS = {
+    "maps.png": "Maps as compared: flattened, smoothed, inside the common region.",
+    OVERLAY: "Registration: contours of the simulated map on the measured one, and the simulated map.",
+}
+FILES = (_STUDY, _TABLE, *_FIGURES, REPORT)

@@ -74,6 +74,7 @@ def _execute(arguments):
     parser = import_module("apt_evap.cli.parser").make_parser()
     try:
         options = parser.parse_args(arguments)
+        options.arguments = list(sys.argv[1:] if arguments is None else arguments)
     except SystemExit as stop:  # --help and --version
         return stop.code or 0
     return import_module(f"apt_evap.cli.{options.command}").execute(options)

@@ -35,6 +35,7 @@ from a simulation to its map, and to the emission energies of a measured map:
                                                      ions as an instrument would write them
   apt-evap reconstruct R5083.epos --element Si --distance 90 -o R5083.pos
                                                      positions in the specimen from the hits
+  apt-evap examples --to FOLDER                      settings files and scripts to start from
   apt-evap COMMAND --help                            all arguments of a command, with examples
 """
 
@@ -58,7 +59,16 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"apt-evap {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", dest="command", required=True)
-    for add in (_add_run, _add_map, _add_info, _add_compare, _add_export, _add_reconstruct):
+    for add in (
+        _add_run,
+        _add_map,
+        _add_info,
+        _add_compare,
+        _add_export,
+        _add_reconstruct,
+        _add_examples,
+        _add_completion,
+    ):
         add(commands)
     return parser
 
@@ -197,7 +207,8 @@ def _add_compare(commands: Any) -> None:
         "  ssim.csv          similarity, error and fraction of the resamples for every energy\n"
         "  ssim.png          plot of the similarities\n"
         "  maps.png          measured, unperturbed and best map side by side, and an enlarged part\n"
-        "  registration.png  overlay of the simulated map on the measured one\n\n"
+        "  registration.png  overlay of the simulated map on the measured one\n"
+        "  report.html       all of this in one file, with both maps on one place: send it around\n\n"
         "example: apt-evap compare ni111.h5 R5083.epos -o R5083_study --mechanism roll-up",
         **_SHAPE,
     )
@@ -311,6 +322,33 @@ def _add_reconstruct(commands: Any) -> None:
     _add_reading(command)
     command.add_argument("--force", action="store_true", help="overwrite an existing file")
     _add_speech(command)
+
+
+def _add_examples(commands: Any) -> None:
+    command = commands.add_parser(
+        "examples",
+        help="list the examples, or copy them",
+        description="List the examples of the package: settings files and Python scripts. With --to, copy them.",
+        epilog="example: apt-evap examples --to apt_examples && apt-evap run apt_examples/ni111.toml",
+        **_SHAPE,
+    )
+    command.add_argument("--to", metavar="FOLDER", help="copy the examples to this folder")
+    command.add_argument("--force", action="store_true", help="overwrite files that differ from the examples")
+    _add_speech(command)
+
+
+def _add_completion(commands: Any) -> None:
+    command = commands.add_parser(
+        "completion",
+        help="print a script for completion in a shell",
+        description="Print a script that lets a shell complete commands, options and file names. It needs shtab:\n"
+        "pip install 'apt_evap[completion]'. The script itself needs nothing.",
+        epilog="examples:\n"
+        "  apt-evap completion bash > ~/.local/share/bash-completion/completions/apt-evap\n"
+        "  apt-evap completion zsh > ~/.zfunc/_apt-evap    # a folder in fpath, before compinit",
+        **_SHAPE,
+    )
+    command.add_argument("shell", choices=("bash", "zsh", "fish", "tcsh"), help="name of the shell")
 
 
 # ---- arguments of several commands -----------------------------------------------------------------------------------

@@ -182,6 +182,7 @@ def fit_energies(
         )
     resampled = values[1:]
     wins = np.ravel_multi_index(cells[1:].T, grid.shape)
+    energy_limit = run.response_settings.energy_limit / np.median(run.energy_scales)  # [eV] of this run
     provenance = {
         "bins": measured.values.shape[::-1],
         "bin_size": measured.bin_size,
@@ -189,7 +190,7 @@ def fit_energies(
         "measured": repr(measured),
         "measured_noise": "Poisson" if measured.is_counts else "not known",
         "registered": rounds or "given",
-        "share_above_energy_limit": grid.share_above(run.response_settings.energy_limit),
+        "share_above_energy_limit": grid.share_above(energy_limit),
         "run": {"ions": len(run), "provenance": run.provenance, **run.settings},
         "real_units": real_units_of(run),
     }

@@ -178,5 +178,9 @@ def describe(map: DetectorMap) -> str:
 def _wrap(text, width):
     """Break text into lines, at commas if possible."""
     unbroken = text.replace(" ", "\N{NO-BREAK SPACE}").replace(",\N{NO-BREAK SPACE}", ", ")
-    lines = "\n".join(fill(line, width, break_long_words=False) for line in unbroken.splitlines())
-    return "\n".join(fill(line.replace("\N{NO-BREAK SPACE}", " "), width) for line in lines.splitlines())
+    lines = "\n".join(
+        fill(line, width, break_long_words=False, break_on_hyphens=False) for line in unbroken.splitlines()
+    )
+    return "\n".join(
+        fill(line.replace("\N{NO-BREAK SPACE}", " "), width, break_on_hyphens=False) for line in lines.splitlines()
+    )

@@ -1,9 +1,11 @@
 """`apt-evap compare`: what it writes, what it takes, what it refuses."""
 
 import csv
+import hashlib
 import json
 import os
 import re
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +18,7 @@ import apt_evap as ae
 from apt_evap.cli.main import main
 
 ROLLUP = ae.RollUp(ae.TruncatedNormal(0.2, 0.1))
-FILES = {"study.json", "ssim.csv", "ssim.png", "maps.png", "registration.png"}
+FILES = {"study.json", "ssim.csv", "ssim.png", "maps.png", "registration.png", "report.html"}
 QUICK = ["--means", "0.1,0.2,0.3", "--rsds", "0.5,1", "--replicas", "1", "--resamples", "4", "--bins", "24"]
 HERE = ["--registration", "0,1,0,0"]
 NO_PICTURES = pytest.mark.usefixtures("blank_pictures")
@@ -90,6 +92,13 @@ def test_everything_is_written(folder, capsys):
     for name in FILES:
         if name.endswith(".png"):
             assert imread(f"study/{name}")[..., :3].std() > 0.05
+    report = ae.report.read("study/report.html")
+    assert report["study"] == held
+    assert report["origin"]["command"] == shlex.join(
+        ["apt-evap", "compare", "run.h5", "map.npz", "-o", "study", *QUICK, *HERE]
+    )
+    sums = [(name, hashlib.sha256(Path(name).read_bytes()).hexdigest()) for name in ("run.h5", "map.npz")]
+    assert [(each["name"], each["sha256"]) for each in report["origin"]["files"]] == sums
     # it is what Python gives
     study = ae.fit_energies(
         ae.load("run.h5"), ae.read_map("map.npz"), means=(0.1, 0.2, 0.3), rsds=(0.5, 1), replicas=1, resamples=4,
@@ -221,6 +230,9 @@ def test_a_doubtful_registration_is_told_once_and_kept(folder, capsys):
     assert err.count("the registration is doubtful") == 1
     assert f"note: check {Path('noise/registration.png')}; --registration sets" in err
     assert "roll-up, registration doubtful, best at" in out
+    told = ae.report.read("noise/report.html")["origin"]["warnings"]
+    assert not any("registration" in text for text in told)  # the report has a sentence of its own
+    assert Path("noise/report.html").read_text().count("The registration is doubtful") == 1
     assert json.loads(Path("noise/study.json").read_text())["registration"]["doubtful"] is True
     assert main(["compare", "run.h5", "noise.npz", "-o", "given", *QUICK, *HERE]) == 0
     assert "doubtful" not in "".join(capsys.readouterr())

@@ -376,6 +376,9 @@ def test_a_study_of_a_run_in_real_units_finds_real_energies(run):
     assert one.optimum.mean == 0.2 and two.optimum.mean == pytest.approx(0.2 * factor, rel=1e-12)
     assert two.ssim == pytest.approx(one.ssim, abs=0.02)  # voltages differ by 1 % along the run
     assert two.real_energies[0] == pytest.approx(two.refined.true_mean, rel=1e-12)
+    # the limit of the responses is a simulated energy: the same fractions are above it
+    above = [np.array(each.provenance["share_above_energy_limit"]) for each in (one, two)]
+    assert above[1] == pytest.approx(above[0], rel=1e-9) and above[0].max() > 0
 
 
 def test_study_settings_are_checked():

@@ -1,0 +1,63 @@
+"""`apt-evap examples`: list the examples of the package, or copy them."""
+
+import argparse
+import ast
+from pathlib import Path
+
+from apt_evap._common.files import FileError, check_path, open_for_reading, replace_file
+from apt_evap.cli._output import tell, tell_json
+
+# in a wheel inside the package, in the repository beside it
+_PACKAGE = Path(__file__).parents[1]
+_PLACES = (_PACKAGE / "examples", _PACKAGE.parent / "examples")
+_SUFFIXES = (".py", ".toml")
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Run the command."""
+    examples = {path.name: path.read_bytes() for path in _paths()}
+    titles = {name: _title(name, content.decode()) for name, content in examples.items()}
+    if options.to is None:
+        for name, title in titles.items():
+            tell(options, f"{name:<{max(map(len, titles))}}  {title}")
+        tell(options, "\napt-evap examples --to FOLDER copies these files")
+        tell_json(options, {"examples": titles})
+        return 0
+    folder = check_path(options.to)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(f"cannot write to {str(folder)!r}: {error.strerror or error}") from error
+    for name, content in examples.items():
+        if not options.force:
+            _check_own(folder / name, content)
+    for name, content in examples.items():
+        with replace_file(folder / name) as file:
+            file.write(content)
+    tell(options, f"wrote {len(examples)} files to {folder}")
+    tell_json(options, {"folder": str(folder), "files": list(examples)})
+    return 0
+
+
+def _paths():
+    for place in _PLACES:
+        paths = sorted(path for path in place.glob("*") if path.suffix in _SUFFIXES)
+        if paths:
+            return paths
+    raise FileError(f"the examples are not in {str(_PLACES[0])!r}: reinstall the package")
+
+
+def _check_own(path, content):
+    """Check that a file that would be overwritten is an unchanged example."""
+    if not path.exists():
+        return
+    with open_for_reading(path) as file:
+        if file.read(len(content) + 1) != content:
+            raise FileError(f"{str(path)!r} exists and differs from the example: --force overwrites it")
+
+
+def _title(name, text):
+    """First sentence of an example."""
+    if name.endswith(".py"):
+        return (ast.get_docstring(ast.parse(text)) or "").partition("\n")[0]
+    return text.lstrip("# ").partition("\n")[0].partition(". ")[0]

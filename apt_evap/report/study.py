@@ -1,0 +1,233 @@
+"""Report of a study: maps that blink on one place, energies with intervals and doubts, similarities, settings."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+from apt_evap import plot
+from apt_evap._common.types import AnyPath
+from apt_evap._common.validation import check_kind
+from apt_evap.energy_fit.study import Score, Study
+from apt_evap.report.origin import add_origin, origin
+from apt_evap.report.page import Page, escape, flat, folded, heading, paragraph, table, text_of
+from apt_evap.report.pictures import blinking_pictures
+
+_COLORS = "viridis"  # of the matrix, as of `plot.ssim_matrix`
+_LONG = ("run", "registered", "share_above_energy_limit")  # settings in tables of their own, or only for programs
+_RARE = 0.05
+"""Largest fraction of resamples without gain, and of energies above the limit of the responses, without a doubt."""
+
+
+def write_study(
+    study: Study,
+    path: AnyPath,
+    *,
+    title: str = "",
+    figures: Mapping[str, Figure] | None = None,
+    files: Sequence[AnyPath] = (),
+    command: str = "",
+    warnings: Sequence[str] = (),
+) -> None:
+    """Write a study as one HTML file.
+
+    The file contains its pictures and needs no network. Measured and simulated map are drawn on the same place; a press
+    on the picture or the key B switches between them, so that errors of the registration are visible as motion. The
+    content of `Study.to_dict` is inside, too (`report.read`).
+
+    Parameters
+    ----------
+    study : Study
+        Result of `fit_energies`.
+    path : str or path-like
+        File to write or replace.
+    title : str
+        Title of the page; by default the mechanism.
+    figures : dict, optional
+        Figures by caption, in addition to the maps; by default that of `plot.side_by_side`.
+    files : sequence of str or path-like
+        Files of the study, whose names, sizes and SHA-256 are listed.
+    command : str
+        Command line to repeat the study.
+    warnings : sequence of str
+        Warnings of the study.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be written, or one of `files` cannot be read.
+    """
+    check_kind(study, "study", Study, "a Study")
+    content, made = study.to_dict(), origin(files, command, warnings)
+    page = Page(title or f"Emission energies: {study.grid.mechanism}")
+    of_registration, others = doubts(content)
+    page.add(*(paragraph(text, "doubt red") for text in of_registration))
+    page.add(*(paragraph(text, "doubt") for text in (*others, *(f"Warning: {each}" for each in made["warnings"]))))
+    page.add(heading("Energies"), _energies(study), heading("Measured and simulated map"), _blinking(page, study))
+    page.add(heading("Similarity with the measured map"), _scores(study))
+    page.add('<div class="matrices">', *(_matrix(study, layer) for layer in range(study.grid.shape[0])), "</div>")
+    page.add(paragraph("Rows: standard deviation / mean. Columns: mean energy [eV]. Frame: the best point.", "note"))
+    if figures is None:
+        figures = {
+            "Maps as compared: flattened, smoothed, inside the common region.": plot.side_by_side(study)[0].figure
+        }
+    page.add(heading("Pictures"), *(page.picture(figure, caption) for caption, figure in figures.items()))
+    page.add(heading("Registration"), _registration(content["registration"]))
+    page.add(heading("Settings"))
+    settings = content["settings"]
+    comparison = {name: value for name, value in settings.items() if name not in _LONG}
+    for name, part in (("Comparison", comparison), ("Simulated run", settings["run"])):
+        page.add(folded(name, table((key, text_of(value)) for key, value in flat(part).items())))
+    add_origin(page, made)
+    page.data("study", content)
+    page.save(path)
+
+
+def doubts(content: Mapping[str, Any]) -> tuple[list[str], list[str]]:
+    """Reasons to doubt the energies of a study.
+
+    Parameters
+    ----------
+    content : dict
+        Result of `Study.to_dict`, also read from study.json.
+
+    Returns
+    -------
+    of_registration, others : list of str
+        Sentences.
+    """
+    registration, settings, edges = content["registration"], content["settings"], content["optimum"]["at_edge"]
+    of_registration, others = [], []
+    if registration["doubtful"]:
+        of_registration.append(
+            f"The registration is doubtful: the correlation of the maps is only {registration['score']:.2f} in their "
+            f"common area ({registration['overlap']:.0%} of the measured one), as for unrelated maps. If it is wrong, "
+            "the energies have no meaning."
+        )
+    if edges:
+        labels = " and ".join({"mean": "the mean", "rsd": "standard deviation / mean"}[name] for name in edges)
+        others.append(f"The best point is at the end of the grid in {labels}: better energies may be beyond it.")
+    if not content["refined"]["intervals"]:
+        others.append("The errors are not known, because there are no resamples.")
+    elif content["gain_share"] < 1 - _RARE:
+        share = f"{content['gain_share']:.0%}"
+        others.append(f"The best map is better than the unperturbed one in only {share} of the resamples.")
+    above = np.max(settings["share_above_energy_limit"])
+    if above > _RARE:
+        others.append(
+            f"At one end of the grid, {above:.0%} of the energies are above the limit of the responses: their hit "
+            "positions are extrapolated."
+        )
+    if settings["measured_noise"] == "not known" and settings["allow_noise"]:
+        others.append(
+            "The noise of the measured densities is not known and not corrected: the best energies have slightly more "
+            "contrast than the true ones."
+        )
+    return of_registration, others
+
+
+# ---- parts of the page -----------------------------------------------------------------------------------------------
+
+
+def _energies(study):
+    best, refined, mechanism = study.optimum, study.refined, study.grid.mechanism
+    names = {"mean": "mean [eV]", "rsd": "standard deviation / mean"}
+    if mechanism == "combined":
+        names["rollup_fraction"] = "roll-up fraction"
+    after = {"true_mean": "mean", "true_standard_deviation": "standard deviation"}
+    names |= {name: f"{label} after truncation [eV]" for name, label in after.items()}
+    rows = [(label, f"{getattr(best, name):.4g}", refined.bounded(name)) for name, label in names.items()]
+    run, real = study.provenance["run"], study.provenance.get("real_units")
+    place = f"at {run['voltage']:g} V"
+    if real is not None:
+        operating = f"at {real['operating_field']:.3g} V/nm and {real['flight_charge']}+"
+        if real["real_per_study"] == 1.0:
+            factor, place, other = real["simulated_per_study"], operating, f"{place} and {real['barrier_charge']}+"
+        else:
+            factor, other = real["real_per_study"], operating
+        for name, label in after.items():
+            values = f"{getattr(best, name) * factor:.4g}", refined.scaled(name, factor)
+            rows.append((f"{label} after truncation, {other} [eV]", *values))
+    rows.append(("SSIM", best.score, refined.score))
+    between = "between its points" + " (95 % of the resamples)" * bool(refined.intervals)
+    note = "Fitted energies scale with the assumed tip radius and voltage."
+    return table(rows, (f"{mechanism}, {place}", "best on the grid", between)) + paragraph(note, "note")
+
+
+def _scores(study):
+    corrected = "noise-corrected SSIM" if study.settings.allow_noise else "SSIM"
+    names = ("unperturbed", "thermal", "optimum")
+    scores = {**study.baselines, "optimum": study.optimum.score}
+    labels = {"thermal": f"thermal, {study.settings.temperature:g} K", "optimum": "best"}
+    rows = [(labels.get(name, name), scores[name], study.plain[name]) for name in names]
+    rows.append(("gain over unperturbed", study.gain, ""))
+    if study.ceiling is not None:
+        rows.append(("two halves of the measured ions", "", study.ceiling))
+    head = ["Map", corrected, "uncorrected SSIM"]
+    if not study.settings.allow_noise:
+        rows, head = [row[:2] if row[1] else (row[0], row[2]) for row in rows], head[:2]
+    width, height = study.measured.bin_size
+    return table(rows, head) + paragraph(
+        f"{study.provenance['bins_compared']:,} bins of {width:.3g} × {height:.3g} mm compared, smoothed by "
+        f"{study.settings.smoothing:.3g} mm. Errors: standard deviations of {study.settings.resamples} resamples.",
+        "note",
+    )
+
+
+def _matrix(study, layer):
+    """Similarities for one roll-up fraction as a table; a cell shows its details under the pointer or the focus."""
+    grid, values = study.grid, study.ssim[layer]
+    colors = matplotlib.colormaps[_COLORS]
+    low, high = float(study.ssim.min()), float(study.ssim.max())
+    shades = colors((values - low) / (high - low) if high > low else np.zeros_like(values))
+    best = study.optimum
+    lines = ['<table class="matrix">']
+    if grid.mechanism == "combined":
+        lines.append(f"<caption>roll-up fraction {grid.rollup_fractions[layer]:g}</caption>")
+    for row in reversed(range(len(grid.rsds))):  # as in the picture, upwards
+        cells = []
+        for column, mean in enumerate(grid.means):
+            shade = shades[row, column, :3]
+            light = np.dot(shade, (0.299, 0.587, 0.114)) > 0.5
+            score = Score(float(values[row, column]), float(study.errors[layer, row, column]))
+            details = f"mean {mean:g} eV, standard deviation / mean {grid.rsds[row]:.4g}: SSIM {score}"
+            if len(study.resampled):
+                details += f", best in {study.shares[layer, row, column]:.0%} of the resamples"
+            at = (grid.rollup_fractions[layer], grid.rsds[row], mean)
+            frame = ' class="best"' if at == (best.rollup_fraction, best.rsd, best.mean) else ""
+            color = matplotlib.colors.to_hex(shade)
+            cells.append(
+                f'<td{frame} tabindex="0" style="background:{color};color:{"#000" if light else "#fff"}">'
+                f"{score.value:z.3f}<span>{escape(details)}</span></td>"
+            )
+        lines.append(f"<tr><th>{grid.rsds[row]:.3g}</th>{''.join(cells)}</tr>")
+    lines.append(f"<tr><th></th>{''.join(f'<th>{mean:.4g}</th>' for mean in grid.means)}</tr></table>")
+    return "\n".join(lines)
+
+
+def _registration(content):
+    scores = {"correlation": content["score"], "common area": content["overlap"], "residual [mm]": content["residual"]}
+    rows = [
+        ("mirrored", content["mirror"]),
+        ("rotation [degrees]", content["rotation"]),
+        ("scale [measured mm per simulated mm]", content["scale"]),
+        ("shift in x, y [mm]", content["shift"]),
+        *((name, value) for name, value in scores.items() if value is not None),
+        ("origin", content["method"] or "given"),
+        ("other transforms that are equally good", len(content["ties"])),
+    ]
+    return table((name, text_of(value)) for name, value in rows)
+
+
+def _blinking(page, study):
+    """The measured and the best map on one place."""
+    best = study.optimum
+    energies = f"{best.mean:g} eV, σ/mean {best.rsd:g}"
+    if study.grid.mechanism == "combined":
+        energies += f", roll-up fraction {best.rollup_fraction:g}"
+    maps = {"measured": study.measured, f"simulated: {study.grid.mechanism}, {energies}": study.maps["optimum"]}
+    pictures = blinking_pictures(page, {title: study.compared(map) for title, map in maps.items()})
+    note = "Both maps are flattened and smoothed as for the comparison, each with its own colour scale."
+    return pictures + paragraph(note, "note")

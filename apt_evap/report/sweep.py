@@ -1,0 +1,160 @@
+"""Report of a sweep: one row for each point, the best one first."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from apt_evap._common.types import AnyPath
+from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.energy_fit.study import plain
+from apt_evap.report.origin import add_origin, origin
+from apt_evap.report.page import Markup, Page, heading, paragraph, table, text_of
+from apt_evap.report.pictures import blinking_pictures
+
+_STUDY = ("SSIM", "mean [eV]", "standard deviation / mean", "roll-up fraction", "real energy [eV]", "doubts")
+
+
+@dataclass(frozen=True)
+class SweepRow:
+    """A point of a sweep.
+
+    Parameters
+    ----------
+    name : str
+        Name of the point.
+    settings : dict
+        Settings that differ between the points, by name, as numbers or text.
+    results : dict
+        Further results of the point, by name with the unit in brackets, such as ``{"ions": 15000}``.
+    study : dict, optional
+        Result of `Study.to_dict`, also read from study.json; None without a comparison.
+    maps : dict
+        Maps by title with the same bins, which blink on one place; the first one is the measured one.
+    message : str
+        What is missing or failed; empty for a complete point.
+    """
+
+    name: str
+    settings: Mapping[str, Any]
+    results: Mapping[str, Any] = field(default_factory=dict)
+    study: Mapping[str, Any] | None = None
+    maps: Mapping[str, DetectorMap] = field(default_factory=dict)
+    message: str = ""
+
+    @property
+    def similarity(self) -> float:
+        """Largest similarity with the measured map, -inf without a study."""
+        return -np.inf if self.study is None else float(self.study["optimum"]["score"]["value"])
+
+
+def write_sweep(
+    rows: Sequence[SweepRow],
+    path: AnyPath,
+    *,
+    title: str = "Sweep",
+    pictures: int = 3,
+    files: Sequence[AnyPath] = (),
+    command: str = "",
+    warnings: Sequence[str] = (),
+) -> None:
+    """Write a sweep as one HTML file, with a row for each point.
+
+    The points are in the order of their similarity with the measured map; points without a study follow in their own
+    order. The file needs no network. The rows are inside as data (`report.read`).
+
+    Parameters
+    ----------
+    rows : sequence of SweepRow
+        The points.
+    path : str or path-like
+        File to write or replace.
+    title : str
+        Title of the page.
+    pictures : int
+        Number of points whose maps are drawn, from the best one.
+    files : sequence of str or path-like
+        Files of the sweep, whose names, sizes and SHA-256 are listed.
+    command : str
+        Command line to repeat the sweep.
+    warnings : sequence of str
+        Warnings of the sweep.
+
+    Raises
+    ------
+    ValueError
+        If there is no row.
+    FileError
+        If the file cannot be written, or one of `files` cannot be read.
+    """
+    if not rows:
+        raise ValueError("rows must contain a point of the sweep, got none")
+    rows = sorted(rows, key=lambda row: -row.similarity)
+    made = origin(files, command, warnings)
+    page = Page(title)
+    page.add(*(paragraph(f"Warning: {text}", "doubt") for text in made["warnings"]))
+    failed = sum(bool(row.message) for row in rows)
+    points = f"{len(rows)} point" + "s" * (len(rows) != 1)
+    page.add(paragraph(f"{points}, {failed} of them incomplete." if failed else f"{points}, all complete."))
+    compared = any(row.study for row in rows)
+    page.add(heading("Points"), _table(rows, compared))
+    if compared:
+        page.add(
+            paragraph(
+                "The best point is first. Energies are those between the points of the grid, with the interval of 95 % "
+                "of the resamples, in the units of each run; real energies are after the truncation. Compare "
+                "similarities only for the same bins and the same smoothing.",
+                "note",
+            )
+        )
+    for row in [row for row in rows if row.maps][:pictures]:
+        page.add(heading(f"Maps of {row.name}"), blinking_pictures(page, row.maps, 5.0))
+    add_origin(page, made)
+    page.data("points", [_data(row) for row in rows])
+    page.save(path)
+
+
+def _table(rows, compared):
+    settings, results = (_names(getattr(row, part) for row in rows) for part in ("settings", "results"))
+    of_study = _STUDY * compared
+    lines = []
+    for row in rows:
+        cells = [text_of(row.settings.get(name)) for name in settings]
+        cells += [text_of(row.results.get(name)) for name in results]
+        cells += _study_cells(row.study) * compared
+        lines.append((row.name, *cells, row.message))
+    head = ["Point", *settings, *results, *of_study, "Message"]
+    if not any(row.message for row in rows):
+        head, lines = head[:-1], [line[:-1] for line in lines]
+    return table(lines, head, best=0 if compared else None)
+
+
+def _study_cells(content):
+    if content is None:
+        return [""] * len(_STUDY)
+    score, refined = content["optimum"]["score"], content["refined"]
+    error = f" ± {score['error']:.3f}" if score["error"] is not None else ""
+    energies = []
+    for name in ("mean", "rsd", "rollup_fraction"):
+        text = f"{refined[name]:.3g}"
+        if refined["intervals"]:
+            low, high = refined["intervals"][name]
+            text += f" ({low:.3g} to {high:.3g})"
+        energies.append(text)
+    reasons = [
+        Markup('<span class="red">registration doubtful</span>') if content["registration"]["doubtful"] else "",
+        "end of the grid" if content["optimum"]["at_edge"] else "",
+    ]
+    real = content["real_energies"]
+    energies.append("" if real is None else f"{real[0]:.3g} ± {real[1]:.3g}")
+    return [f"{score['value']:.3f}{error}", *energies, Markup(", ".join(filter(None, reasons)))]
+
+
+def _names(parts):
+    """Names in the order of their first appearance."""
+    return list(dict.fromkeys(name for part in parts for name in part))
+
+
+def _data(row):
+    return plain({name: getattr(row, name) for name in ("name", "settings", "results", "study", "message")})
