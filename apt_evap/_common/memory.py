@@ -24,6 +24,11 @@ def needed_memory(atoms: float, surface_atoms: float) -> float:
     return _BYTES_PER_ATOM * atoms + _BYTES_PER_SURFACE_ATOM * surface_atoms
 
 
+def copied_memory(surface_atoms: float, n_threads: int) -> float:
+    """Memory [bytes] of the copies of the surface, one per thread."""
+    return _BYTES_PER_COPIED_ATOM * surface_atoms * n_threads
+
+
 def check_memory(atoms: float, surface_atoms: float) -> None:
     """Check that a specimen and its charges fit into the free memory.
 
@@ -47,7 +52,7 @@ def check_memory(atoms: float, surface_atoms: float) -> None:
 def check_copies(surface_atoms: float, n_threads: int) -> None:
     """Check that the copies of the surface, one per thread, fit into the free memory (ValueError)."""
     _check(
-        _BYTES_PER_COPIED_ATOM * surface_atoms * n_threads,
+        copied_memory(surface_atoms, n_threads),
         f"{argument('n_threads', n_threads)}, each with a copy of {surface_atoms:.2g} surface atoms,",
         "use fewer threads",
     )

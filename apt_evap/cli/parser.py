@@ -36,6 +36,7 @@ from a simulation to its map, and to the emission energies of a measured map:
   apt-evap reconstruct R5083.epos --element Si --distance 90 -o R5083.pos
                                                      positions in the specimen from the hits
   apt-evap examples --to FOLDER                      settings files and scripts to start from
+  apt-evap sweep plan study.toml                     many simulations, on one machine or a cluster
   apt-evap COMMAND --help                            all arguments of a command, with examples
 """
 
@@ -68,6 +69,7 @@ def make_parser() -> argparse.ArgumentParser:
         _add_reconstruct,
         _add_examples,
         _add_completion,
+        _add_sweep,
     ):
         add(commands)
     return parser
@@ -349,6 +351,55 @@ def _add_completion(commands: Any) -> None:
         **_SHAPE,
     )
     command.add_argument("shell", choices=("bash", "zsh", "fish", "tcsh"), help="name of the shell")
+
+
+def _add_sweep(commands: Any) -> None:
+    command = commands.add_parser(
+        "sweep",
+        help="run many simulations of one study file, on one machine or a cluster",
+        description="Run all points of a study file: all combinations of some settings, and single points. Every\n"
+        "point has a folder of its own, and can be run by any process that sees it.",
+        epilog="example:\n"
+        "  apt-evap sweep plan study.toml                          folders, memory and hours; runs nothing\n"
+        "  apt-evap sweep work study.toml --workers 4              on this machine\n"
+        "  apt-evap sweep submit study.toml --scheduler slurm      on a cluster\n"
+        "  apt-evap sweep status study.toml\n"
+        "  apt-evap sweep collect study.toml                       index.csv, maps.h5, comparison with a measured map",
+        **_SHAPE,
+    )
+    actions = command.add_subparsers(title="actions", metavar="ACTION", dest="action", required=True)
+
+    def add(name, text, **options):
+        action = actions.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.", **options, **_SHAPE)
+        action.add_argument("study", metavar="STUDY.toml", help="study file, or the folder of its sweep")
+        return action
+
+    _add_speech(add("plan", "make the folder of a sweep, and foresee memory and hours; nothing is run"))
+    work = add("work", "work on the points that are open")
+    where = work.add_mutually_exclusive_group()
+    where.add_argument("--workers", type=_integer(1), default=1, metavar="N", help="processes; default: 1")
+    where.add_argument("--point", action="append", metavar="KEY", help="only this point, by its key or number")
+    where.add_argument("--scheduler", choices=("dask",), help="let the workers of a Dask cluster work")
+    work.add_argument("--address", metavar="TCP", help="address of the scheduler of Dask")
+    work.add_argument("--retry", action="store_true", help="also try failed points again")
+    _add_speech(work)
+    submit = add("submit", "submit the open points to a batch system, as job arrays")
+    submit.add_argument("--scheduler", choices=("slurm", "pbs"), default="slurm", help="default: slurm")
+    submit.add_argument("--dry-run", action="store_true", help="only print the scripts")
+    submit.add_argument("--template", metavar="JOB.sh", help="script with placeholders such as @KEYS@ and @COMMAND@")
+    submit.add_argument("--submit-command", metavar="COMMAND", help="default: sbatch --parsable, or qsub")
+    submit.add_argument(
+        "--option", action="append", metavar="OPTION", help="of the batch system, such as --option=--partition=short"
+    )
+    submit.add_argument("--at-once", type=_integer(1), metavar="N", help="tasks of an array that run at once (slurm)")
+    submit.add_argument("--largest-array", type=_integer(1), metavar="N", help="default: as the system allows, or 1000")
+    _add_speech(submit)
+    add("status", "show the states of all points").add_argument("--json", action="store_true", help="as JSON")
+    gather = add("collect", "collect the finished points: index.csv, maps.h5, and the fit to a measured map")
+    gather.add_argument("--maps", metavar="MAPS.h5", help="default: maps.h5 in the folder of the sweep")
+    gather.add_argument("--bins", type=_integer(1, MAX_BINS), metavar="N", help="default: bins in [maps], or 128")
+    gather.add_argument("--no-compare", action="store_true", help="without the comparison of [compare]")
+    _add_speech(gather)
 
 
 # ---- arguments of several commands -----------------------------------------------------------------------------------

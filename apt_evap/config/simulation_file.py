@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 from apt_evap._common.files import FileError, check_path, read_small_file
 from apt_evap._common.validation import check_count, check_kind, check_number, check_seed, check_switch, short_text
@@ -208,17 +209,42 @@ def read_config(path: str | Path) -> Config:
     FileError
         If the file cannot be read or is not TOML, or a table, key or value is wrong; the message names it.
     """
+    return config_of(read_document(path), Path(path))
+
+
+def read_document(path: str | Path) -> dict[str, Any]:
+    """Content of a TOML file, dict; FileError if it cannot be read or is not TOML."""
     check_path(path)
     if is_run(path):
         raise FileError(f"{str(path)!r} is a run: see apt-evap info")
     content = read_small_file(path, _MAX_BYTES, "a TOML file")
-    path = Path(path)
     try:
-        document = tomllib.loads(content.decode())
+        return tomllib.loads(content.decode())
     except UnicodeDecodeError as error:
         raise FileError(f"{str(path)!r} is not a TOML file: it is not text in UTF-8") from error
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise FileError(f"{str(path)!r} is not a TOML file: {error}") from error
+
+
+def config_of(document: dict[str, Any], path: Path) -> Config:
+    """Settings of a simulation from the content of a TOML file.
+
+    Parameters
+    ----------
+    document : dict
+        The tables, as in `read_config`.
+    path : Path
+        Name of the file, for messages.
+
+    Returns
+    -------
+    Config
+
+    Raises
+    ------
+    FileError
+        If a table, key or value is wrong; the message names it.
+    """
     with _located(path):
         tables = (
             "tip",

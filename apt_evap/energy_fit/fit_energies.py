@@ -138,7 +138,7 @@ def fit_energies(
     grid = EnergyGrid(mechanism, means, rsds, rollup_fractions)  # type: ignore[arg-type]
     if check_kind(run, "run", Run, "a Run").responses is None:
         raise ValueError(f"run must have responses for fit_energies, got {run!r}")
-    measured = _measured_map(measured, bins)
+    measured = measured_map(measured, bins)
     settings = StudySettings(
         smoothing=max(measured.bin_size) * (0.5 if measured.is_counts else 1) if smoothing is None else smoothing,
         flattening=flattening,
@@ -251,8 +251,8 @@ def _replicas(measured, run):
     return int(np.clip(np.ceil(number), FEWEST, MOST))
 
 
-def _measured_map(measured, bins):
-    """Measured map, with about the requested number of bins along the longer side."""
+def measured_map(measured: Hits | DetectorMap, bins: int | None) -> DetectorMap:
+    """Measured map, with about the requested number of bins along the longer side; ValueError if it has no bin."""
     if bins is not None:
         bins = check_count(bins, "bins", at_least=2 * WINDOW + 1)
     if isinstance(measured, Hits):
@@ -272,6 +272,6 @@ def _measured_map(measured, bins):
     mask, values = inside.all(axis=(1, 3)), blocks(np.where(measured.mask, measured.values, 0)).sum(axis=(1, 3))
     if not mask.any():
         raise ValueError(f"bins={bins} leaves no bin inside {measured!r}")
-    edges = {"x_edges": measured.x_edges[: columns + 1 : factor], "y_edges": measured.y_edges[: rows + 1 : factor]}
+    x_edges, y_edges = measured.x_edges[: columns + 1 : factor], measured.y_edges[: rows + 1 : factor]
     ions = int(values[mask].sum()) if measured.is_counts else None
-    return replace(measured, values=values, mask=mask, ions=ions, detected=None, **edges)
+    return replace(measured, values=values, mask=mask, ions=ions, detected=None, x_edges=x_edges, y_edges=y_edges)

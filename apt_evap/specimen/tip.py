@@ -533,3 +533,39 @@ class Tip:
         self.evaporation_fields = np.array([element.evaporation_field for element in elements])
         self.charge_states = np.array([element.charge_state for element in elements], dtype=np.int32)
         self.masses = np.array([element.mass for element in elements])
+
+
+def foreseen_atoms(
+    *,
+    apex_radius: float,
+    material: Material | str | None = None,
+    phases: Sequence[Phase] | None = None,
+    shank_angle: float = 1.5,
+    shank_length: float | None = None,
+    base: str = "rounded",
+    depth: float | None = None,
+    **others: Any,
+) -> tuple[float, float]:
+    """Approximate numbers of atoms in memory and of surface atoms of a `Tip`, without building it.
+
+    Parameters
+    ----------
+    apex_radius, material, phases, shank_angle, shank_length, base, depth
+        As for `Tip`; of several phases, the first.
+    **others
+        The other parameters of `Tip`, which do not change the numbers.
+
+    Returns
+    -------
+    atoms, surface_atoms : float
+    """
+    host = as_material(material) if phases is None else phases[0].material  # type: ignore[arg-type]
+    shape = TaperedCap(apex_radius, 2 * apex_radius if shank_length is None else shank_length, shank_angle, base)
+    criterion = SurfaceCriterion.of(host.structure, host.nearest_neighbour_distance)
+    return _expected_atoms(Shell(shape, depth, criterion.neighbour_radius), host)
+
+
+def _expected_atoms(shell, host):
+    density = lattice.atom_density(host.structure, host.a, host.c)
+    layer = shell.shape.volume(_LAYER * host.nearest_neighbour_distance)
+    return shell.volume() * density, layer * density

@@ -1,0 +1,163 @@
+"""`apt-evap sweep`: plan, run and collect many simulations of one study file."""
+
+import argparse
+import json
+
+from apt_evap._common.files import FileError
+from apt_evap.cli._output import put, say, tell, tell_json
+from apt_evap.sweep.batch_system import largest_array, scripts, submit
+from apt_evap.sweep.collect import collect
+from apt_evap.sweep.plan import open_sweep, plan
+from apt_evap.sweep.pool import work_locally, work_with_dask
+from apt_evap.sweep.status import STATES, status
+from apt_evap.sweep.work import retry, work, work_on
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Run the command."""
+    return _ACTIONS[options.action](options)
+
+
+def _plan(options):
+    sweep = plan(options.study)
+    hours = [needs.hours for needs in sweep.foresights]
+    memory = [needs.memory for needs in sweep.foresights if needs.memory is not None]
+    content = {
+        "folder": str(sweep.folder),
+        "points": [
+            {"key": point.key, "values": point.values, **needs.to_dict()}
+            for point, needs in zip(sweep.points, sweep.foresights, strict=True)
+        ],
+    }
+    if not (options.quiet or options.json):
+        for point, needs in zip(sweep.points, sweep.foresights, strict=True):
+            put(f"{point.key}  {_needs(needs)}  {point}")
+        most = f", {max(memory) / 1e9:.2g} GB at most" if memory else ""
+        total = "" if None in hours else f", about {_hours(sum(hours))} of one worker"
+        put(f"{len(sweep.points):,} points in {sweep.folder}{most}{total}")
+    tell_json(options, content)
+    return 0
+
+
+def _needs(needs):
+    if needs.memory is None:
+        return f"{needs.ions:,} ions"
+    return f"{needs.ions:,} ions of {needs.atoms:.2g} atoms, {needs.memory / 1e9:.2g} GB, {_hours(needs.hours)}"
+
+
+def _hours(hours):
+    return f"{hours:.2g} h" if hours >= 1 else f"{60 * hours:.2g} min"
+
+
+def _work(options):
+    sweep = open_sweep(options.study)
+    if options.retry:
+        tell(options, f"{retry(sweep):,} failed points are tried again")
+    if options.scheduler == "dask":
+        if options.address is None:
+            raise ValueError("--scheduler dask needs --address, such as tcp://10.0.0.1:8786")
+        work_with_dask(sweep, options.address)
+    elif options.address is not None:
+        raise ValueError(f"--address is only for --scheduler dask, got {options.address!r}")
+    elif options.point is not None:
+        keys = [sweep.check_key(point) for point in options.point]
+        states = {key: work_on(sweep, key) for key in keys}
+        for key, state in states.items():
+            tell(options, f"{key}: {state.name}{f', {state.message}' if state.message else ''}")
+        failed = [f"{key}: {state.message}" for key, state in states.items() if state.name == "failed"]
+        tell_json(options, {key: state.name for key, state in states.items()})
+        if failed:
+            raise ValueError(f"point {'; '.join(failed)}")
+        return 0
+    elif options.workers > 1:
+        work_locally(sweep, options.workers)
+    else:
+        work(sweep)
+    content = status(sweep)
+    _tell_counts(options, content)
+    tell_json(options, {"folder": content["folder"], **content["counts"]})
+    return 0
+
+
+def _submit(options):
+    sweep = open_sweep(options.study)
+    keys = [point.key for point, state in sweep.states() if state.name == "open"]
+    if not keys:
+        tell(options, "no point is open: nothing to submit")
+        tell_json(options, {"jobs": [], "points": 0})
+        return 0
+    largest = options.largest_array or (largest_array(options.scheduler) if not options.dry_run else None)
+    texts = scripts(
+        sweep,
+        keys,
+        options.scheduler,
+        template=options.template,
+        options=options.option or (),
+        at_once=options.at_once,
+        **({} if largest is None else {"largest": largest}),
+    )
+    if options.dry_run:
+        if options.json:
+            tell_json(options, {"scripts": texts, "points": len(keys)})
+        else:
+            put("\n".join(texts).removesuffix("\n"))
+        return 0
+    answers = submit(sweep, texts, options.scheduler, options.submit_command)
+    for path, answer in answers:
+        tell(options, f"submitted {path}: {answer}")
+    tell_json(
+        options, {"jobs": [{"script": str(path), "answer": answer} for path, answer in answers], "points": len(keys)}
+    )
+    return 0
+
+
+def _status(options):
+    content = status(open_sweep(options.study))
+    if options.json:
+        put(json.dumps(content, allow_nan=False))
+        return 0
+    for row in content["table"]:
+        values = ", ".join(f"{path} = {json.dumps(value)}" for path, value in row["values"].items())
+        message = f"  {row['message']}" if row["message"] else ""
+        tries = f"{row['tries']} {'try' if row['tries'] == 1 else 'tries'}"
+        put(f"{row['key']}  {row['state']:7}  {row['ions']:,} of {row['n_ions']:,} ions, {tries}  {values}{message}")
+    _tell_counts(argparse.Namespace(quiet=False, json=False), content)
+    return 0
+
+
+def _tell_counts(options, content):
+    counts = ", ".join(f"{content['counts'][name]:,} {name}" for name in STATES)
+    left = content["hours_left"]
+    hours = f"; about {_hours(left)} of one worker left" if left else ""
+    tell(options, f"{content['points']:,} points: {counts}{hours}")
+    failed = [row for row in content["table"] if row["state"] == "failed"]
+    for row in failed[:3]:
+        say("note", f"point {row['key']} failed: {row['message']}")
+    if failed:
+        say("note", "after the reason is removed, apt-evap sweep work --retry tries failed points again")
+
+
+def _collect(options):
+    sweep = open_sweep(options.study)
+    result = collect(
+        sweep,
+        maps=options.maps,
+        bins=options.bins,
+        compare=not options.no_compare,
+        note=lambda text: tell(options, text),
+    )
+    if not result["done"]:
+        raise FileError(f"no point of {str(sweep.folder)!r} is done: apt-evap sweep work runs them")
+    fit = result.pop("fit")
+    if fit is not None:
+        tell(options, repr(fit).strip("<>"))
+        for name, reason in fit.failed.items():
+            say("note", f"point {name} is not compared: {reason}")
+        tell_json(options, result | {"best": fit.best, "table": fit.rows()})
+    else:
+        tell_json(options, result)
+    tell(options, f"wrote {', '.join(result['files'])}")
+    return 0
+
+
+_ACTIONS = {"plan": _plan, "work": _work, "submit": _submit, "status": _status, "collect": _collect}

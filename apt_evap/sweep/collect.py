@@ -1,0 +1,237 @@
+"""Collection of a sweep: a table of all points, the maps of all finished runs, and the comparison with a measurement.
+
+All files are made from the plan and the files of the runs alone, and can be made again at any time.
+"""
+
+import csv
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from apt_evap._common.files import replace_file
+from apt_evap._common.types import AnyPath
+from apt_evap._common.validation import check_count
+from apt_evap._version import __version__
+from apt_evap.config.simulation_file import config_of
+from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.emission.perturbations import to_dict
+from apt_evap.energy_fit.fit_tips import TipFit, fit_tips
+from apt_evap.simulation.run import load
+from apt_evap.sweep.plan import RUN, SETTINGS, Sweep, csv_value
+
+INDEX, MAPS, FIT_TABLE, FIT = "index.csv", "maps.h5", "fit.csv", "fit.json"
+"""Files of a collection."""
+DEFAULT_BINS = 128
+_OF_RUN = ("ended", "version", "created", "processor", "fingerprint")
+
+
+def collect(
+    sweep: Sweep,
+    *,
+    maps: AnyPath | None = None,
+    bins: int | None = None,
+    compare: bool = True,
+    note: Callable[[str], object] = lambda text: None,
+) -> dict[str, Any]:
+    """Collect the results of the finished points of a sweep.
+
+    Writes ``index.csv`` (all points: key, settings that differ, state, tries, ions, end, version, processor,
+    fingerprint of the bits), ``maps.h5`` (see `write_maps`) and, with a table ``[compare]``, ``fit.csv`` and
+    ``fit.json`` (see `fit_tips`) to the folder of the sweep.
+
+    Parameters
+    ----------
+    sweep : Sweep
+        The sweep.
+    maps : str or path-like, optional
+        File of the maps, instead of ``maps.h5``.
+    bins : int, optional
+        Bins along a side of the maps; by default those of ``[maps]`` in the base, or 128.
+    compare : bool
+        Whether to compare with the measured map of ``[compare]``.
+    note : callable, optional
+        Called with a line of text on progress.
+
+    Returns
+    -------
+    dict
+        points, done (numbers), files (list of str), fit (`TipFit` or None).
+
+    Raises
+    ------
+    FileError
+        If a file cannot be read or written.
+    ValueError
+        If no run can be compared.
+    """
+    if bins is not None:
+        check_count(bins, "bins", at_least=1)
+    states = {point.key: state for point, state in sweep.states()}
+    done = [point for point in sweep.points if states[point.key].name == "done"]
+    rows, files = {}, []
+    target = Path(maps) if maps is not None else sweep.folder / MAPS
+    if done:
+        rows = write_maps(sweep, [point.key for point in done], target, bins)
+        files.append(str(target))
+        note(f"{len(done):,} of {len(sweep.points):,} points are done")
+    fit = None
+    if compare and sweep.compare is not None and done:
+        note(f"comparing {len(done):,} runs with {sweep.compare.measured}")
+        fit = _compare(sweep, [point.key for point in done])
+        files += [str(sweep.folder / name) for name in (FIT_TABLE, FIT)]
+    _write_index(sweep, states, rows)
+    return {
+        "points": len(sweep.points),
+        "done": len(done),
+        "files": [str(sweep.folder / INDEX), *files],
+        "fit": fit,
+    }
+
+
+def _write_index(sweep, states, rows):
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(["key", *sweep.paths, "state", "tries", "message", "ions", *_OF_RUN])
+    for point in sweep.points:
+        state, row = states[point.key], rows.get(point.key, {})
+        values = [csv_value(sweep.value(point, path)) for path in sweep.paths]
+        of_run = [row.get(name, "") for name in ("ions", *_OF_RUN)]
+        table.writerow([point.key, *values, state.name, state.tries, state.message, *of_run])
+    _replace(sweep.folder / INDEX, text.getvalue())
+
+
+def write_maps(sweep: Sweep, keys: list[str], path: AnyPath, bins: int | None = None) -> dict[str, dict[str, Any]]:
+    """Write the maps of runs to one rectangular HDF5 file, which xarray and other readers of netCDF-4 open.
+
+    The dimensions of ``maps`` are point, perturbation, y and x; its values are hits per bin, on the same bins for all
+    points. The perturbations are the panels of ``[maps]`` in the base. Further variables: ``x``, ``y`` (centres [mm]),
+    ``x_edges``, ``y_edges`` [mm], ``key``, ``perturbation``, ``ions`` and the settings in which the points differ, with
+    ``_`` instead of the dots: numbers as numbers, everything else as JSON.
+
+    Parameters
+    ----------
+    sweep : Sweep
+        The sweep.
+    keys : list of str
+        Keys of finished points.
+    path : str or path-like
+        File to write or replace.
+    bins : int, optional
+        As for `collect`.
+
+    Returns
+    -------
+    dict
+        For each key: ions, ended, version, created, processor, fingerprint.
+
+    Raises
+    ------
+    FileError
+        If a file cannot be read or written.
+    """
+    points = {point.key: point for point in sweep.points}
+    configs = [config_of(points[key].document, sweep.folder_of(key) / SETTINGS) for key in keys]
+    panels = configs[0].maps.panels
+    bins = bins or configs[0].maps.bins or DEFAULT_BINS
+    half = max(config.detector.width for config in configs) / 2  # of the largest detector
+    edges = np.linspace(-half, half, bins + 1)
+    grid = DetectorMap.from_array(np.ones((bins, bins)), edges, edges)
+    rows = {}
+    with replace_file(path) as target, h5py.File(target, "w") as file:
+        file.attrs["made_by"] = f"apt_evap {__version__}"
+        file.attrs["sweep"] = sweep.folder.name
+        shape = len(keys), len(panels), bins, bins
+        counts = file.create_dataset("maps", shape, np.int32, chunks=(1, 1, bins, bins), compression="gzip")
+        counts.attrs["long_name"] = "hits per bin"
+        ions = np.zeros(len(keys), np.int64)
+        for row, key in enumerate(keys):
+            run = load(sweep.folder_of(key) / RUN)
+            ions[row] = len(run)
+            for column, panel in enumerate(panels):
+                hits = run.hits(panel.perturbation)
+                counts[row, column] = hits.map(like=grid, quantum=None).values if hits.detected.any() else 0
+            systems = run.provenance.get("systems") or [{}]
+            rows[key] = {
+                "ions": len(run),
+                "ended": run.ended or "as planned",
+                "version": run.provenance.get("version", ""),
+                "created": run.provenance.get("created", ""),
+                "processor": "; ".join(dict.fromkeys(each.get("processor", "") for each in systems)),
+                "fingerprint": run.fingerprint(),
+            }
+        centres = (edges[1:] + edges[:-1]) / 2
+        # dimensions are scales of their own name, as in netCDF-4
+        _put(file, "point", np.arange(len(keys)))
+        _put(file, "perturbation", [json.dumps(to_dict(panel.perturbation)) for panel in panels])
+        for axis in ("y", "x"):
+            _put(file, axis, centres, "mm")
+        for axis, name in enumerate(("point", "perturbation", "y", "x")):
+            file[name].make_scale(name)
+            counts.dims[axis].attach_scale(file[name])
+        for axis in ("x", "y"):
+            _put(file, f"{axis}_edges", edges, "mm").make_scale(f"{axis}_edges")
+        _put(file, "title", [panel.title for panel in panels]).dims[0].attach_scale(file["perturbation"])
+        columns = {"key": keys, "ions": ions}
+        for path_of_setting in sweep.paths:
+            values = [sweep.value(points[key], path_of_setting) for key in keys]
+            columns[path_of_setting.replace(".", "_")] = _column(values)
+        for name, values in columns.items():
+            _put(file, name, values).dims[0].attach_scale(file["point"])
+    return rows
+
+
+def _column(values):
+    """Values of a setting: numbers if all are, otherwise text."""
+    if all(isinstance(value, int | float) and not isinstance(value, bool) for value in values):
+        return np.array(values, float)
+    return [csv_value(value) for value in values]
+
+
+def _put(file, name, values, units=None):
+    is_text = isinstance(values, list)
+    values = np.array(values, dtype=object) if is_text else values
+    dataset = file.create_dataset(name, data=values, dtype=h5py.string_dtype() if is_text else None)
+    if units:
+        dataset.attrs["units"] = units
+    return dataset
+
+
+def _compare(sweep: Sweep, keys: list[str]) -> TipFit:
+    """Compare the runs of points with the measured map; write the tables."""
+    settings: Any = sweep.compare
+    fit = fit_tips(
+        {key: sweep.folder_of(key) / RUN for key in keys}, settings.read(), progress=False, **settings.options
+    )
+    points = {point.key: point for point in sweep.points}
+    text = io.StringIO()
+    table, rows = csv.writer(text, lineterminator="\n"), fit.rows()
+    table.writerow(["key", *sweep.paths, *list(rows[0])[1:]])
+    for row in rows:
+        values = [csv_value(sweep.value(points[row["run"]], path)) for path in sweep.paths]
+        table.writerow([row["run"], *values, *(_cell(value) for value in list(row.values())[1:])])
+    _replace(sweep.folder / FIT_TABLE, text.getvalue())
+    content = {
+        "made_by": f"apt_evap {__version__}",
+        "compare": settings.to_dict() | {"sha256": settings.sha256()},
+        "best": fit.best,
+        "settings_of_best": points[fit.best].values,
+        "failed": fit.failed,
+        "table": rows,
+        "studies": {key: study.to_dict() for key, study in fit.studies.items()},
+    }
+    _replace(sweep.folder / FIT, json.dumps(content, indent=1, allow_nan=False) + "\n")
+    return fit
+
+
+def _cell(value):
+    return "" if value is None else f"{value:.6g}" if isinstance(value, float) else value
+
+
+def _replace(path: Path, text: str) -> None:
+    with replace_file(path) as file:
+        file.write(text.encode())

@@ -1,0 +1,76 @@
+"""Memory and hours that the run of a point needs, before it starts."""
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from apt_evap._common.memory import copied_memory, needed_memory
+from apt_evap.config.simulation_file import Config
+from apt_evap.specimen.tip import foreseen_atoms
+
+# Measured: resident memory of the program before a specimen is built, and after its pictures are drawn, 126 to 140 MB
+# for R = 8, 12, 20 and 30 a.
+_PROGRAM = 1.4e8  # bytes
+_BYTES_PER_ION = 500  # measured: peak memory with 12,000 and 2,000 ions (R = 20 a, both responses)
+# Milliseconds per ion of one thread, and their increase per factor e in the number of surface atoms: fits to the table
+# of speeds in docs/accuracy_and_speed.rst within 7 %, from R = 20 to 120 a, times 2 for a slower or busy processor.
+_REFERENCE = 21_591  # surface atoms
+_WITH_RESPONSES = 2 * 1.34, 2 * 0.51
+_ONE_FLIGHT = 2 * 0.32, 2 * 0.10
+_LEAST = 0.3  # [ms], of small tips
+_START = 2 * 3e-5  # seconds per surface atom, from the same table
+_START_OF_PROGRAM = 3.0  # seconds, with the pictures of the maps
+
+
+@dataclass(frozen=True)
+class Foresight:
+    """What a run needs.
+
+    Parameters
+    ----------
+    ions : int
+        Requested number.
+    atoms, surface_atoms : float or None
+        Approximate numbers; None if the specimen is not a tip of this package's own shape.
+    memory : float or None
+        Peak memory [bytes], within about 30 %.
+    hours : float or None
+        Time of one thread [h], within a factor of 3; finished points correct it (`status`).
+    """
+
+    ions: int
+    atoms: float | None
+    surface_atoms: float | None
+    memory: float | None
+    hours: float | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the numbers, dict."""
+        return asdict(self)
+
+
+def foresee(config: Config, threads: int) -> Foresight:
+    """Foresee what the run of a file of settings needs.
+
+    Parameters
+    ----------
+    config : Config
+        The settings.
+    threads : int
+        Threads of the run.
+
+    Returns
+    -------
+    Foresight
+    """
+    try:
+        atoms, surface = foreseen_atoms(**config.tip)
+    except TypeError:  # a specimen without apex_radius
+        return Foresight(config.n_ions, None, None, None, None)
+    memory = _PROGRAM + needed_memory(atoms, surface) + copied_memory(surface, threads)
+    memory += _BYTES_PER_ION * config.n_ions
+    flights = max(1, len(config.emissions))
+    base, slope = _WITH_RESPONSES if config.responses else (flights * value for value in _ONE_FLIGHT)
+    per_ion = max(_LEAST, base + slope * math.log(surface / _REFERENCE))
+    seconds = _START_OF_PROGRAM + _START * surface + 1e-3 * per_ion * config.n_ions
+    return Foresight(config.n_ions, atoms, surface, memory, seconds / 3600)
