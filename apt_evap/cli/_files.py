@@ -57,7 +57,7 @@ def in_real_units(run: Run, options: argparse.Namespace) -> Run:
     return run.at_evaporation_field(options.real_units)
 
 
-_SELECTING = ("ions", "mass", "voltage", "circle", "ranges", "species")
+_SELECTING = ("ions", "mass", "voltage", "circle", "box", "ranges", "species")
 
 
 def selects(options: argparse.Namespace) -> bool:
@@ -74,6 +74,7 @@ def select(hits: Hits, options: argparse.Namespace) -> Hits:
         "mass": lambda hits, bounds: hits.window(mass_to_charge=bounds),
         "voltage": lambda hits, bounds: hits.window(voltage=bounds),
         "circle": lambda hits, circle: hits.within_circle(*circle),
+        "box": lambda hits, box: hits.window(x=box[:2], y=box[2:]),
         "species": lambda hits, names: read_ranges(options.ranges).select(hits, *names.split(",")),
     }
     selection = hits

@@ -39,7 +39,7 @@ def execute(options: argparse.Namespace) -> int:
 def _compare(options, messages):
     folder = check_path(options.output or f"{Path(options.file).stem}_study")
     _check_folder(folder, options.force)
-    registration = None if options.registration is None else _registration(options.registration)
+    registration = None if options.registration is None else read_registration(options.registration)
     measured = _measured(options)
     run = load(options.run)
     if run.responses is None:
@@ -73,7 +73,7 @@ def _compare(options, messages):
 # ---- input ---------------------------------------------------------------------------------------------------------
 
 
-def _registration(text):
+def read_registration(text: str) -> Registration:
     """Registration from a file (of a registration or a study), or from numbers."""
     parts = text.split(",")
     try:

@@ -24,6 +24,7 @@ from apt_evap.cli._files import (
 from apt_evap.cli._output import tell, tell_json
 from apt_evap.config.map_panels import MapSettings, Panel, read_maps
 from apt_evap.config.perturbation_text import read_perturbation, title_of
+from apt_evap.detection.binning import bins_for
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.perturbations import Unperturbed
@@ -56,7 +57,7 @@ def execute(options: argparse.Namespace) -> int:
         check_columns(content, options)
         selection = select(content, options)
         check_places(selection, options)
-        map = selection.map(options.bins or _bins_for(np.count_nonzero(selection.detected)))
+        map = selection.map(options.bins or bins_for(int(selection.detected.sum())))
         part = f", {len(selection):,} of {len(content):,} ions" if selects(options) else ""
         maps = [_smooth(map, options.smooth)], [f"{Path(options.file).name}{part}"]
     save_picture(picture, *maps)
@@ -112,7 +113,7 @@ def run_maps(
 ) -> tuple[list[DetectorMap], list[str]]:
     """Maps of the complete detector, for all ions or a selection, and their titles."""
     half = run.detector.width / 2
-    bins = settings.bins or _bins_for(len(run))
+    bins = settings.bins or bins_for(len(run))
     maps = [
         choose(run.hits(panel.perturbation)).map(
             bins,
@@ -127,11 +128,6 @@ def run_maps(
 
 def _bins_of(detector_map):
     return " x ".join(map(str, detector_map.values.shape[::-1]))
-
-
-def _bins_for(ions):
-    """Bins along a side: the power of 2 from 32 to 256 that is closest to one ion per bin."""
-    return int(2 ** np.clip(np.rint(np.log2(max(ions, 1)) / 2), 5, 8))
 
 
 def _smooth(detector_map, sigma):

@@ -37,6 +37,7 @@ from a simulation to its map, and to the emission energies of a measured map:
                                                      positions in the specimen from the hits
   apt-evap examples --to FOLDER                      settings files and scripts to start from
   apt-evap sweep plan study.toml                     many simulations, on one machine or a cluster
+  apt-evap explore ni111.h5 R5083.epos               both maps in the browser, with sliders for the emission
   apt-evap COMMAND --help                            all arguments of a command, with examples
 """
 
@@ -70,6 +71,7 @@ def make_parser() -> argparse.ArgumentParser:
         _add_examples,
         _add_completion,
         _add_sweep,
+        _add_explore,
     ):
         add(commands)
     return parser
@@ -402,6 +404,37 @@ def _add_sweep(commands: Any) -> None:
     _add_speech(gather)
 
 
+def _add_explore(commands: Any) -> None:
+    command = commands.add_parser(
+        "explore",
+        help="maps of a run in the browser, with sliders for the emission",
+        description="Show the map of a run in the browser, with sliders for the emission, beside a measured map.\n"
+        "Needs the extra of the package: pip install 'apt_evap[explore]'. The page is served to this machine only,\n"
+        "under an address that is printed. Ctrl-C ends the explorer. On the page, a button copies a command or Python\n"
+        "lines that give the same maps.",
+        epilog="example:\n"
+        "  apt-evap explore ni111.h5\n"
+        "  apt-evap explore ni111.h5 R5083.epos --mass 27,29 --registration R5083_study/study.json",
+        **_SHAPE,
+    )
+    command.add_argument("run", metavar="RUN.h5", help="a run with responses")
+    command.add_argument("file", metavar="MEASURED", nargs="?", help="measured ions (.epos, ...) or a map (.npz)")
+    command.add_argument(
+        "--registration",
+        metavar="R",
+        help="a JSON file (such as study.json) or ROTATION,SCALE,DX,DY[,mirror] in degrees and mm; default: automatic",
+    )
+    command.add_argument("--perturbation", metavar="P", help="at the start, as for map; default: RollUp:0.155,0.155")
+    command.add_argument("--bins", type=_integer(11, MAX_BINS), metavar="N", help="bins along the longer side")
+    command.add_argument("--smooth", type=_number("mm"), metavar="MM", help="sigma of a Gaussian; default: one bin")
+    command.add_argument("--flatten", type=_number("mm"), metavar="MM", help="sigma for flattening; default: none")
+    command.add_argument("--simulated", type=_bounds, metavar="FIRST,LAST", help="ions of the run; default: all")
+    command.add_argument("--port", type=_integer(0, 65535), default=0, metavar="N", help="default: a free one")
+    command.add_argument("--no-browser", dest="browser", action="store_false", help="only print the address")
+    _add_real_units(command)
+    _add_reading(command)
+
+
 # ---- arguments of several commands -----------------------------------------------------------------------------------
 
 _FILE_HELP = "a run (.h5), measured ions (.epos, ...) or a map (.npz)"
@@ -422,6 +455,7 @@ def _add_reading(parser: argparse.ArgumentParser) -> Any:
         "--ions", type=_bounds, metavar="FIRST,LAST", help="in the order of the file, from 0; LAST is not included"
     )
     selection.add_argument("--circle", type=_circle, metavar="R[,X,Y]", help="radius and centre on the detector [mm]")
+    selection.add_argument("--box", type=_box, metavar="X0,X1,Y0,Y1", help="rectangle on the detector [mm]")
     selection.add_argument("--ranges", metavar="FILE.rrng", help="or .rng, .env: ranges of mass, for --species")
     selection.add_argument("--species", metavar="NAME[,NAME]", help="ions in the ranges of these names, such as Si")
     return group
@@ -510,3 +544,14 @@ def _circle(text: str) -> tuple[float, tuple[float, ...]]:
     except ValueError:
         raise argparse.ArgumentTypeError(f"must be a radius, or R,X,Y, such as 15,0,-2 [mm], got {text!r}") from None
     return radius, tuple(centre) or (0.0, 0.0)
+
+
+def _box(text: str) -> tuple[float, ...]:
+    """Bounds of a rectangle in x and in y."""
+    try:
+        left, right, lower, upper = (float(part) for part in text.split(","))
+        if not (left < right and lower < upper and all(map(isfinite, (left, right, lower, upper)))):
+            raise ValueError
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be X0,X1,Y0,Y1, such as -5,5,0,8 [mm], got {text!r}") from None
+    return left, right, lower, upper

@@ -1,13 +1,15 @@
 """Perturbations from a table or from text such as RollUp:0.155,0.155."""
 
+import json
 import tomllib
 from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
 from typing import Any
 
 from apt_evap._common.validation import short_text
 from apt_evap.config.tables import check_table
 from apt_evap.emission.energies import Fixed, Thermal, TruncatedNormal
-from apt_evap.emission.perturbations import Perturbation, from_dict
+from apt_evap.emission.perturbations import Perturbation, from_dict, to_dict
 
 
 def read_perturbation(settings: str | Mapping[str, Any]) -> Perturbation:
@@ -62,6 +64,68 @@ def _perturbation_table(text):
         raise ValueError(f"{name} takes {expected}{' and the roll-up fraction' if fraction else ''}, got {numbers!r}")
     normal = dict(zip(("name", "mean", "standard_deviation"), ("TruncatedNormal", *values), strict=False))
     return {"name": name, "energy": values[0] if len(values) == 1 else normal, **fraction}
+
+
+def write_perturbation(perturbation: Perturbation) -> str:
+    """Text of a built-in perturbation that `read_perturbation` reads.
+
+    Parameters
+    ----------
+    perturbation : perturbation
+        With any of the built-in energy distributions.
+
+    Returns
+    -------
+    str
+        The short form, such as ``"RollUp:0.155,0.155"``, or a table in TOML syntax.
+
+    Raises
+    ------
+    ValueError
+        If the perturbation is not a built-in one.
+    """
+    settings = to_dict(perturbation)
+    numbers = list(_numbers_of(settings))
+    short = ":".join([settings["name"], ",".join(map(repr, numbers))] if numbers else [settings["name"]])
+    for text in (short, _toml(settings)):
+        try:
+            if read_perturbation(text) == perturbation:
+                return text
+        except ValueError:
+            continue
+    raise ValueError(f"perturbation must be a built-in one such as RollUp(0.2), got {short_text(perturbation)}")
+
+
+def _numbers_of(settings):
+    """Numbers of a table in the order of its keys, those of inner tables included."""
+    for value in settings.values():
+        if isinstance(value, Mapping):
+            yield from _numbers_of(value)
+        elif isinstance(value, float):
+            yield value
+
+
+def _toml(value):
+    """Value in TOML syntax; tables are inline, None is left out."""
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items() if item is not None) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    return json.dumps(value)  # text, numbers and booleans are the same in both
+
+
+def python_of(value: Any) -> str:
+    """Python expression of a built-in perturbation or distribution, with the package as ``ae`` (str)."""
+    if not is_dataclass(value):
+        return repr(value)
+    parts, by_name = [], False
+    for each in fields(value):
+        content = getattr(value, each.name)
+        by_name = by_name or bool(each.kw_only) or content == each.default
+        if content != each.default:
+            text = python_of(content.energy if isinstance(content, Fixed) else content)
+            parts.append(f"{each.name}={text}" if by_name else text)
+    return f"ae.{type(value).__name__}({', '.join(parts)})"
 
 
 def title_of(perturbation: Any) -> str:

@@ -153,6 +153,11 @@ def bin_edges(
     return tuple(edges)
 
 
+def bins_for(ions: int) -> int:
+    """Bins along a side: the power of 2 from 32 to 256 that is closest to one ion per bin."""
+    return int(2 ** np.clip(np.rint(np.log2(max(ions, 1)) / 2), 5, 8))
+
+
 def _cover(low, high, size):
     number = max(1, int(np.ceil((high - low) / size - 1e-9)))
     edges = low + size * np.arange(number + 1)

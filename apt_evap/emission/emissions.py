@@ -8,6 +8,7 @@ import numpy as np
 
 from apt_evap._common.types import Booleans, Floats
 from apt_evap._common.validation import check_array, check_number
+from apt_evap.emission.ion_random import IonRandom
 from apt_evap.units import FLIGHT_TIME
 
 COLUMNS = ("positions", "normals", "neighbours", "charge_states", "masses", "ions")
@@ -103,6 +104,10 @@ class Emissions:
         """Join batches in their order."""
         columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in parts[0].columns}
         return cls(**columns, nearest_neighbour_distance=parts[0].nearest_neighbour_distance)
+
+    def random(self, seed: int) -> IonRandom:
+        """Random numbers of these ions for a seed, from the first column on."""
+        return IonRandom(seed, self.ions)
 
     @property
     def columns(self) -> tuple[str, ...]:

@@ -8,6 +8,7 @@ from apt_evap._common.types import Booleans, Floats
 from apt_evap._common.validation import check_array
 from apt_evap._core.elementary import exponential
 from apt_evap.emission.emissions import Emissions, Launches
+from apt_evap.emission.kept import kept
 
 
 def tangent_frame(normals: ArrayLike) -> tuple[Floats, Floats]:
@@ -39,6 +40,7 @@ def tangent_frame(normals: ArrayLike) -> tuple[Floats, Floats]:
     return first, np.stack([b, sign + y * y * a, -y], axis=1)
 
 
+@kept
 def rollup_direction(emissions: Emissions, shares: Floats | None = None) -> tuple[Booleans, Floats, Floats]:
     """Ions that can roll up, and the direction of their roll-up.
 
@@ -88,6 +90,7 @@ def rolled_positions(emissions: Emissions) -> Floats:
     return emissions.neighbours + distances[:, None] * emissions.normals
 
 
+@kept
 def target_shares(emissions: Emissions, sharpness: float) -> Floats:
     r"""Shares of the three strongest surface nearest neighbours in the place onto which an atom rolls.
 

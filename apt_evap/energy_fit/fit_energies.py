@@ -251,8 +251,25 @@ def _replicas(measured, run):
     return int(np.clip(np.ceil(number), FEWEST, MOST))
 
 
-def measured_map(measured: Hits | DetectorMap, bins: int | None) -> DetectorMap:
-    """Measured map, with about the requested number of bins along the longer side; ValueError if it has no bin."""
+def measured_map(measured: Hits | DetectorMap, bins: int | None = None) -> DetectorMap:
+    """Measured map, with about the requested number of bins along the longer side.
+
+    Parameters
+    ----------
+    measured : Hits or DetectorMap
+        Measured ions, or a map, whose bins are merged by an integer factor.
+    bins : int, optional
+        Number of bins, at least 11; by default 128 for ions, and those of a map.
+
+    Returns
+    -------
+    DetectorMap
+
+    Raises
+    ------
+    ValueError
+        If the number is too small or leaves no bin.
+    """
     if bins is not None:
         bins = check_count(bins, "bins", at_least=2 * WINDOW + 1)
     if isinstance(measured, Hits):

@@ -284,7 +284,7 @@ class ResponseModel:
                 f"({limit:.3g} eV): their hits are extrapolated; run with a larger energy_limit (ResponseSettings, or "
                 "[responses] in a settings file)",
                 ResponseWarning,
-                stacklevel=3,
+                stacklevel=4,
             )
         values = np.empty((len(velocities), 3))
         for design, coefficients, mask in (

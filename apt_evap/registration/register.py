@@ -150,6 +150,10 @@ class Registration:
         plain.update(shift=list(self.shift), ties=[tie.to_dict() for tie in self.ties], doubtful=bool(self.doubtful))
         return {name: None if value != value else value for name, value in plain.items()}
 
+    def to_text(self) -> str:
+        """Return the transform as ``--registration`` takes it: ROTATION,SCALE,DX,DY[,mirror] (str)."""
+        return ",".join([*map(repr, (self.rotation, self.scale, *self.shift)), *(["mirror"] if self.mirror else [])])
+
     @classmethod
     def from_dict(cls, settings: dict[str, Any]) -> "Registration":
         """Rebuild a registration from the result of `to_dict`.

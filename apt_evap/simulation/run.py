@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, overload
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apt_evap._common.files import FileError, check_path
 from apt_evap._common.types import AnyPath, Booleans, Floats, Integers
@@ -27,7 +28,6 @@ from apt_evap.detection.hits import Hits, Outcome
 from apt_evap.detection.instrument import Instrument
 from apt_evap.detection.timing import Timing
 from apt_evap.emission.emissions import Emissions, TangentialLaunches
-from apt_evap.emission.ion_random import IonRandom
 from apt_evap.emission.perturbations import Perturbation, Unperturbed
 from apt_evap.emission.post_ionisation import PostIonisation
 from apt_evap.evaporation.state import EmitterState
@@ -286,11 +286,39 @@ class Run:
             If the perturbation was not flown and cannot be evaluated from the responses.
         """
         check_switch(by_response, "by_response")
+        directions, times = self._landed(perturbation, by_response)
+        return self._hits(directions, times, perturbation)
+
+    def places(self, perturbation: Perturbation) -> tuple[Floats, Floats, NDArray[np.int8]]:
+        """Positions of the hits alone, the same as those of `hits`.
+
+        Parameters
+        ----------
+        perturbation : perturbation
+            As for `hits`.
+
+        Returns
+        -------
+        x, y : ndarray, shape (n,)
+            Detector coordinates [mm].
+        outcome : ndarray of int8, shape (n,)
+            `Outcome` of each ion.
+
+        Raises
+        ------
+        ValueError
+            As for `hits`.
+        """
+        x, y, _, outcome = self.detector.impacts(*self._landed(perturbation, False))
+        return x, y, outcome
+
+    def _landed(self, perturbation, by_response):
+        """Stereographic directions (n, 2) and times of flight (n,) for a perturbation."""
         for flown_as, flown in zip(self.perturbations, self.flown, strict=True):
             known = flown_as == perturbation or flown_as == described(perturbation)  # by name and repr in a file
             # the energies of flights were those at the simulated voltage
             if known and not by_response and (self.real is None or perturbation == Unperturbed()):
-                return self._hits(flown.directions, flown.times, perturbation)
+                return flown.directions, flown.times
         if not callable(getattr(perturbation, "tangential", None)):
             check_kind(perturbation, "perturbation", "launch", "a perturbation such as Unperturbed() or RollUp(0.2)")
             raise ValueError(
@@ -300,14 +328,13 @@ class Run:
         if self.responses is None:
             raise ValueError(f"this run has no responses and {short_text(perturbation)} was not flown in it")
         emissions = self.emissions
-        launches = TangentialLaunches(*perturbation.tangential(emissions, IonRandom(self.seed, emissions.ions)))  # type: ignore[attr-defined]
+        launches = TangentialLaunches(*perturbation.tangential(emissions, emissions.random(self.seed)))  # type: ignore[attr-defined]
         scale = 1.0
         if self.real is not None and len(self):
             scales = self.energy_scales
             scale, factors = float(np.median(scales)), np.sqrt(scales)
             launches = launches._replace(first=launches.first * factors, second=launches.second * factors)
-        landed = self.response_model.evaluate(self.responses, launches, emissions.masses, scale)
-        return self._hits(*landed, perturbation)
+        return self.response_model.evaluate(self.responses, launches, emissions.masses, scale)
 
     def _hits(self, directions, times, perturbation):
         emissions, columns, units = self.emissions, {}, {"charge": "e", "field": "V/nm"}

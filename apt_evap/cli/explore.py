@@ -1,0 +1,187 @@
+"""`apt-evap explore`: maps of a run in the browser, for any emission, beside a measured map."""
+
+import argparse
+import contextlib
+import os
+import sys
+import tempfile
+import webbrowser
+from collections.abc import Iterator
+from html import escape
+
+from apt_evap._common.optional_imports import optional_import
+from apt_evap.cli._files import check_columns, check_places, in_real_units, read, select
+from apt_evap.cli._output import put, say
+from apt_evap.cli.compare import read_registration
+from apt_evap.config.perturbation_text import read_perturbation
+from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.explore.controls import values_of
+from apt_evap.explore.explorer import Explorer, View
+from apt_evap.simulation.run import Run, load
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Run the command: serve the page until Ctrl-C."""
+    try:
+        optional_import("bokeh.server.server", "explore")
+    except ImportError as error:
+        raise ValueError("explore needs bokeh, which is not installed: pip install 'apt_evap[explore]'") from error
+    from apt_evap.explore.page import serve  # the only module that needs Bokeh
+
+    explorer, view = explorer_and_view(options)
+    server, url = serve(explorer, view, port=options.port, registration_of=read_registration)
+    put(url)
+    say("note", "open this address in a browser on this machine; Ctrl-C ends the explorer")
+    with _opened(url) if options.browser else contextlib.nullcontext(), contextlib.suppress(KeyboardInterrupt):
+        server.io_loop.start()
+    return 0
+
+
+def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer, View]:
+    """Explorer of the files of the command, and the view of its options.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+        Parsed arguments.
+
+    Returns
+    -------
+    explorer : Explorer
+    view : View
+
+    Raises
+    ------
+    ValueError
+        If an option or a file is invalid.
+    """
+    run = load(options.run)
+    if run.responses is None:
+        raise ValueError(f"{options.run!r} has no responses: repeat the run with responses = true in [simulation]")
+    run = in_real_units(run, options)
+    measured = None if options.file is None else _measured(options)
+    registration = None
+    if options.registration is not None:
+        if measured is None:
+            raise ValueError("--registration needs MEASURED")
+        registration = read_registration(options.registration)
+    perturbation = None if options.perturbation is None else read_perturbation(options.perturbation)
+    if perturbation is not None:
+        values_of(perturbation)  # checked before a long registration
+    if measured is not None and registration is None:
+        say("note", "registering the maps, which takes up to some minutes; --registration sets a known registration")
+    run_code = f"ae.load({options.run!r})"
+    if options.real_units is not None:
+        run_code += f".at_evaporation_field({options.real_units!r})"
+    explorer = Explorer(
+        run,
+        measured,
+        registration,
+        run_code=run_code,
+        measured_code="None" if options.file is None else _measured_code(options),
+        run_arguments=[options.run] + ([f"--real-units={options.real_units}"] if options.real_units else []),
+        measured_arguments=[] if options.file is None else _measured_arguments(options),
+    )
+    start = explorer.start
+    bins = options.bins or start.bins
+    view = View(
+        perturbation=perturbation or start.perturbation,
+        bins=bins,
+        smoothing=explorer.smoothing_for(bins) if options.smooth is None else options.smooth,
+        flattening=options.flatten or 0.0,
+        ions=_ions(options, explorer),
+    )
+    return explorer, view
+
+
+def _ions(options, explorer):
+    """First and last ion of `--simulated` within those of the run, None for all."""
+    if options.simulated is None:
+        return None
+    every = explorer.first_and_last
+    first, last = (end if bound is None else int(bound) for bound, end in zip(options.simulated, every, strict=True))
+    first, last = max(first, every[0]), min(last, every[1])
+    if first >= last:
+        raise ValueError(f"--simulated selects none of the ions {every[0]} to {every[1]} of {options.run!r}")
+    return first, last
+
+
+def _measured(options):
+    content = read(options)
+    if isinstance(content, Run):
+        raise ValueError(f"MEASURED must be measured ions or a map, {options.file!r} is a run")
+    if isinstance(content, DetectorMap):
+        return content
+    check_columns(content, options)
+    selection = select(content, options)
+    check_places(selection, options)
+    return selection
+
+
+# ---- the same in text ----------------------------------------------------------------------------------------------
+
+_READING = ("format", "byte_order", "arrays", "unit")
+_SELECTION = {"ions": "ion", "mass": "mass_to_charge", "voltage": "voltage"}
+
+
+def _measured_arguments(options):
+    """Arguments that name MEASURED, its reading and the selection of its ions."""
+    arguments = [options.file]
+    for name in (*_READING, "ranges", "species"):
+        if (value := getattr(options, name)) is not None:
+            arguments += [f"--{name.replace('_', '-')}={value}"]
+    if options.partial:
+        arguments += ["--partial"]
+    for name in _SELECTION:
+        if (value := getattr(options, name)) is not None:
+            arguments += [f"--{name}={','.join('' if bound is None else repr(bound) for bound in value)}"]
+    if options.circle is not None:
+        radius, centre = options.circle
+        arguments += [f"--circle={','.join(map(repr, (radius, *centre)))}"]
+    if options.box is not None:
+        arguments += [f"--box={','.join(map(repr, options.box))}"]
+    return arguments
+
+
+def _measured_code(options):
+    """Python expression that reads MEASURED."""
+    if options.file.lower().endswith(".npz") or (options.format or "").lstrip(".").lower() == "npz":
+        names = zip(("values", "x_edges", "y_edges", "mask"), (options.arrays or "").split(","), strict=False)
+        parameters = {name: value for name, value in names if value} | ({"unit": options.unit} if options.unit else {})
+        return f"ae.read_map({_call(options.file, parameters)})"
+    parameters = {
+        name: getattr(options, name) for name in ("format", "partial", "byte_order") if getattr(options, name)
+    }
+    code = f"ae.read({_call(options.file, parameters)})"
+    for name, column in _SELECTION.items():
+        if (bounds := getattr(options, name)) is not None:
+            code += f".window({column}={bounds!r})"
+    if options.circle is not None:
+        code += f".within_circle({options.circle[0]!r}, {options.circle[1]!r})"
+    if options.box is not None:
+        code += f".window(x={options.box[:2]!r}, y={options.box[2:]!r})"
+    if options.species is not None:
+        names = ", ".join(map(repr, options.species.split(",")))
+        code = f"ae.read_ranges({options.ranges!r}).select({code}, {names})"
+    return code
+
+
+def _call(path, parameters):
+    return ", ".join([repr(path), *(f"{name}={value!r}" for name, value in parameters.items())])
+
+
+@contextlib.contextmanager
+def _opened(url: str) -> Iterator[None]:
+    """Open the page in a graphical browser, if there is one.
+
+    The browser gets a file that leads to the page. The address itself would be in the list of processes, where other
+    users of this machine could read it.
+    """
+    if sys.platform != "darwin" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        yield
+        return
+    with tempfile.NamedTemporaryFile("w", suffix=".html") as file:  # readable by its owner only
+        file.write(f'<meta charset="utf-8"><meta http-equiv="refresh" content="0; url={escape(url)}">')
+        file.flush()
+        webbrowser.open(f"file://{file.name}")
+        yield

@@ -1,0 +1,149 @@
+"""Mechanisms of emission and their parameters, as controls of the explorer. All controls follow from these tables."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+from apt_evap._common.validation import check_choice, short_text
+from apt_evap.emission.energies import Fixed, TruncatedNormal
+from apt_evap.emission.perturbations import Combined, LateralVelocity, Perturbation, RollUp, Unperturbed
+
+MECHANISMS = {"unperturbed": Unperturbed, "lateral": LateralVelocity, "roll-up": RollUp, "combined": Combined}
+"""Perturbation of each mechanism; the last three names are those of `fit_energies`."""
+
+
+@dataclass(frozen=True)
+class Control:
+    """Slider for one number of a perturbation.
+
+    Parameters
+    ----------
+    name : str
+        Field of the perturbation, or one of `ENERGY`.
+    title : str
+        Title with unit.
+    low, high, step : float
+        Range and step.
+    value : float
+        Value at the start.
+    """
+
+    name: str
+    title: str
+    low: float
+    high: float
+    step: float
+    value: float
+
+
+CONTROLS = (
+    # the grid of the paper ends at 0.3725 eV; for the README's tip in real units that is 0.87 eV
+    Control("mean", "mean energy [eV]", 0.0, 1.0, 0.005, 0.155),
+    Control("rsd", "standard deviation / mean", 0.0, 3.2, 0.05, 1.0),
+    Control("rollup_fraction", "roll-up fraction of the energy", 0.0, 1.0, 0.05, 0.5),
+    Control("probability", "probability of a roll-up", 0.0, 1.0, 0.05, 1.0),
+    Control("sharpness", "sharpness of the target", 0.0, 1.0, 0.01, 0.0),
+    Control("height", "launch height [nm]", 0.0, 0.2, 0.005, 0.0),
+)
+"""Sliders for the emission. A mechanism has those that are fields of its perturbation; an energy has two."""
+
+ENERGY = ("mean", "rsd")
+"""Controls of an energy: mean [eV], and standard deviation relative to it, both before the truncation."""
+
+_DIGITS = 9  # of a standard deviation: removes the rounding of the product, far below any step
+
+
+def controls_of(mechanism: str) -> tuple[Control, ...]:
+    """Controls of a mechanism.
+
+    Parameters
+    ----------
+    mechanism : str
+        One of `MECHANISMS`.
+
+    Returns
+    -------
+    tuple of Control
+
+    Raises
+    ------
+    ValueError
+        If the mechanism is unknown.
+    """
+    kind: Any = MECHANISMS[check_choice(mechanism, "mechanism", MECHANISMS)]
+    names = {each.name for each in fields(kind)}
+    return tuple(each for each in CONTROLS if each.name in names or (each.name in ENERGY and "energy" in names))
+
+
+def perturbation_of(mechanism: str, values: Mapping[str, float]) -> Perturbation:
+    """Perturbation of a mechanism for the values of its controls.
+
+    Parameters
+    ----------
+    mechanism : str
+        One of `MECHANISMS`.
+    values : mapping of str to float
+        Value of each control by name; others are ignored.
+
+    Returns
+    -------
+    perturbation
+        With equal energies for a relative standard deviation or a mean of 0, otherwise with a truncated normal
+        distribution.
+
+    Raises
+    ------
+    ValueError
+        If the mechanism is unknown, or a value is missing or outside its range.
+    """
+    names = [each.name for each in controls_of(mechanism)]
+    for name in names:
+        if name not in values:
+            raise ValueError(f"values must contain {name!r} for the mechanism {mechanism!r}, got {short_text(values)}")
+    options: dict[str, Any] = {name: values[name] for name in names if name not in ENERGY}
+    if ENERGY[0] in names:
+        mean, rsd = (values[name] for name in ENERGY)
+        options["energy"] = TruncatedNormal(mean, round(rsd * mean, _DIGITS)) if rsd * mean > 0 else Fixed(mean)
+    kind: Any = MECHANISMS[mechanism]
+    return kind(**options)
+
+
+def values_of(perturbation: Perturbation) -> tuple[str, dict[str, float]]:
+    """Mechanism of a perturbation, and the values of its controls.
+
+    Parameters
+    ----------
+    perturbation : perturbation
+        One of `MECHANISMS`, with a number or `TruncatedNormal` as energy.
+
+    Returns
+    -------
+    mechanism : str
+    values : dict of str to float
+
+    Raises
+    ------
+    ValueError
+        If the perturbation has no controls.
+    """
+    kinds = {kind: mechanism for mechanism, kind in MECHANISMS.items()}
+    if type(perturbation) not in kinds:
+        names = ", ".join(kind.__name__ for kind in kinds)
+        raise ValueError(f"the explorer has controls for {names}, got {short_text(perturbation)}")
+    mechanism = kinds[type(perturbation)]
+    values = {}
+    for each in controls_of(mechanism):
+        if each.name in ENERGY:
+            energy: Any = getattr(perturbation, "energy")  # noqa: B009  # a perturbation need not have one
+            if isinstance(energy, Fixed):
+                values |= {"mean": energy.energy, "rsd": 0.0}
+            elif isinstance(energy, TruncatedNormal) and energy.mean > 0:
+                values |= {"mean": energy.mean, "rsd": energy.standard_deviation / energy.mean}
+            else:
+                raise ValueError(
+                    "the explorer has controls for a number [eV] or a TruncatedNormal of mean > 0 as energy, "
+                    f"got {short_text(energy)}"
+                )
+        else:
+            values[each.name] = getattr(perturbation, each.name)
+    return mechanism, values

@@ -1,0 +1,170 @@
+"""The page of the explorer in a real browser: looked at, driven by keys and mouse, without any request off the machine.
+
+Run by ``pytest -m browser`` with playwright and a Chromium: Debian's chromium-headless-shell, or that of ``playwright
+install``. ``APT_EVAP_SCREENSHOTS=folder`` keeps the pictures.
+"""
+
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from urllib.error import HTTPError
+from urllib.request import urlopen
+
+import pytest
+from rough import ROUGH
+
+import apt_evap as ae
+
+pytest.importorskip("bokeh")
+playwright = pytest.importorskip("playwright.sync_api")
+pytestmark = pytest.mark.browser
+
+CHROMIUM = shutil.which("chromium-headless-shell")  # None: that of playwright
+PATIENCE = 60_000  # ms: the machine may be busy
+
+# the first image of the page, and what is written beside it
+WATCH = """() => {
+  const models = [...Bokeh.documents[0].all_models]
+  const maps = models.filter(m => m.type == "Figure" && ["simulated", "measured"].includes(m.title.text))
+  window.maps = maps
+  window.source = maps[0].renderers.find(r => r.glyph.type == "Image").data_source
+  window.written = () => models.filter(m => m.type == "Div").map(m => m.text).join(" ")
+  window.area = n => {
+    const view = Bokeh.index.find_one(maps[n])
+    const box = view.frame.bbox, own = view.el.getBoundingClientRect()
+    return [own.x + box.x0, own.y + box.y0, box.width, box.height]
+  }
+  window.mean = () => [...window.source.data.image[0]].filter(isFinite).reduce((a, b) => a + b * b)
+  window.model = title => models.find(m => m.title == title || m.label == title || m.title?.text == title)
+}"""
+
+
+@pytest.fixture(scope="module")
+def served(small_tip, made_once, tmp_path_factory):
+    """Address of `apt-evap explore`, started as a user does."""
+    folder = tmp_path_factory.mktemp("served")
+    run = made_once("explored", lambda: ae.Simulation(small_tip, seed=1, **ROUGH).run(2000, progress=False))
+    run.save(folder / "run.h5")
+    hits = replace(run, seed=2).hits(ae.RollUp(0.2))
+    ae.write(folder / "ions.epos", ae.Hits(x=hits.x, y=hits.y).within_circle(60.0))
+    code = "import sys; from apt_evap.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", code, "explore", "run.h5", "ions.epos", "--registration=0,1,0,0", "--no-browser"]
+    environment = os.environ | {"PYTHONPATH": str(Path(ae.__file__).parents[1])}
+    with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True, env=environment) as process:
+        try:
+            yield process.stdout.readline().strip()
+        finally:
+            process.terminate()
+    assert process.returncode == 0
+
+
+@pytest.fixture
+def page(served):
+    """The page, its requests and the errors of its console."""
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        context = browser.new_context(viewport={"width": 1400, "height": 1250})
+        context.grant_permissions(["clipboard-read", "clipboard-write"])
+        page = context.new_page()
+        page.set_default_timeout(PATIENCE)
+        page.requests, page.errors = [], []
+        page.on("request", lambda request: page.requests.append(request.url))
+        page.on("websocket", lambda socket: page.requests.append(socket.url))
+        page.on("console", lambda message: message.type == "error" and page.errors.append(message.text))
+        page.on("pageerror", lambda error: page.errors.append(str(error)))
+        page.goto(served)
+        page.wait_for_selector("canvas")
+        page.wait_for_function("window.Bokeh && Bokeh.documents.length && Bokeh.documents[0].is_idle")
+        page.evaluate(WATCH)
+        yield page
+        browser.close()
+
+
+def picture(page, name):
+    """Save a screenshot, if a folder is given."""
+    if folder := os.environ.get("APT_EVAP_SCREENSHOTS"):
+        page.screenshot(path=Path(folder) / f"{name}.png")
+
+
+def place(page, number, x, y):
+    """Point of a map at fractions of its width and height."""
+    left, top, width, height = page.evaluate(f"area({number})")
+    return left + x * width, top + y * height
+
+
+def drag(page, start, end):
+    page.mouse.move(*start)
+    page.mouse.down()
+    for step in range(1, 6):
+        page.mouse.move(*(a + (b - a) * step / 5 for a, b in zip(start, end, strict=True)))
+    page.mouse.up()
+
+
+def test_the_page_is_driven(page, served):
+    # keys move a slider, the map and what is written
+    page.wait_for_function("written().includes('rings')")
+    picture(page, "1_start")
+    before, text = page.evaluate("mean()"), page.evaluate("written()")
+    pixels = page.screenshot()
+    page.locator(".noUi-handle").first.focus()
+    for _ in range(10):
+        page.keyboard.press("ArrowRight")
+    page.wait_for_function("before => mean() != before && !written().includes('preview')", arg=before)
+    page.wait_for_function("text => written() != text", arg=text)
+    page.wait_for_function("model('mean energy [eV]').value > 0.2")
+    page.wait_for_timeout(500)  # the browser draws
+    assert page.screenshot() != pixels
+    picture(page, "2_keys")
+
+    # difference and blink
+    page.get_by_text("difference", exact=True).click()
+    page.wait_for_function("maps[1].title.text == 'simulated - measured'")
+    page.wait_for_timeout(500)
+    picture(page, "3_difference")
+    page.get_by_text("blink", exact=True).click()
+    page.wait_for_function("maps[0].title.text == 'measured'")
+    picture(page, "4_blink")
+    page.wait_for_function("maps[0].title.text == 'simulated'")
+    page.get_by_text("side by side", exact=True).click()
+    page.wait_for_function("maps[1].title.text == 'measured'")
+
+    # a click shows atoms of the specimen
+    page.mouse.click(*place(page, 0, 0.5, 0.4))
+    page.wait_for_function("model('radius of a click [mm]') && [...Bokeh.documents[0].all_models].some("
+                           "m => m.type == 'Title' && /atoms land within/.test(m.text))")  # fmt: skip
+    picture(page, "5_click")
+
+    # a line drawn by the mouse gives profiles
+    page.get_by_title("line for a profile").first.click()
+    drag(page, place(page, 0, 0.3, 0.3), place(page, 0, 0.7, 0.6))
+    page.wait_for_function("[...Bokeh.documents[0].all_models].some(m => m.type == 'ColumnDataSource' &&"
+                           " m.data.x?.length > 3 && m.data.y?.length > 3 && !m.data.image)")  # fmt: skip
+    page.wait_for_timeout(500)
+    picture(page, "6_profile")
+
+    # a rectangle gives a command, a button copies it
+    page.get_by_title("rectangle of ions").first.click()
+    drag(page, place(page, 0, 0.3, 0.3), place(page, 0, 0.6, 0.6))
+    page.wait_for_function("[...Bokeh.documents[0].all_models].some(m => /--box=/.test(m.text ?? ''))")
+    page.get_by_text("copy as command").click()
+    copied = page.evaluate("navigator.clipboard.readText()")
+    assert copied.startswith("apt-evap map ions.epos --box=")
+    picture(page, "7_rectangle")
+
+    # no request off the machine, and no error
+    assert page.errors == []
+    start = served.split("/?")[0]
+    assert len(page.requests) > 5
+    assert all(each.replace("ws://", "http://").startswith(start) for each in page.requests), page.requests
+    if folder := os.environ.get("APT_EVAP_SCREENSHOTS"):
+        Path(folder, "requests.txt").write_text("\n".join(page.requests))
+
+
+def test_only_the_address_opens_the_page(served):
+    for url in (served.split("?")[0], served[:-4] + "AAAA"):
+        with pytest.raises(HTTPError) as refused:
+            urlopen(url)
+        assert refused.value.code == 403

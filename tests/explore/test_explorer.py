@@ -1,0 +1,377 @@
+"""The numbers of the explorer: the same bits as those of the library, and text that gives them again."""
+
+import re
+import shlex
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rough import ROUGH
+
+import apt_evap as ae
+from apt_evap.cli.explore import explorer_and_view
+from apt_evap.cli.main import main
+from apt_evap.cli.parser import make_parser
+from apt_evap.explore.controls import MECHANISMS, controls_of, perturbation_of, values_of
+from apt_evap.explore.explorer import Explorer, View
+from apt_evap.explore.specimen_image import SIDES, specimen_image
+
+TURNED = ae.Registration(20.0, 0.5, (1.0, -2.0), True)
+ENERGY = ae.TruncatedNormal(0.2, 0.1)
+PERTURBATIONS = [
+    ae.Unperturbed(),
+    ae.LateralVelocity(ENERGY),
+    ae.RollUp(ENERGY),
+    ae.RollUp(0.3),
+    ae.Combined(ENERGY, 0.4),
+]
+
+
+@pytest.fixture(scope="module")
+def run(small_tip, made_once):
+    return made_once("explored", lambda: ae.Simulation(small_tip, seed=1, **ROUGH).run(2000, progress=False))
+
+
+@pytest.fixture(scope="module")
+def measured(run):
+    """Ions of the same run with other random numbers, turned and scaled."""
+    hits = TURNED.hits(replace(run, seed=2).hits(ae.RollUp(ENERGY)))
+    return ae.Hits(x=hits.x, y=hits.y, mass_to_charge=hits.mass_to_charge).within_circle(35.0)
+
+
+@pytest.fixture(scope="module")
+def explorer(run, measured):
+    return Explorer(run, measured, TURNED)
+
+
+def equal(first, second):
+    assert np.array_equal(first.values, second.values) and np.array_equal(first.mask, second.mask)
+    assert np.array_equal(first.x_edges, second.x_edges) and np.array_equal(first.y_edges, second.y_edges)
+    assert first.values.sum() > 300  # not two empty maps
+    return True
+
+
+@pytest.mark.parametrize("units", ["simulated", "cap"])
+@pytest.mark.parametrize("perturbation", PERTURBATIONS, ids=repr)
+def test_maps_have_the_bits_of_the_library(run, measured, perturbation, units):
+    run = run if units == "simulated" else run.at_evaporation_field(units)
+    explorer = Explorer(run, measured, TURNED)
+    view = View(perturbation, 24, 2.0, flattening=8.0)
+    for _ in range(2):  # also when everything is kept from the first time
+        shown = explorer.show(view)
+        like = explorer.bins_like(24)
+        map = TURNED.hits(run.hits(perturbation)).map(like=like)
+        assert equal(shown.simulated, map) and shown.measured is like
+        similarity = ae.ssim(map.flattened(8.0), like.flattened(8.0), smoothing=2.0)
+        assert shown.similarity.value == similarity.value
+        assert np.array_equal(shown.pictures[0].density, map.flattened(8.0).smoothed(2.0).density, equal_nan=True)
+        assert shown.ions == len(run) and not shown.preview
+        explorer.show(replace(view, perturbation=ae.Unperturbed()))
+    plain = explorer.show(replace(view, flattening=0.0))
+    assert plain.ceiling.value == ae.half_ceiling(like, smoothing=2.0).value
+
+
+def test_a_flown_perturbation_has_the_bits_of_its_flights(small_tip):
+    flown = ae.RollUp(ENERGY)
+    run = ae.Simulation(small_tip, seed=3, **ROUGH).run(1200, [flown], progress=False)
+    explorer = Explorer(run, preview=400)
+    shown = explorer.show(View(flown, 32, 0.0))
+    like = explorer.bins_like(32)
+    assert equal(shown.simulated, run.hits(flown).map(like=like))
+    assert not np.array_equal(explorer.hits(shown.view).x, run.hits(flown, by_response=True).x)
+    every = run.hits(flown)[::3]
+    assert np.array_equal(
+        explorer.show(View(flown, 32, 0.0), preview=True).simulated.values, every.map(like=like).values
+    )
+
+
+def test_the_region_is_inside_both_maps(run, measured, explorer):
+    like = explorer.bins_like(24)
+    complete = measured.map(24)
+    assert np.array_equal(like.values, complete.values)
+    assert 0 < like.mask.sum() <= complete.mask.sum() and not (like.mask & ~complete.mask).any()
+    away = Explorer(run, measured, replace(TURNED, scale=0.2, shift=(20.0, 0.0))).bins_like(24)
+    x = np.meshgrid(*away.centres)[0]
+    # smaller and moved to the right, the simulated ions cover the right part of the measured ones only
+    assert away.mask.sum() < like.mask.sum() and x[away.mask].mean() > x[like.mask].mean() + 5
+
+
+def test_ions_from_to(run, explorer):
+    view = View(ae.RollUp(ENERGY), 24, 0.0, ions=(500, 1700))
+    expected = TURNED.hits(run.hits(ae.RollUp(ENERGY))).window(ion=(500, 1700)).map(like=explorer.bins_like(24))
+    assert equal(explorer.show(view).simulated, expected)
+    assert explorer.show(view).ions == 1200
+    late = Explorer(replace(run, emissions=replace(run.emissions, ions=run.emissions.ions + 7000)))
+    assert late.first_and_last == (7000, 9000)
+    assert late.hits(replace(view, ions=(7500, 8000))).ion[[0, -1]].tolist() == [7500, 7999]
+
+
+def test_a_preview_is_every_nth_ion(run, measured):
+    explorer = Explorer(run, measured, TURNED, preview=500)
+    view = View(ae.Combined(ENERGY, 0.4), 24, 2.0)
+    shown = explorer.show(view, preview=True)
+    hits = TURNED.hits(run.hits(view.perturbation)[::4])
+    assert shown.preview and shown.ions == 500
+    assert np.array_equal(shown.simulated.values, hits.map(like=explorer.bins_like(24)).values)
+    assert not explorer.show(view).preview
+    assert not Explorer(run, preview=2000).show(replace(view, bins=32), preview=True).preview  # all of its ions
+
+
+def test_without_a_measurement_it_is_the_map_of_the_command_line(run, tmp_path, monkeypatch):
+    run.save(tmp_path / "run.h5")
+    monkeypatch.chdir(tmp_path)
+    explorer = Explorer(run, run_arguments=["run.h5"])
+    drawn = []
+    monkeypatch.setattr("apt_evap.cli.map.save_picture", lambda path, maps, titles: drawn.append(maps[0]))
+    for view in (explorer.start, View(ae.Combined(ENERGY, 0.4), 48, 3.5, ions=(100, 1500))):
+        words = shlex.split(explorer.commands(view).shell)
+        assert words[:2] == ["apt-evap", "map"]
+        assert main([*words[1:], "-o", "map.png", "--quiet"]) == 0
+        picture = explorer.show(view).pictures[0]
+        assert np.array_equal(drawn[-1].density, picture.density) and np.nanstd(picture.density) > 0.1
+    assert explorer.show(explorer.start).similarity is None
+
+
+def executed(python, **names):
+    """Names that Python lines leave."""
+    exec(python, names)
+    return names
+
+
+@pytest.mark.parametrize("ions", [None, (300, 1900)])
+@pytest.mark.parametrize("with_map", [False, True])
+def test_python_lines_give_the_same_maps(run, measured, with_map, ions, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    explorer = Explorer(run, measured, TURNED) if with_map else Explorer(run)
+    view = View(ae.Combined(ae.TruncatedNormal(0.15, 0.05), 0.25), 30, 2.5, flattening=6.0, ions=ions)
+    names = executed(explorer.commands(view).python, run=run, measured=measured)
+    shown = explorer.show(view)
+    assert equal(names["simulated"], shown.simulated)
+    assert (tmp_path / "maps.png").stat().st_size > 10_000
+    if with_map:
+        assert equal(names["measured"], shown.measured)
+        assert f"{shown.similarity.value:.4f}" in capsys.readouterr().out
+
+
+def test_the_command_gives_the_same_view(run, measured, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run.save("run.h5")
+    ae.write("ions.epos", measured)
+    registration = f"--registration={TURNED.to_text()}"
+    options = ["--mass", "50,", "--circle", "30,1,2", "--box=-25,25,-20,25", "--simulated", ",1800", "--flatten", "9"]
+    line = ["explore", "run.h5", "ions.epos", registration, "--perturbation", "Combined:0.2,0.1,0.3", "--bins", "28"]
+    line += [*options, "--real-units"]
+    explorer, view = explorer_and_view(make_parser().parse_args(line))
+    assert view.ions == (0, 1800) and view.bins == 28 and view.smoothing == explorer.smoothing_for(28)
+    commands = explorer.commands(view)
+    words = shlex.split(commands.shell)
+    assert words[0] == "apt-evap"
+    other, again = explorer_and_view(make_parser().parse_args(words[1:]))
+    assert again == view and other.registration == explorer.registration
+    shown, same = explorer.show(view), other.show(again)
+    assert equal(shown.simulated, same.simulated) and equal(shown.measured, same.measured)
+    assert shown.similarity.value == same.similarity.value
+    assert other.commands(again) == commands
+    # the Python lines read the files as the command does
+    names = executed(commands.python)
+    assert equal(names["simulated"], shown.simulated) and equal(names["measured"], shown.measured)
+
+
+def test_a_rectangle_selects_ions(run, measured, explorer, tmp_path, monkeypatch):
+    view = View(ae.RollUp(ENERGY), 24, 0.0)
+    selection = explorer.selection(view, (10.0, -5.0), (-8.0, 6.0))
+    names = executed(selection.python, run=run, measured=measured)
+    for name, hits in (("hits", explorer.hits(view)), ("measured", measured)):
+        inside = (hits.x >= -5) & (hits.x < 10) & (hits.y >= -8) & (hits.y < 6)
+        assert len(names[name]) == np.count_nonzero(inside) > 50
+    monkeypatch.chdir(tmp_path)
+    ae.write("MEASURED.epos", measured)
+    drawn = []
+    monkeypatch.setattr("apt_evap.cli.map.save_picture", lambda path, maps, titles: drawn.append(maps[0]))
+    words = shlex.split(selection.shell.replace("MEASURED", "MEASURED.epos"))
+    assert main([*words[1:], "--quiet"]) == 0
+    # an .epos has float32
+    assert drawn[0].detected == pytest.approx(len(names["measured"]), abs=2)
+    # of the run alone
+    run.save("RUN.h5")
+    alone = Explorer(run).selection(view, (-50.0, 0.0), (-50.0, 50.0))
+    assert main([*shlex.split(alone.shell)[1:], "-o", "part.png", "--quiet"]) == 0
+    assert drawn[1].detected == np.count_nonzero(executed(alone.python, run=run)["hits"].detected) > 100
+    # a map has no ions
+    assert Explorer(run, measured.map(24), TURNED).selection(view, (-5, 5), (-5, 5)).shell == ""
+
+
+def test_atoms_at_a_place(run, explorer):
+    view = View(ae.RollUp(ENERGY), 24, 0.0, ions=(200, 1900))
+    atoms = explorer.atoms_at(view, 3.0, -2.0, 4.0)
+    hits = TURNED.hits(run.hits(ae.RollUp(ENERGY)))
+    near = [
+        row
+        for row in range(200, 1900)
+        if hits.outcome[row] == 0 and (hits.x[row] - 3.0) ** 2 + (hits.y[row] + 2.0) ** 2 <= 16.0
+    ]
+    assert len(near) > 5 and atoms.site.tolist() == run.site[near].tolist()
+    assert np.array_equal(atoms.positions, run.emissions.positions[near])
+    assert np.array_equal(atoms.extra["field"], run.fields[near])
+    assert len(explorer.atoms_at(view, 900.0, 0.0, 1.0)) == 0
+
+
+def test_profiles_across_a_line(explorer):
+    shown = explorer.show(View(ae.RollUp(ENERGY), 32, 0.0))
+    rectangle, profiles = explorer.profiles(shown, [[-10.0, -10.0], [10.0, 10.0]], 12.0)
+    assert rectangle.centre == (0.0, 0.0) and rectangle.angle == pytest.approx(45)
+    assert rectangle.length == pytest.approx(20 * np.sqrt(2)) and rectangle.width == 12.0
+    for map, profile in zip((shown.simulated, shown.measured), profiles, strict=True):
+        expected = ae.zone_line_profile(map, rectangle, bins=len(profile.position))
+        assert np.array_equal(profile.density, expected.density, equal_nan=True)
+    with pytest.raises(ValueError, match="length"):
+        explorer.profiles(shown, [[1.0, 1.0], [1.0, 1.0]], 3.0)
+
+
+def test_rings_about_the_pole(made_once, tip20):
+    """[111] has three-fold symmetry; the ring statistic is that of the library, in the frame of the measured map."""
+    make = lambda: ae.Simulation(tip20, seed=1, **ROUGH).run(6000, progress=False)  # noqa: E731
+    run = made_once("explored20", make)
+    registration = ae.Registration(33.0, 0.4, (4.0, -3.0))
+    projection = ae.image_compression(run).projection
+    alone = Explorer(run)
+    assert alone.pole.label == "$111$" and alone.pole.fold == 3
+    assert alone.pole.place == pytest.approx((0.0, 0.0), abs=1e-9)  # mm: rounding
+    shown = alone.show(View(ae.Unperturbed(), 256, 0.0))
+    (rings,) = alone.rings(shown)
+    for ring, expected in zip(rings, ae.ring_statistics(shown.simulated, projection, fold=3), strict=True):
+        assert ring.contrast == pytest.approx(expected.contrast, rel=1e-9)
+    measured = registration.hits(run.hits(ae.Unperturbed())).within_circle(30.0, registration.shift)
+    explorer = Explorer(run, ae.Hits(x=measured.x, y=measured.y), registration)
+    assert explorer.pole.place == pytest.approx((4.0, -3.0), abs=1e-9)
+    first, second = explorer.rings(explorer.show(View(ae.Unperturbed(), 256, 0.0)))
+    for one, other, moved in zip(first, second, rings, strict=True):
+        assert one.contrast == pytest.approx(other.contrast, rel=1e-9)  # the same ions
+        # other bins: within the noise of the counts
+        assert one.contrast == pytest.approx(moved.contrast, abs=4 * (one.error + moved.error))
+
+
+@pytest.mark.parametrize(("axis", "label", "fold"), [((0, 0, 1), "$002$", 4), ((0, 1, 1), "$022$", 2)])
+def test_the_symmetry_of_a_pole(run, axis, label, fold):
+    settings = run.settings | {"tip": run.settings["tip"] | {"axis": list(axis)}}
+    explorer = Explorer(replace(run, settings=settings))
+    assert explorer._pole[0] == label and explorer._pole[2] == fold
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the registration is doubtful:UserWarning")
+def test_a_registration_is_found(run, measured):
+    """The best of those for several emissions; half a minute each."""
+    explorer = Explorer(run, measured)
+    target = measured.map(128)
+    scores = [ae.register(run.hits(each), target).score for each in (ae.Unperturbed(), explorer.start.perturbation)]
+    assert explorer.registration.score >= max(scores)
+    assert explorer.registration.method == "search"
+
+
+def test_what_is_refused(run, measured):
+    bare = replace(run, responses=None)
+    for arguments, sentence in [
+        ((bare,), "needs a run with responses"),
+        ((run, None, TURNED), "registration needs measured ions"),
+        (("run",), "run must be a Run"),
+        ((run, measured, 3.0), "registration must be a Registration"),
+    ]:
+        with pytest.raises(ValueError, match=sentence):
+            Explorer(*arguments)
+    with pytest.raises(ValueError, match=r"none of .* hits is in x"):
+        Explorer(run, measured, replace(TURNED, shift=(300.0, 0.0))).bins_like(24)
+    for changes in ({"bins": 0}, {"smoothing": -1.0}, {"ions": (5, 5)}, {"flattening": np.nan}):
+        with pytest.raises(ValueError, match=next(iter(changes)).rstrip("s")):
+            replace(View(ae.Unperturbed(), 24, 0.0), **changes)
+
+
+# ---- controls and the specimen -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mechanism", MECHANISMS)
+def test_controls_and_perturbations_are_the_same(mechanism):
+    values = {each.name: each.low + 0.3 * (each.high - each.low) for each in controls_of(mechanism)}
+    perturbation = perturbation_of(mechanism, values)
+    assert type(perturbation) is MECHANISMS[mechanism]
+    name, back = values_of(perturbation)
+    assert name == mechanism and back == pytest.approx(values, rel=1e-8)  # standard deviations have 9 digits
+    assert perturbation_of(name, back) == perturbation
+    if values:
+        equal_energies = perturbation_of(mechanism, values | {"rsd": 0.0})
+        assert equal_energies.energy == ae.Fixed(values["mean"])
+        with pytest.raises(ValueError, match="'mean'"):
+            perturbation_of(mechanism, {})
+
+
+def test_perturbations_without_controls():
+    for perturbation in (ae.RollUp(ae.Thermal(50.0)), ae.LateralVelocity(ae.TruncatedNormal(0.0, 0.1)), "RollUp"):
+        with pytest.raises(ValueError, match="the explorer has controls for"):
+            values_of(perturbation)
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_the_front_atom_is_seen(run, side):
+    """At the place of an atom, the image has the value of the frontmost atom within half its diameter."""
+    run = replace(run, fields=np.random.default_rng(1).random(len(run)))  # no two are equal
+    image = specimen_image(run, "field", side, ions=(400, 2000))
+    right, up, depth = SIDES[side]
+    positions = run.emissions.positions[400:]
+    nearness = positions[:, depth] if side == "above" else -positions[:, depth]
+    left, _, lower, _ = image.extent
+    ny, nx = image.values.shape
+    pixel = (image.extent[1] - left) / nx
+    diameter = run.emissions.nearest_neighbour_distance
+    checked = 0
+    for x, y in positions[::11, [right, up]]:
+        distance = np.hypot(positions[:, right] - x, positions[:, up] - y)
+        sure, near = distance < diameter / 2 - 1.5 * pixel, distance < diameter / 2 + 1.5 * pixel
+        front = np.flatnonzero(near)[nearness[near].argmax()]
+        if sure[front]:  # no disc ends here
+            value = image.values[int((y - lower) / pixel), int((x - left) / pixel)]
+            assert value == np.float32(run.fields[400 + front])
+            checked += 1
+    assert checked > 15
+    assert np.isnan(image.values[0, 0]) and max(ny, nx) <= 480
+
+
+def test_colours_of_the_specimen(run):
+    for color, values in (("order", run.emissions.ions), ("field", run.fields), ("charge", run.charges)):
+        image = specimen_image(run, color)
+        drawn = image.values[np.isfinite(image.values)]
+        assert np.isin(drawn, values.astype(np.float32)).all() and len(np.unique(drawn)) > 100
+    with pytest.raises(ValueError, match="color must be one of"):
+        specimen_image(run, "mass")
+
+
+# ---- command line ---------------------------------------------------------------------------------------------------
+
+
+def test_without_bokeh_one_sentence(run, tmp_path, monkeypatch, capsys):
+    run.save(tmp_path / "run.h5")
+    for name in [name for name in sys.modules if name.split(".")[0] == "bokeh" or name == "apt_evap.explore.page"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "bokeh", None)
+    assert main(["explore", str(tmp_path / "run.h5")]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err == (
+        "apt-evap: error: explore needs bokeh, which is not installed: pip install 'apt_evap[explore]'\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("line", "sentence"),
+    [
+        (["run.h5", "run.h5"], "MEASURED must be measured ions or a map, 'run.h5' is a run"),
+        (["run.h5", "--registration=1,1,0,0"], "--registration needs MEASURED"),
+        (["run.h5", "--perturbation", "RollUp:1,2,3"], "RollUp takes"),
+        (["run.h5", "--simulated", "5000,"], "--simulated selects none of the ions 0 to 2000"),
+        (["none.h5"], "cannot read 'none.h5'"),
+    ],
+)
+def test_what_the_command_refuses(run, tmp_path, monkeypatch, line, sentence):
+    monkeypatch.chdir(tmp_path)
+    run.save("run.h5")
+    with pytest.raises((ValueError, OSError), match=re.escape(sentence)):
+        explorer_and_view(make_parser().parse_args(["explore", *line]))

@@ -1,0 +1,261 @@
+"""The page of the explorer in a document without a browser."""
+
+import time
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from rough import ROUGH
+
+import apt_evap as ae
+from apt_evap.explore.explorer import Explorer, View
+
+pytest.importorskip("bokeh")
+
+from bokeh.document import Document
+from bokeh.models import Slider
+
+from apt_evap.cli.compare import read_registration
+from apt_evap.explore.page import MODES, Page
+
+SECONDS = 60  # until a test gives up: the machine may be busy
+
+
+@pytest.fixture(scope="module")
+def run(small_tip, made_once):
+    return made_once("explored", lambda: ae.Simulation(small_tip, seed=1, **ROUGH).run(2000, progress=False))
+
+
+@pytest.fixture(scope="module")
+def measured(run):
+    hits = replace(run, seed=2).hits(ae.RollUp(0.2))
+    return hits.map(40, extent=(-60, 60, -60, 60))
+
+
+class Opened:
+    """A page whose document does everything at once, or when it is told to."""
+
+    def __init__(self, explorer, **options):
+        self.waiting = []
+        self.page = Page(explorer, Document(), later=self.waiting.append, **options)
+
+    def settle(self, what):
+        """Do what waits until something is true."""
+        end = time.monotonic() + SECONDS
+        while not (what() and not self.waiting):
+            while self.waiting:
+                self.waiting.pop(0)()
+            assert time.monotonic() < end, "the page does not settle"
+            time.sleep(0.005)
+
+    def shows(self, preview=False):
+        """Whether the page shows what its widgets say."""
+        return self.page.shown.view == self.page.view() and self.page.shown.preview == preview
+
+
+@pytest.fixture
+def opened(run, measured):
+    opened = Opened(Explorer(run, measured, ae.Registration(0.0, 1.0, (0.0, 0.0)), preview=500))
+    yield opened
+    opened.page.latest.close()
+
+
+def image(source):
+    return source.data["image"][0]
+
+
+def throttled(slider, value):
+    """What a browser sends when a slider is released."""
+    slider.value = value
+    slider.trigger("value_throttled", None, value)
+
+
+def test_a_slider_moves_the_map_as_the_core_computes_it(opened):
+    page = opened.page
+    before = image(page.sources[0]).copy()
+    throttled(page.sliders["mean"], 0.33)
+    opened.settle(opened.shows)
+    shown = page.explorer.show(page.view())
+    assert page.view().perturbation == ae.RollUp(ae.TruncatedNormal(0.33, 0.33))
+    assert not np.array_equal(image(page.sources[0]), before, equal_nan=True)
+    for source, picture in zip(page.sources, shown.pictures, strict=True):
+        assert np.array_equal(image(source), picture.density.astype(np.float32), equal_nan=True)
+    assert f"{shown.similarity.value:.3f}" in page.readout.text
+    assert page.python.text == page.explorer.commands(page.view()).python
+    assert "RollUp:0.33,0.33" in page.shell.text
+
+
+def test_every_widget_moves_something(opened):
+    page = opened.page
+    page.mechanism.active = 3  # combined, which has all sliders
+    opened.settle(opened.shows)
+    widgets = [*page.sliders.values(), page.smoothing, page.flattening, page.bins]
+    assert all(each.visible for each in widgets) and len(widgets) >= 6
+    for widget in widgets:
+        before, text = image(page.sources[0]).copy(), page.python.text
+        throttled(widget, widget.start + 0.6 * (widget.end - widget.start) if widget is not page.bins else 20)
+        opened.settle(opened.shows)
+        now = image(page.sources[0])
+        assert now.shape != before.shape or not np.array_equal(now, before, equal_nan=True), widget.title
+        assert page.python.text != text, widget.title
+    before = image(page.sources[0]).copy()
+    throttled(page.ions, (500, 1500))
+    opened.settle(opened.shows)
+    assert page.view().ions == (500, 1500) and page.shown.ions == 1000
+    assert not np.array_equal(image(page.sources[0]), before, equal_nan=True)
+    page.mechanism.active = 0
+    opened.settle(opened.shows)
+    assert not any(each.visible for each in page.sliders.values())
+    assert page.view().perturbation == ae.Unperturbed()
+
+
+def test_a_preview_is_grey(opened):
+    page = opened.page
+    opened.settle(lambda: "rings about 111" in page.rings.text or "rings:" in page.rings.text)
+    page.sliders["mean"].value = 0.4  # still moving
+    opened.settle(lambda: opened.shows(preview=True))
+    assert page.shown.ions == 500 and "preview" in page.readout.text
+    gray = "#a0a0a0"
+    assert gray in page.readout.text and page.rings.styles["color"] == gray
+    page.sliders["mean"].trigger("value_throttled", None, 0.4)
+    opened.settle(opened.shows)
+    opened.settle(lambda: page.rings.styles["color"] != gray)
+    assert (gray not in page.readout.text and "2,000 ions" in page.readout.text) or "of" in page.readout.text
+
+
+def test_overtaken_views_are_not_computed(opened, monkeypatch):
+    page = opened.page
+    opened.settle(opened.shows)
+    views = []
+    show = page.explorer.show
+
+    def slow(view, preview=False):
+        views.append(view)
+        time.sleep(0.05)
+        return show(view, preview)
+
+    monkeypatch.setattr(page.explorer, "show", slow)
+    for value in np.linspace(0.2, 0.4, 41):
+        page.sliders["mean"].value = float(value)
+    page.sliders["mean"].trigger("value_throttled", None, 0.4)
+    opened.settle(opened.shows)
+    assert len(views) < 10  # of 42
+    assert views[-1] == page.view() and page.view().perturbation.energy.mean == 0.4
+
+
+def test_difference_and_blink(opened):
+    page = opened.page
+    opened.settle(opened.shows)
+    first, second = page.shown.pictures
+    page.mode.active = MODES.index("difference")
+    assert page.difference_image.visible and page.maps[1].title.text == "simulated - measured"
+    expected = (first.density - second.density).astype(np.float32)
+    assert np.array_equal(image(page.difference), expected, equal_nan=True)
+    assert page.difference_colors.low == -page.difference_colors.high < 0
+    page.mode.active = MODES.index("blink")
+    assert not page.difference_image.visible and page.maps[1].title.text == "measured"
+    (callback,) = page.document.session_callbacks
+    titles = []
+    for _ in range(4):
+        callback.callback()
+        titles.append(page.maps[0].title.text)
+        assert page.blink_image.visible == (titles[-1] == "measured")
+    assert titles == ["measured", "simulated"] * 2
+    page.mode.active = 0
+    assert page.document.session_callbacks == [] and not page.blink_image.visible
+
+
+def test_linked_maps(opened):
+    first, second = opened.page.maps
+    assert first.x_range is second.x_range and first.y_range is second.y_range
+
+
+def test_a_line_gives_profiles(opened):
+    page = opened.page
+    curve = np.linspace(-20, 20, 30)
+    page.line.data = {"xs": [curve.tolist()], "ys": [(curve + np.sin(curve)).tolist()]}  # as a mouse draws
+    ends = [[-20, -20 + np.sin(-20)], [20, 20 + np.sin(20)]]
+    assert np.allclose(np.transpose([page.line.data["xs"][0], page.line.data["ys"][0]]), ends)  # straight
+    rectangle, profiles = page.explorer.profiles(page.shown, ends, page.width.value)
+    for source, profile in zip(page.curves, profiles, strict=True):
+        assert np.array_equal(source.data["y"], profile.density, equal_nan=True) and len(profile.density) > 3
+    assert np.allclose(page.rectangle.data["x"], rectangle.corners[:, 0])
+    # a new line takes the place of the old one, and follows the map
+    page.line.data = {"xs": [*page.line.data["xs"], [0.0, 1.0, 10.0]], "ys": [*page.line.data["ys"], [0.0, 1.0, 0.0]]}
+    assert page.line.data == {"xs": [[0.0, 10.0]], "ys": [[0.0, 0.0]]}
+    before = np.array(page.curves[0].data["y"])
+    throttled(page.sliders["mean"], 0.5)
+    opened.settle(opened.shows)
+    assert not np.array_equal(page.curves[0].data["y"], before, equal_nan=True)
+
+
+def test_a_click_shows_atoms(opened):
+    page = opened.page
+    page._clicked(SimpleNamespace(x=5.0, y=-3.0))
+    atoms = page.explorer.atoms_at(page.shown.view, 5.0, -3.0, page.radius.value)
+    assert len(atoms) > 0 and f"{len(atoms)} atoms land within" in page.specimen.title.text
+    assert np.array_equal(page.atoms.data["x"], atoms.positions[:, 0])
+    assert page.click.data == {"x": [5.0], "y": [-3.0], "radius": [page.radius.value]}
+    image_above = image(page.specimen_source)
+    page.side.value = "side"
+    assert np.array_equal(page.atoms.data["y"], atoms.positions[:, 2])
+    assert image(page.specimen_source).shape != image_above.shape and page.specimen.yaxis.axis_label == "z [nm]"
+    page.color.value = "field"
+    assert np.nanmax(image(page.specimen_source)) <= page.explorer.run.fields.max() + 1e-4
+
+
+def test_a_rectangle_gives_commands(opened):
+    page = opened.page
+    box = {"type": "rect", "x0": -10.0, "x1": 5.0, "y0": 0.0, "y1": 8.0}
+    page._selected(SimpleNamespace(geometry=box, final=False))
+    assert "window" not in page.python.text
+    page._selected(SimpleNamespace(geometry=box, final=True))
+    expected = page.explorer.selection(page.shown.view, (-10.0, 5.0), (0.0, 8.0))
+    assert page.python.text == expected.python and "no ions" in page.shell.text
+
+
+def test_a_registration_is_typed(run, measured):
+    registration = ae.Registration(0.0, 1.0, (0.0, 0.0))
+    opened = Opened(Explorer(run, measured, registration), registration_of=read_registration)
+    page = opened.page
+    opened.settle(opened.shows)
+    assert page.registration.value == "0.0,1.0,0.0,0.0"
+    before = image(page.sources[0]).copy()
+    page.registration.value = "nonsense"
+    assert "--registration must be" in page.notes.text and page.explorer.registration == registration
+    page.registration.value = "30,0.9,1,2,mirror"
+    assert page.explorer.registration == ae.Registration(30.0, 0.9, (1.0, 2.0), True)
+    opened.settle(lambda: not np.array_equal(image(page.sources[0]), before, equal_nan=True))
+    assert "--registration=30.0,0.9,1.0,2.0,mirror" in page.shell.text
+    page.latest.close()
+
+
+def test_errors_and_warnings_are_shown(opened):
+    page = opened.page
+    opened.settle(opened.shows)
+    page.sliders["mean"].end = 9.0
+    throttled(page.sliders["mean"], 8.0)
+    opened.settle(opened.shows)
+    assert "launch above the energy limit" in page.notes.text
+    page.explorer.set_registration(ae.Registration(0.0, 1.0, (900.0, 0.0)))
+    page.ask(preview=False)
+    opened.settle(lambda: "hits is in x" in page.notes.text)
+
+
+def test_one_map_without_a_measurement(run):
+    opened = Opened(Explorer(run), view=View(ae.LateralVelocity(0.2), 32, 4.0))
+    page = opened.page
+    assert len(page.maps) == 1 and not page.mode.visible and not page.registration.visible
+    assert page.mechanism.active == 1 and page.sliders["rsd"].value == 0.0
+    throttled(page.sliders["mean"], 0.3)
+    opened.settle(opened.shows)
+    assert "similarity" not in page.readout.text and page.shell.text.startswith("apt-evap map RUN.h5")
+    page.document.validate()
+    page.latest.close()
+
+
+def test_a_slider_of_the_document_runs_the_callback(opened):
+    """The widgets are in the document, where a browser finds them."""
+    titles = {each.title for each in opened.page.document.select({"type": Slider})}
+    assert {"mean energy [eV]", "smoothing [mm]", "bins"} <= titles
