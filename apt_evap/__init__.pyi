@@ -10,6 +10,7 @@ from ._common.warnings import MapWarning as MapWarning
 from ._common.warnings import RegistrationWarning as RegistrationWarning
 from ._common.warnings import ResponseWarning as ResponseWarning
 from ._common.warnings import RunWarning as RunWarning
+from ._common.warnings import StructureWarning as StructureWarning
 from .analysis.apex import field_factor as field_factor
 from .analysis.apex import fit_caps as fit_caps
 from .analysis.apex import image_compression as image_compression
@@ -19,6 +20,9 @@ from .analysis.charge_states import charge_state_ratio_map as charge_state_ratio
 from .analysis.field_ion_image import FieldIonImage as FieldIonImage
 from .analysis.field_ion_image import ImagingGas as ImagingGas
 from .analysis.field_ion_image import field_ion_image as field_ion_image
+from .analysis.noise import effective_ions as effective_ions
+from .analysis.pole_profiles import pole_line_profile as pole_line_profile
+from .analysis.pole_profiles import pole_profile as pole_profile
 from .analysis.profiles import Rectangle as Rectangle
 from .analysis.profiles import azimuthal_profile as azimuthal_profile
 from .analysis.profiles import compare_profiles as compare_profiles
@@ -37,6 +41,7 @@ from .crystallography.orientation import Orientation as Orientation
 from .crystallography.orientation import fit_orientation as fit_orientation
 from .detection.detector import Detector as Detector
 from .detection.detector_map import DetectorMap as DetectorMap
+from .detection.distortion import DistortionGrid as DistortionGrid
 from .detection.hits import Hits as Hits
 from .detection.hits import Outcome as Outcome
 from .detection.instrument import Instrument as Instrument
@@ -75,6 +80,7 @@ from .flight.crew import FlightSettings as FlightSettings
 from .flight.designs import Design as Design
 from .flight.designs import WideDesign as WideDesign
 from .flight.response import ResponseSettings as ResponseSettings
+from .io.distortion_grid import read_grid as read_grid
 from .io.formats import chunks as chunks
 from .io.formats import read as read
 from .io.formats import read_ranges as read_ranges
@@ -91,8 +97,10 @@ from .reconstruction.precipitate import PrecipitateErrors as PrecipitateErrors
 from .reconstruction.precipitate import precipitate_errors as precipitate_errors
 from .reconstruction.reconstruct import Reconstruction as Reconstruction
 from .reconstruction.reconstruct import reconstruct as reconstruct
+from .registration.polynomial import Distortion as Distortion
 from .registration.register import Registration as Registration
 from .registration.register import register as register
+from .registration.register import register_distortion as register_distortion
 from .registration.register import register_points as register_points
 from .simulation.checkpoint import Checkpoint as Checkpoint
 from .simulation.ending import Ending as Ending

@@ -25,5 +25,9 @@ class RegistrationWarning(AptWarning):
     """A registration that may be wrong."""
 
 
+class StructureWarning(AptWarning):
+    """A best map by similarity that has lost the zone lines of the measured one."""
+
+
 class RunWarning(AptWarning):
     """A run that ends early, or that cannot be saved as requested."""

@@ -23,6 +23,8 @@ class Profile(NamedTuple):
     """Hits per area relative to the mean over all bins, NaN for bins without area, shape (bins,)."""
     error: np.ndarray
     """Poisson error of the density (one standard deviation), NaN for maps of densities, shape (bins,)."""
+    unit: str = "mm"
+    """Unit of the position: mm or degrees."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,8 @@ def azimuthal_profile(
     ring = (radius >= inner) & (radius < outer)
     sector = np.floor(azimuth[ring] * (bins / 360)).astype(np.intp) % bins
     exact = np.full(bins, np.pi * (outer**2 - inner**2) / bins)
-    return _profile((np.arange(bins) + 0.5) * (360 / bins), sector, ring, places, exact, "between inner and outer")
+    centres = (np.arange(bins) + 0.5) * (360 / bins)
+    return _profile(centres, sector, ring, places, exact, "between inner and outer")._replace(unit="degrees")
 
 
 def radial_profile(

@@ -12,16 +12,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_array, check_count, check_kind, check_sequence
+from apt_evap._common.validation import check_array, check_count, check_sequence
+from apt_evap.analysis.pole_frame import Directions, pole_frame
+from apt_evap.analysis.pole_profiles import RADII, pole_profile
 from apt_evap.detection.detector_map import DetectorMap
-from apt_evap.detection.projection import Projection
 
 RINGS = ((5.0, 9.0), (9.0, 14.0), (14.0, 20.0))
 """Inner and outer radius of the default rings [degrees]: outside the pole of the usual (111) facets."""
-RADII = (0.0, 1.0, 2.0, 3.0, 6.0)
-"""Edges of the radial density [degrees]."""
-_INNER = 16.0  # degrees: the radial density is relative to the mean within this angle
 _FEWEST_BINS = 3  # of a map in a sector
+_RESAMPLES = 200  # for the error of a contrast: 5 % of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,23 +34,30 @@ class Ring:
     profile : ndarray, shape (m,)
         Density in sectors of equal width over their mean, after the first harmonic was divided out and symmetric
         sectors were averaged; NaN for a sector outside the map.
+    profile_error : ndarray, shape (m,)
+        Standard deviation of each value by the noise of the counts; NaN if the noise is not known.
     contrast : float
         Standard deviation of the profile without the noise of the counts.
     error : float
-        Standard deviation of the contrast by the noise of the counts; NaN for densities, whose noise is not known.
+        Standard deviation of the contrast by the noise of the counts; NaN if the noise is not known.
     minimum, maximum : float
-        Of the profile.
+        Of the profile. Noise lowers the minimum and raises the maximum: compare maps with similar errors.
+    minimum_error, maximum_error : float
+        Errors of the profile at its minimum and its maximum.
     ions : float
-        Counts in the ring; NaN for densities.
+        Hits in the ring; for densities the number with the same noise, NaN if it is not known.
     """
 
     inner: float
     outer: float
     profile: np.ndarray
+    profile_error: np.ndarray
     contrast: float
     error: float
     minimum: float
     maximum: float
+    minimum_error: float
+    maximum_error: float
     ions: float
 
     def __repr__(self) -> str:
@@ -64,12 +70,13 @@ class Ring:
 
 def ring_statistics(
     map: DetectorMap,
-    projection: Projection,
+    projection: Directions,
     pole: ArrayLike = (0.0, 0.0, 1.0),
     rings: Sequence[Sequence[float]] = RINGS,
     *,
     fold: int = 1,
     sectors: int = 72,
+    ions: float | None = None,
 ) -> tuple[Ring, ...]:
     """Contrast of the zone lines in rings about a pole.
 
@@ -88,6 +95,9 @@ def ring_statistics(
         Rotational symmetry about the pole: 3 for (111). Symmetric sectors are averaged.
     sectors : int
         Number of sectors, a multiple of `fold`; 72 are 5 degrees wide.
+    ions : float, optional
+        Number of hits in the map whose counting noise it has. By default its counts, and for densities the result of
+        `effective_ions`; infinite for densities without noise.
 
     Returns
     -------
@@ -100,17 +110,15 @@ def ring_statistics(
 
     Notes
     -----
-    The density of a sector is its counts (or the sum of its densities times areas) over the solid angle of its bins
-    inside the mask. A first harmonic a + b cos + c sin is fitted to the densities over their mean and divided out: it
-    contains gradients over the detector. With n counts per averaged sector, 1/n is subtracted from the variance of the
-    profile. The error is that of 200 resamples of the counts with Poisson noise.
+    The density of a sector is its hits over the solid angle of its bins inside the mask. A first harmonic a + b cos + c
+    sin is fitted to the densities over their mean and divided out: it contains gradients over the detector. With n hits
+    per averaged sector, 1/n is subtracted from the variance of the profile. The error is that of 200 resamples of the
+    hits with Poisson noise.
     """
-    check_kind(map, "map", DetectorMap, "a DetectorMap")
-    check_kind(projection, "projection", Projection, "a Projection")
     fold, sectors = check_count(fold, "fold", at_least=1), check_count(sectors, "sectors", at_least=4, at_most=3600)
     if sectors % fold:
         raise ValueError(f"sectors must be a multiple of fold, {fold}, got {sectors}")
-    angle, azimuth, weight, solid = _about(map, projection, pole)
+    _, angle, azimuth, weight, solid, noise_known = pole_frame(map, projection, pole, ions)
     found = []
     for ring in check_sequence(rings, "rings", "pairs of radii [degrees]"):
         inner, outer = check_array(ring, "rings", (2,)).tolist()
@@ -124,14 +132,16 @@ def ring_statistics(
         known = bins >= _FEWEST_BINS
         if np.count_nonzero(known) < sectors / 2 or not counts[known].any():
             raise ValueError(f"the ring {inner:g} to {outer:g} degrees has too few bins or counts on {map!r}")
-        found.append(_ring(inner, outer, counts, np.where(known, areas, np.nan), fold, map.is_counts))
+        found.append(_ring(inner, outer, counts, np.where(known, areas, np.nan), fold, noise_known))
     return tuple(found)
 
 
 def radial_densities(
-    map: DetectorMap, projection: Projection, pole: ArrayLike = (0.0, 0.0, 1.0), radii: Sequence[float] = RADII
+    map: DetectorMap, projection: Directions, pole: ArrayLike = (0.0, 0.0, 1.0), radii: Sequence[float] = RADII
 ) -> Floats:
     """Density in circles about a pole, relative to the mean within 16 degrees: how dark and how wide the pole is.
+
+    `pole_profile` returns the same densities with errors.
 
     Parameters
     ----------
@@ -145,64 +155,33 @@ def radial_densities(
     ndarray, shape (len(radii) - 1,)
         NaN for a ring without a bin.
     """
-    check_kind(map, "map", DetectorMap, "a DetectorMap")
-    check_kind(projection, "projection", Projection, "a Projection")
-    edges = check_array(radii, "radii", ("n",))
-    if len(edges) < 2 or not (np.diff(edges) > 0).all() or edges[0] < 0:
-        raise ValueError(f"radii must be at least two increasing numbers >= 0 [degrees], got {edges.tolist()}")
-    angle, _, weight, solid = _about(map, projection, pole)
-    mean = weight[angle < _INNER].sum() / solid[angle < _INNER].sum()
-    counts, areas = (np.histogram(angle, edges, weights=values)[0] for values in (weight, solid))
-    return np.divide(counts, areas * mean, out=np.full(len(counts), np.nan), where=areas > 0)
+    return pole_profile(map, projection, pole, radii).density
 
 
-def _about(map, projection, pole):
-    """Angle from the pole [degrees], azimuth [turns], weight and solid angle of each bin inside the mask."""
-    pole = check_array(pole, "pole", (3,))
-    if not np.linalg.norm(pole) > 0:
-        raise ValueError("pole must not be zero, got (0, 0, 0)")
-    pole = pole / np.linalg.norm(pole)
-    x, y = (grid[map.mask] for grid in np.meshgrid(*map.centres))
-    width, height = map.bin_size
-    places = np.column_stack([x, y])
-    directions = projection.directions(places)
-    # solid angle of a bin, from the directions of its neighbours
-    across, along = (
-        projection.directions(places + half) - projection.directions(places - half)
-        for half in (np.array([0.5 * width, 0.0]), np.array([0.0, 0.5 * height]))
-    )
-    solid = np.linalg.norm(np.cross(across, along), axis=1)
-    # azimuth 0 towards the axis that is farthest from the pole
-    first = np.eye(3)[np.abs(pole).argmin()]
-    first = first - pole * (first @ pole)
-    first /= np.linalg.norm(first)
-    second = np.cross(pole, first)
-    angle = np.degrees(np.arccos(np.clip(directions @ pole, -1.0, 1.0)))
-    azimuth = np.arctan2(directions @ second, directions @ first) / (2 * np.pi) % 1.0
-    values = np.asarray(map.values[map.mask], float)
-    return angle, azimuth, values if map.is_counts else values * solid, solid
-
-
-def _ring(inner, outer, counts, areas, fold, is_counts):
+def _ring(inner, outer, counts, areas, fold, noise_known):
     profile, fit = _profile(counts, areas, fold)
     variance, error, noise = float(np.nanvar(profile)), float("nan"), 0.0
-    if is_counts:
+    errors = np.full(len(profile), np.nan)
+    if noise_known:
         noise = _noise(counts, areas, fold)
-        random = np.random.default_rng(0)
-        contrasts = []
-        for _ in range(200):
-            resampled = _folded(random.poisson(counts) / areas / fit, fold)
-            contrasts.append(np.sqrt(max(np.nanvar(resampled / np.nanmean(resampled)) - 2 * noise, 0.0)))
-        error = float(np.std(contrasts))
+        errors = _errors(counts, areas, fit, fold)
+        drawn = np.random.default_rng(0).poisson(counts, (_RESAMPLES, len(counts)))
+        resampled = _folded(drawn / areas / fit, fold)
+        resampled /= np.nanmean(resampled, axis=1, keepdims=True)
+        error = float(np.sqrt(np.maximum(np.nanvar(resampled, axis=1) - 2 * noise, 0.0)).std())
+    lowest, highest = np.nanargmin(profile), np.nanargmax(profile)
     return Ring(
         inner=inner,
         outer=outer,
         profile=profile,
+        profile_error=errors,
         contrast=float(np.sqrt(max(variance - noise, 0.0))),
         error=error,
-        minimum=float(np.nanmin(profile)),
-        maximum=float(np.nanmax(profile)),
-        ions=float(counts.sum()) if is_counts else float("nan"),
+        minimum=float(profile[lowest]),
+        maximum=float(profile[highest]),
+        minimum_error=float(errors[lowest]),
+        maximum_error=float(errors[highest]),
+        ions=float(counts.sum()) if noise_known else float("nan"),
     )
 
 
@@ -219,10 +198,20 @@ def _profile(counts, areas, fold):
 
 
 def _folded(profile, fold):
-    parts = profile.reshape(fold, -1)
+    """Mean over the symmetric sectors of profiles of shape (..., sectors)."""
+    parts = profile.reshape(*profile.shape[:-1], fold, -1)
     known = np.isfinite(parts)
-    total = np.where(known, parts, 0.0).sum(axis=0)
-    return np.divide(total, known.sum(axis=0), out=np.full(parts.shape[1], np.nan), where=known.any(axis=0))
+    total = np.where(known, parts, 0.0).sum(axis=-2)
+    return np.divide(total, known.sum(axis=-2), out=np.full(total.shape, np.nan), where=known.any(axis=-2))
+
+
+def _errors(counts, areas, fit, fold):
+    """Poisson errors of the folded profile; an empty sector gets the error of one hit."""
+    of_sector = np.sqrt(np.maximum(counts, 1.0)) / areas / fit
+    known = np.isfinite(of_sector).reshape(fold, -1).sum(axis=0)
+    mean = np.nanmean(_folded(counts / areas / fit, fold))
+    # quadratic mean over the sectors divided by the square root of their number
+    return np.sqrt(_folded(of_sector**2, fold) / np.maximum(known, 1)) / mean
 
 
 def _noise(counts, areas, fold):

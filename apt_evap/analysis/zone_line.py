@@ -21,7 +21,7 @@ class ZoneLine:
     Parameters
     ----------
     centre, width : float
-        Position of the line, and its full width at half height [mm].
+        Position of the line, and its full width at half height [mm, or the unit of the profile].
     height : float
         Density at its centre minus the background, in units of the profile: > 0 for an enhanced line, < 0 for a
         depleted one.
@@ -37,6 +37,8 @@ class ZoneLine:
         Sum of the squared residuals in units of their errors; NaN for a profile without errors.
     degrees_of_freedom : int
         Number of bins minus the number of fitted parameters.
+    unit : str
+        Unit of the profile, mm or degrees.
     """
 
     centre: float
@@ -52,6 +54,7 @@ class ZoneLine:
     exponent_error: float
     chi_square: float
     degrees_of_freedom: int
+    unit: str = "mm"
 
     @property
     def kind(self) -> str:
@@ -64,7 +67,8 @@ class ZoneLine:
         return self.background + self.slope * distance + self.height * _shape(distance, self.width, self.exponent)
 
     def __str__(self):
-        return f"{self.kind}, {self.width:.2f} ± {self.width_error:.2f} mm wide at {self.centre:+.2f} mm"
+        size = f"{self.width:.2f} ± {self.width_error:.2f} {self.unit}"
+        return f"{self.kind}, {size} wide at {self.centre:+.2f} {self.unit}"
 
 
 def fit_zone_line(profile: Profile, *, exponent: float = 2.0) -> ZoneLine:
@@ -102,7 +106,7 @@ def fit_zone_line(profile: Profile, *, exponent: float = 2.0) -> ZoneLine:
     width of the profile.
     """
     finite = np.isfinite(check_kind(profile, "profile", Profile, "a Profile").density)
-    position, density, error = (np.asarray(column)[finite] for column in profile)
+    position, density, error = (np.asarray(column)[finite] for column in profile[:3])
     if len(position) < 8:
         raise ValueError(f"a profile must have at least 8 bins to fit a line, got {len(position)}")
     if exponent is not None:
@@ -138,6 +142,7 @@ def fit_zone_line(profile: Profile, *, exponent: float = 2.0) -> ZoneLine:
         **{f"{name}_error": errors[name] for name in names if name != "slope"},
         chi_square=float(pulls @ pulls),
         degrees_of_freedom=len(position) - len(parameters),
+        unit=profile.unit,
     )
 
 

@@ -15,6 +15,7 @@ from apt_evap._common.types import AnyPath
 from apt_evap._version import __version__
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
+from apt_evap.io.distortion_grid import read_grid
 from apt_evap.io.formats import read as read_file
 from apt_evap.io.formats import read_ranges
 from apt_evap.simulation.run import Run, load
@@ -25,7 +26,18 @@ _MARK_KEYS = {".png": "Software", ".pdf": "Creator", ".svg": "Creator"}
 
 
 def read(options: argparse.Namespace) -> Hits | Run | DetectorMap:
-    """Read the FILE of a command."""
+    """Read the FILE of a command, and remove its distortion if the options have a calibration grid."""
+    content = _read(options)
+    if options.undistort is None:
+        return content
+    if not isinstance(content, Hits):
+        what = "a run" if isinstance(content, Run) else "a map"
+        raise ValueError(f"--undistort is only for measured ions, {options.file!r} contains {what}")
+    check_columns(content, options)
+    return content.undistorted(read_grid(options.undistort))
+
+
+def _read(options):
     parameters = {"partial": options.partial, "byte_order": options.byte_order, "unit": options.unit}
     if options.arrays is not None:
         names = options.arrays.split(",")

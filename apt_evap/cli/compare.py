@@ -54,6 +54,7 @@ def _compare(options, messages):
         flattening=options.flatten,
         temperature=options.temperature,
         allow_noise=not options.plain,
+        options=dict(options.option or ()),
         replicas=options.replicas,
         resamples=options.resamples,
         seed=options.seed,
@@ -164,9 +165,14 @@ def _write(study, run, folder, options, messages):
 def _write_table(study, path):
     with open(path, "w", newline="") as file:
         table = csv.writer(file)
-        table.writerow(["rollup_fraction", "rsd", "mean_eV", "ssim", "error", "share_of_resamples"])
+        matrices = [study.ssim, study.errors, study.shares]
+        names = [*study.grid.options, "rollup_fraction", "rsd", "mean_eV", "ssim", "error", "share_of_resamples"]
+        if study.structure is not None:
+            matrices += [study.structure.misfit, study.structure.errors]
+            names += ["ring_misfit", "ring_misfit_error"]
+        table.writerow(names)
         for cell in study.grid.cells:
-            values = (matrix[cell] for matrix in (study.ssim, study.errors, study.shares))
+            values = (matrix[cell] for matrix in matrices)
             energies = study.grid.values_at(np.array(cell))
             table.writerow([f"{value:.6g}" for value in (*energies, *values)])
 

@@ -208,7 +208,7 @@ def _add_compare(commands: Any) -> None:
         "energies.",
         epilog="writes to FOLDER:\n"
         "  study.json        results and all settings\n"
-        "  ssim.csv          similarity, error and fraction of the resamples for every energy\n"
+        "  ssim.csv          similarity, error, fraction of the resamples and misfit of rings for every energy\n"
         "  ssim.png          plot of the similarities\n"
         "  maps.png          measured, unperturbed and best map side by side, and an enlarged part\n"
         "  registration.png  overlay of the simulated map on the measured one\n"
@@ -227,6 +227,13 @@ def _add_compare(commands: Any) -> None:
     ):
         numbers = ",".join(f"{value:g}" for value in default)
         command.add_argument(f"--{name}", type=_numbers, metavar="N,N,...", help=f"{what}; default: {numbers}")
+    command.add_argument(
+        "--option",
+        action="append",
+        type=_option,
+        metavar="NAME=N,N,...",
+        help="one more axis: a parameter of the perturbation and the numbers to try",
+    )
     command.add_argument(
         "--registration",
         metavar="R",
@@ -448,6 +455,9 @@ def _add_reading(parser: argparse.ArgumentParser) -> Any:
     group.add_argument("--byte-order", choices=("big", "little"), help="byte order of .pos and .epos files")
     group.add_argument("--arrays", metavar="V,X,Y[,MASK]", help="names in an .npz: values, edges in x and y, mask")
     group.add_argument("--unit", metavar="UNIT", help="unit of the edges in an .npz: mm, cm, m or um")
+    group.add_argument(
+        "--undistort", metavar="GRID.csv", help="calibration grid of the instrument, such as a reflectron"
+    )
     selection = parser.add_argument_group("selection of ions", "LOW <= value < HIGH; LOW or HIGH may be omitted: 27,")
     selection.add_argument("--mass", type=_bounds, metavar="LOW,HIGH", help="mass-to-charge ratio [Da]")
     selection.add_argument("--voltage", type=_bounds, metavar="LOW,HIGH", help="DC voltage [V]")
@@ -521,6 +531,14 @@ def _numbers(text: str) -> tuple[float, ...]:
         return tuple(float(part) for part in text.split(","))
     except ValueError:
         raise argparse.ArgumentTypeError(f"must be numbers separated by commas, got {text!r}") from None
+
+
+def _option(text: str) -> tuple[str, tuple[float, ...]]:
+    """Name of an option and its numbers."""
+    name, equals, numbers = text.partition("=")
+    if not (name and equals):
+        raise argparse.ArgumentTypeError(f"must be NAME=N,N,..., got {text!r}")
+    return name, _numbers(numbers)
 
 
 def _bounds(text: str) -> tuple[float | None, float | None]:

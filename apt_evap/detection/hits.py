@@ -2,8 +2,9 @@
 
 from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
 
+import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from numbers import Real
 from typing import TYPE_CHECKING, Any
@@ -12,9 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from apt_evap._common.types import Booleans
-from apt_evap._common.validation import check_array, check_kind, check_number, did_you_mean, short_text
+from apt_evap._common.validation import check_array, check_kind, check_number, check_seed, did_you_mean, short_text
+from apt_evap._common.warnings import DataWarning
+from apt_evap.detection.binning import find_quantisations
 from apt_evap.detection.dataframe import to_dataframe
 from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.detection.distortion import DistortionGrid
 
 if TYPE_CHECKING:
     import pandas
@@ -243,6 +247,57 @@ class Hits:
         with np.errstate(over="ignore", invalid="ignore"):
             distance = np.hypot(x - centre[0], y - centre[1])
         return self[self.detected & (distance <= radius)]
+
+    def undistorted(self, grid: DistortionGrid, *, dither_seed: int = 0) -> Hits:
+        """Remove the distortion of an instrument, such as a reflectron, by its calibration grid.
+
+        Quantised coordinates are first moved at random within one quantisation step, because their steps would have
+        different widths afterwards, and alias into stripes in every map.
+
+        Parameters
+        ----------
+        grid : DistortionGrid
+            The grid of this instrument, see `read_grid`.
+        dither_seed : int
+            Seed of the random moves.
+
+        Returns
+        -------
+        Hits
+            All ions; x and y are NaN outside the grid, so that these ions are not `detected`.
+
+        Raises
+        ------
+        ValueError
+            If there are no detector coordinates, the grid is not a DistortionGrid, or no ion is inside it.
+
+        Warns
+        -----
+        DataWarning
+            If ions are outside the grid; the text contains their number.
+        """
+        x, y = (values.astype(np.float64) for values in self.require("x", "y"))
+        check_kind(grid, "grid", DistortionGrid, "a DistortionGrid, such as read_grid('grid.csv')")
+        dither_seed = check_seed(dither_seed, "dither_seed")
+        detected = self.detected
+        if detected.any() and (steps := find_quantisations(x[detected], y[detected])) is not None:
+            random = np.random.default_rng(dither_seed)
+            x, y = (
+                values + step.spacing * (random.random(len(values)) - 0.5)
+                for values, step in zip((x, y), steps, strict=True)
+            )
+        x, y = grid.undistorted(x, y)
+        outside = int(np.count_nonzero(detected & np.isnan(x)))
+        if outside and outside == np.count_nonzero(detected):
+            raise ValueError(f"grid must contain the ions, got all {outside:,} of them outside {grid!r}")
+        if outside:
+            warnings.warn(
+                f"{outside:,} of {np.count_nonzero(detected):,} ions are outside the calibration grid: they have no "
+                "undistorted place",
+                DataWarning,
+                stacklevel=2,
+            )
+        return replace(self, x=x, y=y, extent=None)
 
     def window(self, **bounds: tuple[float | None, float | None]) -> Hits:
         """Select the ions whose columns are within bounds: ``hits.window(voltage=(4e3, 5e3), multiplicity=(2, None))``.

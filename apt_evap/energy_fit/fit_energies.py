@@ -1,7 +1,7 @@
 """Fit of the emission energies: the simulated map with the largest similarity to a measured one."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -9,16 +9,18 @@ import numpy as np
 
 from apt_evap._common.threads import thread_count
 from apt_evap._common.validation import check_count, check_kind
-from apt_evap._common.warnings import MapWarning, RegistrationWarning, ResponseWarning
+from apt_evap._common.warnings import MapWarning, RegistrationWarning, ResponseWarning, StructureWarning
 from apt_evap.analysis.similarity import WINDOW
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.energies import Thermal
-from apt_evap.emission.perturbations import LateralVelocity, Unperturbed
-from apt_evap.energy_fit.defaults import MEANS, RSDS
+from apt_evap.emission.perturbations import LateralVelocity, Perturbation, Unperturbed
+from apt_evap.energy_fit.defaults import MEANS, MODEL_ERROR, RSDS
 from apt_evap.energy_fit.grid import EnergyGrid, maxima
+from apt_evap.energy_fit.intervals import intervals as intervals_of
 from apt_evap.energy_fit.search import EnergySearch, register_repeatedly
 from apt_evap.energy_fit.settings import StudySettings
+from apt_evap.energy_fit.structure import PoleMeasure, StructureScores
 from apt_evap.energy_fit.study import Score, Study, plain
 from apt_evap.registration.register import Registration
 from apt_evap.simulation.real_units import RealUnits
@@ -35,11 +37,13 @@ FEWEST_IONS = 0.5
 def fit_energies(
     run: Run,
     measured: Hits | DetectorMap,
-    mechanism: str = "roll-up",
+    mechanism: str | Callable[..., Perturbation] = "roll-up",
     *,
     means: Sequence[float] = MEANS,
     rsds: Sequence[float] = RSDS,
     rollup_fractions: Sequence[float] | None = None,
+    options: Mapping[str, Sequence[float]] | None = None,
+    pole: Sequence[int] | None = None,
     registration: Registration | None = None,
     bins: int | None = None,
     smoothing: float | None = None,
@@ -47,6 +51,7 @@ def fit_energies(
     data_range: float = 2.0,
     temperature: float = 50.0,
     allow_noise: bool = True,
+    model_error: float = MODEL_ERROR,
     replicas: int | None = None,
     resamples: int = 200,
     seed: int = 0,
@@ -66,13 +71,19 @@ def fit_energies(
         A run with responses.
     measured : Hits or DetectorMap
         Measured ions, or a map of counts or of densities. The noise of densities is not known.
-    mechanism : {"roll-up", "lateral", "combined"}
-        Mechanism of emission: `RollUp`, `LateralVelocity` or `Combined`.
+    mechanism : {"roll-up", "lateral", "combined"} or callable
+        Mechanism of emission: `RollUp`, `LateralVelocity` or `Combined`; or a class of perturbations whose first
+        parameter is the energy distribution.
     means, rsds : sequence of float
         Means of the truncated normal distributions [eV], and standard deviations relative to the means; by default
         those of the paper.
     rollup_fractions : sequence of float, optional
         Roll-up fractions for "combined"; by default those of the paper.
+    options : mapping of str to sequence of float, optional
+        More axes of the grid: names of parameters of the perturbation, each with the numbers to try.
+    pole : sequence of int, optional
+        Miller indices of the pole for the second objective (`Study.structure`); by default the one with the most
+        complete rings inside the compared region.
     registration : Registration, optional
         Carries simulated hits into the measured frame. By default found by `register` with the middle of the
         grid, repeated with the best point until this is stable, and then refined to the largest similarity of this
@@ -93,6 +104,9 @@ def fit_energies(
         Temperature of the thermal baseline, Maxwell-Boltzmann lateral velocities [K].
     allow_noise : bool
         Whether the similarity is corrected for the noise of both maps, see the notes. False for the standard `ssim`.
+    model_error : float
+        Relative increase of the misfit 1 - SSIM that the difference of the simulated from the measured specimen
+        explains, for the intervals; 0 for intervals by noise alone. The default was measured with twins.
     replicas : int, optional
         Number of draws of energy and direction per ion, which are summed to reduce the noise of a map. By default ten
         times as many simulated as measured ions, with 4 to 16 draws.
@@ -117,7 +131,8 @@ def fit_energies(
     Warns
     -----
     UserWarning
-        If the registration is doubtful, or the run has too few ions for the bins.
+        If the registration is doubtful, the run has too few ions for the bins, or the best map by similarity has lost
+        the structure of the measured one (`StructureWarning`).
 
     Notes
     -----
@@ -135,7 +150,7 @@ def fit_energies(
     ceiling. The noise of measured densities is not known and not corrected: their best energies have slightly more
     contrast than the true ones.
     """
-    grid = EnergyGrid(mechanism, means, rsds, rollup_fractions)  # type: ignore[arg-type]
+    grid = EnergyGrid(mechanism, means, rsds, rollup_fractions, options or {})  # type: ignore[arg-type]
     if check_kind(run, "run", Run, "a Run").responses is None:
         raise ValueError(f"run must have responses for fit_energies, got {run!r}")
     measured = measured_map(measured, bins)
@@ -148,6 +163,7 @@ def fit_energies(
         resamples=resamples,
         seed=seed,
         temperature=temperature,
+        model_error=model_error,
     )
     replicas = settings.replicas
     search = EnergySearch(run, measured, grid, settings, thread_count(n_threads), progress)
@@ -159,10 +175,13 @@ def fit_energies(
             warnings.simplefilter("ignore", RegistrationWarning)  # given once, for the last registration
             registration, rounds = register_repeatedly(search)
         search.place(registration, settings.resamples)
-        values = search.matrix(replicas, "energies")
+        measure, missing = _pole_measure(search, registration, pole)
+        values, structures = search.matrix(replicas, "energies", measure=measure)
         cells = maxima(values)
-        optimum = search.optimum(cells, replicas)
-        refined = search.optimum(search.refine(values, cells, replicas), replicas)
+        best = search.refine(values, cells, replicas)[0]
+        bounds = intervals_of(grid, values, best, settings.model_error) if settings.resamples else None
+        optimum = search.optimum(cells[0], replicas, bounds)
+        refined = search.optimum(best, replicas, bounds)
         scores, plain_scores, maps = {}, {}, {}
         for name, perturbation, draws in (
             ("unperturbed", Unperturbed(), 1),
@@ -171,7 +190,16 @@ def fit_energies(
         ):
             maps[name], scores[name], plain_scores[name] = search.map_and_scores(perturbation, draws)
         gain = scores.pop("optimum") - scores["unperturbed"]
+        structure = _structure_scores(measure, search, structures, maps, cells[0], replicas)
     registration.warn_if_doubtful()
+    if structure is not None and structure.lost:
+        warnings.warn(
+            "the best map by SSIM has lost the zone lines of the measured map: contrasts "
+            f"{_contrasts(structure.optimum)} in the rings about a pole, measured {_contrasts(structure.measured)}; "
+            "SSIM rewards blur if the lines of both maps differ, see Study.structure",
+            StructureWarning,
+            stacklevel=2,
+        )
     density = maps["unperturbed"].ions / search.comparison.mask.sum()
     if density < FEWEST_IONS:
         warnings.warn(
@@ -193,6 +221,7 @@ def fit_energies(
         "share_above_energy_limit": grid.share_above(energy_limit),
         "run": {"ions": len(run), "provenance": run.provenance, **run.settings},
         "real_units": real_units_of(run),
+        "structure": missing,
     }
     return Study(
         grid=grid,
@@ -210,9 +239,43 @@ def fit_energies(
         registration=registration,
         measured=search.region,
         maps=maps,
+        structure=structure,
         settings=search.comparison.settings,
         provenance=plain(provenance),
     )
+
+
+def _pole_measure(search, registration, pole):
+    """Measure of the structure about a pole, or None and the reason."""
+    try:
+        return PoleMeasure(search.run, registration, search.region, pole), None
+    except ValueError as error:
+        if pole is not None:
+            raise
+        return None, str(error)
+
+
+def _structure_scores(measure, search, structures, maps, cell, replicas):
+    if measure is None:
+        return None
+    measured = measure.structure(search.region)
+    misfits = np.array([structure.misfit(measured) for structure in structures])
+    misfit, errors = (column.reshape(search.grid.shape) for column in misfits.T)
+    at = tuple(int(index) for index in cell)
+    return StructureScores(
+        plane=measure.plane,
+        measured=measured,
+        unperturbed=measure.structure(maps["unperturbed"]),
+        optimum=structures[int(np.ravel_multi_index(at, search.grid.shape))],
+        misfit=misfit,
+        errors=errors,
+        best=tuple(int(index) for index in np.unravel_index(misfit.argmin(), misfit.shape)),
+        at_optimum=at,
+    )
+
+
+def _contrasts(structure):
+    return ", ".join(f"{ring.contrast:.2f}" for ring in structure.rings)
 
 
 def real_units_of(run: Run) -> dict[str, Any] | None:

@@ -1,7 +1,7 @@
 """Energies of a study: a grid of distributions for one mechanism, and the maximum between its points."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import product
 
 import numpy as np
@@ -9,11 +9,12 @@ import scipy
 from numpy.typing import ArrayLike
 
 from apt_evap._common.types import Floats, Integers
-from apt_evap._common.validation import check_array, check_choice
+from apt_evap._common.validation import check_array, check_choice, check_kind
 from apt_evap.emission.energies import TruncatedNormal
 from apt_evap.emission.perturbations import Combined, LateralVelocity, Perturbation, RollUp
 from apt_evap.energy_fit.defaults import MEANS, MECHANISMS, ROLLUP_FRACTIONS, RSDS
 
+_RESERVED = ("energy", "mean", "rsd", "rollup_fraction", "true_mean", "true_standard_deviation")
 _HALVES = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
 _FINE = np.linspace(-1.0, 1.0, 41)
 
@@ -24,35 +25,40 @@ class EnergyGrid:
 
     Parameters
     ----------
-    mechanism : {"roll-up", "lateral", "combined"}
-        Mechanism of emission: `RollUp`, `LateralVelocity` or `Combined`.
+    mechanism : {"roll-up", "lateral", "combined"} or callable
+        Mechanism of emission: `RollUp`, `LateralVelocity` or `Combined`; or a function of an energy distribution and
+        of the options by name that returns a perturbation, such as a class of perturbations.
     means : tuple of float
         Means before the truncation [eV], increasing.
     rsds : tuple of float
         Standard deviations before the truncation, relative to the means, increasing.
     rollup_fractions : tuple of float, optional
         Fractions of the energy for the roll-up, increasing; only for "combined".
+    options : mapping of str to sequence of float
+        More axes of the grid: options of the perturbation by name, each with increasing numbers.
 
     Raises
     ------
     ValueError
-        If the mechanism is unknown, or an axis is empty, not increasing or outside its range.
+        If the mechanism or an option is unknown, or an axis is empty, not increasing or outside its range.
     """
 
-    mechanism: str
+    mechanism: str | Callable[..., Perturbation]
     means: Sequence[float] = MEANS
     rsds: Sequence[float] = RSDS
     rollup_fractions: Sequence[float] = None  # type: ignore[assignment]  # the mechanism sets them
+    options: Mapping[str, Sequence[float]] = field(default_factory=dict)
 
     def __post_init__(self):
-        check_choice(self.mechanism, "mechanism", MECHANISMS)
+        if not callable(self.mechanism):
+            check_choice(self.mechanism, "mechanism", MECHANISMS)
         fractions = self.rollup_fractions
         if self.mechanism == "combined":
             fractions = ROLLUP_FRACTIONS if fractions is None else fractions
         elif fractions is not None:
-            raise ValueError(f"rollup_fractions are only for the mechanism 'combined', got {self.mechanism!r}")
+            raise ValueError(f"rollup_fractions are only for the mechanism 'combined', got {self.name!r}")
         else:
-            fractions = (1.0,) if self.mechanism == "roll-up" else (0.0,)
+            fractions = (0.0,) if self.mechanism == "lateral" else (1.0,)
         for name, values, low, high in (
             ("means", self.means, np.nextafter(0, 1), np.inf),
             ("rsds", self.rsds, np.nextafter(0, 1), np.inf),
@@ -63,45 +69,79 @@ class EnergyGrid:
                 bounds = "from 0 to 1" if high == 1 else "> 0"
                 raise ValueError(f"{name} must be increasing numbers {bounds}, got {axis.tolist()}")
             object.__setattr__(self, name, tuple(axis.tolist()))
+        options = {}
+        for name, values in check_kind(self.options, "options", Mapping, "a mapping of names to numbers").items():
+            check_kind(name, "a name in options", str, "text")
+            if name in _RESERVED:
+                raise ValueError(f"options must not contain {name!r}: it has its own argument")
+            axis = check_array(values, f"option {name}", ("n",))
+            if not (len(axis) and (np.diff(axis) > 0).all()):
+                raise ValueError(f"option {name} must have increasing numbers, got {axis.tolist()}")
+            options[name] = tuple(axis.tolist())
+        object.__setattr__(self, "options", options)
+        for end in (0, -1):  # the perturbation validates its own options
+            try:
+                self.perturbation(*(axis[end] for axis in self.axes.values()))
+            except TypeError as error:
+                raise ValueError(f"options must be those of the mechanism {self.name!r}: {error}") from error
 
     @property
-    def shape(self) -> tuple[int, int, int]:
-        """Numbers of roll-up fractions, relative standard deviations and means."""
-        return len(self.rollup_fractions), len(self.rsds), len(self.means)
+    def name(self) -> str:
+        """Name of the mechanism."""
+        return self.mechanism if isinstance(self.mechanism, str) else getattr(self.mechanism, "__name__", "own")
+
+    @property
+    def axes(self) -> dict[str, Sequence[float]]:
+        """Numbers on each axis by name: the options, then "rollup_fraction", "rsd" and "mean", dict."""
+        last = {"rollup_fraction": self.rollup_fractions, "rsd": self.rsds, "mean": self.means}
+        return {**self.options, **last}
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of points on each axis: options, roll-up fractions, relative standard deviations, means."""
+        return tuple(map(len, self.axes.values()))
 
     @property
     def cells(self) -> list[tuple[int, ...]]:
-        """Index (fraction, rsd, mean) of every point of the grid, list of tuple."""
+        """Index (options, fraction, rsd, mean) of every point of the grid, list of tuple."""
         return list(product(*map(range, self.shape)))
 
     def values_at(self, index: ArrayLike) -> Floats:
-        """Roll-up fraction, relative standard deviation and mean [eV] at an index, also between points.
+        """Options, roll-up fraction, relative standard deviation and mean [eV] at an index, also between points.
 
         Parameters
         ----------
         index : array_like
-            Positions on the three axes in steps of the grid, shape (..., 3).
+            Positions on the axes in steps of the grid, shape (..., number of axes).
 
         Returns
         -------
         ndarray
-            Shape (..., 3). Interpolation between points is geometric for the relative standard deviation, and linear
+            Shape as `index`. Interpolation between points is geometric for the relative standard deviation, and linear
             for the others.
         """
         places = np.moveaxis(np.asarray(index, float), -1, 0)
-        axes = np.array(self.rollup_fractions), np.log(self.rsds), np.array(self.means)
-        fraction, rsd, mean = (np.interp(p, np.arange(len(a)), a) for p, a in zip(places, axes, strict=True))
-        nearest = np.rint(places[1]).astype(int)
-        # exact values at the points of the grid, to the last bit
-        rsd = np.where(places[1] == nearest, np.array(self.rsds)[nearest], np.exp(rsd))
-        return np.stack([fraction, rsd, mean], axis=-1)
+        values = []
+        for place, (name, axis) in zip(places, self.axes.items(), strict=True):
+            points = np.arange(len(axis))
+            value = np.interp(place, points, np.log(axis) if name == "rsd" else axis)
+            if name == "rsd":
+                nearest = np.rint(place).astype(int)
+                # exact values at the points of the grid, to the last bit
+                value = np.where(place == nearest, np.array(axis)[nearest], np.exp(value))
+            values.append(value)
+        return np.stack(values, axis=-1)
 
-    def perturbation(self, fraction: float, rsd: float, mean: float) -> Perturbation:
-        """Perturbation with a roll-up fraction, a relative standard deviation and a mean [eV]."""
-        energy = TruncatedNormal(float(mean), float(rsd * mean))
+    def perturbation(self, *values: float) -> Perturbation:
+        """Perturbation for options, a roll-up fraction, a relative standard deviation and a mean [eV]."""
+        *options, fraction, rsd, mean = (float(value) for value in values)
+        energy = TruncatedNormal(mean, rsd * mean)
+        named = dict(zip(self.options, options, strict=True))
+        if callable(self.mechanism):
+            return self.mechanism(energy, **named)
         if self.mechanism == "combined":
-            return Combined(energy, float(fraction))
-        return (RollUp if self.mechanism == "roll-up" else LateralVelocity)(energy)
+            return Combined(energy, rollup_fraction=fraction, **named)
+        return (RollUp if self.mechanism == "roll-up" else LateralVelocity)(energy, **named)
 
     def share_above(self, energy: float) -> Floats:
         """Fraction of the ions above an energy [eV] at every point of the grid, shape `shape`."""
@@ -120,7 +160,7 @@ class EnergyGrid:
         Returns
         -------
         list of ndarray
-            Positions on the three axes in steps of the grid: five, or only that of the point on an axis of less than
+            Positions on the axes in steps of the grid: five, or only that of the point on an axis of less than
             three.
         """
         return [
@@ -130,7 +170,7 @@ class EnergyGrid:
 
 
 def maxima(values: Floats) -> Integers:
-    """Indices of the largest value in each of k matrices, shape (k, a, b, c); int of shape (k, 3)."""
+    """Indices of the largest value in each of k matrices, shape (k, a, b, ...); int of shape (k, number of axes)."""
     return np.stack(np.unravel_index(values.reshape(len(values), -1).argmax(axis=1), values.shape[1:]), axis=1)
 
 
@@ -140,14 +180,14 @@ def spline_maxima(places: list[Floats], values: Floats) -> Floats:
     Parameters
     ----------
     places : list of ndarray
-        Positions on the three axes, five or one.
+        Positions on the axes, five or one.
     values : ndarray
-        Values at these positions, shape (k, a, b, c).
+        Values at these positions, shape (k, a, b, ...).
 
     Returns
     -------
     ndarray
-        Positions of the k maxima, shape (k, 3).
+        Positions of the k maxima, shape (k, number of axes).
     """
     spline, fine = scipy.interpolate.make_interp_spline(_HALVES, np.eye(5))(_FINE), []
     for axis, along in enumerate(places):

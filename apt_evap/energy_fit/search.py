@@ -18,8 +18,10 @@ from apt_evap.emission.energies import TruncatedNormal
 from apt_evap.emission.perturbations import Perturbation, Unperturbed, to_dict
 from apt_evap.energy_fit.comparison import Comparison
 from apt_evap.energy_fit.grid import EnergyGrid, maxima, spline_maxima
+from apt_evap.energy_fit.intervals import Intervals
 from apt_evap.energy_fit.resampling import Sampler, hits_of_draw
 from apt_evap.energy_fit.settings import StudySettings
+from apt_evap.energy_fit.structure import PoleMeasure, Structure
 from apt_evap.energy_fit.study import Optimum, Score
 from apt_evap.registration.register import Registration, register
 from apt_evap.simulation.run import Run
@@ -28,7 +30,6 @@ ROUGH = 4
 """Number of draws per ion for the registration."""
 FLATTENING = 0.15
 """Width of the Gaussian that flattens both maps, relative to the square root of the compared area."""
-INTERVAL = 95.0  # percent of the resamples
 _MAX_ROUNDS = 5  # of alternating registration and search
 
 
@@ -68,7 +69,7 @@ class EnergySearch:
 
     def perturbation(self, index: ArrayLike) -> Perturbation:
         """Perturbation at an index of the grid."""
-        return self.grid.perturbation(*self.grid.values_at(index))
+        return self.grid.perturbation(*self.grid.values_at(np.asarray(index)))
 
     def hits(self, index: ArrayLike) -> Hits:
         """Hits of several draws of all ions at an index of the grid, in the frame of the run."""
@@ -109,8 +110,18 @@ class EnergySearch:
         """Similarities of all ions and of each resample, shape (1 + resamples,)."""
         return self.comparison.similarities(*self.sampler.maps(perturbation, replicas))
 
-    def matrix(self, replicas: int, note: Any, places: Any = None) -> Floats:
-        """Similarities at positions on the three axes, by default the complete grid; shape (1 + resamples, a, b, c)."""
+    def matrix(
+        self, replicas: int, note: Any, places: Any = None, measure: PoleMeasure | None = None
+    ) -> tuple[Floats, list[Structure]]:
+        """Similarities at positions on the axes, by default the complete grid, and the structure of each map.
+
+        Returns
+        -------
+        similarities : ndarray
+            Shape (1 + resamples, number on each axis).
+        structures : list of Structure
+            In the order of the grid; empty without a `measure`.
+        """
         places = [np.arange(number) for number in self.grid.shape] if places is None else places
         perturbations = [self.perturbation(index) for index in product(*places)]
         with (
@@ -119,71 +130,67 @@ class EnergySearch:
         ):
 
             def scores(perturbation):
-                similarities = self.scores(perturbation, replicas)
+                maps, noise = self.sampler.maps(perturbation, replicas)
+                structure = None if measure is None else self.structure(maps[0], replicas, measure)
+                similarities = self.comparison.similarities(maps, noise)
                 bar.update()
-                return similarities
+                return similarities, structure
 
-            values = np.stack(list(pool.map(scores, perturbations)), axis=1)
-        return values.reshape(-1, *map(len, places))
+            values, structures = zip(*pool.map(scores, perturbations), strict=True)
+        found = [] if measure is None else list(structures)
+        return np.stack(values, axis=1).reshape(-1, *map(len, places)), found
+
+    def structure(self, counts: Floats, replicas: int, measure: PoleMeasure) -> Structure:
+        """Structure of a simulated map of the box; several draws of an ion have the noise of one."""
+        simulated = self._simulated(counts, "simulation")
+        return measure.structure(simulated, max(simulated.ions or 0, 1) / replicas)
+
+    def _simulated(self, counts, source):
+        """Map of the compared region from the counts of the box."""
+        values = np.zeros(self.region.values.shape, np.int64)
+        values[self.comparison.box] = counts
+        ions = int(values[self.region.mask].sum())
+        rest = {"quantum": None, "smoothing": 0, "source": source, "detected": None}
+        return replace(self.region, values=values, is_counts=True, ions=ions, **rest)
 
     def refine(self, values: Floats, cells: Any, replicas: int) -> Floats:
-        """Positions of the maxima between the points, shape (1 + resamples, 3).
+        """Positions of the maxima between the points, shape (1 + resamples, number of axes).
 
         The search is within one step of the best point. A resample with its best point elsewhere keeps that point.
         """
         places = self.grid.around(cells[0])
-        refined = spline_maxima(places, self.matrix(replicas, "between points", places))
+        refined = spline_maxima(places, self.matrix(replicas, "between points", places)[0])
         low, high = (np.array([along[end] for along in places]) for end in (0, -1))
         near = ((low <= cells) & (cells <= high)).all(axis=1)
         return np.where(near[:, None], refined, cells)
 
-    def optimum(self, index: Any, replicas: int) -> Optimum:
-        """`Optimum` at indices of the grid, shape (1 + resamples, 3); those of the resamples give its intervals."""
-        fraction, rsd, mean = self.grid.values_at(index).T
-        energies = [TruncatedNormal(m, s * m) for m, s in zip(mean, rsd, strict=True)]
-        numbers = {
-            "mean": mean,
-            "rsd": rsd,
-            "rollup_fraction": fraction,
-            "true_mean": np.array([energy.true_mean for energy in energies]),
-            "true_standard_deviation": np.array([energy.true_standard_deviation for energy in energies]),
-        }
-        tails = (100 - INTERVAL) / 2
-        intervals = {
-            name: tuple(np.percentile(values[1:], [tails, 100 - tails]).tolist())
-            for name, values in numbers.items()
-            if len(values) > 1
-        }
-        best = {name: float(values[0]) for name, values in numbers.items()}
-        perturbation = self.perturbation(index[0])
-        ends = tuple(
-            name for axis, name in ((2, "mean"), (1, "rsd")) if index[0, axis] in (0, self.grid.shape[axis] - 1)
-        )
+    def optimum(self, index: Any, replicas: int, intervals: Intervals | None) -> Optimum:
+        """`Optimum` at an index of the grid, also between points; `intervals` are None without resamples."""
+        values = dict(zip(self.grid.axes, self.grid.values_at(np.asarray(index)).tolist(), strict=True))
+        energy = TruncatedNormal(values["mean"], values["rsd"] * values["mean"])
+        perturbation = self.perturbation(index)
         return Optimum(
             perturbation=perturbation,
-            **best,
+            mean=values["mean"],
+            rsd=values["rsd"],
+            rollup_fraction=values["rollup_fraction"],
+            options={name: values[name] for name in self.grid.options},
+            true_mean=energy.true_mean,
+            true_standard_deviation=energy.true_standard_deviation,
             score=Score.of_resamples(self.scores(perturbation, replicas)),
-            intervals=intervals,
-            at_edge=ends,
+            intervals={} if intervals is None else intervals.bounds,
+            open_ends={} if intervals is None else intervals.open_ends,
+            at_edge=tuple(
+                name
+                for name, place, number in reversed(list(zip(self.grid.axes, index, self.grid.shape, strict=True)))
+                if name != "rollup_fraction" and number > 1 and place in (0, number - 1)
+            ),
         )
 
     def map_and_scores(self, perturbation: Any, replicas: int) -> tuple[DetectorMap, Floats, Floats]:
         """Simulated map on the measured bins, its corrected and uncorrected similarities, each (1 + resamples,)."""
         maps, noise = self.sampler.maps(perturbation, replicas)
-        counts = np.zeros(self.region.values.shape, np.int64)
-        counts[self.comparison.box] = maps[0]
-        ions = int(counts[self.region.mask].sum())
-        source = f"simulation, {perturbation!r}"
-        simulated = replace(
-            self.region,
-            values=counts,
-            is_counts=True,
-            ions=ions,
-            quantum=None,
-            smoothing=0,
-            source=source,
-            detected=None,
-        )
+        simulated = self._simulated(maps[0], f"simulation, {perturbation!r}")
         similarities = self.comparison.similarities
         return simulated, similarities(maps, noise), similarities(maps, noise, plain=True)
 
@@ -204,7 +211,7 @@ def register_repeatedly(search: EnergySearch) -> tuple[Registration, list[dict[s
         registration = replace(registration, method="search")  # of the first round, from which the others start
         rounds.append({"perturbation": to_dict(search.perturbation(best)), "registration": registration.to_dict()})
         search.place(registration, 0)
-        previous, best = best, tuple(maxima(search.matrix(ROUGH, "registration"))[0])
+        previous, best = best, tuple(maxima(search.matrix(ROUGH, "registration")[0])[0])
         if best == previous:
             break
     return search.refine_registration(registration, best), rounds

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from apt_evap._common.validation import check_count, check_number, check_seed, check_switch
 from apt_evap.emission.energies import Thermal
+from apt_evap.energy_fit.defaults import MODEL_ERROR
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,9 @@ class StudySettings:
         Seed of the resamples.
     temperature : float
         Temperature of the thermal baseline [K].
+    model_error : float
+        Relative increase of the misfit 1 - SSIM that the difference of the simulated from the measured specimen
+        explains, for the intervals; 0 for intervals by noise alone.
 
     Raises
     ------
@@ -45,6 +49,7 @@ class StudySettings:
     resamples: int = 200
     seed: int = 0
     temperature: float = 50.0
+    model_error: float = MODEL_ERROR
 
     def __post_init__(self):
         values = {
@@ -55,6 +60,7 @@ class StudySettings:
             "resamples": check_count(self.resamples, "resamples"),
             "seed": check_seed(self.seed),
             "temperature": Thermal(self.temperature).temperature,
+            "model_error": check_number(self.model_error, "model_error", at_least=0),
         }
         if self.flattening is not None:
             values["flattening"] = check_number(self.flattening, "flattening", at_least=0, unit="mm")

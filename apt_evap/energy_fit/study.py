@@ -1,7 +1,7 @@
 """Result of a fit of emission energies: similarities, the best energies, their errors."""
 
 import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +13,10 @@ from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.emission.perturbations import to_dict
 from apt_evap.energy_fit.grid import EnergyGrid
 from apt_evap.energy_fit.settings import StudySettings
+from apt_evap.energy_fit.structure import StructureScores
 from apt_evap.registration.register import Registration
+
+_GRID = ("means", "rsds", "rollup_fractions", "options")
 
 
 class Score(NamedTuple):
@@ -51,9 +54,16 @@ class Optimum:
     score : Score
         Similarity with the measured map.
     intervals : dict
-        Bounds of the central 95 % of the resamples, for each of these five numbers by name; empty without resamples.
+        Bounds of 95 %, for each of these five numbers and for each option by name. They contain the noise of the ions
+        and the error of the model, and follow the ridge of equal true means (`energy_fit.intervals`). Empty without
+        resamples.
     at_edge : tuple of str
-        "mean" and "rsd" if they are at an end of the grid: the best energies may then be beyond it.
+        "mean", "rsd" and options that are at an end of the grid: the best value may then be beyond it.
+    options : dict
+        Options of the perturbation that are axes of the grid, by name.
+    open_ends : dict
+        Whether the lower and the upper bound of an interval are at an end of the grid, two bools by name: the interval
+        may then continue beyond it.
     """
 
     perturbation: object
@@ -65,6 +75,8 @@ class Optimum:
     score: Score
     intervals: dict
     at_edge: tuple
+    options: dict = field(default_factory=dict)
+    open_ends: dict = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the optimum in plain types, dict."""
@@ -76,18 +88,20 @@ class Optimum:
 
     def scaled(self, name: str, factor: float) -> str:
         """Text of one of the numbers and its interval, times a factor, str."""
-        value = f"{getattr(self, name) * factor:.3g}"
+        value = f"{(self.options[name] if name in self.options else getattr(self, name)) * factor:.3g}"
         if not self.intervals:
             return value
         low, high = (bound * factor for bound in self.intervals[name])
-        return f"{value} ({low:.3g} to {high:.3g})"
+        below, above = self.open_ends.get(name, (False, False))
+        return f"{value} ({'at most ' * below}{low:.3g} to {'at least ' * above}{high:.3g})"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Study:
     """Similarity of simulated maps with a measured one for a grid of energies; result of `fit_energies`.
 
-    Matrices have the shape (rollup fractions, relative standard deviations, means).
+    Matrices have the shape (options, rollup fractions, relative standard deviations, means); without options the last
+    three.
 
     Parameters
     ----------
@@ -100,7 +114,7 @@ class Study:
     shares : ndarray
         Fraction of the resamples in which a point is the best.
     resampled : ndarray
-        Similarities in every resample, shape (resamples, a, b, c).
+        Similarities in every resample, shape (resamples, ...).
     optimum, refined : Optimum
         The best point of the grid, and the maximum of a spline around it.
     baselines : dict of Score
@@ -119,6 +133,9 @@ class Study:
         The measured map; its mask is the compared region.
     maps : dict of DetectorMap
         Simulated maps in the measured frame: "unperturbed", "thermal", "optimum".
+    structure : StructureScores or None
+        Second objective, which blur cannot win: contrast of the zone lines and darkness of a pole. None if no pole with
+        its rings is inside the compared region; ``provenance["structure"]`` contains the reason.
     settings : StudySettings
         Settings of the comparison, the random draws and the resampling.
     provenance : dict
@@ -140,6 +157,7 @@ class Study:
     registration: Registration
     measured: DetectorMap
     maps: dict
+    structure: StructureScores | None
     settings: StudySettings
     provenance: dict
 
@@ -150,10 +168,12 @@ class Study:
 
     def to_dict(self) -> dict[str, Any]:
         """Return results and settings in plain types, NaN as None, dict."""
-        results: dict[str, Any] = {"made_by": f"apt_evap {__version__}", "grid": asdict(self.grid)}
+        grid = {"mechanism": self.grid.name, **{name: getattr(self.grid, name) for name in _GRID}}
+        results: dict[str, Any] = {"made_by": f"apt_evap {__version__}", "grid": grid}
         results |= {name: getattr(self, name) for name in ("ssim", "errors", "shares", "gain_share")}
         results |= {name: getattr(self, name).to_dict() for name in ("optimum", "refined", "registration")}
         results |= {name: getattr(self, name) and getattr(self, name)._asdict() for name in ("gain", "ceiling")}
+        results["structure"] = self.structure and self.structure.to_dict()
         for group in ("baselines", "plain"):
             results[group] = {name: score._asdict() for name, score in getattr(self, group).items()}
         return plain(
@@ -180,6 +200,7 @@ class Study:
         best, refined = self.optimum, self.refined
         combined = self.grid.mechanism == "combined"
         fraction = f", roll-up fraction {best.rollup_fraction:g}" if combined else ""
+        fraction += "".join(f", {name} {value:g}" for name, value in best.options.items())
         edge = f" (at the end of the grid in {' and '.join(best.at_edge)})" if best.at_edge else ""
         others = [f"{name} {score}" for name, score in self.baselines.items()]
         uncorrected = f";\n uncorrected {self.plain['optimum']}, " if self.settings.allow_noise else ", "
@@ -187,11 +208,36 @@ class Study:
         others += f"two halves of the measured ions {self.ceiling}" if self.ceiling else ""
         between = f"{refined.bounded('mean')} eV, sigma/mean {refined.bounded('rsd')}"
         between += f", roll-up fraction {refined.bounded('rollup_fraction')}" if combined else ""
+        between += "".join(f", {name} {refined.bounded(name)}" for name in refined.options)
         doubtful = ", registration doubtful" if self.registration.doubtful else ""
         return (
-            f"<Study: {self.grid.mechanism}{doubtful}, best at {best.mean:g} eV, sigma/mean {best.rsd:g}{fraction}"
-            f"{edge}, SSIM {best.score}; {others};\n between points {between}; {self._energies()}>"
+            f"<Study: {self.grid.name}{doubtful}, best at {best.mean:g} eV, sigma/mean {best.rsd:g}{fraction}"
+            f"{edge}, SSIM {best.score}; {others};\n between points {between}; {self._structure()}{self._energies()}>"
         )
+
+    def point(self, index: tuple[int, ...]) -> str:
+        """Text of the energies and options at an index of the grid, str."""
+        values = dict(zip(self.grid.axes, self.grid.values_at(np.asarray(index)).tolist(), strict=True))
+        fraction = values.pop("rollup_fraction")
+        text = f"{values.pop('mean'):g} eV, sigma/mean {values.pop('rsd'):.3g}"
+        text += f", roll-up fraction {fraction:g}" if self.grid.mechanism == "combined" else ""
+        return text + "".join(f", {name} {value:g}" for name, value in values.items())
+
+    def _structure(self):
+        """Text of the second objective."""
+        scores = self.structure
+        if scores is None:
+            return ""
+        plane = "".join(map(str, scores.plane)) if min(scores.plane) >= 0 else " ".join(map(str, scores.plane))
+        contrasts, measured = (
+            " ".join(f"{ring.contrast:.2f}" for ring in each.rings) for each in (scores.optimum, scores.measured)
+        )
+        text = f"rings about ({plane}): contrasts {contrasts}, measured {measured}, misfit "
+        text += f"{scores.misfit[scores.at_optimum]:.2f} ± {scores.errors[scores.at_optimum]:.2f}"
+        if scores.disagrees:
+            text += f"; rings and SSIM disagree: rings are best at {self.point(scores.best)}, misfit "
+            text += f"{scores.misfit[scores.best]:.2f} ± {scores.errors[scores.best]:.2f}"
+        return f"{text};\n "
 
     @property
     def real_energies(self) -> tuple[float, float] | None:

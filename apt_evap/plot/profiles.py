@@ -59,7 +59,7 @@ def profile(
         color = f"C{index}"
         errors = one.error if np.isfinite(one.error).any() else None
         if line is not None:
-            label = f"{label or line.kind}: {line.width:.2f} ± {line.width_error:.2f} mm"
+            label = f"{label or line.kind}: {line.width:.2f} ± {line.width_error:.2f} {line.unit}"
             fine = np.linspace(one.position[0], one.position[-1], 400)
             ax.plot(fine, line.density(fine), color=color, linewidth=1.5, alpha=0.85)
         ax.errorbar(

@@ -1,6 +1,7 @@
 """Plots of a study: similarity against energies, and the maps side by side."""
 
 from collections.abc import Sequence
+from itertools import product
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -19,42 +20,43 @@ _MARK = "#00d0ff"  # visible on all colours of both maps
 def ssim_matrix(study: Study, axes: Sequence[Axes] | None = None, *, colormap: str = "viridis") -> NDArray[np.object_]:
     """Draw the similarity with the measured map against mean and relative standard deviation of the energy.
 
-    A frame marks the best point of the grid. A circle marks the maximum between points, with the interval of 95 % of
-    the resamples. A new figure has a legend.
+    A frame marks the best point of the grid. A circle marks the maximum between points, with its
+    intervals of 95 %. A new figure has a legend.
 
     Parameters
     ----------
     study : Study
         Result of `fit_energies`.
     axes : sequence of matplotlib.axes.Axes, optional
-        Axes for the plots, one per roll-up fraction; by default a new figure with three per row.
+        Axes for the plots, one per roll-up fraction and option; by default a new figure with three per row.
     colormap : str
         Name of a colour map of matplotlib.
 
     Returns
     -------
     ndarray of matplotlib.axes.Axes
-        Shape (n,), one per roll-up fraction.
+        Shape (n,), one per roll-up fraction and option.
 
     Raises
     ------
     ValueError
-        If the numbers of axes and roll-up fractions differ.
+        If the number of axes is wrong.
     """
     grid = study.grid
-    layers, rows, columns = grid.shape
+    *leading, rows, columns = grid.shape
+    layers = int(np.prod(leading))
     across = min(layers, 3)
     if axes is None:
         down = -(-layers // across)
         figure = new_figure((0.75 * columns * across + 1.8, (0.62 * rows + 1.0) * down))
-        figure.suptitle(f"{grid.mechanism}: structural similarity with the measured map", fontsize="medium")
+        figure.suptitle(f"{grid.name}: structural similarity with the measured map", fontsize="medium")
         panels = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True).ravel()
     elif len(axes) == layers:
         panels = np.array(axes, object)
     else:
-        raise ValueError(f"axes must be {layers}, one per roll-up fraction, got {len(axes)}")
+        raise ValueError(f"axes must be {layers}, one per roll-up fraction and option, got {len(axes)}")
     limits = {"vmin": study.ssim.min(), "vmax": study.ssim.max()}
-    for ax, values, fraction in zip(panels, study.ssim, grid.rollup_fractions, strict=False):
+    for ax, values, title in zip(panels, study.ssim.reshape(layers, rows, columns), _layers(grid), strict=False):
         image = ax.imshow(values, origin="lower", cmap=colormap, aspect="auto", **limits)
         for (row, column), value in np.ndenumerate(values):
             shade = image.cmap(image.norm(value))
@@ -64,8 +66,7 @@ def ssim_matrix(study: Study, axes: Sequence[Axes] | None = None, *, colormap: s
             text.set(color="k" if light else "w", path_effects=[withStroke(linewidth=3, foreground=shade)])
         ax.set_xticks(range(columns), [f"{mean:.4g}" for mean in grid.means])
         ax.set_yticks(range(rows), [f"{rsd:.3g}" for rsd in grid.rsds])
-        if grid.mechanism == "combined":
-            ax.set_title(f"roll-up fraction {fraction:g}", fontsize="medium")
+        ax.set_title(title, fontsize="medium")
     for ax in panels[layers:]:
         ax.remove()
     panels = panels[:layers]
@@ -90,7 +91,9 @@ def _mark_optima(study, axes):
     """Mark the best point by a frame, and the maximum between points by a circle with its interval; return both."""
     grid, best, refined = study.grid, study.optimum, study.refined
     column, row = grid.means.index(best.mean), grid.rsds.index(best.rsd)
-    ax = axes[grid.rollup_fractions.index(best.rollup_fraction)]
+    point = {**best.options, "rollup_fraction": best.rollup_fraction}
+    leading = [grid.axes[name].index(value) for name, value in point.items()]
+    ax = axes[int(np.ravel_multi_index(leading, grid.shape[:-2]))]
     frame = Rectangle((column - 0.48, row - 0.48), 0.96, 0.96, fill=False, edgecolor="r", linewidth=2)
     ax.add_patch(frame).set_label("best on the grid")
 
@@ -103,10 +106,23 @@ def _mark_optima(study, axes):
         across = places(refined.intervals["mean"], grid.means)
         along = places(np.log(refined.intervals["rsd"]), np.log(grid.rsds))
         errors = {"xerr": np.abs(across - x)[:, None], "yerr": np.abs(along - y)[:, None]}
-    label = "best between its points" + ", 95 % of the resamples" * bool(errors)
+    label = "best between its points" + ", interval of 95 %" * bool(errors)
     return frame, ax.errorbar(
         x, y, **errors, fmt="o", color="r", capsize=3, markersize=9, markerfacecolor="none", label=label
     )
+
+
+def _layers(grid):
+    """Title of each panel: the values of all axes but the last two, if there are several."""
+    shown = {name: values for name, values in list(grid.axes.items())[:-2] if len(values) > 1}
+    if grid.mechanism == "combined":
+        shown |= {"rollup_fraction": grid.rollup_fractions}
+    titles = []
+    for values in product(*list(grid.axes.values())[:-2]):
+        parts = zip(list(grid.axes)[:-2], values, strict=True)
+        texts = (f"{name.replace('rollup_', 'roll-up ')} {value:g}" for name, value in parts if name in shown)
+        titles.append(", ".join(texts))
+    return titles
 
 
 def side_by_side(
@@ -144,9 +160,10 @@ def side_by_side(
     check_number(float(radius), "the radius of circle", above=0, unit="mm")
     best = study.optimum
     if titles is None:
-        mechanism = study.grid.mechanism
+        mechanism = study.grid.name
         if mechanism == "combined":
             mechanism += f", roll-up fraction {best.rollup_fraction:g}"
+        mechanism += "".join(f", {name} {value:g}" for name, value in best.options.items())
         energies = f"{best.mean:g} eV, σ/mean {best.rsd:g}"
         titles = "measured", "simulated, unperturbed", f"simulated, {mechanism}\n{energies}"
     # below 2 percent may be a dark rim
@@ -207,11 +224,16 @@ def _scores(study):
     if study.registration.doubtful:
         lines.insert(0, f"THE REGISTRATION IS DOUBTFUL: correlation {study.registration.score:.2f}\n")
     lines += [f"{name}: {score}" for name, score in study.baselines.items()]
-    lines.append(f"{study.grid.mechanism}: {study.optimum.score}")
+    lines.append(f"{study.grid.name}: {study.optimum.score}")
     lines.append(f"gain over unperturbed: {study.gain}")
     if study.ceiling is not None:
         lines += [f"uncorrected: {study.plain['optimum']}"] * corrected
         lines.append(f"two halves of the measured ions: {study.ceiling}")
+    if study.structure is not None:
+        for name in ("measured", "unperturbed", "optimum"):
+            rings = getattr(study.structure, name).rings
+            lines.append(f"contrast of rings, {name}: " + ", ".join(f"{ring.contrast:.2f}" for ring in rings))
+        lines += ["RINGS AND SSIM DISAGREE"] * study.structure.disagrees
     width, height = study.measured.bin_size
     lines.append(f"bins {width:.3g} × {height:.3g} mm, smoothed by {study.settings.smoothing:.3g} mm")
     return "\n".join(lines)

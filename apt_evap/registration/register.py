@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_array, check_number, check_sequence, check_switch
+from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence, check_switch
 from apt_evap._common.warnings import RegistrationWarning
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
@@ -25,6 +25,8 @@ from apt_evap.registration.correlation_search import (
     refine,
     search,
 )
+from apt_evap.registration.patches import patch_displacements
+from apt_evap.registration.polynomial import LARGEST_DEGREE, Distortion, fit_polynomial
 from apt_evap.registration.transform import SimilarityTransform
 
 DOUBTFUL = 0.5
@@ -57,10 +59,13 @@ class Registration:
         Origin of the transform: "search", "start", "pole", "points", or "" if given by the user.
     ties : tuple of Registration
         Other transforms that are equally good within the noise, usually by the symmetry of the crystal.
+    distortion : Distortion, optional
+        Polynomial terms, applied last: the distortion of an instrument with a reflectron.
 
     Notes
     -----
-    With z = x + iy, a point moves to z' = scale exp(i rotation) z + shift, with the conjugate of z if mirrored.
+    With z = x + iy, a point moves to z' = scale exp(i rotation) z + shift, with the conjugate of z if mirrored, and
+    then by the distortion.
     """
 
     rotation: float
@@ -72,6 +77,7 @@ class Registration:
     residual: float = float("nan")
     method: str = ""
     ties: tuple = ()
+    distortion: Distortion | None = None
 
     def __post_init__(self):
         rotation = check_number(self.rotation, "rotation", unit="degrees")
@@ -81,6 +87,8 @@ class Registration:
         object.__setattr__(self, "shift", tuple(float(value) for value in shift))
         object.__setattr__(self, "mirror", check_switch(self.mirror, "mirror"))
         object.__setattr__(self, "ties", tuple(self.ties))
+        if self.distortion is not None:
+            check_kind(self.distortion, "distortion", Distortion, "a Distortion")
 
     @property
     def transform(self) -> SimilarityTransform:
@@ -102,6 +110,27 @@ class Registration:
         """
         z = np.asarray(x, float) + 1j * np.asarray(y, float)
         z = self.transform.forth(z)
+        if self.distortion is not None:
+            z = self.distortion.forth(z)
+        return z.real, z.imag
+
+    def back(self, x: ArrayLike, y: ArrayLike) -> tuple[Floats, Floats]:
+        """Move points of the measured frame into the simulated one; NaN where a distortion cannot be inverted.
+
+        Parameters
+        ----------
+        x, y : array_like
+            Measured detector coordinates [mm], of equal shape.
+
+        Returns
+        -------
+        x, y : ndarray
+            Simulated detector coordinates [mm].
+        """
+        z = np.asarray(x, float) + 1j * np.asarray(y, float)
+        if self.distortion is not None:
+            z = self.distortion.back(z)
+        z = self.transform.back(z)
         return z.real, z.imag
 
     def hits(self, hits: Hits) -> "Hits":
@@ -122,7 +151,15 @@ class Registration:
 
     @property
     def inverse(self) -> "Registration":
-        """The transform from the measured into the simulated frame, a Registration without score."""
+        """The transform from the measured into the simulated frame, a Registration without score.
+
+        Raises
+        ------
+        ValueError
+            With a distortion: use `back`.
+        """
+        if self.distortion is not None:
+            raise ValueError("a registration with a distortion has no inverse Registration, use back(x, y)")
         inverse = self.transform.inverse
         back = Registration(inverse.rotation, inverse.scale, (0.0, 0.0), inverse.mirror)
         shift = -back.transform.forth(inverse.anchor)  # with the angle of `back`, to the last bit
@@ -148,6 +185,7 @@ class Registration:
         """Return the registration in the plain types of JSON (dict); NaN becomes None."""
         plain = asdict(self)
         plain.update(shift=list(self.shift), ties=[tie.to_dict() for tie in self.ties], doubtful=bool(self.doubtful))
+        plain["distortion"] = self.distortion and self.distortion.to_dict()
         return {name: None if value != value else value for name, value in plain.items()}
 
     def to_text(self) -> str:
@@ -170,6 +208,9 @@ class Registration:
         settings = {name: float("nan") if value is None else value for name, value in settings.items()}
         ties = tuple(cls.from_dict(tie) for tie in settings.pop("ties", ()))
         settings.pop("doubtful", None)  # follows from the others
+        distortion = settings.pop("distortion", None)
+        if isinstance(distortion, dict):
+            settings["distortion"] = Distortion.from_dict(distortion)
         return cls(**settings, ties=ties)
 
     def __str__(self):
@@ -177,6 +218,8 @@ class Registration:
         parts.append(f"shifted by ({self.shift[0]:.2f}, {self.shift[1]:.2f}) mm")
         if self.mirror:
             parts.insert(0, "mirrored")
+        if self.distortion is not None:
+            parts.append(f"with a distortion of degree {self.distortion.degree}")
         return ", ".join(parts)
 
 
@@ -299,8 +342,59 @@ def register(
     return best
 
 
+def register_distortion(
+    registration: Registration,
+    simulated: DetectorMap | Hits,
+    measured: DetectorMap | Hits,
+    *,
+    degree: int | None = None,
+) -> Registration:
+    """Add polynomial terms to a registration, from the displacements of patches of both maps.
+
+    For a measured map of an instrument with a reflectron, without a calibration grid. The maps are flattened as for
+    `register`, and divided into overlapping patches. The displacement of each patch with the largest correlation is one
+    point of a least squares fit, weighted by its accuracy.
+
+    Parameters
+    ----------
+    registration : Registration
+        Result of `register`.
+    simulated, measured : DetectorMap or Hits
+        The same maps.
+    degree : int, optional
+        As for `register_points`, by default the largest degree that is not over-fitted.
+
+    Returns
+    -------
+    Registration
+        With `residual`, the root mean square residual of the patches [mm]. Unchanged if no terms are significant.
+
+    Raises
+    ------
+    ValueError
+        If too few patches have a clear maximum of the correlation.
+
+    Notes
+    -----
+    A patch is 1/5 of the diameter wide, and may move by a third of that. The accuracy of its place follows from its
+    correlation coefficient r: the variance is proportional to (1 - r^2) / r^2. Patches with r < 0.5 are ignored.
+    """
+    check_kind(registration, "registration", Registration, "a Registration")
+    views = [_view(value, name) for value, name in ((simulated, "simulated"), (measured, "measured"))]
+    best = replace(registration, distortion=None)
+    for _ in range(2):  # repeated with patches of the distorted map
+        centres, targets, weights = patch_displacements(*views, best.back, best.scale)
+        x, y = best.back(centres.real, centres.imag)
+        source = x - 1j * y if best.mirror else x + 1j * y
+        fit = fit_polynomial(source, targets, degree, weights)
+        if fit.degree == 0:
+            return registration
+        best = _polynomial_registration(registration, fit, registration.method)
+    return best
+
+
 def register_points(
-    simulated_points: ArrayLike, measured_points: ArrayLike, mirror: bool | None = None
+    simulated_points: ArrayLike, measured_points: ArrayLike, mirror: bool | None = None, *, degree: int | None = 0
 ) -> "Registration":
     """Find the transform of simulated points, such as poles, to measured points by least squares.
 
@@ -311,6 +405,9 @@ def register_points(
     mirror : bool, optional
         Whether the frames are mirror images. By default the better fit for n >= 3, and False for two points, which fit
         both ways.
+    degree : int, optional
+        Degree of polynomial terms for the distortion of a reflectron: 0 for a similarity transform, 1 with anisotropy,
+        2 and 3 with quadratic and cubic terms. None for the largest degree that is not over-fitted, see the notes.
 
     Returns
     -------
@@ -319,7 +416,19 @@ def register_points(
     Raises
     ------
     ValueError
-        If there are fewer than two points, numbers differ, or all points of one frame coincide.
+        If there are fewer than two points, numbers differ, all points of one frame coincide, or there are too few
+        points for the degree.
+
+    Warns
+    -----
+    RegistrationWarning
+        If a similarity transform was fitted, but polynomial terms are significant.
+
+    Notes
+    -----
+    With None, terms of a degree are kept if they pass two tests, in comparison with the next lower degree: an F test at
+    1 % of the decrease of the residual, and a smaller residual of points that are left out of the fit, one at a time.
+    A degree of 1, 2 or 3 needs more than 3, 6 or 10 points.
     """
     simulated = check_array(simulated_points, "simulated_points", ("n", 2))
     measured = check_array(measured_points, "measured_points", (len(simulated), 2))
@@ -335,7 +444,35 @@ def register_points(
     best = min(fits, key=lambda one: (round(one.residual / np.ptp(target.real + target.imag), 9), one.mirror))
     if not best.scale > 0:
         raise ValueError("simulated_points and measured_points must be related by rotation, scale and shift")
+    if degree is not None:
+        degree = check_count(degree, "degree", at_most=LARGEST_DEGREE)
+    points = source.conj() if best.mirror else source
+    fit = fit_polynomial(points, target, degree or None)
+    if degree != 0:
+        return _polynomial_registration(best, fit, "points")
+    if fit.degree:
+        warnings.warn(
+            f"the residual of the points, {best.residual:.2f} mm, has a systematic part: terms of degree {fit.degree} "
+            f"reduce it to {fit.residual:.2f} mm; for an instrument with a reflectron use Hits.undistorted, or "
+            "degree=None",
+            RegistrationWarning,
+            stacklevel=2,
+        )
     return best
+
+
+def _polynomial_registration(registration, fit, method):
+    """Registration with the linear part and the distortion of a fit."""
+    factor, shift = fit.similarity
+    return replace(
+        registration,
+        rotation=float(np.degrees(np.angle(factor))),
+        scale=float(abs(factor)),
+        shift=(shift.real, shift.imag),
+        residual=fit.residual,
+        method=method,
+        distortion=fit.distortion,
+    )
 
 
 def _least_squares(source, target, mirror):
@@ -354,7 +491,7 @@ def _near(start, pole, tolerance, measured):
         (x, y), (at_x, at_y) = check_array(pole, "pole", (2, 2)).tolist()
         anchor, place, fraction = complex(x, y), complex(at_x, at_y), 1 / 50
     elif start is not None:
-        x, y = start.inverse.points(measured.centre.real, measured.centre.imag)
+        x, y = start.back(measured.centre.real, measured.centre.imag)
         anchor, place, fraction = complex(x, y), measured.centre, 1 / 5
     elif tolerance is not None:
         raise ValueError(f"tolerance needs a pole or a start, got {tolerance!r} alone")

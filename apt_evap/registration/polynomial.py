@@ -1,0 +1,208 @@
+"""Polynomial terms of a registration: what a reflectron adds to rotation, scale and shift.
+
+With z = x + iy, a registered point z' moves to z' + sum c_jk w^j conj(w)^k for w = (z' - centre) / radius: the term
+conj(w) of first order (anisotropy), and those of second and third order. Measured grids of reflectrons are described to
+0.1 mm by the cubic terms, where similarity transforms leave 0.7 to 0.9 mm.
+"""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy
+from numpy.typing import ArrayLike
+
+from apt_evap._common.types import Floats
+from apt_evap._common.validation import check_array, check_count, check_number
+
+SIGNIFICANCE = 0.01
+"""Probability of a smaller residual by chance below which terms of a higher degree are kept."""
+LARGEST_DEGREE = 3
+_TERMS = {1: ((0, 1),), 2: ((2, 0), (1, 1), (0, 2)), 3: ((3, 0), (2, 1), (1, 2), (0, 3))}
+_ITERATIONS = 50  # of the inverse; a distortion of 10 % converges by a factor of 10 each
+
+
+def terms_of(degree: int) -> tuple[tuple[int, int], ...]:
+    """Powers of w and of its conjugate in a polynomial of a degree, beyond a similarity; none for degree 0."""
+    return tuple(term for order in range(1, degree + 1) for term in _TERMS[order])
+
+
+@dataclass(frozen=True)
+class Distortion:
+    """Polynomial terms of a registration.
+
+    Parameters
+    ----------
+    degree : int
+        1 for anisotropy alone, 2 and 3 with quadratic and cubic terms.
+    centre : tuple of float
+        Origin of the polynomial in the measured frame [mm].
+    radius : float
+        Unit of length of the polynomial [mm].
+    coefficients : tuple of complex
+        Of the terms of `terms_of` [mm].
+    errors : tuple of float
+        Their standard errors, of the real and the imaginary part alike [mm]; NaN if not known.
+    """
+
+    degree: int
+    centre: tuple
+    radius: float
+    coefficients: tuple
+    errors: tuple = ()
+
+    def __post_init__(self):
+        degree = check_count(self.degree, "degree", at_least=1, at_most=LARGEST_DEGREE)
+        number = len(terms_of(degree))
+        object.__setattr__(self, "centre", tuple(check_array(self.centre, "centre", (2,)).tolist()))
+        object.__setattr__(self, "radius", check_number(self.radius, "radius", above=0, unit="mm"))
+        coefficients = np.asarray(self.coefficients, complex)
+        if coefficients.shape != (number,) or not np.isfinite(coefficients).all():
+            raise ValueError(f"coefficients must be {number} finite numbers for degree {degree}")
+        errors = np.asarray(self.errors if len(self.errors) else [np.nan] * number, float)
+        if errors.shape != (number,):
+            raise ValueError(f"errors must be {number} numbers for degree {degree}, got {len(errors)}")
+        object.__setattr__(self, "coefficients", tuple(coefficients.tolist()))
+        object.__setattr__(self, "errors", tuple(errors.tolist()))
+
+    def shift(self, points: Any) -> Any:
+        """Displacement of points of the measured frame, complex of any shape [mm]."""
+        w = (points - complex(*self.centre)) / self.radius
+        return sum(
+            c * w**j * np.conj(w) ** k for c, (j, k) in zip(self.coefficients, terms_of(self.degree), strict=True)
+        )
+
+    def forth(self, points: Any) -> Any:
+        """Distort points, complex of any shape [mm]."""
+        return points + self.shift(points)
+
+    def back(self, points: Any) -> Any:
+        """Points that `forth` moves to these, by fixed point iteration; NaN where it does not converge."""
+        found = np.asarray(points, complex)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for _ in range(_ITERATIONS):
+                found = points - self.shift(found)
+            wrong = ~(np.abs(self.forth(found) - points) <= 1e-6 * self.radius)
+        return np.where(wrong, np.nan, found)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the parameters in the plain types of JSON, dict."""
+        return {
+            "degree": self.degree,
+            "centre": list(self.centre),
+            "radius": self.radius,
+            "coefficients": [[c.real, c.imag] for c in self.coefficients],
+            "errors": [None if np.isnan(error) else error for error in self.errors],
+        }
+
+    @classmethod
+    def from_dict(cls, settings: dict[str, Any]) -> "Distortion":
+        """Rebuild the terms from the result of `to_dict`."""
+        errors = [np.nan if error is None else error for error in settings["errors"]]
+        coefficients = [complex(*pair) for pair in settings["coefficients"]]
+        return cls(settings["degree"], settings["centre"], settings["radius"], tuple(coefficients), tuple(errors))
+
+
+class PolynomialFit(NamedTuple):
+    """Least squares fit of displacements by a polynomial."""
+
+    degree: int
+    """Degree that was selected; 0 for none beyond a similarity."""
+    similarity: tuple[complex, complex]
+    """Factor and shift of the linear part: z' = factor z + shift."""
+    distortion: Distortion | None
+    """The other terms, applied after the linear part; None for degree 0."""
+    residual: float
+    """Root mean square distance of the points [mm]."""
+    validated: float
+    """The same for points that were left out of the fit, one at a time [mm]."""
+    probabilities: dict[int, float]
+    """Probability that the terms of each degree reduce the residual as much by chance (F test)."""
+
+
+def fit_polynomial(source: Any, target: Any, degree: int | None, weights: ArrayLike | None = None) -> PolynomialFit:
+    """Fit a similarity transform and polynomial terms to pairs of points.
+
+    Parameters
+    ----------
+    source, target : ndarray
+        The same points in both frames, complex of shape (n,) [mm].
+    degree : int, optional
+        Degree of the polynomial, 0 to 3. By default the largest one whose terms, compared with the next lower degree
+        with enough points, are significant by an F test at 1 %, and reduce the residual of points that are left out.
+    weights : array_like, optional
+        Weights of the points, shape (n,); by default equal.
+
+    Returns
+    -------
+    PolynomialFit
+    """
+    source, target = np.asarray(source, complex), np.asarray(target, complex)
+    n = len(source)
+    weights = np.ones(n) if weights is None else check_array(weights, "weights", (n,))
+    linear = np.column_stack([source, np.ones(n)])
+    root = np.sqrt(weights)
+    similarity = np.linalg.lstsq(linear * root[:, None], target * root, rcond=None)[0]
+    moved = linear @ similarity
+    centre = complex(np.mean(moved))
+    radius = max(float(np.abs(moved - centre).max()), 1e-9)
+    w = (moved - centre) / radius
+    fits = {}
+    for trial in range(LARGEST_DEGREE + 1) if degree is None else sorted({0, degree}):
+        matrix = np.column_stack([w, np.ones(n), *(w**j * np.conj(w) ** k for j, k in terms_of(trial))])
+        if 2 * n <= 2 * matrix.shape[1]:  # no freedom for errors
+            if degree is not None and trial == degree:
+                raise ValueError(f"degree {degree} needs more than {matrix.shape[1]} points, got {n}")
+            break
+        fits[trial] = _least_squares(matrix, target, root)
+    chosen, probabilities = 0, {}
+    for trial in sorted(fits)[1:]:
+        lower, higher = fits[chosen], fits[trial]
+        more, freedom = 2 * (higher.number - lower.number), 2 * (n - higher.number)
+        ratio = (lower.squares - higher.squares) / more / max(higher.squares / freedom, np.finfo(float).tiny)
+        probabilities[trial] = float(scipy.stats.f.sf(ratio, more, freedom))
+        if degree is not None or (probabilities[trial] < SIGNIFICANCE and higher.validated < lower.validated):
+            chosen = trial
+    best = fits[chosen]
+    turn, shift, *others = best.values
+    distortion = None
+    if others:
+        factor = (similarity[0] * turn / radius, shift + turn * (similarity[1] - centre) / radius)
+        # the polynomial acts on the points after this linear part: their w is that of the fit, turned by `unit`
+        unit = turn / abs(turn)
+        coefficients = [c * unit**-j * np.conj(unit) ** -k for c, (j, k) in zip(others, terms_of(chosen), strict=True)]
+        errors = tuple(best.errors[2:].tolist())
+        distortion = Distortion(chosen, (shift.real, shift.imag), abs(turn), tuple(coefficients), errors)
+    else:
+        factor = (complex(similarity[0]), complex(similarity[1]))
+    return PolynomialFit(
+        degree=chosen,
+        similarity=(complex(factor[0]), complex(factor[1])),
+        distortion=distortion,
+        residual=float(np.sqrt(best.squares / weights.sum())),
+        validated=best.validated,
+        probabilities=probabilities,
+    )
+
+
+class _Solution(NamedTuple):
+    values: Floats
+    errors: Floats
+    squares: float
+    validated: float
+    number: int
+
+
+def _least_squares(matrix, target, root):
+    """Complex least squares with errors, and the root mean square residual of points left out."""
+    weighted = matrix * root[:, None]
+    values = np.linalg.lstsq(weighted, target * root, rcond=None)[0]
+    residual = (target - matrix @ values) * root
+    squares = float(np.sum(np.abs(residual) ** 2))
+    inverse = np.linalg.pinv(weighted.conj().T @ weighted)
+    n, number = matrix.shape
+    # of the real and of the imaginary part
+    errors = np.sqrt(np.real(np.diag(inverse)) * squares / (2 * (n - number)))
+    leverage = np.real(np.einsum("ij,jk,ik->i", weighted, inverse, weighted.conj()))
+    left_out = residual / np.maximum(1 - leverage, 1e-9)
+    return _Solution(values, errors, squares, float(np.sqrt(np.sum(np.abs(left_out) ** 2) / np.sum(root**2))), number)
