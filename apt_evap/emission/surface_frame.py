@@ -5,7 +5,7 @@ from numpy.typing import ArrayLike
 
 from apt_evap._common.small_matrices import products
 from apt_evap._common.types import Booleans, Floats
-from apt_evap._common.validation import check_array
+from apt_evap._common.validation import check_array, check_kind
 from apt_evap._core.elementary import exponential
 from apt_evap.emission.emissions import Emissions, Launches
 from apt_evap.emission.kept import kept
@@ -118,7 +118,7 @@ def target_shares(emissions: Emissions, sharpness: float) -> Floats:
     with the charges :math:`q_j` of the neighbours in falling order. Where two of them are nearly equal, an atom moves
     onto the bridge or hollow between them.
     """
-    n = len(emissions)
+    n = len(check_kind(emissions, "emissions", Emissions, "Emissions"))
     shares = np.zeros((n, 3))
     shares[:, 0] = 1.0
     if sharpness == 0.0 or n == 0:

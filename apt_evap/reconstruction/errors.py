@@ -210,7 +210,7 @@ class ReconstructionErrors:
             ]
         scatter = np.sqrt(variances[0] + variances[1]), np.sqrt(variances[2])
         tables = [values.reshape(shape) for values in (ions, *means, *scatter)]
-        return ErrorField(angle_edges, depth_edges, *tables)
+        return ErrorField(angle_edges, depth_edges, *tables)  # type: ignore[arg-type]
 
     def to_dict(self) -> dict[str, Any]:
         """All but the arrays with a row per ion as numbers and lists, None for NaN, for JSON.

@@ -10,7 +10,14 @@ from numpy.typing import ArrayLike
 
 from apt_evap._common.files import FileError, open_for_reading, replace_file
 from apt_evap._common.types import AnyPath, Floats
-from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_switch
+from apt_evap._common.validation import (
+    check_array,
+    check_count,
+    check_kind,
+    check_number,
+    check_sequence,
+    check_switch,
+)
 from apt_evap.analysis.apex import fit_caps, image_compression
 from apt_evap.crystallography.symmetry import symmetry_about_axis
 from apt_evap.emission.perturbations import Perturbation, Unperturbed
@@ -220,7 +227,7 @@ def origin_table(
     projection is that of `image_compression` with them. The table is therefore as valid for another radius, distance or
     compression as the pattern of the map is.
     """
-    runs = [runs] if isinstance(runs, Run) else list(runs)
+    runs = [runs] if isinstance(runs, Run) else list(check_sequence(runs, "runs", "Run"))
     if not runs:
         raise ValueError("runs must contain at least one run, got none")
     perturbation = Unperturbed() if perturbation is None else perturbation
@@ -239,7 +246,7 @@ def origin_table(
             sites = run.emissions.positions[cap.first : cap.last]
             true[cap.first : cap.last] = (sites - cap.centre)[:, :2] / cap.radius
         chosen = hits.detected
-        ideal = projection.projection.directions(np.column_stack([hits.x, hits.y])[chosen])
+        ideal = projection.projection.directions(np.column_stack([hits.x, hits.y])[chosen])  # type: ignore[list-item]
         front = ideal[:, 2] > 0  # a wide detector also sees ions from the shank
         places.append(ideal[front, :2])
         shifts.append(true[chosen][front] - ideal[front, :2])

@@ -400,7 +400,6 @@ def reconstruct(
         "distance": distance,
         "field_of_view": rim,
     }
-    settings |= {name: float(value) for name, value in needs.get(mode, {}).items()}
     swept, widening = _cross_sections(settings)
     per_ion = volume / efficiency
     if mode == "voltage":
@@ -422,6 +421,7 @@ def reconstruct(
     else:
         radii = radii[chosen]
 
+    settings |= {name: float(value) for name, value in needs.get(mode, {}).items()}  # type: ignore[arg-type]
     if mode == "voltage":
         settings |= {"field_factor": field_factor, "smoothing": smoothing}
     shifts = covariances = None

@@ -43,7 +43,7 @@ def surface_after(run: Run, n_threads: int | None = None) -> Emitter:
         run.voltage,
         settings=ChargeSettings(**run.settings["charges"]),
         n_threads=n_threads,
-        rule=rule(**described),  # type: ignore[operator]
+        rule=rule(**described),  # type: ignore[operator, arg-type]
     )
     emitter.restore(run.state)
     return emitter

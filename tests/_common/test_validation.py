@@ -577,6 +577,35 @@ CASES = [
             "seed": COUNT,
         },
     ),
+    (ae.ChargeRatio, {"threshold": 0.9}, {"threshold": [*NUMBER, -1.0, 99.0], "width": [*NUMBER, -1.0, 99.0]}),
+    (
+        ae.WideDesign,
+        {"place": 1, "velocity": 2, "height": 1, "mixed": 2},
+        {
+            **{name: [*COUNT, 7] for name in ("place", "velocity", "height", "mixed")},
+            "launches_per_coefficient": [*NUMBER, 0.9, 5.0],
+        },
+    ),
+    (ae.ResponseSettings.wide, {}, {"height": [*POSITIVE, 2.0], "energy_limit": POSITIVE, "bound": POSITIVE}),
+    (
+        ae.ImagingGas,
+        {"name": "Xe", "ionisation_energy": 12.13, "field": 15.0},
+        {"ionisation_energy": POSITIVE, "field": POSITIVE},
+    ),
+    (
+        ae.pole_profile,
+        {"map": grid, "projection": ae.Projection(10.0, centre=(10.0, 10.0))},
+        {"map": [*OBJECT, None], "projection": [*OBJECT, None], "radii": [3, "x", [1.0], [2.0, 1.0], [NAN, 1.0]]},
+    ),
+    (
+        ae.pole_line_profile,
+        {"map": grid, "projection": ae.Projection(10.0, centre=(10.0, 10.0)), "pole": (0, 0, 1), "toward": (1, 0, 1)},
+        {"map": [*OBJECT, None], "projection": [*OBJECT, None], "pole": [*VECTOR, (0, 0, 0)], "bins": [*COUNT, 0]},
+    ),
+    (ae.effective_ions, {}, {"map": [*OBJECT, None]}),
+    (ae.read_grid, {}, {"path": [None, 3, NAN, [], "a\0b", "none.csv"]}),
+    (ae.read_tip, {}, {"path": [None, 3, NAN, [], "a\0b", "none.lmp"]}),
+    (ae.register_distortion, {"simulated": grid, "measured": grid}, {"registration": [*OBJECT, None]}),
     (ae.load, {}, {"path": [None, 3, NAN, [], "a\0b", "none.h5"]}),
     (ae.read, {}, {"path": [None, 3, NAN, [], "a\0b", "none.epos"]}),
     (ae.read_ranges, {}, {"path": [None, 3, NAN, [], "a\0b", "none.rrng"]}),
@@ -636,6 +665,10 @@ NEEDS_A_RUN = [
         {"perturbation": OBJECT, "seed": [value for value in SEED if value is not None]},
     ),
     (ae.fit_caps, {"windows": 1}, {"run": [*OBJECT, None]}),
+    (ae.origin_table, {}, {"runs": [*OBJECT, None]}),
+    (ae.fit_tips, {"measured": hits}, {"runs": [*OBJECT, None]}),
+    (ae.field_ion_image, {}, {"emitter": [*OBJECT, None]}),
+    (ae.target_shares, {"sharpness": 0.1}, {"emissions": [*OBJECT, None]}),
     (ae.image_compression, {}, {"run": [*OBJECT, None]}),
     (ae.run_field_factor, {}, {"run": [*OBJECT, None]}),
     (ae.lateral_tracks, {"ions": [0], "energies": [0.1]}, {"run": [*OBJECT, None]}),
@@ -730,7 +763,10 @@ def test_every_public_name_with_arguments_is_in_the_table():
     taken |= {"FileError", "TruncatedFile", "Outcome", "Run", "plot", "__version__"}  # made by the package
     taken |= {"Reconstruction", "ReconstructionErrors", "DistributionMap"}  # made by the package
     taken |= {"chunks", "Study", "ZoneLine", "History", "CapHistory", "Batch"}  # in test_chunks; made by the package
-    taken |= {"Ring"}  # made by the package
+    taken |= {"Ring", "FieldIonImage", "PrecipitateErrors", "TipFit"}  # made by the package
+    taken |= {"OriginTable", "Distortion", "DistortionGrid"}  # made by the package, or read from its files
+    taken |= {"precipitate_errors"}  # in test_precipitate
+    taken |= {"report"}  # a module
     taken |= {"Union"}  # takes positional arguments only: in test_regions
     taken |= {name for name in ae.__all__ if name.endswith("Warning")}
     missing = {name for name in ae.__all__ if name not in taken and getattr(ae, name) not in tried}

@@ -14,7 +14,7 @@ import pytest
 import apt_evap as ae
 from apt_evap.config.simulation_file import read_config
 
-FINGERPRINT = "4efc28fb6e8fe3a8272a351cc3bfcd80a432c16644bcf1c41323950bfe3274be"
+FINGERPRINT = "c33de221a7025b190e703cc033055109c6df9aee6b97e8e2e1e935b8af04016e"
 PROGRAM = """
 import warnings
 
