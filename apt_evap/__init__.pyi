@@ -71,6 +71,7 @@ from .evaporation.bonds import CoordinationTable as CoordinationTable
 from .evaporation.bonds import PairEnergies as PairEnergies
 from .evaporation.emitter import Emitter as Emitter
 from .evaporation.law import Extremal as Extremal
+from .evaporation.rule import ConstantPotential as ConstantPotential
 from .evaporation.rule import Robin as Robin
 from .evaporation.settings import ChargeSettings as ChargeSettings
 from .evaporation.thermal import Arrhenius as Arrhenius

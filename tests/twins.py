@@ -4,6 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.special import erf
 
 
 def potential(points, atoms, charges):
@@ -112,6 +113,15 @@ def robin(positions, normals, tolerance=1e-12, most_sweeps=400):
     return charges, 2 * np.pi * n / (matrix @ charges).sum()
 
 
+def constant_potential(positions, self_term, eta=None):
+    """Charges at which every atom has the potential 1 [e/nm], by the dense matrix; eta [1/nm] of Gaussian charges."""
+    d = np.linalg.norm(positions[:, None] - positions, axis=2)
+    np.fill_diagonal(d, 1.0)
+    matrix = (1.0 if eta is None else erf(eta * d / np.sqrt(2))) / d
+    np.fill_diagonal(matrix, self_term)
+    return np.linalg.solve(matrix, np.ones(len(positions)))
+
+
 def verlet(acceleration, position, velocity, centre, reach, factor, first_length):
     """Velocity Verlet with dt = factor |v|/|a|, the first step by a length (Shaikh et al., arXiv 2509.13744).
 
@@ -157,3 +167,13 @@ def hyperbola(strength, position, velocity, radius):
     across = -np.sin(turn) * outward + np.cos(turn) * sideways
     radial = np.sqrt(max(0.0, 2 * (energy - strength / radius) - (momentum / radius) ** 2))
     return radius * direction, radial * direction + momentum / radius * across, time
+
+
+def potential_of_others(atoms, charges):
+    """Sum q/r over all other atoms at each atom, shape (n,)."""
+    out = np.empty(len(atoms))
+    for i, atom in enumerate(atoms):
+        r = np.linalg.norm(atoms - atom, axis=1)
+        r[i] = np.inf
+        out[i] = (charges / r).sum()
+    return out

@@ -5,6 +5,7 @@ from apt_evap._core.octree cimport Octree
 
 cdef class InteractionLists:
     cdef readonly Octree tree
+    cdef readonly double opening_angle
     cdef long n_groups
     cdef int[:, ::1] members     # (n_groups, 32) slots of each group
     cdef double[:, ::1] ball     # (n_groups, 4) centre and radius of each group

@@ -1,7 +1,8 @@
 """Sweeps: the field of all atoms at each atom, by common interaction lists of groups of 32 neighbouring atoms.
 
 The walk collects, the kernel sums: the 32 atoms of a group have one list of the cells and atoms that act on them. Lists
-depend only on positions, so they are valid for all sweeps until an atom is added or removed. The groups are made by
+depend only on positions, so they are valid for all sweeps until an atom is added or removed (and on nodes whose charges
+cancel, which are not used as cells). The groups are made by
 median splits within nodes of the octree. Measured: at equal error, a sweep over R = 80 a takes 0.7 of the time for
 groups of 32 successive atoms in Morton order, which are wider because of the jumps of this order.
 """
@@ -80,7 +81,7 @@ cdef class InteractionLists:
             raise ValueError("lists need a tree without inserted atoms")
         cdef long node = 0, count = 0, group, chunk, n_chunks
         cdef long[::1] chunk_node = np.empty(tree.n_nodes, np.int64), chunk_group = np.zeros(tree.n_nodes + 1, np.int64)
-        self.tree = tree
+        self.tree, self.opening_angle = tree, opening_angle
         n_chunks = 0
         while node < tree.n_nodes:
             count = tree.last[node] - tree.first[node]
@@ -174,7 +175,7 @@ cdef class InteractionLists:
         while node < tree.n_nodes:
             dx, dy, dz = ball[0] - tree.ball[node, 0], ball[1] - tree.ball[node, 1], ball[2] - tree.ball[node, 2]
             reach = tree.ball[node, 3] * factor + ball[3]
-            if reach * reach < dx * dx + dy * dy + dz * dz:
+            if reach * reach < dx * dx + dy * dy + dz * dz and not tree.cancels[node]:
                 if cells != NULL:
                     cells[n_cells] = <int>node
                 n_cells += 1

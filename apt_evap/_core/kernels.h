@@ -22,6 +22,8 @@
 
 #define GROUP 32          /* targets of one group: two or four AVX-512 registers per coordinate */
 #define CELL 10           /* numbers of one cell: centre x y z, charge, quadrupole xx xy xz yy yz zz */
+#define MULTIPOLE 23      /* numbers of one cell of potentials: centre, charge, dipole, quadrupole, octupole */
+#define CHUNK 64          /* sources of a partial sum of potentials */
 #define LANES 8           /* sources of one point sum: an AVX-512 register of doubles */
 #define SINGLE_LANES 16   /* the same in single precision */
 #define SAME_PLACE 1e-12  /* [nm^2] below this a source is the target itself; atoms are 0.2 nm apart */
@@ -233,6 +235,19 @@ APT_CLONES static float patch_dot(long n, const float *restrict a, const float *
          + (((s[1] + s[9]) + (s[5] + s[13])) + ((s[3] + s[11]) + (s[7] + s[15])));
 }
 
+/* One row of the potential matrix: row[k] = 1/|p - r_k|, and `self` for the atom at p. */
+APT_CLONES static void patch_row_potential(long n, const float *restrict x, const float *restrict y,
+                                           const float *restrict z, float px, float py, float pz, float self,
+                                           float *restrict row)
+{
+#pragma omp simd
+    for (long k = 0; k < n; k++) {
+        const float dx = px - x[k], dy = py - y[k], dz = pz - z[k];
+        const float s = dx * dx + dy * dy + dz * dz;
+        row[k] = s > (float)SAME_PLACE ? 1.0f / sqrtf(s) : self;
+    }
+}
+
 /* Adds the field of the n charges q of the patch at m targets, all relative to the hole; m is a multiple of GROUP.
  * Targets are in the lanes: with the sources in the lanes, the sum over the lanes takes longer than the terms. The sums
  * start from the values in memory and each source has its own variables; otherwise GCC 12 replaces the lanes by scalars
@@ -265,6 +280,31 @@ APT_CLONES static void patch_field(long m, const float *restrict targets_x, cons
         memcpy(field_x + k, ex, sizeof ex);
         memcpy(field_y + k, ey, sizeof ey);
         memcpy(field_z + k, ez, sizeof ez);
+    }
+}
+
+/* Adds the potential of the n charges q of the patch at m targets; see patch_field. */
+APT_CLONES static void patch_potential(long m, const float *restrict targets_x, const float *restrict targets_y,
+                                       const float *restrict targets_z, long n, const float *restrict x,
+                                       const float *restrict y, const float *restrict z, const float *restrict q,
+                                       float *restrict potential)
+{
+    for (long k = 0; k < m; k += GROUP) {
+        float tx[GROUP], ty[GROUP], tz[GROUP], sum[GROUP];
+        memcpy(tx, targets_x + k, sizeof tx);
+        memcpy(ty, targets_y + k, sizeof ty);
+        memcpy(tz, targets_z + k, sizeof tz);
+        memcpy(sum, potential + k, sizeof sum);
+        for (long i = 0; i < n; i++) {
+            const float sx = x[i], sy = y[i], sz = z[i], charge = q[i];
+#pragma omp simd
+            for (int l = 0; l < GROUP; l++) {
+                const float dx = tx[l] - sx, dy = ty[l] - sy, dz = tz[l] - sz;
+                const float s = dx * dx + dy * dy + dz * dz;
+                sum[l] += s > (float)SAME_PLACE ? charge / sqrtf(s) : 0.0f;
+            }
+        }
+        memcpy(potential + k, sum, sizeof sum);
     }
 }
 #endif

@@ -16,6 +16,7 @@ cdef class Octree:
     cdef int[::1] first, last, skip, parent, extra   # (n_nodes,) slots [first, last), next node outside, ...
     cdef double[:, ::1] ball            # (n_nodes, 4) centre and radius [nm], fixed while charges change
     cdef double[:, ::1] cells           # (n_nodes, CELL) moments about the centre of charge
+    cdef signed char[::1] cancels              # (n_nodes,) charges of both signs without a centre inside the ball
     cdef signed char[::1] dirty                # (n_nodes,)
     cdef int[::1] queue                 # (n_nodes,) dirty nodes
     cdef long n_dirty

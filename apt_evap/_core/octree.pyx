@@ -2,8 +2,10 @@
 
 The tree is flat: nodes in preorder with two integers each (`skip`, the next node outside the subtree, and the slots
 [first, last)), so a walk is a loop. A cell has a charge and a traceless quadrupole about its centre of charge. Whether
-it replaces its atoms depends on its fixed ball, so the lists do not depend on the charges. Charges must not be
-negative, because the origin of a cell is its centre of charge.
+it replaces its atoms depends on its fixed ball, so the lists do not depend on the charges.
+
+Charges may have either sign. Where they nearly cancel, the centre of charge of a cell can be outside its ball. Such a
+cell does not replace its atoms: its smaller cells or its atoms act one by one.
 """
 
 from cython.parallel cimport prange
@@ -27,7 +29,7 @@ cdef class Octree:
     positions : ndarray, shape (n, 3)
         Positions of the atoms [nm].
     charges : ndarray, shape (n,)
-        Charges [e], >= 0.
+        Charges [e].
     atoms : ndarray of int64, shape (n,), optional
         Index of each atom for the caller; by default 0 ... n - 1.
     leaf_size : int
@@ -61,7 +63,7 @@ cdef class Octree:
             self.x[i], self.y[i], self.z[i], self.q[i] = positions[k, 0], positions[k, 1], positions[k, 2], charges[k]
             self.atom[i] = k if numbered else numbers[k]
         self.enclose(n_threads)
-        self.dirty = np.zeros(self.n_nodes, np.int8)
+        self.dirty, self.cancels = np.zeros((2, self.n_nodes), np.int8)
         self.queue = np.empty(self.n_nodes, np.int32)
         self.n_dirty = 0
         self.cells = np.zeros((self.n_nodes, CELL))
@@ -116,18 +118,24 @@ cdef class Octree:
         # Charge, centre of charge and traceless quadrupole sum q (3 d d - d^2) of one node, from its atoms or children.
         cdef double charge = 0.0, cx = 0.0, cy = 0.0, cz = 0.0, q, dx, dy, dz, s
         cdef double xx = 0.0, xy = 0.0, xz = 0.0, yy = 0.0, yz = 0.0, zz = 0.0
-        cdef long k, end = self.skip[node]
-        cdef bint is_leaf = end == node + 1
+        cdef long k, leaf, end = self.skip[node]
+        cdef bint by_atoms = end == node + 1
+        cdef double* ball = &self.ball[node, 0]
         cdef double* cell
-        if is_leaf:
-            k = self.first[node]
-            while k >= 0:
-                q = self.q[k]
-                charge += q
-                cx += q * self.x[k]
-                cy += q * self.y[k]
-                cz += q * self.z[k]
-                k = self.following(node, k)
+        k = node + 1
+        while k < end and not by_atoms:
+            by_atoms = self.cancels[k]   # such a child has no dipole
+            k = self.skip[k]
+        if by_atoms:
+            for leaf in range(node, end):
+                k = self.first[leaf] if self.skip[leaf] == leaf + 1 else -1
+                while k >= 0:
+                    q = self.q[k]
+                    charge += q
+                    cx += q * self.x[k]
+                    cy += q * self.y[k]
+                    cz += q * self.z[k]
+                    k = self.following(leaf, k)
         else:
             k = node + 1
             while k < end:
@@ -137,24 +145,29 @@ cdef class Octree:
                 cy += q * self.cells[k, 1]
                 cz += q * self.cells[k, 2]
                 k = self.skip[k]
-        if charge > 0.0:
+        if charge != 0.0:
             cx /= charge
             cy /= charge
             cz /= charge
+            dx, dy, dz, s = cx - ball[0], cy - ball[1], cz - ball[2], ball[3] + 1e-6   # the centre is rounded
+            self.cancels[node] = dx * dx + dy * dy + dz * dz > s * s
         else:
-            cx, cy, cz = self.ball[node, 0], self.ball[node, 1], self.ball[node, 2]
-        if is_leaf:
-            k = self.first[node]
-            while k >= 0:
-                q, dx, dy, dz = self.q[k], self.x[k] - cx, self.y[k] - cy, self.z[k] - cz
-                s = dx * dx + dy * dy + dz * dz
-                xx += q * (3.0 * dx * dx - s)
-                xy += q * 3.0 * dx * dy
-                xz += q * 3.0 * dx * dz
-                yy += q * (3.0 * dy * dy - s)
-                yz += q * 3.0 * dy * dz
-                zz += q * (3.0 * dz * dz - s)
-                k = self.following(node, k)
+            self.cancels[node] = cx != 0.0 or cy != 0.0 or cz != 0.0
+        if charge == 0.0 or self.cancels[node]:
+            cx, cy, cz = ball[0], ball[1], ball[2]
+        if by_atoms:
+            for leaf in range(node, end):
+                k = self.first[leaf] if self.skip[leaf] == leaf + 1 else -1
+                while k >= 0:
+                    q, dx, dy, dz = self.q[k], self.x[k] - cx, self.y[k] - cy, self.z[k] - cz
+                    s = dx * dx + dy * dy + dz * dz
+                    xx += q * (3.0 * dx * dx - s)
+                    xy += q * 3.0 * dx * dy
+                    xz += q * 3.0 * dx * dz
+                    yy += q * (3.0 * dy * dy - s)
+                    yz += q * 3.0 * dy * dz
+                    zz += q * (3.0 * dz * dz - s)
+                    k = self.following(leaf, k)
         else:
             k = node + 1
             while k < end:
@@ -251,7 +264,7 @@ cdef class Octree:
                 sources_grow(sources)
             dx, dy, dz = cx - self.ball[node, 0], cy - self.ball[node, 1], cz - self.ball[node, 2]
             apart = self.ball[node, 3] * factor + radius
-            if apart * apart < dx * dx + dy * dy + dz * dz:
+            if apart * apart < dx * dx + dy * dy + dz * dz and not self.cancels[node]:
                 sources.cell[sources.n_cells] = <int>node
                 sources.n_cells += 1
                 node = self.skip[node]
@@ -423,6 +436,11 @@ cdef class Octree:
         return np.asarray(self.atom)[:self.n_slots]
 
     @property
+    def n_cancelling(self):
+        """Number of nodes with charges of both signs and no centre of charge inside their balls."""
+        return np.count_nonzero(self.cancels)
+
+    @property
     def capacity(self):
         """Largest number of slots."""
         return self.x.shape[0]
@@ -442,5 +460,5 @@ cdef class Octree:
         other.first, other.last, other.skip = self.first, self.last, self.skip
         other.parent, other.extra = self.parent, self.extra.copy()
         other.ball, other.cells = self.ball.copy(), self.cells.copy()
-        other.dirty, other.queue = self.dirty.copy(), self.queue.copy()
+        other.dirty, other.cancels, other.queue = self.dirty.copy(), self.cancels.copy(), self.queue.copy()
         return other

@@ -1,7 +1,10 @@
-"""Robin's rule, for derived rules."""
+"""Robin's rule, and the scalar product of the charging rules."""
 
 from apt_evap._core.octree cimport Octree
 from apt_evap._core.rule cimport FieldRule, Patch
+
+
+cdef double dot(const double[::1] first, const double[::1] second) noexcept nogil
 
 
 cdef class Robin(FieldRule):

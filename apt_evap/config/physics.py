@@ -1,4 +1,4 @@
-"""Tables [law], [control] and [real_units] of a TOML file."""
+"""Tables [law], [rule], [control] and [real_units] of a TOML file."""
 
 from collections.abc import Mapping
 from dataclasses import fields
@@ -10,11 +10,13 @@ from apt_evap.detection.timing import Timing
 from apt_evap.emission.post_ionisation import PostIonisation
 from apt_evap.evaporation.bonds import TUNGSTEN_TABLE, CoordinationTable, PairEnergies
 from apt_evap.evaporation.law import Extremal
+from apt_evap.evaporation.rule import ConstantPotential, Robin
 from apt_evap.evaporation.thermal import Arrhenius, Laser
 from apt_evap.evaporation.voltage import VoltageControl
 from apt_evap.simulation.real_units import REFERENCES
 
 _LAWS = {"Extremal": Extremal, "Arrhenius": Arrhenius}
+_RULES = {"Robin": Robin, "ConstantPotential": ConstantPotential}
 _BONDS = {"CoordinationTable": CoordinationTable, "PairEnergies": PairEnergies}
 _REAL_UNITS = ("field_reference", "operating_field", "flight_charges", "timing", "smoothing", "field_factor", "seed")
 
@@ -86,6 +88,30 @@ def _integer(text, element):
         return int(text)
     except ValueError:
         raise ValueError(f"keys in the table of {element} must be numbers of bonds, got {short_text(text)}") from None
+
+
+def read_rule(table: Mapping[str, Any]) -> Robin | ConstantPotential:
+    """Read a charging rule from a table ``[rule]``.
+
+    Parameters
+    ----------
+    table : mapping
+        ``name`` ("Robin" or "ConstantPotential") and the parameters of the class. An empty table is Robin's rule.
+
+    Returns
+    -------
+    rule
+
+    Raises
+    ------
+    ValueError
+        Names the key, its value and the expected value.
+    """
+    if not table:
+        return Robin()
+    name, settings = _parts(table, "rule", _RULES)
+    check_keys(settings, _names(_RULES[name]))
+    return _RULES[name](**settings)
 
 
 def read_control(table: Mapping[str, Any]) -> VoltageControl | None:

@@ -13,11 +13,12 @@ from apt_evap._common.files import FileError, check_path, read_small_file
 from apt_evap._common.validation import check_count, check_kind, check_number, check_seed, check_switch, short_text
 from apt_evap.config.map_panels import MapSettings, read_maps
 from apt_evap.config.phases import read_phases
-from apt_evap.config.physics import read_control, read_law, read_real_units
+from apt_evap.config.physics import read_control, read_law, read_real_units, read_rule
 from apt_evap.config.tables import check_keys, check_table
 from apt_evap.detection.detector import Detector
 from apt_evap.emission.perturbations import Perturbation
 from apt_evap.evaporation.law import Law, check_law
+from apt_evap.evaporation.rule import CompiledRule, Rule, check_rule
 from apt_evap.evaporation.settings import ChargeSettings
 from apt_evap.evaporation.voltage import VoltageControl, check_voltage
 from apt_evap.flight.crew import FlightSettings
@@ -80,6 +81,8 @@ class Config:
         Rate, pulses and control of the voltage.
     real_units : dict or None
         Arguments of `Run.at_evaporation_field`; None: the run is saved at the simulated voltage.
+    rule : charging rule
+        Distribution of the charge over the surface.
 
     Raises
     ------
@@ -103,6 +106,7 @@ class Config:
     law: Law
     control: VoltageControl | None
     real_units: dict | None
+    rule: Rule | CompiledRule
 
     def __post_init__(self):
         for name, kind in _KINDS.items():
@@ -115,6 +119,7 @@ class Config:
             raise ValueError(f"output must be a file name such as 'run.h5', got {short_text(self.output)}")
         self.maps.check_detector(self.detector)
         check_law(self.law)
+        check_rule(self.rule)
 
     def __repr__(self) -> str:
         panels = ", ".join(panel.title for panel in self.maps.panels)
@@ -166,6 +171,7 @@ class Config:
                 watch_settings=self.watch_settings,
                 n_threads=n_threads,
                 law=self.law,
+                rule=self.rule,
                 control=self.control,
             )
 
@@ -190,10 +196,10 @@ def read_config(path: str | Path) -> Config:
     ``file``, relative to the folder of the settings, with ``types`` and further arguments of `read_tip`),
     ``[simulation]`` (ions, voltage, seed, responses), ``[detector]``, ``[charges]``, ``[flights]``, ``[responses]``,
     ``[watch]`` (fields of `Detector`, `ChargeSettings`, `FlightSettings`, `ResponseSettings`, `WatchSettings`),
-    ``[[phases]]`` (see `apt_evap.config.phases`; instead of a material in ``[tip]``), ``[law]``, ``[control]``,
-    ``[real_units]`` (see `apt_evap.config.physics`) and ``[maps]`` (bins, smoothing and
-    panels, each with a title and a perturbation as in `apt_evap.perturbation.from_dict`). Only ``[tip]`` with a
-    material and an apex_radius, or with a file, and the ions in ``[simulation]``, are required.
+    ``[[phases]]`` (see `apt_evap.config.phases`; instead of a material in ``[tip]``), ``[law]``, ``[rule]``,
+    ``[control]``, ``[real_units]`` (see `apt_evap.config.physics`) and ``[maps]`` (bins, smoothing and panels, each
+    with a title and a perturbation as in `apt_evap.perturbation.from_dict`). Only ``[tip]`` with a material and
+    an apex_radius, or with a file, and the ions in ``[simulation]``, are required.
 
     Parameters
     ----------
@@ -255,6 +261,7 @@ def config_of(document: dict[str, Any], path: Path) -> Config:
             "responses",
             "watch",
             "law",
+            "rule",
             "control",
             "real_units",
             "maps",
@@ -295,6 +302,8 @@ def config_of(document: dict[str, Any], path: Path) -> Config:
             sections.append(kind(**document.get(name, {})))
     with _located(path, "law"):
         law = read_law(document.get("law", {}))
+    with _located(path, "rule"):
+        rule = read_rule(document.get("rule", {}))
     with _located(path, "control"):
         control = read_control(document.get("control", {}))
     with _located(path, "real_units"):
@@ -302,7 +311,8 @@ def config_of(document: dict[str, Any], path: Path) -> Config:
     with _located(path, "maps"):
         maps = read_maps(document.get("maps", {}))
         maps.check_detector(sections[0])  # type: ignore[arg-type]
-    return Config(path, tip, n_ions, responses, voltage, seed, *sections, maps, output, law, control, real_units)  # type: ignore[arg-type, call-arg]
+    last = (maps, output, law, control, real_units, rule)
+    return Config(path, tip, n_ions, responses, voltage, seed, *sections, *last)  # type: ignore[arg-type, call-arg]
 
 
 def _responses(wide=False, **settings):

@@ -267,7 +267,7 @@ class Emitter:
         """Fields just outside the surface atoms [V/nm], shape (n,).
 
         The input of the law. For Robin's rule F_i = 4 pi k_e q_i / s, with s the area per surface atom: the field at
-        the outer side of a charged surface.
+        the outer side of a charged surface. `ConstantPotential` has a choice.
         """
         return self._core.slot_fields[self._core.slots]
 
@@ -310,9 +310,14 @@ class Emitter:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Numbers of events, of detached atoms, of negative charges set to 0, of patches that did not converge."""
+        """Counts of events and atoms.
+
+        "events" and "detached" atoms so far, negative charges set to 0 ("clipped") and patches that did not converge
+        ("unsettled") so far, and "negative" charges of the present surface (`ConstantPotential` allows them).
+        """
         core = self._core
         counts = {"clipped": core.n_clipped, "unsettled": core.n_unsettled}
+        counts["negative"] = 0 if core.tree is None else int((core.tree.charges < 0).sum())
         return {"events": core.n_removed, "detached": core.atoms.n_detached, **counts}
 
     def field_at(self, points: ArrayLike, opening_angle: float = 0.3) -> Floats:

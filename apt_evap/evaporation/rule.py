@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_count, check_number
-from apt_evap._core import robin
+from apt_evap._common.validation import check_choice, check_count, check_number
+from apt_evap._core import constant_potential, robin
 from apt_evap._core.rule import ChargingRule, PythonRule
 from apt_evap.specimen.tip import Tip
 
@@ -122,6 +122,63 @@ class Robin:
         kernel = robin.Robin(self.tolerance, self.window)
         kernel.begin(tip.potential_point)
         return kernel
+
+
+CHARGES = ("points", "gaussian")
+"""Shapes of the charges of `ConstantPotential`."""
+
+LAW_SEES = ("charge", "others")
+"""Fields that a law can see with `ConstantPotential`."""
+
+
+@dataclass(frozen=True)
+class ConstantPotential:
+    """Charges at which every surface atom has the potential of the specimen, as in a conductor.
+
+    Parameters
+    ----------
+    self_term : float, optional
+        Potential of an atom by its own charge 1 [1/nm]. By default 3.92 / sqrt(s), with the area s per atom of the
+        first surface: then the electrical surface of a flat lattice passes through its nuclei.
+    charges : {"points", "gaussian"}
+        Point charges, or Gaussian charges with the same self term.
+    law_sees : {"charge", "others"}
+        Field that a law sees: "charge", 4 pi k_e q / s of the charge of an atom, or "others", twice the normal field of
+        all other charges at its place. With `Robin` the two are equal.
+    tolerance : float
+        Largest residual of the charges of a patch, relative to the mean charge of the patch.
+
+    Raises
+    ------
+    ValueError
+        If a parameter has the wrong type or is outside its range. Solutions raise it if the self term is too small.
+
+    Notes
+    -----
+    ``sum_{j != i} q_j u(r_ij) + S q_i = V / k_e``, with ``u(r) = 1/r`` for points and ``u(r) = erf(eta r/sqrt 2)/r``,
+    ``eta = S sqrt(pi/2)``, for Gaussian charges. Charges may be negative at atoms deep below a step.
+    :doc:`/charging_rules` derives the self term.
+    """
+
+    self_term: float | None = None
+    charges: str = "points"
+    law_sees: str = "charge"
+    tolerance: float = 1e-5
+
+    def __post_init__(self):
+        values = {"tolerance": check_number(self.tolerance, "tolerance", at_least=1e-6, at_most=1)}
+        if self.self_term is not None:
+            values["self_term"] = check_number(self.self_term, "self_term", above=0, at_most=1000, unit="1/nm")
+        check_choice(self.charges, "charges", CHARGES)
+        check_choice(self.law_sees, "law_sees", LAW_SEES)
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    def kernel(self, tip: Tip) -> ChargingRule:
+        """Return the compiled rule for a specimen."""
+        return constant_potential.ConstantPotential(
+            self.self_term or 0.0, self.charges == "gaussian", self.law_sees == "others", self.tolerance
+        )
 
 
 def check_rule(rule: object) -> None:

@@ -29,7 +29,8 @@ class EmitterState:
     clipped, unsettled : int
         As in `Emitter.counts`.
     rule_state : dict
-        Further state of the charging rule: for Robin the "potential_point" [nm], shape (3,).
+        Further state of the charging rule: for Robin the "potential_point" [nm], shape (3,); for
+        ConstantPotential the "self_term" [1/nm] and the "area" per atom [nm^2].
     voltage_factor : float
         Voltage of the control divided by that of the charges, after the relaxation.
     """

@@ -26,6 +26,9 @@ int main(void)
     int range[2] = {0, N};
     float targets[3 * GROUP], sums[3 * GROUP] = {0}, dot;
     double wide[3 * GROUP], wide_sums[3 * GROUP] = {0};
+    static double multipoles[MULTIPOLE * N];
+    static float row_potential[N], zero[GROUP];
+    double potentials[GROUP] = {0}, zeros[GROUP] = {0};
     double origin[3] = {5, 5, 12}, e[3] = {0}, normal[3] = {0.1, 0.2, 0.97};
     srand48(7);
     for (int i = 0; i < N; i++) {
@@ -45,6 +48,15 @@ int main(void)
     patch_row(N, fx, fy, fz, 5, 5, 5, normal, row);
     dot = patch_dot(N, row, fx);
     patch_field(N, fx, fy, fz, N - 1, fy, fz, fx, fq, px, py, pz);
+    for (int i = 0; i < MULTIPOLE * N; i++)
+        multipoles[i] = drand48();
+    group_atoms_potential_single(1, range, x, y, z, q, origin, targets, zero, potentials);
+    group_cells_potential_single(N, list, multipoles, origin, targets, zero, potentials);
+    group_atoms_potential_double(1, range, x, y, z, q, origin, wide, zeros, potentials);
+    group_cells_potential_double(N, list, multipoles, origin, wide, zeros, potentials);
+    patch_row_potential(N, fx, fy, fz, 5, 5, 5, 15, row_potential);
+    patch_potential(N, fx, fy, fz, N - 1, fy, fz, fx, fq, row_potential);
+    add(potentials, sizeof potentials), add(row_potential, sizeof row_potential);
     add(sums, sizeof sums), add(wide_sums, sizeof wide_sums), add(e, sizeof e), add(row, sizeof row);
     add(&dot, sizeof dot), add(px, sizeof px), add(py, sizeof py), add(pz, sizeof pz);
     printf("%016llx %g\n", hash, e[0]);

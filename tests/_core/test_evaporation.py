@@ -300,4 +300,4 @@ def test_counts_of_events(tip12):
     emitter = ae.Emitter(tip12)
     evaporate(emitter, 200)
     # a smooth metal tip: every patch settles, no charge comes out negative
-    assert emitter.counts == {"events": 200, "detached": 0, "clipped": 0, "unsettled": 0}
+    assert emitter.counts == {"events": 200, "detached": 0, "clipped": 0, "negative": 0, "unsettled": 0}

@@ -5,7 +5,7 @@ import tomllib
 import pytest
 
 import apt_evap as ae
-from apt_evap.config.physics import read_control, read_law, read_real_units
+from apt_evap.config.physics import read_control, read_law, read_real_units, read_rule
 
 
 def table(text):
@@ -32,6 +32,14 @@ def test_laws():
     )
     bonds = 'name = "Extremal"\nbonds = { name = "CoordinationTable", table = { W = { 3 = 47, 4 = 57.0 } } }'
     assert read_law(table(bonds)) == ae.Extremal(ae.CoordinationTable({"W": {3: 47.0, 4: 57.0}}))
+
+
+def test_rules():
+    assert read_rule({}) == read_rule({"name": "Robin"}) == ae.Robin()
+    text = 'name = "ConstantPotential"\nself_term = 15\ncharges = "gaussian"\nlaw_sees = "others"'
+    assert read_rule(table(text)) == ae.ConstantPotential(15.0, "gaussian", "others")
+    with pytest.raises(ValueError, match="rule must have a name of Robin, ConstantPotential, got 'Potential'"):
+        read_rule({"name": "Potential"})
 
 
 def test_control_and_real_units():

@@ -1,0 +1,27 @@
+"""Rule of the constant potential."""
+
+from apt_evap._core.octree cimport Octree
+from apt_evap._core.potentials cimport Potentials
+from apt_evap._core.robin cimport Robin
+from apt_evap._core.rule cimport FieldRule, Hole, Patch
+
+
+cdef class ConstantPotential(FieldRule):
+    cdef readonly double tolerance
+    cdef readonly double self_term      # potential of an atom by its own charge 1 [1/nm]; 0 before the first solution
+    cdef readonly bint gaussian, sees_others
+    cdef readonly long n_iterations     # of all patches
+    cdef double given, potential        # self term of the user, or 0; potential of the specimen [e/nm]
+    cdef double[::1] value              # (capacity,) potential of each slot with that of its own charge [e/nm]
+    cdef double[:, ::1] normals         # (capacity, 3) by slot
+    cdef Potentials sums
+    cdef Robin robin
+    cdef float[::1] matrix, residual, direction, image, spreads
+
+    cdef void squared_distances(self, const double[:, ::1] atoms, long own, double[::1] squares) noexcept nogil
+    cdef int grow(self, long stride) except -1 nogil
+    cdef long nearest(self, Octree tree, long slot) noexcept nogil
+    cdef double at(self, Octree tree, long slot) noexcept nogil
+    cdef double corrections(self, Octree tree, long slot, const double* sources, long n) noexcept nogil
+    cdef int patch_charges(self, Octree tree, double[:, ::1] normals, Patch* patch) except -1 nogil
+    cdef void spread_potential(self, const Hole* hole, const Patch* patch) noexcept nogil
