@@ -4,11 +4,12 @@ Rules of the roll-up
 
 Contrast of the zone lines about a (111) pole of nickel for several rules of the roll-up, all from one run.
 
-In the model of Shaikh et al., arXiv 2509.13744, every ion rolls up onto its neighbour of highest charge. This draws black
-lines between bright ones, which no measured map shows. With wide responses one run also serves other rules: only a
-fraction of the ions rolls up (``probability``), the ion rolls onto a mean of its strongest neighbours (``sharpness``), it
-starts above the surface (``height``), and ions that do not roll up have a lateral energy (``others``). The script prints
-a table and draws the maps of four rules. With ``--full`` the tip has R = 40 a, with 50,000 ions.
+In the model of Shaikh et al., arXiv 2509.13744, every ion rolls up onto its neighbour of highest charge. This draws
+black lines between bright ones, which no measured map shows. With wide responses one run also serves other rules: only
+a fraction of the ions rolls up (``probability``), the ion rolls onto a mean of its strongest neighbours
+(``sharpness``), it starts above the surface (``height``), and ions that do not roll up have a lateral energy
+(``others``). The script prints a table and draws the maps of four rules. With ``--full`` the tip has R = 40 a, with
+50,000 ions.
 """
 
 import argparse
