@@ -5,7 +5,7 @@
 A twin is a map made from another specimen than the one that is fitted: another lattice origin, and a radius, a shank
 angle and a surface threshold that differ by up to 20 %. Its energies are hidden: a mean of 0.08 to 0.3 eV and a
 relative standard deviation of 0.1 to 1.5, both uniform in their logarithms. Runs are stored in FOLDER, so that the
-script can be stopped and continued. The registration starts at the true one, and is refined by each fit.
+script can be stopped and continued. Each fit uses the true registration.
 
 For each model error, the script prints how many of the intervals of 95 % contain the hidden values, with the
 binomial error.

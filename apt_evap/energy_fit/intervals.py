@@ -7,7 +7,7 @@ end. Two errors count.
 best one by half of the deviation of their difference times its quantile.
 
 *The model*: the simulated specimen is not the measured one. Its misfit 1 - SSIM remains at the best point, and at the
-true point it is larger by a fraction `MODEL_ERROR` of that. This fraction is measured, by `benchmarks/coverage.py`.
+true point it is larger by a fraction `MODEL_ERROR` of that. This fraction is measured (`defaults.MODEL_ERROR`).
 """
 
 from collections.abc import Sequence

@@ -1,6 +1,7 @@
 """Result of a fit of emission energies: similarities, the best energies, their errors."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -88,12 +89,8 @@ class Optimum:
 
     def scaled(self, name: str, factor: float) -> str:
         """Text of one of the numbers and its interval, times a factor, str."""
-        value = f"{(self.options[name] if name in self.options else getattr(self, name)) * factor:.3g}"
-        if not self.intervals:
-            return value
-        low, high = (bound * factor for bound in self.intervals[name])
-        below, above = self.open_ends.get(name, (False, False))
-        return f"{value} ({'at most ' * below}{low:.3g} to {'at least ' * above}{high:.3g})"
+        value = self.options[name] if name in self.options else getattr(self, name)
+        return bounded_text(value, self.intervals.get(name), self.open_ends.get(name), factor)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -268,6 +265,34 @@ class Study:
             f"energies {text(real['real_per_study'])} at {field} and {charge}; "
             f"simulated {text(real['simulated_per_study'])}{place}, {real['barrier_charge']}+"
         )
+
+
+def bounded_text(
+    value: float,
+    interval: Sequence[float] | None,
+    open_ends: Sequence[bool] | None = None,
+    factor: float = 1.0,
+) -> str:
+    """Text of a number and its interval, times a factor; open ends are "at most" and "at least".
+
+    Parameters
+    ----------
+    value : float
+        The number.
+    interval, open_ends : sequence, optional
+        Its lower and upper bound, and whether each of them is at an end of the grid.
+    factor : float
+        Of all numbers.
+
+    Returns
+    -------
+    str
+    """
+    if interval is None:
+        return f"{value * factor:.3g}"
+    low, high = (bound * factor for bound in interval)
+    below, above = open_ends or (False, False)
+    return f"{value * factor:.3g} ({'at most ' * below}{low:.3g} to {'at least ' * above}{high:.3g})"
 
 
 def plain(value: Any) -> Any:

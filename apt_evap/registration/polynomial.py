@@ -19,6 +19,7 @@ SIGNIFICANCE = 0.01
 """Probability of a smaller residual by chance below which terms of a higher degree are kept."""
 LARGEST_DEGREE = 3
 _TERMS = {1: ((0, 1),), 2: ((2, 0), (1, 1), (0, 2)), 3: ((3, 0), (2, 1), (1, 2), (0, 3))}
+_ROUNDING = 1e-12  # residual of an exact fit, relative to the unit of length: some thousand units in the last place
 _ITERATIONS = 50  # of the inverse; a distortion of 10 % converges by a factor of 10 each
 
 
@@ -150,7 +151,7 @@ def fit_polynomial(source: Any, target: Any, degree: int | None, weights: ArrayL
     fits = {}
     for trial in range(LARGEST_DEGREE + 1) if degree is None else sorted({0, degree}):
         matrix = np.column_stack([w, np.ones(n), *(w**j * np.conj(w) ** k for j, k in terms_of(trial))])
-        if 2 * n <= 2 * matrix.shape[1]:  # no freedom for errors
+        if trial and n <= matrix.shape[1]:  # no freedom for errors
             if degree is not None and trial == degree:
                 raise ValueError(f"degree {degree} needs more than {matrix.shape[1]} points, got {n}")
             break
@@ -158,6 +159,8 @@ def fit_polynomial(source: Any, target: Any, degree: int | None, weights: ArrayL
     chosen, probabilities = 0, {}
     for trial in sorted(fits)[1:]:
         lower, higher = fits[chosen], fits[trial]
+        if degree is None and lower.squares <= (_ROUNDING * radius) ** 2 * weights.sum():
+            break  # an exact fit: its residual is rounding
         more, freedom = 2 * (higher.number - lower.number), 2 * (n - higher.number)
         ratio = (lower.squares - higher.squares) / more / max(higher.squares / freedom, np.finfo(float).tiny)
         probabilities[trial] = float(scipy.stats.f.sf(ratio, more, freedom))
@@ -201,8 +204,9 @@ def _least_squares(matrix, target, root):
     squares = float(np.sum(np.abs(residual) ** 2))
     inverse = np.linalg.pinv(weighted.conj().T @ weighted)
     n, number = matrix.shape
-    # of the real and of the imaginary part
-    errors = np.sqrt(np.real(np.diag(inverse)) * squares / (2 * (n - number)))
+    # of the real and of the imaginary part; two points determine a similarity, without any error
+    variance = squares / (2 * (n - number)) if n > number else np.nan
+    errors = np.sqrt(np.real(np.diag(inverse)) * variance)
     leverage = np.real(np.einsum("ij,jk,ik->i", weighted, inverse, weighted.conj()))
     left_out = residual / np.maximum(1 - leverage, 1e-9)
     return _Solution(values, errors, squares, float(np.sqrt(np.sum(np.abs(left_out) ** 2) / np.sum(root**2))), number)

@@ -380,10 +380,10 @@ def register_distortion(
     correlation coefficient r: the variance is proportional to (1 - r^2) / r^2. Patches with r < 0.5 are ignored.
     """
     check_kind(registration, "registration", Registration, "a Registration")
-    views = [_view(value, name) for value, name in ((simulated, "simulated"), (measured, "measured"))]
+    moving, fixed = _view(simulated, "simulated"), _view(measured, "measured")
     best = replace(registration, distortion=None)
     for _ in range(2):  # repeated with patches of the distorted map
-        centres, targets, weights = patch_displacements(*views, best.back, best.scale)
+        centres, targets, weights = patch_displacements(moving, fixed, best.back, best.scale)
         x, y = best.back(centres.real, centres.imag)
         source = x - 1j * y if best.mirror else x + 1j * y
         fit = fit_polynomial(source, targets, degree, weights)

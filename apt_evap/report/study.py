@@ -151,7 +151,7 @@ def _energies(study):
             values = f"{getattr(best, name) * factor:.4g}", refined.scaled(name, factor)
             rows.append((f"{label} after truncation, {other} [eV]", *values))
     rows.append(("SSIM", best.score, refined.score))
-    between = "between its points" + " (95 % of the resamples)" * bool(refined.intervals)
+    between = "between its points" + " (interval of 95 %)" * bool(refined.intervals)
     note = "Fitted energies scale with the assumed tip radius and voltage."
     return table(rows, (f"{mechanism}, {place}", "best on the grid", between)) + paragraph(note, "note")
 

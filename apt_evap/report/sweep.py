@@ -8,7 +8,7 @@ import numpy as np
 
 from apt_evap._common.types import AnyPath
 from apt_evap.detection.detector_map import DetectorMap
-from apt_evap.energy_fit.study import plain
+from apt_evap.energy_fit.study import bounded_text, plain
 from apt_evap.report.origin import add_origin, origin
 from apt_evap.report.page import Markup, Page, heading, paragraph, table, text_of
 from apt_evap.report.pictures import blinking_pictures
@@ -102,9 +102,9 @@ def write_sweep(
     if compared:
         page.add(
             paragraph(
-                "The best point is first. Energies are those between the points of the grid, with the interval of 95 % "
-                "of the resamples, in the units of each run; real energies are after the truncation. Compare "
-                "similarities only for the same bins and the same smoothing.",
+                "The best point is first. Energies are those between the points of the grid, with the interval of "
+                "95 %, in the units of each run; real energies are after the truncation. Compare similarities only for "
+                "the same bins and the same smoothing.",
                 "note",
             )
         )
@@ -135,13 +135,11 @@ def _study_cells(content):
         return [""] * len(_STUDY)
     score, refined = content["optimum"]["score"], content["refined"]
     error = f" ± {score['error']:.3f}" if score["error"] is not None else ""
-    energies = []
-    for name in ("mean", "rsd", "rollup_fraction"):
-        text = f"{refined[name]:.3g}"
-        if refined["intervals"]:
-            low, high = refined["intervals"][name]
-            text += f" ({low:.3g} to {high:.3g})"
-        energies.append(text)
+    open_ends = refined.get("open_ends", {})  # files of earlier versions do not have them
+    energies = [
+        bounded_text(refined[name], refined["intervals"].get(name), open_ends.get(name))
+        for name in ("mean", "rsd", "rollup_fraction")
+    ]
     reasons = [
         Markup('<span class="red">registration doubtful</span>') if content["registration"]["doubtful"] else "",
         "end of the grid" if content["optimum"]["at_edge"] else "",

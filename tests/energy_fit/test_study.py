@@ -138,7 +138,7 @@ class PartlyRolled:
             raise ValueError(f"probability must be from 0 to 1, got {self.probability}")
 
     def tangential(self, emissions, random):
-        rolled, first, second = ae.RollUp(self.energy).tangential(emissions, random)
+        rolled, first, second, *_ = ae.RollUp(self.energy).tangential(emissions, random)
         rolls = rolled & (random.uniform(3)[:, 2] < self.probability)
         return rolls, np.where(rolls, first, 0.0), np.where(rolls, second, 0.0)
 
@@ -191,7 +191,8 @@ def ridge(grid, true_mean=0.2, deviation=0.1, height=0.8):
         [ae.TruncatedNormal(m, r * m).true_mean for m in grid.means] for r in grid.rsds
     ])  # fmt: skip
     tilt = 0.01 * np.arange(len(grid.rsds))[:, None]
-    return (height - 0.3 * ((means - true_mean) / deviation) ** 2 / 9 - tilt / 5)[None, None]
+    # bounded, as a similarity is: across the last step of the deviation the true mean grows by up to 0.6 eV
+    return (height * np.exp(-(((means - true_mean) / deviation) ** 2) / 30 / height) - tilt / 5)[None, None]
 
 
 def test_intervals_follow_the_ridge():
@@ -202,11 +203,10 @@ def test_intervals_follow_the_ridge():
     bounds, ends = intervals(grid, values, best, 0.2)
     assert bounds["rsd"] == (0.01, 3.16) and ends["rsd"] == (False, True)  # below 0.1 nothing changes
     low, high = bounds["true_mean"]
-    # 0.3 / 9 (d / 0.1)^2 = 0.2 (1 - 0.8): d = 0.11, less by the tilt; a tenth of a step is 0.02 eV at the widest
+    # 0.8 (1 - exp(-(d / 0.1)^2 / 24)) = 0.2 (1 - 0.8): d = 0.11, less by the tilt. A tenth of a step is 0.02 eV at the
+    # widest; the spline is up to 0.005 too high at its maximum, where the slope at the bounds is 0.7 / eV: 0.007 eV
     assert low == pytest.approx(0.2 - 0.11, abs=0.025) and high == pytest.approx(0.2 + 0.11, abs=0.025)
     assert bounds["mean"][1] - bounds["mean"][0] > high - low
-    narrow, _ = intervals(grid, values, best, 0.0)
-    assert narrow["mean"][0] == narrow["mean"][1]  # without any error
 
 
 def test_ends_of_the_grid_are_told():
@@ -216,6 +216,7 @@ def test_ends_of_the_grid_are_told():
     assert bounds["mean"][1] == 0.4 and ends["mean"] == (False, True)
     assert ends["rsd"] == (False, False)  # an axis of one point is fixed
     assert ends["true_mean"] == (False, True)
+    assert intervals(grid, values, (0, 0, 3), 0.0).bounds["mean"] == (0.4, 0.4)  # without any error
     limited = EnergyGrid(PartlyRolled, (0.1,), (1.0,), options={"probability": (0.5, 0.75, 1.0)})
     bounds, ends = intervals(limited, np.array([0.5, 0.6, 0.7]).reshape(1, 3, 1, 1, 1), (2, 0, 0, 0), 5.0)
     assert bounds["probability"] == (0.5, 1.0) and ends["probability"] == (True, False)  # there is no 1.1
@@ -236,12 +237,21 @@ def test_intervals_by_noise_are_those_of_a_quadratic_maximum():
 
 
 def test_rings_of_a_study(twin):
-    """The misfit is small for the hidden energies, and large for a map with other lines."""
-    study, _, _ = twin
+    """The misfit excludes the map with other lines, and does not exclude the hidden energies."""
+    study, _, truth = twin
     scores = study.structure
     assert scores.plane == (1, 1, 1) and scores.misfit.shape == study.ssim.shape == scores.errors.shape
-    assert scores.misfit[scores.best] == scores.misfit.min() < 0.15
-    assert scores.unperturbed.misfit(scores.measured)[0] > 3 * scores.misfit.min()
+    assert scores.misfit[scores.best] == scores.misfit.min()
+    # in units of its error: with 15,000 ions the misfit of the best map by SSIM is 0.23 with an error of 0.13
+    hidden = tuple(axis.index(value) for axis, value in zip(
+        (study.grid.rollup_fractions, study.grid.rsds, study.grid.means), truth, strict=True
+    ))  # fmt: skip
+    for (misfit, error), excluded in (
+        ((scores.misfit[hidden], scores.errors[hidden]), False),
+        (scores.unperturbed.misfit(scores.measured), True),
+    ):
+        excess = misfit - scores.misfit.min()
+        assert (excess > 2 * np.hypot(error, scores.errors[scores.best])) == excluded
     assert scores.measured.misfit(scores.measured)[0] == 0
     assert not scores.lost and "rings about (111): contrasts" in repr(study)
     saved = study.to_dict()["structure"]
@@ -511,8 +521,9 @@ def test_energies_are_reported_in_real_units_first(twin, run):
     assert study.real_energies == pytest.approx(
         (study.refined.true_mean * factor, study.refined.true_standard_deviation * factor), rel=1e-12
     )
-    text = repr(study).rpartition("; energies ")[2]
-    assert re.fullmatch(r"[\d. (to)±]+ eV at 35 V/nm and 2\+; simulated [\d. (to)±]+ eV at 1000 V .*, 1\+>", text), text
+    text = repr(study).rpartition(" energies ")[2]
+    numbers = r"(?:[\d. ()±]|to|at most|at least)+"  # bounds at an end of the grid are "at least"
+    assert re.fullmatch(rf"{numbers} eV at 35 V/nm and 2\+; simulated {numbers} eV at 1000 V .*, 1\+>", text), text
     assert f"{study.real_energies[0]:.3g}" in text.partition(" eV")[0]
     assert real_units_of(real)["real_per_study"] == 1.0
     assert real_units_of(real)["simulated_per_study"] == pytest.approx(1 / factor, rel=1e-12)

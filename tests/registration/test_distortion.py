@@ -120,8 +120,10 @@ def test_a_distortion_is_found_from_maps(run20):
     x, y = np.random.default_rng(0).uniform(-36, 36, (2, 500))
     off = [np.sqrt(np.mean(np.sum((np.array(each.points(x, y)) - TRUE.points(x, y)) ** 2, axis=0)))
            for each in (start, found)]  # fmt: skip
-    assert found.distortion is not None and off[0] > 0.45
-    assert off[1] < 0.6 * off[0]
+    assert found.distortion is not None and off[1] < 0.6 * off[0]
+    # better than any similarity transform can be: 0.47 mm for this distortion in this square
+    source, target = x + 1j * y, np.array(TRUE.points(x, y))
+    assert off[1] < fit_polynomial(source, target[0] + 1j * target[1], 0).residual
     # maps without a distortion of their own: what is fitted is no larger than the error of the registration
     straight = ae.Registration(17.0, 0.4, (3.0, -2.0))
     plain = ae.register_distortion(straight, first, straight.hits(second).within_circle(24.0, (3.0, -2.0)))
