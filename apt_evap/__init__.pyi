@@ -92,6 +92,10 @@ from .reconstruction.calibration import DistributionMap as DistributionMap
 from .reconstruction.calibration import compression_from_poles as compression_from_poles
 from .reconstruction.calibration import distribution_map as distribution_map
 from .reconstruction.errors import ReconstructionErrors as ReconstructionErrors
+from .reconstruction.interface import InterfaceProfile as InterfaceProfile
+from .reconstruction.interface import SegregationProfile as SegregationProfile
+from .reconstruction.interface import interface_profile as interface_profile
+from .reconstruction.interface import segregation_profile as segregation_profile
 from .reconstruction.origins import OriginTable as OriginTable
 from .reconstruction.origins import origin_table as origin_table
 from .reconstruction.precipitate import PrecipitateErrors as PrecipitateErrors

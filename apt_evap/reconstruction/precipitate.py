@@ -1,6 +1,7 @@
 """Shape and composition of a reconstructed precipitate against the truth."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -117,6 +118,7 @@ def precipitate_errors(
     inside: ArrayLike,
     truth: Run | ArrayLike | None = None,
     species: ArrayLike | None = None,
+    fit: Sequence[str] = (),
 ) -> PrecipitateErrors:
     r"""Compare a reconstructed precipitate with the truth.
 
@@ -131,6 +133,9 @@ def precipitate_errors(
     species : array_like of int, optional
         Species of each ion, shape (n,); by default that of the run or of an instrument. Without any, 0 for the matrix
         and 1 for the precipitate.
+    fit : sequence of str
+        Free constants that are fitted to all ions before, as for `Reconstruction.errors`. By default none: lengths are
+        compared as they are reconstructed.
 
     Returns
     -------
@@ -145,7 +150,7 @@ def precipitate_errors(
     -----
     The semi-axis of a uniform ellipsoid is :math:`\sqrt{5}` times its standard deviation along this axis. The ions
     within an ellipsoid are those with :math:`(r - m)^T C^{-1} (r - m) \le 5`, with mean m and covariance C of the ions
-    of the precipitate. The free constants are not fitted: lengths are compared as they are reconstructed.
+    of the precipitate.
     """
     check_kind(reconstruction, "reconstruction", Reconstruction, "a Reconstruction")
     belongs = per_ion(inside, "inside", reconstruction.hits, truth, bool)
@@ -154,7 +159,8 @@ def precipitate_errors(
     sites = true_sites(reconstruction.hits, truth)
     kinds = groups_of(reconstruction.hits, truth, species, "species")
     kinds = belongs.astype(np.int64) if kinds is None else kinds
-    apparent, shape = _ellipsoid(reconstruction.positions, belongs)
+    positions = reconstruction.fitted_positions(truth, fit) if fit else reconstruction.positions
+    apparent, shape = _ellipsoid(positions, belongs)
     original, true_shape = _ellipsoid(sites, belongs)
     numbers = np.unique(kinds[belongs | apparent])
     fractions = [np.array([np.mean(kinds[chosen] == number) for number in numbers]) for chosen in (belongs, apparent)]

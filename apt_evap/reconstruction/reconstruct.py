@@ -166,6 +166,24 @@ class Reconstruction:
         errors = errors_of(positions, _angles(positions, radii), sites, linear, group, _below(positions, radii))
         return replace(errors, radius_factor=factor, compression=compression)
 
+    def fitted_positions(self, truth: "Run | ArrayLike | None" = None, fit: Sequence[str] = FREE) -> Floats:
+        """Positions in the coordinates of the specimen, after the fit of the free constants.
+
+        These are the positions that `errors` compares with the sites. The regions of the phases apply to them:
+        ``region.distance(positions)``.
+
+        Parameters
+        ----------
+        truth, fit
+            As for `errors`.
+
+        Returns
+        -------
+        ndarray
+            x, y and z of each ion [nm], shape (n, 3), with z out of the specimen.
+        """
+        return true_sites(self.hits, truth) + self.errors(truth, fit).residuals
+
     def _fitted(self, sites, free):
         """Factor of the radii and compression by least squares, all linear constants fitted for each pair."""
         known = self.settings["compression"]

@@ -1,6 +1,7 @@
 """Shape, overlap and composition of a precipitate, for a compression that is known in closed form."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -108,3 +109,16 @@ def test_what_is_no_precipitate(alloy):
         ae.precipitate_errors(reconstruction_of(sites), inside[:-1], sites)
     with pytest.raises(ValueError, match="must have an extent in all directions"):
         ae.precipitate_errors(reconstruction_of(sites * [1, 1, 0]), inside, sites)
+
+
+def test_constants_are_fitted_before(alloy):
+    """A reconstruction with a wrong scale of the depth is right after the fit of this scale."""
+    sites, inside, species = alloy
+    wrong = replace(reconstruction_of((sites + 1) * [1, 1, -1.3]), settings={"compression": 1.0})
+    as_it_is = ae.precipitate_errors(wrong, inside, sites, species)
+    assert as_it_is.depth_magnification == pytest.approx(1.3)
+    other = ae.precipitate_errors(wrong, inside, sites, species, fit=("shift", "lateral_scale"))
+    assert other.depth_magnification == pytest.approx(1.3)
+    # the cap with R = 100 nm is nearly a plane: the fit leaves the depth below its apex, up to r^2 / 2R = 0.7 nm
+    fitted = ae.precipitate_errors(wrong, inside, sites, species, fit=("shift", "depth_scale"))
+    assert fitted.depth_magnification == pytest.approx(1, rel=0.02)
