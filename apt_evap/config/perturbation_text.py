@@ -129,17 +129,29 @@ def python_of(value: Any) -> str:
 
 
 def title_of(perturbation: Any) -> str:
-    """Title of a map for a perturbation (str), such as "roll-up, 0.155 ± 0.155 eV"."""
+    """Title of a map for a perturbation (str), such as "roll-up, 0.155 ± 0.155 eV, probability 0.5"."""
     name = type(perturbation).__name__
     words = {"Unperturbed": "unperturbed", "LateralVelocity": "lateral velocity", "RollUp": "roll-up"}
     title = words.get(name, name)
     if name == "Combined":
         title = f"{perturbation.rollup_fraction:.3g} roll-up + {1 - perturbation.rollup_fraction:.3g} lateral"
-    energy = getattr(perturbation, "energy", None)
+    parts = [title, _energy_text(getattr(perturbation, "energy", None))]
+    options = to_dict(perturbation)  # those that are not the default
+    for option, unit in (("probability", ""), ("sharpness", ""), ("height", " nm")):
+        if option in options:
+            value = getattr(perturbation, option)
+            parts.append(f"{option} {value:g}{unit}" if isinstance(value, float) else f"{option} {value}")
+    if "others" in options:
+        parts.append(f"others {_energy_text(perturbation.others) or perturbation.others}")
+    return ", ".join(filter(None, parts))
+
+
+def _energy_text(energy):
+    """Text of a built-in energy distribution, empty for any other."""
     if isinstance(energy, Fixed):
-        return f"{title}, {energy.energy:g} eV"
+        return f"{energy.energy:g} eV"
     if isinstance(energy, Thermal):
-        return f"{title}, {energy.temperature:g} K"
+        return f"{energy.temperature:g} K"
     if isinstance(energy, TruncatedNormal):
-        return f"{title}, {energy.mean:g} ± {energy.standard_deviation:g} eV"
-    return title
+        return f"{energy.mean:g} ± {energy.standard_deviation:g} eV"
+    return ""

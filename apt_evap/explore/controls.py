@@ -114,7 +114,7 @@ def values_of(perturbation: Perturbation) -> tuple[str, dict[str, float]]:
     Parameters
     ----------
     perturbation : perturbation
-        One of `MECHANISMS`, with a number or `TruncatedNormal` as energy.
+        One of `MECHANISMS`, with a number or `TruncatedNormal` as energy, and numbers as options.
 
     Returns
     -------
@@ -145,5 +145,13 @@ def values_of(perturbation: Perturbation) -> tuple[str, dict[str, float]]:
                     f"got {short_text(energy)}"
                 )
         else:
-            values[each.name] = getattr(perturbation, each.name)
+            value = getattr(perturbation, each.name)
+            if not isinstance(value, float):
+                raise ValueError(f"the explorer has controls for a number as {each.name}, got {short_text(value)}")
+            values[each.name] = value
+    kind: Any = type(perturbation)
+    for option in fields(kind):
+        value = getattr(perturbation, option.name)
+        if option.name != "energy" and option.name not in values and value != option.default:
+            raise ValueError(f"the explorer has controls for all options but {option.name}, got {short_text(value)}")
     return mechanism, values

@@ -3,7 +3,7 @@
 import pytest
 
 import apt_evap as ae
-from apt_evap.config.perturbation_text import python_of, read_perturbation, write_perturbation
+from apt_evap.config.perturbation_text import python_of, read_perturbation, title_of, write_perturbation
 
 NORMAL = ae.TruncatedNormal(0.155, 0.1)
 
@@ -21,6 +21,12 @@ NORMAL = ae.TruncatedNormal(0.155, 0.1)
             '{name = "RollUp", energy = {name = "Thermal", temperature = 50.0}}',
             "ae.RollUp(ae.Thermal(50.0))",
         ),
+        (
+            ae.RollUp(0.2, ae.ChargeRatio(0.9, 0.05), height=0.05),
+            '{name = "RollUp", energy = {name = "Fixed", energy = 0.2}, '
+            'probability = {name = "ChargeRatio", threshold = 0.9, width = 0.05}, height = 0.05}',
+            "ae.RollUp(0.2, ae.ChargeRatio(0.9, 0.05), height=0.05)",
+        ),
     ],
 )
 def test_text_and_python_are_read_back(perturbation, text, python):
@@ -28,6 +34,20 @@ def test_text_and_python_are_read_back(perturbation, text, python):
     assert read_perturbation(text) == perturbation
     assert python_of(perturbation) == python
     assert eval(python, {"ae": ae}) == perturbation
+
+
+@pytest.mark.parametrize(
+    ("perturbation", "title"),
+    [
+        (ae.RollUp(NORMAL), "roll-up, 0.155 ± 0.1 eV"),
+        (ae.RollUp(NORMAL, 0.5, 0.1, 0.05), "roll-up, 0.155 ± 0.1 eV, probability 0.5, sharpness 0.1, height 0.05 nm"),
+        (ae.RollUp(0.2, 0.5, others=ae.Thermal(50)), "roll-up, 0.2 eV, probability 0.5, others 50 K"),
+        (ae.RollUp(0.2, ae.ChargeRatio(0.9)), "roll-up, 0.2 eV, probability ChargeRatio(threshold=0.9, width=0.0)"),
+        (ae.Unperturbed(0.1), "unperturbed, height 0.1 nm"),
+    ],
+)
+def test_titles_name_the_options(perturbation, title):
+    assert title_of(perturbation) == title
 
 
 def test_a_perturbation_of_a_user_has_no_text():

@@ -306,7 +306,9 @@ def test_controls_and_perturbations_are_the_same(mechanism):
 
 
 def test_perturbations_without_controls():
-    for perturbation in (ae.RollUp(ae.Thermal(50.0)), ae.LateralVelocity(ae.TruncatedNormal(0.0, 0.1)), "RollUp"):
+    others = ae.RollUp(0.2, 0.5, others=0.1), ae.RollUp(0.2, ae.ChargeRatio(0.9)), ae.Combined(0.2, 0.5, others=0.1)
+    energies = ae.RollUp(ae.Thermal(50.0)), ae.LateralVelocity(ae.TruncatedNormal(0.0, 0.1))
+    for perturbation in (*others, *energies, "RollUp"):
         with pytest.raises(ValueError, match="the explorer has controls for"):
             values_of(perturbation)
 
