@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from apt_evap._common.types import Booleans, Floats, Integers
 from apt_evap._common.validation import check_array, check_number
 
-_TEN_TO_NINETY = 2 * math.sqrt(2) * float(scipy.special.erfinv(0.8))  # 10 to 90 % of an error function, in sigma
+_TEN_TO_NINETY = 2.5631031310892007  # 10 to 90 % of an error function in sigma, 2 sqrt(2) erfinv(0.8)
 _FEWEST = 10  # ions on each side: the fits have four constants
 _SHARPEST = 1e-3  # of the reach: far below the distance of two planes
 _TINY = 1e-6  # a fraction of 0 or 1 has no likelihood

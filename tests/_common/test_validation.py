@@ -320,6 +320,26 @@ CASES = [
     (ae.Extremal, {}, {"bonds": [*OBJECT, ae.PairEnergies]}),
     (ae.Robin, {}, {"tolerance": [*POSITIVE, 2.0], "window": [*COUNT, 100]}),
     (
+        ae.ConstantPotential,
+        {},
+        {
+            "self_term": [value for value in POSITIVE if value is not None],
+            "charges": WORD,
+            "law_sees": WORD,
+            "tolerance": [*POSITIVE, 2.0],
+        },
+    ),
+    (
+        ae.interface_profile,
+        {"distances": np.linspace(-0.9, 0.9, 60), "chosen": np.arange(60) % 3 == 0},
+        {"distances": ["x", 3, [NAN, 1.0, 2.0, 3.0]], "reach": POSITIVE, "bin_width": POSITIVE},
+    ),
+    (
+        ae.segregation_profile,
+        {"distances": np.linspace(-0.9, 0.9, 60), "chosen": np.arange(60) % 3 == 0},
+        {"distances": ["x", 3, [NAN, 1.0, 2.0, 3.0]], "reach": POSITIVE, "bin_width": POSITIVE},
+    ),
+    (
         ae.FlightSettings,
         {},
         {
@@ -763,7 +783,14 @@ def test_every_public_name_with_arguments_is_in_the_table():
     taken |= {"FileError", "TruncatedFile", "Outcome", "Run", "plot", "__version__"}  # made by the package
     taken |= {"Reconstruction", "ReconstructionErrors", "DistributionMap"}  # made by the package
     taken |= {"chunks", "Study", "ZoneLine", "History", "CapHistory", "Batch"}  # in test_chunks; made by the package
-    taken |= {"Ring", "FieldIonImage", "PrecipitateErrors", "TipFit"}  # made by the package
+    taken |= {
+        "Ring",
+        "FieldIonImage",
+        "PrecipitateErrors",
+        "TipFit",
+        "InterfaceProfile",
+        "SegregationProfile",
+    }  # made by the package
     taken |= {"OriginTable", "Distortion", "DistortionGrid"}  # made by the package, or read from its files
     taken |= {"precipitate_errors"}  # in test_precipitate
     taken |= {"report"}  # a module

@@ -242,16 +242,13 @@ def test_rings_of_a_study(twin):
     scores = study.structure
     assert scores.plane == (1, 1, 1) and scores.misfit.shape == study.ssim.shape == scores.errors.shape
     assert scores.misfit[scores.best] == scores.misfit.min()
-    # in units of its error: with 15,000 ions the misfit of the best map by SSIM is 0.23 with an error of 0.13
+    # with 15,000 ions the smallest misfit is 0.17, and the errors at the best map by SSIM are 0.13
     hidden = tuple(axis.index(value) for axis, value in zip(
         (study.grid.rollup_fractions, study.grid.rsds, study.grid.means), truth, strict=True
     ))  # fmt: skip
-    for (misfit, error), excluded in (
-        ((scores.misfit[hidden], scores.errors[hidden]), False),
-        (scores.unperturbed.misfit(scores.measured), True),
-    ):
-        excess = misfit - scores.misfit.min()
-        assert (excess > 2 * np.hypot(error, scores.errors[scores.best])) == excluded
+    excess = scores.misfit[hidden] - scores.misfit.min()
+    assert excess < 2 * np.hypot(scores.errors[hidden], scores.errors[scores.best])
+    assert scores.unperturbed.misfit(scores.measured)[0] > 3 * scores.misfit.min()
     assert scores.measured.misfit(scores.measured)[0] == 0
     assert not scores.lost and "rings about (111): contrasts" in repr(study)
     saved = study.to_dict()["structure"]
