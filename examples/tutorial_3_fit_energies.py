@@ -85,12 +85,13 @@ ae.plot.ssim_matrix(study)[0].figure.savefig("ssim.png")
 
 # %%
 # The errors come from 100 resamples of all measured and simulated ions, for which the analysis is repeated. The value
-# after ± is the standard deviation, and the bars contain 95 % of the optima. The errors show how much the result of
-# another measurement with the same number of ions would differ. They do not include errors of the model: the shape of
-# the specimen, the registration, or a mechanism that does not apply to the metal. Two numbers show whether the optimum
-# is credible: its gain over the unperturbed map, and its difference from 1. The uncorrected SSIM is in ``plain``. For a
-# good model, it is higher than the SSIM of two random halves of the measured ions, because each half has the noise of
-# half the ions.
+# after ± is the standard deviation: how much the result of another measurement with the same number of ions would
+# differ. The intervals are wider: they contain all energies whose SSIM is below the best one by less than an allowance
+# for specimens that differ from the simulated one (``model_error``), and they follow the ridge of equal true means. An
+# interval that ends at the end of the grid says "at most" or "at least". They do not include a mechanism that does not
+# apply to the metal. Two numbers show whether the optimum is credible: its gain over the unperturbed map, and its
+# difference from 1. The uncorrected SSIM is in ``plain``. For a good model, it is higher than the SSIM of two random
+# halves of the measured ions, because each half has the noise of half the ions.
 #
 # The mean and the width of the distribution can compensate each other. The true mean, that is, the mean of the energies
 # after truncation at 0, is determined better than both.

@@ -6,7 +6,7 @@ end. Two errors count.
 *Noise* of measured and simulated ions. With a quadratic maximum, the similarity of the true point is below that of the
 best one by half of the deviation of their difference times its quantile.
 
-*The model*: the simulated specimen is not the measured one. Its misfit 1 - SSIM remains at the best point, and at the
+*The model*: the simulated specimen is not the measured one. Its misfit |1 - SSIM| remains at the best point, and at the
 true point it is larger by a fraction `MODEL_ERROR` of that. This fraction is measured (`defaults.MODEL_ERROR`).
 """
 
@@ -57,7 +57,7 @@ def intervals(grid: EnergyGrid, similarities: Floats, best: Sequence[float], mod
     first, resamples = fine[0], fine[1:]
     top = np.unravel_index(first.argmax(), first.shape)
     deficit = first[top] - first
-    allowed = np.full(first.shape, model_error * max(1.0 - float(first[top]), 0.0))
+    allowed = np.full(first.shape, model_error * abs(1.0 - float(first[top])))
     if len(resamples) > 1:
         difference = resamples[(slice(None), *top)].reshape(-1, *[1] * first.ndim) - resamples
         allowed += 0.5 * _NORMAL * difference.std(axis=0, ddof=1)
