@@ -148,7 +148,9 @@ def _values(sweep, keys, system, options, at_once):
         "KEYS": " ".join(keys),
         "COUNT": str(len(keys)),
         "LAST": str(last),
-        "COMMAND": shlex.join([sys.executable, "-m", "apt_evap.cli", "sweep", "work", str(sweep.folder), "--quiet"]),
+        "COMMAND": shlex.join(
+            [sys.executable, "-P", "-m", "apt_evap.cli", "sweep", "work", str(sweep.folder), "--quiet"]
+        ),
         "THREADS": str(sweep.each.threads),
         "MEMORY": str(math.ceil(max(_LEAST_MEMORY, *megabytes))),
         "TIME": f"{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}",

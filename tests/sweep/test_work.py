@@ -45,7 +45,7 @@ def until(condition, seconds=60):
 
 def worker(sweep, *options, **environment):
     """`apt-evap sweep work` as a process."""
-    command = [sys.executable, "-m", "apt_evap.cli", "sweep", "work", str(sweep.folder), "--quiet", *options]
+    command = [sys.executable, "-P", "-m", "apt_evap.cli", "sweep", "work", str(sweep.folder), "--quiet", *options]
     return subprocess.Popen(command, env=os.environ | environment, stderr=subprocess.PIPE, text=True)
 
 
