@@ -22,7 +22,7 @@ def run(script, folder, **environment):
     fake = folder / "python"
     fake.write_text('#!/bin/sh\nfor last; do before=$this this=$last; done; echo "$before $this"\n')
     fake.chmod(0o755)
-    script = re.sub(r"exec \S+ -m", f"exec {fake} -m", script)
+    script = re.sub(r"exec \S+ -P -m", f"exec {fake} -P -m", script)
     done = subprocess.run(["bash", "-euc", script], env=os.environ | environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return done.stdout.strip()
