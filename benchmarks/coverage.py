@@ -38,7 +38,7 @@ def specimen(number, radius):
         shank_length=20 * nickel.a,
         offset_seed=1000 + number,
     )
-    tip.criterion = replace(tip.criterion, surface_threshold=sizes[2] * tip.surface_threshold)
+    tip.criteria = (replace(tip.criterion, surface_threshold=sizes[2] * tip.surface_threshold),)
     return tip
 
 
