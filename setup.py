@@ -75,7 +75,7 @@ extensions = [
     Extension(
         f"apt_evap._core.{name}",
         [f"apt_evap/_core/{name}.pyx"],
-        depends=[f"apt_evap/_core/{header}.h" for header in ("kernels", "kernels_group", "elementary")],
+        depends=[f"apt_evap/_core/{part}.h" for part in ("kernels", "kernels_group", "kernels_point", "elementary")],
         include_dirs=["apt_evap/_core"],
         py_limited_api=ABI3,
         define_macros=[("Py_LIMITED_API", "0x030b0000")] if ABI3 else [],

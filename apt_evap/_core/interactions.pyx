@@ -22,8 +22,8 @@ cdef extern from "kernels.h":
     void group_cells_single(long, const int*, const double*, const double*, const float*, float*) noexcept nogil
     void group_atoms_double(long, const int*, const double*, const double*, const double*, const double*,
                             const double*, const double*, double*) noexcept nogil
-    void point_atoms(long, const double*, const double*, const double*, const double*, double, double, double,
-                     double*) noexcept nogil
+    void point_atoms_double(long, const double*, const double*, const double*, const double*,
+                            double, double, double, double*) noexcept nogil
     void group_cells_double(long, const int*, const double*, const double*, const double*, double*) noexcept nogil
 
 
@@ -257,6 +257,6 @@ def direct_field(const double[:, ::1] points, const double[:, ::1] positions, co
     cdef long i
     with nogil:
         for i in range(points.shape[0]):
-            point_atoms(charges.shape[0], &columns[0, 0], &columns[1, 0], &columns[2, 0], &charges[0],
+            point_atoms_double(charges.shape[0], &columns[0, 0], &columns[1, 0], &columns[2, 0], &charges[0],
                         points[i, 0], points[i, 1], points[i, 2], &field[i, 0])
     return np.asarray(field)

@@ -43,125 +43,24 @@
 #undef REAL_SQRT
 #undef GROUP_NAME
 
-/* Adds the field of n point charges at (px, py, pz) to field[3]. */
-APT_CLONES static void point_atoms(long n, const double *restrict x, const double *restrict y, const double *restrict z,
-                                   const double *restrict q, double px, double py, double pz, double *restrict field)
-{
-    double ex[LANES] = {0}, ey[LANES] = {0}, ez[LANES] = {0};
-    for (long k = 0; k + LANES <= n; k += LANES) {
-#pragma omp simd
-        for (int l = 0; l < LANES; l++) {
-            const double dx = px - x[k + l], dy = py - y[k + l], dz = pz - z[k + l];
-            const double s = dx * dx + dy * dy + dz * dz;
-            const double w = s > SAME_PLACE ? q[k + l] / (s * sqrt(s)) : 0.0;
-            ex[l] += w * dx;
-            ey[l] += w * dy;
-            ez[l] += w * dz;
-        }
-    }
-    for (long k = n - n % LANES; k < n; k++) {
-        const double dx = px - x[k], dy = py - y[k], dz = pz - z[k];
-        const double s = dx * dx + dy * dy + dz * dz;
-        const double w = s > SAME_PLACE ? q[k] / (s * sqrt(s)) : 0.0;
-        ex[k % LANES] += w * dx;
-        ey[k % LANES] += w * dy;
-        ez[k % LANES] += w * dz;
-    }
-    for (int l = 0; l < LANES; l++) {
-        field[0] += ex[l];
-        field[1] += ey[l];
-        field[2] += ez[l];
-    }
-}
-
-/* Adds the field of n cells at (px, py, pz) to field[3]; c holds CELL rows of `stride` numbers, n a multiple of LANES
- * (padded by the caller with cells without charge). */
-APT_CLONES static void point_cells(long n, long stride, const double *restrict c, double px, double py, double pz,
-                                   double *restrict field)
-{
-    const double *restrict x = c, *restrict y = c + stride, *restrict z = c + 2 * stride, *restrict q = c + 3 * stride;
-    const double *restrict xx = c + 4 * stride, *restrict xy = c + 5 * stride, *restrict xz = c + 6 * stride;
-    const double *restrict yy = c + 7 * stride, *restrict yz = c + 8 * stride, *restrict zz = c + 9 * stride;
-    double ex[LANES] = {0}, ey[LANES] = {0}, ez[LANES] = {0};
-    for (long k = 0; k < n; k += LANES) {
-#pragma omp simd
-        for (int l = 0; l < LANES; l++) {
-            const long j = k + l;
-            const double dx = px - x[j], dy = py - y[j], dz = pz - z[j];
-            const double w2 = 1.0 / (dx * dx + dy * dy + dz * dz);
-            const double w3 = w2 * sqrt(w2), w5 = w3 * w2;
-            const double gx = xx[j] * dx + xy[j] * dy + xz[j] * dz;
-            const double gy = xy[j] * dx + yy[j] * dy + yz[j] * dz;
-            const double gz = xz[j] * dx + yz[j] * dy + zz[j] * dz;
-            const double radial = q[j] * w3 + 2.5 * w5 * w2 * (gx * dx + gy * dy + gz * dz);
-            ex[l] += radial * dx - w5 * gx;
-            ey[l] += radial * dy - w5 * gy;
-            ez[l] += radial * dz - w5 * gz;
-        }
-    }
-    for (int l = 0; l < LANES; l++) {
-        field[0] += ex[l];
-        field[1] += ey[l];
-        field[2] += ez[l];
-    }
-}
-
-/* The same sums in single precision, with coordinates relative to a point near the target, so that there is no loss by
- * cancellation; n is a multiple of SINGLE_LANES, padded by the caller with sources without charge. Measured on an Intel
- * Xeon with AVX-512: 1.9 Gpair/s of atoms, 3.3 times the rate in double precision; the square roots and divisions take
- * most of the time. A reciprocal square root by Newton steps makes 2.3 Gpair/s at an error of 1e-6. */
-APT_CLONES static void point_atoms_single(long n, const float *restrict x, const float *restrict y,
-                                          const float *restrict z, const float *restrict q, float px, float py,
-                                          float pz, double *restrict field)
-{
-    float ex[SINGLE_LANES] = {0}, ey[SINGLE_LANES] = {0}, ez[SINGLE_LANES] = {0};
-    for (long k = 0; k < n; k += SINGLE_LANES) {
-#pragma omp simd
-        for (int l = 0; l < SINGLE_LANES; l++) {
-            const float dx = px - x[k + l], dy = py - y[k + l], dz = pz - z[k + l];
-            const float s = dx * dx + dy * dy + dz * dz;
-            const float w = s > (float)SAME_PLACE ? q[k + l] / (s * sqrtf(s)) : 0.0f;
-            ex[l] += w * dx;
-            ey[l] += w * dy;
-            ez[l] += w * dz;
-        }
-    }
-    for (int l = 0; l < SINGLE_LANES; l++) {
-        field[0] += ex[l];
-        field[1] += ey[l];
-        field[2] += ez[l];
-    }
-}
-
-APT_CLONES static void point_cells_single(long n, long stride, const float *restrict c, float px, float py, float pz,
-                                          double *restrict field)
-{
-    const float *restrict x = c, *restrict y = c + stride, *restrict z = c + 2 * stride, *restrict q = c + 3 * stride;
-    const float *restrict xx = c + 4 * stride, *restrict xy = c + 5 * stride, *restrict xz = c + 6 * stride;
-    const float *restrict yy = c + 7 * stride, *restrict yz = c + 8 * stride, *restrict zz = c + 9 * stride;
-    float ex[SINGLE_LANES] = {0}, ey[SINGLE_LANES] = {0}, ez[SINGLE_LANES] = {0};
-    for (long k = 0; k < n; k += SINGLE_LANES) {
-#pragma omp simd
-        for (int l = 0; l < SINGLE_LANES; l++) {
-            const long j = k + l;
-            const float dx = px - x[j], dy = py - y[j], dz = pz - z[j];
-            const float w2 = 1.0f / (dx * dx + dy * dy + dz * dz);
-            const float w3 = w2 * sqrtf(w2), w5 = w3 * w2;
-            const float gx = xx[j] * dx + xy[j] * dy + xz[j] * dz;
-            const float gy = xy[j] * dx + yy[j] * dy + yz[j] * dz;
-            const float gz = xz[j] * dx + yz[j] * dy + zz[j] * dz;
-            const float radial = q[j] * w3 + 2.5f * w5 * w2 * (gx * dx + gy * dy + gz * dz);
-            ex[l] += radial * dx - w5 * gx;
-            ey[l] += radial * dy - w5 * gy;
-            ez[l] += radial * dz - w5 * gz;
-        }
-    }
-    for (int l = 0; l < SINGLE_LANES; l++) {
-        field[0] += ex[l];
-        field[1] += ey[l];
-        field[2] += ez[l];
-    }
-}
+#define REAL float
+#define REAL_SQRT sqrtf
+#define POINT_LANES SINGLE_LANES
+#define POINT_NAME(name) name##_single
+#include "kernels_point.h"
+#undef REAL
+#undef REAL_SQRT
+#undef POINT_LANES
+#undef POINT_NAME
+#define REAL double
+#define REAL_SQRT sqrt
+#define POINT_LANES LANES
+#define POINT_NAME(name) name##_double
+#include "kernels_point.h"
+#undef REAL
+#undef REAL_SQRT
+#undef POINT_LANES
+#undef POINT_NAME
 
 /* Values of three polynomials of the same degree at 16 points: coefficients of all x^i y^j z^k with i + j + k <= degree
  * (k fastest), for each component in turn. */

@@ -4,9 +4,9 @@ cdef extern from "kernels.h":
     const int CELL
     const int LANES, SINGLE_LANES
     const double SAME_PLACE
-    void point_atoms(long, const double*, const double*, const double*, const double*,
+    void point_atoms_double(long, const double*, const double*, const double*, const double*,
                      double, double, double, double*) noexcept nogil
-    void point_cells(long, long, const double*, double, double, double, double*) noexcept nogil
+    void point_cells_double(long, long, const double*, double, double, double, double*) noexcept nogil
     void point_atoms_single(long, const float*, const float*, const float*, const float*,
                             float, float, float, double*) noexcept nogil
     void point_cells_single(long, long, const float*, float, float, float, double*) noexcept nogil

@@ -46,8 +46,8 @@ cdef void sources_field(const Sources* sources, double px, double py, double pz,
     cdef const double* a = sources.atoms
     cdef long stride = sources.capacity
     field[0] = field[1] = field[2] = 0.0
-    point_atoms(sources.n_atoms, a, a + stride, a + 2 * stride, a + 3 * stride, px, py, pz, field)
-    point_cells(sources.n_cells, stride, sources.cells, px, py, pz, field)
+    point_atoms_double(sources.n_atoms, a, a + stride, a + 2 * stride, a + 3 * stride, px, py, pz, field)
+    point_cells_double(sources.n_cells, stride, sources.cells, px, py, pz, field)
 
 
 cdef double sources_potential(const Sources* sources, double px, double py, double pz) noexcept nogil:

@@ -43,8 +43,8 @@ int main(void)
     group_cells_single(N, list, cells, origin, targets, sums);
     group_atoms_double(1, range, x, y, z, q, origin, wide, wide_sums);
     group_cells_double(N, list, cells, origin, wide, wide_sums);
-    point_atoms(N - 3, x, y, z, q, 5, 5, 12, e);
-    point_cells(N, N, cells, 5, 5, 12, e);
+    point_atoms_double(N - 3, x, y, z, q, 5, 5, 12, e);
+    point_cells_double(N, N, cells, 5, 5, 12, e);
     patch_row(N, fx, fy, fz, 5, 5, 5, normal, row);
     dot = patch_dot(N, row, fx);
     patch_field(N, fx, fy, fz, N - 1, fy, fz, fx, fq, px, py, pz);
@@ -77,7 +77,8 @@ def test_bits_do_not_depend_on_the_processor(tmp_path):
         .replace('"default"), unused))', '"default"), unused) */')
     )
     (tmp_path / "kernels.h").write_text(header)
-    (tmp_path / "kernels_group.h").write_text((CORE / "kernels_group.h").read_text())
+    for part in ("kernels_group.h", "kernels_point.h"):
+        (tmp_path / part).write_text((CORE / part).read_text())
     (tmp_path / "sums.c").write_text(PROGRAM)
     seen = {}
     flags = ["-fopenmp", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=off"]
