@@ -14,7 +14,6 @@ from setuptools.command.build_ext import build_ext
 from setuptools.command.build_py import build_py
 
 MODULES = sorted(path.stem for path in Path("apt_evap/_core").glob("*.pyx"))
-ABI3 = bool(os.environ.get("APT_EVAP_ABI3"))  # use only Python's stable ABI: one wheel for all versions from 3.11
 BOUNDS = bool(os.environ.get("APT_EVAP_BOUNDS"))  # check every index: slow, for tools/sanitize.sh
 DIRECTIVES = {
     "language_level": 3,
@@ -77,8 +76,6 @@ extensions = [
         [f"apt_evap/_core/{name}.pyx"],
         depends=[f"apt_evap/_core/{part}.h" for part in ("kernels", "kernels_group", "kernels_point", "elementary")],
         include_dirs=["apt_evap/_core"],
-        py_limited_api=ABI3,
-        define_macros=[("Py_LIMITED_API", "0x030b0000")] if ABI3 else [],
         libraries=[] if platform.system() == "Windows" else ["m"],
     )
     for name in MODULES
@@ -91,5 +88,4 @@ setup(
         quiet="-q" in sys.argv,
     ),
     cmdclass={"build_ext": BuildCore, "build_py": BuildPython},
-    options={"bdist_wheel": {"py_limited_api": "cp311"}} if ABI3 else {},
 )

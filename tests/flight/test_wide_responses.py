@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.emission.emissions import TangentialLaunches
 from apt_evap.emission.surface_frame import shared_positions
 
 ENERGY = ae.TruncatedNormal(0.155, 0.155)
@@ -33,9 +32,10 @@ def test_hits_are_those_of_flights(run, perturbation):
     both = flown.detected & fitted.detected
     assert both.mean() > 0.8
     deviations = np.hypot(flown.x - fitted.x, flown.y - fitted.y)[both]
-    # of a plane 300 mm wide; measured for R = 20 a: medians 0.07 mm (rolled up) and 0.006 mm, largest 0.6 mm
-    assert np.median(deviations) < 0.2
-    assert deviations.max() < 3.0
+    # on a plane at 100 mm, 1.5 times what was measured: rolled up 0.155 and 0.455 mm, from the site 0.006 and 0.017 mm
+    median, largest = (0.24, 0.7) if hasattr(perturbation, "probability") else (0.009, 0.026)
+    assert np.median(deviations) < median
+    assert deviations.max() < largest
     # the launches differ by much more than that from those without the options
     plain = run.hits(ae.RollUp(ENERGY) if perturbation != ae.RollUp(ENERGY) else ae.Unperturbed())
     assert np.nanmedian(np.hypot(flown.x - plain.x, flown.y - plain.y)) > 5 * np.median(deviations)
@@ -135,4 +135,3 @@ def test_launches_of_a_wide_design_determine_its_polynomial():
         matrix = design.monomials(design.launches)
         assert len(matrix) == round(1.4 * matrix.shape[1])
         assert np.linalg.cond(matrix) < 1e4  # coefficients in single precision lose less than four of seven digits
-    assert TangentialLaunches(np.ones(1, bool), np.zeros(1), np.zeros(1)).shares is None
