@@ -118,6 +118,14 @@ def check_places(selection: Hits, options: argparse.Namespace) -> None:
         raise ValueError(f"{source} {what} on the detector: a map needs more")
 
 
+def ions_of_map(hits: Hits, options: argparse.Namespace) -> Hits:
+    """Ions that the options select; ValueError if they make no map."""
+    check_columns(hits, options)
+    selection = select(hits, options)
+    check_places(selection, options)
+    return selection
+
+
 def picture_path(path: AnyPath) -> Path:
     path = check_path(path)
     if path.suffix.lower() not in _MARK_KEYS:

@@ -13,7 +13,7 @@ import numpy as np
 from apt_evap import plot
 from apt_evap._common.files import FileError, check_path, read_small_file, replace_file
 from apt_evap._common.warnings import RegistrationWarning
-from apt_evap.cli._files import check_columns, check_output, check_places, read, select
+from apt_evap.cli._files import check_output, ions_of_map, read, select
 from apt_evap.cli._output import put, say
 from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.detection.detector_map import DetectorMap
@@ -106,10 +106,7 @@ def _measured(options):
         raise ValueError(f"--perturbation is only for a run as MEASURED, {options.file!r} contains measured ions")
     if isinstance(content, DetectorMap):
         return content
-    check_columns(content, options)
-    selection = select(content, options)
-    check_places(selection, options)
-    return selection
+    return ions_of_map(content, options)
 
 
 # ---- output --------------------------------------------------------------------------------------------------------

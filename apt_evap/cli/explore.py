@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from html import escape
 
 from apt_evap._common.optional_imports import optional_import
-from apt_evap.cli._files import check_columns, check_places, in_real_units, read, select
+from apt_evap.cli._files import in_real_units, ions_of_map, read
 from apt_evap.cli._output import put, say
 from apt_evap.cli.compare import read_registration
 from apt_evap.config.perturbation_text import read_perturbation
@@ -112,10 +112,7 @@ def _measured(options):
         raise ValueError(f"MEASURED must be measured ions or a map, {options.file!r} is a run")
     if isinstance(content, DetectorMap):
         return content
-    check_columns(content, options)
-    selection = select(content, options)
-    check_places(selection, options)
-    return selection
+    return ions_of_map(content, options)
 
 
 # ---- the same in text ----------------------------------------------------------------------------------------------

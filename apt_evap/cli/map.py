@@ -10,10 +10,9 @@ import numpy as np
 
 from apt_evap.analysis.field_ion_image import field_ion_image
 from apt_evap.cli._files import (
-    check_columns,
     check_output,
-    check_places,
     in_real_units,
+    ions_of_map,
     is_picture,
     picture_path,
     read,
@@ -54,9 +53,7 @@ def execute(options: argparse.Namespace) -> int:
         sigma = 0.0 if options.smooth is None and not content.is_counts else options.smooth
         maps = [_smooth(content, sigma)], [Path(options.file).name]
     else:
-        check_columns(content, options)
-        selection = select(content, options)
-        check_places(selection, options)
+        selection = ions_of_map(content, options)
         map = selection.map(options.bins or bins_for(int(selection.detected.sum())))
         part = f", {len(selection):,} of {len(content):,} ions" if selects(options) else ""
         maps = [_smooth(map, options.smooth)], [f"{Path(options.file).name}{part}"]

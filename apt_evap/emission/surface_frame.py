@@ -84,10 +84,14 @@ def rolled_positions(emissions: Emissions) -> Floats:
     ndarray, shape (n, 3)
         Positions [nm]; NaN for an ion without a neighbour.
     """
-    distances = emissions.rollup_distances
-    if distances is None:
-        return emissions.neighbours + emissions.nearest_neighbour_distance * emissions.normals
-    return emissions.neighbours + distances[:, None] * emissions.normals
+    return emissions.neighbours + _lift(emissions)
+
+
+def _lift(emissions):
+    """Steps d n from a target to the rolled-up position above it [nm], shape (n, 3)."""
+    if emissions.rollup_distances is None:
+        return emissions.nearest_neighbour_distance * emissions.normals
+    return emissions.rollup_distances[:, None] * emissions.normals
 
 
 @kept
@@ -159,10 +163,7 @@ def shared_positions(emissions: Emissions, shares: Floats) -> Floats:
     ndarray, shape (n, m, 3)
         Positions [nm]; NaN for an ion without a neighbour.
     """
-    distances = emissions.rollup_distances
-    if distances is None:
-        return _mean_targets(emissions, shares) + (emissions.nearest_neighbour_distance * emissions.normals)[:, None]
-    return _mean_targets(emissions, shares) + (distances[:, None] * emissions.normals)[:, None]
+    return _mean_targets(emissions, shares) + _lift(emissions)[:, None]
 
 
 def along_surface(normals: ArrayLike, first: Floats, second: Floats) -> Floats:

@@ -213,36 +213,6 @@ def _to_specimen(coordinates, orientation, origin):
     )
 
 
-def lattice_points_in(
-    structure: str,
-    a: float,
-    c: float | None,
-    orientation: ArrayLike,
-    origin: ArrayLike,
-    signed_distance: Callable[[Floats], Floats],
-    bounds: ArrayLike,
-    *,
-    depth: Callable[[Floats], Floats] | None = None,
-    tolerance: float = 0.0,
-    block: int = _BLOCK,
-) -> Floats:
-    """Lattice points inside a shape, or in a shell below its surface: the positions of `lattice_sites_in`.
-
-    Parameters
-    ----------
-    structure, a, c, orientation, origin, signed_distance, bounds, depth, tolerance, block
-        As for `lattice_sites_in`.
-
-    Returns
-    -------
-    ndarray
-        Positions [nm], shape (n, 3).
-    """
-    return lattice_sites_in(
-        structure, a, c, orientation, origin, signed_distance, bounds, depth=depth, tolerance=tolerance, block=block
-    )[0]
-
-
 def lattice_sites_in(
     structure: str,
     a: float,
