@@ -65,6 +65,8 @@ from .emission.surface_frame import target_shares as target_shares
 from .energy_fit.fit_energies import fit_energies as fit_energies
 from .energy_fit.fit_tips import TipFit as TipFit
 from .energy_fit.fit_tips import fit_tips as fit_tips
+from .energy_fit.radius import RadiusFit as RadiusFit
+from .energy_fit.radius import fit_radius as fit_radius
 from .energy_fit.study import Study as Study
 from .evaporation.bonds import TUNGSTEN_TABLE as TUNGSTEN_TABLE
 from .evaporation.bonds import CoordinationTable as CoordinationTable

@@ -22,6 +22,7 @@ cdef class Evaporation:
     cdef public double rate             # wanted sum of rates [1/s]
     cdef public double memory           # number of events over which the control averages
     cdef readonly double rise           # logarithm of the rate by the control since the last relaxation
+    cdef public double target_stretch   # squared reach of a roll-up over that of a nearest neighbour
     cdef readonly unsigned long long seed
     cdef bint has_support
     cdef int[::1] slot_of               # (n_atoms,) -1 for atoms not at the surface

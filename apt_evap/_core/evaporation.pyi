@@ -77,6 +77,7 @@ class Evaporation:
     memory: float
     @property
     def rise(self) -> float: ...
+    target_stretch: float
     @property
     def seed(self) -> int: ...
     @property

@@ -92,6 +92,7 @@ cdef class Evaporation:
         self.n_removed = self.n_clipped = self.n_unsettled = 0
         self.since_relaxation = NOT_RELAXED
         self.voltage_factor, self.seed, self.rate, self.memory, self.rise = 1.0, seed, 1.0, 1.0, 0.0
+        self.target_stretch = 1.0
         self.has_support = bool(np.asarray(atoms.support).any())
         self.slot_of = np.full(atoms.n_atoms, -1, np.int32)
         self.make_room(ROOM)
@@ -217,7 +218,8 @@ cdef class Evaporation:
     # ---- one event -------------------------------------------------------------------------------------------------
 
     cdef void strongest_neighbours(self, long atom, long long* neighbour, double* charge) noexcept nogil:
-        # The TARGETS surface nearest neighbours with the highest charges, in falling order; -1 if there are fewer.
+        # The TARGETS surface neighbours with the highest charges, in falling order; -1 if there are fewer. Nearest
+        # neighbours, and with a `target_stretch` also those of the second shell.
         cdef int[MAX_NEAR] others
         cdef int n = self.atoms.near(atom, others), i, k, m
         cdef long other
@@ -227,7 +229,7 @@ cdef class Evaporation:
             charge[k] = 0.0
         for i in range(n):
             other = others[i]
-            if self.slot_of[other] < 0 or not self.atoms.bonded(atom, other):
+            if self.slot_of[other] < 0 or not self.atoms.bonded(atom, other, self.target_stretch):
                 continue
             q = self.tree.q[self.slot_of[other]]
             for k in range(TARGETS):

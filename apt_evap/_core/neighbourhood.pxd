@@ -52,7 +52,7 @@ cdef class Neighbourhood:
     cdef int remove(self, long atom, int* fresh) noexcept nogil
     cdef long open_from(self, long atom) noexcept nogil
     cdef void hold_from(self, signed char[::1] held) noexcept nogil
-    cdef bint bonded(self, long first, long second) noexcept nogil
+    cdef bint bonded(self, long first, long second, double stretch=*) noexcept nogil
     cdef void release(self, const int* nearest, int n) noexcept nogil
     cdef long visit(self, int atom, int piece, long n, long* known) noexcept nogil
     cdef void append(self, long at, int piece, int* front, int* last) noexcept nogil

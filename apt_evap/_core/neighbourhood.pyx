@@ -309,14 +309,14 @@ cdef class Neighbourhood:
 
     # ---- atoms without hold ----------------------------------------------------------------------------------------
 
-    cdef bint bonded(self, long first, long second) noexcept nogil:
-        # Whether two atoms are nearest neighbours.
+    cdef bint bonded(self, long first, long second, double stretch=1.0) noexcept nogil:
+        # Whether two atoms are nearest neighbours; `stretch` multiplies the squared length of the bond.
         cdef double s = 0.0, step
         cdef int axis
         for axis in range(3):
             step = self.positions[first, axis] - self.positions[second, axis]
             s += step * step
-        return s <= self.bond[self.kind_of(first), self.kind_of(second)]
+        return s <= stretch * self.bond[self.kind_of(first), self.kind_of(second)]
 
     cdef void release(self, const int* nearest, int n) noexcept nogil:
         # Detaches the parts of the specimen that lost their hold when a common neighbour of these atoms was removed. All

@@ -174,7 +174,7 @@ def fit_tips(
     }
     names = list(studies)
     # similarity of the best point of each resample, shape (runs, resamples)
-    best = np.stack([study.resampled.max(axis=(1, 2, 3)) for study in studies.values()])
+    best = np.stack([study.resampled.max(axis=tuple(range(1, study.resampled.ndim))) for study in studies.values()])
     wins = np.bincount(best.argmax(axis=0), minlength=len(names)) if best.shape[1] else np.full(len(names), np.nan)
     shares = dict(zip(names, (wins / max(best.shape[1], 1)).tolist(), strict=True))
     doubtful = tuple(name for name, each in registrations.items() if each.doubtful)

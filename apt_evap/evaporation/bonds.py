@@ -8,6 +8,7 @@ import numpy as np
 
 from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_count, check_number, short_text
+from apt_evap.specimen.lattice import SECOND_SHELL_FACTORS
 from apt_evap.specimen.tip import Tip
 
 _KITTEL = "Kittel, Introduction to Solid State Physics, 8th ed. (2005), ch. 3, table 1"
@@ -42,8 +43,6 @@ From first, second and third ionisation energies (NIST Atomic Spectra Database) 
 """
 
 _COORDINATION = {"fcc": (12, 6), "hcp": (12, 6), "bcc": (8, 6), "sc": (6, 12), "diamond": (4, 12)}
-# [d_nn] between the second and the third neighbours
-_SECOND = {"fcc": 1.57, "hcp": 1.52, "bcc": 1.39, "sc": 1.57, "diamond": 1.77}
 _BITS = 4  # per count of neighbours: up to 15
 _LEAST = 0.1  # of the energy at a kink: repulsive bonds cannot lower the field below 1 %
 _MOST = 4  # counts: tables of 16^4 numbers
@@ -302,5 +301,5 @@ def bond_table(bonds: Any, tip: Tip) -> tuple[BondCodes, Floats, Integers]:
             )
         table[index] = element.evaporation_field / fields
     distance = tip.nearest_neighbour_distance
-    reach = min(_SECOND[tip.elements[0].structure] * distance, tip.neighbour_radius) if bonds.second_shell else 0.0
+    reach = min(SECOND_SHELL_FACTORS[tip.elements[0].structure] * distance, tip.neighbour_radius) if bonds.second_shell else 0.0
     return BondCodes(near, far, reach), table, tip.species

@@ -25,6 +25,7 @@ from apt_evap.evaporation.settings import ChargeSettings, check_angle
 from apt_evap.evaporation.state import EmitterState
 from apt_evap.evaporation.voltage import RateControl, VoltageControl, check_voltage
 from apt_evap.specimen.ase_atoms import to_atoms
+from apt_evap.specimen.lattice import BOND_FACTORS, SECOND_SHELL_FACTORS
 from apt_evap.specimen.tip import Tip
 from apt_evap.units import COULOMB
 
@@ -118,11 +119,13 @@ class Emitter:
         remain those at `voltage`; the law sees them in proportion to `control_voltage`.
     seed : int
         Seed of the events of a law with a temperature.
+    target_shells : int
+        1: the targets of a roll-up are nearest neighbours; 2: also second neighbours.
 
     Raises
     ------
     ValueError
-        If the voltage is not positive, or if the specimen has no evaporable surface atom.
+        If the voltage is not positive, `target_shells` is not 1 or 2, or if the specimen has no evaporable surface atom.
     """
 
     def __init__(
@@ -135,6 +138,7 @@ class Emitter:
         rule: rules.Rule | rules.CompiledRule | None = None,
         control: VoltageControl | None = None,
         seed: int = 0,
+        target_shells: int = 1,
     ) -> None:
         self.tip = check_kind(tip, "tip", Tip, "a Tip")
         self.voltage = check_voltage(voltage)
@@ -161,6 +165,10 @@ class Emitter:
             self.settings.opening_angle,
             (check_seed(seed) + _SEED_STEP) % (1 << 64),
         )
+        if check_count(target_shells, "target_shells", at_least=1, at_most=2) == 2:
+            structure = tip.elements[0].structure
+            reach = SECOND_SHELL_FACTORS[structure] / BOND_FACTORS[structure]
+            self._core.target_stretch = reach * reach
         if self._rate_control:
             self._rate_control.begin(self._core)
         self._sites, self._deepened = [], []  # evaporated atoms of each batch; numbers of events before each deepening

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from apt_evap._common.small_matrices import squared_lengths
 from apt_evap._common.types import Booleans, Floats
-from apt_evap._common.validation import check_kind, check_number
+from apt_evap._common.validation import check_count, check_kind, check_number
 from apt_evap._common.warnings import ResponseWarning
 from apt_evap.detection.detector import Detector
 from apt_evap.emission.emissions import Emissions, TangentialLaunches
@@ -58,6 +58,9 @@ class ResponseSettings:
         Residual of a fit on the detector above which an ion is flagged [mm].
     height : float
         Largest launch height of wide designs [nm]; 0 for others.
+    shells : int
+        Shells of neighbours that can be targets of a roll-up: 1 for nearest neighbours, 2 also for second ones, which in
+        bcc are only 15 % more distant.
     """
 
     energy_limit: float = 1.5
@@ -65,8 +68,10 @@ class ResponseSettings:
     rolled: Design | WideDesign = _ROLLED
     bound: float = 0.2
     height: float = 0.0
+    shells: int = 1
 
     def __post_init__(self):
+        check_count(self.shells, "shells", at_least=1, at_most=2)
         check_number(self.energy_limit, "energy_limit", above=0, at_most=HIGHEST_ENERGY, unit="eV")
         check_number(self.bound, "bound", above=0, unit="mm")
         for name in ("site", "rolled"):
@@ -83,7 +88,9 @@ class ResponseSettings:
             raise ValueError(f"height needs wide designs (ResponseSettings.wide), got {self.height:g} nm")
 
     @classmethod
-    def wide(cls, height: float = 0.2, energy_limit: float = 1.5, bound: float = 0.2) -> "ResponseSettings":
+    def wide(
+        cls, height: float = 0.2, energy_limit: float = 1.5, bound: float = 0.2, shells: int = 1
+    ) -> "ResponseSettings":
         """Settings whose responses also serve other targets of the roll-up and other launch heights.
 
         A run then serves any `sharpness`, `probability` and `height` of the perturbations in post-processing.
@@ -92,14 +99,14 @@ class ResponseSettings:
         ----------
         height : float
             Largest launch height [nm].
-        energy_limit, bound : float
+        energy_limit, bound, shells
             As in `ResponseSettings`.
 
         Returns
         -------
         ResponseSettings
         """
-        return cls(energy_limit, WideDesign(0, 4, 3, 4), WideDesign(3, 2, 2, 3), bound, height)
+        return cls(energy_limit, WideDesign(0, 4, 3, 4), WideDesign(3, 2, 2, 3), bound, height, shells)
 
     @classmethod
     def from_dict(cls, settings: Mapping[str, Any]) -> "ResponseSettings":
@@ -107,7 +114,8 @@ class ResponseSettings:
         designs = {
             name: (WideDesign if "place" in settings[name] else Design)(**settings[name]) for name in ("site", "rolled")
         }
-        return cls(settings["energy_limit"], designs["site"], designs["rolled"], settings["bound"], settings["height"])
+        others = (settings[name] for name in ("bound", "height", "shells"))
+        return cls(settings["energy_limit"], designs["site"], designs["rolled"], *others)
 
     def to_dict(self) -> dict[str, Any]:
         """All settings in plain types, dict."""

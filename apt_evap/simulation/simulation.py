@@ -108,7 +108,17 @@ class Simulation:
         check_kind(self.watch_settings, "watch_settings", WatchSettings, "WatchSettings")
         self.n_threads = thread_count(n_threads)
         check_reach(self.flight_settings, check_kind(tip, "tip", Tip, "a Tip"), self.detector)
-        self.emitter = Emitter(tip, self.voltage, self.law, charge_settings, self.n_threads, rule, control, self.seed)
+        self.emitter = Emitter(
+            tip,
+            self.voltage,
+            self.law,
+            charge_settings,
+            self.n_threads,
+            rule,
+            control,
+            self.seed,
+            self.response_settings.shells,
+        )
         self.control = self.emitter.control or control
         check_copies(len(self.emitter), self.n_threads)
         self.settings = self._settings_of(tip)

@@ -28,6 +28,8 @@ COORDINATION = {"fcc": 12, "bcc": 8, "sc": 6, "diamond": 4, "hcp": 12}
 
 BOND_FACTORS = {"fcc": 1.2, "bcc": 1.077, "sc": 1.2, "diamond": 1.3, "hcp": 1.2}
 """Cutoff distance of nearest neighbours, in nearest neighbour distances: half way to the second shell."""
+SECOND_SHELL_FACTORS = {"fcc": 1.57, "bcc": 1.39, "sc": 1.57, "diamond": 1.77, "hcp": 1.52}
+"""Cutoff distance of the second shell, in nearest neighbour distances: between the second and the third shell."""
 
 # Percentages: fraction classified as surface atoms, of the atoms with fewer nearest neighbours than in the bulk, and of
 # the other atoms down to 4 d_nn; measured on caps of radius 14 d_nn along 4 or 5 axes

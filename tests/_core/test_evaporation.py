@@ -119,6 +119,30 @@ def check_choices(emitter, events):
             assert (batch.targets[0] == -1).all()
 
 
+@pytest.mark.parametrize(("element", "shells", "reach"), [("W", 1, 1.05), ("W", 2, 1.3), ("Ni", 2, 1.5), ("Ni", 1, 1.2)])
+def test_targets_are_the_strongest_neighbours_of_the_shells(element, shells, reach):
+    """Second neighbours are at 1.155 d in bcc and at 1.414 d in fcc, third ones at 1.633 and 1.732 d."""
+    material = ae.material(element)
+    tip = ae.Tip(material, apex_radius=8 * material.a, axis=(1, 1, 0), shank_length=4 * material.a)
+    emitter = ae.Emitter(tip, target_shells=shells)
+    second = 0
+    for _ in range(60):
+        atoms, charges, positions = emitter.atoms, emitter.charges, emitter.positions
+        batch = emitter.evaporate(1)
+        if len(batch) == 0:
+            emitter.relax()
+            continue
+        distance = np.linalg.norm(positions - tip.positions[batch.site[0]], axis=1) / tip.nearest_neighbour_distance
+        near = np.flatnonzero((distance > 0) & (distance < reach))
+        order = near[np.lexsort((atoms[near], -charges[near]))][:3]
+        expected = np.full(3, -1)
+        expected[: len(order)] = atoms[order]
+        np.testing.assert_array_equal(batch.targets[0], expected)
+        np.testing.assert_array_equal(batch.target_charges[0, : len(order)], charges[order])
+        second += int((distance[order] > 1.1).sum())
+    assert (second > 20) == (shells == 2)
+
+
 def test_extremal_choice(tip12):
     check_choices(ae.Emitter(tip12, settings=ae.ChargeSettings(sweep_interval=60)), 150)
 

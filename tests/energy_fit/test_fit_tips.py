@@ -47,6 +47,21 @@ def test_all_runs_are_compared_in_the_same_region_with_the_same_settings(fit):
     assert first.settings == second.settings
 
 
+def test_options_of_the_perturbation_are_axes_of_every_study(runs):
+    candidates = {name: runs[name] for name in ("axis", "right")}
+    fit = fit_tips(
+        candidates,
+        runs["measured"].hits(ROLLUP),
+        registration=HERE,
+        bins=32,
+        resamples=20,
+        options={"probability": (0.5, 1.0)},
+        **GRID,
+    )
+    assert fit.best == "right" and fit.shares["right"] == 1.0
+    assert fit.studies["right"].optimum.options == {"probability": 1.0}
+
+
 def test_the_table_has_a_row_for_each_run_that_json_takes(fit):
     rows = fit.rows()
     assert [row["run"] for row in rows] == fit.order

@@ -117,6 +117,7 @@ def test_runs_without_wide_responses_say_so(tip12):
         (lambda: ae.ResponseSettings(height=0.1), "height needs wide designs"),
         (lambda: ae.ResponseSettings(site=ae.WideDesign(0, 2, 1, 2)), "must both be a Design or both a WideDesign"),
         (lambda: ae.ResponseSettings.wide(height=0.0), "wide designs need a height > 0 nm"),
+        (lambda: ae.ResponseSettings.wide(shells=3), "shells must be .*2, got 3"),
         (lambda: ae.WideDesign(0, 9, 1, 2), "velocity must be .*6, got 9"),
     ],
 )
