@@ -2,10 +2,10 @@
 
     python benchmarks/radius.py FOLDER --twins 8
 
-A family of Ni[111] tips with radii of 14 to 40 a, and twins with hidden radii between 16 and 36 a (uniform in ln R). All
-tips have other lattice origins, and shank angles and surface thresholds that differ by up to 20 %. All ions have the same
-emission. Runs are stored in FOLDER, so that the script can be stopped and continued. Before the first ion that flies, a
-third of a layer of the cap evaporates.
+A family of Ni[111] tips with radii of 14 to 40 a, and twins with hidden radii between 16 and 36 a (uniform in ln R).
+All tips have other lattice origins, and shank angles and surface thresholds that differ by up to 20 %. All ions have
+the same emission. Runs are stored in FOLDER, so that the script can be stopped and continued. Before the first ion
+that flies, a third of a layer of the cap evaporates.
 """
 
 import argparse
@@ -74,7 +74,8 @@ def main():
         fit = ae.fit_radius(family, counts(run), projection, EMISSION, (1, 1, 1), fold=3, rings=RINGS, radii=EDGES)
         found, (low, high) = fit.radius / 0.352, (bound / 0.352 for bound in fit.interval)
         inside += low <= hidden <= high
-        print(f"hidden {hidden:5.1f} a: {found:5.1f} a ({low:.1f} to {high:.1f}), chi square {fit.chi_square.min():.1f}")
+        bounds = f"({low:.1f} to {high:.1f})"
+        print(f"hidden {hidden:5.1f} a: {found:5.1f} a {bounds}, chi square {fit.chi_square.min():.1f}")
     print(f"{inside} of {options.twins} intervals of 95 % contain the hidden radius")
 
 

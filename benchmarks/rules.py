@@ -2,9 +2,10 @@
 
     python benchmarks/rules.py FOLDER --twins 4
 
-Tips of Ni[111], R = 20 a, with wide responses. The twins have other lattice origins, and radii, shank angles and surface
-thresholds that differ by up to 10 %. Their maps have a hidden probability, sharpness and energy; `fit_energies` searches
-all three in the frame of the instrument. Runs are stored in FOLDER, so that the script can be stopped and continued.
+Tips of Ni[111], R = 20 a, with wide responses. The twins have other lattice origins, and radii, shank angles and
+surface thresholds that differ by up to 10 %. Their maps have a hidden probability, sharpness and energy;
+`fit_energies` searches all three in the frame of the instrument. Runs are stored in FOLDER, so that the script can be
+stopped and continued.
 """
 
 import argparse

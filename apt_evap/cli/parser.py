@@ -373,7 +373,7 @@ def _add_sweep(commands: Any) -> None:
         "  apt-evap sweep work study.toml --workers 4              on this machine\n"
         "  apt-evap sweep submit study.toml --scheduler slurm      on a cluster\n"
         "  apt-evap sweep status study.toml\n"
-        "  apt-evap sweep collect study.toml                       index.csv, maps.h5, comparison with a measured map",
+        "  apt-evap sweep collect study.toml                       tables, maps, a report, fit to a measured map",
         **_SHAPE,
     )
     actions = command.add_subparsers(title="actions", metavar="ACTION", dest="action", required=True)
@@ -404,7 +404,7 @@ def _add_sweep(commands: Any) -> None:
     submit.add_argument("--largest-array", type=_integer(1), metavar="N", help="default: as the system allows, or 1000")
     _add_speech(submit)
     add("status", "show the states of all points").add_argument("--json", action="store_true", help="as JSON")
-    gather = add("collect", "collect the finished points: index.csv, maps.h5, and the fit to a measured map")
+    gather = add("collect", "collect the finished points: table, maps, report, and the fit to a measured map")
     gather.add_argument("--maps", metavar="MAPS.h5", help="default: maps.h5 in the folder of the sweep")
     gather.add_argument("--bins", type=_integer(1, MAX_BINS), metavar="N", help="default: bins in [maps], or 128")
     gather.add_argument("--no-compare", action="store_true", help="without the comparison of [compare]")

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import shlex
 
 from apt_evap._common.files import FileError
 from apt_evap.cli._output import put, say, tell, tell_json
@@ -145,6 +146,7 @@ def _collect(options):
         bins=options.bins,
         compare=not options.no_compare,
         note=lambda text: tell(options, text),
+        command=shlex.join(["apt-evap", *options.arguments]),
     )
     if not result["done"]:
         raise FileError(f"no point of {str(sweep.folder)!r} is done: apt-evap sweep work runs them")

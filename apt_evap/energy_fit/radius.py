@@ -101,8 +101,9 @@ def fit_radius(
     projection : Projection
         Of the measured map, with the scale in crystal degrees from indexed poles (`fit_orientation`).
     perturbations : perturbation or sequence of perturbations
-        Emission of the ions of all runs, or of each one. A pole can also be filled by energy, so that the radius is that
-        for this emission. With runs in real units (`Run.at_evaporation_field`) one energy is the same for all radii.
+        Emission of the ions of all runs, or of each one. A pole can also be filled by energy, so that the radius is
+        that for this emission. With runs in real units (`Run.at_evaporation_field`) one energy is the same for all
+        radii.
     plane : sequence of int
         Miller indices of the pole on the maps of the runs, shape (3,).
     pole : array_like
@@ -143,14 +144,13 @@ def fit_radius(
     if len(perturbations) != len(runs):
         raise ValueError(f"perturbations must be one or {len(runs)}, one for each run, got {len(perturbations)}")
     draws = check_count(draws, "draws", at_least=1)
-    target = _structure(measured, projection, pole, rings, radii, fold, ions)
-    family = np.array(
-        [
-            _structure(_map_of(run, each, draws), *_pole_of(run, plane), rings, radii, fold, None).values
-            for run, each in zip(runs, perturbations, strict=True)
-        ]
-    )
-    return _fit(run_radii, family, target.values, np.nan_to_num(target.errors))
+    settings = rings, radii, fold
+    target = _structure(measured, projection, pole, *settings, ions)
+    values = []
+    for run, each in zip(runs, perturbations, strict=True):
+        own = image_compression(run).projection, _direction(run, plane)
+        values.append(_structure(_map_of(run, each, draws), *own, *settings, None).values)
+    return _fit(run_radii, np.array(values), target.values, np.nan_to_num(target.errors))
 
 
 def _fit(run_radii, family, target, error):
@@ -188,11 +188,10 @@ def _radius_of(run):
     return check_number(radius, "the apex radius of a run", above=0, unit="nm")
 
 
-def _pole_of(run, plane):
-    """Projection of a run, and the direction of a pole in its frame."""
+def _direction(run, plane):
+    """Direction of a pole in the frame of a run."""
     orientation = Orientation.from_settings(run.settings["tip"])
-    normals = plane_normals(orientation.material, np.atleast_2d(np.asarray(plane)))
-    return image_compression(run).projection, orientation.directions(normals)[0]
+    return orientation.directions(plane_normals(orientation.material, np.atleast_2d(np.asarray(plane))))[0]
 
 
 def _map_of(run, perturbation, draws):

@@ -300,6 +300,6 @@ def bond_table(bonds: Any, tip: Tip) -> tuple[BondCodes, Floats, Integers]:
                 f"{short_text(fields)}"
             )
         table[index] = element.evaporation_field / fields
-    distance = tip.nearest_neighbour_distance
-    reach = min(SECOND_SHELL_FACTORS[tip.elements[0].structure] * distance, tip.neighbour_radius) if bonds.second_shell else 0.0
+    second = SECOND_SHELL_FACTORS[tip.elements[0].structure] * tip.nearest_neighbour_distance
+    reach = min(second, tip.neighbour_radius) if bonds.second_shell else 0.0
     return BondCodes(near, far, reach), table, tip.species

@@ -125,7 +125,7 @@ class Emitter:
     Raises
     ------
     ValueError
-        If the voltage is not positive, `target_shells` is not 1 or 2, or if the specimen has no evaporable surface atom.
+        If the voltage is not positive, `target_shells` is not 1 or 2, or the specimen has no evaporable surface atom.
     """
 
     def __init__(

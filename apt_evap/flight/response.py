@@ -59,8 +59,8 @@ class ResponseSettings:
     height : float
         Largest launch height of wide designs [nm]; 0 for others.
     shells : int
-        Shells of neighbours that can be targets of a roll-up: 1 for nearest neighbours, 2 also for second ones, which in
-        bcc are only 15 % more distant.
+        Shells of neighbours that can be targets of a roll-up: 1 for nearest neighbours, 2 also for second ones, which
+        in bcc are only 15 % more distant.
     """
 
     energy_limit: float = 1.5

@@ -13,6 +13,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from apt_evap import report
 from apt_evap._common.files import replace_file
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_count
@@ -24,7 +25,7 @@ from apt_evap.energy_fit.fit_tips import TipFit, fit_tips
 from apt_evap.simulation.run import load
 from apt_evap.sweep.plan import RUN, SETTINGS, Sweep, csv_value
 
-INDEX, MAPS, FIT_TABLE, FIT = "index.csv", "maps.h5", "fit.csv", "fit.json"
+INDEX, MAPS, FIT_TABLE, FIT, REPORT = "index.csv", "maps.h5", "fit.csv", "fit.json", "report.html"
 """Files of a collection."""
 DEFAULT_BINS = 128
 _OF_RUN = ("ended", "version", "created", "processor", "fingerprint")
@@ -37,12 +38,14 @@ def collect(
     bins: int | None = None,
     compare: bool = True,
     note: Callable[[str], object] = lambda text: None,
+    command: str = "",
 ) -> dict[str, Any]:
     """Collect the results of the finished points of a sweep.
 
     Writes ``index.csv`` (all points: key, settings that differ, state, tries, ions, end, version, processor,
     fingerprint of the bits), ``maps.h5`` (see `write_maps`) and, with a table ``[compare]``, ``fit.csv`` and
-    ``fit.json`` (see `fit_tips`) to the folder of the sweep.
+    ``fit.json`` (see `fit_tips`) to the folder of the sweep. ``report.html`` has all of this on one page, with the maps
+    of the points that fit best (see `report.write_sweep`).
 
     Parameters
     ----------
@@ -56,6 +59,8 @@ def collect(
         Whether to compare with the measured map of ``[compare]``.
     note : callable, optional
         Called with a line of text on progress.
+    command : str
+        Command line to repeat the collection, for the report.
 
     Returns
     -------
@@ -85,6 +90,9 @@ def collect(
         fit = _compare(sweep, [point.key for point in done])
         files += [str(sweep.folder / name) for name in (FIT_TABLE, FIT)]
     _write_index(sweep, states, rows)
+    if done:
+        _write_report(sweep, states, rows, fit, command)
+        files.append(str(sweep.folder / REPORT))
     return {
         "points": len(sweep.points),
         "done": len(done),
@@ -103,6 +111,32 @@ def _write_index(sweep, states, rows):
         of_run = [row.get(name, "") for name in ("ions", *_OF_RUN)]
         table.writerow([point.key, *values, state.name, state.tries, state.message, *of_run])
     _replace(sweep.folder / INDEX, text.getvalue())
+
+
+def _write_report(sweep, states, rows, fit, command):
+    studies, failed = ({}, {}) if fit is None else (fit.studies, fit.failed)
+    points = []
+    for point in sweep.points:
+        state, study = states[point.key], studies.get(point.key)
+        maps = {}
+        if study is not None:
+            pair = {"measured": study.measured, "simulated": study.maps["optimum"]}
+            maps = {title: study.compared(map) for title, map in pair.items()}
+        unfinished = state.message or ("" if state.name == "done" else state.name)
+        points.append(
+            report.SweepRow(
+                name=point.key,
+                settings={path: sweep.value(point, path) for path in sweep.paths},
+                results={"ions": rows[point.key]["ions"]} if point.key in rows else {},
+                study=None if study is None else study.to_dict(),
+                maps=maps,
+                message=unfinished or failed.get(point.key, ""),
+            )
+        )
+    files = [sweep.folder / INDEX]
+    if fit is not None:
+        files.append(sweep.compare.measured)
+    report.write_sweep(points, sweep.folder / REPORT, title=f"Sweep {sweep.folder.name}", files=files, command=command)
 
 
 def write_maps(sweep: Sweep, keys: list[str], path: AnyPath, bins: int | None = None) -> dict[str, dict[str, Any]]:

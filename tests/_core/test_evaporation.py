@@ -119,7 +119,10 @@ def check_choices(emitter, events):
             assert (batch.targets[0] == -1).all()
 
 
-@pytest.mark.parametrize(("element", "shells", "reach"), [("W", 1, 1.05), ("W", 2, 1.3), ("Ni", 2, 1.5), ("Ni", 1, 1.2)])
+SHELLS = [("W", 1, 1.05), ("W", 2, 1.3), ("Ni", 1, 1.2), ("Ni", 2, 1.5)]
+
+
+@pytest.mark.parametrize(("element", "shells", "reach"), SHELLS)
 def test_targets_are_the_strongest_neighbours_of_the_shells(element, shells, reach):
     """Second neighbours are at 1.155 d in bcc and at 1.414 d in fcc, third ones at 1.633 and 1.732 d."""
     material = ae.material(element)

@@ -48,9 +48,8 @@ def test_a_radius_beyond_the_family_has_an_open_end():
 
 def tip(radius, number):
     nickel = ae.material("Ni")
-    return ae.Tip(
-        nickel, radius * nickel.a, axis=(1, 1, 1), shank_length=radius * nickel.a, offset_seed=number, depth=5 * nickel.a
-    )
+    size = radius * nickel.a
+    return ae.Tip(nickel, size, axis=(1, 1, 1), shank_length=size, offset_seed=number, depth=5 * nickel.a)
 
 
 def run_of(radius, number, ions):

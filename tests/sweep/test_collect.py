@@ -91,6 +91,16 @@ def test_the_maps_are_those_of_the_runs(sweep, collected):
         assert [file["maps"].dims[axis].keys() for axis in range(4)] == [["point"], ["perturbation"], ["y"], ["x"]]
 
 
+def test_the_report_has_all_points(sweep, collected):
+    assert collected["files"][-1] == str(sweep.folder / "report.html")
+    rows = {row["name"]: row for row in ae.report.read(sweep.folder / "report.html")["points"]}
+    assert set(rows) == set(sweep.keys)
+    states = {point.key: state for point, state in sweep.states()}
+    for key, row in rows.items():
+        done = states[key].name == "done"
+        assert (row["message"] == "") is done and ("ions" in row["results"]) is done
+
+
 def test_the_index_has_all_points(sweep, collected):
     with open(sweep.folder / "index.csv", newline="") as file:
         rows = list(csv.DictReader(file))
@@ -152,6 +162,11 @@ def test_a_sweep_finds_the_tip_of_a_measured_map(tmp_path, capsys, monkeypatch):
     assert content["settings_of_best"] == {"tip.axis": [1, 1, 1], "tip.offset_seed": 1}
     assert len(content["compare"]["sha256"]) == 64
     assert float(best["similarity"]) == pytest.approx(content["table"][0]["similarity"], rel=1e-5)
+    made = ae.report.read(sweep.folder / "report.html")
+    assert [row["name"] for row in made["points"]] == [sweep.keys[1], sweep.keys[0]]
+    assert made["points"][0]["study"]["optimum"]["score"]["value"] > 0
+    assert "sweep collect" in made["origin"]["command"]
+    assert [each["name"] for each in made["origin"]["files"]] == ["index.csv", "measured.epos"]
     (sweep.folder / "fit.csv").unlink()
     assert main(["sweep", "collect", str(tmp_path / "study.toml"), "--no-compare", "--json"]) == 0
     assert not (sweep.folder / "fit.csv").exists()
