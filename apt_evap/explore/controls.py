@@ -1,5 +1,6 @@
 """Mechanisms of emission and their parameters, as controls of the explorer. All controls follow from these tables."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
@@ -44,11 +45,14 @@ CONTROLS = (
     Control("probability", "probability of a roll-up", 0.0, 1.0, 0.05, 1.0),
     Control("sharpness", "sharpness of the target", 0.0, 1.0, 0.01, 0.0),
     Control("height", "launch height [nm]", 0.0, 0.2, 0.005, 0.0),
+    Control("others", "mean energy of ions that do not roll up [eV]", 0.0, 1.0, 0.005, 0.0),
 )
 """Sliders for the emission. A mechanism has those that are fields of its perturbation; an energy has two."""
 
 ENERGY = ("mean", "rsd")
 """Controls of an energy: mean [eV], and standard deviation relative to it, both before the truncation."""
+
+_OTHERS = "others"  # their standard deviation is that of the other energy, relative to the mean
 
 _DIGITS = 9  # of a standard deviation: removes the rounding of the product, far below any step
 
@@ -72,6 +76,8 @@ def controls_of(mechanism: str) -> tuple[Control, ...]:
     """
     kind: Any = MECHANISMS[check_choice(mechanism, "mechanism", MECHANISMS)]
     names = {each.name for each in fields(kind)}
+    if mechanism == "combined":
+        names.discard(_OTHERS)  # they have the random part of the energy
     return tuple(each for each in CONTROLS if each.name in names or (each.name in ENERGY and "energy" in names))
 
 
@@ -100,12 +106,17 @@ def perturbation_of(mechanism: str, values: Mapping[str, float]) -> Perturbation
     for name in names:
         if name not in values:
             raise ValueError(f"values must contain {name!r} for the mechanism {mechanism!r}, got {short_text(values)}")
-    options: dict[str, Any] = {name: values[name] for name in names if name not in ENERGY}
+    options: dict[str, Any] = {name: values[name] for name in names if name not in (*ENERGY, _OTHERS)}
     if ENERGY[0] in names:
-        mean, rsd = (values[name] for name in ENERGY)
-        options["energy"] = TruncatedNormal(mean, round(rsd * mean, _DIGITS)) if rsd * mean > 0 else Fixed(mean)
+        options["energy"] = _distribution(*(values[name] for name in ENERGY))
+    if _OTHERS in names and values[_OTHERS] > 0:
+        options[_OTHERS] = _distribution(values[_OTHERS], values[ENERGY[1]])
     kind: Any = MECHANISMS[mechanism]
     return kind(**options)
+
+
+def _distribution(mean, rsd):
+    return TruncatedNormal(mean, round(rsd * mean, _DIGITS)) if rsd * mean > 0 else Fixed(mean)
 
 
 def values_of(perturbation: Perturbation) -> tuple[str, dict[str, float]]:
@@ -135,15 +146,9 @@ def values_of(perturbation: Perturbation) -> tuple[str, dict[str, float]]:
     for each in controls_of(mechanism):
         if each.name in ENERGY:
             energy: Any = getattr(perturbation, "energy")  # noqa: B009  # a perturbation need not have one
-            if isinstance(energy, Fixed):
-                values |= {"mean": energy.energy, "rsd": 0.0}
-            elif isinstance(energy, TruncatedNormal) and energy.mean > 0:
-                values |= {"mean": energy.mean, "rsd": energy.standard_deviation / energy.mean}
-            else:
-                raise ValueError(
-                    "the explorer has controls for a number [eV] or a TruncatedNormal of mean > 0 as energy, "
-                    f"got {short_text(energy)}"
-                )
+            values |= dict(zip(ENERGY, _mean_and_rsd(energy), strict=True))
+        elif each.name == _OTHERS:
+            values[_OTHERS] = _of_others(getattr(perturbation, _OTHERS), values)
         else:
             value = getattr(perturbation, each.name)
             if not isinstance(value, float):
@@ -155,3 +160,27 @@ def values_of(perturbation: Perturbation) -> tuple[str, dict[str, float]]:
         if option.name != "energy" and option.name not in values and value != option.default:
             raise ValueError(f"the explorer has controls for all options but {option.name}, got {short_text(value)}")
     return mechanism, values
+
+
+def _mean_and_rsd(energy):
+    if isinstance(energy, Fixed):
+        return energy.energy, 0.0
+    if isinstance(energy, TruncatedNormal) and energy.mean > 0:
+        return energy.mean, energy.standard_deviation / energy.mean
+    raise ValueError(
+        "the explorer has controls for a number [eV] or a TruncatedNormal of mean > 0 as energy, "
+        f"got {short_text(energy)}"
+    )
+
+
+def _of_others(energy, values):
+    """Mean energy of the ions that do not roll up."""
+    if energy is None:
+        return 0.0
+    mean, rsd = _mean_and_rsd(energy)
+    if mean == 0.0 or not math.isclose(rsd, values["rsd"], rel_tol=1e-6, abs_tol=1e-6):
+        raise ValueError(
+            "the explorer has controls for others with a mean > 0 and the relative standard deviation of the energy, "
+            f"{values['rsd']:.3g}, got {short_text(energy)}"
+        )
+    return mean

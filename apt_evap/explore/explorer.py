@@ -219,8 +219,10 @@ class Explorer:
 
     def controls(self, mechanism: str) -> tuple[Control, ...]:
         """Controls of a mechanism that this run serves: sharpness and height need wide responses."""
-        served = self.run.response_settings.is_wide
-        return tuple(each for each in controls_of(mechanism) if served or each.name not in ("sharpness", "height"))
+        settings, found = self.run.response_settings, controls_of(mechanism)
+        if not settings.is_wide:
+            return tuple(each for each in found if each.name not in ("sharpness", "height"))
+        return tuple(replace(each, high=settings.height) if each.name == "height" else each for each in found)
 
     @property
     def first_and_last(self) -> tuple[int, int]:

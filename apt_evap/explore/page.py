@@ -117,8 +117,7 @@ class Page:
                 value=values.get(each.name, each.value),
                 format="0[.]000",
             )
-            for each in CONTROLS
-            if any(each in self.explorer.controls(name) for name in MECHANISMS)
+            for each in self._controls()
         }
         like = self.explorer.bins_like(view.bins)
         longer = max(like.extent[1] - like.extent[0], like.extent[3] - like.extent[2])
@@ -247,6 +246,11 @@ class Page:
         return row(left, column(row(*self.maps), below, text))
 
     # ---- from the widgets ------------------------------------------------------------------------------------------
+
+    def _controls(self):
+        """Controls of all mechanisms, each once, in their order."""
+        of_name = {each.name: each for name in MECHANISMS for each in self.explorer.controls(name)}
+        return [of_name[each.name] for each in CONTROLS if each.name in of_name]
 
     def view(self) -> View:
         """View of the current positions of the widgets."""

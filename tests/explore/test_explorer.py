@@ -306,7 +306,8 @@ def test_controls_and_perturbations_are_the_same(mechanism):
 
 
 def test_perturbations_without_controls():
-    others = ae.RollUp(0.2, 0.5, others=0.1), ae.RollUp(0.2, ae.ChargeRatio(0.9)), ae.Combined(0.2, 0.5, others=0.1)
+    widths = ae.RollUp(ae.TruncatedNormal(0.2, 0.1), 0.5, others=ae.TruncatedNormal(0.1, 0.1))
+    others = widths, ae.RollUp(0.2, ae.ChargeRatio(0.9)), ae.Combined(0.2, 0.5, others=0.1)
     energies = ae.RollUp(ae.Thermal(50.0)), ae.LateralVelocity(ae.TruncatedNormal(0.0, 0.1))
     for perturbation in (*others, *energies, "RollUp"):
         with pytest.raises(ValueError, match="the explorer has controls for"):

@@ -88,11 +88,17 @@ def test_a_slider_moves_the_map_as_the_core_computes_it(opened):
 
 def test_every_widget_moves_something(opened):
     page = opened.page
-    page.mechanism.active = 3  # combined, which has all sliders
+    page.mechanism.active = 3  # combined, which has all sliders but one
     opened.settle(opened.shows)
-    widgets = [*page.sliders.values(), page.smoothing, page.flattening, page.bins]
-    assert all(each.visible for each in widgets) and len(widgets) >= 6
-    for widget in widgets:
+    others = page.sliders["others"]
+    widgets = [each for each in page.sliders.values() if each is not others]
+    widgets += [page.smoothing, page.flattening, page.bins]
+    assert all(each.visible for each in widgets) and len(widgets) >= 6 and not others.visible
+    for widget in [*widgets, others]:
+        if widget is others:
+            page.mechanism.active = 2  # roll-up, by now with a probability of 0.6
+            opened.settle(opened.shows)
+            assert others.visible
         before, text = image(page.sources[0]).copy(), page.python.text
         throttled(widget, widget.start + 0.6 * (widget.end - widget.start) if widget is not page.bins else 20)
         opened.settle(opened.shows)
