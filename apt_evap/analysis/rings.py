@@ -166,6 +166,7 @@ def _ring(inner, outer, counts, areas, fold, noise_known):
         noise = _noise(counts, areas, fold)
         errors = _errors(counts, areas, fit, fold)
         drawn = np.random.default_rng(0).poisson(counts, (_RESAMPLES, len(counts)))
+        drawn = drawn[drawn[:, np.isfinite(areas)].any(axis=1)]  # of few hits, a resample may have none
         resampled = _folded(drawn / areas / fit, fold)
         resampled /= np.nanmean(resampled, axis=1, keepdims=True)
         error = float(np.sqrt(np.maximum(np.nanvar(resampled, axis=1) - 2 * noise, 0.0)).std())

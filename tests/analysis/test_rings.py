@@ -129,3 +129,12 @@ def test_rings_off_the_map_are_refused(rng):
     map = counted(simulated(rng, 1000, 0.0))
     with pytest.raises(ValueError, match="70 to 80 degrees has too few bins"):
         ae.ring_statistics(map, PLANE, POLE, [(70, 80)])
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("fold", [1, 3])
+def test_a_few_hits_have_errors_without_warnings(rng, fold):
+    """Some resamples of a few hits have none at all."""
+    map = counted(about(POLE, np.radians(rng.uniform(9, 14, 4)), rng.uniform(0, 2 * np.pi, 4)))
+    (ring,) = ae.ring_statistics(map, PLANE, POLE, [(9, 14)], fold=fold)
+    assert ring.ions == 4 and ring.minimum == 0.0 and ring.error > 0
