@@ -7,12 +7,13 @@ dark lines, its maximum the height of the bright ones.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_array, check_count, check_sequence
+from apt_evap._common.validation import check_array, check_count, check_kind, check_sequence
 from apt_evap.analysis.pole_frame import Directions, pole_frame
 from apt_evap.analysis.pole_profiles import RADII, pole_profile
 from apt_evap.detection.detector_map import DetectorMap
@@ -66,6 +67,15 @@ class Ring:
             f"<Ring {self.inner:g} to {self.outer:g} degrees: contrast {self.contrast:.2f}{error}, "
             f"{self.minimum:.2f} to {self.maximum:.2f} of the mean>"
         )
+
+
+class LineAmplitude(NamedTuple):
+    """Amplitude of the lines of a measured ring in another ring; result of `line_amplitude`."""
+
+    value: float
+    """1 for the measured lines, negative for lines of the other sign."""
+    error: float
+    """Standard deviation by noise; NaN if the noise is not known."""
 
 
 def ring_statistics(
@@ -156,6 +166,56 @@ def radial_densities(
         NaN for a ring without a bin.
     """
     return pole_profile(map, projection, pole, radii).density
+
+
+def line_amplitude(ring: Ring, measured: Ring, *, shift: int = 0, mirror: bool = False) -> LineAmplitude:
+    r"""Amplitude of the lines of a measured ring in another ring, with their sign.
+
+    The contrast of a ring has no sign: a map with dark lines where the measured ones are bright can have the same
+    contrast. The amplitude is 1 for the measured lines, 0 for a map without them, and negative where they are dark. It
+    is linear in the density: for a mixture of two kinds of ions it is the mean of both, weighted with their densities.
+
+    Parameters
+    ----------
+    ring, measured : Ring
+        Rings with the same number of sectors.
+    shift : int
+        Sectors by which the profile of `ring` is turned onto the measured one; 0 for maps in the same frame.
+    mirror : bool
+        Whether the profile of `ring` is mirrored first.
+
+    Returns
+    -------
+    LineAmplitude
+
+    Raises
+    ------
+    ValueError
+        If the numbers of sectors differ, or the measured ring has no contrast.
+
+    Notes
+    -----
+    .. math:: A = \frac{\sum_k (p_k - 1)(m_k - 1)}{n c^2}
+
+    with the profiles p and m of n sectors and the measured contrast c, from which the noise is removed. Noise of p does
+    not bias A. The error is that by the noise of p.
+    """
+    for name, each in (("ring", ring), ("measured", measured)):
+        check_kind(each, name, Ring, "a Ring")
+    if len(ring.profile) != len(measured.profile):
+        raise ValueError(f"the rings must have equal sectors, got {len(ring.profile)} and {len(measured.profile)}")
+    if not measured.contrast > 0:
+        raise ValueError(f"the measured ring must have a contrast > 0, got {measured!r}")
+    turned, error = (
+        np.roll(each[::-1] if mirror else each, shift) for each in (ring.profile - 1.0, ring.profile_error)
+    )
+    pattern = measured.profile - 1.0
+    known = np.isfinite(turned) & np.isfinite(pattern)
+    norm = np.count_nonzero(known) * measured.contrast**2
+    return LineAmplitude(
+        float((turned[known] * pattern[known]).sum() / norm),
+        float(np.sqrt(((error[known] * pattern[known]) ** 2).sum()) / norm),
+    )
 
 
 def _ring(inner, outer, counts, areas, fold, noise_known):

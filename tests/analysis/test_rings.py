@@ -30,7 +30,7 @@ def simulated(rng, n, amplitude, fold=3, gradient=0.0, pole=POLE):
     angle = np.arccos(rng.uniform(np.cos(np.radians(30)), 1, 3 * n))
     azimuth = rng.uniform(0, 2 * np.pi, 3 * n)
     density = (1 + amplitude * np.cos(fold * azimuth)) * (1 + gradient * np.cos(azimuth - 0.3))
-    keep = rng.uniform(0, (1 + amplitude) * (1 + gradient), 3 * n) < density
+    keep = rng.uniform(0, (1 + abs(amplitude)) * (1 + gradient), 3 * n) < density
     return about(pole, angle[keep][:n], azimuth[keep][:n])
 
 
@@ -138,3 +138,29 @@ def test_a_few_hits_have_errors_without_warnings(rng, fold):
     map = counted(about(POLE, np.radians(rng.uniform(9, 14, 4)), rng.uniform(0, 2 * np.pi, 4)))
     (ring,) = ae.ring_statistics(map, PLANE, POLE, [(9, 14)], fold=fold)
     assert ring.ions == 4 and ring.minimum == 0.0 and ring.error > 0
+
+
+def test_the_amplitude_has_a_sign_and_is_linear(rng):
+    """Lines of the same and of the other sign have the same contrast; half of each have none."""
+    bright, dark = (
+        ae.ring_statistics(counted(simulated(rng, 400_000, a)), PLANE, POLE, [(9, 14)], fold=3)[0] for a in (0.4, -0.4)
+    )
+    assert bright.contrast == pytest.approx(dark.contrast, abs=3 * np.hypot(bright.error, dark.error))
+    same, other = ae.line_amplitude(bright, bright), ae.line_amplitude(dark, bright)
+    assert same.value == pytest.approx(1.0, abs=0.1)
+    assert other.value == pytest.approx(-1.0, abs=4 * other.error) and 0 < other.error < 0.1
+    both = np.concatenate([simulated(rng, 200_000, 0.4), simulated(rng, 200_000, -0.4)])
+    mixed = ae.line_amplitude(ae.ring_statistics(counted(both), PLANE, POLE, [(9, 14)], fold=3)[0], bright)
+    assert mixed.value == pytest.approx(0.0, abs=4 * mixed.error)
+    # turned by half a period of the lines, the bright ones are dark
+    half = len(bright.profile) // 2
+    assert ae.line_amplitude(bright, bright, shift=half).value == pytest.approx(-1.0, abs=0.15)
+    mirrored = ae.line_amplitude(bright, bright, mirror=True)
+    assert abs(mirrored.value) <= same.value + 1e-12
+
+
+def test_amplitudes_of_unequal_rings_are_refused(rng):
+    map = counted(simulated(rng, 50_000, 0.4))
+    (first,), (second,) = (ae.ring_statistics(map, PLANE, POLE, [(9, 14)], fold=fold) for fold in (1, 3))
+    with pytest.raises(ValueError, match="equal sectors, got 72 and 24"):
+        ae.line_amplitude(first, second)
