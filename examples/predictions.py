@@ -63,13 +63,14 @@ def evaporate(element, axis, radius, ions, path):
 
 
 def draw(axis, name, run, emission, bins):
-    """Map of a run with its indexed poles."""
-    half = 110.0
+    """Map of a run with its indexed poles, in an equidistant projection and without the broad gradient."""
+    half = 80.0
+    seen = run.seen_by(ae.Detector(distance=100.0, width=2 * half, projection="equidistant"))
     mask = np.ones((bins, bins), bool)
-    counts = run.hits(emission).map(bins, extent=(-half, half, -half, half), quantum=None, mask=mask)
-    ae.plot.detector_map(counts.smoothed(1.0), axis, title=name, colorbar=False, caption=False)
+    counts = seen.hits(emission).map(bins, extent=(-half, half, -half, half), quantum=None, mask=mask)
+    ae.plot.detector_map(counts.flattened(25.0).smoothed(1.0), axis, title=name, colorbar=False, caption=False)
     orientation = Orientation.from_settings(run.settings["tip"])
-    ae.plot.poles(axis, orientation, ae.image_compression(run).projection, families=4, zone_families=(), size=7)
+    ae.plot.poles(axis, orientation, ae.image_compression(seen).projection, families=6, zone_families=(), size=7)
 
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -77,7 +78,7 @@ parser.add_argument("--full", action="store_true", help="six tips, R = 80 a, 300
 parser.add_argument("--tip", action="append", choices=TIPS, help="only this tip; may be repeated")
 parser.add_argument("-o", "--output", type=Path, metavar="FOLDER", help="folder of runs and pictures")
 options = parser.parse_args()
-radius, ions, bins = (80, 300_000, 220) if options.full else (12, 4_000, 60)
+radius, ions, bins = (80, 300_000, 200) if options.full else (12, 4_000, 60)
 if options.output:
     options.output.mkdir(parents=True, exist_ok=True)
 names = options.tip or (list(TIPS) if options.full else ["Ni[001]"])
