@@ -30,7 +30,6 @@ from .analysis.profiles import radial_profile as radial_profile
 from .analysis.profiles import zone_line_profile as zone_line_profile
 from .analysis.response_tracks import lateral_tracks as lateral_tracks
 from .analysis.response_tracks import rollup_tracks as rollup_tracks
-from .analysis.rings import LineAmplitude as LineAmplitude
 from .analysis.rings import Ring as Ring
 from .analysis.rings import line_amplitude as line_amplitude
 from .analysis.rings import radial_densities as radial_densities
