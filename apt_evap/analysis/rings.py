@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_array, check_count, check_kind, check_sequence
+from apt_evap._common.validation import check_array, check_count, check_kind, check_sequence, check_switch
 from apt_evap.analysis.pole_frame import Directions, pole_frame
 from apt_evap.analysis.pole_profiles import RADII, pole_profile
 from apt_evap.detection.detector_map import DetectorMap
@@ -202,8 +202,12 @@ def line_amplitude(ring: Ring, measured: Ring, *, shift: int = 0, mirror: bool =
     """
     for name, each in (("ring", ring), ("measured", measured)):
         check_kind(each, name, Ring, "a Ring")
+    shift = check_count(shift, "shift")
+    check_switch(mirror, "mirror")
     if len(ring.profile) != len(measured.profile):
-        raise ValueError(f"the rings must have equal sectors, got {len(ring.profile)} and {len(measured.profile)}")
+        raise ValueError(
+            f"ring and measured must have equal sectors, got {len(ring.profile)} and {len(measured.profile)}"
+        )
     if not measured.contrast > 0:
         raise ValueError(f"the measured ring must have a contrast > 0, got {measured!r}")
     turned, error = (

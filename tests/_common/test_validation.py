@@ -68,6 +68,7 @@ grid = ae.DetectorMap.from_array(np.ones((20, 20)), np.arange(21), np.arange(21)
 ranges = ae.Ranges(**RANGES)
 ring = ae.radial_profile(hits, outer=9.0)
 strip = ae.Rectangle((0.0, 0.0), 0.0, 20.0, 20.0)
+azimuths = ae.ring_statistics(grid, ae.Projection(10.0, centre=(10.0, 10.0)), rings=[(5.0, 40.0)], sectors=4)[0]
 CORNERS = [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)]
 shell = ae.Tip(**TIP)
 
@@ -279,6 +280,11 @@ CASES = [
             "fold": [*COUNT, 0, 7],
             "sectors": [*COUNT, 0, 1, 10**6],
         },
+    ),
+    (
+        ae.line_amplitude,
+        {"ring": azimuths, "measured": azimuths},
+        {"ring": [*OBJECT, None], "measured": [*OBJECT, None], "shift": COUNT, "mirror": SWITCH},
     ),
     (
         ae.radial_densities,
@@ -687,6 +693,11 @@ NEEDS_A_RUN = [
     (ae.fit_caps, {"windows": 1}, {"run": [*OBJECT, None]}),
     (ae.origin_table, {}, {"runs": [*OBJECT, None]}),
     (ae.fit_tips, {"measured": hits}, {"runs": [*OBJECT, None]}),
+    (
+        ae.fit_radius,
+        {"measured": grid, "projection": ae.Projection(10.0), "perturbations": ae.Unperturbed(), "plane": (1, 1, 1)},
+        {"runs": [*OBJECT, None]},
+    ),
     (ae.field_ion_image, {}, {"emitter": [*OBJECT, None]}),
     (ae.target_shares, {"sharpness": 0.1}, {"emissions": [*OBJECT, None]}),
     (ae.image_compression, {}, {"run": [*OBJECT, None]}),
@@ -785,6 +796,7 @@ def test_every_public_name_with_arguments_is_in_the_table():
     taken |= {"chunks", "Study", "ZoneLine", "History", "CapHistory", "Batch"}  # in test_chunks; made by the package
     taken |= {
         "Ring",
+        "RadiusFit",
         "FieldIonImage",
         "PrecipitateErrors",
         "TipFit",
