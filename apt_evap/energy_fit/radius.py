@@ -124,7 +124,8 @@ def fit_radius(
     Raises
     ------
     ValueError
-        If there are too few runs or radii, numbers differ, or the rings are not on a map.
+        If there are too few runs or radii, numbers differ, the rings are not on a map, or there are several draws of a
+        run without responses.
 
     Notes
     -----
@@ -144,6 +145,8 @@ def fit_radius(
     if len(perturbations) != len(runs):
         raise ValueError(f"perturbations must be one or {len(runs)}, one for each run, got {len(perturbations)}")
     draws = check_count(draws, "draws", at_least=1)
+    if draws > 1 and any(run.responses is None for run in runs):
+        raise ValueError(f"draws must be 1 for runs without responses, whose ions have one flight each, got {draws}")
     settings = rings, radii, fold
     target = _structure(measured, projection, pole, *settings, ions)
     values = []
@@ -198,7 +201,13 @@ def _map_of(run, perturbation, draws):
     """Counts on the complete detector, over several draws."""
     half = run.detector.width / 2
     window = {"extent": (-half, half, -half, half), "quantum": None, "mask": np.ones((_BINS, _BINS), bool)}
-    maps = [replace(run, seed=run.seed + draw).hits(perturbation).map(_BINS, **window) for draw in range(draws)]
+    hits = [
+        replace(run, seed=run.seed + draw).hits(
+            perturbation, by_response=draws > 1
+        )  # a flight does not depend on the seed
+        for draw in range(draws)
+    ]
+    maps = [each.map(_BINS, **window) for each in hits]
     return replace(maps[0], values=np.sum([each.values for each in maps], axis=0), detected=None)
 
 

@@ -92,6 +92,7 @@ def test_runs_and_a_map(family):
         ({"runs": 3}, "runs must be at least 4 with at least 3 radii"),
         ({"perturbations": [ae.Unperturbed()] * 3}, "perturbations must be one or 4, one for each run, got 3"),
         ({"draws": 0}, "draws must be .*1, got 0"),
+        ({"draws": 2}, "draws must be 1 for runs without responses.*, got 2"),
     ],
 )
 def test_bad_arguments_are_refused(family, change, message):
