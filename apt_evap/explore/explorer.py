@@ -197,6 +197,7 @@ class Explorer:
         self._preview_run = _every(self.run, step) if step > 1 else self.run
         self._kept_places: list[tuple[Any, Hits]] = []
         self._kept_maps: dict[Any, Any] = {}
+        self._kept_picture: tuple[Any, Any] = (None, None)
         self.registration = registration
         if measured is not None and registration is None:
             self.register([perturbation_of(name, _starting_values(name)) for name in MECHANISMS])
@@ -293,13 +294,15 @@ class Explorer:
             hits = self.hits(view, preview)
             like = self.bins_like(view.bins)
             simulated = hits.map(like=like, quantum=None)
-            maps = [simulated] if self.measured is None else [simulated, like]
-            pictures = tuple(each.flattened(view.flattening).smoothed(view.smoothing) for each in maps)
+            flat = simulated.flattened(view.flattening)
+            pictures: tuple[DetectorMap, ...] = (flat.smoothed(view.smoothing),)
             similarity = ceiling = None
-            if self.measured is not None and _has_window(like):
-                flat = [each.flattened(view.flattening) for each in maps]
-                similarity = ssim(flat[0], flat[1], smoothing=view.smoothing)
-                ceiling = self._ceiling(view)
+            if self.measured is not None:
+                measured, picture = self._measured_picture(view)
+                pictures += (picture,)
+                if _has_window(like):
+                    similarity = ssim(flat, measured, smoothing=view.smoothing)
+                    ceiling = self._ceiling(view)
         return Shown(
             view=view,
             simulated=simulated,
@@ -378,6 +381,14 @@ class Explorer:
             raise ValueError(f"the simulated map, {registration}, does not cover the measured one")
         ions = int(measured.values[mask].sum()) if measured.is_counts else None
         return replace(measured, mask=mask, ions=ions, detected=None)
+
+    def _measured_picture(self, view):
+        """The measured map flattened, and also smoothed; the same objects as long as a view changes neither."""
+        key = view.bins, view.flattening, view.smoothing, self.registration
+        if self._kept_picture[0] != key:
+            flat = self.bins_like(view.bins).flattened(view.flattening)
+            self._kept_picture = key, (flat, flat.smoothed(view.smoothing))
+        return self._kept_picture[1]
 
     def _ceiling(self, view):
         like = self.bins_like(view.bins)

@@ -51,6 +51,8 @@ MODES = ("side by side", "difference", "blink")
 """What the page shows beside the simulated map, if there is a measured one."""
 BLINK = 600
 """Time that each map is visible in the mode "blink" [ms]."""
+READOUT_DELAY = 60
+"""Delay of the numbers of a preview [ms]: a text changes the layout, which takes as long as to paint a map (50 ms)."""
 _ADDRESS = "127.0.0.1"
 _SIDE = 380  # pixels of a map
 _TOOLS = "pan,wheel_zoom,box_zoom,reset,save"
@@ -74,7 +76,7 @@ class Page:
     registration_of : callable, optional
         Makes a `Registration` from the text of a user; without it, the registration cannot be typed.
     later : callable, optional
-        Calls a function in the thread of the document; by default its `add_next_tick_callback`.
+        Calls a function in the thread of the document, after a delay [ms]; by default the document itself does.
     """
 
     def __init__(
@@ -83,12 +85,13 @@ class Page:
         document: Document,
         view: View | None = None,
         registration_of: Callable[[str], Registration] | None = None,
-        later: Callable[[Callable[[], None]], Any] | None = None,
+        later: Callable[[Callable[[], None], int], Any] | None = None,
     ) -> None:
         self.explorer, self.document = explorer, document
-        self._later = document.add_next_tick_callback if later is None else later
+        self._later = self._call_later if later is None else later
         self._registration_of = registration_of
         self._blinking: Any = None
+        self._readout_waits = False
         self.shown = explorer.show(explorer.start if view is None else view)
         self.latest = Latest(lambda wish: wish())
         self._make_controls(self.shown.view)
@@ -272,14 +275,20 @@ class Page:
         """Ask for the maps of the current view; they come later."""
         self.latest.ask(partial(self._compute, self.view(), preview))
 
+    def _call_later(self, function, delay):
+        if delay:
+            self.document.add_timeout_callback(function, delay)
+        else:
+            self.document.add_next_tick_callback(function)  # the only one that other threads may call
+
     def _compute(self, view, preview):
         """Compute a view in the worker thread; what is overtaken is not put on the page."""
         try:
             shown = self.explorer.show(view, preview)
         except ValueError as error:
-            self._later(partial(self._put_notes, [str(error)]))
+            self._later(partial(self._put_notes, [str(error)]), 0)
             return
-        self._later(partial(self.put, shown))
+        self._later(partial(self.put, shown), 0)
         if not preview:
             self._rings_of(shown)
 
@@ -292,7 +301,7 @@ class Page:
             text = f"rings: {escape(str(error))}"
         else:
             text = self._rings_text(rings)
-        self._later(partial(self._put_rings, shown, text))
+        self._later(partial(self._put_rings, shown, text), 0)
 
     def _mechanism_changed(self):
         self._show_sliders()
@@ -309,10 +318,15 @@ class Page:
             self.document.remove_periodic_callback(self._blinking)
             self._blinking = None
         self._blink(False)
+        if mode == "difference":
+            self._put_difference()
         self.difference_image.visible = mode == "difference"
         self.maps[1].title.text = "simulated - measured" if mode == "difference" else "measured"
         if mode == "blink":
             self._blinking = self.document.add_periodic_callback(self._next_blink, BLINK)
+
+    def _is_mode(self, mode):
+        return MODES[self.mode.active] == mode
 
     def _next_blink(self):
         self._blink(not self.blink_image.visible)
@@ -329,7 +343,7 @@ class Page:
         try:
             self.explorer.register([view.perturbation])
         except ValueError as error:
-            self._later(partial(self._put_notes, [str(error)]))
+            self._later(partial(self._put_notes, [str(error)]), 0)
             return
         self._compute(view, False)
 
@@ -377,20 +391,29 @@ class Page:
     # ---- to the page -----------------------------------------------------------------------------------------------
 
     def put(self, shown: Shown) -> None:
-        """Put maps on the page, and all that belongs to them."""
-        same_ions = shown.view.ions == self.shown.view.ions
-        self.shown = shown
+        """Put maps on the page, and all that belongs to them.
+
+        A preview keeps the colours of the last complete map, and a map that stays the same is not sent again: the
+        browser paints every figure that changes.
+        """
+        before, self.shown = self.shown, shown
+        same_ions = shown.view.ions == before.view.ions
         self.document.hold("combine")
         try:
-            low, high = common_limits(shown.pictures)
-            self.colors.update(low=low, high=high)
-            for source, picture in zip(self.sources, shown.pictures, strict=True):
-                source.data = _image(picture)
-            if len(shown.pictures) > 1:
-                self._put_difference()
-            self._put_readout()
-            self._put_notes(shown.notes)
             if not shown.preview:
+                low, high = common_limits(shown.pictures)
+                self.colors.update(low=low, high=high)
+            for source, old, new in zip(self.sources, before.pictures, shown.pictures, strict=True):
+                if new is not old:
+                    source.data = _image(new)
+            if self._is_mode("difference"):
+                self._put_difference()
+            if shown.preview and not self._readout_waits:
+                self._readout_waits = True
+                self._later(self._put_preview_readout, READOUT_DELAY)
+            if not shown.preview:
+                self._put_readout()
+                self._put_notes(shown.notes)
                 self._put_profiles()
                 self._put_commands(self.explorer.commands(shown.view), "maps")
                 if self.registration.value != self._registration_text():
@@ -407,6 +430,12 @@ class Page:
         largest = float(np.nanpercentile(np.abs(difference), 99.5)) or 1.0
         self.difference_colors.update(low=-largest, high=largest)
         self.difference.data = _image(first, difference)
+
+    def _put_preview_readout(self):
+        self._readout_waits = False
+        if self.shown.preview:
+            self._put_readout()
+            self._put_notes(self.shown.notes)
 
     def _put_readout(self):
         shown = self.shown

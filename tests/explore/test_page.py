@@ -38,7 +38,7 @@ class Opened:
 
     def __init__(self, explorer, **options):
         self.waiting = []
-        self.page = Page(explorer, Document(), later=self.waiting.append, **options)
+        self.page = Page(explorer, Document(), later=lambda function, delay: self.waiting.append(function), **options)
 
     def settle(self, what):
         """Do what waits until something is true."""
@@ -128,6 +128,24 @@ def test_a_preview_is_grey(opened):
     opened.settle(opened.shows)
     opened.settle(lambda: page.rings.styles["color"] != gray)
     assert (gray not in page.readout.text and "2,000 ions" in page.readout.text) or "of" in page.readout.text
+
+
+def test_a_preview_sends_only_what_changes(opened):
+    page = opened.page
+    opened.settle(opened.shows)
+    limits, data = (page.colors.low, page.colors.high), [dict(each.data) for each in (*page.sources, page.difference)]
+    page.sliders["mean"].value = 0.4
+    opened.settle(lambda: opened.shows(preview=True))
+    simulated, measured, difference = (*page.sources, page.difference)
+    assert simulated.data["image"][0] is not data[0]["image"][0]
+    assert measured.data["image"][0] is data[1]["image"][0] and difference.data["image"][0] is data[2]["image"][0]
+    assert (page.colors.low, page.colors.high) == limits
+    page.sliders["mean"].trigger("value_throttled", None, 0.4)
+    opened.settle(opened.shows)
+    assert (page.colors.low, page.colors.high) != limits
+    page.smoothing.value = 2.0  # changes both maps
+    opened.settle(lambda: opened.shows(preview=True))
+    assert not np.array_equal(measured.data["image"][0], data[1]["image"][0], equal_nan=True)
 
 
 def test_overtaken_views_are_not_computed(opened, monkeypatch):
