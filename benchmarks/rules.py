@@ -15,12 +15,20 @@ from pathlib import Path
 import numpy as np
 
 import apt_evap as ae
+from apt_evap.energy_fit.intervals import intervals
 
 RADIUS = 20.0  # a
 INSTRUMENT = ae.Registration(rotation=17.0, scale=0.4, shift=(3.0, -2.0))
 OPTIONS = {"probability": (0.0, 0.2, 0.4, 0.6, 0.8, 1.0), "sharpness": (0.05, 0.15, 0.3, 0.6, 1.2)}
 MEANS, RSDS = (0.05, 0.1, 0.155, 0.3), (1.0,)
-HIDDEN = ((0.5, 0.2, 0.155), (0.7, 0.1, 0.1), (0.3, 0.4, 0.2), (0.9, 0.3, 0.08))
+NAMES = ("probability", "sharpness", "mean")
+
+
+def hidden(twin):
+    """Probability, sharpness and mean energy [eV] of a twin; the last two uniform in their logarithms."""
+    random = np.random.default_rng((9, twin))
+    sharpness, mean = np.exp(random.uniform(np.log([0.08, 0.08]), np.log([0.8, 0.25])))
+    return float(random.uniform(0.1, 0.9)), float(sharpness), float(mean)
 
 
 def rule(energy, probability, sharpness):
@@ -57,11 +65,12 @@ def main():
     parser.add_argument("folder", type=Path)
     parser.add_argument("--twins", type=int, default=4)
     parser.add_argument("--ions", type=int, default=15_000)
+    parser.add_argument("--model-errors", type=float, nargs="+", default=[0.0, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5])
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
-    run, inside = run_of(0, options.ions, options.folder), np.zeros(2, int)
+    run, found = run_of(0, options.ions, options.folder), []
     for twin in range(options.twins):
-        probability, sharpness, mean = HIDDEN[twin % len(HIDDEN)]
+        probability, sharpness, mean = truth = hidden(twin)
         other = run_of(1 + twin, options.ions, options.folder)
         emission = rule(ae.TruncatedNormal(mean, mean), probability, sharpness)
         hits = INSTRUMENT.hits(other.hits(emission)).within_circle(INSTRUMENT.scale * 60.0, INSTRUMENT.shift)
@@ -73,20 +82,28 @@ def main():
             rsds=RSDS,
             options=OPTIONS,
             registration=INSTRUMENT,
+            replicas=4,
+            resamples=40,
             n_threads=1,
             progress=False,
         )
         best = study.refined
-        rows = [best.options[name] for name in OPTIONS]
-        bounds = [best.intervals[name] for name in OPTIONS]
-        inside += [low <= value <= high for value, (low, high) in zip((probability, sharpness), bounds, strict=True)]
-        print(
-            f"hidden {probability}, {sharpness}, {mean} eV: probability {rows[0]:.2f} ({bounds[0][0]:.2f} to "
-            f"{bounds[0][1]:.2f}), sharpness {rows[1]:.2f} ({bounds[1][0]:.2f} to {bounds[1][1]:.2f}), mean "
-            f"{best.bounded('mean')} eV, SSIM {best.score}",
-            flush=True,
-        )
-    print(f"of {options.twins} intervals of 95 %, {inside[0]} contain the probability and {inside[1]} the sharpness")
+        print(f"hidden {', '.join(f'{name} {value:.3g}' for name, value in zip(NAMES, truth, strict=True))}:", end=" ")
+        print(", ".join(f"{name} {best.bounded(name)}" for name in NAMES), f"SSIM {best.score}", flush=True)
+        values = np.concatenate([study.ssim[None], study.resampled])
+        place = [
+            np.interp(best.options.get(name, getattr(best, name, None)), axis, np.arange(len(axis)))
+            for name, axis in study.grid.axes.items()
+        ]
+        found.append([])
+        for error in options.model_errors:
+            bounds = intervals(study.grid, values, place, error).bounds
+            found[-1].append(
+                [bounds[name][0] <= value <= bounds[name][1] for name, value in zip(NAMES, truth, strict=True)]
+            )
+    print(f"\n{len(found)} twins; model error, then the intervals that contain the hidden value")
+    for error, row in zip(options.model_errors, np.mean(found, axis=0), strict=True):
+        print(f"{error:5.2f}  {', '.join(f'{name} {share:.0%}' for name, share in zip(NAMES, row, strict=True))}")
 
 
 if __name__ == "__main__":

@@ -106,6 +106,18 @@ class EnergyGrid:
         """Index (options, fraction, rsd, mean) of every point of the grid, list of tuple."""
         return list(product(*map(range, self.shape)))
 
+    @property
+    def layers(self) -> list[str]:
+        """Title of each matrix of energies: the roll-up fraction and the options, if there are several, list of str."""
+        leading = dict(list(self.axes.items())[:-2])
+        shown = [name for name, values in leading.items() if len(values) > 1 and name != "rollup_fraction"]
+        shown += ["rollup_fraction"] * (self.mechanism == "combined")
+        titles = []
+        for values in product(*leading.values()):
+            named = dict(zip(leading, values, strict=True))
+            titles.append(", ".join(f"{name.replace('rollup_', 'roll-up ')} {named[name]:g}" for name in shown))
+        return titles
+
     def values_at(self, index: ArrayLike) -> Floats:
         """Options, roll-up fraction, relative standard deviation and mean [eV] at an index, also between points.
 

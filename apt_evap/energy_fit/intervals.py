@@ -7,7 +7,8 @@ end. Two errors count.
 best one by half of the deviation of their difference times its quantile.
 
 *The model*: the simulated specimen is not the measured one. Its misfit |1 - SSIM| remains at the best point, and at the
-true point it is larger by a fraction `MODEL_ERROR` of that. This fraction is measured (`defaults.MODEL_ERROR`).
+true point it is larger by a fraction `MODEL_ERROR` of that. This fraction is measured (`defaults.MODEL_ERROR`). The
+misfit of few ions is uncertain, and could be 0 by accident: its largest value within the errors counts.
 """
 
 from collections.abc import Sequence
@@ -57,9 +58,12 @@ def intervals(grid: EnergyGrid, similarities: Floats, best: Sequence[float], mod
     first, resamples = fine[0], fine[1:]
     top = np.unravel_index(first.argmax(), first.shape)
     deficit = first[top] - first
-    allowed = np.full(first.shape, model_error * abs(1.0 - float(first[top])))
+    misfit = abs(1.0 - float(first[top]))
+    allowed = np.full(first.shape, model_error * misfit)
     if len(resamples) > 1:
-        difference = resamples[(slice(None), *top)].reshape(-1, *[1] * first.ndim) - resamples
+        at_top = resamples[(slice(None), *top)].reshape(-1, *[1] * first.ndim)
+        allowed += model_error * _NORMAL * at_top.std(ddof=1)
+        difference = at_top - resamples
         allowed += 0.5 * _NORMAL * difference.std(axis=0, ddof=1)
     return _bounds(grid, places, deficit <= allowed, best)
 

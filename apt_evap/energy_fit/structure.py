@@ -162,11 +162,18 @@ class PoleMeasure:
 
     def structure(self, map: DetectorMap, ions: float | None = None) -> Structure:
         """Structure of a map in the measured frame; `ions` as for `ring_statistics`."""
-        rings = tuple(
-            ring_statistics(map, self.projection, self.pole, (ring,), fold=self.fold, sectors=sectors, ions=ions)[0]
-            for ring, sectors in self.rings
-        )
+        rings = tuple(self._ring(map, ring, sectors, ions) for ring, sectors in self.rings)
         return Structure(rings, pole_profile(map, self.projection, self.pole, ions=ions))
+
+    def _ring(self, map, ring, sectors, ions):
+        """A ring; one without hits has no contrast: its values are NaN."""
+        try:
+            return ring_statistics(
+                map, self.projection, self.pole, (ring,), fold=self.fold, sectors=sectors, ions=ions
+            )[0]
+        except ValueError:  # not too few bins: the number of sectors is chosen for them
+            unknown, profile = float("nan"), np.full(sectors // self.fold, np.nan)
+            return Ring(*ring, profile, profile, *[unknown] * 6, ions=0.0)
 
     def _sectors(self, region, ring):
         """Largest number of sectors of a ring for the bins of the region, 0 if there are too few bins."""

@@ -193,6 +193,13 @@ class Study:
         with replace_file(path) as file:
             file.write((json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n").encode())
 
+    @property
+    def best_cell(self) -> tuple[int, ...]:
+        """Index of the best point of the grid."""
+        best = self.optimum
+        values = {**best.options, "rollup_fraction": best.rollup_fraction, "rsd": best.rsd, "mean": best.mean}
+        return tuple(axis.index(values[name]) for name, axis in self.grid.axes.items())
+
     def __repr__(self) -> str:
         best, refined = self.optimum, self.refined
         combined = self.grid.mechanism == "combined"

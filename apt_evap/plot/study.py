@@ -1,7 +1,6 @@
 """Plots of a study: similarity against energies, and the maps side by side."""
 
 from collections.abc import Sequence
-from itertools import product
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -56,7 +55,7 @@ def ssim_matrix(study: Study, axes: Sequence[Axes] | None = None, *, colormap: s
     else:
         raise ValueError(f"axes must be {layers}, one per roll-up fraction and option, got {len(axes)}")
     limits = {"vmin": study.ssim.min(), "vmax": study.ssim.max()}
-    for ax, values, title in zip(panels, study.ssim.reshape(layers, rows, columns), _layers(grid), strict=False):
+    for ax, values, title in zip(panels, study.ssim.reshape(layers, rows, columns), grid.layers, strict=False):
         image = ax.imshow(values, origin="lower", cmap=colormap, aspect="auto", **limits)
         for (row, column), value in np.ndenumerate(values):
             shade = image.cmap(image.norm(value))
@@ -89,10 +88,8 @@ def ssim_matrix(study: Study, axes: Sequence[Axes] | None = None, *, colormap: s
 
 def _mark_optima(study, axes):
     """Mark the best point by a frame, and the maximum between points by a circle with its interval; return both."""
-    grid, best, refined = study.grid, study.optimum, study.refined
-    column, row = grid.means.index(best.mean), grid.rsds.index(best.rsd)
-    point = {**best.options, "rollup_fraction": best.rollup_fraction}
-    leading = [grid.axes[name].index(value) for name, value in point.items()]
+    grid, refined = study.grid, study.refined
+    *leading, row, column = study.best_cell
     ax = axes[int(np.ravel_multi_index(leading, grid.shape[:-2]))]
     frame = Rectangle((column - 0.48, row - 0.48), 0.96, 0.96, fill=False, edgecolor="r", linewidth=2)
     ax.add_patch(frame).set_label("best on the grid")
@@ -110,19 +107,6 @@ def _mark_optima(study, axes):
     return frame, ax.errorbar(
         x, y, **errors, fmt="o", color="r", capsize=3, markersize=9, markerfacecolor="none", label=label
     )
-
-
-def _layers(grid):
-    """Title of each panel: the values of all axes but the last two, if there are several."""
-    shown = {name: values for name, values in list(grid.axes.items())[:-2] if len(values) > 1}
-    if grid.mechanism == "combined":
-        shown |= {"rollup_fraction": grid.rollup_fractions}
-    titles = []
-    for values in product(*list(grid.axes.values())[:-2]):
-        parts = zip(list(grid.axes)[:-2], values, strict=True)
-        texts = (f"{name.replace('rollup_', 'roll-up ')} {value:g}" for name, value in parts if name in shown)
-        titles.append(", ".join(texts))
-    return titles
 
 
 def side_by_side(

@@ -67,7 +67,7 @@ def write_study(
     page.add(*(paragraph(text, "doubt") for text in (*others, *(f"Warning: {each}" for each in made["warnings"]))))
     page.add(heading("Energies"), _energies(study), heading("Measured and simulated map"), _blinking(page, study))
     page.add(heading("Similarity with the measured map"), _scores(study))
-    page.add('<div class="matrices">', *(_matrix(study, layer) for layer in range(study.grid.shape[0])), "</div>")
+    page.add('<div class="matrices">', *_matrices(study), "</div>")
     page.add(paragraph("Rows: standard deviation / mean. Columns: mean energy [eV]. Frame: the best point.", "note"))
     if figures is None:
         figures = {
@@ -107,8 +107,9 @@ def doubts(content: Mapping[str, Any]) -> tuple[list[str], list[str]]:
             "the energies have no meaning."
         )
     if edges:
-        labels = " and ".join({"mean": "the mean", "rsd": "standard deviation / mean"}[name] for name in edges)
-        others.append(f"The best point is at the end of the grid in {labels}: better energies may be beyond it.")
+        names = {"mean": "the mean", "rsd": "standard deviation / mean"}
+        labels = " and ".join(names.get(name, name) for name in edges)
+        others.append(f"The best point is at the end of the grid in {labels}: better values may be beyond it.")
     if not content["refined"]["intervals"]:
         others.append("The errors are not known, because there are no resamples.")
     elif content["gain_share"] < 1 - _RARE:
@@ -139,6 +140,7 @@ def _energies(study):
     after = {"true_mean": "mean", "true_standard_deviation": "standard deviation"}
     names |= {name: f"{label} after truncation [eV]" for name, label in after.items()}
     rows = [(label, f"{getattr(best, name):.4g}", refined.bounded(name)) for name, label in names.items()]
+    rows += [(name, f"{value:.4g}", refined.bounded(name)) for name, value in best.options.items()]
     run, real = study.provenance["run"], study.provenance.get("real_units")
     place = f"at {run['voltage']:g} V"
     if real is not None:
@@ -176,27 +178,35 @@ def _scores(study):
     )
 
 
-def _matrix(study, layer):
+def _matrices(study):
+    """A table for each roll-up fraction and option."""
+    *_, rows, columns = study.grid.shape
+    values, errors, shares = (each.reshape(-1, rows, columns) for each in (study.ssim, study.errors, study.shares))
+    at = study.best_cell
+    best = int(np.ravel_multi_index(at[:-2], study.grid.shape[:-2]))
+    for layer, title in enumerate(study.grid.layers):
+        yield _matrix(study, title, values[layer], errors[layer], shares[layer], at[-2:] if layer == best else None)
+
+
+def _matrix(study, title, values, errors, shares, best):
     """Similarities for one roll-up fraction as a table; a cell shows its details under the pointer or the focus."""
-    grid, values = study.grid, study.ssim[layer]
+    grid = study.grid
     colors = matplotlib.colormaps[_COLORS]
     low, high = float(study.ssim.min()), float(study.ssim.max())
     shades = colors((values - low) / (high - low) if high > low else np.zeros_like(values))
-    best = study.optimum
     lines = ['<table class="matrix">']
-    if grid.mechanism == "combined":
-        lines.append(f"<caption>roll-up fraction {grid.rollup_fractions[layer]:g}</caption>")
+    if title:
+        lines.append(f"<caption>{escape(title)}</caption>")
     for row in reversed(range(len(grid.rsds))):  # as in the picture, upwards
         cells = []
         for column, mean in enumerate(grid.means):
             shade = shades[row, column, :3]
             light = np.dot(shade, (0.299, 0.587, 0.114)) > 0.5
-            score = Score(float(values[row, column]), float(study.errors[layer, row, column]))
+            score = Score(float(values[row, column]), float(errors[row, column]))
             details = f"mean {mean:g} eV, standard deviation / mean {grid.rsds[row]:.4g}: SSIM {score}"
             if len(study.resampled):
-                details += f", best in {study.shares[layer, row, column]:.0%} of the resamples"
-            at = (grid.rollup_fractions[layer], grid.rsds[row], mean)
-            frame = ' class="best"' if at == (best.rollup_fraction, best.rsd, best.mean) else ""
+                details += f", best in {shares[row, column]:.0%} of the resamples"
+            frame = ' class="best"' if (row, column) == best else ""
             color = matplotlib.colors.to_hex(shade)
             cells.append(
                 f'<td{frame} tabindex="0" style="background:{color};color:{"#000" if light else "#fff"}">'

@@ -15,6 +15,7 @@ import pytest
 from html_reader import Reader
 from matplotlib.figure import Figure
 from matplotlib.image import imread
+from rough import ROUGH
 
 import apt_evap as ae
 from apt_evap.report.origin import recorded_warnings
@@ -49,6 +50,29 @@ def test_nothing_is_loaded(seen):
     assert all(each.startswith(("data:", "#")) for each in seen.addresses)
     (policy,) = (each["content"] for each in seen.all("meta") if each.get("http-equiv") == "Content-Security-Policy")
     assert policy.startswith("default-src 'none'; img-src data:;") and "http" not in policy
+
+
+def test_options_of_the_perturbation_are_in_the_report(small_tip, tmp_path):
+    settings = {**ROUGH, "response_settings": ae.ResponseSettings.wide(bound=5.0)}
+    run = ae.Simulation(small_tip, seed=1, **settings).run(400, progress=False)
+    measured = run.hits(ae.RollUp(0.2)).within_circle(60.0).map(bins=24, extent=(-60, 60, -60, 60))
+    study = ae.fit_energies(
+        run,
+        measured,
+        means=(0.1, 0.2, 0.3),
+        rsds=(1.0,),
+        options={"probability": (0.3, 0.6, 1.0), "sharpness": (0.0, 0.3)},
+        registration=ae.Registration(0.0, 1.0, (0.0, 0.0)),
+        replicas=1,
+        resamples=5,
+        progress=False,
+    )
+    assert {"probability", "sharpness"} & set(study.optimum.at_edge)
+    ae.report.write_study(study, tmp_path / "report.html")
+    text = Reader((tmp_path / "report.html").read_text()).text
+    assert "at the end of the grid in" in text
+    for name in ("probability", "sharpness"):
+        assert study.refined.bounded(name) in text
 
 
 def test_the_reader_sees_what_would_be_loaded():
