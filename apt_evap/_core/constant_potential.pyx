@@ -49,12 +49,12 @@ that of all other charges is lower by 3.92 q/sqrt(s) for a triangular lattice, 3
 ROUGH_ANGLE = 1.2
 """Opening angle of the potentials of a change of the charges [rad], unless that of the surface is larger.
 
-Measured (88,800 atoms): potentials of random changes have an error of 3.7e-3, of smooth ones 3.7e-4, and take 0.37 of the
-time of those with 0.6.
+Measured (88,800 atoms): potentials of random changes have an error of 3.7e-3, of smooth ones 3.7e-4, and take 0.37 of
+the time of those with 0.6.
 """
 
 ROUGH_ERROR = 0.01
-"""Bound of the error of a change by rough potentials, over the change: beyond the tolerance, it is corrected in turn."""
+"""Error of a change by rough potentials over the change, at most: above the tolerance, it is corrected in turn."""
 
 _FAR = 3.5   # erfc(3.5) = 7e-7: beyond, Gaussian and point charges agree to 1/10 of the tolerance of a patch
 _ENTRIES = 4096   # of the table of differences; linear interpolation is exact to 1e-6 of the self term
@@ -170,8 +170,8 @@ cdef class ConstantPotential(FieldRule):
                 bint double_precision, int n_threads):
         """Conjugate gradients for the change of the charges that removes residuals, by rough potentials.
 
-        Returns the number of sweeps, counted on, and the largest of the last change of a charge and the bound of its error
-        by the rough potentials, over the mean charge.
+        Returns the number of sweeps, counted on, and the larger of the last change of a charge and its error by the
+        rough potentials, over the mean charge.
         """
         cdef double square, before, curvature, step, bound, last = np.inf
         image = np.empty(len(change))

@@ -81,10 +81,11 @@ class Structure(NamedTuple):
     def misfit(self, measured: "Structure") -> tuple[float, float]:
         """Root mean square difference of the values from measured ones, and its error by noise.
 
-        All values are relative to the mean density: 0.1 is a difference by 10 % of the mean.
+        All values are relative to the mean density: 0.1 is a difference by 10 % of the mean. A ring without hits lacks
+        all of it: its difference is 1.
         """
-        difference = self.values - measured.values
-        known = np.isfinite(difference)
+        known = np.isfinite(measured.values)
+        difference = np.nan_to_num(self.values - measured.values, nan=1.0)
         difference = difference[known]
         error = np.hypot(np.nan_to_num(self.errors[known]), np.nan_to_num(measured.errors[known]))
         misfit = float(np.sqrt(np.mean(difference**2)))

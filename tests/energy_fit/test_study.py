@@ -11,6 +11,7 @@ from rough import ROUGH
 from scipy.stats import truncnorm
 
 import apt_evap as ae
+from apt_evap.analysis.pole_frame import pole_frame
 from apt_evap.emission.perturbations import Combined, launch_tangentially
 from apt_evap.energy_fit.comparison import Comparison
 from apt_evap.energy_fit.fit_energies import real_units_of
@@ -19,6 +20,7 @@ from apt_evap.energy_fit.intervals import intervals
 from apt_evap.energy_fit.resampling import NOISE, Sampler
 from apt_evap.energy_fit.search import EnergySearch
 from apt_evap.energy_fit.settings import StudySettings
+from apt_evap.energy_fit.structure import PoleMeasure
 
 EDGES = np.linspace(-60, 60, 49)
 ROLLUP = ae.RollUp(ae.TruncatedNormal(0.155, 0.155))
@@ -233,6 +235,16 @@ def test_intervals_by_noise_are_those_of_a_quadratic_maximum():
     assert (high - low) / 2 == pytest.approx(1.96 * 0.05, abs=0.012)
 
 
+def test_a_misfit_that_is_0_by_accident_is_not_certain():
+    """S = 1 - (m - m0)^2 + d, each resample with a common deviation d: 0.2 * 1.96 of its standard deviations remain."""
+    grid = EnergyGrid("roll-up", means=tuple(np.linspace(0.1, 0.9, 9)), rsds=(0.01,))
+    common = np.concatenate([[0.0], 0.1 * np.random.default_rng(0).normal(size=400)])
+    values = (1.0 - (np.array(grid.means) - 0.5) ** 2 + common[:, None]).reshape(401, 1, 1, 9)
+    low, high = intervals(grid, values, (0, 0, 4), 0.2).bounds["mean"]
+    # a tenth of a step is 0.01; 400 resamples: 3.5 % of the deviation
+    assert (high - low) / 2 == pytest.approx(np.sqrt(0.2 * 1.96 * 0.1), abs=0.012)
+
+
 # ---- rings ---------------------------------------------------------------------------------------------------------
 
 
@@ -266,6 +278,20 @@ def test_blur_is_warned_of(run, other):
     assert study.structure.lost
     for own, measured in zip(study.structure.optimum.rings, study.structure.measured.rings, strict=True):
         assert own.contrast < 0.5 * measured.contrast
+
+
+def test_a_ring_without_hits_has_no_contrast(run, other):
+    """Such a simulated map is a result, and the fit goes on."""
+    region = seen(other, ROLLUP)
+    measure = PoleMeasure(run, HERE, region, (1, 1, 1))
+    (inner, outer), _ = measure.rings[0]
+    frame = pole_frame(region, measure.projection, measure.pole, np.inf)
+    empty = region.values.copy()
+    empty[region.mask] = np.where((frame.angle >= inner) & (frame.angle < outer), 0, region.values[region.mask])
+    found, measured = measure.structure(replace(region, values=empty)), measure.structure(region)
+    assert np.isnan(found.rings[0].contrast) and np.isfinite(found.rings[1].contrast)
+    misfit, error = found.misfit(measured)
+    assert misfit > np.sqrt(1 / len(found.values)) and np.isfinite(error)  # its difference is 1
 
 
 def test_no_pole_is_no_error(run, other):
