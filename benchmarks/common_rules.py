@@ -15,21 +15,21 @@ import numpy as np
 import apt_evap as ae
 
 ENERGY = 0.35  # eV in real units, mean and standard deviation before the truncation
-SHARPNESS, HEIGHT = 0.15, 0.1
-FRACTIONS = (0.0, 0.05, 0.1, 0.3, 0.4, 0.5, 1.0)
+HEIGHT = 0.1  # nm
+FRACTIONS = (0.0, 0.05, 0.1, 0.3, 0.4, 0.5, 0.6, 1.0)
 RINGS = {"Ni": ((5, 9), (9, 14), (14, 20)), "Al": ((5, 9), (9, 14), (5, 16))}
 BINS, HALF = 800, 150.0
 MOST_TILTED = 28.0  # degrees: the rings of a pole are inside the map
 
 
-def launches(scale):
+def launches(scale, sharpness):
     """Perturbations by name; `scale` is the simulated energy per real energy."""
     energy = ae.TruncatedNormal(ENERGY * scale, ENERGY * scale)
     return {
         "unperturbed": ae.Unperturbed(),
         "all, strongest neighbour": ae.RollUp(energy),
         "none rolls": ae.LateralVelocity(energy, HEIGHT),
-        "all roll": ae.RollUp(energy, 1.0, SHARPNESS, HEIGHT),
+        "all roll": ae.RollUp(energy, 1.0, sharpness, HEIGHT),
     }
 
 
@@ -64,6 +64,8 @@ def main():
     parser.add_argument("--scale", type=float, required=True, help="mm per radian of crystal angle")
     parser.add_argument("--skip", type=int, default=40_000, help="events before the first ion that flies")
     parser.add_argument("--ions", type=int, default=102_400)
+    parser.add_argument("--constant-potential", action="store_true", help="charges; default: Robin's")
+    parser.add_argument("--sharpness", type=float, default=0.15, help="of the target of a roll-up")
     parser.add_argument("--like", default="all, strongest neighbour", help="rule that gives the azimuth")
     options = parser.parse_args()
     measured, place = ae.read_map(options.measured), ae.Projection(options.scale, centre=tuple(options.pole))
@@ -74,9 +76,10 @@ def main():
     size = options.radius * material.a
     axis = tuple(float(index) for index in options.axis.split())
     tip = ae.Tip(material, size, axis=axis, shank_length=2 * size, depth=8 * material.a)
-    simulation = ae.Simulation(tip, seed=1, response_settings=ae.ResponseSettings.wide())
+    rule = ae.ConstantPotential() if options.constant_potential else ae.Robin()
+    simulation = ae.Simulation(tip, seed=1, rule=rule, response_settings=ae.ResponseSettings.wide())
     pilot = simulation.run(256, responses=False, progress=False).at_evaporation_field()
-    emissions = launches(float(np.median(pilot.energy_scales)))
+    emissions = launches(float(np.median(pilot.energy_scales)), options.sharpness)
     for _ in simulation.emitter.advance(options.skip):
         pass
     run = simulation.run(options.ions, list(emissions.values()), responses=False)
