@@ -5,9 +5,12 @@ from numpy.typing import NDArray
 
 from apt_evap._core.interactions import InteractionLists
 from apt_evap._core.octree import Octree
+from apt_evap._core.potentials import Potentials
 from apt_evap._core.rule import FieldRule
 
 LATTICE_SUM: float
+ROUGH_ANGLE: float
+ROUGH_ERROR: float
 
 def gaussian_table(eta: float) -> tuple[NDArray[np.float64], float]: ...
 
@@ -41,8 +44,26 @@ class ConstantPotential(FieldRule):
     def field_unit(self, coulomb: float) -> float: ...
     def preconditioned(self, residuals: NDArray[np.float64]) -> NDArray[np.float64]: ...
     def effective_area(self, tree: Octree) -> float: ...
+    def sums_of(self, lists: InteractionLists) -> Potentials: ...
+    def correct(
+        self,
+        rough: Potentials,
+        change: NDArray[np.float64],
+        residuals: NDArray[np.float64],
+        mean: float,
+        tolerance: float,
+        sweeps: int,
+        max_sweeps: int,
+        double_precision: bool,
+        n_threads: int,
+    ) -> tuple[int, float]: ...
     def multiply(
-        self, charges: NDArray[np.float64], image: NDArray[np.float64], double_precision: bool, n_threads: int
+        self,
+        sums: Potentials,
+        charges: NDArray[np.float64],
+        image: NDArray[np.float64],
+        double_precision: bool,
+        n_threads: int,
     ) -> None: ...
     def indefinite(self) -> str: ...
     def fields_of(self, tree: Octree, lists: InteractionLists, n_threads: int) -> None: ...
