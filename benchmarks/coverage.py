@@ -95,15 +95,14 @@ def fitted(run, measured, **options):
 
 def inside(study, truth, model_error):
     """Whether the interval of each number contains its hidden value, dict of bool."""
-    values = np.concatenate([study.ssim[None], study.resampled])
-    axes = study.grid.axes
-    best = [
-        np.interp(np.log(study.refined.rsd), np.log(axis), np.arange(len(axis))) if name == "rsd"
-        else np.interp(getattr(study.refined, name), axis, np.arange(len(axis)))
-        for name, axis in axes.items()
-    ]  # fmt: skip
-    bounds = intervals(study.grid, values, best, model_error).bounds
-    return {name: bounds[name][0] <= truth[name] <= bounds[name][1] for name in NAMES}
+    refined = study.refined
+    best = []
+    for name, axis in study.grid.axes.items():
+        scale = np.log if name == "rsd" else np.asarray
+        value = refined.options[name] if name in refined.options else getattr(refined, name)
+        best.append(np.interp(scale(value), scale(axis), np.arange(len(axis))))
+    bounds = intervals(study.grid, np.concatenate([study.ssim[None], study.resampled]), best, model_error).bounds
+    return {name: bounds[name][0] <= value <= bounds[name][1] for name, value in truth.items()}
 
 
 def main():

@@ -13,9 +13,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from coverage import inside
 
 import apt_evap as ae
-from apt_evap.energy_fit.intervals import intervals
 
 RADIUS = 20.0  # a
 INSTRUMENT = ae.Registration(rotation=17.0, scale=0.4, shift=(3.0, -2.0))
@@ -90,17 +90,8 @@ def main():
         best = study.refined
         print(f"hidden {', '.join(f'{name} {value:.3g}' for name, value in zip(NAMES, truth, strict=True))}:", end=" ")
         print(", ".join(f"{name} {best.bounded(name)}" for name in NAMES), f"SSIM {best.score}", flush=True)
-        values = np.concatenate([study.ssim[None], study.resampled])
-        place = [
-            np.interp(best.options.get(name, getattr(best, name, None)), axis, np.arange(len(axis)))
-            for name, axis in study.grid.axes.items()
-        ]
-        found.append([])
-        for error in options.model_errors:
-            bounds = intervals(study.grid, values, place, error).bounds
-            found[-1].append(
-                [bounds[name][0] <= value <= bounds[name][1] for name, value in zip(NAMES, truth, strict=True)]
-            )
+        hidden_values = dict(zip(NAMES, truth, strict=True))
+        found.append([list(inside(study, hidden_values, error).values()) for error in options.model_errors])
     print(f"\n{len(found)} twins; model error, then the intervals that contain the hidden value")
     for error, row in zip(options.model_errors, np.mean(found, axis=0), strict=True):
         print(f"{error:5.2f}  {', '.join(f'{name} {share:.0%}' for name, share in zip(NAMES, row, strict=True))}")

@@ -139,8 +139,9 @@ cdef class ConstantPotential(FieldRule):
         if first:
             self.robin.iterate(tree, normals, lists, tolerance=1e-2, max_sweeps=max_sweeps, n_threads=n_threads)
             self.self_term = self.given if self.given > 0.0 else LATTICE_SUM / sqrt(self.robin.area)
-        self.sums = self.sums_of(lists)
-        rough = self.sums_of(InteractionLists(tree, max(ROUGH_ANGLE, lists.opening_angle), n_threads))
+        shape = gaussian_table(self.self_term * sqrt(M_PI / 2.0)) if self.gaussian else ()
+        self.sums = Potentials(lists, *shape)
+        rough = Potentials(InteractionLists(tree, max(ROUGH_ANGLE, lists.opening_angle), n_threads), *shape)
         charges, image = tree.charges.copy(), np.empty(n)
         self.multiply(self.sums, charges, image, double_precision, n_threads)
         multiple = potential * charges.sum() / dot(charges, image)   # the one with the smallest error
@@ -164,10 +165,6 @@ cdef class ConstantPotential(FieldRule):
         if first:
             self.area = self.effective_area(tree)
         return sweeps, residual
-
-    def sums_of(self, InteractionLists lists):
-        """Potentials of all atoms by interaction lists."""
-        return Potentials(lists, *(gaussian_table(self.self_term * sqrt(M_PI / 2.0)) if self.gaussian else ()))
 
     def correct(self, Potentials rough, change, residuals, double mean, double tolerance, int sweeps, int max_sweeps,
                 bint double_precision, int n_threads):

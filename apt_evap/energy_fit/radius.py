@@ -201,12 +201,8 @@ def _map_of(run, perturbation, draws):
     """Counts on the complete detector, over several draws."""
     half = run.detector.width / 2
     window = {"extent": (-half, half, -half, half), "quantum": None, "mask": np.ones((_BINS, _BINS), bool)}
-    hits = [
-        replace(run, seed=run.seed + draw).hits(
-            perturbation, by_response=draws > 1
-        )  # a flight does not depend on the seed
-        for draw in range(draws)
-    ]
+    by_response = draws > 1  # a flight does not depend on the seed
+    hits = [replace(run, seed=run.seed + draw).hits(perturbation, by_response=by_response) for draw in range(draws)]
     maps = [each.map(_BINS, **window) for each in hits]
     return replace(maps[0], values=np.sum([each.values for each in maps], axis=0), detected=None)
 

@@ -325,9 +325,6 @@ class Page:
         if mode == "blink":
             self._blinking = self.document.add_periodic_callback(self._next_blink, BLINK)
 
-    def _is_mode(self, mode):
-        return MODES[self.mode.active] == mode
-
     def _next_blink(self):
         self._blink(not self.blink_image.visible)
 
@@ -391,7 +388,7 @@ class Page:
     # ---- to the page -----------------------------------------------------------------------------------------------
 
     def put(self, shown: Shown) -> None:
-        """Put maps on the page, and all that belongs to them.
+        """Put maps and their numbers on the page.
 
         A preview keeps the colours of the last complete map, and a map that stays the same is not sent again: the
         browser paints every figure that changes.
@@ -406,7 +403,7 @@ class Page:
             for source, old, new in zip(self.sources, before.pictures, shown.pictures, strict=True):
                 if new is not old:
                     source.data = _image(new)
-            if self._is_mode("difference"):
+            if MODES[self.mode.active] == "difference":
                 self._put_difference()
             if shown.preview and not self._readout_waits:
                 self._readout_waits = True
