@@ -32,18 +32,23 @@ TIPS = {
 }
 ENERGY = 0.35  # mean and standard deviation before the truncation [eV], in real units
 HEIGHT = 0.1  # nm
-SHARPNESS = 0.15
-FIELDS, FRACTIONS = (19.0, 35.0), (0.05, 0.4)  # evaporation fields [V/nm] of Al and Ni, and the ions that roll up
+FIELDS = 19.0, 35.0  # evaporation fields of Al and Ni [V/nm]
+# charging rule, sharpness, and the fractions of Al and Ni that roll up
+RULES = {
+    "constant potential": (ae.ConstantPotential(), 2.0, (0.05, 0.6)),
+    "Robin": (ae.Robin(), 0.15, (0.05, 0.4)),
+}
 
 
-def rule(material, scale):
+def emission_of(material, rules, scale):
     """Emission of a metal; `scale` is the simulated energy per real energy."""
+    _, sharpness, fractions = RULES[rules]
     energy = ae.TruncatedNormal(ENERGY * scale, ENERGY * scale)
-    fraction = float(np.interp(material.evaporation_field, FIELDS, FRACTIONS))
-    return ae.RollUp(energy, fraction, SHARPNESS, HEIGHT, others=energy)
+    fraction = float(np.interp(material.evaporation_field, FIELDS, fractions))
+    return ae.RollUp(energy, fraction, sharpness, HEIGHT, others=energy)
 
 
-def evaporate(element, axis, radius, ions, path):
+def evaporate(element, axis, rules, radius, ions, path):
     """Run of a tip with a radius [a], and its emission; from the file if it exists."""
     if path is not None and path.exists():
         run = ae.load(path)
@@ -52,10 +57,11 @@ def evaporate(element, axis, radius, ions, path):
     size = radius * material.a
     tip = ae.Tip(material, size, axis=axis, shank_length=2 * size, depth=6 * material.a)
     # wide responses are not computed, but their settings record the neighbours for the sharpness
-    simulation = ae.Simulation(tip, seed=1, response_settings=ae.ResponseSettings.wide())
+    settings = ae.ResponseSettings.wide()
+    simulation = ae.Simulation(tip, seed=1, rule=RULES[rules][0], response_settings=settings)
     # the first ions give the voltage at which the cap has the evaporation field
     pilot = simulation.run(256, responses=False, progress=False).at_evaporation_field()
-    emission = rule(material, float(np.median(pilot.energy_scales)))
+    emission = emission_of(material, rules, float(np.median(pilot.energy_scales)))
     run = simulation.run(ions, [ae.Unperturbed(), emission], responses=False)
     if path is not None:
         run.save(path)
@@ -75,6 +81,7 @@ def draw(axis, name, run, emission, bins):
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--full", action="store_true", help="six tips, R = 80 a, 300,000 ions")
+parser.add_argument("--charges", choices=RULES, default="constant potential", help="rules found with these charges")
 parser.add_argument("--tip", action="append", choices=TIPS, help="only this tip; may be repeated")
 parser.add_argument("-o", "--output", type=Path, metavar="FOLDER", help="folder of runs and pictures")
 options = parser.parse_args()
@@ -86,7 +93,7 @@ figure, axes = plt.subplots(-(-len(names) // 3), min(len(names), 3), squeeze=Fal
 figure.set_size_inches(4.6 * axes.shape[1], 4.4 * axes.shape[0])
 for name, axis in zip(names, axes.flat, strict=False):
     path = options.output and options.output / f"{name.replace('[', '_').rstrip(']')}.h5"
-    run, emission = evaporate(*TIPS[name], radius, ions, path)
+    run, emission = evaporate(*TIPS[name], options.charges, radius, ions, path)
     print(f"{name}: {len(run):,} ions, {emission}")
     draw(axis, name, run, emission, bins)
 if options.output:

@@ -31,7 +31,7 @@ settings.load_profile("quick")
 
 def read_only(thing):
     """The same object, whose arrays, one level down too, nobody can change: all tests share it."""
-    for value in (*vars(thing).values(), *getattr(thing, "flown", ()), getattr(thing, "responses", None) or ()):
+    for value in (*vars(thing).values(), *getattr(thing, "flown", ())):
         for array in (value, *getattr(value, "__dict__", {}).values()):
             if isinstance(array, np.ndarray):
                 array.flags.writeable = False

@@ -40,7 +40,7 @@ cdef class Evaporation:
     cdef int[::1] key_bonds
 
     cdef void make_room(self, long room)
-    cdef void strongest_neighbours(self, long atom, long long* neighbour, double* charge) noexcept nogil
+    cdef void strongest_neighbours(self, long atom, long leaving, long long* neighbour, double* charge) noexcept nogil
     cdef void join(self, int slot, double dx, double dy, double dz) noexcept nogil
     cdef double wait(self, double u) noexcept nogil
     cdef int surroundings(self, long atom) noexcept nogil

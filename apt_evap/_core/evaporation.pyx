@@ -217,9 +217,10 @@ cdef class Evaporation:
 
     # ---- one event -------------------------------------------------------------------------------------------------
 
-    cdef void strongest_neighbours(self, long atom, long long* neighbour, double* charge) noexcept nogil:
-        # The TARGETS surface neighbours with the highest charges, in falling order; -1 if there are fewer. Nearest
-        # neighbours, and with a `target_stretch` also those of the second shell.
+    cdef void strongest_neighbours(self, long atom, long leaving, long long* neighbour, double* charge) noexcept nogil:
+        # The TARGETS surface neighbours of an atom with the highest charges, in falling order; -1 if there are fewer.
+        # Nearest neighbours, and with a `target_stretch` also those of the second shell. Those of another atom than the
+        # leaving one are neither it nor its neighbours.
         cdef int[MAX_NEAR] others
         cdef int n = self.atoms.near(atom, others), i, k, m
         cdef long other
@@ -230,6 +231,8 @@ cdef class Evaporation:
         for i in range(n):
             other = others[i]
             if self.slot_of[other] < 0 or not self.atoms.bonded(atom, other, self.target_stretch):
+                continue
+            if atom != leaving and self.atoms.bonded(leaving, other, self.target_stretch):   # also the leaving one
                 continue
             q = self.tree.q[self.slot_of[other]]
             for k in range(TARGETS):
@@ -390,9 +393,9 @@ cdef class Evaporation:
             Maximum number of events.
         sweep_interval : int
             Events after which a relaxation is due.
-        atom, charge, field, normal, neighbour, neighbour_charge, detached, wait, rise : ndarray, shape (m,) or (m, 3)
+        atom, charge, field, normal, neighbour, neighbour_charge, detached, wait, rise : ndarray, first axis m
             Filled, for each event, with the evaporated atom, its charge [e], the field just outside before evaporation
-            [V/nm], its normal, its three surface nearest neighbours with the highest charges (-1: fewer), their charges
+            [V/nm], its normal, the targets of a roll-up and of a second one (see `Batch`; -1: fewer), their charges
             [e], and 1 for an atom that left because it was detached, the time since the previous event [s] (0: a law without a time, or detached), and
             the logarithm of the factor by which the control had increased the rates since the last relaxation.
 
@@ -408,6 +411,8 @@ cdef class Evaporation:
         cdef bint drawn
         if journal.start.shape[0] <= max_events:
             raise ValueError(f"journal must have room for {max_events} events")
+        neighbour[:, :] = -1
+        neighbour_charge[:, :] = 0.0
         with nogil:
             while journal.n_events < max_events:
                 n = journal.n_events
@@ -436,7 +441,10 @@ cdef class Evaporation:
                 field[n] = self.field_unit * self.rule.strength(self.tree, best)
                 for axis in range(3):
                     normal[n, axis] = self.normals[best, axis]
-                self.strongest_neighbours(leaving, &neighbour[n, 0], &neighbour_charge[n, 0])
+                self.strongest_neighbours(leaving, leaving, &neighbour[n, 0], &neighbour_charge[n, 0])
+                if neighbour[n, 0] >= 0:
+                    self.strongest_neighbours(neighbour[n, 0], leaving, &neighbour[n, TARGETS],
+                                              &neighbour_charge[n, TARGETS])
                 self.event(leaving, journal)
         return status
 

@@ -8,7 +8,6 @@ from numpy.typing import ArrayLike
 from apt_evap._common.validation import check_array, check_kind
 from apt_evap.emission.emissions import TangentialLaunches
 from apt_evap.emission.surface_frame import rollup_direction
-from apt_evap.flight.response import Responses
 from apt_evap.simulation.run import Run
 from apt_evap.units import speed_from_energy
 
@@ -104,7 +103,7 @@ def _places(run, ions, velocities, rolled):
     """Positions on the detector [mm], shape (...), of launches along the surface [nm/ns] of shape (..., 2)."""
     shape = velocities.shape[:-1]
     repeats = np.repeat(ions, int(np.prod(shape[1:])))
-    responses = Responses(*(part[repeats] for part in run.responses))
+    responses = run.responses[repeats]
     first, second = velocities.reshape(-1, 2).T
     starts = np.full(len(repeats), rolled)
     launches = TangentialLaunches(starts, first, second)

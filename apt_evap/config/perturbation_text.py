@@ -141,6 +141,8 @@ def title_of(perturbation: Any) -> str:
         if option in options:
             value = getattr(perturbation, option)
             parts.append(f"{option} {value:g}{unit}" if isinstance(value, float) else f"{option} {value}")
+    if "second_roll" in options:
+        parts.append(f"second roll-up {perturbation.second_roll:g}")
     if "others" in options:
         parts.append(f"others {_energy_text(perturbation.others) or perturbation.others}")
     return ", ".join(filter(None, parts))

@@ -294,7 +294,7 @@ def config_of(document: dict[str, Any], path: Path) -> Config:
         ("detector", Detector, _field_names(Detector)),
         ("charges", ChargeSettings, _field_names(ChargeSettings)),
         ("flights", FlightSettings, _field_names(FlightSettings)),
-        ("responses", _responses, ("energy_limit", "bound", "wide", "height", "shells")),
+        ("responses", _responses, ("energy_limit", "bound", "wide", "height", "shells", "rolls")),
         ("watch", WatchSettings, _field_names(WatchSettings)),
     ):
         with _located(path, name):

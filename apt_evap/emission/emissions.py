@@ -13,6 +13,7 @@ from apt_evap.units import FLIGHT_TIME
 
 COLUMNS = ("positions", "normals", "neighbours", "charge_states", "masses", "ions")
 TARGET_COLUMNS = ("targets", "charge_ratios")
+SECOND_TARGET_COLUMNS = ("second_targets", "second_charge_ratios")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -40,6 +41,9 @@ class Emissions:
         Their charges over that of the atom, shape (n, 3); NaN if there are fewer.
     rollup_distances : array_like, optional
         Distance of each rolled-up ion from its neighbour [nm], shape (n,); by default `nearest_neighbour_distance`.
+    second_targets, second_charge_ratios : array_like, optional
+        The same as `targets` and `charge_ratios` for a second roll-up: of the surface neighbours of the strongest
+        neighbour that are neither the atom nor neighbours of it.
 
     Raises
     ------
@@ -57,6 +61,8 @@ class Emissions:
     targets: Any = None
     charge_ratios: Any = None
     rollup_distances: np.ndarray | None = None
+    second_targets: Any = None
+    second_charge_ratios: Any = None
 
     def __post_init__(self):
         positions = check_array(self.positions, "positions", ("n", 3))
@@ -71,11 +77,12 @@ class Emissions:
             "ions": check_array(self.ions, "ions", (n,), dtype=np.int64),
             "nearest_neighbour_distance": distance,
         }
-        if (self.targets is None) != (self.charge_ratios is None):
-            raise ValueError("targets and charge_ratios must be given together, got one of them")
-        if self.targets is not None:
-            values["targets"] = check_array(self.targets, "targets", (n, 3, 3), finite=False)
-            values["charge_ratios"] = check_array(self.charge_ratios, "charge_ratios", (n, 3), finite=False)
+        for places, ratios in (TARGET_COLUMNS, SECOND_TARGET_COLUMNS):
+            if (getattr(self, places) is None) != (getattr(self, ratios) is None):
+                raise ValueError(f"{places} and {ratios} must be given together, got one of them")
+            if getattr(self, places) is not None:
+                values[places] = check_array(getattr(self, places), places, (n, 3, 3), finite=False)
+                values[ratios] = check_array(getattr(self, ratios), ratios, (n, 3), finite=False)
         if self.rollup_distances is not None:
             values["rollup_distances"] = check_array(self.rollup_distances, "rollup_distances", (n,))
         deviation = np.abs(np.linalg.norm(values["normals"], axis=1) - 1)
@@ -112,13 +119,23 @@ class Emissions:
     @property
     def columns(self) -> tuple[str, ...]:
         """Names of the arrays with one row per atom."""
-        optional = (*TARGET_COLUMNS, "rollup_distances")
+        optional = (*TARGET_COLUMNS, *SECOND_TARGET_COLUMNS, "rollup_distances")
         return COLUMNS + tuple(name for name in optional if getattr(self, name) is not None)
 
     @property
     def can_roll(self) -> Booleans:
         """Whether each atom has a neighbour to roll onto, bool (n,)."""
         return np.isfinite(self.neighbours).all(axis=1)
+
+    @property
+    def can_roll_twice(self) -> Booleans:
+        """Whether each atom has a target of a second roll-up, bool (n,); ValueError if the emissions have none."""
+        if self.second_targets is None:
+            raise ValueError(
+                "a second roll-up needs its targets, which this run does not have: run with "
+                "response_settings=ResponseSettings(rolls=2) or ResponseSettings.wide(rolls=2)"
+            )
+        return np.isfinite(self.second_targets[:, 0]).all(axis=1)
 
     @property
     def slowness(self) -> Floats:
@@ -143,6 +160,10 @@ class TangentialLaunches(NamedTuple):
     """Shares of the three targets in the place of the roll-up, shape (n, 3), sum 1; by default the first only."""
     heights: Floats | None = None
     """Heights of the launches above the usual start [nm], shape (n,); by default 0."""
+    twice: Booleans | None = None
+    """Whether each ion rolled up twice, shape (n,), a part of `rolled`; by default none did."""
+    second_shares: Floats | None = None
+    """Shares of the targets of the second roll-up, shape (n, 3), sum 1; by default the first only."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -1,9 +1,10 @@
 """Perturbations of the emission: start position of an ion, and its velocity along the surface.
 
 A perturbation is any object with one method, ``launch(emissions, random) -> Launches``, over a batch of
-emissions. The built-in ones use up to three random numbers per ion: the first is the quantile of the energy, the second
-gives the azimuth, the third decides whether the ion rolls up. The model is that of Shaikh et al., arXiv 2509.13744; the
-probability of a roll-up, the sharpness of its target and the launch height are additions to it.
+emissions. The built-in ones use up to four random numbers per ion: the first is the quantile of the energy, the second
+gives the azimuth, the third decides whether the ion rolls up, the fourth whether it does so twice. The model is that of
+Shaikh et al., arXiv 2509.13744; the probability of a roll-up and of a second one, the sharpness of the target and the
+launch height are additions to it.
 """
 
 from collections.abc import Mapping
@@ -26,7 +27,13 @@ from apt_evap.emission.energies import (
     draw_energies,
 )
 from apt_evap.emission.ion_random import IonRandom
-from apt_evap.emission.surface_frame import launch_tangentially, rollup_direction, tangent_frame, target_shares
+from apt_evap.emission.surface_frame import (
+    launch_tangentially,
+    rollup_direction,
+    second_direction,
+    tangent_frame,
+    target_shares,
+)
 from apt_evap.units import speed_from_energy
 
 __all__ = [
@@ -165,18 +172,27 @@ class _Rolling(_Tangential):
             object.__setattr__(self, "probability", probability)
         sharpness = check_number(self.sharpness, "sharpness", at_least=0, at_most=100)
         object.__setattr__(self, "sharpness", sharpness)
+        second_roll = check_number(self.second_roll, "second_roll", at_least=0, at_most=1)
+        object.__setattr__(self, "second_roll", second_roll)
 
     def _roll(self, emissions, random):
         """Launches with a roll-up of some ions."""
         n = len(emissions)
         certain = self.probability == 1.0
-        u = random.uniform(2 if certain else 3)
+        u = random.uniform(4 if self.second_roll else 2 if certain else 3)
         shares = None if self.sharpness == 0.0 else target_shares(emissions, self.sharpness)
         rolled, first, second = rollup_direction(emissions, shares)
         if not certain:
             given = self.probability
             wanted = u[:, 2] < (given if isinstance(given, float) else given.probabilities(emissions))
             rolled = rolled & wanted
+        twice = second_shares = None
+        if self.second_roll:
+            if shares is not None:
+                second_shares = target_shares(emissions, self.sharpness, second=True)
+            can_roll_twice, onward, aside = second_direction(emissions, shares, second_shares)
+            twice = rolled & can_roll_twice & (u[:, 3] < self.second_roll)
+            first, second = np.where(twice, onward, first), np.where(twice, aside, second)
         energies = draw_energies(self.energy, u[:, 0])
         fraction = getattr(self, "rollup_fraction", 1.0)
         rolling = np.where(rolled, fraction * energies, 0.0)
@@ -186,7 +202,7 @@ class _Rolling(_Tangential):
         random_speed = speed_from_energy(lateral, emissions.masses)
         sine, cosine = sine_and_cosine(2 * np.pi * u[:, 1])
         first, second = speed * first + random_speed * cosine, speed * second + random_speed * sine
-        return TangentialLaunches(rolled, first, second, shares, self._heights(n))
+        return TangentialLaunches(rolled, first, second, shares, self._heights(n), twice, second_shares)
 
 
 @dataclass(frozen=True, repr=False)
@@ -258,6 +274,11 @@ class RollUp(_Rolling):
     others : distribution or float, optional
         Energy, in a random direction along the surface, of ions that do not roll up [eV]; by default they start at
         rest.
+    second_roll : float
+        Probability that an ion that rolls up rolls once more, from above its strongest neighbour onto the strongest
+        one of those beyond, and starts there, in the direction of this last step. Beyond are the surface neighbours of
+        the neighbour that are no neighbours of the site; an ion without any rolls once. Above 0 it needs responses with
+        ``rolls=2`` (`ResponseSettings`).
     """
 
     energy: Distribution | float
@@ -265,6 +286,7 @@ class RollUp(_Rolling):
     sharpness: float = 0.0
     height: float = 0.0
     others: Distribution | float | None = None
+    second_roll: float = 0.0
 
     def __post_init__(self):
         self._check("energy", *(("others",) if self.others is not None else ()))
@@ -292,6 +314,8 @@ class Combined(_Rolling):
         As in `RollUp`.
     others : distribution or float, optional
         Energy of ions that do not roll up [eV]; by default the random part of E.
+    second_roll : float
+        As in `RollUp`.
     """
 
     energy: Distribution | float
@@ -300,6 +324,7 @@ class Combined(_Rolling):
     sharpness: float = 0.0
     height: float = 0.0
     others: Distribution | float | None = None
+    second_roll: float = 0.0
 
     def __post_init__(self):
         fraction = check_number(self.rollup_fraction, "rollup_fraction", at_least=0, at_most=1)
@@ -321,7 +346,7 @@ class Combined(_Rolling):
         -------
         TangentialLaunches
             Whether each ion rolls up, its velocity along t1 and t2 of `tangent_frame` [nm/ns], each of shape (n,),
-            and if they are not the default, the shares of the targets and the heights.
+            and if they are not the default, the shares of the targets, the heights, and which ions roll up twice.
         """
         return self._roll(emissions, random)
 

@@ -58,18 +58,57 @@ def rollup_direction(emissions: Emissions, shares: Floats | None = None) -> tupl
         of the unit vector from the site to the rolled-up position, projected perpendicular to the normal; zero if there
         is no neighbour, or if it lies along the normal.
     """
-    rolled = np.isfinite(emissions.neighbours).all(axis=1)
-    places = emissions.neighbours if shares is None else _mean_targets(emissions, shares[:, None])[:, 0]
-    step = np.where(rolled[:, None], places - emissions.positions, 0.0)
+    rolled = emissions.can_roll
+    return rolled, *_direction(emissions, rolled, _place(emissions, shares) - emissions.positions)
+
+
+@kept
+def second_direction(
+    emissions: Emissions, shares: Floats | None = None, second_shares: Floats | None = None
+) -> tuple[Booleans, Floats, Floats]:
+    """Ions that can roll up twice, and the direction of the second roll-up.
+
+    Parameters
+    ----------
+    emissions : Emissions
+        A batch of n, with the targets of a second roll-up.
+    shares, second_shares : ndarray, shape (n, 3), optional
+        Shares of the targets of both, see `target_shares`; by default the strongest ones only.
+
+    Returns
+    -------
+    tuple of ndarray
+        As of `rollup_direction`, for the step from the first to the second rolled-up position.
+
+    Raises
+    ------
+    ValueError
+        If the emissions have no targets of a second roll-up.
+    """
+    twice = emissions.can_roll_twice
+    step = _place(emissions, second_shares, second=True) - _place(emissions, shares)
+    return twice, *_direction(emissions, twice, step)
+
+
+def _direction(emissions, there, steps):
+    """Components along t1 and t2 of steps (n, 3), as unit vectors perpendicular to the normal; zero where not there."""
+    step = np.where(there[:, None], steps, 0.0)
     # the lift d n of the rolled-up position is along the normal and drops out
     along = [products(step, tangent) for tangent in tangent_frame(emissions.normals)]
     length = np.sqrt(along[0] * along[0] + along[1] * along[1])
     straight = length < 1e-9 * emissions.nearest_neighbour_distance
     scale = np.where(straight, 0.0, 1 / np.where(straight, 1.0, length))
-    return rolled, along[0] * scale, along[1] * scale
+    return along[0] * scale, along[1] * scale
 
 
-def rolled_positions(emissions: Emissions) -> Floats:
+def _place(emissions, shares, second=False):
+    """The target of a roll-up, or the mean of the targets with these shares; shape (n, 3)."""
+    if shares is None:
+        return emissions.second_targets[:, 0] if second else emissions.neighbours
+    return _mean_targets(emissions, shares[:, None], second)[:, 0]
+
+
+def rolled_positions(emissions: Emissions, second: bool = False) -> Floats:
     """Positions p_r = s + d n, one nearest neighbour distance d above the neighbour s that each ion rolls onto.
 
     Between two phases, d is the mean of their distances.
@@ -78,13 +117,15 @@ def rolled_positions(emissions: Emissions) -> Floats:
     ----------
     emissions : Emissions
         A batch of n.
+    second : bool
+        Whether after a second roll-up, with the same d.
 
     Returns
     -------
     ndarray, shape (n, 3)
         Positions [nm]; NaN for an ion without a neighbour.
     """
-    return emissions.neighbours + _lift(emissions)
+    return _place(emissions, None, second) + _lift(emissions)
 
 
 def _lift(emissions):
@@ -94,8 +135,7 @@ def _lift(emissions):
     return emissions.rollup_distances[:, None] * emissions.normals
 
 
-@kept
-def target_shares(emissions: Emissions, sharpness: float) -> Floats:
+def target_shares(emissions: Emissions, sharpness: float, second: bool = False) -> Floats:
     r"""Shares of the three strongest surface nearest neighbours in the place onto which an atom rolls.
 
     Parameters
@@ -104,6 +144,8 @@ def target_shares(emissions: Emissions, sharpness: float) -> Floats:
         A batch of n, with its targets.
     sharpness : float
         :math:`\tau`; 0 for the strongest neighbour only.
+    second : bool
+        Whether for a second roll-up.
 
     Returns
     -------
@@ -122,33 +164,47 @@ def target_shares(emissions: Emissions, sharpness: float) -> Floats:
     with the charges :math:`q_j` of the neighbours in falling order. Where two of them are nearly equal, an atom moves
     onto the bridge or hollow between them.
     """
-    n = len(check_kind(emissions, "emissions", Emissions, "Emissions"))
+    check_kind(emissions, "emissions", Emissions, "Emissions")
+    return _second_shares(emissions, sharpness) if second else _first_shares(emissions, sharpness)
+
+
+@kept
+def _first_shares(emissions, sharpness):
+    return _shares(emissions.charge_ratios, len(emissions), sharpness)
+
+
+@kept
+def _second_shares(emissions, sharpness):
+    return _shares(emissions.second_charge_ratios, len(emissions), sharpness)
+
+
+def _shares(ratios, n, sharpness):
     shares = np.zeros((n, 3))
     shares[:, 0] = 1.0
     if sharpness == 0.0 or n == 0:
         return shares
-    if emissions.charge_ratios is None:
+    if ratios is None:
         raise ValueError(
             "a sharpness > 0 needs the targets of the roll-up, which this run does not have: run with "
             "response_settings=ResponseSettings.wide()"
         )
-    ratios = emissions.charge_ratios
     there = np.isfinite(ratios[:, 1:])
     relative = np.where(there, ratios[:, 1:], 0.0) / np.where(ratios[:, :1] > 0, ratios[:, :1], 1.0)
     shares[:, 1:] = np.where(there, exponential(np.ascontiguousarray((relative - 1.0) / sharpness)), 0.0)
     return shares / (shares[:, 0] + shares[:, 1] + shares[:, 2])[:, None]
 
 
-def _mean_targets(emissions, shares):
+def _mean_targets(emissions, shares, second=False):
     """Weighted means of the targets, shares (n or 1, m, 3) -> (n, m, 3); a missing target is replaced by the first."""
-    targets = np.where(np.isfinite(emissions.targets), emissions.targets, emissions.neighbours[:, None])
+    targets = emissions.second_targets if second else emissions.targets
+    targets = np.where(np.isfinite(targets), targets, targets[:, :1])
     mean = shares[..., 0, None] * targets[:, None, 0]
     for k in (1, 2):
         mean = mean + shares[..., k, None] * targets[:, None, k]
     return mean
 
 
-def shared_positions(emissions: Emissions, shares: Floats) -> Floats:
+def shared_positions(emissions: Emissions, shares: Floats, second: bool = False) -> Floats:
     """Positions one nearest neighbour distance above weighted means of the targets.
 
     Parameters
@@ -157,13 +213,15 @@ def shared_positions(emissions: Emissions, shares: Floats) -> Floats:
         A batch of n, with its targets.
     shares : ndarray, shape (n or 1, m, 3)
         Shares of the targets.
+    second : bool
+        Whether of those of a second roll-up.
 
     Returns
     -------
     ndarray, shape (n, m, 3)
         Positions [nm]; NaN for an ion without a neighbour.
     """
-    return _mean_targets(emissions, shares) + _lift(emissions)[:, None]
+    return _mean_targets(emissions, shares, second) + _lift(emissions)[:, None]
 
 
 def along_surface(normals: ArrayLike, first: Floats, second: Floats) -> Floats:
@@ -193,6 +251,8 @@ def launch_tangentially(
     second: Floats,
     shares: Floats | None = None,
     heights: Floats | None = None,
+    twice: Booleans | None = None,
+    second_shares: Floats | None = None,
 ) -> Launches:
     """Launches with velocities along the surface.
 
@@ -204,7 +264,7 @@ def launch_tangentially(
         Whether an ion starts at its rolled-up position, see `rolled_positions`, or at its site, shape (n,).
     first, second : array_like
         Velocity along t1 and t2 of `tangent_frame` [nm/ns], shape (n,).
-    shares, heights : ndarray, optional
+    shares, heights, twice, second_shares : ndarray, optional
         As in `TangentialLaunches`.
 
     Returns
@@ -213,6 +273,12 @@ def launch_tangentially(
     """
     up = rolled_positions(emissions) if shares is None else shared_positions(emissions, shares[:, None])[:, 0]
     positions = np.where(np.asarray(rolled)[:, None], up, emissions.positions)
+    if twice is not None:
+        if second_shares is None:
+            up = rolled_positions(emissions, second=True)
+        else:
+            up = shared_positions(emissions, second_shares[:, None], second=True)[:, 0]
+        positions = np.where(np.asarray(twice)[:, None], up, positions)
     if heights is not None:
         positions = positions + np.asarray(heights)[:, None] * emissions.normals
     return Launches(

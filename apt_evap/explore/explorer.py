@@ -30,6 +30,7 @@ from apt_evap.emission.kept import KeptEmissions
 from apt_evap.emission.perturbations import Perturbation, RollUp, TruncatedNormal, Unperturbed
 from apt_evap.energy_fit.fit_energies import BINS, measured_map
 from apt_evap.explore.controls import MECHANISMS, Control, controls_of, perturbation_of
+from apt_evap.flight.response import Responses
 from apt_evap.registration.register import Registration, register
 from apt_evap.simulation.real_units import RealColumns
 from apt_evap.simulation.run import Clock, Flown, Run
@@ -221,6 +222,8 @@ class Explorer:
     def controls(self, mechanism: str) -> tuple[Control, ...]:
         """Controls of a mechanism that this run serves: sharpness and height need wide responses."""
         settings, found = self.run.response_settings, controls_of(mechanism)
+        if settings.rolls == 1:
+            found = tuple(each for each in found if each.name != "second_roll")
         if not settings.is_wide:
             return tuple(each for each in found if each.name not in ("sharpness", "height"))
         return tuple(replace(each, high=settings.height) if each.name == "height" else each for each in found)
@@ -651,10 +654,9 @@ def _every(run: Run, step: int) -> Run:
         name: getattr(run, name)[rows] for name in ("site", "species", "charges", "fields", "detached")
     }
     parts["flown"] = tuple(Flown(each.directions[rows], each.times[rows]) for each in run.flown)
-    responses: Any = run.responses
-    parts["responses"] = type(responses)(
-        *(each if each is None else np.ascontiguousarray(each[rows]) for each in responses)
-    )
+    if run.responses is not None:
+        columns = run.responses.columns.items()
+        parts["responses"] = Responses(**{name: np.ascontiguousarray(each[rows]) for name, each in columns})
     for name, kind in (("clock", Clock), ("real", RealColumns)):
         if getattr(run, name) is not None:
             parts[name] = kind(*(each[rows] for each in getattr(run, name)))

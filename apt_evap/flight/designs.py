@@ -205,15 +205,14 @@ def _launches_of(design):
         places = [(i / steps, j / steps) for i in range(steps + 1) for j in range(steps + 1 - i)]
     grid = np.array([[*a, *b, *c] for a, b, c in itertools.product(places, velocities, heights)])
     matrix = design.monomials(grid)
-    n = matrix.shape[1]
-    inverse, chosen = np.eye(n) * 1e6, []
-    while len(chosen) < min(round(design.launches_per_coefficient * n), len(grid)):
-        product = (matrix[:, :, None] * inverse).sum(axis=1)
+    # rows of the matrix times the covariance of the coefficients, which every chosen launch reduces
+    product, chosen = matrix * 1e6, []
+    while len(chosen) < min(round(design.launches_per_coefficient * matrix.shape[1]), len(grid)):
         leverage = np.round((product * matrix).sum(axis=1), 9)
         leverage[chosen] = -1.0
         chosen.append(int(leverage.argmax()))
-        row = product[chosen[-1]]
-        inverse = inverse - row[:, None] * row / (1.0 + (row * matrix[chosen[-1]]).sum())
+        row, along = product[chosen[-1]], (product * matrix[chosen[-1]]).sum(axis=1)
+        product = product - along[:, None] * (row / (1.0 + along[chosen[-1]]))
     return grid[sorted(chosen)]
 
 

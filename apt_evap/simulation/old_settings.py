@@ -28,7 +28,7 @@ def upgraded(settings: Mapping[str, Any]) -> dict[str, Any]:
     if new.get("law") in ({"name": "Extremal", "repr": "Extremal()"}, {"name": "Extremal"}):
         new["law"] = {"name": "Extremal", "bonds": None}
     if "responses" in new:
-        new["responses"] = {"height": 0.0, "shells": 1} | dict(new["responses"])
+        new["responses"] = {"height": 0.0, "shells": 1, "rolls": 1} | dict(new["responses"])
     new.setdefault("control", None)
     new.setdefault("pulse_length", None)
     return new

@@ -226,7 +226,7 @@ class Run:
         """Ions whose responses deviate from their own flights by more than the bound, or have no fit, bool (n,)."""
         if self.responses is None:
             return np.zeros(len(self), bool)
-        return self.response_model.flagged(self.responses, self.emissions.can_roll)
+        return self.response_model.flagged(self.responses, self.emissions)
 
     @property
     def first_perturbation(self) -> Any:
@@ -248,7 +248,7 @@ class Run:
         for number, flown in enumerate(self.flown):
             columns |= {f"flown/{number}/directions": flown.directions, f"flown/{number}/times": flown.times}
         if self.responses is not None:
-            columns |= {f"responses/{name}": values for name, values in self.responses._asdict().items()}
+            columns |= {f"responses/{name}": values for name, values in self.responses.columns.items()}
         if self.clock is not None:
             columns |= {f"clock/{name}": values for name, values in self.clock._asdict().items()}
         hashed = hashlib.sha256()
@@ -609,7 +609,8 @@ class Run:
             flown = tuple(Flown(each.directions, each.times * ratio) for each in flown)
             if responses is not None:
                 factors = np.array([1.0, 1.0, ratio], np.float32)[:, None]  # directions and time
-                responses = Responses(responses.site * factors, responses.rolled * factors, responses.residuals * ratio)
+                site, rolled, *twice = (each * factors for each in responses.polynomials)
+                responses = Responses(site, rolled, responses.residuals * ratio, *twice)
         settings = self.settings | {"detector": vars(detector)}
         return replace(self, detector=detector, settings=settings, flown=flown, responses=responses)
 
@@ -647,9 +648,7 @@ class Run:
         )
         responses = None
         if first.responses is not None:
-            responses = Responses(
-                *(np.concatenate(parts) for parts in zip(*(run.responses for run in runs), strict=True))
-            )
+            responses = Responses.join([run.responses for run in runs])  # type: ignore[misc]
         history = History.join([run.history for run in runs])
         columns["provenance"] = joined([run.provenance for run in runs])
         columns["cap"] = CapHistory.join([run.cap for run in runs])

@@ -53,6 +53,7 @@ _UNITS = {
     "positions": "nm",
     "neighbours": "nm",
     "targets": "nm",
+    "second_targets": "nm",
     "charge_states": "e",
     "masses": "Da",
     "charges": "e",
@@ -76,11 +77,13 @@ _KINDS = {  # datasets with one row per ion, besides the ions: name, type, shape
     "charges": (f"{_SIMULATION}/charges", np.float64, ()),
     "fields": (f"{_SIMULATION}/fields", np.float64, ()),
 }
-# only with wide responses
+# only with wide responses, and with those for two roll-ups
 _TARGETS = {
-    "targets": (f"{_SIMULATION}/targets", np.float64, (3, 3)),
-    "charge_ratios": (f"{_SIMULATION}/charge_ratios", np.float64, (3,)),
+    f"{before}{name}": (f"{_SIMULATION}/{before}{name}", np.float64, shape)
+    for before in ("", "second_")
+    for name, shape in (("targets", (3, 3)), ("charge_ratios", (3,)))
 }
+_RESPONSES = ("site", "rolled", "twice")  # polynomials in the order of the designs
 # not in all files: datasets with one row per ion of `Run.clock` and `Run.real`
 _CLOCK = {name: (f"{_SIMULATION}/clock/{name}", np.float64, ()) for name in ("waits", "voltages")}
 _REAL = {
@@ -173,7 +176,7 @@ def _write(file, run):
         _put(simulation, f"flown/{index}/times", flown.times)
         put_text(simulation[f"flown/{index}"], "perturbation", json.dumps(described(perturbation)))
     if run.responses is not None:
-        for name, values in run.responses._asdict().items():
+        for name, values in run.responses.columns.items():
             _put(simulation, f"responses/{name}", values)
     for name, values in run.history._asdict().items():
         _put(simulation, f"history/{_HISTORY.get(name, name)}", values)
@@ -272,12 +275,12 @@ def _read(file, partial):
         kinds[f"{len(perturbations)} directions"] = f"{group}/directions", np.float64, (2,)
         kinds[f"{len(perturbations)} times"] = f"{group}/times", np.float64, ()
         perturbations.append(_known(json.loads(file.text("perturbation", group))))
-    group = f"{_SIMULATION}/responses"
-    has_responses = group in file
-    if has_responses:
-        for name, design in (("site", response_settings.site), ("rolled", response_settings.rolled)):
-            kinds[f"responses {name}"] = f"{group}/{name}", np.float32, (3, len(design.exponents))
-        kinds["responses residuals"] = f"{group}/residuals", np.float32, (2,)
+    group, responses = f"{_SIMULATION}/responses", {}
+    if group in file:
+        designs = response_settings.designs
+        shapes = {name: (3, len(each.exponents)) for name, each in zip(_RESPONSES, designs, strict=False)}
+        for name, shape in {**shapes, "residuals": (len(designs),)}.items():
+            kinds[f"responses {name}"] = responses[name] = f"{group}/{name}", np.float32, shape
     targets = {name: kind for name, kind in _TARGETS.items() if kind[0] in file}
     kinds |= targets
     kinds |= {name: kind for name, kind in (_DETACHED, _PHASE, _ROLLUP) if kind[0] in file}
@@ -317,9 +320,7 @@ def _read(file, partial):
         "phase": columns.get("phase"),
         "perturbations": tuple(perturbations),
         "flown": tuple((columns[f"{k} directions"], columns[f"{k} times"]) for k in range(len(perturbations))),
-        "responses": Responses(*(columns[f"responses {name}"] for name in Responses._fields))
-        if has_responses
-        else None,
+        "responses": Responses(**{name: columns[f"responses {name}"] for name in responses}) if responses else None,
         "seed": check_seed(settings["seed"]),
         "voltage": check_voltage(settings["voltage"]),
         "detector": Detector(**settings["detector"]),

@@ -20,7 +20,7 @@ from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_count, check_kind, check_seed, check_sequence, check_switch
 from apt_evap._common.warnings import RunWarning
 from apt_evap.detection.detector import Detector
-from apt_evap.emission.emissions import Emissions, check_launches
+from apt_evap.emission.emissions import SECOND_TARGET_COLUMNS, Emissions, check_launches
 from apt_evap.emission.ion_random import IonRandom
 from apt_evap.emission.perturbations import Perturbation, Unperturbed
 from apt_evap.evaporation.emitter import BATCH, Emitter
@@ -321,12 +321,19 @@ class Simulation:
     def _emissions(self, batch, ions):
         species = self.tip.species[batch.site]
         positions = self.tip.positions
-        targets = np.where((batch.targets >= 0)[..., None], positions[batch.targets], np.nan)
-        columns = {}
-        if self.response_settings.is_wide:
+
+        def places_and_ratios(atoms, charges):
+            """Positions of targets [nm], and their charges over that of the evaporating atom; NaN if there are none."""
+            there = atoms >= 0
             with np.errstate(divide="ignore", invalid="ignore"):
-                ratios = batch.target_charges / batch.charges[:, None]
-            columns = {"targets": targets, "charge_ratios": np.where(batch.targets >= 0, ratios, np.nan)}
+                ratios = charges / batch.charges[:, None]
+            return np.where(there[..., None], positions[atoms], np.nan), np.where(there, ratios, np.nan)
+
+        targets, ratios = places_and_ratios(batch.targets, batch.target_charges)
+        columns = {"targets": targets, "charge_ratios": ratios} if self.response_settings.is_wide else {}
+        if self.response_settings.rolls == 2:
+            second = places_and_ratios(batch.second_targets, batch.second_target_charges)
+            columns |= dict(zip(SECOND_TARGET_COLUMNS, second, strict=True))
         return Emissions(
             positions=positions[batch.site],
             normals=batch.normals,

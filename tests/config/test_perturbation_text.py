@@ -40,6 +40,7 @@ def test_text_and_python_are_read_back(perturbation, text, python):
     ("perturbation", "title"),
     [
         (ae.RollUp(NORMAL), "roll-up, 0.155 ± 0.1 eV"),
+        (ae.RollUp(0.2, second_roll=0.3), "roll-up, 0.2 eV, second roll-up 0.3"),
         (ae.RollUp(NORMAL, 0.5, 0.1, 0.05), "roll-up, 0.155 ± 0.1 eV, probability 0.5, sharpness 0.1, height 0.05 nm"),
         (ae.RollUp(0.2, 0.5, others=ae.Thermal(50)), "roll-up, 0.2 eV, probability 0.5, others 50 K"),
         (ae.RollUp(0.2, ae.ChargeRatio(0.9)), "roll-up, 0.2 eV, probability ChargeRatio(threshold=0.9, width=0.0)"),

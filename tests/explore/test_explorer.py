@@ -305,6 +305,18 @@ def test_controls_and_perturbations_are_the_same(mechanism):
             perturbation_of(mechanism, {})
 
 
+def test_controls_are_those_that_the_run_serves(run):
+    options = {"second_roll", "sharpness", "height"}
+    for settings, served in (
+        (ae.ResponseSettings(), set()),
+        (ae.ResponseSettings(rolls=2), {"second_roll"}),
+        (ae.ResponseSettings.wide(), {"sharpness", "height"}),
+        (ae.ResponseSettings.wide(rolls=2), options),
+    ):
+        names = {each.name for each in Explorer(replace(run, response_settings=settings)).controls("roll-up")}
+        assert names & options == served
+
+
 def test_perturbations_without_controls():
     widths = ae.RollUp(ae.TruncatedNormal(0.2, 0.1), 0.5, others=ae.TruncatedNormal(0.1, 0.1))
     others = widths, ae.RollUp(0.2, ae.ChargeRatio(0.9)), ae.Combined(0.2, 0.5, others=0.1)

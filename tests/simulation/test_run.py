@@ -39,7 +39,7 @@ def arrays_of(run):
     for index, flown in enumerate(run.flown):
         named |= {f"{index} directions": flown.directions, f"{index} times": flown.times}
     if run.responses is not None:
-        named |= run.responses._asdict()
+        named |= run.responses.columns
     return named
 
 

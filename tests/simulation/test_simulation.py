@@ -18,7 +18,7 @@ def columns(run):
     for index, flown in enumerate(run.flown):
         named |= {f"{index} directions": flown.directions, f"{index} times": flown.times}
     if run.responses is not None:
-        named |= run.responses._asdict()
+        named |= run.responses.columns
     for perturbation in (ae.Unperturbed(), ae.RollUp(ENERGY)):
         hits = run.hits(perturbation)
         named |= {f"{perturbation} {name}": getattr(hits, name) for name in hits.columns}

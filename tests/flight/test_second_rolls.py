@@ -1,0 +1,233 @@
+"""Second roll-ups: their targets, launches and responses."""
+
+import numpy as np
+import pytest
+
+import apt_evap as ae
+from apt_evap.emission.emissions import Emissions, TangentialLaunches
+from apt_evap.emission.surface_frame import rolled_positions, second_direction
+
+ENERGY = ae.TruncatedNormal(0.155, 0.155)
+TWICE = ae.RollUp(ENERGY, second_roll=1.0)
+FLOWN = (TWICE, ae.RollUp(0.5, 0.7, others=0.3, second_roll=0.5), ae.Combined(ENERGY, 0.6, second_roll=0.8))
+WIDE = (
+    ae.RollUp(ENERGY, sharpness=0.15, height=0.1, second_roll=1.0),
+    ae.RollUp(0.35, 0.6, 2.0, 0.2, others=0.35, second_roll=0.5),
+    ae.RollUp(0.35, sharpness=2.0),
+)
+D = 0.25
+
+
+@pytest.fixture(scope="module")
+def run(tip12):
+    settings = ae.ResponseSettings(rolls=2)
+    return ae.Simulation(tip12, seed=5, response_settings=settings).run(120, FLOWN, progress=False)
+
+
+@pytest.fixture(scope="module")
+def wide_run(tip12):
+    settings = ae.ResponseSettings.wide(rolls=2)
+    return ae.Simulation(tip12, seed=5, response_settings=settings).run(80, (*WIDE, TWICE), progress=False)
+
+
+def line_of_atoms():
+    """Two atoms with normal z: one rolls along x and then along y, one has no second target."""
+    up = np.tile([0.0, 0.0, 1.0], (2, 1))
+    positions = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]])
+    targets, second = np.full((2, 3, 3), np.nan), np.full((2, 3, 3), np.nan)
+    targets[:, 0] = positions + np.array([D, 0.0, 0.0])
+    targets[0, 1] = [0.0, D, 0.0]
+    second[0, 0], second[0, 1] = [D, D, 0.0], [2 * D, 0.0, 0.0]
+    ratios, second_ratios = np.full((2, 3), np.nan), np.full((2, 3), np.nan)
+    ratios[:, 0], ratios[0, 1] = 0.9, 0.9
+    second_ratios[0, :2] = 0.8, 0.4
+    columns = {"targets": targets, "charge_ratios": ratios}
+    columns |= {"second_targets": second, "second_charge_ratios": second_ratios}
+    return Emissions(positions, up, targets[:, 0], [1, 1], [58.7, 58.7], [0, 1], D, **columns)
+
+
+def test_launches_by_hand():
+    emissions = line_of_atoms()
+    launches = ae.RollUp(0.3, second_roll=1.0).launch(emissions, ae.IonRandom(1, emissions.ions))
+    np.testing.assert_allclose(launches.positions, [[D, D, D], [5 + D, 0, D]], rtol=0, atol=1e-15)
+    speed = np.linalg.norm(launches.velocities, axis=1)
+    # the first one moves in the direction of its second step, the other in that of its only one
+    np.testing.assert_allclose(launches.velocities / speed[:, None], [[0, 1, 0], [1, 0, 0]], atol=1e-15)
+    np.testing.assert_allclose(speed, speed[0], rtol=1e-15)
+    # means: (D, D)/2 first, then (D, D) and (2 D, 0) with the weights 1 and exp(-1/2 / 0.5)
+    soft = ae.RollUp(0.3, sharpness=0.5, second_roll=1.0).launch(emissions, ae.IonRandom(1, emissions.ions))
+    weight = np.exp(-1.0) / (1 + np.exp(-1.0))
+    place = np.array([D + weight * D, D - weight * D, D])
+    np.testing.assert_allclose(soft.positions[0], place, rtol=1e-14)
+    step = place[:2] - D / 2
+    np.testing.assert_allclose(
+        soft.velocities[0, :2] / np.linalg.norm(soft.velocities[0]), step / np.linalg.norm(step), atol=1e-14
+    )
+
+
+def test_no_second_roll_is_the_usual_roll_up():
+    emissions = line_of_atoms()
+    one, other = (
+        each.tangential(emissions, ae.IonRandom(1, emissions.ions))
+        for each in (ae.RollUp(ENERGY, 0.5), ae.RollUp(ENERGY, 0.5, second_roll=1e-12))
+    )
+    for name in ("rolled", "first", "second"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    assert one.twice is None and not other.twice.any()
+
+
+def test_the_share_of_second_rolls_is_the_probability():
+    n = 4000
+    few = line_of_atoms()
+    many = few[np.zeros(n, int)]
+    many = Emissions(
+        **{name: getattr(many, name) for name in many.columns if name != "ions"},
+        ions=np.arange(n),
+        nearest_neighbour_distance=D,
+    )
+    launches = ae.RollUp(0.1, 0.6, second_roll=0.3).tangential(many, ae.IonRandom(3, many.ions))
+    # four standard deviations; the two decisions are independent
+    assert abs(launches.rolled.mean() - 0.6) < 4 * np.sqrt(0.24 / n)
+    assert abs(launches.twice.mean() - 0.18) < 4 * np.sqrt(0.15 / n)
+    assert not (launches.twice & ~launches.rolled).any()
+
+
+@pytest.mark.parametrize(("element", "shells"), [("Ni", 1), ("W", 1), ("W", 2)])
+def test_targets_of_the_emitter(element, shells):
+    """The strongest surface neighbours of the strongest neighbour, without the atom and its neighbours."""
+    material = ae.material(element)
+    tip = ae.Tip(material, apex_radius=8 * material.a, axis=(1, 1, 0), shank_length=4 * material.a)
+    reach = (1.2 if element == "Ni" else 1.3 if shells == 2 else 1.05) * tip.nearest_neighbour_distance
+    emitter, found = ae.Emitter(tip, target_shells=shells), 0
+    for _ in range(60):
+        atoms, charges, positions = emitter.atoms, emitter.charges, emitter.positions
+        batch = emitter.evaporate(1)
+        if len(batch) == 0:
+            emitter.relax()
+            continue
+        expected = np.full(3, -1)
+        if batch.targets[0, 0] >= 0:
+            site = np.linalg.norm(positions - tip.positions[batch.site[0]], axis=1)
+            beyond = np.linalg.norm(positions - tip.positions[batch.targets[0, 0]], axis=1)
+            near = np.flatnonzero((beyond > 1e-9) & (beyond < reach) & (site > reach))
+            order = near[np.lexsort((atoms[near], -charges[near]))][:3]
+            expected[: len(order)] = atoms[order]
+            np.testing.assert_array_equal(batch.second_target_charges[0, : len(order)], charges[order])
+            found += len(order)
+        np.testing.assert_array_equal(batch.second_targets[0], expected)
+    assert found > 30
+
+
+@pytest.mark.parametrize("perturbation", FLOWN, ids=repr)
+def test_hits_are_those_of_flights(run, perturbation):
+    flown, fitted = run.hits(perturbation), run.hits(perturbation, by_response=True)
+    both = flown.detected & fitted.detected
+    assert both.mean() > 0.9
+    deviations = np.hypot(flown.x - fitted.x, flown.y - fitted.y)[both]
+    # mm; measured 0.0005 and 0.0028
+    assert np.median(deviations) < 0.001 and deviations.max() < 0.006
+    once = run.hits(ae.RollUp(perturbation.energy))
+    assert np.nanmedian(np.hypot(flown.x - once.x, flown.y - once.y)[both]) > 1000 * np.median(deviations)
+
+
+@pytest.mark.parametrize("perturbation", (*WIDE, TWICE), ids=repr)
+def test_wide_hits_are_those_of_flights(wide_run, perturbation):
+    flown, fitted = wide_run.hits(perturbation), wide_run.hits(perturbation, by_response=True)
+    both = flown.detected & fitted.detected
+    assert both.mean() > 0.9
+    deviations = np.hypot(flown.x - fitted.x, flown.y - fitted.y)[both]
+    # mm; measured 0.09 and 0.27 for the worst of the four
+    assert np.median(deviations) < 0.14 and deviations.max() < 0.4
+
+
+def test_places_after_the_second_roll(run):
+    emissions = run.emissions
+    assert emissions.second_targets.shape == (120, 3, 3) and emissions.targets is None
+    twice, first, second = second_direction(emissions)
+    assert twice.sum() > 100
+    np.testing.assert_allclose(np.hypot(first, second)[twice], 1.0, rtol=1e-12)
+    # the last step of the path is one nearest neighbour distance long
+    step = rolled_positions(emissions, second=True) - rolled_positions(emissions)
+    d = emissions.nearest_neighbour_distance
+    np.testing.assert_allclose(np.linalg.norm(step[twice], axis=1), d, rtol=1e-6)
+    # no neighbour of the site: the next shell of fcc is at 1.41 d
+    distance = np.linalg.norm(emissions.second_targets[:, 0] - emissions.positions, axis=1)
+    assert distance[twice].min() > 1.4 * d
+
+
+def test_a_run_comes_back_from_its_file(run, wide_run, tmp_path):
+    for each in (run, wide_run):
+        each.save(tmp_path / "twice.h5")
+        loaded = ae.load(tmp_path / "twice.h5")
+        assert loaded.fingerprint() == each.fingerprint()
+        assert loaded.response_settings == each.response_settings
+        assert loaded.perturbations == each.perturbations
+        again = loaded.hits(TWICE, by_response=True)
+        np.testing.assert_array_equal(again.x, each.hits(TWICE, by_response=True).x)
+        further = loaded.seen_by(ae.Detector(distance=200.0, width=500.0))
+        np.testing.assert_allclose(further.hits(TWICE, by_response=True).x, 2 * again.x, rtol=1e-6)
+
+
+def test_bits_depend_neither_on_batches_nor_on_threads(tip12, run):
+    settings = ae.ResponseSettings(rolls=2)
+    other = ae.Simulation(tip12, seed=5, response_settings=settings, n_threads=2).run(
+        120, FLOWN, progress=False, batch_size=17
+    )
+    assert other.fingerprint() == run.fingerprint()
+
+
+def test_the_first_roll_is_that_of_a_run_for_one_roll_up(tip12, run):
+    once = ae.Simulation(tip12, seed=5).run(120, FLOWN[:0], progress=False)
+    np.testing.assert_array_equal(once.responses.rolled, run.responses.rolled)
+    np.testing.assert_array_equal(once.hits(ae.RollUp(ENERGY)).x, run.hits(ae.RollUp(ENERGY)).x)
+    assert once.responses.residuals.shape == (120, 2) and run.responses.residuals.shape == (120, 3)
+
+
+def test_bad_fits_of_second_rolls_are_flagged(run):
+    residuals = run.responses.residuals.copy()
+    can = np.flatnonzero(run.emissions.can_roll_twice)[3]
+    residuals[can, 2] = 1.0
+    responses = type(run.responses)(**run.responses.columns | {"residuals": residuals})
+    assert np.flatnonzero(run.response_model.flagged(responses, run.emissions)).tolist() == [can]
+
+
+@pytest.mark.parametrize("perturbation", [TWICE, WIDE[0]], ids=repr)
+def test_runs_for_one_roll_up_say_so(tip12, perturbation):
+    once = ae.Simulation(tip12, seed=5).run(20, progress=False)
+    with pytest.raises(ValueError, match=r"rolls=2|ResponseSettings\.wide"):
+        once.hits(perturbation)
+
+
+def test_launches_that_the_responses_do_not_serve_are_refused(tip12):
+    once = ae.Simulation(tip12, seed=5).run(20, progress=False)
+    n = len(once)
+    launches = TangentialLaunches(np.ones(n, bool), np.zeros(n), np.zeros(n), twice=np.ones(n, bool))
+    with pytest.raises(ValueError, match=r"serve one roll-up, .*rolls=2"):
+        once.response_model.evaluate(once.responses, launches, once.emissions.masses)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ae.RollUp(0.1, second_roll=1.5), "second_roll must be .* <= 1, got 1.5"),
+        (lambda: ae.Combined(0.1, 0.5, second_roll=-0.1), "second_roll must be .*>= 0.*, got -0.1"),
+        (lambda: ae.ResponseSettings(rolls=3), "rolls must be .*2, got 3"),
+        (lambda: ae.ResponseSettings.wide(rolls=0), "rolls must be .*1.*, got 0"),
+        (
+            lambda: Emissions(
+                np.zeros((1, 3)),
+                [[0, 0, 1.0]],
+                np.zeros((1, 3)),
+                [1],
+                [1.0],
+                [0],
+                D,
+                second_targets=np.zeros((1, 3, 3)),
+            ),
+            "second_targets and second_charge_ratios must be given together",
+        ),
+    ],
+)
+def test_bad_options_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
