@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -151,10 +151,13 @@ class Emitter:
         self.voltage = check_voltage(voltage)
         self.law = Extremal() if law is None else law
         check_law(self.law)
-        self.settings = ChargeSettings() if settings is None else settings
-        check_kind(self.settings, "settings", ChargeSettings, "ChargeSettings")
         self.rule = rules.Robin() if rule is None else rule
         rules.check_rule(self.rule)
+        settings = ChargeSettings() if settings is None else settings
+        check_kind(settings, "settings", ChargeSettings, "ChargeSettings")
+        if settings.tolerance is None:
+            settings = replace(settings, tolerance=rules.relaxation_tolerance_of(self.rule))
+        self.settings = settings
         self.n_threads = thread_count(n_threads)
         if control is not None:
             check_kind(control, "control", VoltageControl, "a VoltageControl")

@@ -29,8 +29,9 @@ class ChargeSettings:
     sweep_interval : int, optional
         Events between two relaxations of the whole surface; by default 1/300 of the initial number of surface atoms,
         but at least 100.
-    tolerance : float
-        Largest change of a charge, relative to the mean charge, at which a relaxation between events stops.
+    tolerance : float, optional
+        Largest change of a charge, relative to the mean charge, at which a relaxation between events stops; by default
+        that of the rule (`RELAXATION_TOLERANCE` of `Robin` or `ConstantPotential`).
     start_tolerance : float
         The same for the first relaxation, which starts from equal charges.
     relaxation_angle : float
@@ -42,7 +43,7 @@ class ChargeSettings:
     patch_radius: float = 8.5
     update_radius: float = 18.0
     sweep_interval: int | None = None
-    tolerance: float = 3e-3
+    tolerance: float | None = None
     start_tolerance: float = 1e-5
     relaxation_angle: float = 0.6
 
@@ -51,7 +52,8 @@ class ChargeSettings:
         check_number(self.patch_radius, "patch_radius", at_least=1.5, at_most=30, unit="d_nn")
         check_number(self.update_radius, "update_radius", at_least=self.patch_radius, at_most=40, unit="d_nn")
         check_number(self.relaxation_angle, "relaxation_angle", at_least=self.opening_angle, at_most=1.5, unit="rad")
-        check_number(self.tolerance, "tolerance", above=0, at_most=1)
+        if self.tolerance is not None:
+            check_number(self.tolerance, "tolerance", above=0, at_most=1)
         check_number(self.start_tolerance, "start_tolerance", above=0, at_most=1)
         if self.sweep_interval is not None:
             check_count(self.sweep_interval, "sweep_interval", at_least=1)

@@ -215,7 +215,7 @@ CASES = [
             "patch_radius": [*POSITIVE, 100],
             "update_radius": [*POSITIVE, 5.0, 100],
             "sweep_interval": [value for value in COUNT if value is not None] + [0],
-            "tolerance": [*POSITIVE, 2.0],
+            "tolerance": [value for value in POSITIVE if value is not None] + [2.0],
             "start_tolerance": [*POSITIVE, 2.0],
             "relaxation_angle": [*NUMBER, -0.1, 3.0],
         },

@@ -220,3 +220,10 @@ def test_bits_do_not_depend_on_threads_batches_and_resumes(small_tip, tmp_path, 
 def test_bad_parameters_of_the_constant_potential_are_refused(bad, message):
     with pytest.raises(ValueError, match=message):
         ae.ConstantPotential(**bad)
+
+
+def test_the_tolerance_of_relaxations_is_that_of_the_rule(tip12):
+    for rule, expected in ((None, 3e-3), (ae.Robin(), 3e-3), (ae.ConstantPotential(), 8e-3)):
+        assert ae.Emitter(tip12, rule=rule).settings.tolerance == expected
+    given = ae.ChargeSettings(tolerance=1e-3)
+    assert ae.Emitter(tip12, rule=ae.ConstantPotential(), settings=given).settings == given
