@@ -3,9 +3,9 @@
     python benchmarks/common_rules.py Ni 80 "0.302 0.540 0.786" MAP.npz --pole -9.6 -0.3 --scale 25.8
 
 The tip has a radius of 80 a and the given axis. The pole of the measured map is at a position [mm], with a scale
-[mm/rad]. Every rule is flown for the same ions; for a fraction that rolls up, every ion takes one of two hits by a
-random number. The azimuth between the patterns is the one with the largest correlation for ``--like``: "all, strongest
-neighbour" for nickel, "none rolls" for aluminium.
+[mm/rad]. Every rule is flown for the same ions; for a fraction that rolls up, once or twice, every ion takes one of
+several hits by random numbers. The azimuth between the patterns is the one with the largest correlation for ``--like``:
+"all, strongest neighbour" for nickel, "none rolls" for aluminium.
 """
 
 import argparse
@@ -30,6 +30,7 @@ def launches(scale, sharpness):
         "all, strongest neighbour": ae.RollUp(energy),
         "none rolls": ae.LateralVelocity(energy, HEIGHT),
         "all roll": ae.RollUp(energy, 1.0, sharpness, HEIGHT),
+        "all roll twice": ae.RollUp(energy, 1.0, sharpness, HEIGHT, second_roll=1.0),
     }
 
 
@@ -66,6 +67,7 @@ def main():
     parser.add_argument("--ions", type=int, default=102_400)
     parser.add_argument("--constant-potential", action="store_true", help="charges; default: Robin's")
     parser.add_argument("--sharpness", type=float, default=0.15, help="of the target of a roll-up")
+    parser.add_argument("--second-roll", type=float, default=0.0, help="part of the ions that roll which roll twice")
     parser.add_argument("--like", default="all, strongest neighbour", help="rule that gives the azimuth")
     options = parser.parse_args()
     measured, place = ae.read_map(options.measured), ae.Projection(options.scale, centre=tuple(options.pole))
@@ -77,7 +79,7 @@ def main():
     axis = tuple(float(index) for index in options.axis.split())
     tip = ae.Tip(material, size, axis=axis, shank_length=2 * size, depth=8 * material.a)
     rule = ae.ConstantPotential() if options.constant_potential else ae.Robin()
-    simulation = ae.Simulation(tip, seed=1, rule=rule, response_settings=ae.ResponseSettings.wide())
+    simulation = ae.Simulation(tip, seed=1, rule=rule, response_settings=ae.ResponseSettings.wide(rolls=2))
     pilot = simulation.run(256, responses=False, progress=False).at_evaporation_field()
     emissions = launches(float(np.median(pilot.energy_scales)), options.sharpness)
     for _ in simulation.emitter.advance(options.skip):
@@ -98,11 +100,12 @@ def main():
         return rings, ae.radial_densities(found, projection, pole)
 
     places = {name: (each.x, each.y) for name, each in hits.items()}
-    u = np.random.default_rng(3).random(len(run))
+    u, v = np.random.default_rng(3).random((2, len(run)))
     for fraction in FRACTIONS:
-        rolls = u < fraction
+        chosen = np.where(u >= fraction, 0, np.where(v >= options.second_roll, 1, 2))
         places[f"rules, fraction {fraction:g}"] = tuple(
-            np.where(rolls, getattr(hits["all roll"], name), getattr(hits["none rolls"], name)) for name in "xy"
+            np.choose(chosen, [getattr(hits[each], name) for each in ("none rolls", "all roll", "all roll twice")])
+            for name in "xy"
         )
     mirror, shift = turn(structure(*places[options.like])[0], target)
     wanted = ae.radial_densities(measured, place)
