@@ -127,15 +127,19 @@ class Emissions:
         """Whether each atom has a neighbour to roll onto, bool (n,)."""
         return np.isfinite(self.neighbours).all(axis=1)
 
-    @property
-    def can_roll_twice(self) -> Booleans:
-        """Whether each atom has a target of a second roll-up, bool (n,); ValueError if the emissions have none."""
+    def known_second_targets(self) -> np.ndarray:
+        """Return the `second_targets`; ValueError if there are none."""
         if self.second_targets is None:
             raise ValueError(
                 "a second roll-up needs its targets, which this run does not have: run with "
                 "response_settings=ResponseSettings(rolls=2) or ResponseSettings.wide(rolls=2)"
             )
-        return np.isfinite(self.second_targets[:, 0]).all(axis=1)
+        return self.second_targets
+
+    @property
+    def can_roll_twice(self) -> Booleans:
+        """Whether each atom has a target of a second roll-up, bool (n,); ValueError if these are not known."""
+        return np.isfinite(self.known_second_targets()[:, 0]).all(axis=1)
 
     @property
     def slowness(self) -> Floats:

@@ -104,7 +104,7 @@ def _direction(emissions, there, steps):
 def _place(emissions, shares, second=False):
     """The target of a roll-up, or the mean of the targets with these shares; shape (n, 3)."""
     if shares is None:
-        return emissions.second_targets[:, 0] if second else emissions.neighbours
+        return emissions.known_second_targets()[:, 0] if second else emissions.neighbours
     return _mean_targets(emissions, shares[:, None], second)[:, 0]
 
 
@@ -196,7 +196,7 @@ def _shares(ratios, n, sharpness):
 
 def _mean_targets(emissions, shares, second=False):
     """Weighted means of the targets, shares (n or 1, m, 3) -> (n, m, 3); a missing target is replaced by the first."""
-    targets = emissions.second_targets if second else emissions.targets
+    targets = emissions.known_second_targets() if second else emissions.targets
     targets = np.where(np.isfinite(targets), targets, targets[:, :1])
     mean = shares[..., 0, None] * targets[:, None, 0]
     for k in (1, 2):

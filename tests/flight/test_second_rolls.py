@@ -5,7 +5,7 @@ import pytest
 
 import apt_evap as ae
 from apt_evap.emission.emissions import Emissions, TangentialLaunches
-from apt_evap.emission.surface_frame import rolled_positions, second_direction
+from apt_evap.emission.surface_frame import launch_tangentially, rolled_positions, second_direction
 
 ENERGY = ae.TruncatedNormal(0.155, 0.155)
 TWICE = ae.RollUp(ENERGY, second_roll=1.0)
@@ -196,6 +196,13 @@ def test_runs_for_one_roll_up_say_so(tip12, perturbation):
     once = ae.Simulation(tip12, seed=5).run(20, progress=False)
     with pytest.raises(ValueError, match=r"rolls=2|ResponseSettings\.wide"):
         once.hits(perturbation)
+
+
+def test_a_second_roll_of_a_users_own_needs_its_targets(tip12):
+    once = ae.Simulation(tip12, seed=5).run(20, progress=False)
+    n = len(once)
+    with pytest.raises(ValueError, match="a second roll-up needs its targets"):
+        launch_tangentially(once.emissions, np.ones(n, bool), np.zeros(n), np.zeros(n), twice=np.ones(n, bool))
 
 
 def test_launches_that_the_responses_do_not_serve_are_refused(tip12):
