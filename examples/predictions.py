@@ -7,7 +7,8 @@ Maps of tips that nobody has fitted, by one set of rules.
 The rules of the emission are those that describe the measured maps of nickel and aluminium best, see the results in
 the documentation: energies of 0.35 eV in real units for all ions, a launch 0.1 nm above the surface, and a fraction of
 ions that rolls up onto a mean of its neighbours. Only this fraction depends on the metal. It is 0.05 for aluminium and
-0.4 for nickel; between their evaporation fields it is interpolated, and beyond them it is constant.
+0.6 for nickel; between their evaporation fields it is interpolated, and beyond them it is constant. With
+``--charges Robin`` the rules are those found with Robin's charges.
 
 By default one small tip is simulated. With ``--full`` all six have R = 80 a and 300,000 ions. The run of each tip is
 stored in the folder ``-o``, so that the script can be stopped and continued.
@@ -92,10 +93,13 @@ names = options.tip or (list(TIPS) if options.full else ["Ni[001]"])
 figure, axes = plt.subplots(-(-len(names) // 3), min(len(names), 3), squeeze=False, layout="constrained")
 figure.set_size_inches(4.6 * axes.shape[1], 4.4 * axes.shape[0])
 for name, axis in zip(names, axes.flat, strict=False):
-    path = options.output and options.output / f"{name.replace('[', '_').rstrip(']')}.h5"
+    stem = f"{name.rstrip(']')} {options.charges}".replace("[", " ").replace(" ", "_")
+    path = options.output and options.output / f"{stem}.h5"
     run, emission = evaporate(*TIPS[name], options.charges, radius, ions, path)
     print(f"{name}: {len(run):,} ions, {emission}")
     draw(axis, name, run, emission, bins)
+for axis in axes.flat[len(names) :]:
+    axis.remove()
 if options.output:
     figure.savefig(options.output / "predictions.png", dpi=110)
 plt.show()
