@@ -16,6 +16,10 @@ _BYTES_PER_ION = 500  # measured: peak memory with 12,000 and 2,000 ions (R = 20
 # of speeds in docs/accuracy_and_speed.rst within 7 %, from R = 20 to 120 a, times 2 for a slower or busy processor.
 _REFERENCE = 21_591  # surface atoms
 _WITH_RESPONSES = 2 * 1.34, 2 * 0.51
+# Of other responses than the usual 30 launches and 25 coefficients: processor times per ion of 43, 119, 187 and 326
+# launches were 1.22, 2.10, 2.86 and 4.59 times as long (R = 20 a); coefficients are three float32.
+_LAUNCHES, _PER_LAUNCH = 30, 1 / 82
+_COEFFICIENTS, _BYTES_PER_COEFFICIENT = 25, 12
 _ONE_FLIGHT = 2 * 0.32, 2 * 0.10
 _LEAST = 0.3  # [ms], of small tips
 _START = 2 * 3e-5  # seconds per surface atom, from the same table
@@ -68,9 +72,15 @@ def foresee(config: Config, threads: int) -> Foresight:
     except TypeError:  # a specimen without apex_radius
         return Foresight(config.n_ions, None, None, None, None)
     memory = _PROGRAM + needed_memory(atoms, surface) + copied_memory(surface, threads)
-    memory += _BYTES_PER_ION * config.n_ions
-    flights = max(1, len(config.emissions))
-    base, slope = _WITH_RESPONSES if config.responses else (flights * value for value in _ONE_FLIGHT)
+    bytes_per_ion, flights, per_flight = _BYTES_PER_ION, max(1, len(config.emissions)), _ONE_FLIGHT
+    if config.responses:
+        designs = config.response_settings.designs
+        launches = sum(len(each.launches) for each in designs)
+        coefficients = sum(len(each.exponents) for each in designs)
+        bytes_per_ion += _BYTES_PER_COEFFICIENT * (coefficients - _COEFFICIENTS)
+        flights, per_flight = 1 + _PER_LAUNCH * (launches - _LAUNCHES), _WITH_RESPONSES
+    memory += bytes_per_ion * config.n_ions
+    base, slope = (flights * value for value in per_flight)
     per_ion = max(_LEAST, base + slope * math.log(surface / _REFERENCE))
     seconds = _START_OF_PROGRAM + _START * surface + 1e-3 * per_ion * config.n_ions
     return Foresight(config.n_ions, atoms, surface, memory, seconds / 3600)

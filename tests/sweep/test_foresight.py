@@ -1,0 +1,32 @@
+"""Memory and hours foreseen for a run."""
+
+import pytest
+
+from apt_evap.config.simulation_file import read_config
+from apt_evap.sweep.foresight import foresee
+
+BASE = """
+[tip]
+material = "Ni"
+apex_radius = 7.04
+axis = [1, 1, 1]
+[simulation]
+ions = 10_000
+"""
+
+
+def foreseen(tmp_path, text=""):
+    (tmp_path / "run.toml").write_text(BASE + text)
+    return foresee(read_config(tmp_path / "run.toml"), 1)
+
+
+@pytest.mark.parametrize(
+    ("table", "ratio", "coefficients"),
+    [("rolls = 2", 1.22, 10), ("wide = true", 2.10, 60), ("wide = true\nshells = 2", 2.86, 108),
+     ("wide = true\nrolls = 2", 4.59, 207)],
+)  # fmt: skip
+def test_responses_with_more_launches_take_longer(tmp_path, table, ratio, coefficients):
+    usual, other = foreseen(tmp_path), foreseen(tmp_path, f"[responses]\n{table}\n")
+    # measured ratios; the time before the first ion is small
+    assert other.hours / usual.hours == pytest.approx(ratio, rel=0.12)
+    assert other.memory - usual.memory == pytest.approx(12 * coefficients * 10_000)
