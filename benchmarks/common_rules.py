@@ -22,16 +22,18 @@ BINS, HALF = 800, 150.0
 MOST_TILTED = 28.0  # degrees: the rings of a pole are inside the map
 
 
-def launches(scale, sharpness):
+def launches(scale, sharpness, twice):
     """Perturbations by name; `scale` is the simulated energy per real energy."""
     energy = ae.TruncatedNormal(ENERGY * scale, ENERGY * scale)
-    return {
+    found = {
         "unperturbed": ae.Unperturbed(),
         "all, strongest neighbour": ae.RollUp(energy),
         "none rolls": ae.LateralVelocity(energy, HEIGHT),
         "all roll": ae.RollUp(energy, 1.0, sharpness, HEIGHT),
-        "all roll twice": ae.RollUp(energy, 1.0, sharpness, HEIGHT, second_roll=1.0),
     }
+    if twice:
+        found["all roll twice"] = ae.RollUp(energy, 1.0, sharpness, HEIGHT, second_roll=1.0)
+    return found
 
 
 def counts(x, y):
@@ -79,9 +81,10 @@ def main():
     axis = tuple(float(index) for index in options.axis.split())
     tip = ae.Tip(material, size, axis=axis, shank_length=2 * size, depth=8 * material.a)
     rule = ae.ConstantPotential() if options.constant_potential else ae.Robin()
-    simulation = ae.Simulation(tip, seed=1, rule=rule, response_settings=ae.ResponseSettings.wide(rolls=2))
+    rolls = 2 if options.second_roll > 0 else 1
+    simulation = ae.Simulation(tip, seed=1, rule=rule, response_settings=ae.ResponseSettings.wide(rolls=rolls))
     pilot = simulation.run(256, responses=False, progress=False).at_evaporation_field()
-    emissions = launches(float(np.median(pilot.energy_scales)), options.sharpness)
+    emissions = launches(float(np.median(pilot.energy_scales)), options.sharpness, rolls == 2)
     for _ in simulation.emitter.advance(options.skip):
         pass
     run = simulation.run(options.ions, list(emissions.values()), responses=False)
@@ -104,7 +107,10 @@ def main():
     for fraction in FRACTIONS:
         chosen = np.where(u >= fraction, 0, np.where(v >= options.second_roll, 1, 2))
         places[f"rules, fraction {fraction:g}"] = tuple(
-            np.choose(chosen, [getattr(hits[each], name) for each in ("none rolls", "all roll", "all roll twice")])
+            np.choose(
+                chosen,
+                [getattr(hits[each], name) for each in ("none rolls", "all roll", "all roll twice")[: 1 + rolls]],
+            )
             for name in "xy"
         )
     mirror, shift = turn(structure(*places[options.like])[0], target)

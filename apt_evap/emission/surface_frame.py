@@ -168,6 +168,7 @@ def target_shares(emissions: Emissions, sharpness: float, second: bool = False) 
     return _second_shares(emissions, sharpness) if second else _first_shares(emissions, sharpness)
 
 
+# two functions, as each one keeps its last result only
 @kept
 def _first_shares(emissions, sharpness):
     return _shares(emissions.charge_ratios, len(emissions), sharpness)
