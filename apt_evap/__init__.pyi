@@ -10,6 +10,7 @@ from ._common.warnings import MapWarning as MapWarning
 from ._common.warnings import RegistrationWarning as RegistrationWarning
 from ._common.warnings import ResponseWarning as ResponseWarning
 from ._common.warnings import RunWarning as RunWarning
+from ._common.warnings import SpecimenWarning as SpecimenWarning
 from ._common.warnings import StructureWarning as StructureWarning
 from .analysis.apex import field_factor as field_factor
 from .analysis.apex import fit_caps as fit_caps
@@ -66,8 +67,10 @@ from .emission.surface_frame import target_shares as target_shares
 from .energy_fit.fit_energies import fit_energies as fit_energies
 from .energy_fit.fit_tips import TipFit as TipFit
 from .energy_fit.fit_tips import fit_tips as fit_tips
+from .energy_fit.grid import EnergyGrid as EnergyGrid
 from .energy_fit.radius import RadiusFit as RadiusFit
 from .energy_fit.radius import fit_radius as fit_radius
+from .energy_fit.settings import FitSettings as FitSettings
 from .energy_fit.study import Study as Study
 from .evaporation.bonds import TUNGSTEN_TABLE as TUNGSTEN_TABLE
 from .evaporation.bonds import CoordinationTable as CoordinationTable

@@ -1,16 +1,19 @@
 """Sphinx: `sphinx-build -W docs docs/_build` in an environment with `pip install '.[docs]'`."""
 
 import shutil
+import sys
 import warnings
 from pathlib import Path
 
 import matplotlib
-from PIL import Image
 
 import apt_evap
 
 HERE = Path(__file__).parent
 GENERATED = HERE / "generated"
+sys.path.insert(0, str(HERE))
+
+import generate  # noqa: E402
 
 project = "apt_evap"
 author = "The apt_evap developers"
@@ -22,23 +25,35 @@ extensions = [
     "sphinx.ext.autosummary",
     "sphinx.ext.mathjax",
     "numpydoc",
+    "sphinx_copybutton",
+    "sphinx_design",
     "sphinx_gallery.gen_gallery",
     "sphinxcontrib.bibtex",
-    "sphinx_design",
 ]
-SECTIONS = ("start", "background", "evidence", "development")  # pages that only list other pages
+SECTIONS = ("tutorials", "howto/index", "physics", "reference", "validation", "results/index", "development")
 default_role = "py:obj"
-rst_prolog = r".. |v| replace:: \|v\|"  # docstrings write the magnitude of v as |v|
+smartquotes = False  # texts in quotes are values to copy
+# docstrings write the magnitude of v as |v|; names in `single backticks` are those of the package
+rst_prolog = r""".. |v| replace:: \|v\|
+
+.. py:currentmodule:: apt_evap
+
+"""
 exclude_patterns = ["_build", "generated/scripts"]
 templates_path = ["_templates"]
 
 autosummary_generate = True
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
+autodoc_typehints = "none"  # the docstrings have the types
 numpydoc_show_class_members = False
 
 bibtex_bibfiles = ["references.bib"]
 bibtex_default_style = "alpha"
+
+generate.api(GENERATED / "api")
+generate.commands(GENERATED / "commands.inc")
+generate.settings(GENERATED / "settings.inc")
 
 # examples write files to the folder where they run: run copies, not the originals
 shutil.copytree(HERE.parent / "examples", GENERATED / "scripts", dirs_exist_ok=True)
@@ -47,7 +62,7 @@ warnings.filterwarnings("ignore", message=".*non-interactive.*")
 sphinx_gallery_conf = {
     "examples_dirs": str(GENERATED / "scripts"),
     "gallery_dirs": str(GENERATED / "gallery"),
-    "filename_pattern": r"/tutorial_",  # the figures of the paper take minutes and are not run
+    "filename_pattern": r"/tutorial_",  # the other examples need a measured file
     "within_subsection_order": "ExampleTitleSortKey",
     "download_all_examples": False,
     "show_memory": False,
@@ -55,31 +70,40 @@ sphinx_gallery_conf = {
     "write_computation_times": False,
 }
 
-# pictures of the cards on the front page: parts of figures, given by left, upper, right and lower fractions
-CARDS = {
-    "first_map": ("ni111.png", (0.555, 0.12, 0.895, 0.86)),
-    "accuracy": ("figure7.png", (0.50, 0.05, 0.985, 0.362)),
-    "results": ("figure6.png", (0.711, 0.10, 0.939, 0.453)),
-    "physics": ("figure2.png", (0.555, 0.048, 0.895, 0.26)),
-    "code": ("figure2.png", (0.064, 0.045, 0.424, 0.30)),
-}
-(GENERATED / "cards").mkdir(parents=True, exist_ok=True)
-for name, (figure, (left, upper, right, lower)) in CARDS.items():
-    picture = Image.open(HERE / figure)
-    width, height = picture.size
-    box = (round(left * width), round(upper * height), round(right * width), round(lower * height))
-    picture.crop(box).save(GENERATED / "cards" / f"{name}.png")
+copybutton_prompt_text = "$ "
+copybutton_exclude = ".linenos, .gp"
 
 html_theme = "pydata_sphinx_theme"
 html_title = f"apt_evap {version}"
+html_logo = "_static/logo.svg"
+html_favicon = "_static/favicon.svg"
 html_static_path = ["_static"]
 html_css_files = ["pages.css"]
 html_show_sourcelink = False
 # no empty columns: the front page has no sidebars, and pages that only list other pages have no table of contents
 html_sidebars = {"index": [], "search": [], "genindex": []}
 html_theme_options = {
+    "logo": {"text": "apt_evap"},
+    "header_links_before_dropdown": 8,
     "show_toc_level": 2,
-    "show_nav_level": 2,
+    "show_nav_level": 1,
     "navigation_with_keys": False,
     "secondary_sidebar_items": {"**": ["page-toc"], "index": [], **{section: [] for section in SECTIONS}},
 }
+
+
+def in_package(app, env, node, contnode):
+    """Link to a public name from a docstring of a module below the package, and to the class of a field."""
+    if node.get("reftype") != "obj":
+        return None
+    node["py:module"], node["py:class"] = "apt_evap", None
+    python, target = env.domains["py"], node["reftarget"]
+    for name in filter(None, (target, target.rpartition(".")[0])):
+        found = python.resolve_xref(env, node["refdoc"], app.builder, "obj", name, node, contnode)
+        if found is not None:
+            return found
+    return None
+
+
+def setup(app):
+    app.connect("missing-reference", in_package)

@@ -14,7 +14,7 @@ ions, which take a quarter of an hour on two cores. The script writes the run. F
 similarity matrix, the maps side by side, and a JSON file.
 """
 
-# sphinx_gallery_thumbnail_path = 'figure3.png'
+# sphinx_gallery_thumbnail_path = '../articles/hidden_energies/figure6.png'
 
 import argparse
 from pathlib import Path
@@ -85,7 +85,7 @@ else:
     run.save(folder / "run.h5")
 compression = ae.image_compression(run).compression
 distance = 100.0
-run = run.seen_by(ae.Detector(distance=distance, width=4 * distance, projection="equidistant"))
+run = run.on_detector(ae.Detector(distance=distance, width=4 * distance, projection="equidistant"))
 print(run)
 
 # %%
@@ -109,9 +109,8 @@ print(f"from poles: {start}\nfrom maps: {registration}, correlation {registratio
 
 np.set_printoptions(precision=3, suppress=True)
 for mechanism in options.mechanism or MECHANISMS:
-    study = ae.fit_energies(
-        run, measured, mechanism, registration=registration, bins=options.bins, smoothing=options.smoothing
-    )
+    settings = ae.FitSettings(bins=options.bins, smoothing=options.smoothing)
+    study = ae.fit_energies(run, measured, ae.EnergyGrid(mechanism), settings, registration=registration)
     print(f"\n{study}\n{study.ssim}")
     study.save(folder / f"{mechanism}.json")
     ae.plot.ssim_matrix(study)[0].figure.savefig(folder / f"{mechanism}_ssim.png")

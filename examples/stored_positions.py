@@ -15,7 +15,7 @@ The flight length is not in the file. It can hardly be told apart from the image
 distance in rings and depths of the best one. One million ions take a minute.
 """
 
-# sphinx_gallery_thumbnail_path = 'figure7.png'
+# sphinx_gallery_thumbnail_path = '../articles/origins/origins.png'
 
 import argparse
 from itertools import pairwise

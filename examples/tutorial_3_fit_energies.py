@@ -67,15 +67,8 @@ ae.plot.overlay(guess, measured_map.smoothed(0.6), registration).figure.savefig(
 # For the true energies, it is therefore about 1 within the error, although two noisy maps are never equal. In this
 # example, a small grid of energies is sufficient. Without ``means`` and ``rsds``, the grid is that of :cite:t:`Shaikh`.
 
-study = ae.fit_energies(
-    run,
-    measured_map,
-    mechanism="roll-up",
-    means=(0.01, 0.0825, 0.155, 0.2275, 0.3),
-    rsds=(0.0316, 0.1, 0.316, 1.0, 3.16),
-    registration=registration,
-    resamples=100,
-)
+grid = ae.EnergyGrid("roll-up", means=(0.01, 0.0825, 0.155, 0.2275, 0.3), rsds=(0.0316, 0.1, 0.316, 1.0, 3.16))
+study = ae.fit_energies(run, measured_map, grid, ae.FitSettings(resamples=100), registration=registration)
 print(study)
 
 # %%

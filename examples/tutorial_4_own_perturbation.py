@@ -6,7 +6,7 @@ A perturbation is any object with a method that takes a batch of emissions. In t
 velocity along the surface, and only a fraction of them rolls up.
 """
 
-# sphinx_gallery_thumbnail_path = 'figure2.png'
+# sphinx_gallery_thumbnail_path = '../articles/paper_figures/figure2.png'
 
 import sys
 from dataclasses import dataclass, replace

@@ -17,6 +17,8 @@ from matplotlib.figure import Figure
 
 sys.path.append(str(Path(__file__).parent))  # for twins.py, whatever the import mode
 
+from rough import ROUGH
+
 import apt_evap as ae
 
 # a shell that has put the tests into the background lets them ignore Ctrl-C, which some of them press
@@ -95,14 +97,13 @@ def tip20(nickel):
 
 @pytest.fixture(scope="session")
 def run20(tip20, made_once):
-    """15,000 ions of `tip20`, each flown at rest and rolled up."""
+    """15,000 ions of `tip20`, each flown at rest and rolled up, with responses."""
     detector = ae.Detector(distance=100.0, width=300.0)
     flown = (ae.Unperturbed(), ae.RollUp(ae.TruncatedNormal(0.155, 0.155)))
 
     def make():
-        flight = ae.FlightSettings(opening_angle=0.6, tolerance=1e-2)  # to 0.1 mm: patterns of many mm are looked at
-        simulation = ae.Simulation(tip20, voltage=1000.0, seed=1, detector=detector, flight_settings=flight)
-        return simulation.run(15_000, flown, responses=False, progress=False)
+        simulation = ae.Simulation(tip20, voltage=1000.0, seed=1, detector=detector, **ROUGH)
+        return simulation.run(15_000, flown, progress=False)
 
     return made_once("run20", make)
 

@@ -2,11 +2,10 @@
 
 python tools/fuzz_runs.py [--mutants 20000] [--seed 1] [--processes 2] [--run RUN.h5] [--state STATE.h5]
 
-Each mutant is loaded in a child process. It must come back as the original or be refused by a FileError. Those whose
-checksums were made again after the damage are told apart: nothing can notice their damage for certain, but it should
-end in a FileError or in other values, and in no crash. Files of your own, such as those of an earlier version without
-checksums, take the place of the two that are made here. Exit code 1 if a mutant with the checksums of the original is
-silently wrong, hangs, or ends in a crash or in another error.
+Each mutant is loaded in a child process. It must come back as the original or be refused by a FileError. Mutants whose
+digest was made again after the damage are counted separately: nothing can notice their damage for certain, but it
+should end in a FileError or in other values, and in no crash. Exit code 1 if a mutant with the digest of the original
+is silently wrong, hangs, or ends in a crash or in another error.
 """
 
 import argparse
@@ -28,8 +27,9 @@ from pathlib import Path
 import numpy as np
 
 import apt_evap as ae
-from apt_evap.simulation import checked_hdf5
 from apt_evap.simulation.run_hdf5 import count_ions, is_run, read_state, write_state
+from apt_evap.storage import digested_hdf5
+from apt_evap.storage.digested_hdf5 import tail_of
 
 KINDS = ("flipped bits", "zeroed range", "random range", "truncation", "insertion", "deletion")
 GOOD = ("as the original", "FileError")
@@ -89,20 +89,11 @@ def mutant(content, random):
     return bytes(damaged), kind
 
 
-def sealed(content, blocks):
-    """An HDF5 file with checksums that fit it."""
-    end = blocks["begin"] + blocks["size"]
+def sealed(content, tail):
+    """An HDF5 file with a digest that fits it."""
     file = io.BytesIO(content)
-    checked_hdf5._append_sums(file, blocks[end <= len(content)].copy())
-    return file.getvalue()
-
-
-def split(content):
-    """An HDF5 file without its checksums, and the blocks that these are of; none of a file of an earlier version."""
-    if (tail := checked_hdf5._tail(io.BytesIO(content), len(content))) is None:
-        return content, np.empty(0, checked_hdf5._BLOCK)
-    _, size, n = tail
-    return content[:size], np.frombuffer(content[size:], checked_hdf5._BLOCK, n)
+    end = digested_hdf5._end(len(content), tail)
+    return content + digested_hdf5._digest(file, len(content), end) + end
 
 
 def outcome_of(path, load, original):
@@ -115,9 +106,9 @@ def outcome_of(path, load, original):
         return f"{type(error).__name__}: {error!s:.60}"
 
 
-def try_some(numbers, seed, content, load, original, seal, folder):
+def try_some(numbers, seed, content, load, original, seal, folder, original_path):
     """Outcomes of some mutants; a child that dies takes one with it, and another child goes on behind that."""
-    inner, blocks = split(content)
+    inner, tail = content[: -digested_hdf5._TAIL.size], tail_of(original_path)
     path, done = Path(folder) / f"{os.getpid()}.h5", []
     while len(done) < len(numbers):
         reader, writer = os.pipe()
@@ -130,7 +121,7 @@ def try_some(numbers, seed, content, load, original, seal, folder):
                 for number in numbers[len(done) :]:
                     signal.alarm(SECONDS)
                     damaged, kind = mutant(inner if seal else content, np.random.default_rng([seed, number]))
-                    path.write_bytes(sealed(damaged, blocks) if seal else damaged)
+                    path.write_bytes(sealed(damaged, tail) if seal else damaged)
                     print(json.dumps([kind, None]), file=told, flush=True)
                     print(json.dumps([kind, outcome_of(path, load, original)]), file=told, flush=True)
             os._exit(0)
@@ -150,7 +141,7 @@ def fuzz(name, path, load, options, seal, folder):
     original = values_of(load(path))
     content, began = path.read_bytes(), time.perf_counter()
     numbers = [list(range(k, options.mutants, 50 * options.processes)) for k in range(50 * options.processes)]
-    same = (options.seed, content, load, original, seal, folder)
+    same = (options.seed, content, load, original, seal, folder, path)
     context = multiprocessing.get_context("fork")
     with context.Pool(options.processes) as pool:
         parts = pool.starmap(try_some, [(part, *same) for part in numbers if part], chunksize=1)
@@ -159,7 +150,7 @@ def fuzz(name, path, load, options, seal, folder):
         counts[kind, outcome] += 1
         firsts.setdefault(outcome, number)
     seconds = time.perf_counter() - began
-    how = "checksums made again" if seal else "as damaged"
+    how = "digest made again" if seal else "as damaged"
     print(f"{name} ({len(content):,} bytes), {how}: {options.mutants:,} mutants in {seconds:.0f} s")
     for outcome in sorted(firsts):
         by_kind = ", ".join(f"{kind} {counts[kind, outcome]:,}" for kind in KINDS if counts[kind, outcome])
@@ -172,7 +163,7 @@ def fuzz(name, path, load, options, seal, folder):
 def main():
     """Damage the files as often as the command line says."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--mutants", type=int, default=1000, help="of each file, and as many with new checksums")
+    parser.add_argument("--mutants", type=int, default=1000, help="of each file, and as many with a new digest")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--run", type=Path, help="a run file instead of the one that is made here")
@@ -184,8 +175,7 @@ def main():
         well = True
         for name, path, load in files:
             well &= fuzz(name, path, load, options, False, folder)
-            if checked_hdf5.has_checksums(path):
-                fuzz(name, path, load, options, True, folder)
+            fuzz(name, path, load, options, True, folder)
     sys.exit(not well)
 
 

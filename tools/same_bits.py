@@ -1,14 +1,16 @@
-"""Compare two commits bit by bit: install both, make three runs with each, and compare every dataset.
+"""Compare two commits bit by bit: install both, make the same runs with each, and compare the hashes of the results.
 
     python tools/same_bits.py BASE [HEAD]        two commits; HEAD is the working tree if not given
     python tools/same_bits.py BASE --times 5     the same, and pairs of timed runs
 
-The runs: Ni[111], R = 20 a, with responses; a random alloy with a user-defined perturbation; a shell with R = 60 a
-that is deepened. Prints the hashes of each dataset that differs. The exit code is 1 if a dataset differs.
+The runs: Ni[111], R = 20 a, with responses; two phases at a temperature with a controlled voltage; a constant
+potential with responses for two roll-ups; a random alloy with a user-defined perturbation; a shell with R = 60 a that
+is deepened. Compared are `Run.fingerprint`, and the hits of the ions: unperturbed and rolled up. The exit code is 1 if
+one differs.
 """
 
 import argparse
-import hashlib
+import json
 import statistics
 import subprocess
 import sys
@@ -18,6 +20,8 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 
 CASES = """
+import hashlib
+import json
 import sys
 import time
 import warnings
@@ -41,25 +45,45 @@ class FromAbove:
 
 
 def simulation(name):
+    nickel, aluminium = ae.material("Ni"), ae.material("Al")
+    a = nickel.a
     if name == "nickel":
-        nickel = ae.material("Ni")
-        tip = ae.Tip(nickel, apex_radius=20 * nickel.a, axis=(1, 1, 1), shank_length=20 * nickel.a)
+        tip = ae.Tip(nickel, apex_radius=20 * a, axis=(1, 1, 1), shank_length=20 * a)
         return ae.Simulation(tip, seed=1, detector=ae.Detector(distance=100.0, width=300.0)), 3000, ()
+    if name == "phases":
+        core = ae.Sphere((0, 0, 8 * a), 3 * a)
+        matrix = ae.Phase("matrix", nickel, solutes={"Al": 0.1})
+        phases = [matrix, ae.Phase("core", nickel, core, evaporation_field=30.0)]
+        tip = ae.Tip(phases=phases, apex_radius=12 * a, axis=(0, 0, 1), seed=4)
+        control = ae.VoltageControl(rate=0.02, memory=100)
+        return ae.Simulation(tip, seed=4, law=ae.Arrhenius(60.0), control=control), 2000, ()
+    if name == "potential":
+        tip = ae.Tip(nickel, apex_radius=12 * a, axis=(1, 1, 1))
+        rule = ae.ConstantPotential(charges="gaussian")
+        return ae.Simulation(tip, seed=5, rule=rule, response_settings=ae.ResponseSettings(rolls=2)), 1500, ()
     if name == "alloy":
-        al = ae.material("Al")
-        tip = ae.Tip(al, apex_radius=12 * al.a, axis=(0, 1, 2), solutes={"Ni": 0.05}, seed=3, offset_seed=5)
+        radius = 12 * aluminium.a
+        tip = ae.Tip(aluminium, apex_radius=radius, axis=(0, 1, 2), solutes={"Ni": 0.05}, seed=3, offset_seed=5)
         return ae.Simulation(tip, seed=2, voltage=800.0), 3000, (FromAbove(0.3), ae.LateralVelocity(0.2))
-    nickel = ae.material("Ni")
-    tip = ae.Tip(nickel, apex_radius=60 * nickel.a, axis=(1, 1, 1), shank_length=20 * nickel.a, depth=0.9)
+    tip = ae.Tip(nickel, apex_radius=60 * a, axis=(1, 1, 1), shank_length=20 * a, depth=0.9)
     return ae.Simulation(tip, seed=3), 1500, ()
 
 
-for name in sys.argv[2:]:
+def digest(hits):
+    columns = [np.nan_to_num(each, nan=-1e9) for each in (hits.x, hits.y, hits.time_of_flight)]
+    return hashlib.sha256(b"".join(np.ascontiguousarray(each).tobytes() for each in columns)).hexdigest()[:16]
+
+
+for name in sys.argv[1:]:
     case, ions, emissions = simulation(name)
     start = time.perf_counter()
     run = case.run(ions, emissions, progress=False)
-    print(name, time.perf_counter() - start, len(case.tip.positions), flush=True)
-    run.save(f"{sys.argv[1]}/{name}.h5")
+    seconds = time.perf_counter() - start
+    rolled = ae.RollUp(ae.TruncatedNormal(0.155, 0.155), **({"second_roll": 0.3} if name == "potential" else {}))
+    hashes = {"run": run.fingerprint()} | {repr(each): digest(run.hits(each)) for each in (ae.Unperturbed(), rolled)}
+    if name != "phases":
+        hashes["real units"] = digest(run.at_evaporation_field().hits(rolled))
+    print(json.dumps([name, seconds, hashes]), flush=True)
 """
 
 
@@ -83,27 +107,10 @@ def install(commit, folder):
 
 
 def run_cases(python, folder, cases):
-    """Make the runs; return their times [s] by name."""
-    outcome = subprocess.run(
-        [python, folder / "cases.py", folder, *cases], check=True, cwd=folder, capture_output=True, text=True
-    )
-    return {line.split()[0]: float(line.split()[1]) for line in outcome.stdout.splitlines()}
-
-
-def datasets(path):
-    """Hash of every dataset of a run file, by name."""
-    import h5py  # from the environment of this tool
-
-    hashes = {}
-
-    def visit(name, item):
-        if isinstance(item, h5py.Dataset) and item.dtype.kind in "biuf":  # no texts, such as the time
-            values = item[()]
-            hashes[name] = hashlib.sha256(str(values.dtype).encode() + str(values.shape).encode() + values.tobytes())
-
-    with h5py.File(path) as file:
-        file.visititems(visit)
-    return {name: digest.hexdigest()[:16] for name, digest in hashes.items()}
+    """Make the runs; return their times [s] and their hashes by name."""
+    command = [python, folder / "cases.py", *cases]
+    outcome = subprocess.run(command, check=True, cwd=folder, capture_output=True, text=True)
+    return {name: (seconds, hashes) for name, seconds, hashes in map(json.loads, outcome.stdout.splitlines())}
 
 
 def main():
@@ -113,27 +120,25 @@ def main():
     parser.add_argument("head", nargs="?")
     parser.add_argument("--times", type=int, default=0, help="number of pairs of timed runs")
     options = parser.parse_args()
-    cases = ("nickel", "alloy", "shell")
+    cases = ("nickel", "phases", "potential", "alloy", "shell")
     with tempfile.TemporaryDirectory() as folder:
-        sides = {}
+        sides, results = {}, {}
         for side, commit in (("base", options.base), ("head", options.head)):
             path = Path(folder, side)
             path.mkdir()
             sides[side] = install(commit, path), path
-            run_cases(*sides[side], cases)
+            results[side] = run_cases(*sides[side], cases)
         differences = 0
         for case in cases:
-            base, head = (datasets(path / f"{case}.h5") for _, path in sides.values())
-            for name in sorted(base | head):
-                if base.get(name) != head.get(name):
-                    differences += 1
-                    print(f"{case}: {name} {base.get(name)} -> {head.get(name)}")
-            print(f"{case}: {sum(base[name] == head.get(name) for name in base)} of {len(base)} datasets equal")
+            base, head = (list(results[side][case][1].items()) for side in ("base", "head"))
+            for (name, one), (_, other) in zip(base, head, strict=True):
+                differences += one != other
+                print(f"{case}, {name}: {'equal' if one == other else f'{one} -> {other}'}")
         ratios = {case: [] for case in cases}
         for _ in range(options.times):
             base, head = (run_cases(*sides[side], cases) for side in ("base", "head"))
             for case in cases:
-                ratios[case].append(head[case] / base[case])
+                ratios[case].append(head[case][0] / base[case][0])
         for case, values in ratios.items():
             if values:
                 print(f"{case}: head / base {statistics.median(values):.3f} ({min(values):.3f} to {max(values):.3f})")

@@ -1,5 +1,6 @@
 """Reading and writing of files: error messages of one sentence, and no incomplete files."""
 
+import hashlib
 import os
 import re
 import secrets
@@ -98,6 +99,12 @@ def read_small_file(path: AnyPath, at_most: int, what: str) -> bytes:
     if size > at_most:
         raise FileError(f"{str(path)!r} has more than {at_most} bytes, expected {what}")
     return b"".join(parts)
+
+
+def sha256_of(path: AnyPath) -> str:
+    """SHA-256 of the content of a file, str; FileError if it cannot be read."""
+    with open_for_reading(path) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]  # an unbuffered file
 
 
 @contextmanager

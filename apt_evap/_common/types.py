@@ -1,6 +1,7 @@
 """Types of arrays and paths in signatures."""
 
 import os
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,3 +10,5 @@ AnyPath = str | os.PathLike[str]
 Booleans = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
+# A column that may be missing, None: Any lets a checker accept its use without a test for None, and the test, too.
+Column = NDArray[Any] | Any

@@ -112,6 +112,7 @@ def check_number(
     ValueError
         Names the argument, its value and the bounds.
     """
+    value = value.item() if isinstance(value, np.number) else value  # bounds may overflow in single precision
     number = isinstance(value, Real) and not isinstance(value, bool)
     if number and at_most is None and below is None and _LARGEST < abs(value) < math.inf:
         at_most = _LARGEST

@@ -6,7 +6,7 @@ class AptWarning(UserWarning):
 
 
 class DataWarning(AptWarning):
-    """Incomplete or ambiguous ions, ranges or files: the text says what was lost, skipped or assumed."""
+    """Incomplete or ambiguous ions, ranges, specimens or files: the text says what was lost, skipped or assumed."""
 
 
 class ChargesWarning(AptWarning):
@@ -27,6 +27,10 @@ class RegistrationWarning(AptWarning):
 
 class StructureWarning(AptWarning):
     """A best map by similarity that has lost the zone lines of the measured one."""
+
+
+class SpecimenWarning(AptWarning):
+    """A specimen in an unusual position: upside down, or lying on its side."""
 
 
 class RunWarning(AptWarning):

@@ -8,6 +8,8 @@ from apt_evap.detection.binning import find_quantisations
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.simulation.run import Run
+from apt_evap.specimen.posture import apex_sphere, depths
+from apt_evap.specimen.tip import Tip
 
 UNITS = {
     "x": "mm",
@@ -29,6 +31,10 @@ UNITS = {
     "median_residual": "mm",
     "flagged_above": "mm",
     "apex_radius": "nm",
+    "height": "nm",
+    "extent_x": "nm",
+    "extent_y": "nm",
+    "extent_z": "nm",
     "shank_length": "nm",
     "shank_angle": "degrees",
     "rotation": "degrees",
@@ -52,13 +58,13 @@ UNITS = {
 _MEASURED = ("x", "y", "time_of_flight", "voltage", "pulse_voltage", "mass_to_charge", "positions", "pulse_id")
 
 
-def describe(data: Run | Hits | DetectorMap) -> dict[str, Any]:
-    """Summarise a run, ions or a map.
+def describe(data: Run | Hits | DetectorMap | Tip) -> dict[str, Any]:
+    """Summarise a run, ions, a map or a specimen.
 
     Parameters
     ----------
-    data : Run or Hits or DetectorMap
-        Result of `apt_evap.read`.
+    data : Run or Hits or DetectorMap or Tip
+        Result of `apt_evap.read` or `apt_evap.read_tip`.
 
     Returns
     -------
@@ -67,7 +73,41 @@ def describe(data: Run | Hits | DetectorMap) -> dict[str, Any]:
     """
     if isinstance(data, DetectorMap):
         return _of_map(data)
+    if isinstance(data, Tip):
+        return _of_tip(data)
     return _of_run(data) if isinstance(data, Run) else _of_hits(data)
+
+
+def _of_tip(tip):
+    low, high = tip.positions.min(axis=0), tip.positions.max(axis=0)
+    names = [element.name for element in tip.elements]
+    contents = {
+        "kind": "specimen",
+        "atoms": len(tip),
+        "species": _counts(names, tip.species),
+        "evaporable": int(tip.evaporable.sum()),
+        "extent_x": [_plain(low[0]), _plain(high[0])],
+        "extent_y": [_plain(low[1]), _plain(high[1])],
+        "extent_z": [_plain(low[2]), _plain(high[2])],
+        "height": _plain(high[2] - low[2]),
+        "apex_radius": None,
+    }
+    sphere = apex_sphere(tip.positions)
+    if sphere is not None:
+        contents["apex_radius"] = _plain(sphere[1])
+        contents["atoms_above"] = _atoms_above(tip, depths(tip.positions, *sphere), names)
+    return contents
+
+
+def _atoms_above(tip, depth, names):
+    """Atoms that are less deep than the first one of a minority, by phase or by species, within 45 degrees."""
+    labels, groups = (tip.phase, tip.phase_names) if len(tip.phase_names) > 1 else (tip.species, names)
+    above = {}
+    for number, name in enumerate(groups):
+        own = depth[labels == number]
+        if number and np.isfinite(own).any():
+            above[name] = int(np.count_nonzero(depth < np.nanmin(own)))
+    return above
 
 
 def _of_map(map):

@@ -5,6 +5,8 @@ on the critical surface, about half a nanometre outside. The probability is that
 barrier in the field there. The ions then fly to the screen.
 """
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 import math
 from dataclasses import asdict, dataclass, field
 from types import MappingProxyType
@@ -381,7 +383,7 @@ def field_ion_image(
         magnification=_magnification(starts - centre, x, y, detector, radius),
         voltage=emitter.voltage * scale,
         detector=detector,
-        settings=MappingProxyType(constants),
+        settings=constants,
     )
 
 

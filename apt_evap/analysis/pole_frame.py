@@ -1,5 +1,7 @@
 """Bins of a map in the frame of a pole: angle from the pole, azimuth, hits and solid angle."""
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 from typing import NamedTuple, Protocol
 
 import numpy as np

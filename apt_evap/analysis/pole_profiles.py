@@ -1,5 +1,7 @@
 """Profiles about a pole in degrees of crystal angle: density against the angle from it, and across its zone lines."""
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 from collections.abc import Sequence
 
 import numpy as np

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
+from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence
 from apt_evap.detection.detector_map import DetectorMap
@@ -25,6 +26,9 @@ class Profile(NamedTuple):
     """Poisson error of the density (one standard deviation), NaN for maps of densities, shape (bins,)."""
     unit: str = "mm"
     """Unit of the position: mm or degrees."""
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 @dataclass(frozen=True)
@@ -225,6 +229,9 @@ class ProfileComparison(NamedTuple):
     """Probability that counting noise alone gives a larger chi_square."""
     relative: float
     """Root mean square difference of the densities after subtraction of the noise; 0 if noise explains all of it."""
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def compare_profiles(first: Profile, second: Profile) -> ProfileComparison:

@@ -1,10 +1,13 @@
 """Tracks on the detector of selected ions of a run, for varying launch energy and direction."""
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from apt_evap._common.short_repr import short_repr
 from apt_evap._common.validation import check_array, check_kind
 from apt_evap.emission.emissions import TangentialLaunches
 from apt_evap.emission.surface_frame import rollup_direction
@@ -21,6 +24,9 @@ class Tracks(NamedTuple):
     """[mm], same shape."""
     energies: np.ndarray
     """Launch energies [eV], shape (m,)."""
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def lateral_tracks(run: Run, ions: ArrayLike, energies: ArrayLike, azimuths: ArrayLike | None = None) -> Tracks:
@@ -52,7 +58,8 @@ def lateral_tracks(run: Run, ions: ArrayLike, energies: ArrayLike, azimuths: Arr
     azimuths = np.radians(azimuths)
     speeds = speed_from_energy(energies, run.emissions.masses[ions][:, None])[:, :, None]
     velocities = np.stack([speeds * np.cos(azimuths), speeds * np.sin(azimuths)], axis=-1)
-    return Tracks(*_places(run, ions, velocities, rolled=False), energies)
+    x, y = _places(run, ions, velocities, rolled=False)
+    return Tracks(x, y, energies)
 
 
 def rollup_tracks(run: Run, ions: ArrayLike, energies: ArrayLike) -> Tracks:
@@ -103,10 +110,10 @@ def _places(run, ions, velocities, rolled):
     """Positions on the detector [mm], shape (...), of launches along the surface [nm/ns] of shape (..., 2)."""
     shape = velocities.shape[:-1]
     repeats = np.repeat(ions, int(np.prod(shape[1:])))
-    responses = run.responses[repeats]
+    chosen = run[repeats]
     first, second = velocities.reshape(-1, 2).T
     starts = np.full(len(repeats), rolled)
     launches = TangentialLaunches(starts, first, second)
-    ends = run.response_model.evaluate(responses, launches, run.emissions.masses[repeats])
+    ends = run.response_model.evaluate(chosen.responses, launches, chosen.emissions.masses)
     x, y, *_ = run.detector.impacts(*ends)
     return x.reshape(shape), y.reshape(shape)

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
+import skimage
 
 from apt_evap._common.types import Booleans, Floats
 from apt_evap._common.validation import check_kind, check_number, check_seed
@@ -42,8 +43,8 @@ def local_moments(density: Floats) -> Moments:
     return Moments(density, mean, window_mean(density**2) - mean**2)
 
 
-def local_similarity(first: Moments, second: Moments, data_range: float, noise: float | Floats = 0.0) -> Floats:
-    r"""Structural similarity in the window around every bin.
+def local_similarity(first: Moments, second: Moments, data_range: float, noise: float | Floats) -> Floats:
+    r"""Structural similarity in the window around every bin, corrected for noise, of maps or of stacks of maps.
 
     Parameters
     ----------
@@ -52,7 +53,7 @@ def local_similarity(first: Moments, second: Moments, data_range: float, noise: 
     data_range : float
         Range L of the densities.
     noise : float or ndarray
-        Sum of the noise variances of both maps, which counts as common structure, shape (ny, nx); 0 by default.
+        Sum of the noise variances of both maps, which counts as common structure, shape (ny, nx); 0 for none.
 
     Returns
     -------
@@ -76,8 +77,8 @@ def local_similarity(first: Moments, second: Moments, data_range: float, noise: 
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Similarity:
-    """Structural similarity of two maps, with its parameters; ``float(similarity)`` is its value.
+class Similarity(float):
+    """Structural similarity of two maps, a float with the parameters of the comparison.
 
     Parameters
     ----------
@@ -105,8 +106,8 @@ class Similarity:
     data_range: float
     inside: int
 
-    def __float__(self) -> float:
-        return self.value
+    def __new__(cls, value: float, *parameters: Any, **named: Any) -> "Similarity":  # noqa: D102
+        return super().__new__(cls, value)
 
     def __repr__(self) -> str:
         return (
@@ -145,7 +146,7 @@ def ssim(map_a: DetectorMap, map_b: DetectorMap, *, smoothing: float = 0.0, data
     Notes
     -----
     Wang, Bovik, Sheikh and Simoncelli, IEEE Trans. Image Process. 13, 600 (2004): Gaussian windows of
-    1.5 bins, K1 = 0.01, K2 = 0.03 (`local_similarity`).
+    1.5 bins, K1 = 0.01, K2 = 0.03, computed by ``skimage.metrics.structural_similarity``.
     """
     smoothing = check_number(smoothing, "smoothing", at_least=0, unit="mm")
     data_range = check_number(data_range, "data_range", above=0)
@@ -159,11 +160,13 @@ def ssim(map_a: DetectorMap, map_b: DetectorMap, *, smoothing: float = 0.0, data
             f"the common mask of the two maps must contain a window of {2 * WINDOW + 1} bins, got "
             f"{np.count_nonzero(common)} common bins"
         )
-    first, second = (
-        local_moments(np.where(common, replace(each.smoothed(smoothing), mask=common).density, 1.0))
-        for each in (map_a, map_b)
+    densities = (
+        np.where(common, replace(each.smoothed(smoothing), mask=common).density, 1.0) for each in (map_a, map_b)
     )
-    local = local_similarity(first, second, data_range)
+    # its window ends at 3.5 sigma, as TRUNCATE
+    _, local = skimage.metrics.structural_similarity(
+        *densities, data_range=data_range, gaussian_weights=True, sigma=SIGMA, use_sample_covariance=False, full=True
+    )
     return Similarity(
         value=float(local[inside].mean()),
         local=np.where(inside, local, np.nan),

@@ -1,10 +1,13 @@
 """Evaporation voltage of the ions of a run, and the course of a quantity over the ions."""
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_count, check_kind
 from apt_evap.simulation.run import Run
@@ -21,6 +24,9 @@ class Course(NamedTuple):
     """50th percentile."""
     high: np.ndarray
     """95th percentile."""
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def evaporation_fields(run: Run) -> Floats:

@@ -1,5 +1,7 @@
 """Width of a zone line, fitted to a profile across it."""
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 from dataclasses import dataclass
 
 import numpy as np

@@ -12,6 +12,7 @@ import numpy as np
 from apt_evap import plot
 from apt_evap._common.files import FileError, check_path, open_for_reading, replace_file
 from apt_evap._common.types import AnyPath
+from apt_evap._common.validation import did_you_mean
 from apt_evap._version import __version__
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
@@ -51,7 +52,7 @@ def _read(options):
             what = "ions" if is_map else "a map in an .npz file"
             raise ValueError(f"--{name} is for {what}, got {options.file!r}")
     if path.is_dir():
-        return load(path, partial=bool(options.partial))  # an unfinished run
+        return load(path)  # an unfinished run
     try:
         parameters = {key: value for key, value in parameters.items() if value is not None}
         return read_file(options.file, format=options.format, **parameters)
@@ -66,7 +67,7 @@ def in_real_units(run: Run, options: argparse.Namespace) -> Run:
     """The run, in real units if the options ask for them; a run that already is keeps its own."""
     if options.real_units is None or (run.units is not None and run.units.field_reference == options.real_units):
         return run
-    return run.at_evaporation_field(options.real_units)
+    return run.at_evaporation_field(field_reference=options.real_units)
 
 
 _SELECTING = ("ions", "mass", "voltage", "circle", "box", "ranges", "species")
@@ -79,15 +80,19 @@ def selects(options: argparse.Namespace) -> bool:
 
 def select(hits: Hits, options: argparse.Namespace) -> Hits:
     """Select ions by the options; ValueError if a column is missing, or no ion remains."""
-    if (options.ranges is None) != (options.species is None):
-        raise ValueError("--ranges and --species must be used together: a file of ranges, and names of its species")
+    if options.species is None and options.ranges is not None:
+        raise ValueError(f"--species is missing: names of species in {options.ranges!r}")
+    if options.species is not None and options.ranges is None and "element" not in hits.extra:
+        raise ValueError(
+            "--species needs --ranges, a file of ranges of mass: only the ions of a run have known elements"
+        )
     steps: dict[str, Callable[[Hits, Any], Hits]] = {
         "ions": lambda hits, bounds: hits.window(ion=bounds),  # first: numbers of the ions in the file
         "mass": lambda hits, bounds: hits.window(mass_to_charge=bounds),
         "voltage": lambda hits, bounds: hits.window(voltage=bounds),
         "circle": lambda hits, circle: hits.within_circle(*circle),
         "box": lambda hits, box: hits.window(x=box[:2], y=box[2:]),
-        "species": lambda hits, names: read_ranges(options.ranges).select(hits, *names.split(",")),
+        "species": lambda hits, names: _of_species(hits, names.split(","), options.ranges),
     }
     selection = hits
     for name, step in steps.items():
@@ -99,6 +104,18 @@ def select(hits: Hits, options: argparse.Namespace) -> Hits:
     if selects(options) and len(selection) == 0:
         raise ValueError(f"the options select none of the {len(hits):,} ions of {options.file!r}")
     return selection
+
+
+def _of_species(hits, names, ranges):
+    """Ions of these species: by a file of ranges, or by the elements that simulated ions know."""
+    if ranges is not None:
+        return read_ranges(ranges).select(hits, *names)
+    elements = hits.extra["element"]
+    known = np.unique(elements).tolist()
+    for name in names:
+        if name not in known:
+            raise ValueError(f"no ion is of species {name!r}{did_you_mean(name, known)}, only of {', '.join(known)}")
+    return hits[np.isin(elements, names)]
 
 
 def check_columns(hits: Hits, options: argparse.Namespace) -> None:

@@ -11,13 +11,16 @@ from pathlib import Path
 import numpy as np
 
 from apt_evap import plot
+from apt_evap._common.codec import declared, from_plain
 from apt_evap._common.files import FileError, check_path, read_small_file, replace_file
-from apt_evap._common.warnings import RegistrationWarning
+from apt_evap._common.warnings import RegistrationWarning, StructureWarning
 from apt_evap.cli._files import check_output, ions_of_map, read, select
-from apt_evap.cli._output import put, say
+from apt_evap.cli._output import put
 from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.energy_fit.fit_energies import fit_energies
+from apt_evap.energy_fit.grid import EnergyGrid
+from apt_evap.energy_fit.settings import FitSettings
 from apt_evap.registration.register import Registration
 from apt_evap.report.origin import recorded_warnings
 from apt_evap.report.study import write_study
@@ -32,7 +35,8 @@ OVERLAY, REPORT = "registration.png", "report.html"
 
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
-    with recorded_warnings() as messages:
+    # these are a line of the result
+    with recorded_warnings(() if options.quiet else (RegistrationWarning, StructureWarning)) as messages:
         return _compare(options, messages)
 
 
@@ -47,28 +51,23 @@ def _compare(options, messages):
     study = fit_energies(
         run,
         measured,
-        options.mechanism,
+        EnergyGrid(**_given(options, EnergyGrid)),
+        FitSettings(**_given(options, FitSettings)),
         registration=registration,
-        bins=options.bins,
-        smoothing=options.smooth,
-        flattening=options.flatten,
-        temperature=options.temperature,
-        allow_noise=not options.plain,
-        options=dict(options.option or ()),
-        replicas=options.replicas,
-        resamples=options.resamples,
-        seed=options.seed,
         n_threads=options.threads,
         progress=False if options.quiet else None,
-        **{name: getattr(options, name) for name in ("means", "rsds", "rollup_fractions") if getattr(options, name)},
     )
     _write(study, run, folder, options, messages)
-    if study.registration.doubtful:
-        say("note", f"check {folder / OVERLAY}; --registration sets a known registration")
     if not options.quiet:
-        put(repr(study).strip("<>"))
-        put(f"wrote {', '.join(FILES)} to {folder}")
+        put("\n".join(study.lines()))
+        check = f"; check {OVERLAY}, --registration sets a known registration" if study.registration.doubtful else ""
+        put(f"wrote {', '.join(FILES)} to {folder}{check}")
     return 0
+
+
+def _given(options, kind):
+    """Fields of a class of settings that the command line gives."""
+    return {name: value for name in declared(kind) if (value := getattr(options, name, None)) is not None}
 
 
 # ---- input ---------------------------------------------------------------------------------------------------------
@@ -91,7 +90,9 @@ def read_registration(text: str) -> Registration:
     written = read_small_file(text, _MAX_BYTES, "a registration or a study")
     try:
         content = json.loads(written)
-        return Registration.from_dict(dict(content.get("registration", content)))
+        registration = dict(content.get("registration", content))
+        registration.pop("doubtful", None)  # follows from the others
+        return from_plain(registration, Registration, what="registration")
     except (ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:
         raise FileError(f"{text!r} does not contain a registration: {error}") from error
 

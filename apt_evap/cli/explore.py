@@ -72,7 +72,7 @@ def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer, View]:
         say("note", "registering the maps, which takes up to some minutes; --registration sets a known registration")
     run_code = f"ae.load({options.run!r})"
     if options.real_units is not None:
-        run_code += f".at_evaporation_field({options.real_units!r})"
+        run_code += f".at_evaporation_field(field_reference={options.real_units!r})"
     explorer = Explorer(
         run,
         measured,

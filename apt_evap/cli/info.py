@@ -2,20 +2,23 @@
 
 import argparse
 import json
+from pathlib import Path
 
 from apt_evap.analysis.description import UNITS, describe
 from apt_evap.cli._files import read, select, selects
 from apt_evap.cli._output import put
 from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.io.specimens import read_tip, specimen_format
 from apt_evap.simulation.ending import Ending
 from apt_evap.simulation.run import Run
+from apt_evap.specimen.tip import Tip
 
 
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
-    content = read(options)
+    content = _specimen(options) or read(options)
     summary = {"file": options.file}
-    if selects(options) and not isinstance(content, DetectorMap):
+    if selects(options) and not isinstance(content, DetectorMap | Tip):
         ions = content.hits(content.first_perturbation) if isinstance(content, Run) else content
         summary["selected_of"], content = len(ions), select(ions, options)
     summary |= describe(content)
@@ -27,6 +30,16 @@ def execute(options: argparse.Namespace) -> int:
     else:
         put("\n".join(_lines(summary)))
     return 0
+
+
+def _specimen(options):
+    """The specimen of a file, or None for a file of ions."""
+    path = Path(options.file)
+    if options.format is not None or not path.is_file():
+        return None
+    if specimen_format(path) == "ase" and path.suffix.lower() not in _SPECIMENS:
+        return None
+    return read_tip(options.file, dict(options.types or ()))
 
 
 def _lines(summary, indent=0, of_columns=False):
@@ -46,7 +59,8 @@ def _lines(summary, indent=0, of_columns=False):
             yield f"{'':{indent}}{labels[key]:{width}}  {text}"
 
 
-_EXTENTS = ("field_before_leaving", "x", "y", "values", "voltages")
+_SPECIMENS = (".xyz", ".cfg", ".cif", ".vasp")  # of ASE; other formats are recognised by their content
+_EXTENTS = ("extent_x", "extent_y", "extent_z", "field_before_leaving", "x", "y", "values", "voltages")
 _SIZES = ("bins", "bin_size", "detector_extent", "detector_quantum")
 
 

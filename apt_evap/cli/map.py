@@ -6,8 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from apt_evap._common.codec import from_plain
 from apt_evap.analysis.field_ion_image import field_ion_image
 from apt_evap.cli._files import (
     check_output,
@@ -21,8 +20,8 @@ from apt_evap.cli._files import (
     selects,
 )
 from apt_evap.cli._output import tell, tell_json
-from apt_evap.config.map_panels import MapSettings, Panel, read_maps
-from apt_evap.config.perturbation_text import read_perturbation, title_of
+from apt_evap.config.map_panels import MapSettings, Panel
+from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.detection.binning import bins_for
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
@@ -42,7 +41,8 @@ def execute(options: argparse.Namespace) -> int:
         maps = _field_ion_map(content, options)
     elif isinstance(content, Run):
         content = in_real_units(content, options)
-        maps = run_maps(content, _map_settings(content, options), lambda hits: select(hits, options))
+        drawn, titles = run_maps(content, _map_settings(content, options), lambda hits: select(hits, options))
+        maps = drawn, [f"{title}{_species(options)}" for title in titles]
     elif options.perturbation or options.real_units:
         what = "a map" if isinstance(content, DetectorMap) else "measured ions"
         name = "--perturbation" if options.perturbation else "--real-units"
@@ -56,7 +56,7 @@ def execute(options: argparse.Namespace) -> int:
         selection = ions_of_map(content, options)
         map = selection.map(options.bins or bins_for(int(selection.detected.sum())))
         part = f", {len(selection):,} of {len(content):,} ions" if selects(options) else ""
-        maps = [_smooth(map, options.smooth)], [f"{Path(options.file).name}{part}"]
+        maps = [_smooth(map, options.smooth)], [f"{Path(options.file).name}{_species(options)}{part}"]
     save_picture(picture, *maps)
     tell(options, f"wrote {picture}")
     tell_json(options, {"wrote": str(picture), "file": options.file, "maps": summaries(*maps)})
@@ -78,6 +78,11 @@ def _field_ion_map(content, options):
     return [map if options.smooth is None else map.smoothed(options.smooth)], [f"field-ion image, {options.field_ion}"]
 
 
+def _species(options):
+    """Selected species as part of a title."""
+    return "" if options.species is None else f", {options.species.replace(',', ' and ')}"
+
+
 def summaries(maps: Any, titles: Sequence[str]) -> list[dict[str, Any]]:
     """Summary of each map of a picture in plain types: title, number of ions if known, bins, and smoothing [mm]."""
     return [
@@ -88,14 +93,13 @@ def summaries(maps: Any, titles: Sequence[str]) -> list[dict[str, Any]]:
 
 def _map_settings(run, options):
     """Settings of the maps of a run: from the options, else those of the run, else the defaults."""
-    settings = read_maps(run.provenance.get("maps", {}))
+    settings = from_plain(run.provenance.get("maps", {}), MapSettings, what="maps")
     if options.perturbation:
-        perturbations = [read_perturbation(text) for text in options.perturbation]
-        panels = tuple(Panel(title_of(perturbation), perturbation) for perturbation in perturbations)
+        panels = tuple(Panel(read_perturbation(text)) for text in options.perturbation)
         settings = replace(settings, panels=panels)
     elif "maps" not in run.provenance and run.responses is None:
         perturbations = tuple(perturbation for perturbation in run.perturbations if not isinstance(perturbation, dict))
-        settings = MapSettings(tuple(Panel(title_of(each), each) for each in perturbations or (Unperturbed(),)))
+        settings = MapSettings(tuple(map(Panel, perturbations or (Unperturbed(),))))
     if options.bins is not None:
         # the smoothing of the settings is for other bins
         settings = replace(settings, bins=options.bins, smoothing=None)
@@ -109,17 +113,8 @@ def run_maps(
     run: Run, settings: MapSettings, choose: Callable[[Hits], Hits] = lambda hits: hits
 ) -> tuple[list[DetectorMap], list[str]]:
     """Maps of the complete detector, for all ions or a selection, and their titles."""
-    half = run.detector.width / 2
-    bins = settings.bins or bins_for(len(run))
-    maps = [
-        choose(run.hits(panel.perturbation)).map(
-            bins,
-            extent=(-half, half, -half, half),
-            quantum=None,
-            mask=np.broadcast_to(True, (bins, bins)),  # the complete detector, without an outline
-        )
-        for panel in settings.panels
-    ]
+    grid = run.detector.grid(settings.bins or bins_for(len(run)))
+    maps = [choose(run.hits(panel.perturbation)).map(like=grid, quantum=None) for panel in settings.panels]
     return [_smooth(each, settings.smoothing) for each in maps], [panel.title for panel in settings.panels]
 
 

@@ -98,6 +98,14 @@ class _Parser(argparse.ArgumentParser):
             raise argparse.ArgumentError(action, f"invalid choice: {value!r}{hint} (choose from {known})")
 
 
+class _Options(argparse.Action):
+    """Collects pairs of a name and its numbers in a dict."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        name, numbers = values
+        setattr(namespace, self.dest, {**(getattr(namespace, self.dest) or {}), name: numbers})
+
+
 def _did_you_mean(word: str, known: Iterable[str]) -> str:
     from apt_evap._common.validation import did_you_mean  # with numpy, for those who mistype
 
@@ -190,12 +198,16 @@ def _add_info(commands: Any) -> None:
     command = commands.add_parser(
         "info",
         help="summarise a file",
-        description="Summarise a run (for an unfinished run, give the folder), a file of ions or a map.",
+        description="Summarise a run (for an unfinished run, give the folder), a file of ions, a map, or a specimen\n"
+        "(LAMMPS, TAPSim, ASE).",
         epilog="example: apt-evap info ni111.h5\n         apt-evap info R5083.epos --json | jq .columns.voltage",
         **_SHAPE,
     )
     command.add_argument("file", metavar="FILE", help=_FILE_HELP)
     _add_reading(command)
+    command.add_argument(
+        "--types", type=_types, metavar="1=Al,2=Cu", help="elements of the types of a specimen that have no names"
+    )
     command.add_argument("--json", action="store_true", help="as JSON, for programs; units as in the text output")
 
 
@@ -219,7 +231,7 @@ def _add_compare(commands: Any) -> None:
     command.add_argument("run", metavar="RUN.h5", help="a run with responses")
     command.add_argument("file", metavar="MEASURED", help="measured ions (.epos, ...), a map (.npz), or a run (.h5)")
     command.add_argument("-o", "--output", metavar="FOLDER", help="default: MEASURED_study in this folder")
-    command.add_argument("--mechanism", choices=MECHANISMS, default="roll-up", help="default: roll-up")
+    command.add_argument("--mechanism", choices=MECHANISMS, help="default: roll-up")
     for name, default, what in (
         ("means", MEANS, "means of the energy [eV]"),
         ("rsds", RSDS, "standard deviations relative to the means"),
@@ -229,7 +241,8 @@ def _add_compare(commands: Any) -> None:
         command.add_argument(f"--{name}", type=_numbers, metavar="N,N,...", help=f"{what}; default: {numbers}")
     command.add_argument(
         "--option",
-        action="append",
+        dest="options",
+        action=_Options,
         type=_option,
         metavar="NAME=N,N,...",
         help="one more axis: a parameter of the perturbation and the numbers to try",
@@ -242,22 +255,25 @@ def _add_compare(commands: Any) -> None:
     command.add_argument("--bins", type=_integer(11, MAX_BINS), metavar="N", help="bins along the longer side")
     command.add_argument(
         "--smooth",
+        dest="smoothing",
         type=_number("mm"),
         metavar="MM",
         help="sigma of a Gaussian; default: half a bin, for densities one bin",
     )
     command.add_argument(
-        "--flatten", type=_number("mm"), metavar="MM", help="sigma of the Gaussian for flattening; 0 for none"
+        "--flatten",
+        dest="flattening",
+        type=_number("mm"),
+        metavar="MM",
+        help="sigma of the Gaussian for flattening; 0 for none",
     )
+    command.add_argument("--temperature", type=float, metavar="K", help="temperature of the thermal map; default: 50")
     command.add_argument(
-        "--temperature", type=float, default=50.0, metavar="K", help="temperature of the thermal map; default: 50"
+        "--plain", dest="allow_noise", action="store_const", const=False, help="SSIM without noise correction"
     )
-    command.add_argument("--plain", action="store_true", help="SSIM without noise correction")
     command.add_argument("--replicas", type=_integer(1), metavar="N", help="draws per ion; default: 4 to 16")
-    command.add_argument(
-        "--resamples", type=_integer(0), default=200, metavar="N", help="resamples for errors; default: 200"
-    )
-    command.add_argument("--seed", type=_integer(0), default=0, metavar="N", help="seed of the resamples; default: 0")
+    command.add_argument("--resamples", type=_integer(0), metavar="N", help="resamples for errors; default: 200")
+    command.add_argument("--seed", type=_integer(0), metavar="N", help="seed of the resamples; default: 0")
     command.add_argument("--threads", type=_integer(1), metavar="N", help="default: all processors")
     command.add_argument("--quiet", action="store_true", help="no progress bar, no summary")
     command.add_argument("--force", action="store_true", help="overwrite files not made by apt-evap")
@@ -293,10 +309,10 @@ def _add_reconstruct(commands: Any) -> None:
         "reconstruct",
         help="reconstruct the positions of ions from their hits",
         description="Reconstruct the positions of ions in the specimen from their hits and their sequence, and write\n"
-        "them as .pos, .epos, .xyz or .vtp. A run has its flight length; its true sites give the errors.",
+        "them as .pos, .epos, .xyz or .vtp. A run has its own constants; its true sites give the errors.",
         epilog="example:\n"
         "  apt-evap reconstruct R5083.epos --element Si --distance 90 --efficiency 0.57 -o R5083.pos\n"
-        "  apt-evap reconstruct ni111.h5 --real-units --element Ni --field-factor 1.4 --compression 1.13\n"
+        "  apt-evap reconstruct ni111.h5 --real-units\n"
         "  apt-evap reconstruct R5083.epos --atomic-volume 0.02 --distance 90 --radius shank --initial-radius 30 \\\n"
         "      --shank-angle 5",
         **_SHAPE,
@@ -306,13 +322,20 @@ def _add_reconstruct(commands: Any) -> None:
     command.add_argument(
         "--frame", choices=FRAMES, default="depth", help="z is the depth, or goes out of the specimen; default: depth"
     )
-    constants = command.add_argument_group("constants")
+    constants = command.add_argument_group("constants", "The defaults of a run are its own constants.")
     constants.add_argument("--protocol", choices=PROTOCOLS, default="cap", help="depth increment; default: cap")
-    constants.add_argument("--projection", choices=PROJECTIONS, default="bas", help="angle on the cap; default: bas")
-    constants.add_argument("--distance", type=float, metavar="MM", help="flight length; default: that of the run")
-    constants.add_argument("--detector-radius", type=float, metavar="MM", help="default: that of the outermost ion")
     constants.add_argument(
-        "--compression", type=float, default=1.5, metavar="XI", help="image compression; default: 1.5"
+        "--projection", choices=PROJECTIONS, help="angle on the cap; default: bas, of a run compressed"
+    )
+    constants.add_argument("--distance", type=float, metavar="MM", help="flight length; default: that of the run")
+    constants.add_argument(
+        "--detector-radius",
+        type=float,
+        metavar="MM",
+        help="default: that of the outermost ion, of a run half its width",
+    )
+    constants.add_argument(
+        "--compression", type=float, metavar="XI", help="image compression; default: 1.5, of a run its own"
     )
     constants.add_argument("--efficiency", type=float, default=1.0, metavar="ETA", help="of the detector; default: 1")
     constants.add_argument("--element", metavar="NAME", help="material that gives the atomic volume and the field")
@@ -320,7 +343,7 @@ def _add_reconstruct(commands: Any) -> None:
     constants.add_argument(
         "--radius", default="voltage", metavar="R", help="voltage, shank, or a constant radius [nm]; default: voltage"
     )
-    constants.add_argument("--field-factor", type=float, default=3.3, metavar="KF", help="default: 3.3")
+    constants.add_argument("--field-factor", type=float, metavar="KF", help="default: 3.3, of a run its own")
     constants.add_argument("--evaporation-field", type=float, metavar="F", help="[V/nm]; default: that of the element")
     constants.add_argument(
         "--smoothing", type=_integer(1), default=1, metavar="N", help="ions in the mean of the voltage; default: 1"
@@ -467,8 +490,17 @@ def _add_reading(parser: argparse.ArgumentParser) -> Any:
     selection.add_argument("--circle", type=_circle, metavar="R[,X,Y]", help="radius and centre on the detector [mm]")
     selection.add_argument("--box", type=_box, metavar="X0,X1,Y0,Y1", help="rectangle on the detector [mm]")
     selection.add_argument("--ranges", metavar="FILE.rrng", help="or .rng, .env: ranges of mass, for --species")
-    selection.add_argument("--species", metavar="NAME[,NAME]", help="ions in the ranges of these names, such as Si")
+    selection.add_argument(
+        "--species", metavar="NAME[,NAME]", help="ions of these names, such as Si: in --ranges, or of a run"
+    )
     return group
+
+
+def _types(text: str) -> list[tuple[str, str]]:
+    pairs = [(part.partition("=")[0], part.partition("=")[2]) for part in text.split(",")]
+    if not all(key and name for key, name in pairs):
+        raise argparse.ArgumentTypeError(f"must be types with their elements, such as 1=Al,2=Cu, got {text!r}")
+    return pairs
 
 
 def _add_real_units(command: argparse.ArgumentParser) -> None:

@@ -11,9 +11,10 @@ from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.detection.hits import Hits
 from apt_evap.reconstruction.origins import OriginTable
 from apt_evap.reconstruction.reconstruct import reconstruct
+from apt_evap.reconstruction.run_constants import run_constants
 from apt_evap.simulation.run import Run
 from apt_evap.specimen.lattice import atom_density
-from apt_evap.specimen.materials import material
+from apt_evap.specimen.materials import MATERIALS, material
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -21,15 +22,21 @@ def execute(options: argparse.Namespace) -> int:
     output = check_path(options.output or f"{Path(options.file).stem}_reconstructed.pos")
     if output.exists() and not options.force:
         raise FileError(f"{str(output)!r} exists: --force overwrites it")
-    hits, distance = _ions(options)
-    settings = _constants(options)
-    if distance is None:
+    hits, known = _ions(options)
+    settings = known | _constants(options)
+    if settings["radius"] != "voltage":
+        for name in ("field_factor", "evaporation_field"):
+            if getattr(options, name) is None:
+                settings.pop(name, None)
+    if "atomic_volume" not in settings:
+        raise ValueError("--atomic-volume [nm^3] or --element is missing")
+    if "distance" not in settings:
         raise ValueError("--distance is missing: the flight length [mm] is needed for ions that are not from a run")
     if hits.voltage is None and settings["radius"] == "voltage":
         raise ValueError(
             f"{options.file!r} has no voltages: --radius shank, or a radius [nm], needs none, got --radius voltage"
         )
-    reconstruction = reconstruct(select(hits, options), distance=distance, **settings)
+    reconstruction = reconstruct(select(hits, options), **settings)
     reconstruction.write(output, frame=options.frame)
     tell(options, f"{reconstruction!r}")
     result = {"wrote": str(output), "file": options.file, "ions": len(reconstruction)}
@@ -44,7 +51,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _ions(options):
-    """Ions of the file, and the flight length of the options or of a run."""
+    """Ions of the file, and the constants that it determines."""
     content = read(options)
     if isinstance(content, Run):
         run = in_real_units(content, options)
@@ -53,33 +60,60 @@ def _ions(options):
         perturbation = run.first_perturbation
         if options.perturbation is not None:
             perturbation = read_perturbation(options.perturbation)
-        distance = run.detector.distance if options.distance is None else options.distance
-        return run.hits(perturbation), distance
+        return run.hits(perturbation), run_constants(run, _field(options))
     if not isinstance(content, Hits):
         raise ValueError(f"reconstruct needs ions or a run, {options.file!r} contains a map")
     for name in ("real_units", "perturbation"):
         if getattr(options, name) is not None:
             raise ValueError(f"--{name.replace('_', '-')} needs a run (.h5), {options.file!r} contains measured ions")
-    return content, options.distance
+    return content, {}
+
+
+_GIVEN = (
+    "protocol",
+    "projection",
+    "distance",
+    "compression",
+    "efficiency",
+    "detector_radius",
+    "field_factor",
+    "smoothing",
+    "initial_radius",
+    "shank_angle",
+    "evaporation_field",
+    "atomic_volume",
+)
 
 
 def _constants(options):
-    """Arguments of `reconstruct` from the options."""
-    names = ("protocol", "projection", "compression", "efficiency", "detector_radius", "field_factor", "smoothing")
-    settings = {name: getattr(options, name) for name in names}
-    settings |= {name: getattr(options, name) for name in ("initial_radius", "shank_angle", "evaporation_field")}
+    """Arguments of `reconstruct` that the options set."""
+    settings = {name: getattr(options, name) for name in _GIVEN if getattr(options, name) is not None}
     settings["radius"] = _radius(options.radius)
-    settings["origins"] = None if options.origins is None else OriginTable.load(options.origins)
-    settings["atomic_volume"] = options.atomic_volume
+    if options.origins is not None:
+        settings["origins"] = OriginTable.load(options.origins)
     if options.element is not None:
-        element = material(options.element)
-        if options.atomic_volume is None:
-            settings["atomic_volume"] = 1 / atom_density(element.structure, element.a, element.c)
-        if options.evaporation_field is None and settings["radius"] == "voltage":
-            settings["evaporation_field"] = element.evaporation_field
-    if settings["atomic_volume"] is None:
-        raise ValueError("--atomic-volume [nm^3] or --element is missing")
+        element = _element(options.element)
+        settings.setdefault("atomic_volume", 1 / atom_density(element.structure, element.a, element.c))
+        if settings["radius"] == "voltage":
+            settings.setdefault("evaporation_field", element.evaporation_field)
     return settings
+
+
+def _field(options):
+    """Evaporation field of the options [V/nm], None if they have none."""
+    if options.evaporation_field is None and options.element is not None:
+        return _element(options.element).evaporation_field
+    return options.evaporation_field
+
+
+def _element(name):
+    try:
+        return material(name)
+    except ValueError as error:
+        raise ValueError(
+            f"--element must be one of {', '.join(MATERIALS)}, got {name!r}: for other elements use "
+            "--atomic-volume [nm^3] and --evaporation-field [V/nm]"
+        ) from error
 
 
 def _radius(text):

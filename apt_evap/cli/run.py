@@ -1,28 +1,37 @@
 """`apt-evap run`: run the simulation of a TOML file."""
 
 import argparse
+import contextlib
 import sys
 import time
-from dataclasses import replace
+from pathlib import Path
 
 from apt_evap._common.files import FileError, check_path
+from apt_evap._common.progress import progress_bar
 from apt_evap.analysis.description import real_units_line
 from apt_evap.cli._files import check_output, is_picture, picture_path, save_picture
 from apt_evap.cli._output import INTERRUPTED, say, tell, tell_json
 from apt_evap.cli.map import run_maps, summaries
-from apt_evap.config.simulation_file import read_config
+from apt_evap.config.simulation_file import config_of, read_document
 from apt_evap.simulation.checkpoint import Checkpoint
 from apt_evap.simulation.ending import Ending
 from apt_evap.simulation.recorder import RunInterrupted
 from apt_evap.simulation.run_hdf5 import is_run
+from apt_evap.sweep.foresight import foresee
 
 SECONDS_BETWEEN_LINES = 60.0
+_BAR = "{percentage:3.0f}%|{bar:20}| {n_fmt} of {total_fmt} ions, {remaining} left"
 _CONTINUE = "the same command with --resume continues"
 
 
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
-    config = read_config(options.config)
+    document = read_document(options.config)
+    own = {"ions": options.ions, "seed": options.seed}
+    document["simulation"] = document.get("simulation", {}) | {
+        name: value for name, value in own.items() if value is not None
+    }
+    config = config_of(document, Path(options.config))
     output = check_path(options.output or config.output or f"{config.path.stem}.h5")
     if output.suffix.lower() != ".h5":
         raise FileError(f"a run is saved in an HDF5 file with the suffix .h5, got {str(output)!r}")
@@ -31,23 +40,24 @@ def execute(options: argparse.Namespace) -> int:
     check_output(output, is_run, options.force)
     check_output(picture, is_picture, options.force)
 
-    simulation = config.simulation(seed=options.seed, n_threads=options.threads)
+    n_ions = config.n_ions
+    tell(options, f"{foresee(config, 1)} of one thread")
+    tell(options, "building the specimen and relaxing the charges of its surface")
+    simulation = config.simulation(n_threads=options.threads)
     tell(options, f"{str(simulation.tip).strip('<>')}; {len(simulation.emitter):,} atoms on the surface")
     began = time.perf_counter()
     checkpoint = Checkpoint(output, options.checkpoint, resume=options.resume, overwrite=options.force)
-    provenance = {"config": config.path.name, "maps": config.maps.to_dict()}
-    n_ions = options.ions or config.n_ions
     replaced, unfinished = output.exists(), checkpoint.folder.exists()
     n_previous = checkpoint.ions_there() if options.resume else 0
     if 0 < n_previous < n_ions:
         tell(options, f"resumed at {n_previous:,} of {n_ions:,} ions")
-    run = _simulate(options, config, simulation, checkpoint, n_ions, provenance)
+    run = _simulate(options, config, simulation, checkpoint, n_ions, n_previous)
     seconds = time.perf_counter() - began
-    if n_previous == n_ions and not unfinished:
+    if n_previous == n_ions and not unfinished and run.provenance.get("settings") == config.key:
         tell(options, f"{output} is complete: nothing to do")
         tell_json(options, {"wrote": None, "picture": None, "maps": [], **_counts(run, seconds)})
         return 0
-    run = config.in_real_units(replace(run, provenance=run.provenance | provenance))
+    run = config.as_saved(run)
     run.save(output)
     new = "" if not n_previous else f", {len(run) - n_previous:,} of them new,"
     tell(options, f"{len(run):,} ions{new} in {seconds:.1f} s, {(len(run) - n_previous) / seconds:,.0f} ions/s")
@@ -66,24 +76,24 @@ def execute(options: argparse.Namespace) -> int:
     return INTERRUPTED if run.ended == Ending.INTERRUPTED else 0
 
 
-def _simulate(options, config, simulation, checkpoint, n_ions, provenance):
+def _simulate(options, config, simulation, checkpoint, n_ions, n_previous):
     """Run the simulation; after an interrupt or an error a note names the file of its ions."""
-    lines = not options.quiet and not sys.stderr.isatty()
+    if options.quiet:
+        progress = contextlib.nullcontext(False)
+    else:
+        progress = _Bar(n_ions, n_previous) if sys.stderr.isatty() else contextlib.nullcontext(_Lines())
     try:
-        return simulation.run(
-            n_ions,
-            config.emissions,
-            responses=config.responses,
-            progress=False if options.quiet else _Lines() if lines else None,
-            checkpoint=checkpoint,
-        )
+        with progress as shown:
+            return simulation.run(
+                n_ions, config.emissions, responses=config.responses, progress=shown, checkpoint=checkpoint
+            )
     except KeyboardInterrupt:
         if ions := checkpoint.ions_there():
             where = checkpoint.folder if checkpoint.folder.exists() else checkpoint.path
             say("note", f"{ions:,} of {n_ions:,} ions are in {str(where)!r}; {_CONTINUE}")
         raise
     except RunInterrupted as error:
-        replace(error.run, provenance=error.run.provenance | provenance).save(checkpoint.path)
+        config.with_origin(error.run).save(checkpoint.path)
         say("note", f"the {len(error.run):,} ions so far are in {str(checkpoint.path)!r}")
         raise
 
@@ -113,6 +123,22 @@ def _tell_outcomes(options, config, run, output, n_ions):
 
 def _counts(run, seconds):
     return run.summary() | {"seconds": round(seconds, 3), "ended": run.ended or "as planned"}
+
+
+class _Bar:
+    """Progress of a run in a terminal: a bar of a fixed width, which fits into 80 columns with its numbers."""
+
+    def __init__(self, n_ions: int, n_previous: int) -> None:
+        self._bar = progress_bar(total=n_ions, initial=n_previous, bar_format=_BAR, unit=" ions", mininterval=0.5)
+
+    def __enter__(self) -> "_Bar":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._bar.close()
+
+    def __call__(self, ions: int, n_ions: int) -> None:
+        self._bar.update(ions - self._bar.n)
 
 
 class _Lines:

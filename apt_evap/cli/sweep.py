@@ -4,13 +4,15 @@ import argparse
 import json
 import shlex
 
+from apt_evap._common.codec import to_plain
 from apt_evap._common.files import FileError
 from apt_evap.cli._output import put, say, tell, tell_json
 from apt_evap.sweep.batch_system import largest_array, scripts, submit
 from apt_evap.sweep.collect import collect
-from apt_evap.sweep.plan import open_sweep, plan
+from apt_evap.sweep.foresight import hours_text
+from apt_evap.sweep.plan import STATES, open_sweep, plan
 from apt_evap.sweep.pool import work_locally, work_with_dask
-from apt_evap.sweep.status import STATES, status
+from apt_evap.sweep.status import status
 from apt_evap.sweep.work import retry, work, work_on
 
 
@@ -26,28 +28,18 @@ def _plan(options):
     content = {
         "folder": str(sweep.folder),
         "points": [
-            {"key": point.key, "values": point.values, **needs.to_dict()}
+            {"key": point.key, "values": point.values, **to_plain(needs)}
             for point, needs in zip(sweep.points, sweep.foresights, strict=True)
         ],
     }
     if not (options.quiet or options.json):
         for point, needs in zip(sweep.points, sweep.foresights, strict=True):
-            put(f"{point.key}  {_needs(needs)}  {point}")
+            put(f"{point.key}  {needs}  {point}")
         most = f", {max(memory) / 1e9:.2g} GB at most" if memory else ""
-        total = "" if None in hours else f", about {_hours(sum(hours))} of one worker"
+        total = "" if None in hours else f", about {hours_text(sum(hours))} of one worker"
         put(f"{len(sweep.points):,} points in {sweep.folder}{most}{total}")
     tell_json(options, content)
     return 0
-
-
-def _needs(needs):
-    if needs.memory is None:
-        return f"{needs.ions:,} ions"
-    return f"{needs.ions:,} ions of {needs.atoms:.2g} atoms, {needs.memory / 1e9:.2g} GB, {_hours(needs.hours)}"
-
-
-def _hours(hours):
-    return f"{hours:.2g} h" if hours >= 1 else f"{60 * hours:.2g} min"
 
 
 def _work(options):
@@ -65,7 +57,8 @@ def _work(options):
         states = {key: work_on(sweep, key) for key in keys}
         for key, state in states.items():
             tell(options, f"{key}: {state.name}{f', {state.message}' if state.message else ''}")
-        failed = [f"{key}: {state.message}" for key, state in states.items() if state.name == "failed"]
+        wrong = ("failed", "damaged", "foreign")
+        failed = [f"{key}: {state.message}" for key, state in states.items() if state.name in wrong]
         tell_json(options, {key: state.name for key, state in states.items()})
         if failed:
             raise ValueError(f"point {'; '.join(failed)}")
@@ -127,15 +120,19 @@ def _status(options):
 
 
 def _tell_counts(options, content):
-    counts = ", ".join(f"{content['counts'][name]:,} {name}" for name in STATES)
+    counts = content["counts"]
+    shown = [name for name in STATES if counts[name] or name not in ("damaged", "foreign")]
+    text = ", ".join(f"{counts[name]:,} {name}" for name in shown)
     left = content["hours_left"]
-    hours = f"; about {_hours(left)} of one worker left" if left else ""
-    tell(options, f"{content['points']:,} points: {counts}{hours}")
-    failed = [row for row in content["table"] if row["state"] == "failed"]
-    for row in failed[:3]:
-        say("note", f"point {row['key']} failed: {row['message']}")
-    if failed:
+    hours = f"; about {hours_text(left)} of one worker left" if left else ""
+    tell(options, f"{content['points']:,} points: {text}{hours}")
+    wrong = [row for row in content["table"] if row["state"] in ("failed", "damaged", "foreign")]
+    for row in wrong[:3]:
+        say("note", f"point {row['key']}, {row['state']}: {row['message']}")
+    if counts["failed"]:
         say("note", "after the reason is removed, apt-evap sweep work --retry tries failed points again")
+    if counts["damaged"] or counts["foreign"]:
+        say("note", "after a damaged or foreign run.h5 is removed, apt-evap sweep work runs its point again")
 
 
 def _collect(options):
@@ -148,6 +145,8 @@ def _collect(options):
         note=lambda text: tell(options, text),
         command=shlex.join(["apt-evap", *options.arguments]),
     )
+    for key, reason in result["wrong"].items():
+        say("note", f"point {key} is not collected: {reason}")
     if not result["done"]:
         raise FileError(f"no point of {str(sweep.folder)!r} is done: apt-evap sweep work runs them")
     fit = result.pop("fit")

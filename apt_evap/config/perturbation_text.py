@@ -1,15 +1,14 @@
 """Perturbations from a table or from text such as RollUp:0.155,0.155."""
 
-import json
 import tomllib
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
 from typing import Any
 
+from apt_evap._common.codec import declared, to_plain
 from apt_evap._common.validation import short_text
-from apt_evap.config.tables import check_table
+from apt_evap.config.toml_text import inline
 from apt_evap.emission.energies import Fixed, Thermal, TruncatedNormal
-from apt_evap.emission.perturbations import Perturbation, from_dict, to_dict
+from apt_evap.emission.perturbations import Perturbation, perturbation_of
 
 
 def read_perturbation(settings: str | Mapping[str, Any]) -> Perturbation:
@@ -37,14 +36,7 @@ def read_perturbation(settings: str | Mapping[str, Any]) -> Perturbation:
             return read_perturbation(_perturbation_table(settings))
         except ValueError as error:
             raise ValueError(f"perturbation {settings!r}: {error}; an example is RollUp:0.155,0.155") from error
-    check_table(settings, "perturbation")
-    for table in (settings, *settings.values()):
-        if isinstance(table, Mapping) and not isinstance(table.get("name"), str):
-            raise ValueError(f"a perturbation or distribution must have a name, got {short_text(dict(table))}")
-    perturbation = from_dict(settings)
-    if not callable(getattr(perturbation, "launch", None)):
-        raise ValueError(f"perturbation must be one such as Unperturbed or RollUp, got {short_text(dict(settings))}")
-    return perturbation
+    return perturbation_of(settings)
 
 
 def _perturbation_table(text):
@@ -84,10 +76,10 @@ def write_perturbation(perturbation: Perturbation) -> str:
     ValueError
         If the perturbation is not a built-in one.
     """
-    settings = to_dict(perturbation)
+    settings = to_plain(perturbation, short=True)
     numbers = list(_numbers_of(settings))
     short = ":".join([settings["name"], ",".join(map(repr, numbers))] if numbers else [settings["name"]])
-    for text in (short, _toml(settings)):
+    for text in (short, inline(settings)):
         try:
             if read_perturbation(text) == perturbation:
                 return text
@@ -105,27 +97,7 @@ def _numbers_of(settings):
             yield value
 
 
-def _toml(value):
-    """Value in TOML syntax; tables are inline, None is left out."""
-    if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items() if item is not None) + "}"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(_toml, value)) + "]"
-    return json.dumps(value)  # text, numbers and booleans are the same in both
-
-
-def python_of(value: Any) -> str:
-    """Python expression of a built-in perturbation or distribution, with the package as ``ae`` (str)."""
-    if not is_dataclass(value):
-        return repr(value)
-    parts, by_name = [], False
-    for each in fields(value):
-        content = getattr(value, each.name)
-        by_name = by_name or bool(each.kw_only) or content == each.default
-        if content != each.default:
-            text = python_of(content.energy if isinstance(content, Fixed) else content)
-            parts.append(f"{each.name}={text}" if by_name else text)
-    return f"ae.{type(value).__name__}({', '.join(parts)})"
+_WORDS = {"second_roll": "second roll-up"}  # of options in a title
 
 
 def title_of(perturbation: Any) -> str:
@@ -136,15 +108,12 @@ def title_of(perturbation: Any) -> str:
     if name == "Combined":
         title = f"{perturbation.rollup_fraction:.3g} roll-up + {1 - perturbation.rollup_fraction:.3g} lateral"
     parts = [title, _energy_text(getattr(perturbation, "energy", None))]
-    options = to_dict(perturbation)  # those that are not the default
-    for option, unit in (("probability", ""), ("sharpness", ""), ("height", " nm")):
-        if option in options:
-            value = getattr(perturbation, option)
-            parts.append(f"{option} {value:g}{unit}" if isinstance(value, float) else f"{option} {value}")
-    if "second_roll" in options:
-        parts.append(f"second roll-up {perturbation.second_roll:g}")
-    if "others" in options:
-        parts.append(f"others {_energy_text(perturbation.others) or perturbation.others}")
+    fields = declared(type(perturbation))
+    for option in to_plain(perturbation, short=True):  # those that are not the default
+        if option in fields and option not in ("energy", "rollup_fraction"):
+            value, unit = getattr(perturbation, option), fields[option].unit
+            text = f"{value:g}" if isinstance(value, float) else _energy_text(value) or str(value)
+            parts.append(" ".join(filter(None, (_WORDS.get(option, option.replace("_", " ")), text, unit))))
     return ", ".join(filter(None, parts))
 
 

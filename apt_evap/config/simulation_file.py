@@ -1,36 +1,39 @@
 """Simulations from TOML files, with validation of every table and key."""
 
+import hashlib
 import inspect
+import json
+import math
 import re
 import tomllib
 from collections.abc import Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from apt_evap._common.files import FileError, check_path, read_small_file
+from apt_evap._common.codec import from_plain, to_plain
+from apt_evap._common.files import FileError, check_path, read_small_file, sha256_of
 from apt_evap._common.validation import check_count, check_kind, check_number, check_seed, check_switch, short_text
-from apt_evap.config.map_panels import MapSettings, read_maps
-from apt_evap.config.phases import read_phases
-from apt_evap.config.physics import read_control, read_law, read_real_units, read_rule
+from apt_evap.config.map_panels import MapSettings
 from apt_evap.config.tables import check_keys, check_table
 from apt_evap.detection.detector import Detector
 from apt_evap.emission.perturbations import Perturbation
-from apt_evap.evaporation.law import Law, check_law
-from apt_evap.evaporation.rule import CompiledRule, Rule, check_rule
+from apt_evap.evaporation.law import Extremal, Law, check_law
+from apt_evap.evaporation.rule import CompiledRule, ConstantPotential, Robin, Rule, check_rule
 from apt_evap.evaporation.settings import ChargeSettings
+from apt_evap.evaporation.thermal import Arrhenius
 from apt_evap.evaporation.voltage import VoltageControl, check_voltage
 from apt_evap.flight.crew import FlightSettings
 from apt_evap.flight.response import ResponseSettings
 from apt_evap.io.specimens import read_tip
 from apt_evap.simulation.monitor import WatchSettings
-from apt_evap.simulation.real_units import check_flight_charges
+from apt_evap.simulation.real_units import OperatingPoint, check_flight_charges
 from apt_evap.simulation.run import Run
 from apt_evap.simulation.run_hdf5 import is_run
 from apt_evap.simulation.simulation import Simulation
-from apt_evap.specimen.materials import MATERIALS, Material, material
-from apt_evap.specimen.phases import check_phases
+from apt_evap.specimen.materials import as_material
+from apt_evap.specimen.phases import Phase, check_phases
 from apt_evap.specimen.tip import Tip
 
 _KINDS = {
@@ -44,6 +47,7 @@ _KINDS = {
     "maps": MapSettings,
 }
 _MAX_BYTES = 1 << 22  # bytes
+_DIGITS = 12  # of a key: two of 100,000 settings have the same one with a probability of 2e-5
 _LENGTH = re.compile(r"\s*(\S+?)\s*(a|nm)\s*")
 
 
@@ -79,10 +83,12 @@ class Config:
         Selects the next atom to evaporate.
     control : VoltageControl or None
         Rate, pulses and control of the voltage.
-    real_units : dict or None
-        Arguments of `Run.at_evaporation_field`; None: the run is saved at the simulated voltage.
+    real_units : OperatingPoint or None
+        Argument of `Run.at_evaporation_field`; None: the run is saved at the simulated voltage.
     rule : charging rule
         Distribution of the charge over the surface.
+    key : str
+        Result of `key_of` for the content of the file.
 
     Raises
     ------
@@ -105,8 +111,9 @@ class Config:
     output: str | None
     law: Law
     control: VoltageControl | None
-    real_units: dict | None
+    real_units: OperatingPoint | None
     rule: Rule | CompiledRule
+    key: str = ""
 
     def __post_init__(self):
         for name, kind in _KINDS.items():
@@ -134,13 +141,33 @@ class Config:
         """Perturbations with their own flights: none, or without responses those of the maps."""
         return () if self.responses else tuple(dict.fromkeys(panel.perturbation for panel in self.maps.panels))
 
-    def simulation(self, *, seed: int | None = None, n_threads: int | None = None) -> Simulation:
+    def specimen(self) -> Tip:
+        """Build the specimen, or read it from its file.
+
+        Raises
+        ------
+        FileError
+            If it is impossible, or its file cannot be read or has another SHA-256 than the settings.
+        """
+        with _located(self.path, "tip"):
+            if "path" not in self.tip:
+                return Tip(**self.tip)
+            settings = dict(self.tip)
+            expected = settings.pop("sha256", None)
+            if expected is not None and (found := sha256_of(settings["path"])) != expected:
+                raise ValueError(
+                    f"{str(settings['path'])!r} has changed: expected sha256 {short_text(expected)}, got {found!r}"
+                )
+            try:
+                return read_tip(**settings)
+            except ImportError as error:  # a format that needs another package
+                raise ValueError(str(error)) from error
+
+    def simulation(self, *, n_threads: int | None = None) -> Simulation:
         """Build the specimen and the simulation.
 
         Parameters
         ----------
-        seed : int, optional
-            Replaces the seed of the file.
         n_threads : int, optional
             Number of threads; by default the number of processors that this process may use.
 
@@ -153,17 +180,16 @@ class Config:
         FileError
             If the specimen is impossible, or the flights do not fit the specimen; the message names the file.
         """
-        with _located(self.path, "tip"):
-            tip = read_tip(**self.tip) if "path" in self.tip else Tip(**self.tip)
+        tip = self.specimen()
         if self.real_units is not None:
             with _located(self.path, "real_units"):
                 names = tuple(element.name for element in tip.elements)
-                check_flight_charges(self.real_units.get("flight_charges"), names)
+                check_flight_charges(self.real_units.flight_charges, names)
         with _located(self.path):  # flights and tip or detector: no single table
             return Simulation(
                 tip,
                 voltage=self.voltage,
-                seed=self.seed if seed is None else seed,
+                seed=self.seed,
                 detector=self.detector,
                 charge_settings=self.charge_settings,
                 flight_settings=self.flight_settings,
@@ -175,31 +201,38 @@ class Config:
                 control=self.control,
             )
 
-    def in_real_units(self, run: Run) -> Run:
-        """The run as it is saved: in real units if the file has a table ``[real_units]``.
+    def with_origin(self, run: Run) -> Run:
+        """The run with the name of this file, its maps and its key in the provenance."""
+        origin = {"config": self.path.name, "maps": to_plain(self.maps), "settings": self.key}
+        return replace(run, provenance=run.provenance | origin)
+
+    def as_saved(self, run: Run) -> Run:
+        """The run as it is saved: with its origin, and in real units if the file has a table ``[real_units]``.
 
         Raises
         ------
         FileError
             If it cannot be converted; the message names the file.
         """
+        run = self.with_origin(run)
         if self.real_units is None:
             return run
         with _located(self.path, "real_units"):
-            return run.at_evaporation_field(**self.real_units)
+            return run.at_evaporation_field(self.real_units)
 
 
 def read_config(path: str | Path) -> Config:
     """Read a simulation from a TOML file.
 
     The tables are ``[tip]`` (the arguments of `Tip`; lengths in nm or, as text, in lattice constants: "20 a"; or a
-    ``file``, relative to the folder of the settings, with ``types`` and further arguments of `read_tip`),
+    ``file``, relative to the folder of the settings, with ``types``, further arguments of `read_tip` and perhaps its
+    ``sha256``),
     ``[simulation]`` (ions, voltage, seed, responses), ``[detector]``, ``[charges]``, ``[flights]``, ``[responses]``,
     ``[watch]`` (fields of `Detector`, `ChargeSettings`, `FlightSettings`, `ResponseSettings`, `WatchSettings`),
-    ``[[phases]]`` (see `apt_evap.config.phases`; instead of a material in ``[tip]``), ``[law]``, ``[rule]``,
-    ``[control]``, ``[real_units]`` (see `apt_evap.config.physics`) and ``[maps]`` (bins, smoothing and panels, each
-    with a title and a perturbation as in `apt_evap.perturbation.from_dict`). Only ``[tip]`` with a material and
-    an apex_radius, or with a file, and the ions in ``[simulation]``, are required.
+    ``[[phases]]`` (fields of `Phase`; instead of a material in ``[tip]``), ``[law]`` and ``[rule]`` (a name and the
+    fields of that class), ``[control]`` (`VoltageControl`), ``[real_units]`` (arguments of `Run.at_evaporation_field`)
+    and ``[maps]`` (fields of `MapSettings`). Only ``[tip]`` with a material and an apex_radius, or with a file,
+    and the ions in ``[simulation]``, are required.
 
     Parameters
     ----------
@@ -269,16 +302,17 @@ def config_of(document: dict[str, Any], path: Path) -> Config:
         check_keys(document, ("output", "phases", *tables), ("tip", "simulation"))
         for name in tables:
             check_table(document.get(name, {}), f"[{name}]")
+        key = key_of(document)
         output = document.get("output")
         if output is not None and not (isinstance(output, str) and output):
             raise ValueError(f"output must be a file name such as 'run.h5', got {short_text(output)}")
     phases = None
     if "phases" in document:
         with _located(path, "phases"):
-            phases = check_phases(read_phases(document["phases"], _material))
+            phases = check_phases(_phases(document["phases"]))
     with _located(path, "tip"):
         if phases is not None and "file" in document["tip"]:
-            raise ValueError("a specimen from a file has no [[phases]], got both")
+            raise ValueError("[[phases]] cannot be combined with a specimen file")
         tip = _tip_from_file(document["tip"], path) if "file" in document["tip"] else _tip(document["tip"], phases)
     with _located(path, "simulation"):
         simulation = document["simulation"]
@@ -290,36 +324,87 @@ def config_of(document: dict[str, Any], path: Path) -> Config:
         if not isinstance(responses, bool):
             raise ValueError(f"responses must be true or false, got {short_text(responses)}")
     sections = []
-    for name, kind, known in (
-        ("detector", Detector, _field_names(Detector)),
-        ("charges", ChargeSettings, _field_names(ChargeSettings)),
-        ("flights", FlightSettings, _field_names(FlightSettings)),
-        ("responses", _responses, ("energy_limit", "bound", "wide", "height", "shells", "rolls")),
-        ("watch", WatchSettings, _field_names(WatchSettings)),
+    for name, *kinds in (
+        ("detector", Detector),
+        ("charges", ChargeSettings),
+        ("flights", FlightSettings),
+        ("watch", WatchSettings),
+        ("law", Extremal, Arrhenius),
+        ("rule", Robin, ConstantPotential),
+        ("control", VoltageControl),
     ):
         with _located(path, name):
-            check_keys(document.get(name, {}), known)
-            sections.append(kind(**document.get(name, {})))
-    with _located(path, "law"):
-        law = read_law(document.get("law", {}))
-    with _located(path, "rule"):
-        rule = read_rule(document.get("rule", {}))
-    with _located(path, "control"):
-        control = read_control(document.get("control", {}))
+            table = document.get(name)
+            sections.append(from_plain(table, *kinds, what=name) if table else kinds[0]())
+    detector, charges, flights, watch, law, rule, control = sections
+    with _located(path, "responses"):
+        response_settings = ResponseSettings.of_table(document.get("responses", {}))
     with _located(path, "real_units"):
-        real_units = read_real_units(document["real_units"]) if "real_units" in document else None
+        real_units = None
+        if "real_units" in document:
+            real_units = from_plain(document["real_units"], OperatingPoint, what="real_units")
     with _located(path, "maps"):
-        maps = read_maps(document.get("maps", {}))
-        maps.check_detector(sections[0])  # type: ignore[arg-type]
-    last = (maps, output, law, control, real_units, rule)
-    return Config(path, tip, n_ions, responses, voltage, seed, *sections, *last)  # type: ignore[arg-type, call-arg]
+        maps = from_plain(document.get("maps", {}), MapSettings, what="maps")
+        maps.check_detector(detector)
+    return Config(
+        path=path,
+        tip=tip,
+        n_ions=n_ions,
+        responses=responses,
+        voltage=voltage,
+        seed=seed,
+        detector=detector,
+        charge_settings=charges,
+        flight_settings=flights,
+        response_settings=response_settings,
+        watch_settings=watch,
+        maps=maps,
+        output=output,
+        law=law,
+        control=control if document.get("control") else None,
+        real_units=real_units,
+        rule=rule,
+        key=key,
+    )
 
 
-def _responses(wide=False, **settings):
-    """Settings of the responses from the table [responses]."""
-    if not isinstance(wide, bool):
-        raise ValueError(f"wide must be true or false, got {short_text(wide)}")
-    return ResponseSettings.wide(**settings) if wide else ResponseSettings(**settings)
+def key_of(document: Mapping[str, Any]) -> str:
+    """Key of settings: the first 12 digits of the SHA-256 of their canonical JSON.
+
+    The name of the output does not count, nor do the maps if the run has responses: they only select pictures then.
+    The file of a specimen with a SHA-256 counts by this, not by its name. Numbers that are equal have equal keys.
+
+    Raises
+    ------
+    ValueError
+        If a value is not of the types of JSON, such as a date.
+    """
+    document = {name: value for name, value in document.items() if name != "output"}
+    if document["simulation"].get("responses", True):
+        document.pop("maps", None)
+    if "sha256" in document["tip"]:
+        document["tip"] = {name: value for name, value in document["tip"].items() if name != "file"}
+    return hashlib.sha256(json.dumps(_canonical(document), sort_keys=True).encode()).hexdigest()[:_DIGITS]
+
+
+def _canonical(value):
+    match value:
+        case Mapping():
+            return {key: _canonical(each) for key, each in value.items()}
+        case list():
+            return [_canonical(each) for each in value]
+        case float() if math.isfinite(value):
+            return int(value) if value.is_integer() else value
+        case bool() | int() | str() | None:
+            return value
+    raise ValueError(f"settings must be texts, finite numbers, booleans, lists and tables, got {short_text(value)}")
+
+
+def _phases(tables):
+    """Phases of a tip from the tables ``[[phases]]``, with the fields of `Phase`."""
+    if not isinstance(tables, list):
+        raise ValueError(f"phases must be tables [[phases]], got {short_text(tables)}")
+    return [from_plain(table, Phase, what="phases") for table in tables]
 
 
 def _host(tip):
@@ -332,7 +417,7 @@ def _tip(table, phases):
     known = tuple(name for name in inspect.signature(Tip).parameters if name != "phases")
     if phases is None:
         check_keys(table, known, ("material", "apex_radius"))
-        settings = dict(table, material=_material(table["material"]))
+        settings = dict(table, material=as_material(table["material"]))
     else:
         known = tuple(name for name in known if name not in ("material", "solutes"))
         check_keys(table, known, ("apex_radius",))
@@ -348,22 +433,9 @@ def _tip(table, phases):
     return settings
 
 
-def _material(host, name="material"):
-    """Material from its name or a table."""
-    if isinstance(host, Mapping):
-        check_keys(host, _field_names(Material), ("name",))
-        changes = {key: value for key, value in host.items() if key != "name"}
-        if host["name"] in list(MATERIALS):
-            return material(**host)
-        check_keys(host, _field_names(Material), ("structure", "a", "evaporation_field", "charge_state", "mass"))
-        return Material(host["name"], **changes)
-    if isinstance(host, str):
-        return material(host)
-    raise ValueError(f"{name} must be a name such as 'Ni' or a table, got {short_text(host)}")
-
-
 _FILE_KEYS = (
     "file",
+    "sha256",
     "types",
     "format",
     "units",
@@ -382,7 +454,7 @@ def _tip_from_file(table, path):
     if not (isinstance(table["file"], str) and table["file"]):
         raise ValueError(f"file must be a file name such as 'tip.lmp', got {short_text(table['file'])}")
     check_table(settings.get("types", {}), "types")
-    settings["types"] = {key: _material(value, f"types.{key}") for key, value in settings.get("types", {}).items()}
+    settings["types"] = {key: as_material(value, f"types.{key}") for key, value in settings.get("types", {}).items()}
     return {"path": path.parent / table["file"], **settings}
 
 
@@ -397,10 +469,6 @@ def _length(value, name, a):
         raise ValueError(
             f"{name} must be a number [nm] or text such as '20 a' or '7 nm', got {short_text(value)}"
         ) from None
-
-
-def _field_names(kind):
-    return tuple(item.name for item in fields(kind) if item.name != "sources")
 
 
 @contextmanager

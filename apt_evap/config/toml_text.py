@@ -29,9 +29,9 @@ def toml_text(document: Mapping[str, Any]) -> str:
     """
     plain = [(key, value) for key, value in document.items() if not isinstance(value, Mapping)]
     tables = [(key, value) for key, value in document.items() if isinstance(value, Mapping)]
-    lines = [f"{_key(key)} = {_value(value)}" for key, value in plain]
+    lines = [f"{_key(key)} = {inline(value)}" for key, value in plain]
     for name, table in tables:
-        lines += ["", f"[{_key(name)}]", *(f"{_key(key)} = {_value(value)}" for key, value in table.items())]
+        lines += ["", f"[{_key(name)}]", *(f"{_key(key)} = {inline(value)}" for key, value in table.items())]
     return "\n".join(lines).lstrip("\n") + "\n"
 
 
@@ -43,7 +43,8 @@ def _text(value):
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")  # JSON allows this character, TOML does not
 
 
-def _value(value):
+def inline(value: Any) -> str:
+    """Text of a value in one line; tables are inline."""
     match value:
         case bool():
             return "true" if value else "false"
@@ -56,7 +57,7 @@ def _value(value):
         case float():
             return repr(value)
         case list() | tuple():
-            return "[" + ", ".join(map(_value, value)) + "]"
+            return "[" + ", ".join(map(inline, value)) + "]"
         case Mapping():
-            return "{" + ", ".join(f"{_key(key)} = {_value(each)}" for key, each in value.items()) + "}"
+            return "{" + ", ".join(f"{_key(key)} = {inline(each)}" for key, each in value.items()) + "}"
     raise ValueError(f"settings must be texts, numbers, booleans, lists and tables, got {value!r:.80}")

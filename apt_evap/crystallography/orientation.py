@@ -1,5 +1,7 @@
 """Orientation of the crystal of a specimen, and its fit to poles on a map."""
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,43 +12,33 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
+from apt_evap._common.codec import checked, number, settings
+from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_array, check_number, check_sequence, check_switch, short_text
+from apt_evap._common.validation import check_array, check_sequence, check_switch, short_text
 from apt_evap.crystallography.poles import plane_normals
 from apt_evap.detection.projection import Projection
 from apt_evap.specimen import lattice
-from apt_evap.specimen.materials import Material, as_material
+from apt_evap.specimen.materials import as_material
 
 _SAME = math.radians(0.1)  # directions closer than this count as one
 
 
-@dataclass(frozen=True)
+@settings
 class Orientation:
-    """Orientation of a crystal in the frame of the specimen, as for `Tip`.
+    """Orientation of a crystal in the frame of the specimen, as for `Tip`."""
 
-    Parameters
-    ----------
-    material : Material or str
-        The crystal; a str is looked up by `material`.
-    axis : sequence of float
-        Crystal direction along +z, see `lattice.rotation_to_axis`.
-    rotation : float
-        Rotation of the crystal about z [degrees].
+    material: Any = checked("The crystal; a str is looked up by `material`.", "Material or str", as_material)
+    axis: tuple = checked(
+        "Crystal direction along +z, see `specimen.lattice.rotation_to_axis`.",
+        "sequence of float",
+        lambda axis, name: axis,  # checked with the structure
+        default=(0, 0, 1),
+    )
+    rotation: float = number("Rotation of the crystal about z.", default=0.0, unit="degrees")
 
-    Raises
-    ------
-    ValueError
-        If the material is unknown or the direction invalid.
-    """
-
-    material: Material
-    axis: tuple = (0, 0, 1)
-    rotation: float = 0.0
-
-    def __post_init__(self):
-        object.__setattr__(self, "material", as_material(self.material))
-        object.__setattr__(self, "axis", lattice.check_axis(self.material.structure, self.axis))
-        object.__setattr__(self, "rotation", check_number(self.rotation, "rotation", unit="degrees"))
+    def _check(self):
+        return {"axis": lattice.check_axis(self.material.structure, self.axis)}
 
     @cached_property
     def matrix(self) -> Floats:
@@ -54,7 +46,7 @@ class Orientation:
         return lattice.rotation_to_axis(self.material, self.axis, self.rotation)
 
     @classmethod
-    def from_matrix(cls, material: Any, matrix: ArrayLike) -> "Orientation":
+    def from_matrix(cls, material: Any, matrix: ArrayLike) -> Orientation:
         """Make an orientation from its rotation matrix.
 
         Parameters
@@ -87,7 +79,7 @@ class Orientation:
         return cls(host, axis, math.degrees(angle))
 
     @classmethod
-    def from_settings(cls, settings: Mapping[str, Any]) -> "Orientation":
+    def from_settings(cls, settings: Mapping[str, Any]) -> Orientation:
         """Make the orientation of a tip from its settings: `Tip.settings`, or ``Run.settings["tip"]``.
 
         With several phases it is that of the matrix.
@@ -100,10 +92,10 @@ class Orientation:
         if "axis" not in settings:
             raise ValueError(f"settings must contain the axis of a crystal, got {', '.join(settings)}")
         if "phases" not in settings:
-            return cls(Material(**settings["material"]), tuple(settings["axis"]), settings["rotation"])
+            return cls(settings["material"], tuple(settings["axis"]), settings["rotation"])
         matrix = settings["phases"][0]
         axis, rotation = (settings[name] if matrix[name] is None else matrix[name] for name in ("axis", "rotation"))
-        return cls(Material(**matrix["material"]), tuple(axis), rotation)
+        return cls(matrix["material"], tuple(axis), rotation)
 
     def directions(self, crystal_directions: ArrayLike) -> Floats:
         """Rotate vectors from the frame of the crystal to the frame of the specimen, both of shape (n, 3)."""
@@ -138,6 +130,9 @@ class FittedOrientation:
     angle_error: float
     scale_error: float
     mirrored_rms: float
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def fit_orientation(

@@ -1,5 +1,7 @@
 """Poles and zone axes of a crystal: the lattice planes visible on a map, their directions and labels."""
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 from collections.abc import Iterable, Sequence
 from itertools import permutations, product
 from math import gcd
@@ -8,10 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_count, short_text
 from apt_evap.specimen import lattice
-from apt_evap.specimen.materials import Material
+from apt_evap.specimen.materials import Material, as_material
 
 _LARGEST = 9  # largest index in the search: includes the 50 families of largest spacing of all lattices
 _MAX_FAMILIES = 50
@@ -38,6 +41,9 @@ class Poles(NamedTuple):
     labels: tuple
     """Labels of the poles in the math syntax of matplotlib, with bars over negative indices."""
 
+    def __repr__(self) -> str:
+        return short_repr(self)
+
 
 class Zones(NamedTuple):
     """Zone axes of a crystal, one of each pair of opposite directions."""
@@ -49,8 +55,11 @@ class Zones(NamedTuple):
     families: np.ndarray
     """Index of the family of each axis, shape (n,)."""
 
+    def __repr__(self) -> str:
+        return short_repr(self)
 
-def poles(material: Material, families: int = 8) -> Poles:
+
+def poles(material: Any, families: int = 8) -> Poles:
     """Poles of a crystal: the families of lattice planes with the largest spacing.
 
     Higher steps between terraces give a larger facet and a darker pole on a map. So the families are ordered by their
@@ -58,8 +67,8 @@ def poles(material: Material, families: int = 8) -> Poles:
 
     Parameters
     ----------
-    material : Material
-        The crystal.
+    material : Material or str or Orientation or FittedOrientation
+        The crystal; of an orientation its material. A str is looked up by `material`.
     families : int
         Number of families, from 1 to 50.
 
@@ -73,6 +82,7 @@ def poles(material: Material, families: int = 8) -> Poles:
     ValueError
         If `families` is not an integer from 1 to 50.
     """
+    material = _crystal(material)
     families = check_count(families, "families", at_least=1)
     if families > _MAX_FAMILIES:
         raise ValueError(f"families must be <= {_MAX_FAMILIES}, got {families}")
@@ -100,13 +110,13 @@ def poles(material: Material, families: int = 8) -> Poles:
     )
 
 
-def zones(material: Material, families: Sequence[Any] | None = None) -> Zones:
+def zones(material: Any, families: Sequence[Any] | None = None) -> Zones:
     """Zone axes of a crystal; the zone line is the great circle perpendicular to the axis, which contains its poles.
 
     Parameters
     ----------
-    material : Material
-        The crystal.
+    material : Material or str or Orientation or FittedOrientation
+        As for `poles`.
     families : sequence, optional
         One member of each family, [u v w] or for hcp [u v t w]; by default those of `ZONES`.
 
@@ -119,6 +129,7 @@ def zones(material: Material, families: Sequence[Any] | None = None) -> Zones:
     ValueError
         If an axis is not a lattice direction.
     """
+    material = _crystal(material)
     families = ZONES[material.structure] if families is None else families
     if not len(families):
         raise ValueError("families must contain at least one zone axis, got none")
@@ -133,6 +144,12 @@ def zones(material: Material, families: Sequence[Any] | None = None) -> Zones:
                 numbers.append(number)
     axes = np.array(axes)
     return Zones(axes, direction_normals(material, axes), np.array(numbers))
+
+
+def _crystal(thing):
+    """The material of an orientation, of a fitted one, or itself."""
+    thing = getattr(thing, "orientation", thing)
+    return as_material(getattr(thing, "material", thing))
 
 
 def plane_normals(material: Material, planes: ArrayLike, name: str = "planes") -> Floats:

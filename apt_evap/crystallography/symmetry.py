@@ -1,10 +1,11 @@
-"""Point group of a crystal, and the part of it that keeps the axis of a specimen."""
+"""Point group of a crystal, and the parts of it that keep a direction or the axis of a specimen."""
 
-import math
-from itertools import permutations, product
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
 
 from apt_evap._common.types import Floats
@@ -28,14 +29,30 @@ def point_group(structure: str) -> Floats:
         Orthogonal matrices in the frame of the crystal: 48 of m-3m, or 24 of 6/mmm for hcp, shape (n, 3, 3). In diamond
         and hcp some of them map the crystal onto itself only with a shift by a part of the cell.
     """
-    if check_structure(structure) != "hcp":
-        signs = product((1.0, -1.0), repeat=3)
-        return np.array([np.diag(sign)[list(order)] for sign in signs for order in permutations(range(3))])
-    members = []
-    for turn, across, along in product(range(6), (1.0, -1.0), (1.0, -1.0)):
-        cosine, sine = math.cos(turn * math.pi / 3), math.sin(turn * math.pi / 3)
-        members.append(np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]]) @ np.diag([1.0, across, along]))
-    return np.array(members)
+    rotations = "D6" if check_structure(structure) == "hcp" else "O"
+    members = scipy.spatial.transform.Rotation.create_group(rotations).as_matrix()
+    return np.concatenate([members, -members])  # both groups contain the inversion
+
+
+def rotational_symmetry(material: Any, direction: ArrayLike) -> int:
+    """Order of the rotations about a direction that map the lattice of a crystal onto itself.
+
+    Parameters
+    ----------
+    material : Material
+        The crystal.
+    direction : array_like
+        In the Cartesian frame of the crystal, of any length, shape (3,).
+
+    Returns
+    -------
+    int
+        1, 2, 3, 4 or 6.
+    """
+    along = check_array(direction, "direction", (3,))
+    group = point_group(material.structure)
+    turned = group[np.linalg.det(group) > 0] @ along
+    return int(np.count_nonzero(np.linalg.norm(turned - along, axis=1) < _TOLERANCE * np.linalg.norm(along)))
 
 
 def symmetry_about_axis(material: Any, orientation: ArrayLike) -> Floats:

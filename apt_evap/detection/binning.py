@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
+import skimage
 
 from apt_evap._common.types import Booleans, Floats, Integers
 from apt_evap._common.validation import check_array, check_count, check_number, short_text
@@ -239,47 +240,7 @@ def field_of_view(counts: Integers) -> Booleans:
     if number > 1:
         region = labels == 1 + np.argmax(scipy.ndimage.sum_labels(counts, labels, np.arange(1, number + 1)))
     region &= scipy.ndimage.uniform_filter((counts > 0).astype(float), side, mode="constant") > 0
-    if min(np.ptp(axis) for axis in np.nonzero(region)) == 0:
+    if min(np.ptp(axis) for axis in np.nonzero(region)) == 0:  # one row or column has no hull
         return region
-    return convex_hull(region)
-
-
-def convex_hull(region: Booleans) -> Booleans:
-    """Bins whose centres lie within the convex hull of the centres of a region, or on its border.
-
-    Parameters
-    ----------
-    region : ndarray
-        bool of shape (ny, nx), not all False.
-
-    Returns
-    -------
-    ndarray
-        bool of shape (ny, nx).
-    """
-    nx = region.shape[1]
-    rows = np.flatnonzero(region.any(axis=1))
-    left, right = region[rows].argmax(axis=1), nx - 1 - region[rows, ::-1].argmax(axis=1)
-    inner = np.arange(rows[0], rows[-1] + 1)
-    columns = np.arange(nx)
-    hull = np.zeros_like(region)
-    hull[inner] = (-_upper_hull(rows, -left, inner)[:, None] <= columns) & (
-        columns <= _upper_hull(rows, right, inner)[:, None]
-    )
-    return hull
-
-
-def _upper_hull(x, y, at):
-    """Integer part of the upper convex hull of integer points, at the integers `at`, in exact arithmetic."""
-    corners = []
-    for point in zip(x.tolist(), y.tolist(), strict=True):
-        while len(corners) > 1 and not _turns_right(*corners[-2:], point):
-            corners.pop()
-        corners.append(point)
-    x, y = np.array(corners + corners[-1:]).T
-    step = np.minimum(np.searchsorted(x, at, side="right"), len(x) - 1) - 1
-    return y[step] + (y[step + 1] - y[step]) * (at - x[step]) // np.maximum(x[step + 1] - x[step], 1)
-
-
-def _turns_right(a, b, c):
-    return (b[0] - a[0]) * (c[1] - a[1]) < (b[1] - a[1]) * (c[0] - a[0])
+    # of the centres of the bins, with those on its border
+    return skimage.morphology.convex_hull_image(region, offset_coordinates=False)

@@ -1,13 +1,13 @@
 """The detector, and the hits of straight flights onto it."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
+from apt_evap._common.codec import choice, number, settings
 from apt_evap._common.small_matrices import squared_lengths
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_choice, check_number
+from apt_evap.detection.binning import bin_edges
+from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Outcome
 from apt_evap.detection.projection import Projection, along_axis, stereographic, stereographic_stretch
 from apt_evap.units import NM_PER_MM
@@ -16,43 +16,49 @@ PROJECTIONS = {"plane": 1.0, "equidistant": None}
 """Image compression of each `Projection`; None is the azimuthal equidistant one."""
 
 
-@dataclass(frozen=True)
+@settings
 class Detector:
-    """Square detector, centred on the axis of the specimen.
+    """Square detector, centred on the axis of the specimen."""
 
-    Parameters
-    ----------
-    distance : float
-        Distance from the apex to the detector [mm].
-    width : float
-        Edge of the square [mm].
-    projection : str
-        Position of an ion at the polar angle theta. "plane": a flat detector at the distance D, at D tan(theta) from
-        the centre. "equidistant": at D theta, the azimuthal equidistant projection. It approximates measured maps,
-        whose ions pass a reflectron or a curved field. The time of flight is then that to the sphere of radius D.
-
-    Raises
-    ------
-    ValueError
-        If a length is not positive or exceeds 1 km, or the projection is unknown.
-    """
-
-    distance: float = 100.0
-    width: float = 300.0
-    projection: str = "plane"
-
-    def __post_init__(self):
-        check_choice(self.projection, "projection", PROJECTIONS)
-        for name in ("distance", "width"):
-            # more than 1 km is a wrong unit
-            length = check_number(getattr(self, name), name, above=0, at_most=1e6, unit="mm")
-            object.__setattr__(self, name, length)
+    # more than 1 km is a wrong unit
+    distance: float = number("Distance from the apex to the detector.", default=100.0, above=0, at_most=1e6, unit="mm")
+    width: float = number("Edge of the square.", default=300.0, above=0, at_most=1e6, unit="mm")
+    projection: str = choice(
+        'Position of an ion at the polar angle theta. "plane": a flat detector at the distance D, at D tan(theta) from '
+        'the centre. "equidistant": at D theta, the azimuthal equidistant projection. It approximates measured maps, '
+        "whose ions pass a reflectron or a curved field. The time of flight is then that to the sphere of radius D.",
+        PROJECTIONS,
+        default="plane",
+    )
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
         """Area of the detector: x_min, x_max, y_min, y_max [mm]."""
         half = self.width / 2
         return -half, half, -half, half
+
+    def grid(self, bins: int) -> DetectorMap:
+        """Empty map of the complete detector, for the `like` of other maps.
+
+        Parameters
+        ----------
+        bins : int
+            Number of bins along each side.
+
+        Returns
+        -------
+        DetectorMap
+            Without hits and without an outline: all bins are inside.
+
+        Examples
+        --------
+        >>> grid = Detector(width=80.0).grid(200)
+        >>> grid
+        <DetectorMap: 0 ions, 200 x 200 bins of 0.4 x 0.4 mm>
+        """
+        x_edges, y_edges = bin_edges(np.empty(0), np.empty(0), bins, self.extent)
+        empty = np.zeros((len(y_edges) - 1, len(x_edges) - 1))
+        return DetectorMap.from_array(empty, x_edges, y_edges, is_counts=True)
 
     @property
     def seen_from_apex(self) -> Projection:

@@ -1,5 +1,7 @@
 """Maps of the hits on the detector, with bins that avoid stripes from the quantisation of measured coordinates."""
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -88,8 +90,8 @@ class DetectorMap:
         quantum: str | tuple[float, float] | None = "auto",
         dither_seed: int | None = None,
         mask: ArrayLike | None = None,
-        like: "DetectorMap | None" = None,
-    ) -> "DetectorMap":
+        like: DetectorMap | None = None,
+    ) -> DetectorMap:
         """Count the detected ions in approximately square bins.
 
         Measured coordinates are quantised. Bins that are not multiples of the quantisation step alias into stripes. So
@@ -184,7 +186,7 @@ class DetectorMap:
         *,
         is_counts: bool = False,
         source: str = "",
-    ) -> "DetectorMap":
+    ) -> DetectorMap:
         """Make a map from an array, such as a published one.
 
         Parameters
@@ -268,7 +270,7 @@ class DetectorMap:
         """Centres of the bins in x and in y [mm], shapes (nx,) and (ny,)."""
         return tuple((edges[:-1] + edges[1:]) / 2 for edges in (self.x_edges, self.y_edges))
 
-    def smoothed(self, sigma: float) -> "DetectorMap":
+    def smoothed(self, sigma: float) -> DetectorMap:
         """Smooth the density with a Gaussian inside the detector.
 
         The smoothed density is divided by the smoothed mask, so that it does not decrease at the rim.
@@ -288,14 +290,13 @@ class DetectorMap:
         ValueError
             If sigma is negative, or larger than the map.
         """
-        longer = max(self.extent[1] - self.extent[0], self.extent[3] - self.extent[2])
-        sigma = check_number(sigma, "sigma", at_least=0, at_most=longer, unit="mm")
+        sigma = check_sigma(sigma, "sigma", self)
         if sigma == 0:
             return self
         total = float(np.hypot(sigma, self.smoothing))
         return replace(self, values=self._smooth(sigma), is_counts=False, smoothing=total)
 
-    def flattened(self, sigma: float) -> "DetectorMap":
+    def flattened(self, sigma: float) -> DetectorMap:
         """Remove slow variations over the detector: divide the density by the smoothed density.
 
         Parameters
@@ -311,9 +312,9 @@ class DetectorMap:
         Raises
         ------
         ValueError
-            If sigma is negative.
+            If sigma is negative, or larger than the map.
         """
-        sigma = check_number(sigma, "sigma", at_least=0, unit="mm")
+        sigma = check_sigma(sigma, "sigma", self)
         if sigma == 0:
             return self
         background = self._smooth(sigma)
@@ -332,6 +333,12 @@ class DetectorMap:
         smoothing = f", smoothed by {self.smoothing:g} mm" if self.smoothing else ""
         source = f" from {self.source!r}" if self.source else ""
         return f"<DetectorMap: {what}{source}, {nx} x {ny} bins of {width:.4g} x {height:.4g} mm{smoothing}>"
+
+
+def check_sigma(sigma: object, name: str, map: DetectorMap) -> float:
+    """Return a standard deviation [mm] from 0 to the longer side of a map, or raise a ValueError with its name."""
+    longer = max(map.extent[1] - map.extent[0], map.extent[3] - map.extent[2])
+    return check_number(sigma, name, at_least=0, at_most=longer, unit="mm")
 
 
 def masked_gaussian(values: Floats, mask: Booleans, sigmas: ArrayLike) -> Floats:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from apt_evap._common.types import Booleans
+from apt_evap._common.types import Booleans, Column
 from apt_evap._common.validation import check_array, check_kind, check_number, check_seed, did_you_mean, short_text
 from apt_evap._common.warnings import DataWarning
 from apt_evap.detection.binning import find_quantisations
@@ -94,19 +94,19 @@ class Hits:
         If there is no column, a column has the wrong shape or type, lengths differ, or an outcome is unknown.
     """
 
-    x: np.ndarray | None = None
-    y: np.ndarray | None = None
-    time_of_flight: np.ndarray | None = None
-    voltage: np.ndarray | None = None
-    pulse_voltage: np.ndarray | None = None
-    mass_to_charge: np.ndarray | None = None
-    positions: np.ndarray | None = None
-    pulses: np.ndarray | None = None
-    multiplicity: np.ndarray | None = None
-    pulse_id: np.ndarray | None = None
-    site: np.ndarray | None = None
-    ion: np.ndarray | None = None
-    outcome: np.ndarray | None = None
+    x: Column = None
+    y: Column = None
+    time_of_flight: Column = None
+    voltage: Column = None
+    pulse_voltage: Column = None
+    mass_to_charge: Column = None
+    positions: Column = None
+    pulses: Column = None
+    multiplicity: Column = None
+    pulse_id: Column = None
+    site: Column = None
+    ion: Column = None
+    outcome: Column = None
     extra: dict = field(default_factory=dict)
     units: dict = field(default_factory=dict)
     source: str = ""

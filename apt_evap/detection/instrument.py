@@ -1,12 +1,13 @@
 """The instrument: which ions it records, and the columns that it writes for them."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import IntEnum
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from apt_evap._common.codec import checked, number, part, settings, vector
 from apt_evap._common.validation import check_array, check_choice, check_kind, check_number, check_seed
 from apt_evap._core.elementary import arctangent, normal_quantile
 from apt_evap.detection.detector import PROJECTIONS
@@ -48,43 +49,16 @@ class Recording(NamedTuple):
         return f"<Recording: {_counted(self)}>"
 
 
-@dataclass(frozen=True)
+def _projection(given, name):
+    return given if callable(given) else check_choice(given, name, PROJECTIONS)
+
+
+@settings
 class Instrument:
     """Instrument that records ions: image, efficiency, dead time, resolution and quantisation of its detector.
 
-    It is applied after the simulation (`Run.seen_by`). The effects follow one another: position on the detector, field
+    It is applied after the simulation (`Run.record`). The effects follow one another: position on the detector, field
     of view, efficiency, dead time, resolution, quantisation. By default only the field of view is limited.
-
-    Parameters
-    ----------
-    distance : float
-        Distance from the apex to the plane on which straight flights form the image [mm]. A reflectron has a shorter
-        virtual distance than its flight path.
-    field_of_view : float
-        Diameter of the circular detector [mm].
-    projection : str or callable
-        Position of an ion at the polar angle theta: "plane" at D tan(theta) from the centre, "equidistant" at D theta,
-        as for `Detector`. Or a function that maps the positions of straight flights on the plane at `distance` to
-        positions on the detector, (n, 2) -> (n, 2) [mm], such as the measured map of a reflectron; NaN for an ion that
-        does not arrive.
-    efficiency : float
-        Fraction of the ions that the detector responds to, > 0 and <= 1. Every ion has the same probability.
-    dead_time, dead_zone : float
-        An ion is lost if it arrives less than `dead_time` [ns] after a recorded ion of the same pulse, and less than
-        `dead_zone` [mm] from it both in x and in y.
-    resolution : float
-        Standard deviation of the measured position in x and in y [mm].
-    quantisation : tuple of float, optional
-        Steps in x and y [mm]: measured positions are multiples of them. None for continuous positions.
-    timing : Timing, optional
-        Errors of the times of flight, instead of those of the run; None keeps those of the run.
-    flight_path : float, optional
-        Length of the flights [mm] if it is not that of straight flights, as in a reflectron: the same for all ions.
-
-    Raises
-    ------
-    ValueError
-        If a number is outside its range, or the projection is unknown.
 
     Notes
     -----
@@ -100,39 +74,59 @@ class Instrument:
     Its limits differ between instruments, and have no default here.
     """
 
-    distance: float = 100.0
-    field_of_view: float = 80.0
-    projection: str | Callable[[Any], Any] = "plane"
-    efficiency: float = 1.0
-    dead_time: float = 0.0
-    dead_zone: float = 0.0
-    resolution: float = 0.0
-    quantisation: tuple[float, float] | None = None
-    timing: Timing | None = None
-    flight_path: float | None = None
-
-    def __post_init__(self):
-        if not callable(self.projection):
-            check_choice(self.projection, "projection", PROJECTIONS)
-        values = {
-            # more than 1 km is a wrong unit
-            "distance": check_number(self.distance, "distance", above=0, at_most=1e6, unit="mm"),
-            "field_of_view": check_number(self.field_of_view, "field_of_view", above=0, at_most=1e6, unit="mm"),
-            "efficiency": check_number(self.efficiency, "efficiency", above=0, at_most=1),
-            "dead_time": check_number(self.dead_time, "dead_time", at_least=0, unit="ns"),
-            "dead_zone": check_number(self.dead_zone, "dead_zone", at_least=0, unit="mm"),
-            "resolution": check_number(self.resolution, "resolution", at_least=0, at_most=1e6, unit="mm"),
-        }
-        if self.quantisation is not None:
-            steps = check_array(self.quantisation, "quantisation", (2,)).tolist()
-            values["quantisation"] = tuple(check_number(step, "quantisation", above=0, unit="mm") for step in steps)
-        if self.timing is not None:
-            check_kind(self.timing, "timing", Timing, "a Timing or None")
-        if self.flight_path is not None:
-            length = check_number(self.flight_path, "flight_path", above=0, at_most=1e6, unit="mm")
-            values["flight_path"] = length
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+    # less than 1 mm or more than 1 km is a wrong unit
+    distance: float = number(
+        "Distance from the apex to the plane on which straight flights form the image. A reflectron has a shorter "
+        "virtual distance than its flight path.",
+        default=100.0,
+        at_least=1,
+        at_most=1e6,
+        unit="mm",
+    )
+    field_of_view: float = number("Diameter of the circular detector.", default=80.0, above=0, at_most=1e6, unit="mm")
+    projection: str | Callable[[Any], Any] = checked(
+        'Position of an ion at the polar angle theta: "plane" at D tan(theta) from the centre, "equidistant" at D '
+        "theta, as for `Detector`. Or a function that maps the positions of straight flights on the plane at "
+        "`distance` to positions on the detector, (n, 2) -> (n, 2) [mm], such as the measured map of a reflectron; NaN "
+        "for an ion that does not arrive.",
+        "str or callable",
+        _projection,
+        default="plane",
+    )
+    efficiency: float = number(
+        "Fraction of the ions that the detector responds to. Every ion has the same probability.",
+        default=1.0,
+        above=0,
+        at_most=1,
+    )
+    dead_time: float = number(
+        "An ion is lost if it arrives less than this after a recorded ion of the same pulse, and closer than "
+        "`dead_zone`.",
+        default=0.0,
+        at_least=0,
+        unit="ns",
+    )
+    dead_zone: float = number("Distance both in x and in y.", default=0.0, at_least=0, unit="mm")
+    resolution: float = number(
+        "Standard deviation of the measured position in x and in y.", default=0.0, at_least=0, at_most=1e6, unit="mm"
+    )
+    quantisation: tuple[float, float] | None = vector(
+        "Steps in x and y: measured positions are multiples of them. None for continuous positions.",
+        2,
+        default=None,
+        above=0,
+        unit="mm",
+    )
+    timing: Timing | None = part(
+        "Errors of the times of flight, instead of those of the run; None keeps those of the run.", Timing, default=None
+    )
+    flight_path: float | None = number(
+        "Length of the flights if it is not that of straight flights, as in a reflectron: the same for all ions.",
+        default=None,
+        above=0,
+        at_most=1e6,
+        unit="mm",
+    )
 
     @classmethod
     def preset(cls, name: str, **changes: Any) -> "Instrument":
@@ -228,7 +222,8 @@ class Instrument:
         """Recording of all ions, and measured columns of the recorded ones."""
         check_kind(hits, "hits", Hits, "Hits")
         x, y, times, pulse, ion = hits.require("x", "y", "time_of_flight", "pulse_id", "ion")
-        distance = self.distance if distance is None else check_number(distance, "distance", above=0, unit="mm")
+        distance = self.distance if distance is None else distance
+        distance = check_number(distance, "distance", at_least=1, at_most=1e6, unit="mm")
         u = IonRandom((check_seed(seed) + _SEED_STEP) % (1 << 64), ion).uniform(_COLUMNS)
         points = np.column_stack([x, y]).astype(np.float64) * (self.distance / distance)
         places = self._places(points)

@@ -12,6 +12,8 @@ The directions at the end of flights are stereographic, s = tan(theta / 2) (cos,
 finite also for ions that fly parallel to a plane detector or away from it, where the position on it diverges.
 """
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 import math
 from dataclasses import dataclass, replace
 
@@ -169,7 +171,7 @@ class Projection:
             return math.inf
         return self.scale * float(radius_of(np.array(self.last_angle), self.compression))
 
-    def compressed(self, compression: float) -> "Projection":
+    def compressed(self, compression: float) -> Projection:
         """Projection for polar angles in the specimen that are `compression` times the angles of this projection."""
         compression = check_number(compression, "compression", above=0)
         product = None if self.compression is None else self.compression * compression

@@ -1,10 +1,11 @@
 """Times of flight: from a time to a mass, and the errors of the measured times."""
 
-from dataclasses import dataclass
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from apt_evap._common.codec import number, settings
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_number, check_switch
 from apt_evap._core.elementary import logarithm, normal_quantile
@@ -66,7 +67,7 @@ def mass_to_charge(
     return MASS_TO_CHARGE * voltage * time * time / (distance * distance + across)
 
 
-@dataclass(frozen=True)
+@settings
 class Timing:
     """Errors of the measured times of flight: energy deficits of voltage pulses, and jitter.
 
@@ -75,21 +76,6 @@ class Timing:
     instrument calculates m/n with the peak voltage V, and obtains (m/n) / (1 - delta): each peak has a tail to high
     masses. The slope of ln N per relative mass is -C / (k T) for deficits << 1. Field evaporation energy loss
     spectroscopy (FEELS) measures C from it.
-
-    Parameters
-    ----------
-    jitter : float
-        Standard deviation of the measured time [ns], >= 0.
-    temperature : float, optional
-        Temperature of the specimen [K], > 0; None for no deficits, for example with laser pulses.
-    sensitivity : float
-        Sensitivity C of the barrier to the field [eV], > 0: C = -dQ / d(ln F) of the energy barrier Q at the field of
-        the evaporation. The mean deficit k T / C must be <= 1/37: the model is one of small deficits.
-
-    Raises
-    ------
-    ValueError
-        If a number is outside its range.
 
     Notes
     -----
@@ -100,20 +86,26 @@ class Timing:
     Source: "Introducing field evaporation energy loss spectroscopy", Commun. Phys. (2023), 10.1038/s42005-023-01203-2.
     """
 
-    jitter: float = 0.2
-    temperature: float | None = None
-    sensitivity: float = 1.0
+    jitter: float = number("Standard deviation of the measured time.", default=0.2, at_least=0, unit="ns")
+    temperature: float | None = number(
+        "Temperature of the specimen. None for no deficits, for example with laser pulses.",
+        default=None,
+        above=0,
+        unit="K",
+    )
+    sensitivity: float = number(
+        "Sensitivity C of the barrier to the field: C = -dQ / d(ln F) of the energy barrier Q at the field of the "
+        "evaporation. The mean deficit k T / C must be <= 1/37: the model is one of small deficits.",
+        default=1.0,
+        above=0,
+        unit="eV",
+    )
 
-    def __post_init__(self):
-        object.__setattr__(self, "jitter", check_number(self.jitter, "jitter", at_least=0, unit="ns"))
-        sensitivity = check_number(self.sensitivity, "sensitivity", above=0, unit="eV")
-        object.__setattr__(self, "sensitivity", sensitivity)
+    def _check(self):
         if self.temperature is not None:
-            highest = _LARGEST_MEAN * sensitivity / BOLTZMANN
-            kelvin = check_number(
-                self.temperature, "temperature", above=0, at_most=highest, unit="K", why="k T <= sensitivity / 37"
-            )
-            object.__setattr__(self, "temperature", kelvin)
+            highest = _LARGEST_MEAN * self.sensitivity / BOLTZMANN
+            why = "k T <= sensitivity / 37"
+            check_number(self.temperature, "temperature", at_most=highest, unit="K", why=why)
 
     @property
     def mean_deficit(self) -> float:

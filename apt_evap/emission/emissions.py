@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import Booleans, Floats
 from apt_evap._common.validation import check_array, check_number
 from apt_evap.emission.ion_random import IonRandom
@@ -168,6 +169,9 @@ class TangentialLaunches(NamedTuple):
     """Whether each ion rolled up twice, shape (n,), a part of `rolled`; by default none did."""
     second_shares: Floats | None = None
     """Shares of the targets of the second roll-up, shape (n, 3), sum 1; by default the first only."""
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -1,7 +1,8 @@
 """Energy distributions: any object with a method `quantile(u)`."""
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 import math
-from dataclasses import dataclass
 from decimal import Decimal, localcontext
 from functools import lru_cache
 from numbers import Real
@@ -11,8 +12,9 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
+from apt_evap._common.codec import number, settings
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_array, check_number, short_text
+from apt_evap._common.validation import check_array, short_text
 from apt_evap._core.elementary import logarithm, normal_quantile
 from apt_evap.units import BOLTZMANN
 
@@ -51,31 +53,14 @@ def normal_probability(x: float) -> float:
         return float(Decimal("0.5") + density * total)
 
 
-@dataclass(frozen=True)
+@settings
 class TruncatedNormal:
-    """Normal distribution of the energy, truncated below zero.
+    """Normal distribution of the energy, truncated below zero."""
 
-    Parameters
-    ----------
-    mean : float
-        Mean before the truncation [eV], from 0 to 100.
-    standard_deviation : float
-        Standard deviation before the truncation [eV], > 0 and <= 100.
-
-    Raises
-    ------
-    ValueError
-        If a number is outside its range.
-    """
-
-    mean: float
-    standard_deviation: float
-
-    def __post_init__(self):
-        sigma = check_number(self.standard_deviation, "standard_deviation", above=0, at_most=HIGHEST_ENERGY, unit="eV")
-        mean = check_number(self.mean, "mean", at_least=0, at_most=HIGHEST_ENERGY, unit="eV")
-        object.__setattr__(self, "mean", mean)
-        object.__setattr__(self, "standard_deviation", sigma)
+    mean: float = number("Mean before the truncation.", at_least=0, at_most=HIGHEST_ENERGY, unit="eV")
+    standard_deviation: float = number(
+        "Standard deviation before the truncation.", above=0, at_most=HIGHEST_ENERGY, unit="eV"
+    )
 
     def quantile(self, u: ArrayLike) -> Floats:
         """Energy [eV] below which the fraction `u` (in (0, 1), any shape) of the distribution lies."""
@@ -105,45 +90,25 @@ class TruncatedNormal:
         return math.exp(-0.5 * ratio * ratio - scipy.special.log_ndtr(ratio)) / math.sqrt(2 * math.pi)
 
 
-@dataclass(frozen=True)
+@settings
 class Fixed:
-    """The same energy for every ion.
+    """The same energy for every ion."""
 
-    Parameters
-    ----------
-    energy : float
-        Energy [eV], from 0 to 100.
+    energy: float = number("Energy.", at_least=0, at_most=HIGHEST_ENERGY, unit="eV")
 
-    Raises
-    ------
-    ValueError
-        If the energy is outside this range or not a number.
-    """
-
-    energy: float
-
-    def __post_init__(self):
-        energy = check_number(self.energy, "energy", at_least=0, at_most=HIGHEST_ENERGY, unit="eV")
-        object.__setattr__(self, "energy", energy)
+    @property
+    def as_argument(self) -> float:
+        """The energy: a perturbation takes the number alone."""
+        return self.energy
 
     def quantile(self, u: ArrayLike) -> Floats:
         """Return the energy [eV] in the shape of `u`."""
         return np.full(np.shape(u), self.energy)
 
 
-@dataclass(frozen=True)
+@settings
 class Thermal:
     """Energy of the thermal motion along the surface: exponential, with the mean k T.
-
-    Parameters
-    ----------
-    temperature : float
-        Temperature [K], > 0 and <= 1e5.
-
-    Raises
-    ------
-    ValueError
-        If the temperature is outside this range.
 
     Notes
     -----
@@ -151,27 +116,23 @@ class Thermal:
     their energies therefore has an exponential distribution.
     """
 
-    temperature: float
-
-    def __post_init__(self):
-        kelvin = check_number(self.temperature, "temperature", above=0, at_most=1e5, unit="K")
-        object.__setattr__(self, "temperature", kelvin)
+    temperature: float = number("Temperature.", above=0, at_most=1e5, unit="K")
 
     def quantile(self, u: ArrayLike) -> Floats:
         """Energy [eV] below which the fraction `u` (in (0, 1), any shape) of the distribution lies."""
         return -BOLTZMANN * self.temperature * logarithm(1.0 - np.asarray(u, dtype=np.float64))
 
 
-DISTRIBUTIONS = {kind.__name__: kind for kind in (TruncatedNormal, Fixed, Thermal)}
-"""The built-in distributions by name."""
+DISTRIBUTIONS = (TruncatedNormal, Fixed, Thermal)
+"""The built-in distributions."""
 
 
-def as_distribution(energy: Any) -> Distribution:
+def as_distribution(energy: Any, name: str = "energy") -> Distribution:
     """Return a distribution unchanged, a number [eV] as `Fixed`; ValueError otherwise."""
     if isinstance(energy, Real) and not isinstance(energy, bool):
         return Fixed(energy)  # type: ignore[arg-type]  # any real number; checked by Fixed
     if not callable(getattr(energy, "quantile", None)):
-        raise ValueError(f"energy must be a number [eV] or have a method quantile(u), got {short_text(energy)}")
+        raise ValueError(f"{name} must be a number [eV] or have a method quantile(u), got {short_text(energy)}")
     return energy
 
 

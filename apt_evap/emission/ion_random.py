@@ -1,5 +1,7 @@
 """Random numbers keyed by seed and ion number: independent of the batches and of the number of threads."""
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 import numpy as np
 from numpy.typing import ArrayLike
 

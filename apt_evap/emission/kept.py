@@ -1,5 +1,7 @@
 """Emissions that keep what is computed from them, for many perturbations of one run."""
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 import copy
 from collections.abc import Callable, Mapping
 from dataclasses import fields
@@ -21,7 +23,7 @@ class KeptRandom(IonRandom):
         super().__init__(seed, ions)
         self._kept: dict[tuple[int, int], Floats] = {}
 
-    def rewound(self) -> "KeptRandom":
+    def rewound(self) -> KeptRandom:
         """Return the same random numbers from the first column on."""
         other = copy.copy(self)  # with the same arrays
         other._column = 0
@@ -50,7 +52,7 @@ class KeptEmissions(Emissions):
         object.__setattr__(self, "_results", {})
 
     @classmethod
-    def of(cls, emissions: Emissions) -> "KeptEmissions":
+    def of(cls, emissions: Emissions) -> KeptEmissions:
         """Return the same batch, with shared arrays."""
         return cls(**{each.name: getattr(emissions, each.name) for each in fields(emissions)})
 

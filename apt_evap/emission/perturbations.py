@@ -7,14 +7,13 @@ Shaikh et al., arXiv 2509.13744; the probability of a roll-up and of a second on
 launch height are additions to it.
 """
 
-from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, fields
 from typing import Any, Protocol
 
 import numpy as np
 
+from apt_evap._common.codec import from_plain, is_settings, number, part, settings, to_plain, to_python
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_kind, check_number, did_you_mean, short_text
+from apt_evap._common.validation import check_number
 from apt_evap._core.elementary import exponential, sine_and_cosine
 from apt_evap.emission.emissions import Emissions, Launches, TangentialLaunches
 from apt_evap.emission.energies import (
@@ -52,12 +51,12 @@ __all__ = [
     "Thermal",
     "TruncatedNormal",
     "Unperturbed",
-    "from_dict",
+    "described",
     "launch_tangentially",
+    "perturbation_of",
     "rollup_direction",
     "tangent_frame",
     "target_shares",
-    "to_dict",
 ]
 
 
@@ -91,28 +90,21 @@ class RollProbability(Protocol):
         ...
 
 
-@dataclass(frozen=True)
+@settings
 class ChargeRatio:
     """Probability of a roll-up by the charge of the strongest neighbour over that of the atom.
-
-    Parameters
-    ----------
-    threshold : float
-        Ratio at which half of the atoms roll up. In runs of fcc and bcc tips the median ratio is about 0.9.
-    width : float
-        Width of the transition; 0 for a step.
 
     Notes
     -----
     p = 1 / (1 + exp(-(ratio - threshold) / width)).
     """
 
-    threshold: float
-    width: float = 0.0
-
-    def __post_init__(self):
-        object.__setattr__(self, "threshold", check_number(self.threshold, "threshold", at_least=0, at_most=10))
-        object.__setattr__(self, "width", check_number(self.width, "width", at_least=0, at_most=10))
+    threshold: float = number(
+        "Ratio at which half of the atoms roll up. In runs of fcc and bcc tips the median ratio is about 0.9.",
+        at_least=0,
+        at_most=10,
+    )
+    width: float = number("Width of the transition; 0 for a step.", default=0.0, at_least=0, at_most=10)
 
     def probabilities(self, emissions: Emissions) -> Floats:
         """Probability of each ion, shape (n,); 0 without a neighbour. ValueError if the emissions have no targets."""
@@ -128,13 +120,20 @@ class ChargeRatio:
         return 1.0 / (1.0 + exponential(np.clip(-excess / self.width, -700.0, 700.0)))
 
 
+_HEIGHT = "Height of the start above the site, of a rolled ion above p_r. Above 0 it needs `ResponseSettings.wide`."
+
+
+def _probability(given, name):
+    """Probability of a roll-up: a number, or an object with a method `probabilities`."""
+    own = callable(getattr(given, "probabilities", None))
+    return given if own else check_number(given, name, at_least=0, at_most=1)
+
+
 class _Tangential:
     """Base of the built-in perturbations: `launch` from `tangential`."""
 
     def __repr__(self) -> str:
-        values = ((item, getattr(self, item.name)) for item in fields(self))  # type: ignore[arg-type]
-        options = ", ".join(f"{item.name}={value!r}" for item, value in values if value != item.default)
-        return f"{type(self).__name__}({options})"
+        return to_python(self, "")
 
     def launch(self: TangentialPerturbation, emissions: Emissions, random: IonRandom) -> Launches:
         """Launch a batch of ions.
@@ -152,28 +151,58 @@ class _Tangential:
         """
         return launch_tangentially(emissions, *self.tangential(emissions, random))
 
-    def _check(self, *distributions):
-        """Validate the fields that several perturbations have."""
-        for name in distributions:
-            object.__setattr__(self, name, as_distribution(getattr(self, name)))
-        height = check_number(self.height, "height", at_least=0, at_most=1.0, unit="nm")
-        object.__setattr__(self, "height", height)
-
     def _heights(self, n):
         return np.full(n, self.height) if self.height > 0 else None
 
 
-class _Rolling(_Tangential):
-    """Base of the perturbations with a roll-up."""
+@settings
+class _Energetic:
+    """Base of the perturbations with an energy, their first parameter."""
 
-    def _check_roll(self):
-        if not callable(getattr(self.probability, "probabilities", None)):
-            probability = check_number(self.probability, "probability", at_least=0, at_most=1)
-            object.__setattr__(self, "probability", probability)
-        sharpness = check_number(self.sharpness, "sharpness", at_least=0, at_most=100)
-        object.__setattr__(self, "sharpness", sharpness)
-        second_roll = check_number(self.second_roll, "second_roll", at_least=0, at_most=1)
-        object.__setattr__(self, "second_roll", second_roll)
+    energy: Distribution | float = part(
+        "Energy E: any object with `quantile(u)`, or one number for all ions.",
+        *DISTRIBUTIONS,
+        check=as_distribution,
+        kind="distribution or float [eV]",
+    )
+
+
+@settings
+class _Rolling(_Tangential):
+    """Base of the perturbations with a roll-up, and their options."""
+
+    probability: RollProbability | float = part(
+        "Probability that an ion rolls up: one number, or an object such as `ChargeRatio`.",
+        ChargeRatio,
+        default=1.0,
+        check=_probability,
+        kind="float or RollProbability",
+    )
+    sharpness: float = number(
+        "0: s is the neighbour of highest charge. Above 0: s is a mean of the three strongest ones with the weights of "
+        "`target_shares`; this needs wide responses (`ResponseSettings.wide`).",
+        default=0.0,
+        at_least=0,
+        at_most=100,
+    )
+    height: float = number(_HEIGHT, default=0.0, at_least=0, at_most=1.0, unit="nm")
+    others: Distribution | float | None = part(
+        "Energy, in a random direction along the surface, of ions that do not roll up. By default they start at rest "
+        "(`RollUp`), or with the random part of E (`Combined`).",
+        *DISTRIBUTIONS,
+        check=as_distribution,
+        kind="distribution or float [eV]",
+        default=None,
+    )
+    second_roll: float = number(
+        "Probability that an ion that rolls up rolls once more, from above its strongest neighbour onto the strongest "
+        "one of those beyond, and starts there, in the direction of this last step. Beyond are the surface neighbours "
+        "of the neighbour that are not neighbours of the site; an ion without any rolls once. Above 0 it needs "
+        "responses with ``rolls=2`` (`ResponseSettings`).",
+        default=0.0,
+        at_least=0,
+        at_most=1,
+    )
 
     def _roll(self, emissions, random):
         """Launches with a roll-up of some ions."""
@@ -205,20 +234,11 @@ class _Rolling(_Tangential):
         return TangentialLaunches(rolled, first, second, shares, self._heights(n), twice, second_shares)
 
 
-@dataclass(frozen=True, repr=False)
+@settings
 class Unperturbed(_Tangential):
-    """Every ion starts at rest from its site.
+    """Every ion starts at rest from its site."""
 
-    Parameters
-    ----------
-    height : float
-        Height of the start above the site [nm]; above 0 it needs wide responses (`ResponseSettings.wide`).
-    """
-
-    height: float = 0.0
-
-    def __post_init__(self):
-        self._check()
+    height: float = number(_HEIGHT, default=0.0, at_least=0, at_most=1.0, unit="nm")
 
     def tangential(self, emissions: Emissions, random: IonRandom) -> TangentialLaunches:
         """No ion rolls up; both velocities along the surface are zero: see `Combined.tangential`."""
@@ -226,23 +246,11 @@ class Unperturbed(_Tangential):
         return TangentialLaunches(np.zeros(n, dtype=bool), np.zeros(n), np.zeros(n), None, self._heights(n))
 
 
-@dataclass(frozen=True, repr=False)
-class LateralVelocity(_Tangential):
-    """Every ion starts from its site, with |v| = sqrt(2 E/m) in a random direction along the surface.
+@settings
+class LateralVelocity(_Tangential, _Energetic):
+    """Every ion starts from its site, with |v| = sqrt(2 E/m) in a random direction along the surface."""
 
-    Parameters
-    ----------
-    energy : distribution or float
-        Energy E: any object with `quantile(u)` [eV], or one number for all ions [eV].
-    height : float
-        Height of the start above the site [nm]; above 0 it needs wide responses (`ResponseSettings.wide`).
-    """
-
-    energy: Distribution | float
-    height: float = 0.0
-
-    def __post_init__(self):
-        self._check("energy")
+    height: float = number(_HEIGHT, default=0.0, at_least=0, at_most=1.0, unit="nm")
 
     def tangential(self, emissions: Emissions, random: IonRandom) -> TangentialLaunches:
         """No ion rolls up; velocities along t1 and t2 [nm/ns]: see `Combined.tangential`."""
@@ -252,85 +260,36 @@ class LateralVelocity(_Tangential):
         return TangentialLaunches(np.zeros(n, dtype=bool), speed * cosine, speed * sine, None, self._heights(n))
 
 
-@dataclass(frozen=True, repr=False)
-class RollUp(_Rolling):
+@settings
+class RollUp(_Rolling, _Energetic):
     """Ions roll up onto a neighbour and start there, in the direction of the roll-up.
 
     They start at p_r = s + d n, with |v| = sqrt(2 E/m) along the component of p_r - p perpendicular to n. By default
     every ion rolls up, and s is its surface nearest neighbour of highest charge, as in the paper. An ion that does not
     roll up, as it has no neighbour or by the probability, starts from its site.
-
-    Parameters
-    ----------
-    energy : distribution or float
-        Energy E: any object with `quantile(u)` [eV], or one number for all ions [eV].
-    probability : float or RollProbability
-        Probability that an ion rolls up: one number, or an object such as `ChargeRatio`.
-    sharpness : float
-        0: s is the neighbour of highest charge. Above 0: s is a mean of the three strongest ones with the weights of
-        `target_shares`; this needs wide responses (`ResponseSettings.wide`).
-    height : float
-        Height of the start above p_r, or above the site [nm]; above 0 it needs wide responses.
-    others : distribution or float, optional
-        Energy, in a random direction along the surface, of ions that do not roll up [eV]; by default they start at
-        rest.
-    second_roll : float
-        Probability that an ion that rolls up rolls once more, from above its strongest neighbour onto the strongest
-        one of those beyond, and starts there, in the direction of this last step. Beyond are the surface neighbours of
-        the neighbour that are no neighbours of the site; an ion without any rolls once. Above 0 it needs responses with
-        ``rolls=2`` (`ResponseSettings`).
     """
-
-    energy: Distribution | float
-    probability: "RollProbability | float" = 1.0
-    sharpness: float = 0.0
-    height: float = 0.0
-    others: Distribution | float | None = None
-    second_roll: float = 0.0
-
-    def __post_init__(self):
-        self._check("energy", *(("others",) if self.others is not None else ()))
-        self._check_roll()
 
     def tangential(self, emissions: Emissions, random: IonRandom) -> TangentialLaunches:
         """Which ions roll up, and the velocities along t1 and t2 [nm/ns]: see `Combined.tangential`."""
         return self._roll(emissions, random)
 
 
-@dataclass(frozen=True, repr=False)
-class Combined(_Rolling):
+@settings
+class _Divided(_Energetic):
+    """Base of `Combined`: how the energy is divided comes before the options."""
+
+    rollup_fraction: float = number(
+        "Fraction of the energy for the roll-up; at 0 the ion still rolls up.", at_least=0, at_most=1
+    )
+
+
+@settings
+class Combined(_Rolling, _Divided):
     """Roll-up with a fraction of the energy, plus a random direction with the rest; the velocities add.
 
     An ion that does not roll up, as it has no neighbour or by the probability, starts from its site with the random
     part only.
-
-    Parameters
-    ----------
-    energy : distribution or float
-        Energy E: any object with `quantile(u)` [eV], or one number for all ions [eV].
-    rollup_fraction : float
-        Fraction of the energy for the roll-up, from 0 to 1; at 0 the ion still rolls up.
-    probability, sharpness, height : float
-        As in `RollUp`.
-    others : distribution or float, optional
-        Energy of ions that do not roll up [eV]; by default the random part of E.
-    second_roll : float
-        As in `RollUp`.
     """
-
-    energy: Distribution | float
-    rollup_fraction: float
-    probability: "RollProbability | float" = 1.0
-    sharpness: float = 0.0
-    height: float = 0.0
-    others: Distribution | float | None = None
-    second_roll: float = 0.0
-
-    def __post_init__(self):
-        fraction = check_number(self.rollup_fraction, "rollup_fraction", at_least=0, at_most=1)
-        object.__setattr__(self, "rollup_fraction", fraction)
-        self._check("energy", *(("others",) if self.others is not None else ()))
-        self._check_roll()
 
     def tangential(self, emissions: Emissions, random: IonRandom) -> TangentialLaunches:
         """Which ions roll up, and their velocities along the surface.
@@ -351,66 +310,19 @@ class Combined(_Rolling):
         return self._roll(emissions, random)
 
 
-PERTURBATIONS = {kind.__name__: kind for kind in (Unperturbed, LateralVelocity, RollUp, Combined)}
-"""The built-in perturbations by name."""
-PROBABILITIES = {kind.__name__: kind for kind in (ChargeRatio,)}
-"""The built-in probabilities of a roll-up by name."""
+PERTURBATIONS = (Unperturbed, LateralVelocity, RollUp, Combined)
+"""The built-in perturbations."""
 
 
-def to_dict(perturbation: Any) -> dict[str, Any]:
-    """Name and parameters of a perturbation or a distribution, in plain types, for files.
-
-    A user-defined one is described by its name and `repr`: enough to recognise it, not to rebuild it.
-
-    Parameters
-    ----------
-    perturbation : object
-        A perturbation or a distribution.
-
-    Returns
-    -------
-    dict
-    """
-    name = type(perturbation).__name__
-    if type(perturbation) not in (*PERTURBATIONS.values(), *DISTRIBUTIONS.values(), *PROBABILITIES.values()):
-        return {"name": name, "repr": repr(perturbation)}
-    values = {item.name: (getattr(perturbation, item.name), item.default) for item in fields(perturbation)}
-    return {"name": name} | {
-        key: value if isinstance(value, float) else to_dict(value)
-        for key, (value, default) in values.items()
-        if value != default  # as in files of earlier versions, which did not have these options
-    }
+def described(perturbation: Any) -> dict[str, Any]:
+    """Description of a perturbation in a file: its plain form, or of a user-defined one the name and `repr`."""
+    if isinstance(perturbation, dict):  # of a loaded run
+        return perturbation
+    if is_settings(perturbation):
+        return to_plain(perturbation)
+    return {"name": type(perturbation).__name__, "repr": repr(perturbation)}
 
 
-def from_dict(settings: Mapping[str, Any]) -> Any:
-    """Rebuild a perturbation or distribution from the result of `to_dict`.
-
-    Parameters
-    ----------
-    settings : mapping
-        Its "name" and parameters.
-
-    Returns
-    -------
-    object
-
-    Raises
-    ------
-    ValueError
-        If the name or a parameter is unknown, or if a parameter is missing.
-    """
-    known = PERTURBATIONS | DISTRIBUTIONS | PROBABILITIES
-    name = check_kind(settings, "settings", Mapping, "a mapping with a name and parameters").get("name")
-    if not isinstance(name, str) or name not in known:
-        hint = did_you_mean(name, known)
-        raise ValueError(
-            f"no perturbation or distribution is named {short_text(name)}{hint}; known are {', '.join(known)}"
-        )
-    parameters = {key: value for key, value in settings.items() if key != "name"}
-    expected = {item.name: item.default is MISSING for item in fields(known[name])}
-    if not {key for key, needed in expected.items() if needed} <= set(parameters) <= set(expected):
-        optional = [f"{key} (optional)" for key, needed in expected.items() if not needed]
-        lists = sorted(key for key, needed in expected.items() if needed) + optional, sorted(parameters)
-        raise ValueError(f"{name} needs {', got '.join(', '.join(each) or 'no parameters' for each in lists)}")
-    parameters = {key: from_dict(value) if isinstance(value, dict) else value for key, value in parameters.items()}
-    return known[name](**parameters)
+def perturbation_of(perturbation: Any) -> Any:
+    """Rebuild a built-in perturbation from its plain form; ValueError otherwise."""
+    return from_plain(perturbation, *PERTURBATIONS, what="perturbation")

@@ -10,12 +10,14 @@ ions, as a function of the field F::
 CSR is 0 below F = 0.256 a / (b + 0.256), and infinite from F = a. It grows about as F^30 where it is 1.
 """
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from apt_evap._common.codec import number, settings
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_choice, check_count, check_number, check_sequence
 from apt_evap._core.elementary import exponential, logarithm
@@ -167,7 +169,7 @@ def charge_probabilities(element: str, field: ArrayLike, least: int = 1) -> Floa
     return reached * stay
 
 
-@dataclass(frozen=True)
+@settings
 class PostIonisation:
     """Charges of the ions in flight, drawn from the field at each site.
 
@@ -180,28 +182,17 @@ class PostIonisation:
     * Evaporation field derived from a charge state ratio: it is on Kingham's scale already, keep 1.
     * No measurement: 1. The mean charge can then be wrong: at 35 V/nm no Ni+ is left, at 48 V/nm no Pt2+.
 
-    Parameters
-    ----------
-    field_scale : float
-        Field on Kingham's scale divided by the field of the simulation, > 0.
-
-    Raises
-    ------
-    ValueError
-        If the scale is not positive.
-
     Notes
     -----
     The ratio grows about as the 30th power of the field. An error of 1 % in the scale changes it by a third.
     """
 
-    field_scale: float = 1.0
-
-    def __post_init__(self):
-        object.__setattr__(self, "field_scale", check_number(self.field_scale, "field_scale", above=0))
+    field_scale: float = number(
+        "Field on Kingham's scale divided by the field of the simulation.", default=1.0, above=0
+    )
 
     @classmethod
-    def calibrated(cls, element: str, charge: int, ratio: float, field: float) -> "PostIonisation":
+    def calibrated(cls, element: str, charge: int, ratio: float, field: float) -> PostIonisation:
         """Post-ionisation with the scale that gives a measured charge state ratio.
 
         Parameters

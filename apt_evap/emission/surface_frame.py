@@ -1,5 +1,7 @@
 """Start position and direction of an ion on the surface: the tangent frame, the roll-up, the launch."""
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 import numpy as np
 from numpy.typing import ArrayLike
 

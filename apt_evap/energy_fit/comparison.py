@@ -18,9 +18,9 @@ import numpy as np
 
 from apt_evap._common.types import Floats
 from apt_evap.analysis.similarity import WINDOW, local_moments, local_similarity, window_fits, window_mean
-from apt_evap.detection.detector_map import DetectorMap, masked_gaussian
+from apt_evap.detection.detector_map import DetectorMap, check_sigma, masked_gaussian
 from apt_evap.energy_fit.resampling import NOISE
-from apt_evap.energy_fit.settings import StudySettings
+from apt_evap.energy_fit.settings import FitSettings
 
 NOISE_MAPS = 50
 """Smallest number of maps for the variance of the measured noise: error 20 % in a bin, less in a window."""
@@ -33,18 +33,20 @@ class Comparison:
     ----------
     measured : DetectorMap
         The measured map; its mask is the compared region.
-    settings : StudySettings
+    settings : FitSettings
         Settings of the comparison, and number of resamples.
 
     Raises
     ------
     ValueError
-        If the mask contains no window, or the flattening is not set.
+        If the mask contains no window, or the flattening is not set, or a width is larger than the map.
     """
 
-    def __init__(self, measured: DetectorMap, settings: StudySettings) -> None:
-        if settings.flattening is None:
-            raise ValueError("settings must have a flattening, got None")
+    def __init__(self, measured: DetectorMap, settings: FitSettings) -> None:
+        if settings.flattening is None or settings.smoothing is None:
+            raise ValueError("settings must have a smoothing and a flattening, got None")
+        for name in ("smoothing", "flattening"):
+            check_sigma(getattr(settings, name), name, measured)
         inside = window_fits(measured.mask)
         if not inside.any():
             raise ValueError(

@@ -1,12 +1,13 @@
 """Fit of the emission energies: the simulated map with the largest similarity to a measured one."""
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
 
+from apt_evap._common.codec import for_json
 from apt_evap._common.threads import thread_count
 from apt_evap._common.validation import check_count, check_kind
 from apt_evap._common.warnings import MapWarning, RegistrationWarning, ResponseWarning, StructureWarning
@@ -14,14 +15,13 @@ from apt_evap.analysis.similarity import WINDOW
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.energies import Thermal
-from apt_evap.emission.perturbations import LateralVelocity, Perturbation, Unperturbed
-from apt_evap.energy_fit.defaults import MEANS, MODEL_ERROR, RSDS
+from apt_evap.emission.perturbations import LateralVelocity, Unperturbed
 from apt_evap.energy_fit.grid import EnergyGrid, maxima
 from apt_evap.energy_fit.intervals import intervals as intervals_of
 from apt_evap.energy_fit.search import EnergySearch, register_repeatedly
-from apt_evap.energy_fit.settings import StudySettings
+from apt_evap.energy_fit.settings import FitSettings
 from apt_evap.energy_fit.structure import PoleMeasure, StructureScores
-from apt_evap.energy_fit.study import Score, Study, plain
+from apt_evap.energy_fit.study import Score, Study
 from apt_evap.registration.register import Registration
 from apt_evap.simulation.real_units import RealUnits
 from apt_evap.simulation.run import Run
@@ -37,24 +37,11 @@ FEWEST_IONS = 0.5
 def fit_energies(
     run: Run,
     measured: Hits | DetectorMap,
-    mechanism: str | Callable[..., Perturbation] = "roll-up",
+    grid: EnergyGrid | None = None,
+    settings: FitSettings | None = None,
     *,
-    means: Sequence[float] = MEANS,
-    rsds: Sequence[float] = RSDS,
-    rollup_fractions: Sequence[float] | None = None,
-    options: Mapping[str, Sequence[float]] | None = None,
-    pole: Sequence[int] | None = None,
     registration: Registration | None = None,
-    bins: int | None = None,
-    smoothing: float | None = None,
-    flattening: float | None = None,
-    data_range: float = 2.0,
-    temperature: float = 50.0,
-    allow_noise: bool = True,
-    model_error: float = MODEL_ERROR,
-    replicas: int | None = None,
-    resamples: int = 200,
-    seed: int = 0,
+    pole: Sequence[int] | None = None,
     n_threads: int | None = None,
     progress: bool | None = None,
 ) -> Study:
@@ -71,49 +58,17 @@ def fit_energies(
         A run with responses.
     measured : Hits or DetectorMap
         Measured ions, or a map of counts or of densities. The noise of densities is not known.
-    mechanism : {"roll-up", "lateral", "combined"} or callable
-        Mechanism of emission: `RollUp`, `LateralVelocity` or `Combined`; or a class of perturbations whose first
-        parameter is the energy distribution.
-    means, rsds : sequence of float
-        Means of the truncated normal distributions [eV], and standard deviations relative to the means; by default
-        those of the paper.
-    rollup_fractions : sequence of float, optional
-        Roll-up fractions for "combined"; by default those of the paper.
-    options : mapping of str to sequence of float, optional
-        More axes of the grid: names of parameters of the perturbation, each with the numbers to try.
-    pole : sequence of int, optional
-        Miller indices of the pole for the second objective (`Study.structure`); by default the one with the most
-        complete rings inside the compared region.
+    grid : EnergyGrid, optional
+        Mechanism of emission and energies; by default ``EnergyGrid("roll-up")`` with the energies of the paper.
+    settings : FitSettings, optional
+        Bins, smoothing, draws and resamples.
     registration : Registration, optional
         Carries simulated hits into the measured frame. By default found by `register` with the middle of the
         grid, repeated with the best point until this is stable, and then refined to the largest similarity of this
         point.
-    bins : int, optional
-        Number of bins along the longer side. For measured hits 128 by default. The bins of a map are merged by an
-        integer factor to come closest to this number, or unchanged by default.
-    smoothing : float, optional
-        Standard deviation of the Gaussian that smooths both maps [mm]; by default half a bin for counts, and one bin
-        for densities, whose noise is not known.
-    flattening : float, optional
-        Standard deviation of the Gaussian that flattens both maps [mm]: each map is divided by a smoothed copy; 0 for
-        no flattening. By default 0.15 of the square root of the compared area. This removes gradients from the
-        instrument or from the shape of the specimen, which do not depend on the energy.
-    data_range : float
-        Range of densities, as for `ssim`.
-    temperature : float
-        Temperature of the thermal baseline, Maxwell-Boltzmann lateral velocities [K].
-    allow_noise : bool
-        Whether the similarity is corrected for the noise of both maps, see the notes. False for the standard `ssim`.
-    model_error : float
-        Relative increase of the misfit 1 - SSIM that the difference of the simulated from the measured specimen
-        explains, for the intervals; 0 for intervals by noise alone. The default was measured with twins.
-    replicas : int, optional
-        Number of draws of energy and direction per ion, which are summed to reduce the noise of a map. By default ten
-        times as many simulated as measured ions, with 4 to 16 draws.
-    resamples : int
-        Number of resamples of all measured and simulated ions, for the errors; 0 for none.
-    seed : int
-        Seed of the resamples.
+    pole : sequence of int, optional
+        Miller indices of the pole for the second objective (`Study.structure`); by default the one with the most
+        complete rings inside the compared region.
     n_threads : int, optional
         Number of threads; by default the number of processors that this process may use. Results do not depend on it.
     progress : bool, optional
@@ -150,22 +105,17 @@ def fit_energies(
     ceiling. The noise of measured densities is not known and not corrected: their best energies have slightly more
     contrast than the true ones.
     """
-    grid = EnergyGrid(mechanism, means, rsds, rollup_fractions, options or {})  # type: ignore[arg-type]
+    grid = check_kind(EnergyGrid() if grid is None else grid, "grid", EnergyGrid, "an EnergyGrid")
+    settings = check_kind(FitSettings() if settings is None else settings, "settings", FitSettings, "FitSettings")
     if check_kind(run, "run", Run, "a Run").responses is None:
         raise ValueError(f"run must have responses for fit_energies, got {run!r}")
-    measured = measured_map(measured, bins)
-    settings = StudySettings(
-        smoothing=max(measured.bin_size) * (0.5 if measured.is_counts else 1) if smoothing is None else smoothing,
-        flattening=flattening,
-        data_range=data_range,
-        allow_noise=allow_noise,
-        replicas=_replicas(measured, run) if replicas is None else replicas,
-        resamples=resamples,
-        seed=seed,
-        temperature=temperature,
-        model_error=model_error,
+    measured = measured_map(measured, settings.bins)
+    bin_size = max(measured.bin_size) * (0.5 if measured.is_counts else 1)
+    settings = replace(
+        settings,
+        smoothing=bin_size if settings.smoothing is None else settings.smoothing,
+        replicas=settings.replicas or _replicas(measured, run),
     )
-    replicas = settings.replicas
     search = EnergySearch(run, measured, grid, settings, thread_count(n_threads), progress)
     with warnings.catch_warnings():
         # once per energy; the settings contain the same information
@@ -176,21 +126,21 @@ def fit_energies(
             registration, rounds = register_repeatedly(search)
         search.place(registration, settings.resamples)
         measure, missing = _pole_measure(search, registration, pole)
-        values, structures = search.matrix(replicas, "energies", measure=measure)
+        values, structures = search.matrix("energies", measure=measure)
         cells = maxima(values)
-        best = search.refine(values, cells, replicas)[0]
+        best = search.refine(values, cells)[0]
         bounds = intervals_of(grid, values, best, settings.model_error) if settings.resamples else None
-        optimum = search.optimum(cells[0], replicas, bounds)
-        refined = search.optimum(best, replicas, bounds)
+        optimum = search.optimum(cells[0], bounds)
+        refined = search.optimum(best, bounds)
         scores, plain_scores, maps = {}, {}, {}
-        for name, perturbation, draws in (
-            ("unperturbed", Unperturbed(), 1),
-            ("thermal", LateralVelocity(Thermal(settings.temperature)), replicas),
-            ("optimum", optimum.perturbation, replicas),
+        for name, perturbation in (
+            ("unperturbed", Unperturbed()),
+            ("thermal", LateralVelocity(Thermal(settings.temperature))),
+            ("optimum", optimum.perturbation),
         ):
-            maps[name], scores[name], plain_scores[name] = search.map_and_scores(perturbation, draws)
+            maps[name], scores[name], plain_scores[name] = search.map_and_scores(perturbation)
         gain = scores.pop("optimum") - scores["unperturbed"]
-        structure = _structure_scores(measure, search, structures, maps, cells[0], replicas)
+        structure = _structure_scores(measure, search, structures, maps, cells[0])
     registration.warn_if_doubtful()
     if structure is not None and structure.lost:
         warnings.warn(
@@ -212,7 +162,7 @@ def fit_energies(
     wins = np.ravel_multi_index(cells[1:].T, grid.shape)
     energy_limit = run.response_settings.energy_limit / np.median(run.energy_scales)  # [eV] of this run
     provenance = {
-        "bins": measured.values.shape[::-1],
+        "map_bins": measured.values.shape[::-1],
         "bin_size": measured.bin_size,
         "bins_compared": search.comparison.inside.sum(),
         "measured": repr(measured),
@@ -241,7 +191,7 @@ def fit_energies(
         maps=maps,
         structure=structure,
         settings=search.comparison.settings,
-        provenance=plain(provenance),
+        provenance=for_json(provenance),
     )
 
 
@@ -255,7 +205,7 @@ def _pole_measure(search, registration, pole):
         return None, str(error)
 
 
-def _structure_scores(measure, search, structures, maps, cell, replicas):
+def _structure_scores(measure, search, structures, maps, cell):
     if measure is None:
         return None
     measured = measure.structure(search.region)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from apt_evap._common.codec import for_json
 from apt_evap._common.files import check_path
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_kind
@@ -14,7 +15,9 @@ from apt_evap._common.warnings import RegistrationWarning
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.energy_fit.fit_energies import fit_energies, measured_map
-from apt_evap.energy_fit.study import Study, plain
+from apt_evap.energy_fit.grid import EnergyGrid
+from apt_evap.energy_fit.settings import FitSettings
+from apt_evap.energy_fit.study import Study
 from apt_evap.registration.register import Registration
 from apt_evap.simulation.run import Run, load
 
@@ -90,7 +93,7 @@ class TipFit:
                     "doubtful": name in self.doubtful,
                 }
             )
-        return [plain(row) for row in rows]
+        return for_json(rows)
 
     def __repr__(self) -> str:
         lines = [f"<TipFit: {len(self.studies)} runs, {len(self.failed)} failed; best {self.best!r}"]
@@ -105,12 +108,10 @@ class TipFit:
 def fit_tips(
     runs: Mapping[str, Run | AnyPath],
     measured: Hits | DetectorMap,
-    mechanism: str = "roll-up",
+    grid: EnergyGrid | None = None,
+    settings: FitSettings | None = None,
     *,
     registration: Registration | None = None,
-    bins: int | None = None,
-    smoothing: float | None = None,
-    flattening: float | None = None,
     **options: Any,
 ) -> TipFit:
     """Find the specimen, and the emission energies, with the largest similarity to a measurement.
@@ -126,12 +127,10 @@ def fit_tips(
         Runs with responses, or their files, by name. Files are loaded one after the other.
     measured : Hits or DetectorMap
         Measured ions, or a map.
-    mechanism : {"roll-up", "lateral", "combined"}
-        Mechanism of emission.
+    grid, settings : optional
+        As for `fit_energies`.
     registration : Registration, optional
         Carries the hits of all runs into the measured frame; by default found for each run.
-    bins, smoothing, flattening : optional
-        As for `fit_energies`.
     **options
         Other parameters of `fit_energies`.
 
@@ -152,14 +151,14 @@ def fit_tips(
     """
     if not check_kind(runs, "runs", Mapping, "a mapping of runs by name"):
         raise ValueError("runs must contain at least one run, got none")
-    measured = measured_map(measured, bins)
-    settings: dict[str, Any] = {"smoothing": smoothing, "flattening": flattening, **options}
+    settings = check_kind(FitSettings() if settings is None else settings, "settings", FitSettings, "FitSettings")
+    measured, settings = measured_map(measured, settings.bins), replace(settings, bins=None)
     registrations: dict[str, Registration] = {}
     failed: dict[str, str] = {}
     region = measured.mask
     for name, run in runs.items():
         try:
-            study = _fit(run, measured, mechanism, registration=registration, **settings | {"resamples": 0})
+            study = _fit(run, measured, grid, replace(settings, resamples=0), registration=registration, **options)
         except ValueError as error:
             failed[name] = str(error)
             continue
@@ -170,7 +169,8 @@ def fit_tips(
     ions = int(measured.values[region].sum()) if measured.is_counts else None
     common = replace(measured, mask=region, ions=ions, detected=None)
     studies = {
-        name: _fit(runs[name], common, mechanism, registration=each, **settings) for name, each in registrations.items()
+        name: _fit(runs[name], common, grid, settings, registration=each, **options)
+        for name, each in registrations.items()
     }
     names = list(studies)
     # similarity of the best point of each resample, shape (runs, resamples)

@@ -1,13 +1,15 @@
 """Energies of a study: a grid of distributions for one mechanism, and the maximum between its points."""
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from itertools import product
 
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
+from apt_evap._common.codec import checked, settings
 from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_array, check_choice, check_kind
 from apt_evap.emission.energies import TruncatedNormal
@@ -19,66 +21,88 @@ _HALVES = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
 _FINE = np.linspace(-1.0, 1.0, 41)
 
 
-@dataclass(frozen=True)
+def _mechanism(given, name):
+    return given if callable(given) else check_choice(given, name, MECHANISMS)
+
+
+def _increasing(values, name):
+    """Increasing numbers."""
+    axis = check_array(values, name, ("n",))
+    if not (len(axis) and (np.diff(axis) > 0).all()):
+        raise ValueError(f"{name} must be increasing numbers, got {axis.tolist()}")
+    return tuple(axis.tolist())
+
+
+def _positive(values, name):
+    axis = _increasing(values, name)
+    if not axis[0] > 0:
+        raise ValueError(f"{name} must be increasing numbers > 0, got {list(axis)}")
+    return axis
+
+
+def _fractions(values, name):
+    axis = _increasing(values, name)
+    if not 0 <= axis[0] <= axis[-1] <= 1:
+        raise ValueError(f"{name} must be increasing numbers from 0 to 1, got {list(axis)}")
+    return axis
+
+
+def _options(options, name):
+    axes = {}
+    for option, values in check_kind(options, name, Mapping, "a mapping of names to numbers").items():
+        check_kind(option, f"a name in {name}", str, "text")
+        if option in _RESERVED:
+            raise ValueError(f"{name} must not contain {option!r}: it has its own argument")
+        axes[option] = _increasing(values, f"option {option}")
+    return axes
+
+
+@settings
 class EnergyGrid:
-    """Grid of truncated normal energy distributions, by mean and relative standard deviation, for one mechanism.
+    """Grid of truncated normal energy distributions, by mean and relative standard deviation, for one mechanism."""
 
-    Parameters
-    ----------
-    mechanism : {"roll-up", "lateral", "combined"} or callable
-        Mechanism of emission: `RollUp`, `LateralVelocity` or `Combined`; or a function of an energy distribution and
-        of the options by name that returns a perturbation, such as a class of perturbations.
-    means : tuple of float
-        Means before the truncation [eV], increasing.
-    rsds : tuple of float
-        Standard deviations before the truncation, relative to the means, increasing.
-    rollup_fractions : tuple of float, optional
-        Fractions of the energy for the roll-up, increasing; only for "combined".
-    options : mapping of str to sequence of float
-        More axes of the grid: options of the perturbation by name, each with increasing numbers.
+    mechanism: str | Callable[..., Perturbation] = checked(
+        "Mechanism of emission: `RollUp`, `LateralVelocity` or `Combined`; or a function of an energy distribution and "
+        "of the options by name that returns a perturbation, such as a class of perturbations.",
+        '{"roll-up", "lateral", "combined"} or callable',
+        _mechanism,
+        default="roll-up",
+    )
+    means: Sequence[float] = checked(
+        "Means before the truncation, increasing; by default those of the paper.",
+        "sequence of float",
+        _positive,
+        default=MEANS,
+        unit="eV",
+    )
+    rsds: Sequence[float] = checked(
+        "Standard deviations before the truncation, relative to the means, increasing; by default those of the paper.",
+        "sequence of float",
+        _positive,
+        default=RSDS,
+    )
+    rollup_fractions: Sequence[float] | None = checked(
+        'Fractions of the energy for the roll-up, increasing; only for "combined", by default those of the paper.',
+        "sequence of float",
+        _fractions,
+        default=None,
+    )
+    options: Mapping[str, Sequence[float]] = checked(
+        "More axes of the grid: options of the perturbation by name, each with increasing numbers.",
+        "mapping",
+        _options,
+        default={},
+        hash=False,
+    )
 
-    Raises
-    ------
-    ValueError
-        If the mechanism or an option is unknown, or an axis is empty, not increasing or outside its range.
-    """
-
-    mechanism: str | Callable[..., Perturbation]
-    means: Sequence[float] = MEANS
-    rsds: Sequence[float] = RSDS
-    rollup_fractions: Sequence[float] = None  # type: ignore[assignment]  # the mechanism sets them
-    options: Mapping[str, Sequence[float]] = field(default_factory=dict)
-
-    def __post_init__(self):
-        if not callable(self.mechanism):
-            check_choice(self.mechanism, "mechanism", MECHANISMS)
+    def _check(self):
+        fixed = (0.0,) if self.mechanism == "lateral" else (1.0,)
         fractions = self.rollup_fractions
         if self.mechanism == "combined":
             fractions = ROLLUP_FRACTIONS if fractions is None else fractions
-        elif fractions is not None:
+        elif fractions not in (None, fixed):
             raise ValueError(f"rollup_fractions are only for the mechanism 'combined', got {self.name!r}")
-        else:
-            fractions = (0.0,) if self.mechanism == "lateral" else (1.0,)
-        for name, values, low, high in (
-            ("means", self.means, np.nextafter(0, 1), np.inf),
-            ("rsds", self.rsds, np.nextafter(0, 1), np.inf),
-            ("rollup_fractions", fractions, 0.0, 1.0),
-        ):
-            axis = check_array(values, name, ("n",))
-            if not (len(axis) and (np.diff(axis) > 0).all() and low <= axis[0] and axis[-1] <= high):
-                bounds = "from 0 to 1" if high == 1 else "> 0"
-                raise ValueError(f"{name} must be increasing numbers {bounds}, got {axis.tolist()}")
-            object.__setattr__(self, name, tuple(axis.tolist()))
-        options = {}
-        for name, values in check_kind(self.options, "options", Mapping, "a mapping of names to numbers").items():
-            check_kind(name, "a name in options", str, "text")
-            if name in _RESERVED:
-                raise ValueError(f"options must not contain {name!r}: it has its own argument")
-            axis = check_array(values, f"option {name}", ("n",))
-            if not (len(axis) and (np.diff(axis) > 0).all()):
-                raise ValueError(f"option {name} must have increasing numbers, got {axis.tolist()}")
-            options[name] = tuple(axis.tolist())
-        object.__setattr__(self, "options", options)
+        object.__setattr__(self, "rollup_fractions", fractions or fixed)
         for end in (0, -1):  # the perturbation validates its own options
             try:
                 self.perturbation(*(axis[end] for axis in self.axes.values()))
@@ -93,7 +117,7 @@ class EnergyGrid:
     @property
     def axes(self) -> dict[str, Sequence[float]]:
         """Numbers on each axis by name: the options, then "rollup_fraction", "rsd" and "mean", dict."""
-        last = {"rollup_fraction": self.rollup_fractions, "rsd": self.rsds, "mean": self.means}
+        last = {"rollup_fraction": self.rollup_fractions or (), "rsd": self.rsds, "mean": self.means}
         return {**self.options, **last}
 
     @property

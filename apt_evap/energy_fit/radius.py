@@ -1,5 +1,7 @@
 """Radius of a tip from its map: the width of a pole and the contrast of its zone lines, for a family of runs over R."""
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -199,11 +201,10 @@ def _direction(run, plane):
 
 def _map_of(run, perturbation, draws):
     """Counts on the complete detector, over several draws."""
-    half = run.detector.width / 2
-    window = {"extent": (-half, half, -half, half), "quantum": None, "mask": np.ones((_BINS, _BINS), bool)}
+    grid = run.detector.grid(_BINS)
     by_response = draws > 1  # a flight does not depend on the seed
     hits = [replace(run, seed=run.seed + draw).hits(perturbation, by_response=by_response) for draw in range(draws)]
-    maps = [each.map(_BINS, **window) for each in hits]
+    maps = [each.map(like=grid, quantum=None) for each in hits]
     return replace(maps[0], values=np.sum([each.values for each in maps], axis=0), detected=None)
 
 

@@ -28,7 +28,7 @@ class Sampler:
     """Maps of a run in the measured frame, for all its ions and for resamples of them.
 
     In a resample the weight of an ion is 1 plus a tenth of the deviation of a Poisson number of mean 1 from its mean.
-    The weight is the same for all perturbations and replicas of an ion: resamples are paired. With more than `GROUPS`
+    The weight is the same for all perturbations and draws of an ion: resamples are paired. With more than `GROUPS`
     ions, some ions have common weights.
 
     Parameters
@@ -68,14 +68,14 @@ class Sampler:
         weights = 1 + NOISE * (random.poisson(1.0, shape) - 1)
         self._weights = np.concatenate([np.ones((shape[0], 1)), weights], axis=1, dtype=np.float32)
 
-    def maps(self, perturbation: Perturbation, replicas: int) -> tuple[Floats, Floats | None]:
+    def maps(self, perturbation: Perturbation, number: int) -> tuple[Floats, Floats | None]:
         """Hits per bin of all ions and of each resample, and the noise of the draws.
 
         Parameters
         ----------
         perturbation : perturbation
             Perturbation of the ions.
-        replicas : int
+        number : int
             Number of draws per ion, which are summed.
 
         Returns
@@ -87,10 +87,10 @@ class Sampler:
             no signal; shape (ny, nx). None for a single draw.
         """
         size = int(np.prod(self.shape))
-        draws = [self._cells(perturbation, replica) for replica in range(replicas)]
+        draws = [self._cells(perturbation, draw) for draw in range(number)]
         noise = None
-        if replicas > 1:
-            weights = np.linspace(-1, 1, replicas)
+        if number > 1:
+            weights = np.linspace(-1, 1, number)
             weights /= np.sqrt((weights**2).mean())
             counts = (np.bincount(cells, minlength=size) for cells, _ in draws)
             noise = sum(w * count for w, count in zip(weights, counts, strict=True)).reshape(self.shape)
@@ -101,9 +101,9 @@ class Sampler:
         table = scipy.sparse.coo_array((ones, (cells, self._groups[ions])), (size, len(self._weights))).tocsr()
         return (table @ self._weights).T.reshape(-1, *self.shape).astype(float), noise
 
-    def _cells(self, perturbation, replica):
+    def _cells(self, perturbation, draw):
         """Bins and indices of the ions within the box."""
-        hits = self.registration.hits(hits_of_draw(self.run, perturbation, replica))
+        hits = self.registration.hits(hits_of_draw(self.run, perturbation, draw))
         detected = hits.detected
         index = []
         for values, edges in zip((hits.y, hits.x), self._edges, strict=True):
@@ -116,10 +116,10 @@ class Sampler:
         return row * self.shape[1] + column, inside
 
 
-def hits_of_draw(run: Run, perturbation: Perturbation, replica: int) -> Hits:
-    """Hits for one draw of the energies and directions of all ions; replica 0 is that of the run."""
-    if replica:  # derived, because an adjacent seed may be that of another run
-        seed = np.random.SeedSequence((run.seed, replica)).generate_state(1, np.uint64)[0]
+def hits_of_draw(run: Run, perturbation: Perturbation, draw: int) -> Hits:
+    """Hits for one draw of the energies and directions of all ions; draw 0 is that of the run."""
+    if draw:  # derived, because an adjacent seed may be that of another run
+        seed = np.random.SeedSequence((run.seed, draw)).generate_state(1, np.uint64)[0]
         run = replace(run, seed=int(seed))
     # flights of the run used its own seed
-    return run.hits(perturbation, by_response=bool(replica))
+    return run.hits(perturbation, by_response=bool(draw))

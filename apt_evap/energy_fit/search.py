@@ -1,5 +1,7 @@
 """Search of `fit_energies`: similarities of the maps of a run with a measured one, and the registration."""
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import product
@@ -9,18 +11,19 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
+from apt_evap._common.codec import to_plain
 from apt_evap._common.progress import progress_bar
 from apt_evap._common.types import Floats
 from apt_evap.detection.binning import field_of_view
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.energies import TruncatedNormal
-from apt_evap.emission.perturbations import Perturbation, Unperturbed, to_dict
+from apt_evap.emission.perturbations import Perturbation, Unperturbed, described
 from apt_evap.energy_fit.comparison import Comparison
 from apt_evap.energy_fit.grid import EnergyGrid, maxima, spline_maxima
 from apt_evap.energy_fit.intervals import Intervals
 from apt_evap.energy_fit.resampling import Sampler, hits_of_draw
-from apt_evap.energy_fit.settings import StudySettings
+from apt_evap.energy_fit.settings import FitSettings
 from apt_evap.energy_fit.structure import PoleMeasure, Structure
 from apt_evap.energy_fit.study import Optimum, Score
 from apt_evap.registration.register import Registration, register
@@ -41,7 +44,7 @@ class EnergySearch:
         run: Run,
         measured: DetectorMap,
         grid: EnergyGrid,
-        settings: StudySettings,
+        settings: FitSettings,
         n_threads: int,
         progress: bool | None,
     ) -> None:
@@ -73,7 +76,7 @@ class EnergySearch:
 
     def hits(self, index: ArrayLike) -> Hits:
         """Hits of several draws of all ions at an index of the grid, in the frame of the run."""
-        draws = [hits_of_draw(self.run, self.perturbation(index), replica) for replica in range(ROUGH)]
+        draws = [hits_of_draw(self.run, self.perturbation(index), draw) for draw in range(ROUGH)]
         x, y = (np.concatenate([getattr(hits, name) for hits in draws]) for name in ("x", "y"))
         return Hits(x=x, y=y)
 
@@ -86,7 +89,7 @@ class EnergySearch:
         """
         region, hits = self.region, self.hits(index)
         bin_size = max(region.bin_size)
-        smoothing = max(self.settings.smoothing, bin_size)  # less is too rough for a search
+        smoothing = max(self.comparison.settings.smoothing or 0.0, bin_size)  # less is too rough for a search
         settings = replace(self.comparison.settings, smoothing=smoothing, resamples=0, seed=0)
         comparison = Comparison(region, settings)
 
@@ -106,12 +109,12 @@ class EnergySearch:
         best = scipy.optimize.minimize(dissimilarity, simplex[0], method="Nelder-Mead", bounds=bounds, options=options)
         return moved(best.x)
 
-    def scores(self, perturbation: Any, replicas: int) -> Floats:
-        """Similarities of all ions and of each resample, shape (1 + resamples,)."""
-        return self.comparison.similarities(*self.sampler.maps(perturbation, replicas))
+    def _draws(self, perturbation):
+        """Draws per ion: one for ions without random numbers."""
+        return 1 if isinstance(perturbation, Unperturbed) else self.settings.replicas or ROUGH
 
     def matrix(
-        self, replicas: int, note: Any, places: Any = None, measure: PoleMeasure | None = None
+        self, note: Any, places: Any = None, measure: PoleMeasure | None = None, draws: int | None = None
     ) -> tuple[Floats, list[Structure]]:
         """Similarities at positions on the axes, by default the complete grid, and the structure of each map.
 
@@ -130,8 +133,9 @@ class EnergySearch:
         ):
 
             def scores(perturbation):
-                maps, noise = self.sampler.maps(perturbation, replicas)
-                structure = None if measure is None else self.structure(maps[0], replicas, measure)
+                number = draws or self._draws(perturbation)
+                maps, noise = self.sampler.maps(perturbation, number)
+                structure = None if measure is None else self._structure(maps[0], number, measure)
                 similarities = self.comparison.similarities(maps, noise)
                 bar.update()
                 return similarities, structure
@@ -140,10 +144,10 @@ class EnergySearch:
         found = [] if measure is None else list(structures)
         return np.stack(values, axis=1).reshape(-1, *map(len, places)), found
 
-    def structure(self, counts: Floats, replicas: int, measure: PoleMeasure) -> Structure:
+    def _structure(self, counts, draws, measure):
         """Structure of a simulated map of the box; several draws of an ion have the noise of one."""
         simulated = self._simulated(counts, "simulation")
-        return measure.structure(simulated, max(simulated.ions or 0, 1) / replicas)
+        return measure.structure(simulated, max(simulated.ions or 0, 1) / draws)
 
     def _simulated(self, counts, source):
         """Map of the compared region from the counts of the box."""
@@ -153,18 +157,18 @@ class EnergySearch:
         rest = {"quantum": None, "smoothing": 0, "source": source, "detected": None}
         return replace(self.region, values=values, is_counts=True, ions=ions, **rest)
 
-    def refine(self, values: Floats, cells: Any, replicas: int) -> Floats:
+    def refine(self, values: Floats, cells: Any) -> Floats:
         """Positions of the maxima between the points, shape (1 + resamples, number of axes).
 
         The search is within one step of the best point. A resample with its best point elsewhere keeps that point.
         """
         places = self.grid.around(cells[0])
-        refined = spline_maxima(places, self.matrix(replicas, "between points", places)[0])
+        refined = spline_maxima(places, self.matrix("between points", places)[0])
         low, high = (np.array([along[end] for along in places]) for end in (0, -1))
         near = ((low <= cells) & (cells <= high)).all(axis=1)
         return np.where(near[:, None], refined, cells)
 
-    def optimum(self, index: Any, replicas: int, intervals: Intervals | None) -> Optimum:
+    def optimum(self, index: Any, intervals: Intervals | None) -> Optimum:
         """`Optimum` at an index of the grid, also between points; `intervals` are None without resamples."""
         values = dict(zip(self.grid.axes, self.grid.values_at(np.asarray(index)).tolist(), strict=True))
         energy = TruncatedNormal(values["mean"], values["rsd"] * values["mean"])
@@ -177,7 +181,7 @@ class EnergySearch:
             options={name: values[name] for name in self.grid.options},
             true_mean=energy.true_mean,
             true_standard_deviation=energy.true_standard_deviation,
-            score=Score.of_resamples(self.scores(perturbation, replicas)),
+            score=Score.of_resamples(self.map_and_scores(perturbation)[1]),
             intervals={} if intervals is None else intervals.bounds,
             open_ends={} if intervals is None else intervals.open_ends,
             at_edge=tuple(
@@ -187,9 +191,9 @@ class EnergySearch:
             ),
         )
 
-    def map_and_scores(self, perturbation: Any, replicas: int) -> tuple[DetectorMap, Floats, Floats]:
+    def map_and_scores(self, perturbation: Any) -> tuple[DetectorMap, Floats, Floats]:
         """Simulated map on the measured bins, its corrected and uncorrected similarities, each (1 + resamples,)."""
-        maps, noise = self.sampler.maps(perturbation, replicas)
+        maps, noise = self.sampler.maps(perturbation, self._draws(perturbation))
         simulated = self._simulated(maps[0], f"simulation, {perturbation!r}")
         similarities = self.comparison.similarities
         return simulated, similarities(maps, noise), similarities(maps, noise, plain=True)
@@ -209,9 +213,9 @@ def register_repeatedly(search: EnergySearch) -> tuple[Registration, list[dict[s
     for _ in range(_MAX_ROUNDS):
         registration = register(search.hits(best), search.measured, start=registration)
         registration = replace(registration, method="search")  # of the first round, from which the others start
-        rounds.append({"perturbation": to_dict(search.perturbation(best)), "registration": registration.to_dict()})
+        rounds.append({"perturbation": described(search.perturbation(best)), "registration": to_plain(registration)})
         search.place(registration, 0)
-        previous, best = best, tuple(maxima(search.matrix(ROUGH, "registration")[0])[0])
+        previous, best = best, tuple(maxima(search.matrix("registration", draws=ROUGH)[0])[0])
         if best == previous:
             break
     return search.refine_registration(registration, best), rounds

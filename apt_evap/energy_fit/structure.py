@@ -5,13 +5,16 @@ more similar than a sharp one. The contrast of rings about a pole and the radial
 reduces the contrast, and fills the pole.
 """
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import Floats
 from apt_evap.analysis.apex import image_compression
 from apt_evap.analysis.pole_frame import pole_frame
@@ -20,6 +23,7 @@ from apt_evap.analysis.profiles import Profile
 from apt_evap.analysis.rings import RINGS, Ring, ring_statistics
 from apt_evap.crystallography.orientation import Orientation
 from apt_evap.crystallography.poles import plane_normals, poles
+from apt_evap.crystallography.symmetry import rotational_symmetry
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.projection import Projection
 from apt_evap.registration.register import Registration
@@ -31,7 +35,6 @@ SIGNIFICANT = 2.0
 """A measured contrast above this number of its errors, or a difference of misfits, is significant."""
 _FAMILIES = 3  # of largest spacing: their poles have wide dark facets
 _COVERED = 0.7  # fraction of the circle of the outermost ring inside the compared region
-_FOLDS = (6, 4, 3, 2)
 _SECTORS = (72, 36, 24)  # of a ring: the most that its bins fill, and multiples of all folds
 
 
@@ -78,7 +81,7 @@ class Structure(NamedTuple):
         """Their errors, NaN for unknown noise, shape (n,)."""
         return np.array([*(ring.error for ring in self.rings), *self.radial.error])
 
-    def misfit(self, measured: "Structure") -> tuple[float, float]:
+    def misfit(self, measured: Structure) -> tuple[float, float]:
         """Root mean square difference of the values from measured ones, and its error by noise.
 
         All values are relative to the mean density: 0.1 is a difference by 10 % of the mean. A ring without hits lacks
@@ -93,7 +96,7 @@ class Structure(NamedTuple):
             return 0.0, float(np.sqrt(np.mean(error**2)))
         return misfit, float(np.sqrt(np.sum((difference * error) ** 2)) / (len(difference) * misfit))
 
-    def lost(self, measured: "Structure") -> bool:
+    def lost(self, measured: Structure) -> bool:
         """Whether all rings with a significant measured contrast have lost it."""
         pairs = [
             (own.contrast, other.contrast)
@@ -101,16 +104,6 @@ class Structure(NamedTuple):
             if other.contrast > SIGNIFICANT * np.nan_to_num(other.error) and other.contrast > 0
         ]
         return bool(pairs) and all(own < LOST * other for own, other in pairs)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the values in plain types, dict."""
-        return {
-            "rings": [
-                {name: getattr(ring, name) for name in ("inner", "outer", "contrast", "error", "minimum", "maximum")}
-                for ring in self.rings
-            ],
-            "radial": {name: getattr(self.radial, name).tolist() for name in ("position", "density", "error")},
-        }
 
 
 class PoleMeasure:
@@ -155,7 +148,7 @@ class PoleMeasure:
             )
         self.plane = tuple(int(index) for index in planes[best])
         self.pole = directions[best]
-        self.fold = _fold(poles(orientation.material).normals, normals[best])
+        self.fold = rotational_symmetry(orientation.material, normals[best])
         sectors = [self._sectors(region, ring) for ring in RINGS]
         self.rings = [(ring, number) for ring, number in zip(RINGS, sectors, strict=True) if number]
         if not self.rings:
@@ -198,19 +191,6 @@ class PoleMeasure:
         return len(np.unique((frame.azimuth[ring] * 36).astype(int))) / 36
 
 
-def _fold(normals, axis):
-    """Order of the rotation about an axis that maps a set of normals onto itself."""
-    axis = axis / np.linalg.norm(axis)
-    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    for fold in _FOLDS:
-        angle = 2 * np.pi / fold
-        rotation = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-        # the nearest normal of each rotated one
-        if ((normals @ rotation.T @ normals.T).max(axis=1) > 1 - 1e-9).all():
-            return fold
-    return 1
-
-
 class StructureScores(NamedTuple):
     """Second objective of a study: misfit of the contrasts of rings and of the radial densities about a pole."""
 
@@ -231,6 +211,9 @@ class StructureScores(NamedTuple):
     at_optimum: tuple[int, ...]
     """Index of the point that is best by similarity."""
 
+    def __repr__(self) -> str:
+        return short_repr(self)
+
     @property
     def disagrees(self) -> bool:
         """Whether the point that is best by similarity has a significantly larger misfit than the best one."""
@@ -242,9 +225,3 @@ class StructureScores(NamedTuple):
     def lost(self) -> bool:
         """Whether the map that is best by similarity has lost the structure of the measured one."""
         return self.optimum.lost(self.measured)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the scores in plain types, dict."""
-        structures = {name: getattr(self, name).to_dict() for name in ("measured", "unperturbed", "optimum")}
-        rest = {name: getattr(self, name) for name in ("plane", "misfit", "errors", "best", "disagrees", "lost")}
-        return structures | rest

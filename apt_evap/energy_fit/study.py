@@ -2,22 +2,23 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from apt_evap._common.codec import for_json, to_plain
 from apt_evap._common.files import replace_file
 from apt_evap._common.types import AnyPath, Floats
 from apt_evap._version import __version__
 from apt_evap.detection.detector_map import DetectorMap
-from apt_evap.emission.perturbations import to_dict
+from apt_evap.emission.perturbations import described
 from apt_evap.energy_fit.grid import EnergyGrid
-from apt_evap.energy_fit.settings import StudySettings
+from apt_evap.energy_fit.settings import FitSettings
 from apt_evap.energy_fit.structure import StructureScores
+from apt_evap.registration.likeness import Likeness, likeness
 from apt_evap.registration.register import Registration
-
-_GRID = ("means", "rsds", "rollup_fractions", "options")
 
 
 class Score(NamedTuple):
@@ -79,10 +80,6 @@ class Optimum:
     options: dict = field(default_factory=dict)
     open_ends: dict = field(default_factory=dict)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the optimum in plain types, dict."""
-        return asdict(self) | {"perturbation": to_dict(self.perturbation), "score": self.score._asdict()}
-
     def bounded(self, name: str) -> str:
         """Text of one of the numbers and its interval, str."""
         return self.scaled(name, 1.0)
@@ -133,7 +130,7 @@ class Study:
     structure : StructureScores or None
         Second objective, which blur cannot win: contrast of the zone lines and darkness of a pole. None if no pole with
         its rings is inside the compared region; ``provenance["structure"]`` contains the reason.
-    settings : StudySettings
+    settings : FitSettings
         Settings of the comparison, the random draws and the resampling.
     provenance : dict
         All other input of the study, in plain types: run, measured map, bins, rounds of the registration.
@@ -155,27 +152,32 @@ class Study:
     measured: DetectorMap
     maps: dict
     structure: StructureScores | None
-    settings: StudySettings
+    settings: FitSettings
     provenance: dict
+
+    @cached_property
+    def likeness(self) -> Likeness:
+        """Whether the best simulated map and the measured one show the same crystal along the same axis."""
+        return likeness(self.maps["optimum"], self.measured, self.registration)
 
     def compared(self, map: DetectorMap) -> DetectorMap:
         """Prepare a map of the measured frame as for the comparison: common region, flattened and smoothed."""
         flat = replace(map, mask=self.measured.mask).flattened(self.settings.flattening or 0.0)
-        return flat.smoothed(self.settings.smoothing)
+        return flat.smoothed(self.settings.smoothing or 0.0)
 
     def to_dict(self) -> dict[str, Any]:
         """Return results and settings in plain types, NaN as None, dict."""
-        grid = {"mechanism": self.grid.name, **{name: getattr(self.grid, name) for name in _GRID}}
-        results: dict[str, Any] = {"made_by": f"apt_evap {__version__}", "grid": grid}
-        results |= {name: getattr(self, name) for name in ("ssim", "errors", "shares", "gain_share")}
-        results |= {name: getattr(self, name).to_dict() for name in ("optimum", "refined", "registration")}
-        results |= {name: getattr(self, name) and getattr(self, name)._asdict() for name in ("gain", "ceiling")}
-        results["structure"] = self.structure and self.structure.to_dict()
-        for group in ("baselines", "plain"):
-            results[group] = {name: score._asdict() for name, score in getattr(self, group).items()}
-        return plain(
-            results | {"real_energies": self.real_energies, "settings": asdict(self.settings) | self.provenance}
-        )
+        names = ("ssim", "errors", "shares", "gain_share", "optimum", "refined", "registration", "gain", "ceiling")
+        names += ("baselines", "plain", "real_energies", "likeness")
+        results = to_plain({name: getattr(self, name) for name in names})
+        results["made_by"] = f"apt_evap {__version__}"
+        results["grid"] = to_plain(self.grid) | {"mechanism": self.grid.name}
+        for name in ("optimum", "refined"):
+            results[name]["perturbation"] = described(getattr(self, name).perturbation)
+        results["registration"]["doubtful"] = bool(self.registration.doubtful)
+        scores = self.structure
+        results["structure"] = scores and to_plain(scores) | {"disagrees": scores.disagrees, "lost": scores.lost}
+        return for_json(results | {"settings": to_plain(self.settings) | self.provenance})
 
     def save(self, path: AnyPath) -> None:
         """Write results and settings to a JSON file; the file is replaced only when complete.
@@ -215,9 +217,33 @@ class Study:
         between += "".join(f", {name} {refined.bounded(name)}" for name in refined.options)
         doubtful = ", registration doubtful" if self.registration.doubtful else ""
         return (
-            f"<Study: {self.grid.name}{doubtful}, best at {best.mean:g} eV, sigma/mean {best.rsd:g}{fraction}"
+            f"<Study: maps {self.likeness.verdict}; {self.grid.name}{doubtful}, "
+            f"best at {best.mean:g} eV, sigma/mean {best.rsd:g}{fraction}"
             f"{edge}, SSIM {best.score}; {others};\n between points {between}; {self._structure()}{self._energies()}>"
         )
+
+    def lines(self) -> list[str]:
+        """Result, similarity, and doubts if there are any: at most three lines, list of str."""
+        best, likeness = self.optimum, self.likeness
+        verdict = {"alike": "the maps are alike", "doubtful": "it is doubtful that the maps are alike"}
+        first = f"{verdict.get(likeness.verdict, 'the maps are not alike')} ({likeness.reason}); {self.grid.name}, "
+        first += f"best at {self.point(self.best_cell)}"
+        second = f"similarity {best.score}, unperturbed {self.baselines['unperturbed']}"
+        if self.settings.allow_noise:
+            second += f"; uncorrected for noise {self.plain['optimum']}"
+        second += f", two halves of the measured ions {self.ceiling}" if self.ceiling else ", ceiling not known"
+        doubts = []
+        if likeness.verdict != "alike":
+            doubts.append("the energies have no meaning if the maps are not alike")
+        if self.registration.doubtful:
+            doubts.append(f"the registration, correlation {self.registration.score:.2f}")
+        if best.at_edge:
+            doubts.append(f"best at the end of the grid in {' and '.join(best.at_edge)}")
+        if self.structure is not None and self.structure.lost:
+            doubts.append("the best map has lost the zone lines")
+        elif self.structure is not None and self.structure.disagrees:
+            doubts.append(f"the rings about the pole are best at {self.point(self.structure.best)}")
+        return [first, second, *([f"doubt: {'; '.join(doubts)}"] if doubts else [])]
 
     def point(self, index: tuple[int, ...]) -> str:
         """Text of the energies and options at an index of the grid, str."""
@@ -300,16 +326,3 @@ def bounded_text(
     low, high = (bound * factor for bound in interval)
     below, above = open_ends or (False, False)
     return f"{value * factor:.3g} ({'at most ' * below}{low:.3g} to {'at least ' * above}{high:.3g})"
-
-
-def plain(value: Any) -> Any:
-    """Return a value in the types of JSON; NaN and infinity become None."""
-    if isinstance(value, dict):
-        return {str(key): plain(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(each) for each in value]
-    if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
-    if isinstance(value, float):
-        return value if np.isfinite(value) else None
-    return value if value is None or isinstance(value, bool | int | str) else repr(value)

@@ -1,11 +1,11 @@
 """Evaporation field of an atom by its bonds: a table over coordination numbers, or pair energies between species."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from apt_evap._common.codec import checked, from_plain, number, settings
 from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_count, check_number, short_text
 from apt_evap.specimen.lattice import SECOND_SHELL_FACTORS
@@ -81,43 +81,40 @@ class BondField(Protocol):
         ...
 
 
-@dataclass(frozen=True)
+def _table(table, name):
+    """Fields by element and number of bonds; in files the numbers are text."""
+    if not isinstance(table, Mapping) or not table:
+        raise ValueError(
+            f"{name} must be fields by element and number of bonds, such as {{'W': {{4: 57.0, 3: 47.0}}}}, got "
+            f"{short_text(table)}"
+        )
+    by_element = {}
+    for element, fields in table.items():
+        if not isinstance(fields, Mapping) or not fields:
+            raise ValueError(f"{name} of {element} must be fields by number of bonds, got {short_text(fields)}")
+        by_element[element] = {
+            check_count(
+                int(n) if isinstance(n, str) and n.isdecimal() else n, f"bonds in the {name} of {element}", at_most=15
+            ): check_number(field, f"field in the {name} of {element}", above=0, at_most=1000, unit="V/nm")
+            for n, field in fields.items()
+        }
+    return by_element
+
+
+@settings
 class CoordinationTable:
-    """Evaporation field by the number of remaining nearest neighbours.
+    """Evaporation field by the number of remaining nearest neighbours."""
 
-    Parameters
-    ----------
-    table : mapping
-        For each element a mapping of the number of nearest neighbours to the field [V/nm]. Numbers in between are
-        interpolated, beyond the ends the field is that of the end. Other elements keep their evaporation fields.
-
-    Raises
-    ------
-    ValueError
-        If a number or a field is outside its range.
-    """
-
-    table: Mapping[str, Mapping[int, float]] = field(hash=False)
+    table: Mapping[str, Mapping[int, float]] = checked(
+        "For each element a mapping of the number of nearest neighbours to the field. Numbers in between are "
+        "interpolated, beyond the ends the field is that of the end. Other elements keep their evaporation fields.",
+        "mapping",
+        _table,
+        unit="V/nm",
+        hash=False,
+    )
     by_species = False
     second_shell = False
-
-    def __post_init__(self):
-        if not isinstance(self.table, Mapping) or not self.table:
-            raise ValueError(
-                f"table must be fields by element and number of bonds, such as {{'W': {{4: 57.0, 3: 47.0}}}}, got "
-                f"{short_text(self.table)}"
-            )
-        plain = {}
-        for name, fields in self.table.items():
-            if not isinstance(fields, Mapping) or not fields:
-                raise ValueError(f"table of {name} must be fields by number of bonds, got {short_text(fields)}")
-            plain[name] = {
-                check_count(n, f"bonds in the table of {name}", at_least=0, at_most=15): check_number(
-                    value, f"field in the table of {name}", above=0, at_most=1000, unit="V/nm"
-                )
-                for n, value in fields.items()
-            }
-        object.__setattr__(self, "table", plain)
 
     def fields(self, tip: Tip, species: int, nearest: Integers, second: Integers) -> Floats:
         """Evaporation fields [V/nm]: see `BondField.fields`."""
@@ -132,28 +129,27 @@ TUNGSTEN_TABLE = CoordinationTable({"W": {n: 17.0 + 10.0 * n for n in range(1, 1
 """Evaporation fields of tungsten by coordination in the program pyvaporate (Ashton et al., 2020): 10 V/nm a bond."""
 
 
-@dataclass(frozen=True)
+def _by_element(energies, name):
+    if not isinstance(energies, Mapping):
+        raise ValueError(f"{name} must be numbers [eV] by element, got {short_text(energies)}")
+    return {key: check_number(each, f"{name} of {key}", above=0, unit="eV") for key, each in energies.items()}
+
+
+def _by_pair(energies, name):
+    if not isinstance(energies, Mapping):
+        raise ValueError(f"{name} must be energies [eV] by pair such as 'Al-Cu', got {short_text(energies)}")
+    for pair in energies:
+        if not isinstance(pair, str) or pair.count("-") != 1:
+            raise ValueError(f"{name} must be by pair such as 'Al-Cu', got {short_text(pair)}")
+    return {
+        pair: check_number(each, f"{name} of {pair}", at_least=-10, at_most=10, unit="eV")
+        for pair, each in energies.items()
+    }
+
+
+@settings
 class PairEnergies:
     r"""Evaporation field from pair energies of the remaining bonds, in the image-hump model.
-
-    Parameters
-    ----------
-    cohesive_energies : mapping, optional
-        Cohesive energy by element [eV]; by default `COHESIVE_ENERGIES`.
-    ionisation_works : mapping, optional
-        S = sum of the ionisation energies less n work functions, by element [eV], for the charge at the barrier; by
-        default `IONISATION_WORKS`.
-    ordering : mapping, optional
-        w > 0 for unlike bonds that are stronger than the mean of the like ones [eV], by pair, such as {"Al-Cu": 0.05};
-        0 by default.
-    second_weight : float
-        Energy of a bond to a second neighbour, relative to a nearest one. 0.5 is sensible for bcc, whose second
-        neighbours are only 15 % farther; 0 does not count them.
-
-    Raises
-    ------
-    ValueError
-        If a number is outside its range.
 
     Notes
     -----
@@ -164,31 +160,40 @@ class PairEnergies:
     kink of the pure metal has half of the bonds, so that its Λ is E_A, and its field the evaporation field.
     """
 
-    cohesive_energies: Mapping[str, float] | None = field(default=None, hash=False)
-    ionisation_works: Mapping[str, float] | None = field(default=None, hash=False)
-    ordering: Mapping[str, float] | None = field(default=None, hash=False)
-    second_weight: float = 0.0
+    cohesive_energies: Mapping[str, float] | None = checked(
+        "Cohesive energy by element; by default `COHESIVE_ENERGIES`.",
+        "mapping",
+        _by_element,
+        default=None,
+        unit="eV",
+        hash=False,
+    )
+    ionisation_works: Mapping[str, float] | None = checked(
+        "S = sum of the ionisation energies less n work functions, by element, for the charge at the barrier; by "
+        "default `IONISATION_WORKS`.",
+        "mapping",
+        _by_element,
+        default=None,
+        unit="eV",
+        hash=False,
+    )
+    ordering: Mapping[str, float] = checked(
+        'w > 0 for unlike bonds that are stronger than the mean of the like ones, by pair, such as {"Al-Cu": 0.05}; 0 '
+        "for pairs that are not in it.",
+        "mapping",
+        _by_pair,
+        default={},
+        unit="eV",
+        hash=False,
+    )
+    second_weight: float = number(
+        "Energy of a bond to a second neighbour, relative to a nearest one. 0.5 is sensible for bcc, whose second "
+        "neighbours are only 15 % farther; 0 does not count them.",
+        default=0.0,
+        at_least=0,
+        at_most=1,
+    )
     by_species = True
-
-    def __post_init__(self):
-        check_number(self.second_weight, "second_weight", at_least=0, at_most=1)
-        for name in ("cohesive_energies", "ionisation_works"):
-            given = getattr(self, name)
-            if given is not None:
-                if not isinstance(given, Mapping):
-                    raise ValueError(f"{name} must be numbers [eV] by element, got {short_text(given)}")
-                values = {
-                    key: check_number(value, f"{name} of {key}", above=0, unit="eV") for key, value in given.items()
-                }
-                object.__setattr__(self, name, values)
-        pairs = {}
-        if self.ordering is not None and not isinstance(self.ordering, Mapping):
-            raise ValueError(f"ordering must be energies [eV] by pair such as 'Al-Cu', got {short_text(self.ordering)}")
-        for pair, value in ({} if self.ordering is None else self.ordering).items():
-            if not isinstance(pair, str) or pair.count("-") != 1:
-                raise ValueError(f"ordering must be by pair such as 'Al-Cu', got {short_text(pair)}")
-            pairs[pair] = check_number(value, f"ordering of {pair}", at_least=-10, at_most=10, unit="eV")
-        object.__setattr__(self, "ordering", pairs)
 
     @property
     def second_shell(self) -> bool:
@@ -210,7 +215,7 @@ class PairEnergies:
             cohesive = self._number(self.cohesive_energies, COHESIVE_ENERGIES, element.name, "cohesive_energies")
             energies.append(2.0 * cohesive / (near + self.second_weight * far))
         names = [tip.elements[index].name for index in (first, second)]
-        extra = self.ordering.get("-".join(names), self.ordering.get("-".join(names[::-1]), 0.0))  # type: ignore[union-attr]
+        extra = self.ordering.get("-".join(names), self.ordering.get("-".join(names[::-1]), 0.0))
         return 0.5 * (energies[0] + energies[1]) + (extra if first != second else 0.0)
 
     def energies(self, tip: Tip, species: int, nearest: Integers, second: Integers) -> Floats:
@@ -231,16 +236,26 @@ class PairEnergies:
         return element.evaporation_field * ratio * ratio
 
 
-def check_bonds(bonds: Any) -> None:
-    """Raise a ValueError unless `bonds` is None or an evaporation field by bonds."""
-    if bonds is None:
-        return
-    complete = all(hasattr(bonds, name) for name in ("fields", "by_species", "second_shell"))
+def _bonds(bonds, name):
+    complete = all(hasattr(bonds, each) for each in ("fields", "by_species", "second_shell"))
     if not complete or isinstance(bonds, type | Mapping) or not callable(bonds.fields):
         raise ValueError(
-            "bonds must be an evaporation field by bonds with by_species, second_shell and a method fields, such as "
+            f"{name} must be an evaporation field by bonds with by_species, second_shell and a method fields, such as "
             f"PairEnergies(), got {short_text(bonds)}"
         )
+    return bonds
+
+
+def bonds_field() -> Any:
+    """Declare the evaporation field by bonds of a law; in a file also "TUNGSTEN_TABLE"."""
+
+    def read(plain, name):
+        if plain == "TUNGSTEN_TABLE":
+            return TUNGSTEN_TABLE
+        return from_plain(plain, CoordinationTable, PairEnergies, what=name)
+
+    text = "Evaporation field by the bonds of an atom; by default that of its species."
+    return checked(text, "BondField", _bonds, default=None, read=read)
 
 
 class BondCodes(NamedTuple):

@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from apt_evap._common.small_matrices import lengths, matrix_product, products, pseudo_inverse
+from apt_evap._common.small_matrices import lengths
+from apt_evap._common.sphere import fit_sphere
 from apt_evap._common.types import Floats
 from apt_evap._core.elementary import sine_and_cosine
 
@@ -57,8 +58,7 @@ def measure_cap(positions: Floats, normals: Floats, fields: Floats, evaporation_
     sum of q r.E over all charges is their energy Q V/2 (virial theorem). Measured on spheres of fcc atoms: 2.2, 1.0 and
     0.5 % less at R = 12, 24 and 40 a. A mean without weights is 13 % less: it counts atoms below steps fully.
 
-    The sphere minimises the sum of (|r - c|^2 - R^2)^2, a linear problem for c and R^2 - |c|^2. It begins with atoms
-    whose normals are within 45 degrees of the axis.
+    The fit of the sphere (`fit_sphere`) begins with atoms whose normals are within 45 degrees of the axis.
     """
     cosine = float(sine_and_cosine(math.radians(HALF_ANGLE))[1])
     chosen = normals[:, 2] >= cosine
@@ -66,20 +66,9 @@ def measure_cap(positions: Floats, normals: Floats, fields: Floats, evaporation_
     for _ in range(_ROUNDS):
         if np.count_nonzero(chosen) < _FEWEST:
             return NO_CAP
-        centre, radius = _sphere(positions[chosen])
+        centre, radius = fit_sphere(positions[chosen])
         from_centre = positions - centre
         chosen = from_centre[:, 2] >= cosine * lengths(from_centre)
     fields = fields[chosen]
     weights = fields / fields.sum()  # fields are proportional to charges
     return Cap(float((weights * fields).sum()), float((weights * fields / evaporation_fields[chosen]).sum()), radius)
-
-
-def _sphere(points):
-    """Centre and radius of the algebraic least-squares sphere through points."""
-    middle = points.mean(axis=0)
-    shifted = points - middle
-    matrix = np.column_stack([2.0 * shifted, np.ones(len(shifted))])
-    right = products(shifted, shifted)
-    inverse = pseudo_inverse(matrix_product(matrix.T, matrix))
-    *centre, rest = matrix_product(inverse, matrix_product(matrix.T, right)).tolist()
-    return middle + centre, math.sqrt(max(rest + float(products(centre, centre)), 0.0))

@@ -1,5 +1,7 @@
 """The emitter: the charged surface of a specimen, and the sequence of its evaporating atoms."""
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
@@ -9,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from apt_evap._common.describe import describe
 from apt_evap._common.threads import thread_count, usable_threads
 from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_seed
@@ -187,7 +188,7 @@ class Emitter:
         self.relax(tolerance=self.settings.start_tolerance)
         if self._core.next_slot < 0:
             raise ValueError(
-                f"law {describe(self.law)['name']} gives no surface atom of {tip!r} a key > 0: no atom can evaporate"
+                f"law {type(self.law).__name__} gives no surface atom of {tip!r} a key > 0: no atom can evaporate"
             )
         self.sweep_interval = self.settings.sweep_interval or max(100, len(self) // 300)
 

@@ -1,14 +1,14 @@
 """Evaporation laws: the choice of the next atom to evaporate."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 
+from apt_evap._common.codec import settings
 from apt_evap._common.types import Floats, Integers
 from apt_evap._core.law import LawKernel, PythonLaw, WeightedField
-from apt_evap.evaporation.bonds import BondField, bond_table, check_bonds
+from apt_evap.evaporation.bonds import BondField, bond_table, bonds_field
 from apt_evap.evaporation.voltage import VoltageControl
 from apt_evap.specimen.tip import Tip
 
@@ -42,23 +42,41 @@ class Law(Protocol):
         ...
 
 
-@dataclass(frozen=True)
+@runtime_checkable
+class ThermalLaw(Protocol):
+    """Interface of a law with rates, whose events take time: the voltage is controlled (`RateControl`)."""
+
+    @property
+    def peak_temperature(self) -> float:
+        """Temperature at which most events happen [K]; 0 for a law without rates."""
+        ...
+
+    def default_control(self) -> VoltageControl:
+        """Control of the voltage if none is given."""
+        ...
+
+    def sensitivities(self, tip: Tip) -> Floats:
+        """Sensitivity C of each species [eV], shape (n_species,)."""
+        ...
+
+    def working_point(self, sensitivity: float, control: VoltageControl) -> tuple[float, float]:
+        """Barrier over kT at the wanted rate, and the time at the top of a pulse [s], 0 without pulses."""
+        ...
+
+    def kernel(self, tip: Tip, control: VoltageControl | None = None) -> LawKernel:
+        """Return the compiled law for a specimen, whose keys are logarithms of rates."""
+        ...
+
+
+@settings
 class Extremal:
     """Extremal law: the atom with the largest ratio of field to evaporation field evaporates next.
 
     Equal ratios are ordered by the index of the atom. This is the low-temperature limit of the Arrhenius rate nu_0
     exp(-C (1 - F/F_evap)/kT) (Vurpillot et al., 2013).
-
-    Parameters
-    ----------
-    bonds : BondField, optional
-        Evaporation field by the bonds of an atom; by default that of its species.
     """
 
-    bonds: BondField | None = None
-
-    def __post_init__(self):
-        check_bonds(self.bonds)
+    bonds: BondField | None = bonds_field()
 
     def kernel(self, tip: Tip) -> LawKernel:
         """Return the compiled law for a specimen: F / F_evap, 0 for atoms that cannot evaporate."""
@@ -76,9 +94,9 @@ def check_law(law: object) -> None:
         raise ValueError(f"law must be an evaporation law with a method keys, such as Extremal(), got {law!r:.80}")
 
 
-def has_temperature(law: Any) -> bool:
-    """Whether the law is one of rates, whose events take time: its voltage is controlled."""
-    return callable(getattr(law, "working_point", None)) and getattr(law, "peak_temperature", 0.0) > 0
+def has_temperature(law: Any) -> TypeGuard[ThermalLaw]:
+    """Whether the law is a `ThermalLaw` with a temperature above 0."""
+    return isinstance(law, ThermalLaw) and law.peak_temperature > 0
 
 
 def kernel_of(law: Any, tip: Tip, control: VoltageControl | None = None) -> LawKernel:

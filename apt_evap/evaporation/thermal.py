@@ -1,23 +1,17 @@
 """Thermally activated evaporation: rates of all atoms, at a temperature, under a laser, with controlled voltage."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from apt_evap._common.codec import checked, choice, number, part, settings, vector
 from apt_evap._common.small_matrices import lengths
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import (
-    check_array,
-    check_choice,
-    check_kind,
-    check_number,
-    short_text,
-)
+from apt_evap._common.validation import check_number, short_text
 from apt_evap._core.elementary import logarithm
 from apt_evap._core.law import BARRIERS, LawKernel, ThermalRate, WeightedField
-from apt_evap.evaporation.bonds import BondField, bond_table, check_bonds
+from apt_evap.evaporation.bonds import BondField, bond_table, bonds_field
 from apt_evap.evaporation.voltage import VoltageControl
 from apt_evap.specimen.tip import Tip
 from apt_evap.units import BOLTZMANN
@@ -26,25 +20,15 @@ CANDIDATES = 100.0  # atoms that may leave next; measured on Ni[111], R = 16 a: 
 _ROUNDS = 20  # of the fixed point of width of a pulse and barrier; it converges to 1e-12
 
 
-@dataclass(frozen=True)
+def _not_zero(direction, name):
+    if not lengths(np.array(direction)) > 0:
+        raise ValueError(f"{name} must not be zero, got {short_text(direction)}")
+    return direction
+
+
+@settings
 class Laser:
     """Laser pulses that heat the specimen, one side more than the other.
-
-    Parameters
-    ----------
-    temperature_rise : float
-        Rise of the temperature at the peak on the hottest side [K].
-    decay : float
-        Time constant of the cooling [ns].
-    direction : sequence of float
-        Direction from which the light comes, perpendicular to the axis: x and y of any length.
-    asymmetry : float
-        a, from 0 (both sides equally hot) to 1 (no rise on the far side).
-
-    Raises
-    ------
-    ValueError
-        If a number is outside its range, or the direction is zero.
 
     Notes
     -----
@@ -53,19 +37,19 @@ class Laser:
     decays exponentially.
     """
 
-    temperature_rise: float
-    decay: float = 1.0
-    direction: tuple[float, float] = (1.0, 0.0)
-    asymmetry: float = 0.0
-
-    def __post_init__(self):
-        check_number(self.temperature_rise, "temperature_rise", above=0, at_most=5000, unit="K")
-        check_number(self.decay, "decay", above=0, at_most=1e6, unit="ns")
-        check_number(self.asymmetry, "asymmetry", at_least=0, at_most=1)
-        direction = check_array(self.direction, "direction", (2,))
-        if not lengths(direction) > 0:
-            raise ValueError(f"direction must not be zero, got {short_text(self.direction)}")
-        object.__setattr__(self, "direction", tuple(direction.tolist()))
+    temperature_rise: float = number(
+        "Rise of the temperature at the peak on the hottest side.", above=0, at_most=5000, unit="K"
+    )
+    decay: float = number("Time constant of the cooling.", default=1.0, above=0, at_most=1e6, unit="ns")
+    direction: tuple[float, float] = vector(
+        "Direction from which the light comes, perpendicular to the axis: x and y of any length.",
+        2,
+        default=(1.0, 0.0),
+        check=_not_zero,
+    )
+    asymmetry: float = number(
+        "a, from 0 (both sides equally hot) to 1 (no rise on the far side).", default=0.0, at_least=0, at_most=1
+    )
 
     def temperatures(self, positions: Floats, radius: float, base: float) -> Floats:
         """Temperature of each atom at the peak of a pulse [K], shape (n,).
@@ -85,29 +69,18 @@ class Laser:
         return base + self.temperature_rise * rise
 
 
-@dataclass(frozen=True)
+def _sensitivity(given, name):
+    """One sensitivity, or sensitivities by element."""
+    if isinstance(given, Mapping):
+        return {
+            key: check_number(each, f"{name} of {key}", above=0, at_most=1000, unit="eV") for key, each in given.items()
+        }
+    return check_number(given, name, above=0, at_most=1000, unit="eV")
+
+
+@settings
 class Arrhenius:
     """Thermal law: every atom leaves at the rate nu_0 exp(-Q(F)/kT); an event is drawn from all rates.
-
-    Parameters
-    ----------
-    temperature : float
-        Temperature of the specimen [K], before laser pulses. 0 is the extremal law, bit by bit.
-    sensitivity : float or mapping
-        C = -dQ/dx at the working point, x = F/F_evap [eV], for all atoms or by element. About 1 eV for most metals.
-    attempt_frequency : float
-        nu_0 [1/s], 1e12 to 1e13.
-    barrier : {"linear", "image_hump", "parabolic", "quadratic"}
-        Form of the barrier, see the notes.
-    laser : Laser, optional
-        Laser pulses.
-    bonds : BondField, optional
-        Evaporation field by the bonds of an atom; by default that of its species.
-
-    Raises
-    ------
-    ValueError
-        If a number is outside its range, or the barrier is unknown.
 
     Notes
     -----
@@ -131,27 +104,28 @@ class Arrhenius:
     number of the event only.
     """
 
-    temperature: float
-    sensitivity: float | Mapping[str, float] = field(default=1.0, hash=False)
-    attempt_frequency: float = 1e13
-    barrier: str = "linear"
-    laser: Laser | None = None
-    bonds: BondField | None = None
+    temperature: float = number(
+        "Temperature of the specimen, before laser pulses. 0 is the extremal law, bit by bit.",
+        at_least=0,
+        at_most=5000,
+        unit="K",
+    )
+    sensitivity: float | Mapping[str, float] = checked(
+        "C = -dQ/dx at the working point, x = F/F_evap, for all atoms or by element. About 1 eV for most metals.",
+        "float or mapping",
+        _sensitivity,
+        default=1.0,
+        unit="eV",
+        hash=False,
+    )
+    attempt_frequency: float = number("nu_0, 1e12 to 1e13.", default=1e13, above=0, at_most=1e20, unit="1/s")
+    barrier: str = choice("Form of the barrier, see the notes.", BARRIERS, default="linear")
+    laser: Laser | None = part("Laser pulses.", Laser, default=None)
+    bonds: BondField | None = bonds_field()
 
-    def __post_init__(self):
-        check_number(self.temperature, "temperature", at_least=0, at_most=5000, unit="K")
-        if isinstance(self.sensitivity, Mapping):
-            for name, value in self.sensitivity.items():
-                check_number(value, f"sensitivity of {name}", above=0, at_most=1000, unit="eV")
-            object.__setattr__(self, "sensitivity", dict(self.sensitivity))
-        else:
-            check_number(self.sensitivity, "sensitivity", above=0, at_most=1000, unit="eV")
-        check_number(self.attempt_frequency, "attempt_frequency", above=0, at_most=1e20, unit="1/s")
-        check_choice(self.barrier, "barrier", BARRIERS)
+    def _check(self):
         if self.laser is not None:
-            check_kind(self.laser, "laser", Laser, "a Laser or None")
             check_number(self.temperature, "temperature", above=0, unit="K", why="the far side stays at it")
-        check_bonds(self.bonds)
 
     @property
     def peak_temperature(self) -> float:

@@ -1,12 +1,17 @@
 """The applied voltage, and its control to a constant rate of evaporation."""
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from apt_evap._common.validation import check_count, check_number
+from apt_evap._common.codec import count, number, settings
+from apt_evap._common.validation import check_number
 from apt_evap._core.elementary import exponential, logarithm
+from apt_evap._core.evaporation import Evaporation
 from apt_evap.units import BOLTZMANN
+
+if TYPE_CHECKING:
+    from apt_evap.evaporation.law import ThermalLaw
+    from apt_evap.specimen.tip import Tip
 
 _STEP = 1e-6  # relative, for the slope of the rate: 1e-3 of what changes the rate by a factor of e at 20 K
 _LARGEST_STEP = 0.05  # relative change of the voltage in one step of Newton's method
@@ -21,28 +26,9 @@ def check_voltage(voltage: Any) -> float:
     return check_number(voltage, "voltage", above=0, at_most=1e6, unit="V")
 
 
-@dataclass(frozen=True)
+@settings
 class VoltageControl:
     """Voltage of an instrument: a constant rate of evaporation, with or without voltage pulses.
-
-    Parameters
-    ----------
-    rate : float
-        Ions per pulse, of the voltage or of a laser; without pulses, ions per second. 0.002 to 0.05 ions per pulse are
-        usual.
-    pulse_fraction : float
-        Height of the voltage pulse relative to the standing voltage, V_p / V_dc; 0.2 is usual. 0: no pulses.
-    pulse_width : float
-        Standard deviation of the Gaussian top of a pulse [ns].
-    pulse_frequency : float
-        Pulses per second [kHz]; only for the duration of a measurement.
-    memory : int
-        Number of ions over which the control averages the rate.
-
-    Raises
-    ------
-    ValueError
-        If a number is outside its range.
 
     Notes
     -----
@@ -51,21 +37,28 @@ class VoltageControl:
     the mean rate is the wanted one. This changes V by dlnV = dlnK s, with s = dlnV/dlnK of the sum of the rates.
     """
 
-    rate: float = 0.01
-    pulse_fraction: float = 0.2
-    pulse_width: float = 0.5
-    pulse_frequency: float = 200.0
-    memory: int = 250
-
-    def __post_init__(self):
-        for name, value in {
-            "rate": check_number(self.rate, "rate", above=0, at_most=1e6),
-            "pulse_fraction": check_number(self.pulse_fraction, "pulse_fraction", at_least=0, at_most=1),
-            "pulse_width": check_number(self.pulse_width, "pulse_width", above=0, at_most=1e6, unit="ns"),
-            "pulse_frequency": check_number(self.pulse_frequency, "pulse_frequency", above=0, at_most=1e6, unit="kHz"),
-            "memory": check_count(self.memory, "memory", at_least=1, at_most=1_000_000),
-        }.items():
-            object.__setattr__(self, name, value)
+    rate: float = number(
+        "Ions per pulse, of the voltage or of a laser; without pulses, ions per second. 0.002 to 0.05 ions per pulse "
+        "are usual.",
+        default=0.01,
+        above=0,
+        at_most=1e6,
+    )
+    pulse_fraction: float = number(
+        "Height of the voltage pulse relative to the standing voltage, V_p / V_dc; 0.2 is usual. 0: no pulses.",
+        default=0.2,
+        at_least=0,
+        at_most=1,
+    )
+    pulse_width: float = number(
+        "Standard deviation of the Gaussian top of a pulse.", default=0.5, above=0, at_most=1e6, unit="ns"
+    )
+    pulse_frequency: float = number(
+        "Pulses per second; only for the duration of a measurement.", default=200.0, above=0, at_most=1e6, unit="kHz"
+    )
+    memory: int = count(
+        "Number of ions over which the control averages the rate.", default=250, at_least=1, at_most=1_000_000
+    )
 
     def effective_width(self, softness: float) -> float:
         r"""Time at the top of a pulse with the same number of events [s].
@@ -93,6 +86,10 @@ class VoltageControl:
 class RateControl:
     """Control of the voltage of an emitter during its events, for a law with a temperature.
 
+    Before the first event, `begin` sets the wanted ``rate`` and the ``memory`` of the compiled events, which then keep
+    the logarithm ``rise`` of the factor of all rates since the last relaxation. `keep` and `look` are called before and
+    after each relaxation; they change its ``voltage_factor``, the voltage that the law sees over that of the charges.
+
     Parameters
     ----------
     control : VoltageControl
@@ -110,7 +107,7 @@ class RateControl:
         self._slope = math.nan  # dlnV/dlnK at the last relaxation
 
     @classmethod
-    def of(cls, law: Any, tip: Any, control: VoltageControl | None) -> "RateControl":
+    def of(cls, law: "ThermalLaw", tip: "Tip", control: VoltageControl | None) -> "RateControl":
         """Return the control for a law on a specimen; by default the usual one of the law."""
         control = law.default_control() if control is None else control
         sensitivity = float(law.sensitivities(tip)[0])
@@ -118,15 +115,15 @@ class RateControl:
         thermal = BOLTZMANN * law.peak_temperature / sensitivity
         return cls(control, pulse_length, thermal / max(1.0 - barrier * thermal, 0.3))
 
-    def begin(self, core: Any) -> None:
+    def begin(self, core: Evaporation) -> None:
         """Pass the wanted rate to the events."""
         core.rate, core.memory = self.rate, float(self.control.memory)
 
-    def voltage_factors(self, core: Any, rise: Any) -> Any:
+    def voltage_factors(self, core: Evaporation, rise: Any) -> Any:
         """Voltage over that of the charges, from the logarithm of the factor of the rates since the relaxation."""
         return core.voltage_factor * exponential(self._slope * rise)
 
-    def keep(self, core: Any, n_threads: int) -> None:
+    def keep(self, core: Evaporation, n_threads: int) -> None:
         """Before a relaxation: include the changes of the voltage since the last one in its factor.
 
         The first guess of the factor is linear in the logarithm of the rate; it is then corrected.
@@ -143,7 +140,7 @@ class RateControl:
             factor *= float(exponential(min(max(step, -_LARGEST_STEP), _LARGEST_STEP)))
         core.voltage_factor = factor
 
-    def look(self, core: Any, n_threads: int, restored: bool = False) -> None:
+    def look(self, core: Evaporation, n_threads: int, restored: bool = False) -> None:
         """After a relaxation: determine the slope of the rate; on a new surface, set the wanted rate.
 
         Parameters

@@ -11,16 +11,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from apt_evap._common.types import Floats
+from apt_evap._common.codec import to_python
 from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence
 from apt_evap._common.warnings import AptWarning
 from apt_evap.analysis.apex import image_compression
 from apt_evap.analysis.profiles import Profile, Rectangle, zone_line_profile
 from apt_evap.analysis.rings import Ring, ring_statistics
 from apt_evap.analysis.similarity import WINDOW, Similarity, half_ceiling, ssim, window_fits
-from apt_evap.config.perturbation_text import python_of, write_perturbation
+from apt_evap.config.perturbation_text import write_perturbation
 from apt_evap.crystallography.orientation import Orientation
 from apt_evap.crystallography.poles import poles
+from apt_evap.crystallography.symmetry import rotational_symmetry
 from apt_evap.detection.binning import bins_for, field_of_view
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
@@ -30,10 +31,8 @@ from apt_evap.emission.kept import KeptEmissions
 from apt_evap.emission.perturbations import Perturbation, RollUp, TruncatedNormal, Unperturbed
 from apt_evap.energy_fit.fit_energies import BINS, measured_map
 from apt_evap.explore.controls import MECHANISMS, Control, controls_of, perturbation_of
-from apt_evap.flight.response import Responses
 from apt_evap.registration.register import Registration, register
-from apt_evap.simulation.real_units import RealColumns
-from apt_evap.simulation.run import Clock, Flown, Run
+from apt_evap.simulation.run import Run
 
 PREVIEW = 50_000
 """Ions of a preview. Measured: 22 ms for a view with this many, `RollUp`, 256 bins and one thread of an Intel Xeon."""
@@ -371,8 +370,7 @@ class Explorer:
 
     def _bins_of_run(self, bins):
         """Map on the complete detector, as `apt-evap map` makes it."""
-        hits = self.run.hits(Unperturbed())
-        return hits.map(bins, extent=self.run.detector.extent, quantum=None, mask=np.ones((bins, bins), bool))
+        return self.run.hits(Unperturbed()).map(like=self.run.detector.grid(bins), quantum=None)
 
     def _region(self, bins, registration):
         measured = measured_map(self.measured, bins)
@@ -419,7 +417,8 @@ class Explorer:
             directions = orientation.directions(family.normals)
             nearest = int(directions[:, 2].argmax())
             if directions[nearest, 2] > math.cos(math.radians(_NEAR)):
-                return family.labels[nearest], directions[nearest], _symmetry(directions, directions[nearest])
+                fold = rotational_symmetry(orientation.material, family.normals[nearest])
+                return family.labels[nearest], directions[nearest], fold
         return "axis", np.array([0.0, 0.0, 1.0]), 1
 
     @property
@@ -593,8 +592,8 @@ class Explorer:
         return options
 
     def _python_hits(self, view):
-        lines = ["import numpy as np", "import apt_evap as ae", "", f"run = {self.run_code}"]
-        hits = f"run.hits({python_of(view.perturbation)})"
+        lines = ["import apt_evap as ae", "", f"run = {self.run_code}"]
+        hits = f"run.hits({to_python(view.perturbation)})"
         if self.registration is not None:
             r = self.registration
             lines.append(f"registration = ae.Registration({r.rotation!r}, {r.scale!r}, {r.shift!r}, {r.mirror!r})")
@@ -604,10 +603,7 @@ class Explorer:
 
     def _python_maps(self, view):
         if self.measured is None:
-            options = (
-                f"extent={self.run.detector.extent!r}, quantum=None, mask=np.ones(({view.bins}, {view.bins}), bool)"
-            )
-            lines = [f"simulated = hits.map({view.bins}, {options})"]
+            lines = [f"simulated = hits.map(like=run.detector.grid({view.bins}), quantum=None)"]
             names = ["simulated"]
         else:
             lines = [
@@ -632,32 +628,7 @@ def _starting_values(mechanism):
     return {each.name: each.value for each in controls_of(mechanism)}
 
 
-def _symmetry(directions: Floats, axis: Floats) -> int:
-    """Rotational symmetry of directions about one of them: 6, 4, 3, 2 or 1."""
-    for fold in (6, 4, 3, 2):
-        angle = 2 * np.pi / fold
-        # Rodrigues' formula
-        turned = (
-            directions * np.cos(angle)
-            + np.cross(axis, directions) * np.sin(angle)
-            + axis * (directions @ axis)[:, None] * (1 - np.cos(angle))
-        )
-        if ((turned @ directions.T).max(axis=1) > 1 - 1e-9).all():
-            return fold
-    return 1
-
-
 def _every(run: Run, step: int) -> Run:
     """Run of every `step`-th ion, for `Run.places`."""
-    rows = slice(None, None, step)
-    parts: dict[str, Any] = {
-        name: getattr(run, name)[rows] for name in ("site", "species", "charges", "fields", "detached")
-    }
-    parts["flown"] = tuple(Flown(each.directions[rows], each.times[rows]) for each in run.flown)
-    if run.responses is not None:
-        columns = run.responses.columns.items()
-        parts["responses"] = Responses(**{name: np.ascontiguousarray(each[rows]) for name, each in columns})
-    for name, kind in (("clock", Clock), ("real", RealColumns)):
-        if getattr(run, name) is not None:
-            parts[name] = kind(*(each[rows] for each in getattr(run, name)))
-    return replace(run, emissions=KeptEmissions.of(run.emissions[rows]), **parts)
+    thinned = run[::step]
+    return replace(thinned, emissions=KeptEmissions.of(thinned.emissions))

@@ -1,5 +1,6 @@
 """The page of the explorer, and the server that shows it to this user on this machine. Only this module needs Bokeh."""
 
+import logging
 import math
 import secrets
 import socket
@@ -172,12 +173,17 @@ class Page:
     def _make_maps(self):
         self.sources = [ColumnDataSource(_image(each)) for each in self.shown.pictures]
         self.colors = LinearColorMapper(palette=Inferno256, nan_color=_OUTSIDE)
+        self.bars: list[ColorBar] = []
         self.maps = [self._map("simulated", self.sources[0], **_ranges(self.shown.simulated.extent))]
         if len(self.sources) > 1:
             self.maps.append(
                 self._map("measured", self.sources[1], x_range=self.maps[0].x_range, y_range=self.maps[0].y_range)
             )
             self.difference_colors = LinearColorMapper(palette=_DIFFERENCES, nan_color=_OUTSIDE, low=-1, high=1)
+            self.difference_bar = ColorBar(
+                color_mapper=self.difference_colors, width=10, title="simulated less / more", visible=False
+            )
+            self.maps[1].add_layout(self.difference_bar, "right")
             self.difference = ColumnDataSource(_image(self.shown.pictures[0]))
             self.difference_image = self._draw(self.maps[1], self.difference, self.difference_colors, visible=False)
             self.blink_image = self._draw(self.maps[0], self.sources[1], self.colors, visible=False)
@@ -198,7 +204,8 @@ class Page:
         fig = _square(title, x_axis_label="x [mm]", y_axis_label="y [mm]", **ranges)
         image = self._draw(fig, source, self.colors)
         fig.add_tools(HoverTool(renderers=[image], tooltips=[("x, y [mm]", "$x{0.0}, $y{0.0}"), ("density", "@image")]))
-        fig.add_layout(ColorBar(color_mapper=self.colors, width=10), "right")
+        self.bars.append(ColorBar(color_mapper=self.colors, width=10, title="hits per area / mean"))
+        fig.add_layout(self.bars[-1], "right")
         return fig
 
     @staticmethod
@@ -320,7 +327,8 @@ class Page:
         self._blink(False)
         if mode == "difference":
             self._put_difference()
-        self.difference_image.visible = mode == "difference"
+        self.difference_image.visible = self.difference_bar.visible = mode == "difference"
+        self.bars[1].visible = mode != "difference"
         self.maps[1].title.text = "simulated - measured" if mode == "difference" else "measured"
         if mode == "blink":
             self._blinking = self.document.add_periodic_callback(self._next_blink, BLINK)
@@ -557,6 +565,16 @@ def _plain(label):
     return label
 
 
+class _WithoutStrangers(logging.Filter):
+    """Leaves out the tracebacks of connections that end before they belong to a session, as of other web pages."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        return not record.getMessage().startswith("Uncaught exception GET /ws ")
+
+
+_WITHOUT_STRANGERS = _WithoutStrangers()  # one object: a logger takes it once
+
+
 def serve(
     explorer: Explorer,
     view: View | None = None,
@@ -598,6 +616,7 @@ def serve(
         page = Page(explorer, document, view, registration_of)
         document.on_session_destroyed(lambda _: page.latest.close())
 
+    logging.getLogger("tornado.application").addFilter(_WITHOUT_STRANGERS)
     key = secrets.token_bytes(32)  # other users of this machine reach 127.0.0.1, too
     server = Server(
         {"/": Application(FunctionHandler(make))},

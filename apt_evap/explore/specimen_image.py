@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_choice, check_count
 from apt_evap.simulation.run import Run
@@ -37,6 +38,9 @@ class SpecimenImage:
     extent: tuple[float, float, float, float]
     color: str
     side: str
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
     def places(self, positions: Floats) -> Floats:
         """Places of atoms on the image [nm], shape (n, 2), from their positions [nm], shape (n, 3)."""

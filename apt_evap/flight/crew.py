@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from apt_evap._common.codec import count, number, settings
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_count, check_number
 from apt_evap._core.flights import LEFT, Flights
 from apt_evap._core.journal import Journal
 from apt_evap._core.octree import Octree
@@ -24,34 +24,34 @@ from apt_evap.units import COULOMB, NM_PER_MM
 _MAX_STEPS = 1_000_000  # flights take a few tens
 
 
-@dataclass(frozen=True)
+@settings
 class FlightSettings:
-    """Accuracy and end of the flights.
+    """Accuracy and end of the flights."""
 
-    Parameters
-    ----------
-    opening_angle : float
-        Largest full angle of an octree cell that replaces its atoms [rad]. Measured on Ni[111], R = 20 a: with 0.3,
-        hits on a detector at 100 mm deviate by 2 um (median) and 6 um (largest of 40) from those of direct sums.
-    tolerance : float
-        Error of a step relative to path and velocity; 1e-3 moves hits by 0.1 um.
-    reach : float
-        Distance from the apex at which the integration ends and the ion continues in a straight line [d_nn]; 11,314 is
-        8,000 lattice constants of fcc, as in Shaikh et al.
-    max_steps : int
-        Number of steps after which an ion counts as one that never left.
-    """
-
-    opening_angle: float = 0.3
-    tolerance: float = 1e-3
-    reach: float = 11314.0
-    max_steps: int = 500
-
-    def __post_init__(self):
-        check_number(self.opening_angle, "opening_angle", at_least=0, at_most=1.0, unit="rad")
-        check_number(self.tolerance, "tolerance", above=0, at_most=0.1)
-        check_number(self.reach, "reach", at_least=100, unit="d_nn")
-        check_count(self.max_steps, "max_steps", at_least=1, at_most=_MAX_STEPS)
+    opening_angle: float = number(
+        "Largest full angle of an octree cell that replaces its atoms. Measured on Ni[111], R = 20 a: with 0.3, hits "
+        "on a detector at 100 mm deviate by 2 um (median) and 6 um (largest of 40) from those of direct sums.",
+        default=0.3,
+        at_least=0,
+        at_most=1.0,
+        unit="rad",
+    )
+    tolerance: float = number(
+        "Error of a step relative to path and velocity; 1e-3 moves hits by 0.1 um.", default=1e-3, above=0, at_most=0.1
+    )
+    reach: float = number(
+        "Distance from the apex at which the integration ends and the ion continues in a straight line; 11,314 is "
+        "8,000 lattice constants of fcc, as in Shaikh et al.",
+        default=11314.0,
+        at_least=100,
+        unit="d_nn",
+    )
+    max_steps: int = count(
+        "Number of steps after which an ion counts as one that never left.",
+        default=500,
+        at_least=1,
+        at_most=_MAX_STEPS,
+    )
 
 
 def check_reach(settings: FlightSettings, tip: Tip, detector: Detector) -> None:

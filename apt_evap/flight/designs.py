@@ -4,14 +4,16 @@ The variables of a launch are: the shares of the second and the third target of 
 of `tangent_frame` in units of the largest velocity, and the height above the usual start in units of the largest one.
 """
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 import functools
 import itertools
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from apt_evap._common.codec import checked, count, number, settings
 from apt_evap._common.small_matrices import pseudo_inverse
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_count, check_number, check_sequence, short_text
@@ -71,33 +73,28 @@ class _Polynomial:
         )
 
 
-@dataclass(frozen=True)
+def _rings(rings, name):
+    rings = tuple(_ring(ring) for ring in check_sequence(rings, name, "(radius, launches)"))
+    if not rings:
+        raise ValueError(f"{name} must contain at least one (radius, launches), got none")
+    return rings
+
+
+@settings
 class Design(_Polynomial):
-    """Launches that determine a polynomial.
+    """Launches that determine a polynomial."""
 
-    Parameters
-    ----------
-    degree : int
-        Total degree of the polynomial in the two velocities.
-    rings : tuple of (float, int)
-        Radius in units of the largest velocity, and number of launches, of each ring; every second ring is rotated by
-        half a step.
+    degree: int = count(
+        "Total degree of the polynomial in the two velocities.", at_least=0, at_most=polynomials.HIGHEST_DEGREE
+    )
+    rings: tuple = checked(
+        "Radius in units of the largest velocity, and number of launches, of each ring; every second ring is rotated "
+        "by half a step. They must determine the polynomial.",
+        "tuple of (float, int)",
+        _rings,
+    )
 
-    Raises
-    ------
-    ValueError
-        If the launches do not determine the polynomial.
-    """
-
-    degree: int
-    rings: tuple
-
-    def __post_init__(self):
-        check_count(self.degree, "degree", at_most=polynomials.HIGHEST_DEGREE)
-        rings = [_ring(ring) for ring in check_sequence(self.rings, "rings", "(radius, launches)")]
-        if not rings:
-            raise ValueError("rings must contain at least one (radius, launches), got none")
-        object.__setattr__(self, "rings", tuple(rings))
+    def _check(self):
         matrix = self.monomials(self.launches)
         if np.linalg.matrix_rank(matrix) < matrix.shape[1]:
             raise ValueError(
@@ -118,50 +115,29 @@ class Design(_Polynomial):
     def launches(self) -> Floats:  # type: ignore[override]
         """Launches in units of the largest velocity, shape (m, 2)."""
         rings = []
-        for index, (radius, count) in enumerate(self.rings):
-            angles = 2 * np.pi * (np.arange(count) + 0.5 * (index % 2)) / count
+        for index, (radius, launches) in enumerate(self.rings):
+            angles = 2 * np.pi * (np.arange(launches) + 0.5 * (index % 2)) / launches
             sine, cosine = sine_and_cosine(angles)
             rings.append(radius * np.stack([cosine, sine], axis=1))
         return np.concatenate(rings)
 
 
-@dataclass(frozen=True)
+@settings
 class WideDesign(_Polynomial):
     """Launches from any place between the targets of a roll-up, with any velocity and height.
 
     Monomials of one kind of variable have degrees up to `place`, `velocity` or `height`, others a total degree of up to
     `mixed`. The launches are chosen from a grid, one after the other, as those that the previous ones predict worst
     (a D-optimal design).
-
-    Parameters
-    ----------
-    place : int
-        Degree in the shares of the second and third target; 0 for launches from the site.
-    velocity : int
-        Degree in the two velocities.
-    height : int
-        Degree in the height.
-    mixed : int
-        Degree of monomials of several kinds.
-    launches_per_coefficient : float
-        Number of launches per coefficient.
-
-    Raises
-    ------
-    ValueError
-        If a degree is outside its range.
     """
 
-    place: int
-    velocity: int
-    height: int
-    mixed: int
-    launches_per_coefficient: float = 1.4
-
-    def __post_init__(self):
-        for name, least in (("place", 0), ("velocity", 1), ("height", 1), ("mixed", 1)):
-            check_count(getattr(self, name), name, at_least=least, at_most=6)
-        check_number(self.launches_per_coefficient, "launches_per_coefficient", at_least=1.0, at_most=4.0)
+    place: int = count("Degree in the shares of the second and third target; 0 for launches from the site.", at_most=6)
+    velocity: int = count("Degree in the two velocities.", at_least=1, at_most=6)
+    height: int = count("Degree in the height.", at_least=1, at_most=6)
+    mixed: int = count("Degree of monomials of several kinds.", at_least=1, at_most=6)
+    launches_per_coefficient: float = number(
+        "Number of launches per coefficient.", default=1.4, at_least=1.0, at_most=4.0
+    )
 
     @property
     def columns(self) -> tuple:  # type: ignore[override]
@@ -195,9 +171,9 @@ def _exponents_of(design):
 def _launches_of(design):
     """Launches of a wide design, from a grid of candidates."""
     velocities = [(0.0, 0.0)]
-    for number, radius in enumerate((0.55, 1.0)):
-        count = 2 * design.velocity + 1 + 2 * number
-        sine, cosine = sine_and_cosine(2 * np.pi * (np.arange(count) + 0.5 * number) / count)
+    for ring, radius in enumerate((0.55, 1.0)):
+        launches = 2 * design.velocity + 1 + 2 * ring
+        sine, cosine = sine_and_cosine(2 * np.pi * (np.arange(launches) + 0.5 * ring) / launches)
         velocities += zip(radius * cosine, radius * sine, strict=True)
     heights = [(k / design.height,) for k in range(design.height + 1)]
     places = [()]

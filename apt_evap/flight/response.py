@@ -10,17 +10,20 @@ cosine of the polar angle. They are smoother than the detector position, which d
 the detector.
 """
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from apt_evap._common.codec import count, from_plain, number, part, settings
 from apt_evap._common.small_matrices import squared_lengths
 from apt_evap._common.types import Booleans, Floats
-from apt_evap._common.validation import check_count, check_kind, check_number
+from apt_evap._common.validation import check_switch
 from apt_evap._common.warnings import ResponseWarning
 from apt_evap.detection.detector import Detector
 from apt_evap.emission.emissions import Emissions, TangentialLaunches
@@ -39,51 +42,58 @@ from apt_evap.flight.designs import (
 from apt_evap.flight.landing import Ends, land
 from apt_evap.units import FLIGHT_TIME
 
-_SITE, _ROLLED = Design(4, ((0.0, 1), (0.55, 7), (1.0, 9))), Design(3, ((0.0, 1), (0.6, 5), (1.0, 7)))
 
-
-@dataclass(frozen=True)
+@settings
 class ResponseSettings:
     """Flights and polynomials of the responses.
 
-    Parameters
-    ----------
-    energy_limit : float
-        Largest energy of the launches [eV]; above it the polynomials extrapolate.
-    site, rolled : Design
-        Launches from the site and from the rolled-up position. Measured on Ni[111], R = 80 a, 300 ions: median
-        deviation from flights at random energies up to 1.5 eV 0.008 mm and 0.0016 mm on a detector at 100 mm.
-        Both are `Design`, or both `WideDesign`, see `wide`.
-    bound : float
-        Residual of a fit on the detector above which an ion is flagged [mm].
-    height : float
-        Largest launch height of wide designs [nm]; 0 for others.
-    shells : int
-        Shells of neighbours that can be targets of a roll-up: 1 for nearest neighbours, 2 also for second ones, which
-        in bcc are only 15 % more distant.
-    rolls : int
-        Roll-ups of an ion that the responses serve: 1, or 2 for a `second_roll` of the perturbations, with additional
-        launches of the design `rolled` from the place after the second one.
+    Both designs are `Design`, or both `WideDesign`, see `wide`.
     """
 
-    energy_limit: float = 1.5
-    site: Design | WideDesign = _SITE
-    rolled: Design | WideDesign = _ROLLED
-    bound: float = 0.2
-    height: float = 0.0
-    shells: int = 1
-    rolls: int = 1
+    energy_limit: float = number(
+        "Largest energy of the launches; above it the polynomials extrapolate.",
+        default=1.5,
+        above=0,
+        at_most=HIGHEST_ENERGY,
+        unit="eV",
+    )
+    site: Design | WideDesign = part(
+        "Launches from the site. Measured on Ni[111], R = 80 a, 300 ions: median deviation from flights at random "
+        "energies up to 1.5 eV 0.008 mm on a detector at 100 mm.",
+        Design,
+        WideDesign,
+        default=Design(4, ((0.0, 1), (0.55, 7), (1.0, 9))),
+    )
+    rolled: Design | WideDesign = part(
+        "Launches from the rolled-up position; the same deviation is 0.0016 mm.",
+        Design,
+        WideDesign,
+        default=Design(3, ((0.0, 1), (0.6, 5), (1.0, 7))),
+    )
+    bound: float = number(
+        "Residual of a fit on the detector above which an ion is flagged.", default=0.2, above=0, unit="mm"
+    )
+    height: float = number(
+        "Largest launch height of wide designs; 0 for others.", default=0.0, at_least=0, at_most=1.0, unit="nm"
+    )
+    shells: int = count(
+        "Shells of neighbours that can be targets of a roll-up: 1 for nearest neighbours, 2 also for second ones, "
+        "which in bcc are only 15 % more distant.",
+        default=1,
+        at_least=1,
+        at_most=2,
+    )
+    rolls: int = count(
+        "Roll-ups of an ion that the responses cover: 1, or 2 for a `second_roll` of the perturbations, with "
+        "additional launches of the design `rolled` from the place after the second one.",
+        default=1,
+        at_least=1,
+        at_most=2,
+    )
 
-    def __post_init__(self):
-        check_count(self.shells, "shells", at_least=1, at_most=2)
-        check_count(self.rolls, "rolls", at_least=1, at_most=2)
-        check_number(self.energy_limit, "energy_limit", above=0, at_most=HIGHEST_ENERGY, unit="eV")
-        check_number(self.bound, "bound", above=0, unit="mm")
-        for name in ("site", "rolled"):
-            check_kind(getattr(self, name), name, (Design, WideDesign), "a Design")
+    def _check(self):
         if isinstance(self.site, WideDesign) != isinstance(self.rolled, WideDesign):
             raise ValueError(f"site and rolled must both be a Design or both a WideDesign, got {self.site!r:.60}")
-        check_number(self.height, "height", at_least=0, at_most=1.0, unit="nm")
         if self.is_wide and not (self.height > 0 and self.rolled.place > 0 == self.site.place):  # type: ignore[union-attr]
             raise ValueError(
                 "wide designs need a height > 0 nm, and a place of degree 0 for site and > 0 for rolled, got "
@@ -93,19 +103,17 @@ class ResponseSettings:
             raise ValueError(f"height needs wide designs (ResponseSettings.wide), got {self.height:g} nm")
 
     @classmethod
-    def wide(
-        cls, height: float = 0.2, energy_limit: float = 1.5, bound: float = 0.2, shells: int = 1, rolls: int = 1
-    ) -> "ResponseSettings":
-        """Settings whose responses also serve other targets of the roll-up and other launch heights.
+    def wide(cls, height: float = 0.2, **others: Any) -> ResponseSettings:
+        """Settings whose responses also cover other targets of the roll-up and other launch heights.
 
-        A run then serves any `sharpness`, `probability` and `height` of the perturbations in post-processing.
+        A run then covers any `sharpness`, `probability` and `height` of the perturbations in post-processing.
 
         Parameters
         ----------
         height : float
             Largest launch height [nm].
-        energy_limit, bound, shells, rolls
-            As in `ResponseSettings`.
+        **others
+            Further parameters but the designs.
 
         Returns
         -------
@@ -118,21 +126,19 @@ class ResponseSettings:
         mm after one roll-up and 0.007 to 0.09 mm after two, on a detector at 100 mm; with the terms for nearest
         neighbours, they would be 0.07 to 0.16 mm and 0.05 to 0.28 mm.
         """
-        rolled = WideDesign(4, 2, 2, 4) if max(shells, rolls) == 2 else WideDesign(3, 2, 2, 3)
-        return cls(energy_limit, WideDesign(0, 4, 3, 4), rolled, bound, height, shells, rolls)
+        far = 2 in (others.get("shells"), others.get("rolls"))
+        rolled = WideDesign(4, 2, 2, 4) if far else WideDesign(3, 2, 2, 3)
+        return cls(site=WideDesign(0, 4, 3, 4), rolled=rolled, height=height, **others)
 
     @classmethod
-    def from_dict(cls, settings: Mapping[str, Any]) -> "ResponseSettings":
-        """The settings of a file, see `to_dict`."""
-        designs = {
-            name: (WideDesign if "place" in settings[name] else Design)(**settings[name]) for name in ("site", "rolled")
-        }
-        others = (settings[name] for name in ("bound", "height", "shells", "rolls"))
-        return cls(settings["energy_limit"], designs["site"], designs["rolled"], *others)
-
-    def to_dict(self) -> dict[str, Any]:
-        """All settings in plain types, dict."""
-        return vars(self) | {name: vars(getattr(self, name)) for name in ("site", "rolled")}
+    def of_table(cls, table: dict[str, Any]) -> ResponseSettings:
+        """Settings from a table ``[responses]`` of a file: ``wide = true`` chooses wide designs."""
+        values = dict(table)
+        wide = check_switch(values.pop("wide", False), "wide")
+        if not wide:
+            return from_plain(values, cls, what="responses")
+        from_plain({name: value for name, value in values.items() if name != "height"}, cls, what="responses")
+        return cls.wide(**values)
 
     @property
     def is_wide(self) -> bool:
@@ -200,23 +206,9 @@ class Responses:
         return f"<Responses: {n:,} ions, {coefficients} coefficients from the site, {rolled}>"
 
     @property
-    def columns(self) -> dict[str, np.ndarray]:
-        """The arrays by name."""
-        return {name: values for name, values in vars(self).items() if values is not None}
-
-    @property
     def polynomials(self) -> tuple[np.ndarray, ...]:
         """Coefficients of launches from the site, and after one roll-up or more."""
         return (self.site, self.rolled) if self.twice is None else (self.site, self.rolled, self.twice)
-
-    def __getitem__(self, ions: Any) -> "Responses":
-        """Return the responses of selected ions; takes a slice, a mask or indices."""
-        return Responses(**{name: values[ions] for name, values in self.columns.items()})
-
-    @classmethod
-    def join(cls, parts: "Sequence[Responses]") -> "Responses":
-        """Join the responses of batches in their order."""
-        return cls(**{name: np.concatenate([part.columns[name] for part in parts]) for name in parts[0].columns})
 
 
 class ResponseModel:

@@ -43,6 +43,8 @@ def points_and_data(path: AnyPath, hits: Hits) -> tuple[Booleans | slice, Floats
     finite = np.isfinite(positions).all(axis=1)
     n_omitted = len(hits) - np.count_nonzero(finite)
     reason = f"{n_omitted:,} of {len(hits):,} ions have positions that are not finite"
+    if len(hits) == 0:
+        raise ValueError(f"no ion to write to {str(path)!r}: the hits are empty")
     if n_omitted == len(hits):
         raise ValueError(f"no ion to write to {str(path)!r}: {reason}")
     if n_omitted:

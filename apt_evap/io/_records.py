@@ -271,7 +271,8 @@ def choose(path: AnyPath, hits: Hits, columns: Any) -> Any:
     reasons = " and ".join(f"{count:,} {what}" for count, what in counts if count)
     n_omitted = n_missed + n_not_finite
     if n_omitted == len(hits):
-        raise ValueError(f"no ion to write to {str(path)!r}: of {len(hits):,} ions {reasons}")
+        what = f"of {len(hits):,} ions {reasons}" if reasons else "the hits are empty"
+        raise ValueError(f"no ion to write to {str(path)!r}: {what}")
     if n_omitted == 0:
         return slice(None)
     warnings.warn(

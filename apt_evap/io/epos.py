@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 
 from apt_evap._common.types import AnyPath
+from apt_evap._common.validation import check_choice
 from apt_evap._common.warnings import DataWarning
+from apt_evap._common.wording import argument
 from apt_evap.detection.hits import Hits
 from apt_evap.io._pulses import PulseCheck, first_from_equal, pulses_from_first, whole_pulses
 from apt_evap.io._records import check_any, choose, choose_fields, open_words, write_words
@@ -28,13 +30,20 @@ _FIELDS = {
     "pulses": (9, 1, "u4"),
     "ions": (10, 1, "u4"),
 }
+_UNITS = ("V", "kV")
+_LEAST = 100.0  # [V]: instruments have higher voltages, and files in kV lower numbers
 _COLUMNS = (*tuple(_FIELDS)[:-1], "pulse_id", "multiplicity")
 # further fields needed to find out whether a column is absent, and its unit
 _WITH = {"x": ("y",), "y": ("x",), "pulse_voltage": ("voltage",), "pulse_id": ("ions",), "multiplicity": ("ions",)}
 
 
 def read_epos(
-    path: AnyPath, *, columns: Sequence[str] | None = None, partial: bool = False, byte_order: str | None = None
+    path: AnyPath,
+    *,
+    columns: Sequence[str] | None = None,
+    partial: bool = False,
+    byte_order: str | None = None,
+    voltage_unit: str | None = None,
 ) -> Hits:
     """Read an .epos file.
 
@@ -52,12 +61,14 @@ def read_epos(
         Read the complete ions of a file that ends in the middle of an ion.
     byte_order : {None, "big", "little"}
         None reads big-endian and checks the byte order.
+    voltage_unit : {None, "V", "kV"}
+        Unit of the voltages in the file. By default V, or kV if all voltages are below 100, with a warning.
 
     Returns
     -------
     Hits
         `pulse_id` and `multiplicity` are computed from the last column alone. If it is inconsistent, they are None,
-        with a warning. If all voltages are below 100, they are interpreted as kV and converted to V.
+        with a warning.
 
     Raises
     ------
@@ -67,9 +78,9 @@ def read_epos(
         If the size is not a multiple of 44 bytes and `partial` is False.
     """
     chosen, fields = choose_fields(columns, _COLUMNS, _FIELDS, path, _WITH)
+    survey = _Survey(voltage_unit)
     with _open(path, partial, byte_order) as words:
         block = words.read(fields)
-        survey = _Survey()
         survey.add(block)
         survey.end(words.cut, path)
         return _hits(block, survey, chosen, path)
@@ -82,6 +93,7 @@ def chunk_epos(
     columns: Sequence[str] | None = None,
     partial: bool = False,
     byte_order: str | None = None,
+    voltage_unit: str | None = None,
 ) -> Iterator[Hits]:
     """Read an .epos file in `Hits` of at most `rows` ions in complete pulses; otherwise as `read_epos`.
 
@@ -99,8 +111,8 @@ def chunk_epos(
     """
     chosen, fields = choose_fields(columns, _COLUMNS, _FIELDS, path, _WITH)
     fields = {**fields, "ions": _FIELDS["ions"]}
+    survey = _Survey(voltage_unit)
     with _open(path, partial, byte_order) as words:
-        survey = _Survey()
         for block in words.survey(fields):
             survey.add(block)
             del block
@@ -133,7 +145,8 @@ def chunk_epos(
 class _Survey:
     """Properties of the complete file: columns of zeros, unit of the voltages, consistency of the pulses."""
 
-    def __init__(self) -> None:
+    def __init__(self, voltage_unit: str | None) -> None:
+        self._unit = voltage_unit if voltage_unit is None else check_choice(voltage_unit, "voltage_unit", _UNITS)
         self.present = set()
         self.highest = {}
         self.pulses = PulseCheck()
@@ -157,7 +170,15 @@ class _Survey:
         if self.present & {"x", "y"}:
             self.present |= {"x", "y"}
         decisive = "voltage" if "voltage" in self.present else "pulse_voltage"
-        self.kilovolts = self.highest.get(decisive, 100) < 100
+        highest = self.highest.get(decisive, np.nan)
+        self.kilovolts = self._unit == "kV" or (self._unit is None and bool(highest < _LEAST))
+        if self.kilovolts and self._unit is None and decisive in self.present:
+            warnings.warn(
+                f"{str(path)!r}: voltages of at most {highest:.4g} are taken for kV; "
+                f"{argument('voltage_unit', 'V')} reads them in V",
+                DataWarning,
+                stacklevel=5,
+            )
         if "voltage" in self.present:
             self.present.add("pulse_voltage")
         self.present.add("pulses")
@@ -196,7 +217,9 @@ def write_epos(path: AnyPath, hits: Hits) -> None:
 
     Ions that did not hit the detector and ions with a value that is not finite are left out, and a warning gives their
     number. Missing columns are written as zeros. The number of ions per pulse is recomputed for the written ions:
-    consecutive ions with the same `pulse_id` are one pulse. Each simulated ion without `pulse_id` is one pulse.
+    consecutive ions with the same `pulse_id` are one pulse. Each simulated ion without `pulse_id` is one pulse. The
+    format does not contain the unit of the voltages: if all are below 100 V, a warning says that they can be taken for
+    kV.
 
     Parameters
     ----------
@@ -223,6 +246,16 @@ def write_epos(path: AnyPath, hits: Hits) -> None:
         (9, hits.pulses, "u4"),
     ]
     chosen = choose(path, hits, columns)
+    highest = next(
+        (v[chosen].max() for v in (hits.voltage, hits.pulse_voltage) if v is not None and v[chosen].any()), np.nan
+    )
+    if highest < _LEAST:
+        warnings.warn(
+            f"{str(path)!r}: voltages of at most {highest:.4g} V can be taken for kV: the format does not contain "
+            f"their unit; {argument('voltage_unit', 'V')} reads them in V",
+            DataWarning,
+            stacklevel=3,
+        )
     ions = np.zeros(len(hits), np.uint32)
     if hits.pulse_id is not None:
         ions[chosen] = first_from_equal(hits.pulse_id[chosen])

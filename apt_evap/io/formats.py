@@ -46,10 +46,10 @@ class Format:
 # imported on demand, so that other formats do not import HDF5
 
 
-def _read_hdf5(path, *, columns=None, partial=False):
+def _read_hdf5(path, *, columns=None):
     from apt_evap.io.hdf5 import read_hdf5
 
-    return read_hdf5(path, columns=columns, partial=partial)
+    return read_hdf5(path, columns=columns)
 
 
 def _read_nxapm(path, *, columns=None):
@@ -96,8 +96,8 @@ def read(path: AnyPath, *, format: str | None = None, columns: Sequence[str] | N
         Names of the columns to read; only these are kept in memory. All by default. Not for a run, an .npz and TAPSim.
     **options
         Options of the reader of the format: ``partial=True`` reads the complete ions of a truncated file (the complete
-        sections of an .apt, the undamaged ions of a run), ``byte_order="little"`` a .pos or .epos in the wrong byte
-        order; for an .npz the options of `read_map`.
+        sections of an .apt), ``byte_order="little"`` a .pos or .epos in the wrong byte
+        order, ``voltage_unit="V"`` an .epos with voltages below 100 V; for an .npz the options of `read_map`.
 
     Returns
     -------

@@ -6,12 +6,12 @@ from typing import Any
 from apt_evap._common.files import FileError, check_path
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import short_text
-from apt_evap.io.nxapm import has_ions, read_nxapm
+from apt_evap.io.nxapm import read_nxapm
 from apt_evap.io.pyccapt import is_pyccapt, read_pyccapt
-from apt_evap.simulation.checked_hdf5 import open_checked
+from apt_evap.storage.digested_hdf5 import open_hdf5, tail_of
 
 
-def read_hdf5(path: AnyPath, *, columns: Sequence[str] | None = None, partial: bool = False) -> Any:
+def read_hdf5(path: AnyPath, *, columns: Sequence[str] | None = None) -> Any:
     """Read an HDF5 file of any known kind.
 
     Parameters
@@ -20,8 +20,6 @@ def read_hdf5(path: AnyPath, *, columns: Sequence[str] | None = None, partial: b
         The file.
     columns : sequence of str, optional
         Names of the columns of the ions to read; not for a run. All by default.
-    partial : bool
-        Read the undamaged ions of a damaged run.
 
     Returns
     -------
@@ -32,25 +30,24 @@ def read_hdf5(path: AnyPath, *, columns: Sequence[str] | None = None, partial: b
     FileError
         If the file is missing, damaged, or of another kind.
     """
-    # imported on demand, so that reading ions does not import the simulation
-    from apt_evap.simulation.run import load
-    from apt_evap.simulation.run_hdf5 import is_run
-
     name = str(check_path(path))
-    if is_run(path):
+    tail = tail_of(path)
+    if tail is not None and tail.kind == "run":
+        from apt_evap.simulation.run import load  # reading ions does not import the simulation
+
         if columns is not None:
             raise FileError(f"{name!r}: reading a run takes no columns, got {short_text(columns)}")
-        return load(path, partial=partial)
-    with open_checked(path, with_data=False) as file:
+        return load(path)
+    if tail is not None:
+        return read_nxapm(path, columns=columns)
+    with open_hdf5(path) as file:
         try:
-            reader = read_nxapm if has_ions(file) else read_pyccapt if is_pyccapt(file) else None
+            known = is_pyccapt(file)
         except (OSError, RuntimeError, ValueError, KeyError):
-            reader = None
-    if reader is None:
+            known = False
+    if not known:
         raise FileError(
             f"{name!r} is an HDF5 file of unknown kind, expected a run, ions in NXapm written by this package, or a "
             "file of PyCCAPT"
         )
-    if partial:
-        raise FileError(f"{name!r}: only a run can be read partially")
-    return reader(path, columns=columns)
+    return read_pyccapt(path, columns=columns)

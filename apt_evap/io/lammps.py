@@ -21,7 +21,7 @@ _NM = {"metal": 0.1, "real": 0.1, "electron": 0.052917721, "nano": 1.0, "micro":
 """Length unit of each style of units [nm]; electron: the Bohr radius (CODATA 2022)."""
 # columns before x in the section Atoms: those of the type, and all of them
 _STYLES = {"atomic": (1, 2), "charge": (1, 3), "molecular": (2, 3), "bond": (2, 3), "angle": (2, 3), "full": (2, 4)}
-_SECTION = re.compile(r"^\s*([A-Z][A-Za-z]*(?: [A-Z][A-Za-z]*)*)\s*(?:#\s*(.*?)\s*)?$")
+_SECTION = re.compile(r"[A-Z][A-Za-z]*(?: [A-Z][A-Za-z]*)*")
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ def is_dump(head: str) -> bool:
 
 def is_data(head: str) -> bool:
     """Whether a text begins like a LAMMPS data file: a line "100 atoms" and one with the bounds of the box in x."""
-    return bool(re.search(r"^\s*[0-9]+\s+atoms\s*(#.*)?$", head, re.M) and re.search(r"\bxlo\s+xhi\b", head))
+    return bool(re.search(r"^[ \t]*[0-9]+[ \t]+atoms[ \t\r]*(#.*)?$", head, re.M) and re.search(r"\bxlo\s+xhi\b", head))
 
 
 def read_dump(path: AnyPath, *, units: str = "metal", frame: int = -1) -> Atoms:
@@ -173,8 +173,9 @@ def read_data(path: AnyPath, *, units: str = "metal", style: str | None = None) 
     )
     sections = {}
     for at, line in enumerate(lines[1:], 1):
-        if found := _SECTION.match(line):
-            sections.setdefault(found[1], (at, found[2]))
+        title, _, comment = line.partition("#")
+        if _SECTION.fullmatch(title.strip()):
+            sections.setdefault(title.strip(), (at, comment))
     if header is None or "Atoms" not in sections:
         raise FileError(f"{where} has no line such as '100 atoms' or no section Atoms, as in a LAMMPS data file")
     n = int(header[1])
@@ -185,7 +186,7 @@ def read_data(path: AnyPath, *, units: str = "metal", style: str | None = None) 
     if style is not None:
         check_choice(style, "style", _STYLES)
     width = len(rows[0])
-    given = (comment or "").split()[:1]
+    given = comment.split()[:1]
     if style is None and given:
         style = given[0] if given[0] in _STYLES else ""
     if style is None and width in (5, 8):  # without or with the numbers of the periodic images
@@ -213,7 +214,7 @@ def _section_rows(lines, at, n):
         text = line.partition("#")[0]
         if not text.strip():
             continue
-        if len(rows) == n or _SECTION.match(line):
+        if len(rows) == n or _SECTION.fullmatch(text.strip()):
             break
         rows.append(text.split())
     return rows

@@ -1,11 +1,16 @@
 """Maps in .npz files: a NumPy array with its bin edges."""
 
+import math
+import zipfile
+
 import numpy as np
 
 from apt_evap._common.files import FileError, open_for_reading
 from apt_evap._common.types import AnyPath
 from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.detection.limits import MAX_BINS
 
+_MAX_BYTES = 8 * MAX_BINS**2
 _MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 1e-3}
 
 
@@ -48,6 +53,8 @@ def read_map(
             raise FileError(f"{str(path)!r} does not begin like an .npz file, expected b'PK'")
         file.seek(0)
         try:
+            _check_sizes(file)
+            file.seek(0)
             with np.load(file, allow_pickle=False) as archive:
                 arrays = {name: archive[name] for name in archive.files}
             if not all(isinstance(array, np.ndarray) for array in arrays.values()):
@@ -84,3 +91,19 @@ def read_map(
         return DetectorMap.from_array(plane, *edges, inside, is_counts=is_counts, source=str(path))
     except ValueError as error:
         raise FileError(f"{str(path)!r}: {error}") from error
+
+
+def _check_sizes(file):
+    """Check from the headers of all arrays that they are stored completely, before memory is taken for them."""
+    headers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    with zipfile.ZipFile(file) as archive:
+        for info in archive.infolist():
+            with archive.open(info) as member:
+                version = np.lib.format.read_magic(member)
+                if version not in headers:
+                    raise ValueError(f"{info.filename} has a header of version {version[0]}, expected 1 or 2")
+                shape, _, dtype = headers[version](member)
+            if math.prod(shape) * dtype.itemsize > min(info.file_size, _MAX_BYTES):
+                raise ValueError(
+                    f"{info.filename} has the shape {shape}, too large for its {info.file_size} bytes or for a map"
+                )

@@ -1,6 +1,6 @@
 """NeXus NXapm: ions in an HDF5 file with the groups and fields of this standard for atom probe data.
 
-Columns for which NXapm has no name are in the group ``entry1/ions`` (NXcollection). See `apt_evap.simulation.nexus`.
+Columns for which NXapm has no name are in the group ``entry1/ions`` (NXcollection). See `apt_evap.storage.nexus`.
 """
 
 import datetime
@@ -8,7 +8,6 @@ import json
 from collections.abc import Sequence
 from typing import Any
 
-import h5py
 import numpy as np
 
 from apt_evap._common.files import FileError, check_path
@@ -18,8 +17,8 @@ from apt_evap._version import __version__
 from apt_evap.detection.hits import Hits
 from apt_evap.io._records import check_columns
 from apt_evap.io._texts import ELEMENTS
-from apt_evap.simulation.checked_hdf5 import CheckedFile, first_line, open_checked, write_checked
-from apt_evap.simulation.nexus import (
+from apt_evap.storage.digested_hdf5 import CheckedFile, first_line, open_hdf5, write_hdf5
+from apt_evap.storage.nexus import (
     ENTRY,
     HITS,
     IONS,
@@ -73,7 +72,7 @@ def write_nxapm(path: AnyPath, hits: Hits, *, elements: Sequence[str], start_tim
     if hits.x is not None and hits.y is not None and hits.x.dtype == hits.y.dtype:
         positions = np.column_stack([hits.x, hits.y])
         names = [name for name in names if name not in ("x", "y")]
-    with write_checked(path, _ROWS) as file:
+    with write_hdf5(path, "ions", len(hits)) as file:
         put_nxapm(
             file,
             ions=np.arange(len(hits)) if hits.ion is None else hits.ion,
@@ -136,7 +135,7 @@ def read_nxapm(path: AnyPath, *, columns: Sequence[str] | None = None) -> Hits:
     """
     name = str(check_path(path))
     try:
-        with open_checked(path) as file:
+        with open_hdf5(path) as file:
             if _OWN not in file or file.text("format", _OWN) != FORMAT:
                 raise FileError(f"{name!r} is not an NXapm file of this package: it has no group {_OWN!r}")
             return _read(file, name, columns)
@@ -144,11 +143,6 @@ def read_nxapm(path: AnyPath, *, columns: Sequence[str] | None = None) -> Hits:
         raise
     except _READ_ERRORS as error:
         raise FileError(f"cannot read {name!r} as NXapm: {first_line(error)}") from error
-
-
-def has_ions(file: h5py.File) -> bool:
-    """Whether an open HDF5 file has the ions of `write_nxapm`."""
-    return _OWN in file
 
 
 def _read(file: CheckedFile, path: str, columns: Sequence[str] | None) -> Hits:
@@ -183,5 +177,5 @@ def numbers(file: CheckedFile, path: str) -> Any:
     item = file.dataset(path, None, None)
     if item.dtype.kind not in "biuf" or not item.shape:
         raise ValueError(f"{path} must contain numbers, got {item.dtype} of shape {item.shape}")
-    values = file.rows(item)
+    values = item[()]
     return values.astype(values.dtype.newbyteorder("="), copy=False)

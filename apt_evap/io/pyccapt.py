@@ -14,7 +14,7 @@ from apt_evap.detection.hits import Hits
 from apt_evap.io._pulses import first_from_equal, pulses_from_first
 from apt_evap.io._records import check_any, check_columns
 from apt_evap.io.nxapm import numbers
-from apt_evap.simulation.checked_hdf5 import CheckedFile, first_line, open_checked
+from apt_evap.storage.digested_hdf5 import CheckedFile, first_line, open_hdf5
 
 _MM_PER_CM = 10.0
 _MAX_BLOCKS = 100
@@ -81,7 +81,7 @@ def read_pyccapt(path: AnyPath, *, columns: Sequence[str] | None = None) -> Hits
     """
     name = str(check_path(path))
     try:
-        with open_checked(path) as file:
+        with open_hdf5(path) as file:
             if "dld" in file:
                 found = _instrument(file)
             elif "df" in file:
@@ -121,7 +121,7 @@ def _calibrated(file, path):
         items = file.dataset(f"df/block{index}_items", None, None)
         if items.dtype.kind != "S" or len(items.shape) != 1:
             raise ValueError(f"df/block{index}_items must contain the names of columns")
-        names = [name.decode("utf-8", "replace") for name in file.rows(items).tolist()]
+        names = [name.decode("utf-8", "replace") for name in items[()].tolist()]
         known += names
         if not any(name in wanted for name in names):
             continue  # a block of texts or lists

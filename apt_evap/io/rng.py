@@ -96,15 +96,16 @@ def _table(lines, path):
     columns = line.split()[1:] or shorts
     if len(columns) != n_species:
         raise FileError(f"{where}, line {at}: expected {n_species} species after the dashes, got {len(columns)}")
-    rows = []
+    rows, n_rows = {}, 0
     for at, line in lines[2 * n_species + 2 :]:
-        dot, *cells = line.split()
-        if dot != ".":
+        if line.split(maxsplit=1)[0] != ".":
             break
-        rows.append(_row(cells, columns, f"{where}, line {at}"))
-    if len(rows) != n_ranges:
-        warnings.warn(f"{where} states {n_ranges} ranges but contains {len(rows)}", DataWarning, stacklevel=3)
-    return rows, colours
+        n_rows += 1
+        if line not in rows:  # `Ranges` ignores a repeated one
+            rows[line] = _row(line.split()[1:], columns, f"{where}, line {at}")
+    if n_rows != n_ranges:
+        warnings.warn(f"{where} states {n_ranges} ranges but contains {n_rows}", DataWarning, stacklevel=3)
+    return list(rows.values()), colours
 
 
 def _row(cells, columns, where):

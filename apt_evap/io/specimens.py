@@ -1,5 +1,6 @@
 """Specimens from files: LAMMPS, TAPSim, and all formats that ASE reads."""
 
+import os
 import warnings
 from collections import Counter
 from collections.abc import Mapping
@@ -68,7 +69,7 @@ def read_tip(
     """
     name = str(check_path(path))
     names = {str(key): value for key, value in check_kind(types or {}, "types", Mapping, "a mapping").items()}
-    own = _format_of(path)
+    own = specimen_format(path)
     kind = own if format is None else check_choice(format, "format", SPECIMEN_FORMATS)
     if kind == "ase" != own:  # ASE makes hydrogen of types without a name
         raise FileError(f"{name!r} is a file of the format {own}, which ASE reads without the names of its types")
@@ -107,7 +108,8 @@ def read_tip(
         raise FileError(f"{name!r}: {error}") from error
 
 
-def _format_of(path):
+def specimen_format(path: AnyPath) -> str:
+    """Format of a file of a specimen by its content; "ase" if it is not one of the others, str."""
     with open_for_reading(path) as file:
         head = file.read(_HEAD).decode("latin-1")
     if is_dump(head):
@@ -122,7 +124,8 @@ def _read_ase(path):
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            atoms = read(str(path))
+            # neither "@" nor "-" in a name has a meaning of its own here
+            atoms = read(os.path.abspath(path), do_not_split_by_at_sign=True)
         if not hasattr(atoms, "get_chemical_symbols"):
             raise ValueError("it contains no atoms")
     except Exception as error:  # every format of ASE has its own errors

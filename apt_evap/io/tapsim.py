@@ -44,6 +44,7 @@ _UNITS |= {f"potential{when}": "V" for when in ("Before", "After")}
 _UNITS |= {f"field{when}": "V/m" for when in ("Before", "After")}
 _NAMES = tuple(_ROW.names or ())
 _INTEGERS = ("index", "id", "number")
+_TEXT_ROW = np.dtype([(name, _ROW[name].base if name in _INTEGERS else "f8", _ROW[name].shape) for name in _NAMES])
 # columns of `extra`: name in the table, factor to the unit here, unit
 _EXTRA: dict[str, tuple[str, float, str]] = {
     "id": ("id", 1, ""),
@@ -152,9 +153,7 @@ def _text(data, n_lines, path, partial):
             ) from error
         rows.append(values)
     table = np.array(rows, float).reshape(-1, width)
-    result = np.empty(
-        len(rows), [(name, _ROW[name].base if name in _INTEGERS else "f8", _ROW[name].shape) for name in _NAMES]
-    )
+    result = np.empty(len(rows), _TEXT_ROW)
     at = 0
     for name in _NAMES:
         size = int(np.prod(_ROW[name].shape, dtype=int))
@@ -180,7 +179,7 @@ def write_tapsim(path: AnyPath, hits: Hits, *, binary: bool = False) -> None:
 
     The columns are those of `read_tapsim`. A number that the ions do not have is "nan", the index their row, the id and
     the number of the node 0. The ions of a run have neither the potentials nor the direction of the field. Text has
-    nine digits, TAPSim itself writes seven.
+    nine digits, TAPSim itself writes seven; binary numbers are float32.
 
     Parameters
     ----------
@@ -198,7 +197,7 @@ def write_tapsim(path: AnyPath, hits: Hits, *, binary: bool = False) -> None:
     """
     check_switch(binary, "binary")
     n = len(hits)
-    rows = np.zeros(n, _ROW)
+    rows = np.zeros(n, _ROW if binary else _TEXT_ROW)
     for name in _NAMES:
         if name not in _INTEGERS:
             rows[name] = np.nan

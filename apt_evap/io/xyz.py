@@ -13,7 +13,7 @@ _CHUNK = 1 << 14
 _ANGSTROM_PER_NM = 10
 
 
-def write_xyz(path: AnyPath, hits: Hits, *, species: str | Sequence[str] = "X") -> None:
+def write_xyz(path: AnyPath, hits: Hits, *, species: str | Sequence[str] | None = None) -> None:
     """Write ions as extended XYZ.
 
     Positions are in Angstrom, with five decimals. All other columns are in the units of `Hits`, with at most nine
@@ -27,8 +27,9 @@ def write_xyz(path: AnyPath, hits: Hits, *, species: str | Sequence[str] = "X") 
         The file; an existing one is replaced when the new one is complete.
     hits : Hits
         Ions with positions.
-    species : str or sequence of str
-        Species of all ions, or of each ion, such as ``ranges.labels(hits)``. ASE accepts only chemical elements and X.
+    species : str or sequence of str, optional
+        Species of all ions, or of each ion, such as ``ranges.labels(hits)``; by default the column "element" of
+        ``hits.extra``, which simulated ions have, otherwise X. ASE accepts only chemical elements and X.
 
     Raises
     ------
@@ -37,6 +38,8 @@ def write_xyz(path: AnyPath, hits: Hits, *, species: str | Sequence[str] = "X") 
     FileError
         If the file cannot be written.
     """
+    if species is None:  # a name of the user may have several words
+        species = np.char.replace(hits.extra["element"], " ", "_") if "element" in hits.extra else "X"
     labels = _labels(species, len(hits))
     chosen, positions, data = points_and_data(path, hits)
     properties = ["species:S:1", "pos:R:3"]

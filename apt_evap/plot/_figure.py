@@ -4,7 +4,7 @@ import importlib
 import re
 import sys
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,6 +14,16 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
+
+if TYPE_CHECKING:
+
+    class DrawnAxes(Axes):
+        """Axes of a picture, whose figure is complete: ``ax.figure.savefig`` writes it."""
+
+        figure: Figure
+
+else:
+    DrawnAxes = Axes
 
 OUTSIDE = "0.88"
 """Colour outside the detector."""
@@ -50,6 +60,14 @@ def set_title(ax: Axes, title: str | None, **options: Any) -> None:
     """Set a title without math syntax: a file name may contain dollar signs, and bytes that are not text."""
     if title:
         ax.set_title(re.sub("[\ud800-\udfff]", "\N{REPLACEMENT CHARACTER}", title), parse_math=False, **options)
+
+
+def set_caption(ax: Axes, text: str) -> None:
+    """Write a caption above the axes, as the label of an axis there: a title of any time comes above it."""
+    above = ax.secondary_xaxis("top")
+    above.set_xlabel(text, fontsize="small", color="0.35", labelpad=5, parse_math=False)
+    above.tick_params(length=0, pad=0, labeltop=False)
+    above.spines["top"].set_visible(False)
 
 
 def ion_label(element: str, charge: int, mass_number: int | None = None) -> str:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from apt_evap._common.validation import check_array, check_choice, check_kind
 from apt_evap.analysis.charge_states import ChargeStateMap
-from apt_evap.plot._figure import OUTSIDE, add_colorbar, ion_label, new_figure, set_log_ticks, set_title
+from apt_evap.plot._figure import OUTSIDE, add_colorbar, ion_label, new_figure, set_caption, set_log_ticks, set_title
 from apt_evap.plot.maps import describe
 
 _LEAST_RANGE = {
@@ -82,11 +82,8 @@ def charge_states(
     for ax, map, value, (xlim, ylim), title in zip(axes, maps, values, ends, titles, strict=True):
         ax.imshow(value, origin="lower", extent=map.counts.extent, cmap=colormap, norm=scale, interpolation="nearest")
         ax.set(facecolor=OUTSIDE, aspect="equal", xlabel="x [mm]", ylabel="y [mm]", xlim=xlim, ylim=ylim)
-        set_title(ax, title, pad=20)
-        ax.annotate(
-            f"{describe(map.to_map('ratio'))}, ratio {map.total:.3g}", (0.5, 1), xytext=(0, 5),
-            xycoords="axes fraction", textcoords="offset points", ha="center", fontsize="small", color="0.35",
-        )  # fmt: skip
+        set_title(ax, title, pad=8)
+        set_caption(ax, f"{describe(map.to_map('ratio'))}, ratio {map.total:.3g}")
     element, charge = ions[0]
     label = f"{ion_label(element, charge + 1)} / {ion_label(element, charge)}"
     if quantity == "field":

@@ -8,12 +8,15 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
+from apt_evap._common.validation import check_kind
+from apt_evap.detection.binning import bins_for
 from apt_evap.detection.detector_map import DetectorMap
-from apt_evap.plot._figure import OUTSIDE, add_colorbar, new_figure, set_title
+from apt_evap.detection.hits import Hits
+from apt_evap.plot._figure import OUTSIDE, DrawnAxes, add_colorbar, new_figure, set_caption, set_title
 
 
 def detector_map(
-    map: DetectorMap,
+    map: DetectorMap | Hits,
     ax: Axes | None = None,
     *,
     title: str | None = None,
@@ -21,13 +24,14 @@ def detector_map(
     colormap: str = "inferno",
     colorbar: bool = True,
     caption: bool = True,
-) -> Axes:
+) -> DrawnAxes:
     """Draw a detector map.
 
     Parameters
     ----------
-    map : DetectorMap
-        The map; its density relative to the mean is drawn.
+    map : DetectorMap or Hits
+        The map; its density relative to the mean is drawn. Ions are counted in bins that suit their
+        number, and smoothed by one bin.
     ax : matplotlib.axes.Axes, optional
         Where to draw; a new figure by default.
     title : str, optional
@@ -44,6 +48,7 @@ def detector_map(
     matplotlib.axes.Axes
         Its ``figure.savefig`` writes a file.
     """
+    map = _map_of(map, "map")
     if ax is None:
         ax = new_figure((5.6, 5.0)).subplots()
     low, high = color_limits(map) if limits is None else limits
@@ -58,21 +63,17 @@ def detector_map(
     )
     # bins outside the mask are NaN: the background is visible there
     ax.set(facecolor=OUTSIDE, aspect="equal", xlabel="x [mm]", ylabel="y [mm]")
-    text = _wrap(describe(map), 54)  # fits above a map of `detector_maps`
     if title:
-        set_title(ax, _wrap(title, 36), pad=10 + 10 * len(text.splitlines()) if caption else 8)
+        set_title(ax, _wrap(title, 36), pad=8)
     if caption:
-        ax.annotate(
-            text, (0.5, 1), xytext=(0, 5), xycoords="axes fraction", textcoords="offset points",
-            ha="center", fontsize="small", color="0.35",
-        )  # fmt: skip
+        set_caption(ax, _wrap(describe(map), 54))  # fits above a map of `detector_maps`
     if colorbar:
         add_colorbar([image], ax)
     return ax
 
 
 def detector_maps(
-    maps: Sequence[DetectorMap],
+    maps: Sequence[DetectorMap | Hits],
     titles: Sequence[str] | None = None,
     *,
     limits: tuple[float, float] | None = None,
@@ -83,8 +84,8 @@ def detector_maps(
 
     Parameters
     ----------
-    maps : sequence of DetectorMap
-        The maps.
+    maps : sequence of DetectorMap or Hits
+        The maps, or ions as for `detector_map`.
     titles : sequence of str, optional
         One title per map.
     limits : tuple of float, optional
@@ -105,25 +106,33 @@ def detector_maps(
     ValueError
         If there is no map, or the number of titles differs.
     """
-    maps = list(maps)
-    titles = [None] * len(maps) if titles is None else list(titles)
-    if not maps or len(titles) != len(maps):
-        raise ValueError(f"detector_maps needs maps and one title per map, got {len(maps)} and {len(titles)}")
-    n = len(maps)
+    drawn = [_map_of(map, "maps") for map in maps]
+    titles = [None] * len(drawn) if titles is None else list(titles)
+    if not drawn or len(titles) != len(drawn):
+        raise ValueError(f"detector_maps needs maps and one title per map, got {len(drawn)} and {len(titles)}")
+    n = len(drawn)
     columns = min(n, columns or (n if n <= 3 else ceil(sqrt(n))))
-    rows = -(-len(maps) // columns)
+    rows = -(-len(drawn) // columns)
     if limits is None:
-        each = np.array([color_limits(map) for map in maps])
+        each = np.array([color_limits(map) for map in drawn])
         limits = each[:, 0].min(), each[:, 1].max()
     figure = new_figure((4.1 * columns + 0.9, 4.3 * rows))
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    for ax, map, title in zip(axes, maps, titles, strict=False):
+    for ax, map, title in zip(axes, drawn, titles, strict=False):
         detector_map(map, ax, title=title, limits=limits, colormap=colormap, colorbar=False)
-    for ax in axes[len(maps) :]:
+    for ax in axes[len(drawn) :]:
         ax.remove()
-    axes = axes[: len(maps)]
+    axes = axes[: len(drawn)]
     add_colorbar([ax.images[0] for ax in axes], list(axes))
     return axes
+
+
+def _map_of(map: DetectorMap | Hits, name: str) -> DetectorMap:
+    """A map; of ions as `apt-evap map` makes it, in bins that suit their number and smoothed by one bin."""
+    if isinstance(map, Hits):
+        counts = map.map(bins_for(int(np.count_nonzero(map.detected))))
+        return counts.smoothed(max(counts.bin_size))
+    return check_kind(map, name, DetectorMap, "a DetectorMap or Hits, such as run.hits(perturbation)")
 
 
 def color_limits(map: DetectorMap) -> tuple[float, float]:

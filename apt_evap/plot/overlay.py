@@ -6,7 +6,7 @@ from matplotlib.lines import Line2D
 
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
-from apt_evap.plot._figure import OUTSIDE, add_colorbar, new_figure, set_title
+from apt_evap.plot._figure import OUTSIDE, DrawnAxes, add_colorbar, new_figure, set_caption, set_title
 from apt_evap.plot.maps import detector_map
 from apt_evap.registration.correlation_search import BROAD, View
 from apt_evap.registration.register import Registration
@@ -14,10 +14,6 @@ from apt_evap.registration.register import Registration
 BRIGHT, DARK, RIM = "cyan", "lime", "white"
 _SMOOTHING = 0.015
 """Smoothing of the contours [diameters of the measured field of view]."""
-_ABOVE = {
-    "xytext": (0, 5), "xycoords": "axes fraction", "textcoords": "offset points", "ha": "center", "fontsize": "small",
-    "color": "0.35",
-}  # fmt: skip
 
 
 def overlay(
@@ -29,7 +25,7 @@ def overlay(
     title: str | None = None,
     colormap: str = "inferno",
     colorbar: bool = True,
-) -> Axes:
+) -> DrawnAxes:
     """Draw a measured map with contours of the registered simulated map, and the simulated map beside it.
 
     The contours enclose the brightest and the darkest eighth of the area of the flattened simulated map. A dashed line
@@ -59,7 +55,7 @@ def overlay(
     beside = None
     if ax is None:
         ax, beside = new_figure((10.4, 5.2)).subplots(1, 2)
-    detector_map(measured, ax, title=title, colormap=colormap, colorbar=colorbar, caption=False)
+    detector_map(measured, ax, colormap=colormap, colorbar=colorbar, caption=False)
     view, measured_view = View(simulated), View(measured)
     scale = registration.scale
     image = view.flatten(_SMOOTHING * measured_view.diameter / scale, BROAD * measured_view.diameter / scale)
@@ -82,19 +78,20 @@ def overlay(
             vmin=max(0, 1 + values.min()), vmax=1 + values.max(),
         )  # fmt: skip
         beside.set(facecolor=OUTSIDE, xlabel="x [mm]", ylabel="y [mm]")
-        beside.annotate("simulated, flattened, as registered", (0.5, 1), **_ABOVE)
+        set_caption(beside, "simulated, flattened, as registered")
         if colorbar:
             add_colorbar([image], beside, label="hits per area / mean, flattened")
     if not covered.all():
         ax.contour(x, y, covered.astype(float), levels=[0.5], colors=RIM, linewidths=1.2, linestyles="dashed")
-        legend.append(Line2D([], [], color="0.4", linestyle="dashed", label="simulated field of view"))
-    options = {"handles": legend, "ncols": 3, "fontsize": "small", "frameon": False}
+        legend.append(Line2D([], [], color=RIM, linestyle="dashed", label="simulated field of view"))
+    options = {"handles": legend, "ncols": 3, "fontsize": "small"}
+    options |= {"facecolor": "0.2", "edgecolor": "none", "framealpha": 1, "labelcolor": "white"}  # white lines are seen
     if beside is None:
         ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.11), **options)
     else:
         ax.figure.legend(loc="outside lower center", **options)
-    ax.annotate(_caption(registration), (0.5, 1), **_ABOVE)
-    set_title(ax, title, pad=34)
+    set_caption(ax, _caption(registration))
+    set_title(ax, title, pad=8)
     return ax
 
 

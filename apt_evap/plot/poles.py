@@ -7,11 +7,15 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
 
-from apt_evap.crystallography.orientation import Orientation
+from apt_evap._common.validation import check_kind
+from apt_evap.analysis.apex import image_compression
+from apt_evap.crystallography.orientation import FittedOrientation, Orientation
 from apt_evap.crystallography.poles import poles as poles_of
 from apt_evap.crystallography.poles import zones
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.projection import Projection
+from apt_evap.plot._figure import DrawnAxes
+from apt_evap.simulation.run import Run
 
 _COLORS = ("#35b6ff", "#ff9d3b", "#7be07b", "#e58cff")
 _AZIMUTHS = np.radians(np.arange(0.0, 360.5, 0.5))
@@ -20,25 +24,25 @@ _APART = 30  # smallest distance between labels [points], at font size 9
 
 def poles(
     ax: Axes,
-    orientation: Orientation,
-    projection: Projection,
+    orientation: Orientation | FittedOrientation | Run,
+    projection: Projection | None = None,
     *,
     families: int = 6,
     zone_families: Sequence[Any] | None = None,
     labels: bool = True,
     region: DetectorMap | None = None,
     size: float = 9,
-) -> Axes:
+) -> DrawnAxes:
     """Draw the poles and zone lines of a specimen over a map.
 
     Parameters
     ----------
     ax : matplotlib.axes.Axes
         Axes of a map in mm, such as `detector_map` returns; only points within their limits are drawn.
-    orientation : Orientation
-        Orientation of the crystal, from a fit, or ``Orientation.from_settings(run.settings["tip"])``.
-    projection : Projection
-        Projection of directions onto the map, from a fit, or ``image_compression(run).projection``.
+    orientation : Orientation or FittedOrientation or Run
+        Orientation of the crystal; a fit and a run have theirs.
+    projection : Projection, optional
+        Projection of directions onto the map; by default that of the fit, or of the run by `image_compression`.
     families : int
         Number of families of poles, see `poles.poles`; 0 for none.
     zone_families : sequence, optional
@@ -54,6 +58,8 @@ def poles(
     -------
     matplotlib.axes.Axes
     """
+    check_kind(ax, "ax", Axes, "axes of a map, such as detector_map(map)")
+    orientation, projection = _oriented(orientation, projection)
     x_limits, y_limits = sorted(ax.get_xlim()), sorted(ax.get_ylim())
     material = orientation.material
 
@@ -99,3 +105,14 @@ def poles(
                             path_effects=outline, clip_on=True)  # fmt: skip
     ax.set(xlim=x_limits, ylim=y_limits)
     return ax
+
+
+def _oriented(orientation, projection):
+    """Orientation of the crystal and projection onto the map."""
+    if isinstance(orientation, FittedOrientation):
+        return orientation.orientation, projection or orientation.projection
+    if isinstance(orientation, Run):
+        projection = projection or image_compression(orientation).projection
+        return Orientation.from_settings(orientation.settings["tip"]), projection
+    check_kind(orientation, "orientation", Orientation, "an Orientation, the result of fit_orientation, or a Run")
+    return orientation, check_kind(projection, "projection", Projection, "a Projection")

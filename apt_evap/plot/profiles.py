@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from apt_evap.analysis.profiles import Profile, Rectangle, compare_profiles
 from apt_evap.analysis.zone_line import ZoneLine
-from apt_evap.plot._figure import new_figure
+from apt_evap.plot._figure import DrawnAxes, new_figure
 
 
 def profile(
@@ -20,7 +20,7 @@ def profile(
     *,
     lines: Sequence[ZoneLine] | None = None,
     xlabel: str = "distance from the line [mm]",
-) -> Axes:
+) -> DrawnAxes:
     """Draw profiles with their errors, and fitted lines.
 
     Parameters
@@ -127,7 +127,7 @@ def profile_comparison(
 
 def rectangles(
     chosen: Rectangle | Sequence[Rectangle], ax: Axes, *, colors: Any = "cyan", labels: Sequence[str] | None = None
-) -> Axes:
+) -> DrawnAxes:
     """Draw rectangles on a detector map, with a thin line at the zero of the profile.
 
     Parameters

@@ -1,5 +1,7 @@
 """Hits of selected ions for increasing energy of the perturbation."""
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 from typing import Any
 
 import numpy as np
@@ -10,7 +12,7 @@ from matplotlib.colors import Normalize
 from numpy.typing import ArrayLike
 
 from apt_evap.analysis.response_tracks import lateral_tracks, rollup_tracks
-from apt_evap.plot._figure import new_figure, set_title
+from apt_evap.plot._figure import DrawnAxes, new_figure, set_title
 from apt_evap.simulation.run import Run
 
 MECHANISMS = ("lateral velocity", "roll-up")
@@ -33,7 +35,7 @@ def response(
     colorbar: bool = True,
     zoom: int | None = None,
     title: str | None = None,
-) -> Axes:
+) -> DrawnAxes:
     """Draw the hits of selected ions for increasing launch energies.
 
     For a lateral velocity, all directions along the surface are drawn. For roll-up, a track is drawn: from the hit

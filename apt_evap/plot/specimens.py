@@ -1,5 +1,7 @@
 """Surface atoms of a specimen, seen from any direction, and slices of a specimen."""
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,17 +12,19 @@ from matplotlib.colors import to_rgba
 from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike
 
-from apt_evap._common.validation import check_array, check_choice, check_number
+from apt_evap._common.validation import check_array, check_choice, check_kind, check_number
 from apt_evap.evaporation.emitter import Emitter
-from apt_evap.plot._figure import add_colorbar, new_figure, set_title
+from apt_evap.plot._figure import DrawnAxes, add_colorbar, new_figure, set_title
+from apt_evap.simulation.simulation import Simulation
 from apt_evap.specimen.tip import Tip
 
 _SMALL = 0.75  # diameter of a disc [d_nn], so that atoms in the second plane are visible
+_VOLTAGE = 1000.0  # [V] of a tip without a simulation
 COLORED_BY = {"fields": "field [V/nm]", "charges": "charge [e]"}
 
 
 def specimen(
-    emitter: Emitter,
+    emitter: Emitter | Simulation | Tip,
     color: str | ArrayLike = "fields",
     ax: Axes | None = None,
     *,
@@ -31,13 +35,14 @@ def specimen(
     colormap: str = "viridis",
     colorbar: bool = True,
     title: str | None = None,
-) -> Axes:
+) -> DrawnAxes:
     """Draw the surface atoms of a specimen as discs, front atoms over back atoms.
 
     Parameters
     ----------
-    emitter : Emitter
-        The charged surface.
+    emitter : Emitter or Simulation or Tip
+        The charged surface; of a simulation its current one. The surface of a tip is charged at 1000 V by Robin's
+        equation, which takes seconds for a large tip.
     color : str or array_like
         "fields", "charges", or one number per surface atom, shape (n,).
     ax : matplotlib.axes.Axes, optional
@@ -67,6 +72,7 @@ def specimen(
     ValueError
         If `color` is neither of these names nor one number per surface atom.
     """
+    emitter = _emitter_of(emitter)
     if isinstance(color, str):
         if color not in COLORED_BY:
             raise ValueError(f"color must be one of {', '.join(COLORED_BY)}, or numbers, got {color!r}")
@@ -102,6 +108,15 @@ def specimen(
     return ax
 
 
+def _emitter_of(specimen):
+    """The charged surface of a specimen."""
+    if isinstance(specimen, Simulation):
+        return specimen.emitter
+    if isinstance(specimen, Tip):
+        return Emitter(specimen, _VOLTAGE)
+    return check_kind(specimen, "emitter", Emitter, "an Emitter, a Simulation or a Tip")
+
+
 def _discs(ax, places, diameter, **colors):
     """Draw discs with a diameter [nm] that scales with the axes."""
     sizes = np.full(len(places), diameter)
@@ -125,7 +140,7 @@ def cut(
     colors: Mapping[str, Any] | None = None,
     legend: bool = True,
     title: str | None = None,
-) -> Axes:
+) -> DrawnAxes:
     """Draw the atoms of a thin slice of a specimen, coloured by phase or by species; rare species on top.
 
     Parameters
@@ -227,7 +242,7 @@ def mark_atoms(
     elevation: float = 90.0,
     azimuth: float = -90.0,
     size: float = 14.0,
-) -> Axes:
+) -> DrawnAxes:
     """Draw dashed circles around atoms in a plot of the specimen.
 
     Parameters

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 
 from apt_evap._common.validation import check_array, check_choice, check_kind, check_number, check_sequence
 from apt_evap.detection.hits import Hits
-from apt_evap.plot._figure import ion_label, new_figure
+from apt_evap.plot._figure import DrawnAxes, ion_label, new_figure
 from apt_evap.simulation.run import Run
 from apt_evap.specimen.isotopes import ISOTOPES
 
@@ -31,7 +31,7 @@ def spectrum(
     bin_width: float = 0.02,
     limits: tuple[float, float] | None = None,
     elements: Sequence[str] | None = None,
-) -> Axes:
+) -> DrawnAxes:
     """Draw one or more mass spectra with a logarithmic scale, and label the isotopes.
 
     Parameters

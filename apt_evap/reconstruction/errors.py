@@ -1,5 +1,7 @@
 """Errors of reconstructed positions against the true sites of the ions."""
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -9,6 +11,8 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
+from apt_evap._common.codec import for_json
+from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_array, check_choice, check_count, check_number, check_sequence, short_text
 from apt_evap.detection.hits import Hits
@@ -41,6 +45,9 @@ class ErrorBins(NamedTuple):
     depth: Floats
     """RMS of the depth error in each bin [nm], shape (n,); NaN without ions."""
 
+    def __repr__(self) -> str:
+        return short_repr(self)
+
 
 class GroupErrors(NamedTuple):
     """Errors of groups of ions, such as species or phases; each of the k groups has one row."""
@@ -55,6 +62,9 @@ class GroupErrors(NamedTuple):
     """RMS of the lateral error [nm], shape (k,)."""
     depth: Floats
     """RMS of the depth error [nm], shape (k,)."""
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,19 +229,12 @@ class ReconstructionErrors:
         -------
         dict
         """
-        names: tuple[str, ...] = ("rotation", "lateral_scale", "depth_scale", "radius_factor", "compression")
-        names += ("lateral_rms", "depth_rms", "order_correlation")
-        content: dict[str, Any] = {"shift": _plain(self.shift)}
-        content |= {name: _plain([getattr(self, name)])[0] for name in names}
-        content["cylinders"] = self.cylinders
-        for name in ("by_angle", "by_depth"):
-            content[name] = {part: _plain(values) for part, values in getattr(self, name)._asdict().items()}
-        if self.by_group is not None:
-            content["by_group"] = {part: _plain(values) for part, values in self.by_group._asdict().items()}
-        return content
+        names = ("shift", "rotation", "lateral_scale", "depth_scale", "radius_factor", "compression", "lateral_rms")
+        names += ("depth_rms", "order_correlation", "cylinders", "by_angle", "by_depth", "by_group")
+        return for_json({name: getattr(self, name) for name in names})
 
 
-def true_sites(hits: Hits, truth: "Run | ArrayLike | None") -> Floats:
+def true_sites(hits: Hits, truth: Run | ArrayLike | None) -> Floats:
     """Sites of reconstructed ions [nm], shape (n, 3); `truth` as for `Reconstruction.errors`."""
     if isinstance(truth, Run):
         return truth.emissions.positions[rows_of(hits, truth)]
@@ -253,7 +256,7 @@ def rows_of(hits: Hits, run: Run) -> Integers:
     return order[place]
 
 
-def per_ion(values: ArrayLike, name: str, hits: Hits, truth: "Run | ArrayLike | None", dtype: type) -> NDArray[Any]:
+def per_ion(values: ArrayLike, name: str, hits: Hits, truth: Run | ArrayLike | None, dtype: type) -> NDArray[Any]:
     """Validated values of each hit, shape (n,), given for the hits or for all ions of the run."""
     n = len(values) if np.iterable(values) and not isinstance(values, str) else 0  # type: ignore[arg-type]
     if isinstance(truth, Run) and n == len(truth) != len(hits):
@@ -262,7 +265,7 @@ def per_ion(values: ArrayLike, name: str, hits: Hits, truth: "Run | ArrayLike | 
 
 
 def groups_of(
-    hits: Hits, truth: "Run | ArrayLike | None", groups: ArrayLike | None, name: str = "groups"
+    hits: Hits, truth: Run | ArrayLike | None, groups: ArrayLike | None, name: str = "groups"
 ) -> Integers | None:
     """Group of each hit, shape (n,); by default the species, if it is known."""
     if groups is not None:
@@ -446,8 +449,3 @@ def _grouped(groups, residuals):
     shift = np.column_stack([np.bincount(place, part) / ions for part in residuals.T])
     lateral, depth = (np.sqrt(np.bincount(place, part) / ions) for part in _squares(residuals).T)
     return GroupErrors(numbers, ions, shift, lateral, depth)
-
-
-def _plain(values):
-    """List of numbers, None for NaN."""
-    return [None if value != value else value for value in np.asarray(values).tolist()]

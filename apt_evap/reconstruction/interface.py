@@ -1,5 +1,7 @@
 """Composition about an interface: width of a step, and excess of a segregated element."""
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 import math
 from dataclasses import dataclass, field
 from typing import Any
@@ -8,6 +10,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
+from apt_evap._common.codec import for_json
 from apt_evap._common.types import Booleans, Floats, Integers
 from apt_evap._common.validation import check_array, check_number
 
@@ -53,12 +56,7 @@ class DistanceProfile:
         -------
         dict
         """
-        content = {}
-        for name, value in vars(self).items():
-            numbers = np.asarray(value).tolist()
-            plain = [None if each != each else each for each in np.atleast_1d(numbers).tolist()]
-            content[name] = plain if isinstance(numbers, list) else plain[0]
-        return content
+        return for_json(vars(self))
 
 
 @dataclass(frozen=True, eq=False)

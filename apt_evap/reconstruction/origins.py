@@ -1,5 +1,7 @@
 """Where the ions of a place on the detector came from, counted in simulated runs, and the correction by it."""
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -128,7 +130,7 @@ class OriginTable:
             covariances[part] = np.einsum("nki,nkj->nij", deviations, deviations) / (k - 1) * (1 + 1 / k)
         return means, covariances
 
-    def rotated(self, angle: float) -> "OriginTable":
+    def rotated(self, angle: float) -> OriginTable:
         """The table of a specimen that is rotated about its axis.
 
         Parameters
@@ -163,7 +165,7 @@ class OriginTable:
             np.savez(file, **{name: getattr(self, name) for name in _ARRAYS})
 
     @classmethod
-    def load(cls, path: AnyPath) -> "OriginTable":
+    def load(cls, path: AnyPath) -> OriginTable:
         """Read a table from a file of `save`.
 
         Parameters

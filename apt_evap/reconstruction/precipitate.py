@@ -1,5 +1,7 @@
 """Shape and composition of a reconstructed precipitate against the truth."""
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -8,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from apt_evap._common.codec import for_json
 from apt_evap._common.types import Booleans, Floats, Integers
 from apt_evap._common.validation import check_kind, short_text
 from apt_evap.reconstruction.errors import groups_of, per_ion, true_sites
@@ -103,14 +106,13 @@ class PrecipitateErrors:
         -------
         dict
         """
-        content: dict[str, Any] = {"ions": self.ions}
-        for name in ("true", "apparent"):
-            axes = getattr(self, name)
-            content[name] = {"lateral": axes.lateral, "depth": axes.depth, "ratio": axes.ratio}
-        names = ("overlap", "lost", "magnification", "depth_magnification", "density_ratio")
-        content |= {name: getattr(self, name) for name in names}
-        names = ("species", "true_composition", "apparent_composition", "composition_errors")
-        return content | {name: getattr(self, name).tolist() for name in names}
+        names = ("ions", "overlap", "lost", "magnification", "depth_magnification", "density_ratio")
+        names += ("species", "true_composition", "apparent_composition", "composition_errors")
+        axes = {
+            name: {part: getattr(getattr(self, name), part) for part in ("lateral", "depth", "ratio")}
+            for name in ("true", "apparent")
+        }
+        return for_json({name: getattr(self, name) for name in names} | axes)
 
 
 def precipitate_errors(

@@ -4,10 +4,11 @@ Every ion leaves the surface of a spherical cap that recedes along the axis. Its
 distance from the centre of the detector, and its depth from the volume of all ions before it.
 """
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -121,7 +122,7 @@ class Reconstruction:
 
     def errors(
         self,
-        truth: "Run | ArrayLike | None" = None,
+        truth: Run | ArrayLike | None = None,
         fit: Sequence[str] = FREE,
         groups: ArrayLike | None = None,
     ) -> ReconstructionErrors:
@@ -166,7 +167,7 @@ class Reconstruction:
         errors = errors_of(positions, _angles(positions, radii), sites, linear, group, _below(positions, radii))
         return replace(errors, radius_factor=factor, compression=compression)
 
-    def fitted_positions(self, truth: "Run | ArrayLike | None" = None, fit: Sequence[str] = FREE) -> Floats:
+    def fitted_positions(self, truth: Run | ArrayLike | None = None, fit: Sequence[str] = FREE) -> Floats:
         """Positions in the coordinates of the specimen, after the fit of the free constants.
 
         These are the positions that `errors` compares with the sites. The regions of the phases apply to them:
@@ -422,7 +423,7 @@ def reconstruct(
     per_ion = volume / efficiency
     if mode == "voltage":
         field = check_number(evaporation_field, "evaporation_field", above=0, unit="V/nm")
-        field_factor = check_number(field_factor, "field_factor", above=0)
+        field_factor = check_number(field_factor, "field_factor", at_least=0.1, at_most=100)
         radii = trailing_mean(_voltages(selection), check_count(smoothing, "smoothing", at_least=1))
         radii /= field_factor * field
     elif mode == "shank":
@@ -447,7 +448,7 @@ def reconstruct(
         shifts, covariances = origins.shifts_at(_on_cap(selection, settings)[0])
         covariances *= (radii * radii)[:, None, None]
     positions = _placed(selection, radii, settings, shifts)
-    return Reconstruction(positions, selection, radii, MappingProxyType(settings), shifts, covariances)
+    return Reconstruction(positions, selection, radii, settings, shifts, covariances)
 
 
 def _on_cap(hits, settings):

@@ -5,15 +5,17 @@ conj(w) of first order (anisotropy), and those of second and third order. Measur
 0.1 mm by the cubic terms, where similarity transforms leave 0.7 to 0.9 mm.
 """
 
-from dataclasses import dataclass
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
+from apt_evap._common.codec import checked, count, number, settings, vector
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_array, check_count, check_number
+from apt_evap._common.validation import check_array
 
 SIGNIFICANCE = 0.01
 """Probability of a smaller residual by chance below which terms of a higher degree are kept."""
@@ -28,43 +30,43 @@ def terms_of(degree: int) -> tuple[tuple[int, int], ...]:
     return tuple(term for order in range(1, degree + 1) for term in _TERMS[order])
 
 
-@dataclass(frozen=True)
+def _complex(numbers, name):
+    """Complex numbers; in files they are pairs."""
+    pairs = [complex(*each) if isinstance(each, list) else each for each in numbers]
+    return tuple(np.asarray(pairs, complex).tolist())
+
+
+def _errors(errors, name):
+    """Errors; unknown ones are NaN, in files None."""
+    return tuple(np.asarray([np.nan if each is None else each for each in errors], float).tolist())
+
+
+@settings
 class Distortion:
-    """Polynomial terms of a registration.
+    """Polynomial terms of a registration."""
 
-    Parameters
-    ----------
-    degree : int
-        1 for anisotropy alone, 2 and 3 with quadratic and cubic terms.
-    centre : tuple of float
-        Origin of the polynomial in the measured frame [mm].
-    radius : float
-        Unit of length of the polynomial [mm].
-    coefficients : tuple of complex
-        Of the terms of `terms_of` [mm].
-    errors : tuple of float
-        Their standard errors, of the real and the imaginary part alike [mm]; NaN if not known.
-    """
+    degree: int = count(
+        "1 for anisotropy alone, 2 and 3 with quadratic and cubic terms.", at_least=1, at_most=LARGEST_DEGREE
+    )
+    centre: tuple = vector("Origin of the polynomial in the measured frame.", 2, unit="mm")
+    radius: float = number("Unit of length of the polynomial.", above=0, unit="mm")
+    coefficients: tuple = checked("Of the terms of `terms_of`.", "tuple of complex", _complex, unit="mm")
+    errors: tuple = checked(
+        "Their standard errors, of the real and the imaginary part alike; NaN if not known.",
+        "tuple of float",
+        _errors,
+        default=(),
+        unit="mm",
+    )
 
-    degree: int
-    centre: tuple
-    radius: float
-    coefficients: tuple
-    errors: tuple = ()
-
-    def __post_init__(self):
-        degree = check_count(self.degree, "degree", at_least=1, at_most=LARGEST_DEGREE)
-        number = len(terms_of(degree))
-        object.__setattr__(self, "centre", tuple(check_array(self.centre, "centre", (2,)).tolist()))
-        object.__setattr__(self, "radius", check_number(self.radius, "radius", above=0, unit="mm"))
-        coefficients = np.asarray(self.coefficients, complex)
-        if coefficients.shape != (number,) or not np.isfinite(coefficients).all():
-            raise ValueError(f"coefficients must be {number} finite numbers for degree {degree}")
-        errors = np.asarray(self.errors if len(self.errors) else [np.nan] * number, float)
-        if errors.shape != (number,):
-            raise ValueError(f"errors must be {number} numbers for degree {degree}, got {len(errors)}")
-        object.__setattr__(self, "coefficients", tuple(coefficients.tolist()))
-        object.__setattr__(self, "errors", tuple(errors.tolist()))
+    def _check(self):
+        terms = len(terms_of(self.degree))
+        if len(self.coefficients) != terms or not np.isfinite(self.coefficients).all():
+            raise ValueError(f"coefficients must be {terms} finite numbers for degree {self.degree}")
+        errors = self.errors or (np.nan,) * terms
+        if len(errors) != terms:
+            raise ValueError(f"errors must be {terms} numbers for degree {self.degree}, got {len(errors)}")
+        return {"errors": errors}
 
     def shift(self, points: Any) -> Any:
         """Displacement of points of the measured frame, complex of any shape [mm]."""
@@ -85,23 +87,6 @@ class Distortion:
                 found = points - self.shift(found)
             wrong = ~(np.abs(self.forth(found) - points) <= 1e-6 * self.radius)
         return np.where(wrong, np.nan, found)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the parameters in the plain types of JSON, dict."""
-        return {
-            "degree": self.degree,
-            "centre": list(self.centre),
-            "radius": self.radius,
-            "coefficients": [[c.real, c.imag] for c in self.coefficients],
-            "errors": [None if np.isnan(error) else error for error in self.errors],
-        }
-
-    @classmethod
-    def from_dict(cls, settings: dict[str, Any]) -> "Distortion":
-        """Rebuild the terms from the result of `to_dict`."""
-        errors = [np.nan if error is None else error for error in settings["errors"]]
-        coefficients = [complex(*pair) for pair in settings["coefficients"]]
-        return cls(settings["degree"], settings["centre"], settings["radius"], tuple(coefficients), tuple(errors))
 
 
 class PolynomialFit(NamedTuple):

@@ -1,13 +1,16 @@
 """Registration: rotation, scale, shift and mirror that transform a simulated map into the frame of a measured one."""
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 import warnings
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from apt_evap._common.codec import checked, from_plain, number, part, settings, switch, vector
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence, check_switch
 from apt_evap._common.warnings import RegistrationWarning
@@ -35,32 +38,18 @@ _MAX_FITS = 12  # transforms that are refined: twice the number of symmetric one
 _BINS = 384  # bins of a map of simulated hits
 
 
-@dataclass(frozen=True)
+def _score(given, name):
+    """A number that may be NaN; in files NaN is None."""
+    return float("nan") if given is None else float(given)
+
+
+def _ties(plain, name):
+    return [from_plain(each, Registration, what=name) for each in plain]
+
+
+@settings
 class Registration:
     """A similarity transform from the simulated into the measured frame, made by `register` or `register_points`.
-
-    Parameters
-    ----------
-    rotation : float
-        Rotation, anticlockwise [degrees].
-    scale : float
-        Measured mm per simulated mm.
-    shift : tuple of float
-        Shift in x and y, applied last [mm].
-    mirror : bool
-        Whether y changes sign, before the rotation.
-    score : float
-        Correlation coefficient of the flattened maps in their common area; NaN if points were registered.
-    overlap : float
-        Fraction of the measured field of view that the simulated map covers; NaN if points were registered.
-    residual : float
-        Root mean square distance of registered points [mm]; NaN if maps were registered.
-    method : str
-        Origin of the transform: "search", "start", "pole", "points", or "" if given by the user.
-    ties : tuple of Registration
-        Other transforms that are equally good within the noise, usually by the symmetry of the crystal.
-    distortion : Distortion, optional
-        Polynomial terms, applied last: the distortion of an instrument with a reflectron.
 
     Notes
     -----
@@ -68,27 +57,51 @@ class Registration:
     then by the distortion.
     """
 
-    rotation: float
-    scale: float
-    shift: tuple
-    mirror: bool = False
-    score: float = float("nan")
-    overlap: float = float("nan")
-    residual: float = float("nan")
-    method: str = ""
-    ties: tuple = ()
-    distortion: Distortion | None = None
+    rotation: float = number("Rotation, anticlockwise.", unit="degrees")
+    scale: float = number("Measured mm per simulated mm.", above=0)
+    shift: tuple = vector("Shift in x and y, applied last.", 2, unit="mm")
+    mirror: bool = switch("Whether y changes sign, before the rotation.", default=False)
+    score: float = checked(
+        "Correlation coefficient of the flattened maps in their common area; NaN if points were registered.",
+        "float",
+        _score,
+        default=float("nan"),
+        read=_score,
+    )
+    overlap: float = checked(
+        "Fraction of the measured field of view that the simulated map covers; NaN if points were registered.",
+        "float",
+        _score,
+        default=float("nan"),
+        read=_score,
+    )
+    residual: float = checked(
+        "Root mean square distance of registered points; NaN if maps were registered.",
+        "float",
+        _score,
+        default=float("nan"),
+        read=_score,
+        unit="mm",
+    )
+    method: str = checked(
+        'Origin of the transform: "search", "start", "pole", "points", or "" if given by the user.',
+        "str",
+        lambda method, name: str(method),
+        default="",
+    )
+    ties: tuple = checked(
+        "Other transforms that are equally good within the noise, usually by the symmetry of the crystal.",
+        "tuple of Registration",
+        lambda ties, name: tuple(ties),
+        default=(),
+        read=_ties,
+    )
+    distortion: Distortion | None = part(
+        "Polynomial terms, applied last: the distortion of an instrument with a reflectron.", Distortion, default=None
+    )
 
-    def __post_init__(self):
-        rotation = check_number(self.rotation, "rotation", unit="degrees")
-        object.__setattr__(self, "rotation", (rotation + 180) % 360 - 180)
-        object.__setattr__(self, "scale", check_number(self.scale, "scale", above=0))
-        shift = check_array(self.shift, "shift", (2,))
-        object.__setattr__(self, "shift", tuple(float(value) for value in shift))
-        object.__setattr__(self, "mirror", check_switch(self.mirror, "mirror"))
-        object.__setattr__(self, "ties", tuple(self.ties))
-        if self.distortion is not None:
-            check_kind(self.distortion, "distortion", Distortion, "a Distortion")
+    def _check(self):
+        return {"rotation": (self.rotation + 180) % 360 - 180}
 
     @property
     def transform(self) -> SimilarityTransform:
@@ -133,7 +146,7 @@ class Registration:
         z = self.transform.back(z)
         return z.real, z.imag
 
-    def hits(self, hits: Hits) -> "Hits":
+    def hits(self, hits: Hits) -> Hits:
         """Move hits into the measured frame.
 
         Parameters
@@ -150,7 +163,7 @@ class Registration:
         return replace(hits, x=x, y=y, extent=None)
 
     @property
-    def inverse(self) -> "Registration":
+    def inverse(self) -> Registration:
         """The transform from the measured into the simulated frame, a Registration without score.
 
         Raises
@@ -181,37 +194,9 @@ class Registration:
                 stacklevel=3,
             )
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the registration in the plain types of JSON (dict); NaN becomes None."""
-        plain = asdict(self)
-        plain.update(shift=list(self.shift), ties=[tie.to_dict() for tie in self.ties], doubtful=bool(self.doubtful))
-        plain["distortion"] = self.distortion and self.distortion.to_dict()
-        return {name: None if value != value else value for name, value in plain.items()}
-
     def to_text(self) -> str:
         """Return the transform as ``--registration`` takes it: ROTATION,SCALE,DX,DY[,mirror] (str)."""
         return ",".join([*map(repr, (self.rotation, self.scale, *self.shift)), *(["mirror"] if self.mirror else [])])
-
-    @classmethod
-    def from_dict(cls, settings: dict[str, Any]) -> "Registration":
-        """Rebuild a registration from the result of `to_dict`.
-
-        Parameters
-        ----------
-        settings : dict
-            Result of `to_dict`.
-
-        Returns
-        -------
-        Registration
-        """
-        settings = {name: float("nan") if value is None else value for name, value in settings.items()}
-        ties = tuple(cls.from_dict(tie) for tie in settings.pop("ties", ()))
-        settings.pop("doubtful", None)  # follows from the others
-        distortion = settings.pop("distortion", None)
-        if isinstance(distortion, dict):
-            settings["distortion"] = Distortion.from_dict(distortion)
-        return cls(**settings, ties=ties)
 
     def __str__(self):
         parts = [f"rotated by {self.rotation:.2f}°", f"scaled by {self.scale:.4g}"]
@@ -234,7 +219,7 @@ def register(
     scales: float | tuple[float, ...] | None = None,
     mirrors: Sequence[bool] | None = None,
     overlap: float = 0.5,
-) -> "Registration":
+) -> Registration:
     """Find the rotation, scale, shift and mirror that transform a simulated map into a measured one.
 
     Each map is smoothed slightly and divided by a strongly smoothed copy. Poles and zone lines remain; broad density
@@ -395,7 +380,7 @@ def register_distortion(
 
 def register_points(
     simulated_points: ArrayLike, measured_points: ArrayLike, mirror: bool | None = None, *, degree: int | None = 0
-) -> "Registration":
+) -> Registration:
     """Find the transform of simulated points, such as poles, to measured points by least squares.
 
     Parameters

@@ -44,14 +44,15 @@ def describe_file(path: AnyPath) -> dict[str, Any]:
 
 
 @contextmanager
-def recorded_warnings() -> Iterator[list[Any]]:
-    """Yield a list that receives every warning; the warnings are also shown as before."""
+def recorded_warnings(hidden: tuple[type[Warning], ...] = ()) -> Iterator[list[Any]]:
+    """Yield a list that receives every warning; those of other classes than `hidden` are also shown as before."""
     messages: list[Any] = []
     show = warnings.showwarning
 
     def record(message: Any, *where: Any, **options: Any) -> None:
         messages.append(message)
-        show(message, *where, **options)
+        if not isinstance(message, hidden):
+            show(message, *where, **options)
 
     warnings.showwarning = record
     try:

@@ -63,6 +63,8 @@ def write_study(
     content, made = study.to_dict(), origin(files, command, warnings)
     page = Page(title or f"Emission energies: {study.grid.mechanism}")
     of_registration, others = doubts(content)
+    if study.likeness.verdict == "alike":
+        page.add(paragraph(f"The maps are alike: {study.likeness.reason}."))
     page.add(*(paragraph(text, "doubt red") for text in of_registration))
     page.add(*(paragraph(text, "doubt") for text in (*others, *(f"Warning: {each}" for each in made["warnings"]))))
     page.add(heading("Energies"), _energies(study), heading("Measured and simulated map"), _blinking(page, study))
@@ -100,6 +102,10 @@ def doubts(content: Mapping[str, Any]) -> tuple[list[str], list[str]]:
     """
     registration, settings, edges = content["registration"], content["settings"], content["optimum"]["at_edge"]
     of_registration, others = [], []
+    if content["likeness"]["verdict"] != "alike":
+        doubtful = content["likeness"]["verdict"] == "doubtful"
+        verdict = "It is doubtful that the maps are alike" if doubtful else "The maps are not alike"
+        of_registration.append(f"{verdict}: {content['likeness']['reason']}.")
     if registration["doubtful"]:
         of_registration.append(
             f"The registration is doubtful: the correlation of the maps is only {registration['score']:.2f} in their "

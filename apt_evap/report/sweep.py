@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from apt_evap._common.codec import for_json
 from apt_evap._common.types import AnyPath
 from apt_evap.detection.detector_map import DetectorMap
-from apt_evap.energy_fit.study import bounded_text, plain
+from apt_evap.energy_fit.study import bounded_text
 from apt_evap.report.origin import add_origin, origin
 from apt_evap.report.page import Markup, Page, heading, paragraph, table, text_of
 from apt_evap.report.pictures import blinking_pictures
@@ -135,7 +136,7 @@ def _study_cells(content):
         return [""] * len(_STUDY)
     score, refined = content["optimum"]["score"], content["refined"]
     error = f" ± {score['error']:.3f}" if score["error"] is not None else ""
-    open_ends = refined.get("open_ends", {})  # files of earlier versions do not have them
+    open_ends = refined["open_ends"]
     energies = [
         bounded_text(refined[name], refined["intervals"].get(name), open_ends.get(name))
         for name in ("mean", "rsd", "rollup_fraction")
@@ -155,4 +156,4 @@ def _names(parts):
 
 
 def _data(row):
-    return plain({name: getattr(row, name) for name in ("name", "settings", "results", "study", "message")})
+    return for_json({name: getattr(row, name) for name in ("name", "settings", "results", "study", "message")})

@@ -27,10 +27,11 @@ from apt_evap._common.interrupts import uninterrupted
 from apt_evap._common.validation import check_count, check_number, check_switch
 from apt_evap._common.warnings import DataWarning, RunWarning
 from apt_evap._common.wording import argument
+from apt_evap.emission.perturbations import described
 from apt_evap.evaporation.state import EmitterState
 from apt_evap.simulation.ending import Ending
 from apt_evap.simulation.run import PART_NAME, Run, load, part_paths
-from apt_evap.simulation.run_hdf5 import count_ions, described, is_run, plain, read_state, write_state
+from apt_evap.simulation.run_hdf5 import count_ions, is_run, read_state, write_state
 
 try:
     import fcntl
@@ -124,9 +125,7 @@ class Keeper:
         self.previous = None  # the ions so far of a resumed run
         self._in_file = False  # whether these are in the file only, and not yet in the folder
         self.complete = False  # whether all requested ions are in the file
-        self._setup = dict(
-            _flat(plain(settings)), responses=responses, flown=[described(each) for each in perturbations]
-        )
+        self._setup = dict(_flat(settings), responses=responses, flown=[described(each) for each in perturbations])
         try:
             self._open()
             self._prepare(n_ions)

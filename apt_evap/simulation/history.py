@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from apt_evap._common.short_repr import short_repr
 from apt_evap.evaporation.cap import Cap
 
 
@@ -31,6 +32,9 @@ class History(NamedTuple):
     never_left: np.ndarray
     flagged: np.ndarray
     field: np.ndarray
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
     @classmethod
     def empty(cls) -> "History":
@@ -62,6 +66,9 @@ class CapHistory(NamedTuple):
     fields: np.ndarray
     ratios: np.ndarray
     radii: np.ndarray
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
     @classmethod
     def empty(cls) -> "CapHistory":

@@ -2,13 +2,12 @@
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from apt_evap._common.codec import count, number, settings
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_count, check_number
 from apt_evap._common.warnings import ChargesWarning, ResponseWarning, RunWarning
 from apt_evap.detection.hits import Outcome
 from apt_evap.evaporation.emitter import Emitter
@@ -18,37 +17,31 @@ if TYPE_CHECKING:
     from apt_evap.simulation.run import Run
 
 
-@dataclass(frozen=True)
+@settings
 class WatchSettings:
-    """Monitoring of a run; it does not change the results.
+    """Monitoring of a run; it does not change the results."""
 
-    Parameters
-    ----------
-    interval : int, optional
-        Ions between two checks, by default those of ten relaxations. A check comes just before a relaxation, when the
-        errors of the charges are largest.
-    sample : int
-        Surface atoms whose charges are checked by direct sums.
-    charge_bound : float
-        RMS residual of the charges, relative to the mean charge, above which a warning is given. Measured on Ni[111]
-        with the default settings (R = 20 a and 40 a, 4,000 events): 0.0005 to 0.0032. The RMS deviation from converged
-        charges was 0.8 to 2.5 times the residual.
-    fraction_bound : float
-        Fraction of the ions between two checks that never left, or that have inexact responses, above which a
-        warning is given; in the same runs there were none.
-    """
-
-    interval: int | None = None
-    sample: int = 128
-    charge_bound: float = 0.01
-    fraction_bound: float = 0.01
-
-    def __post_init__(self):
-        if self.interval is not None:
-            check_count(self.interval, "interval", at_least=1)
-        check_count(self.sample, "sample", at_least=1)
-        check_number(self.charge_bound, "charge_bound", above=0)
-        check_number(self.fraction_bound, "fraction_bound", at_least=0, at_most=1)
+    interval: int | None = count(
+        "Ions between two checks, by default those of ten relaxations. A check comes just before a relaxation, when "
+        "the errors of the charges are largest.",
+        default=None,
+        at_least=1,
+    )
+    sample: int = count("Surface atoms whose charges are checked by direct sums.", default=128, at_least=1)
+    charge_bound: float = number(
+        "RMS residual of the charges, relative to the mean charge, above which a warning is given. Measured on Ni[111] "
+        "with the default settings (R = 20 a and 40 a, 4,000 events): 0.0005 to 0.0032. The RMS deviation from "
+        "converged charges was 0.8 to 2.5 times the residual.",
+        default=0.01,
+        above=0,
+    )
+    fraction_bound: float = number(
+        "Fraction of the ions between two checks that never left, or that have inexact responses, above which a "
+        "warning is given; in the same runs there were none.",
+        default=0.01,
+        at_least=0,
+        at_most=1,
+    )
 
 
 def charge_residuals(emitter: Emitter, sample: int, seed: int) -> Floats:

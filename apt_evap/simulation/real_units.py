@@ -6,14 +6,14 @@ same run at the voltage of an experiment, with scaled energies and times: no fli
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from apt_evap._common.codec import checked, choice, count, from_plain, number, part, settings
 from apt_evap._common.types import Floats, Integers
-from apt_evap._common.validation import check_choice, check_count, check_kind, check_number, check_seed, short_text
+from apt_evap._common.validation import check_count, check_seed, short_text
 from apt_evap._core.elementary import logarithm
 from apt_evap.detection.timing import Timing
 from apt_evap.emission.ion_random import IonRandom
@@ -28,62 +28,93 @@ _SEED_STEP = 0x5851F42D4C957F2D  # other random numbers than those of the pertur
 _COLUMNS = 5  # random numbers per ion: isotope, charge, pulse, energy deficit, delay
 
 
-@dataclass(frozen=True)
+def _flight_charges(given, name):
+    """Charges in flight: one for all, by element (checked with the elements of a run), or `PostIonisation`."""
+    return given if isinstance(given, PostIonisation | Mapping) else check_count(given, name, at_least=1)
+
+
+def _read_flight_charges(plain, name):
+    drawn = isinstance(plain, Mapping) and "name" in plain
+    return from_plain(plain, PostIonisation, what=name) if drawn else plain
+
+
+@settings
+class OperatingPoint:
+    """Arguments of `Run.at_evaporation_field`, and the table ``[real_units]`` of a settings file."""
+
+    field_reference: str = choice(
+        '"cap": the mean field of the cap is the operating field. Literature evaporation fields are such means, as '
+        'they are determined as V / (k_f R). "site": the field at the evaporating atom, which is about 1.4 times '
+        "higher, is the operating field.",
+        REFERENCES,
+        default="cap",
+    )
+    operating_field: float | None = number(
+        "Operating field of the host. By default its evaporation field; for a law with a temperature, the field to "
+        "which the control led.",
+        default=None,
+        above=0,
+        at_most=1000,
+        unit="V/nm",
+    )
+    flight_charges: int | Mapping[str, int] | PostIonisation | None = checked(
+        "Charge of the ions in flight, for all ions or by element; `PostIonisation` draws it from the local field. By "
+        "default that of the main peak in usual spectra, such as 2 for Ni. It is not the charge at the barrier, which "
+        "defines the evaporation field.",
+        "int or mapping or PostIonisation",
+        _flight_charges,
+        default=None,
+        read=_read_flight_charges,
+        hash=False,
+    )
+    control: VoltageControl | None = part(
+        "Rate and pulses; by default those of the run, or `VoltageControl()`.", VoltageControl, default=None
+    )
+    timing: Timing | None = part(
+        "Errors of the times of flight, so that `Hits.mass_to_charge` is a spectrum; by default the times are exact.",
+        Timing,
+        default=None,
+    )
+    smoothing: int = count(
+        "Number of ions over which the voltage is averaged, as by the control of an instrument.",
+        default=250,
+        at_least=1,
+    )
+    field_factor: float | None = number(
+        "k_f of the instrument, V = k_f F R, with the initial apex radius R. The reported voltages are then those of "
+        "the instrument, the ratio of both factors is constant. By default the voltages are those of the model, whose "
+        "field factor is smaller because it has no counter electrode.",
+        default=None,
+        at_least=0.1,
+        at_most=100,
+    )
+    seed: int | None = checked(
+        "Seed of isotopes, charges, pulses and times; by default that of the run.", "int", check_seed, default=None
+    )
+
+
+@settings
 class RealUnits:
-    """Operating point and instrument of a run in real units; made by `Run.at_evaporation_field`.
+    """Operating point and instrument of a run in real units; made by `Run.at_evaporation_field`."""
 
-    Parameters
-    ----------
-    field_reference : {"cap", "site"}
-        What is at the operating field: the mean over the cap, or the evaporating atom.
-    operating_field : float
-        Operating field of the host [V/nm].
-    field_ratio : float or None
-        Field at the evaporating atoms divided by the mean field of the cap; None without a history of the cap.
-    smoothing : int
-        Number of ions over which the voltage is averaged.
-    control : VoltageControl
-        Rate and pulses.
-    timing : Timing or None
-        Errors of the times of flight.
-    voltage_ratio : float
-        Voltage of the instrument divided by that of the model, see `field_factor` in `Run.at_evaporation_field`.
-    seed : int
-        Seed of isotopes, charges, pulses and times.
-    """
-
-    field_reference: str
-    operating_field: float
-    field_ratio: float | None
-    smoothing: int
-    control: VoltageControl
-    timing: Timing | None
-    voltage_ratio: float
-    seed: int
-
-    def __post_init__(self):
-        check_choice(self.field_reference, "field_reference", REFERENCES)
-        check_number(self.operating_field, "operating_field", above=0, at_most=1000, unit="V/nm")
-        if self.field_ratio is not None:
-            check_number(self.field_ratio, "field_ratio", above=0)
-        check_count(self.smoothing, "smoothing", at_least=1)
-        check_kind(self.control, "control", VoltageControl, "a VoltageControl")
-        if self.timing is not None:
-            check_kind(self.timing, "timing", Timing, "a Timing or None")
-        check_number(self.voltage_ratio, "voltage_ratio", above=0)
-        check_seed(self.seed)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the settings in plain types, dict."""
-        timing = None if self.timing is None else vars(self.timing)
-        return vars(self) | {"control": vars(self.control), "timing": timing}
-
-    @classmethod
-    def from_dict(cls, settings: Mapping[str, Any]) -> "RealUnits":
-        """Rebuild the settings from the result of `to_dict`."""
-        timing = settings["timing"]
-        objects = {"control": VoltageControl(**settings["control"]), "timing": timing and Timing(**timing)}
-        return cls(**{**settings, **objects})
+    field_reference: str = choice(
+        "What is at the operating field: the mean over the cap, or the evaporating atom.", REFERENCES
+    )
+    operating_field: float = number("Operating field of the host.", above=0, at_most=1000, unit="V/nm")
+    field_ratio: float | None = number(
+        "Field at the evaporating atoms divided by the mean field of the cap; None without a history of the cap.",
+        default=None,
+        above=0,
+    )
+    smoothing: int = count("Number of ions over which the voltage is averaged.", default=1, at_least=1)
+    control: VoltageControl = part("Rate and pulses.", VoltageControl, default=VoltageControl())
+    timing: Timing | None = part("Errors of the times of flight.", Timing, default=None)
+    voltage_ratio: float = number(
+        "Voltage of the instrument divided by that of the model, see `field_factor` in `Run.at_evaporation_field`.",
+        default=1.0,
+        above=0,
+    )
+    seed: int = checked("Seed of isotopes, charges, pulses and times.", "int", check_seed, default=0)
 
 
 class RealColumns(NamedTuple):
@@ -168,8 +199,8 @@ def real_voltages(
         cap_ratios = np.interp(ions, cap.ions[known], cap.ratios[known])
     elif field_reference == "cap":
         raise ValueError(
-            "field_reference 'cap' needs the mean field of the cap, which this run does not contain: it was made by an "
-            "earlier version, or too few of its surface atoms are around the axis; use field_reference='site'"
+            "field_reference 'cap' needs the mean field of the cap, which this run does not contain: too few of "
+            "its surface atoms are around the axis; use field_reference='site'"
         )
     field_ratio = float(np.mean(site_ratios / cap_ratios)) if known.any() and len(ions) else None
     ratios = cap_ratios if field_reference == "cap" else site_ratios
@@ -279,3 +310,79 @@ def isotopes_of(names: tuple[str, ...], species: Integers, masses: Floats, u: Fl
     by_species = np.ones(len(names))
     by_species[species] = masses
     return draw_isotopes(names, species, by_species, u)
+
+
+def in_real_units(run: Any, point: OperatingPoint) -> tuple[RealUnits, RealColumns]:
+    """Operating point and columns of a run in real units, see `Run.at_evaporation_field`.
+
+    Parameters
+    ----------
+    run : Run
+        The run at its simulated voltage.
+    point : OperatingPoint
+        Operating field, charges in flight, pulses and errors of the times.
+
+    Returns
+    -------
+    RealUnits
+    RealColumns
+    """
+    tip, emissions, evaporation_fields = run.settings["tip"], run.emissions, run.evaporation_fields
+    control = point.control
+    if control is None:
+        stored = run.settings["control"]
+        control = from_plain(stored, VoltageControl) if stored else VoltageControl()
+    seed = run.seed if point.seed is None else point.seed
+    given_charges = check_flight_charges(point.flight_charges, run.elements)
+    host_field = (tip["material"] if "material" in tip else tip["elements"][0])["evaporation_field"]
+    voltages, goal, field_ratio = real_voltages(
+        run.fields / evaporation_fields,
+        run.cap,
+        emissions.ions,
+        run.voltage,
+        None if run.clock is None else run.clock.voltages,
+        point.field_reference,
+        None if point.operating_field is None else point.operating_field / host_field,
+        point.smoothing,
+    )
+    u = random_of(seed, emissions.ions)
+    # fields at the evaporations, about their mean, which is the operating field
+    local = run.fields * voltages / evaporation_fields
+    local = local / (local.mean() or 1.0) * goal if len(run) else local
+    fields = local * evaporation_fields
+    real = RealColumns(
+        voltages=voltages,
+        charges=flight_charges_of(given_charges, run.elements, run.species, emissions.charge_states, fields, u[:, 1]),
+        masses=isotopes_of(run.elements, run.species, emissions.masses, u[:, 0]),
+        pulse_ids=_pulse_ids(run, control, local / goal, u[:, 2]),
+    )
+    units = RealUnits(
+        field_reference=point.field_reference,
+        operating_field=goal * host_field,
+        field_ratio=field_ratio,
+        smoothing=point.smoothing,
+        control=control,
+        timing=point.timing,
+        voltage_ratio=_voltage_ratio(point.field_factor, tip.get("apex_radius"), voltages, goal * host_field),
+        seed=seed,
+    )
+    return units, real
+
+
+def _voltage_ratio(field_factor, radius, voltages, operating_field):
+    """Voltage of an instrument with this field factor over that of the model."""
+    if field_factor is None:
+        return 1.0
+    if radius is None or not len(voltages):
+        raise ValueError("field_factor needs the apex radius, which a tip made from positions does not have")
+    return field_factor * operating_field * radius / float(voltages[0])
+
+
+def _pulse_ids(run, control, excess, u):
+    """Number of the pulse of each ion: from the clock, or drawn for the rate, or without pulses its own."""
+    pulse_length = run.settings["pulse_length"]
+    if run.clock is not None and pulse_length:
+        return np.floor(np.cumsum(run.clock.waits) / pulse_length).astype(np.int64)
+    if run.clock is not None or control.pulse_fraction == 0:
+        return np.arange(len(run))
+    return pulses_of(excess, control.rate, u)

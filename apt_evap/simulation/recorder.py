@@ -36,6 +36,9 @@ class RunInterrupted(RuntimeError):
         super().__init__(message)
         self.run = run
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (str(self), self.run)  # by default the message only: a process pool would wait forever
+
 
 class RunNotSaved(FileError):
     """Error for a completed run that cannot be written.
@@ -51,6 +54,9 @@ class RunNotSaved(FileError):
     def __init__(self, message: str, run: Run) -> None:
         super().__init__(message)
         self.run = run
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (str(self), self.run)  # by default the message only: a process pool would wait forever
 
 
 class Recorder:

@@ -2,75 +2,46 @@
 
 import hashlib
 import json
-import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple, overload
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from apt_evap._common.codec import changed, to_plain
 from apt_evap._common.files import FileError, check_path
 from apt_evap._common.types import AnyPath, Booleans, Floats, Integers
 from apt_evap._common.validation import (
-    check_choice,
-    check_count,
     check_kind,
-    check_number,
     check_seed,
     check_switch,
     short_text,
 )
-from apt_evap._common.warnings import DataWarning
 from apt_evap.detection.detector import Detector
 from apt_evap.detection.hits import Hits, Outcome
 from apt_evap.detection.instrument import Instrument
-from apt_evap.detection.timing import Timing
 from apt_evap.emission.emissions import Emissions, TangentialLaunches
-from apt_evap.emission.perturbations import Perturbation, Unperturbed
-from apt_evap.emission.post_ionisation import PostIonisation
+from apt_evap.emission.perturbations import Perturbation, Unperturbed, described
 from apt_evap.evaporation.state import EmitterState
-from apt_evap.evaporation.voltage import VoltageControl
 from apt_evap.flight.response import ResponseModel, Responses, ResponseSettings
+from apt_evap.simulation.columns import (
+    ALWAYS,
+    OPTIONAL,
+    Clock,
+    Column,
+    Flown,
+    columns_of,
+    flown_columns,
+    parts_of,
+    response_columns,
+)
 from apt_evap.simulation.ending import Ending
 from apt_evap.simulation.history import CapHistory, History
 from apt_evap.simulation.provenance import joined, provenance_now
-from apt_evap.simulation.real_units import (
-    REFERENCES,
-    RealColumns,
-    RealUnits,
-    check_flight_charges,
-    flight_charges_of,
-    isotopes_of,
-    pulses_of,
-    random_of,
-    real_voltages,
-)
-from apt_evap.simulation.run_hdf5 import described, read_run, write_run
-
-
-@dataclass(frozen=True, eq=False)
-class Flown:
-    """Results of the flights of one perturbation: stereographic directions (n, 2) and times of flight (n,) [ns]."""
-
-    directions: np.ndarray
-    times: np.ndarray
-
-    def __repr__(self) -> str:
-        return f"<Flown: directions and times of {len(self.times):,} ions>"
-
-
-class Clock(NamedTuple):
-    """Course of a run with a temperature; each of shape (n,)."""
-
-    waits: np.ndarray
-    """Time before each event [s]; with pulses, time at the top of pulses."""
-    voltages: np.ndarray
-    """Voltage of the control at each event [V]."""
-
-    def __repr__(self) -> str:
-        return f"<Clock: {len(self.waits):,} events>"
+from apt_evap.simulation.real_units import OperatingPoint, RealColumns, RealUnits, in_real_units, random_of
+from apt_evap.simulation.run_hdf5 import read_run, write_run
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -118,8 +89,7 @@ class Run:
     provenance : dict
         Version, time, and under "systems" the processors and libraries of the computation.
     detached : ndarray of bool, shape (n,), optional
-        Atoms that left because they had lost all chains of bonds to the body; by default none, as in files of earlier
-        versions.
+        Atoms that left because they had lost all chains of bonds to the body; by default none.
     phase : ndarray of int8, shape (n,), optional
         Index of the phase of each atom into `phase_names`; by default 0.
     cap : CapHistory
@@ -166,6 +136,20 @@ class Run:
 
     def __len__(self) -> int:
         return len(self.site)
+
+    def __getitem__(self, rows: Any) -> "Run":
+        """Return the run with selected ions only; takes a slice, a mask or indices."""
+        arrays = {path: values[rows] for path, values in columns_of(self, self.every_column).items()}
+        return replace(self, **parts_of(arrays, self.emissions.nearest_neighbour_distance))
+
+    @property
+    def every_column(self) -> list[Column]:
+        """The columns of this run, see `apt_evap.simulation.columns`."""
+        columns = [*ALWAYS, *OPTIONAL, *(each for k in range(len(self.flown)) for each in flown_columns(k))]
+        if self.responses is not None:
+            columns += response_columns(self.response_settings)
+        there = columns_of(self, columns)
+        return [column for column in columns if column.path in there]
 
     def __repr__(self) -> str:
         flown = ", ".join(_describe(perturbation) for perturbation in self.perturbations)
@@ -243,14 +227,7 @@ class Run:
             and voltages of a control, flown perturbations and responses, but not the real units, which follow from
             them. By design it does not depend on the machine.
         """
-        columns = {name: getattr(self, name) for name in ("site", "species", "charges", "fields")}
-        columns |= {f"emissions/{name}": getattr(self.emissions, name) for name in self.emissions.columns}
-        for number, flown in enumerate(self.flown):
-            columns |= {f"flown/{number}/directions": flown.directions, f"flown/{number}/times": flown.times}
-        if self.responses is not None:
-            columns |= {f"responses/{name}": values for name, values in self.responses.columns.items()}
-        if self.clock is not None:
-            columns |= {f"clock/{name}": values for name, values in self.clock._asdict().items()}
+        columns = columns_of(self, [column for column in self.every_column if not column.derived])
         hashed = hashlib.sha256()
         for name in sorted(columns):
             values = np.array(columns[name], order="C")
@@ -278,7 +255,8 @@ class Run:
         Returns
         -------
         Hits
-            One row per ion, in the sequence of evaporation; `outcome` is the outcome of each flight.
+            One row per ion, in the sequence of evaporation; `outcome` is the outcome of each flight. ``extra`` contains
+            the element of each ion, and its charge and field before evaporation.
 
         Raises
         ------
@@ -354,6 +332,7 @@ class Run:
             scale = self.real.voltages / self.voltage
             extra = {"charge": self.charges * scale, "field": self.fields * scale, "charge_state": self.real.charges}
             units["charge_state"] = "e"
+        extra["element"] = np.array(self.elements)[self.species]
         return Hits(
             x=x,
             y=y,
@@ -395,18 +374,7 @@ class Run:
             multiplicity[hit] = counts[np.searchsorted(first, pulse)]
         return columns | {"pulses": pulses, "multiplicity": multiplicity}
 
-    def at_evaporation_field(
-        self,
-        field_reference: str = "cap",
-        *,
-        operating_field: float | None = None,
-        flight_charges: int | Mapping[str, int] | PostIonisation | None = None,
-        control: VoltageControl | None = None,
-        timing: Timing | None = None,
-        smoothing: int = 250,
-        field_factor: float | None = None,
-        seed: int | None = None,
-    ) -> "Run":
+    def at_evaporation_field(self, point: OperatingPoint | None = None, **arguments: Any) -> "Run":
         r"""The same run in real units: at the voltages that bring it to its evaporation field.
 
         Energies of perturbations are then true eV, `voltages` true V and times of flight true ns. Nothing is simulated
@@ -414,29 +382,10 @@ class Run:
 
         Parameters
         ----------
-        field_reference : {"cap", "site"}
-            "cap": the mean field of the cap is the operating field. Literature evaporation fields are such means, as
-            they are determined as V / (k_f R). "site": the field at the evaporating atom, which is about 1.4 times
-            higher, is the operating field.
-        operating_field : float, optional
-            Operating field of the host [V/nm]. By default its evaporation field; for a law with a temperature, the
-            field to which the control led.
-        flight_charges : int or mapping or PostIonisation, optional
-            Charge of the ions in flight, for all ions or by element; `PostIonisation` draws it from the local field. By
-            default that of the main peak in usual spectra, such as 2 for Ni. It is not the charge at the barrier,
-            which defines the evaporation field.
-        control : VoltageControl, optional
-            Rate and pulses; by default those of the run, or `VoltageControl()`.
-        timing : Timing, optional
-            Errors of the times of flight, so that `Hits.mass_to_charge` is a spectrum; by default the times are exact.
-        smoothing : int
-            Number of ions over which the voltage is averaged, as by the control of an instrument.
-        field_factor : float, optional
-            k_f of the instrument, V = k_f F R, with the initial apex radius R. The reported voltages are then those of
-            the instrument, the ratio of both factors is constant. By default the voltages are those of the model, whose
-            field factor is smaller because it has no counter electrode.
-        seed : int, optional
-            Seed of isotopes, charges, pulses and times; by default that of the run.
+        point : OperatingPoint, optional
+            Operating field, charges in flight, pulses and errors of the times; by default `OperatingPoint()`.
+        **arguments
+            Fields of `OperatingPoint` that replace those of `point`: ``run.at_evaporation_field(field_factor=3.3)``.
 
         Returns
         -------
@@ -459,151 +408,30 @@ class Run:
         the species, also for a law with bonds. The path depends on
         :math:`E_\perp / (n V)` only, and the time of flight is proportional to :math:`\sqrt{m / (n V)}`.
         """
-        check_choice(field_reference, "field_reference", REFERENCES)
-        smoothing = check_count(smoothing, "smoothing", at_least=1)
-        if control is None:
-            stored = self.settings.get("control")
-            control = VoltageControl(**stored) if stored else VoltageControl()
-        check_kind(control, "control", VoltageControl, "a VoltageControl")
-        if timing is not None:
-            check_kind(timing, "timing", Timing, "a Timing")
-        seed = self.seed if seed is None else check_seed(seed)
-        given_charges = check_flight_charges(flight_charges, self.elements)
-        if field_factor is not None:
-            field_factor = check_number(field_factor, "field_factor", above=0, at_most=100)
-        host_field = self._host_field()
-        goal = None
-        if operating_field is not None:
-            goal = check_number(operating_field, "operating_field", above=0, at_most=1000, unit="V/nm") / host_field
-        emissions = self.emissions
-        voltages, goal, field_ratio = real_voltages(
-            self.fields / self.evaporation_fields,
-            self.cap,
-            emissions.ions,
-            self.voltage,
-            None if self.clock is None else self.clock.voltages,
-            field_reference,
-            goal,
-            smoothing,
-        )
-        u = random_of(seed, emissions.ions)
-        # fields at the evaporations, about their mean, which is the operating field
-        local = self.fields * voltages / self.evaporation_fields
-        local = local / (local.mean() or 1.0) * goal if len(self) else local
-        real = RealColumns(
-            voltages=voltages,
-            charges=flight_charges_of(
-                given_charges,
-                self.elements,
-                self.species,
-                emissions.charge_states,
-                local * self.evaporation_fields,
-                u[:, 1],
-            ),
-            masses=isotopes_of(self.elements, self.species, emissions.masses, u[:, 0]),
-            pulse_ids=self._pulse_ids(control, local / goal, u[:, 2]),
-        )
-        units = RealUnits(
-            field_reference=field_reference,
-            operating_field=goal * host_field,
-            field_ratio=field_ratio,
-            smoothing=smoothing,
-            control=control,
-            timing=timing,
-            voltage_ratio=self._voltage_ratio(field_factor, voltages, goal * host_field),
-            seed=seed,
-        )
+        if point is not None:
+            check_kind(point, "point", OperatingPoint, "an OperatingPoint")
+        units, real = in_real_units(self, changed(point or OperatingPoint(), arguments))
         return replace(self, units=units, real=real)
 
     def simulated(self) -> "Run":
         """The same run without real units, at the simulated voltage."""
         return self if self.units is None else replace(self, units=None, real=None)
 
-    def _host_field(self):
-        """Evaporation field of the first species [V/nm]."""
-        tip = self.settings["tip"]
-        return (tip["material"] if "material" in tip else tip["elements"][0])["evaporation_field"]
-
-    def _voltage_ratio(self, field_factor, voltages, operating_field):
-        """Voltage of an instrument with this field factor over that of the model."""
-        if field_factor is None:
-            return 1.0
-        radius = self.settings["tip"].get("apex_radius")
-        if radius is None or not len(self):
-            raise ValueError("field_factor needs the apex radius, which a tip made from positions does not have")
-        return field_factor * operating_field * radius / float(voltages[0])
-
-    def _pulse_ids(self, control, excess, u):
-        """Number of the pulse of each ion: from the clock, or drawn for the rate, or without pulses its own."""
-        pulse_length = self.settings.get("pulse_length")
-        if self.clock is not None and pulse_length:
-            return np.floor(np.cumsum(self.clock.waits) / pulse_length).astype(np.int64)
-        if self.clock is not None or control.pulse_fraction == 0:
-            return np.arange(len(self))
-        return pulses_of(excess, control.rate, u)
-
-    @overload
-    def seen_by(self, detector: Detector) -> "Run": ...
-
-    @overload
-    def seen_by(
-        self, detector: Instrument, perturbation: Perturbation | None = None, *, seed: int | None = None
-    ) -> Hits: ...
-
-    def seen_by(
-        self,
-        detector: Detector | Instrument,
-        perturbation: Perturbation | None = None,
-        *,
-        seed: int | None = None,
-    ) -> "Run | Hits":
-        """The same ions on another detector, or the ions that an instrument records.
+    def on_detector(self, detector: Detector) -> "Run":
+        """The same ions on another detector.
 
         Parameters
         ----------
-        detector : Detector or Instrument
-            Detector with another distance, width or projection. Or the instrument that records the ions of a run in
-            real units.
-        perturbation : perturbation, optional
-            Initial conditions of the ions that an instrument records; by default the first perturbation flown in the
-            run, or `Unperturbed`.
-        seed : int, optional
-            Seed of the random numbers of an instrument; by default that of the run.
+        detector : Detector
+            Detector with another distance, width or projection. Outside the field, the time of flight is proportional
+            to the distance.
 
         Returns
         -------
-        Run or Hits
-            For a detector the same run. For an instrument the recorded ions: what the instrument writes, and the truth:
-            `site`, `ion`, `positions`, and in `extra` the species, the phase if there are several, the charge in
-            flight, and charge and field before evaporation.
-
-        Raises
-        ------
-        ValueError
-            If the run is not in real units, which an instrument needs, or an argument is wrong.
+        Run
         """
-        if not isinstance(detector, Instrument):
-            check_kind(detector, "detector", Detector, "a Detector or an Instrument")
-            if perturbation is not None or seed is not None:
-                raise ValueError("perturbation and seed are for an Instrument, got a Detector")
-            return self._at_distance(detector.distance / self.detector.distance, detector)
-        if self.units is None:
-            raise ValueError(
-                "this run is not in real units, so it has no voltages, times and pulses that an instrument could "
-                "record: use run.at_evaporation_field().seen_by(instrument)"
-            )
-        # errors of the times of an instrument replace those of the run
-        units = self.units if detector.timing is None else replace(self.units, timing=None)
-        plane = replace(self, units=units, detector=replace(self.detector, projection="plane"))
-        hits = plane.hits(self.first_perturbation if perturbation is None else perturbation)
-        truth = {"species": self.species}
-        if len(self.phase_names) > 1:
-            truth["phase"] = self.phase
-        hits = replace(hits, extra=hits.extra | truth)
-        return detector.hits(hits, self.detector.distance, seed=self.seed if seed is None else check_seed(seed))
-
-    def _at_distance(self, ratio, detector):
-        """The run on a detector at `ratio` times the distance: outside the field, the time is proportional to it."""
+        check_kind(detector, "detector", Detector, "a Detector")
+        ratio = detector.distance / self.detector.distance
         flown, responses = self.flown, self.responses
         if ratio != 1.0:
             flown = tuple(Flown(each.directions, each.times * ratio) for each in flown)
@@ -611,8 +439,49 @@ class Run:
                 factors = np.array([1.0, 1.0, ratio], np.float32)[:, None]  # directions and time
                 site, rolled, *twice = (each * factors for each in responses.polynomials)
                 responses = Responses(site, rolled, responses.residuals * ratio, *twice)
-        settings = self.settings | {"detector": vars(detector)}
+        settings = self.settings | {"detector": to_plain(detector)}
         return replace(self, detector=detector, settings=settings, flown=flown, responses=responses)
+
+    def record(
+        self, instrument: Instrument, perturbation: Perturbation | None = None, *, seed: int | None = None
+    ) -> Hits:
+        """Ions that an instrument records.
+
+        Parameters
+        ----------
+        instrument : Instrument
+            The instrument, which records the ions of a run in real units.
+        perturbation : perturbation, optional
+            Initial conditions of the ions; by default the first perturbation flown in the run, or `Unperturbed`.
+        seed : int, optional
+            Seed of the random numbers of the instrument; by default that of the run.
+
+        Returns
+        -------
+        Hits
+            What the instrument writes, and the truth: `site`, `ion`, `positions`, and in `extra` the species, the phase
+            if there are several, the charge in flight, and charge and field before evaporation.
+
+        Raises
+        ------
+        ValueError
+            If the run is not in real units.
+        """
+        check_kind(instrument, "instrument", Instrument, "an Instrument")
+        if self.units is None:
+            raise ValueError(
+                "this run is not in real units, so it has no voltages, times and pulses that an instrument could "
+                "record: use run.at_evaporation_field().record(instrument)"
+            )
+        # errors of the times of an instrument replace those of the run
+        units = self.units if instrument.timing is None else replace(self.units, timing=None)
+        plane = replace(self, units=units, detector=replace(self.detector, projection="plane"))
+        hits = plane.hits(self.first_perturbation if perturbation is None else perturbation)
+        truth = {"species": self.species}
+        if len(self.phase_names) > 1:
+            truth["phase"] = self.phase
+        hits = replace(hits, extra=hits.extra | truth)
+        return instrument.hits(hits, self.detector.distance, seed=self.seed if seed is None else check_seed(seed))
 
     def summary(self) -> dict[str, Any]:
         """Counts, dict: ions, outcomes of the first perturbation, ions that cannot roll up, flagged ions."""
@@ -633,30 +502,15 @@ class Run:
     @classmethod
     def join(cls, runs: "Sequence[Run]") -> "Run":
         """Join the parts of one run in their order."""
-        first = runs[0]
-        emissions = Emissions.join([run.emissions for run in runs])
-        columns: dict[str, Any] = {
-            name: np.concatenate([getattr(run, name) for run in runs])
-            for name in ("site", "species", "charges", "fields", "detached", "phase")
-        }
-        flown = tuple(
-            Flown(
-                np.concatenate([part.directions for part in parts]),
-                np.concatenate([part.times for part in parts]),
-            )
-            for parts in zip(*(run.flown for run in runs), strict=True)
+        first, parts = runs[0], [columns_of(run, run.every_column) for run in runs]
+        arrays = {path: np.concatenate([part[path] for part in parts]) for path in parts[0]}
+        return replace(
+            first,
+            **parts_of(arrays, first.emissions.nearest_neighbour_distance),
+            history=History.join([run.history for run in runs]),
+            cap=CapHistory.join([run.cap for run in runs]),
+            provenance=joined([run.provenance for run in runs]),
         )
-        responses = None
-        if first.responses is not None:
-            responses = Responses.join([run.responses for run in runs])  # type: ignore[misc]
-        history = History.join([run.history for run in runs])
-        columns["provenance"] = joined([run.provenance for run in runs])
-        columns["cap"] = CapHistory.join([run.cap for run in runs])
-        for name, kind in (("clock", Clock), ("real", RealColumns)):
-            if getattr(first, name) is not None:
-                parts = zip(*(getattr(run, name) for run in runs), strict=True)
-                columns[name] = kind(*map(np.concatenate, parts))
-        return replace(first, emissions=emissions, flown=flown, responses=responses, history=history, **columns)  # type: ignore[arg-type]
 
     def ended_by(self, reason: str) -> "Run":
         """The same run with the reason of an early end."""
@@ -680,15 +534,13 @@ class Run:
         write_run(path, self)
 
 
-def load(path: AnyPath, *, partial: bool = False) -> Run:
+def load(path: AnyPath) -> Run:
     """Read a run from an HDF5 file of `Run.save`, or from the folder of an unfinished run.
 
     Parameters
     ----------
     path : str or path-like
         The file; or the folder beside it, whose name ends in ".unfinished" (see `Checkpoint`).
-    partial : bool
-        Whether to read the undamaged ions of a damaged file or folder; a warning gives the number of lost ions.
 
     Returns
     -------
@@ -700,28 +552,13 @@ def load(path: AnyPath, *, partial: bool = False) -> Run:
         If it is missing, unreadable, damaged or not a run.
     """
     path = check_path(path)
-    if path.is_dir():
-        return _load_parts(path, partial)
-    return _load_file(path, partial)
+    return _load_parts(path) if path.is_dir() else Run(**read_run(path))
 
 
-def _load_file(path, partial=False):
-    arguments = read_run(path, partial)
-    arguments["flown"] = tuple(Flown(*flown) for flown in arguments["flown"])
-    arguments["clock"] = arguments["clock"] and Clock(*arguments["clock"])
-    return Run(**arguments)
-
-
-def _load_parts(folder, partial):
+def _load_parts(folder):
     parts, names = [], []
     for path in part_paths(folder):
-        try:
-            part = _load_file(path, partial)
-        except FileError as error:
-            if not partial:
-                raise
-            warnings.warn(f"{error}: its ions are lost", DataWarning, stacklevel=3)
-            continue
+        part = Run(**read_run(path))
         if parts and (name := _difference(parts[0], part)):
             raise FileError(f"{str(path)!r} belongs to another run than {names[0]!r}: its {name} differ")
         parts.append(part)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from apt_evap._common.describe import describe
+from apt_evap._common.codec import to_plain
 from apt_evap._common.files import FileError
 from apt_evap._common.interrupts import interruptible
 from apt_evap._common.memory import check_copies
@@ -32,10 +32,11 @@ from apt_evap.flight.crew import FlightCrew, FlightSettings, check_reach
 from apt_evap.flight.landing import land
 from apt_evap.flight.response import ResponseModel, ResponseSettings
 from apt_evap.simulation.checkpoint import Checkpoint, Keeper
+from apt_evap.simulation.columns import Clock, Flown
 from apt_evap.simulation.history import CapHistory
 from apt_evap.simulation.monitor import WatchSettings
 from apt_evap.simulation.recorder import Recorder
-from apt_evap.simulation.run import Clock, Flown, Run
+from apt_evap.simulation.run import Run
 from apt_evap.specimen.tip import Tip
 
 BACKLOG = 4  # batches whose flights may be pending during further events
@@ -372,13 +373,13 @@ class Simulation:
             "tip": tip.settings,
             "voltage": self.voltage,
             "seed": self.seed,
-            "detector": vars(self.detector),
-            "law": describe(self.law),
-            "rule": describe(self.emitter.rule),
-            "charges": vars(self.emitter.settings),
-            "flights": vars(self.flight_settings),
-            "responses": self.response_settings.to_dict(),
-            "watch": vars(self.watch_settings),
-            "control": None if self.control is None else vars(self.control),
+            "detector": to_plain(self.detector),
+            "law": to_plain(self.law),
+            "rule": to_plain(self.emitter.rule),
+            "charges": to_plain(self.emitter.settings),
+            "flights": to_plain(self.flight_settings),
+            "responses": to_plain(self.response_settings),
+            "watch": to_plain(self.watch_settings),
+            "control": to_plain(self.control),
             "pulse_length": self.emitter.pulse_length,
         }

@@ -1,10 +1,9 @@
 """The surface of the specimen at the end of a run."""
 
-import dataclasses
-
+from apt_evap._common.codec import from_plain
 from apt_evap._common.validation import check_kind
-from apt_evap.evaporation import rule as rules
 from apt_evap.evaporation.emitter import Emitter
+from apt_evap.evaporation.rule import ConstantPotential, Robin
 from apt_evap.evaporation.settings import ChargeSettings
 from apt_evap.simulation.run import Run
 from apt_evap.specimen.tip import Tip
@@ -34,16 +33,13 @@ def surface_after(run: Run, n_threads: int | None = None) -> Emitter:
     check_kind(run, "run", Run, "a Run")
     if run.state is None:
         raise ValueError(f"{run!r} does not contain the state of its surface")
-    described = dict(run.settings["rule"])
-    rule = getattr(rules, str(described.pop("name")), None)
-    if not dataclasses.is_dataclass(rule):
-        raise ValueError(f"the charging rule must be one of this package, got {run.settings['rule']}")
+    rule = from_plain(run.settings["rule"], Robin, ConstantPotential, what="the charging rule")
     emitter = Emitter(
         Tip.from_settings(run.settings["tip"]),
         run.voltage,
-        settings=ChargeSettings(**run.settings["charges"]),
+        settings=from_plain(run.settings["charges"], ChargeSettings),
         n_threads=n_threads,
-        rule=rule(**described),  # type: ignore[operator, arg-type]
+        rule=rule,
     )
     emitter.restore(run.state)
     return emitter

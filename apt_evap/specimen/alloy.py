@@ -5,43 +5,26 @@ another shape, is therefore the same alloy.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from apt_evap._common.codec import checked, from_plain, number, settings
 from apt_evap._common.counter_random import GAMMA, mix, open_interval
 from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_kind, check_number, check_seed
 from apt_evap._core.elementary import exponential
 from apt_evap.specimen.materials import Material, as_material
-from apt_evap.specimen.regions import check_region
+from apt_evap.specimen.regions import region_of, with_boundary
 
 VACANCY, SUBLATTICE, SOLUTE = range(3)
 """Uses of the random numbers of a site."""
 
 
-@dataclass(frozen=True)
+@settings
 class Segregation:
     r"""Fraction of a solute that changes with the distance from a boundary.
-
-    Parameters
-    ----------
-    bulk : float
-        Atomic fraction far from the boundary.
-    peak : float
-        Atomic fraction at the boundary; below `bulk` for a depleted boundary.
-    width : float
-        Standard deviation of the profile [nm].
-    region : region, optional
-        The region with this boundary. By default that of the phase; for the matrix, the nearest boundary of any other
-        phase.
-
-    Raises
-    ------
-    ValueError
-        If a number is outside its range.
 
     Notes
     -----
@@ -50,18 +33,19 @@ class Segregation:
     with the distance d from the boundary.
     """
 
-    bulk: float
-    peak: float
-    width: float
-    region: Any = None
-
-    def __post_init__(self):
-        for name in ("bulk", "peak"):
-            object.__setattr__(self, name, check_number(getattr(self, name), name, at_least=0, at_most=1))
-        object.__setattr__(self, "width", check_number(self.width, "width", above=0, unit="nm"))
-        if self.region is not None:
-            check_region(self.region)
-            check_kind(self.region, "region", "distance", "a region with a boundary, such as Sphere((0, 0, 20), 4)")
+    bulk: float = number("Atomic fraction far from the boundary.", at_least=0, at_most=1)
+    peak: float = number(
+        "Atomic fraction at the boundary; below `bulk` for a depleted boundary.", at_least=0, at_most=1
+    )
+    width: float = number("Standard deviation of the profile.", above=0, unit="nm")
+    region: Any = checked(
+        "The region with this boundary. By default that of the phase; for the matrix, the nearest boundary of any "
+        "other phase.",
+        "region",
+        with_boundary,
+        default=None,
+        read=region_of,
+    )
 
     @property
     def largest(self) -> float:
@@ -102,6 +86,8 @@ def check_solutes(
         solute = as_material(element, "solutes")
         if isinstance(fraction, Segregation) and profiles:
             fractions[solute] = fraction
+        elif isinstance(fraction, Mapping) and profiles:  # of a file
+            fractions[solute] = from_plain(fraction, Segregation, what=f"solute {solute.name}")
         else:
             fractions[solute] = check_number(fraction, f"fraction of {solute.name}", above=0, at_most=1)
     total = sum(each.largest if isinstance(each, Segregation) else each for each in fractions.values())

@@ -1,5 +1,7 @@
 """Crystal lattices: unit cells, orientations, and the lattice points inside a shape."""
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
 import math
 from collections.abc import Callable, Sequence
 from typing import Any

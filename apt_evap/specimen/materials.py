@@ -1,11 +1,12 @@
 """Materials: properties of the elements, each number with its source."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import fields, replace
 from typing import Any
 
-from apt_evap._common.validation import check_count, check_kind, check_number, did_you_mean, short_text
-from apt_evap.specimen.lattice import check_structure, nearest_neighbour_distance
+from apt_evap._common.codec import checked, choice, count, from_plain, number, settings
+from apt_evap._common.validation import check_kind, check_number, did_you_mean, short_text
+from apt_evap.specimen.lattice import BASES, nearest_neighbour_distance
 from apt_evap.units import ELEMENTARY_CHARGE
 
 _KITTEL = "Kittel, Introduction to Solid State Physics, 8th ed. (2005), ch. 1, table 3"
@@ -18,71 +19,51 @@ _LONGEST = 2.0
 _HIGHEST_FIELD = 1000.0
 
 
-@dataclass(frozen=True)
+def _name(name, what):
+    if not isinstance(name, str) or not name:
+        raise ValueError(f"{what} must be text such as 'Ni', got {short_text(name)}")
+    return name
+
+
+def _sources(given, name):
+    return dict(check_kind(given, name, Mapping, "a mapping of a field to its source"))
+
+
+@settings
 class Material:
-    """A pure element (or the host of an alloy) as a field emitter.
+    """A pure element (or the host of an alloy) as a field emitter."""
 
-    Parameters
-    ----------
-    name : str
-        Chemical symbol, or any name.
-    structure : str
-        One of fcc, bcc, sc, diamond, hcp.
-    a : float
-        Lattice constant [nm].
-    evaporation_field : float
-        Field at which an atom leaves without a barrier [V/nm].
-    charge_state : int
-        Dominant charge of the ion at the evaporation field [e].
-    mass : float
-        Mass of the ion [Da].
-    c : float, optional
-        Height of the hexagonal cell [nm]; needed for hcp, not allowed for the others.
-    polarizability : float, optional
-        Polarizability of the free atom [F m^2].
-    sources : mapping of str to str
-        Source of each number, by the name of the field.
+    name: str = checked("Chemical symbol, or any name.", "str", _name)
+    structure: str = choice("Crystal structure.", BASES)
+    a: float = number("Lattice constant.", above=0, at_most=_LONGEST, unit="nm")
+    evaporation_field: float = number(
+        "Field at which an atom leaves without a barrier.", above=0, at_most=_HIGHEST_FIELD, unit="V/nm"
+    )
+    charge_state: int = count("Dominant charge of the ion at the evaporation field.", at_least=1, at_most=118, unit="e")
+    mass: float = number("Mass of the ion.", at_least=1, at_most=1e4, unit="Da")
+    c: float | None = number(
+        "Height of the hexagonal cell; needed for hcp, not allowed for the others.",
+        default=None,
+        above=0,
+        at_most=_LONGEST,
+        unit="nm",
+    )
+    polarizability: float | None = number(
+        "Polarizability of the free atom.", default=None, above=0, at_most=1e-30, unit="F m^2"
+    )
+    sources: Mapping[str, str] = checked(
+        "Source of each number, by the name of the field.",
+        "mapping of str to str",
+        _sources,
+        default={},
+        compare=False,
+        repr=False,
+    )
 
-    Raises
-    ------
-    ValueError
-        If a number is outside its range, if the structure is unknown, or if `c` is missing or not allowed.
-    """
-
-    name: str
-    structure: str
-    a: float
-    evaporation_field: float
-    charge_state: int
-    mass: float
-    c: float | None = None
-    polarizability: float | None = None
-    sources: Mapping[str, str] = field(default_factory=dict, compare=False, repr=False)
-
-    def __post_init__(self):
-        if not isinstance(self.name, str) or not self.name:
-            raise ValueError(f"name must be text such as 'Ni', got {short_text(self.name)}")
-        check_structure(self.structure)
-        values = {
-            "a": check_number(self.a, "a", above=0, at_most=_LONGEST, unit="nm"),
-            "evaporation_field": check_number(
-                self.evaporation_field, "evaporation_field", above=0, at_most=_HIGHEST_FIELD, unit="V/nm"
-            ),
-            "charge_state": check_count(self.charge_state, "charge_state", at_least=1, at_most=118),
-            "mass": check_number(self.mass, "mass", at_least=1, at_most=1e4, unit="Da"),
-            "sources": dict(check_kind(self.sources, "sources", Mapping, "a mapping of a field to its source")),
-        }
+    def _check(self):
         if (self.structure == "hcp") != (self.c is not None):
             requirement = "be a number for hcp" if self.structure == "hcp" else f"be None for {self.structure}"
             raise ValueError(f"c must {requirement}, got {short_text(self.c)}")
-        if self.c is not None:
-            values["c"] = check_number(self.c, "c", above=0, at_most=_LONGEST, unit="nm")
-        if self.polarizability is not None:
-            values["polarizability"] = check_number(
-                self.polarizability, "polarizability", above=0, at_most=1e-30, unit="F m^2"
-            )
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
 
     @property
     def nearest_neighbour_distance(self) -> float:
@@ -166,13 +147,14 @@ def material(name: str, **changes: Any) -> Material:
     return replace(element, **changes, sources=element.sources | dict.fromkeys(changes, "given by the user"))
 
 
-def as_material(value: Material | str, name: str = "material") -> Material:
+def as_material(value: Material | str | Mapping[str, Any], name: str = "material") -> Material:
     """Return a Material, looked up if `value` is a name.
 
     Parameters
     ----------
-    value : Material or str
-        Material, or the name of a known one.
+    value : Material or str or mapping
+        Material, the name of a known one, or a table of a file: the name of a known one and the numbers that are
+        changed, or all fields.
     name : str
         Name of the argument, for the message.
 
@@ -183,10 +165,14 @@ def as_material(value: Material | str, name: str = "material") -> Material:
     Raises
     ------
     ValueError
-        If it is neither, or if no material has this name.
+        If it is none of these, or if no material has this name.
     """
     if isinstance(value, str):
         return material(value)
+    if isinstance(value, Mapping):
+        if value.get("name") in list(MATERIALS) and "sources" not in value:
+            return material(**value)
+        return from_plain(value, Material, what=name)
     return check_kind(value, name, Material, "a Material or its name")
 
 
@@ -224,7 +210,7 @@ def polarization_energy(
     """
     alpha = check_number(polarizability, "polarizability", above=0, unit="F m^2")
     voltage = check_number(voltage, "voltage", unit="V")
-    factor = check_number(field_factor, "field_factor", above=0)
+    factor = check_number(field_factor, "field_factor", at_least=0.1, at_most=100)
     radius = check_number(radius, "radius", above=0, unit="nm")
     step = check_number(step, "step", at_least=0, unit="nm")
     return alpha * (voltage / factor) ** 2 * step / radius**3 * 1e18 / ELEMENTARY_CHARGE

@@ -1,13 +1,13 @@
 """Ordered compounds: which element is on which site of a crystal."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
+from apt_evap._common.codec import checked, choice, from_plain, settings
 from apt_evap._common.types import Integers
-from apt_evap._common.validation import check_choice, check_count, check_number, check_sequence, short_text
+from apt_evap._common.validation import check_count, check_number, check_sequence, short_text
 from apt_evap.specimen.lattice import BASES
 from apt_evap.specimen.materials import Material, as_material
 
@@ -56,40 +56,38 @@ def _with_materials(occupant):
     return dict(occupant) or None
 
 
-def _given(occupant):
-    """Occupant in plain types, for a file."""
-    return [[asdict(element), fraction] for element, fraction in occupant] or None
+def _of_file(plain, name):
+    """Occupant from a file: a name, a table of a material or of fractions, or pairs of a material and its fraction."""
+    if plain in ("", None):  # TOML has no None
+        return None
+    if isinstance(plain, list):
+        return {as_material(element, name): fraction for element, fraction in plain}
+    return as_material(plain, name) if isinstance(plain, Mapping) and "structure" in plain else plain
 
 
-@dataclass(frozen=True)
+def _second(given, name):
+    if given is None:
+        raise ValueError(f"{name} must be an element or a mapping of elements to fractions, got None")
+    return _with_materials(_occupant(given, name))
+
+
+@settings
 class Order:
     """Order of a compound of two elements on the sites of a crystal.
 
     The first element is the material of the phase. The crystal is cubic: the small tetragonal distortion of real L1_0
     compounds is not modelled.
-
-    Parameters
-    ----------
-    prototype : str
-        "L1_2", "L1_0", "B2" or "D0_3", see `apt_evap.specimen.ordered.PROTOTYPES`.
-    second : Material or str or mapping
-        Element on the sites of the second sublattice; or several with their fractions there, such as
-        ``{"Al": 0.6, "Ti": 0.4}``, whose sum is 1.
-
-    Raises
-    ------
-    ValueError
-        If the prototype is unknown, or the element is.
     """
 
-    prototype: str
-    second: Any = field(hash=False)
-
-    def __post_init__(self):
-        check_choice(self.prototype, "prototype", PROTOTYPES)
-        if self.second is None:
-            raise ValueError("second must be an element or a mapping of elements to fractions, got None")
-        object.__setattr__(self, "second", _with_materials(_occupant(self.second, "second")))
+    prototype: str = choice("See `apt_evap.specimen.ordered.PROTOTYPES`.", PROTOTYPES)
+    second: Any = checked(
+        "Element on the sites of the second sublattice; or several with their fractions there, such as "
+        '``{"Al": 0.6, "Ti": 0.4}``, whose sum is 1.',
+        "Material or str or mapping",
+        _second,
+        read=_of_file,
+        hash=False,
+    )
 
     @property
     def structure(self) -> str:
@@ -108,28 +106,22 @@ class Order:
         occupant = _occupant(self.second, "second")
         return [occupant if (cell, site) in second else () for cell in cells for site in range(len(BASES[structure]))]
 
-    def settings(self) -> dict[str, Any]:
-        """Parameters in plain types."""
-        return {"prototype": self.prototype, "second": _given(_occupant(self.second, "second"))}
+
+def _sites(given, name):
+    sites = check_sequence(given, name, "elements")
+    return tuple(_with_materials(_occupant(site, name)) for site in sites)
 
 
-@dataclass(frozen=True)
+def _cells(given, name):
+    cells = check_sequence(given, name, "three integers")
+    if len(cells) != 3:
+        raise ValueError(f"{name} must be three integers, got {short_text(given)}")
+    return tuple(check_count(n, name, at_least=1, at_most=100) for n in cells)
+
+
+@settings
 class Basis:
     """Elements on the sites of a cell of a user's own.
-
-    Parameters
-    ----------
-    sites : sequence
-        Element of each site: a Material or its name, None for the material of the phase, or a mapping of elements to
-        fractions. In the order of the sites in `apt_evap.specimen.lattice.BASES`; with several cells, those of cell
-        (0, 0, 0) come first, then (0, 0, 1) and so on.
-    cells : tuple of int
-        Conventional cells along each axis after which the sites repeat.
-
-    Raises
-    ------
-    ValueError
-        If an element is unknown, or the number of sites is not a multiple of the number of cells.
 
     Examples
     --------
@@ -137,24 +129,28 @@ class Basis:
     None))``.
     """
 
-    sites: Sequence[Any] = field(hash=False)
-    cells: tuple[int, int, int] = (1, 1, 1)
-    _occupants: tuple[Any, ...] = field(init=False, repr=False, compare=False)
+    sites: Sequence[Any] = checked(
+        "Element of each site: a Material or its name, None for the material of the phase, or a mapping of elements to "
+        "fractions. In the order of the sites in `apt_evap.specimen.lattice.BASES`; with several cells, those of cell "
+        "(0, 0, 0) come first, then (0, 0, 1) and so on.",
+        "sequence",
+        _sites,
+        read=lambda plain, name: [_of_file(site, name) for site in check_sequence(plain, name, "elements")],
+        hash=False,
+    )
+    cells: tuple[int, int, int] = checked(
+        "Conventional cells along each axis after which the sites repeat.",
+        "tuple of int",
+        _cells,
+        default=(1, 1, 1),
+    )
 
-    def __post_init__(self):
-        cells = check_sequence(self.cells, "cells", "three integers")
-        if len(cells) != 3:
-            raise ValueError(f"cells must be three integers, got {short_text(self.cells)}")
-        cells = tuple(check_count(n, "cells", at_least=1, at_most=100) for n in cells)
-        sites = check_sequence(self.sites, "sites", "elements")
-        if not sites or len(sites) % int(np.prod(cells)) or len(sites) > _MOST_SITES:
+    def _check(self):
+        n_cells = int(np.prod(self.cells))
+        if not self.sites or len(self.sites) % n_cells or len(self.sites) > _MOST_SITES:
             raise ValueError(
-                f"sites must be a multiple of {int(np.prod(cells))} cells and at most {_MOST_SITES:,}, got {len(sites)}"
+                f"sites must be a multiple of {n_cells} cells and at most {_MOST_SITES:,}, got {len(self.sites)}"
             )
-        object.__setattr__(self, "cells", cells)
-        occupants = tuple(_occupant(site, "sites") for site in sites)
-        object.__setattr__(self, "sites", tuple(map(_with_materials, occupants)))
-        object.__setattr__(self, "_occupants", occupants)
 
     @property
     def structure(self) -> None:
@@ -168,11 +164,7 @@ class Basis:
 
     def occupants(self) -> list[tuple[tuple[Material, float], ...]]:
         """Elements with their fractions by (cell, site), the site fastest; empty for the material of the phase."""
-        return list(self._occupants)
-
-    def settings(self) -> dict[str, Any]:
-        """Parameters in plain types."""
-        return {"sites": [_given(site) for site in self._occupants], "cells": list(self.cells)}
+        return [_occupant(site, "sites") for site in self.sites]
 
 
 def check_order(order: Any, structure: str) -> None:
@@ -210,33 +202,7 @@ def sublattice(order: Order | Basis, cells: Integers, site: int, n_sites: int) -
     return ((i * order.period[1] + j) * order.period[2] + k) * n_sites + site
 
 
-def order_from_dict(table: Any) -> Order | Basis:
-    """Make an order from its description: its class under "name" and its parameters.
-
-    Raises
-    ------
-    ValueError
-        If a name or a parameter is unknown or missing.
-    """
-    kinds = {"Order": (Order, ("prototype", "second")), "Basis": (Basis, ("sites", "cells"))}
-    kind, known = kinds[check_choice(table.get("name", "Order"), "name of order", kinds)]
-    parameters = {key: value for key, value in table.items() if key != "name"}
-    for key in parameters:
-        check_choice(key, "parameter of order", known)
-    if known[0] not in parameters or (kind is Order and "second" not in parameters):
-        raise ValueError(f"order must have {', '.join(known)}, got {', '.join(parameters) or 'none'}")
-    if "second" in parameters:
-        parameters["second"] = _from_plain(parameters["second"])
-    if "sites" in parameters:
-        sites = check_sequence(parameters["sites"], "sites", "elements")
-        parameters["sites"] = tuple(_from_plain(site) for site in sites)
-    return kind(**parameters)
-
-
-def _from_plain(value):
-    """Occupant from its description in a file: text, a table of fractions, or a list of materials with fractions."""
-    if value in ("", None):  # TOML has no None
-        return None
-    if isinstance(value, list):
-        return {Material(**element): fraction for element, fraction in value}
-    return value
+def order_of(plain: Any, name: str = "order") -> Order | Basis:
+    """Order from its plain form; which one is known from its parameters."""
+    kind = Basis if isinstance(plain, Mapping) and "sites" in plain else Order
+    return from_plain(plain, kind, what=name)

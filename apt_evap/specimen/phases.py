@@ -1,104 +1,115 @@
 """Phases: the parts of a specimen, each with its crystal, its composition and its evaporation fields."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apt_evap._common.describe import describe
+from apt_evap._common.codec import checked, number, settings
 from apt_evap._common.small_matrices import matrix_product
 from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_choice, check_kind, check_number, check_sequence, short_text
 from apt_evap.specimen import lattice
 from apt_evap.specimen.alloy import SOLUTE, SUBLATTICE, VACANCY, Segregation, check_solutes, choose, site_numbers
 from apt_evap.specimen.materials import Material, as_material
-from apt_evap.specimen.ordered import check_order, order_from_dict, sublattice
-from apt_evap.specimen.regions import REGIONS, boundary_distance, check_region, contains, region_from_dict
+from apt_evap.specimen.ordered import check_order, order_of, sublattice
+from apt_evap.specimen.regions import boundary_distance, check_region, contains, region_of
 from apt_evap.specimen.surface_criterion import SurfaceCriterion
 
 _MOST_PHASES = 127  # int8 per atom
 _HIGHEST_FIELD = 1000.0  # [V/nm]: as for a Material
 
 
-@dataclass(frozen=True)
+def _name(name, what):
+    if not isinstance(name, str) or not name:
+        raise ValueError(f"{what} must be text such as 'matrix', got {short_text(name)}")
+    return name
+
+
+def _field(given, name):
+    """Evaporation field of a phase, a number or by element."""
+    if not isinstance(given, Mapping):
+        return check_number(given, name, above=0, at_most=_HIGHEST_FIELD, unit="V/nm")
+    return {
+        str(element): check_number(each, f"{name} of {element}", above=0, at_most=_HIGHEST_FIELD, unit="V/nm")
+        for element, each in given.items()
+    }
+
+
+def _solutes(given, name):
+    return check_solutes(given)
+
+
+def _pairs(plain, name):
+    """Pairs of an element and its fraction from a table, or from the list that a run contains."""
+    return plain if isinstance(plain, list) else check_kind(plain, name, Mapping, "a table").items()
+
+
+@settings
 class Phase:
-    """A part of a specimen: a crystal in a region.
+    """A part of a specimen: a crystal in a region."""
 
-    Parameters
-    ----------
-    name : str
-        Any name, such as "matrix".
-    material : Material or str
-        The crystal, and its main element. A precipitate that is coherent with the matrix has the lattice constant of
-        the matrix: ``ae.material("Cu", a=aluminium.a)``.
-    region : region or callable, optional
-        Where the phase is: a region such as `Sphere`, or a function of points (n, 3) [nm] that returns booleans (n,).
-        None for the first phase, the matrix, which is everywhere else.
-    axis : sequence of float, optional
-        Crystal direction along +z, see `lattice.rotation_to_axis`; by default that of the tip.
-    rotation : float, optional
-        Rotation of the crystal about z [degrees]; by default that of the tip.
-    order : Order or Basis, optional
-        Order of a compound on the sites of the crystal.
-    solutes : mapping, optional
-        Substitutional solutes on random sites: atomic fraction, or a `Segregation`, by element (str or Material).
-    evaporation_field : float or mapping, optional
-        Evaporation field of the atoms in this phase [V/nm], for all elements or by name; by default that of each
-        material.
-    vacancies : float
-        Fraction of the sites without an atom; 1 for a void.
+    name: str = checked('Any name, such as "matrix".', "str", _name)
+    material: Any = checked(
+        "The crystal, and its main element. A precipitate that is coherent with the matrix has the lattice constant of "
+        'the matrix: ``ae.material("Cu", a=aluminium.a)``.',
+        "Material or str",
+        as_material,
+    )
+    region: Any = checked(
+        "Where the phase is: a region such as `Sphere`, or a function of points (n, 3) [nm] that returns booleans "
+        "(n,). None for the first phase, the matrix, which is everywhere else.",
+        "region or callable",
+        check_region,
+        default=None,
+        read=region_of,
+    )
+    axis: Sequence[float] | None = checked(
+        "Crystal direction along +z, see `specimen.lattice.rotation_to_axis`; by default that of the tip.",
+        "sequence of float",
+        lambda axis, name: axis,  # checked with the structure
+        default=None,
+    )
+    rotation: float | None = number(
+        "Rotation of the crystal about z; by default that of the tip.", default=None, unit="degrees"
+    )
+    order: Any = checked(
+        "Order of a compound on the sites of the crystal.",
+        "Order or Basis",
+        lambda order, name: order,  # checked with the structure
+        default=None,
+        read=order_of,
+    )
+    solutes: Mapping[Any, Any] = checked(
+        "Substitutional solutes on random sites: atomic fraction, or a `Segregation`, by element (str or Material).",
+        "mapping",
+        _solutes,
+        default={},
+        read=lambda plain, name: {as_material(key, name): each for key, each in _pairs(plain, name)},
+        hash=False,
+    )
+    evaporation_field: float | Mapping[str, float] | None = checked(
+        "Evaporation field of the atoms in this phase, for all elements or by name; by default that of each material.",
+        "float or mapping",
+        _field,
+        default=None,
+        unit="V/nm",
+        hash=False,
+    )
+    vacancies: float = number(
+        "Fraction of the sites without an atom; 1 for a void.", default=0.0, at_least=0, at_most=1
+    )
 
-    Raises
-    ------
-    ValueError
-        If an argument is outside its range, or the order does not fit the structure of the material.
-    """
-
-    name: str
-    material: Material
-    region: Any = None
-    axis: tuple[float, ...] | None = None
-    rotation: float | None = None
-    order: Any = None
-    solutes: Mapping[Any, Any] = field(default_factory=dict, hash=False)
-    evaporation_field: float | Mapping[str, float] | None = field(default=None, hash=False)
-    vacancies: float = 0.0
-
-    def __init__(
-        self,
-        name: str,
-        material: Material | str,
-        region: Any = None,
-        axis: Sequence[float] | None = None,
-        rotation: float | None = None,
-        order: Any = None,
-        solutes: Mapping[Material, Any] | Mapping[str, Any] | None = None,
-        evaporation_field: float | Mapping[str, float] | None = None,
-        vacancies: float = 0.0,
-    ) -> None:
-        if not isinstance(name, str) or not name:
-            raise ValueError(f"name must be text such as 'matrix', got {short_text(name)}")
-        host = as_material(material)
-        check_order(order, host.structure)
-        values = {
-            "name": name,
-            "material": host,
-            "region": None if region is None else check_region(region),
-            "axis": None if axis is None else lattice.check_axis(host.structure, axis),
-            "rotation": None if rotation is None else check_number(rotation, "rotation", unit="degrees"),
-            "order": order,
-            "solutes": check_solutes(solutes),
-            "evaporation_field": _checked_field(evaporation_field),
-            "vacancies": check_number(vacancies, "vacancies", at_least=0, at_most=1),
-        }
-        for key, value in values.items():
-            object.__setattr__(self, key, value)
+    def _check(self):
+        structure = self.material.structure
+        check_order(self.order, structure)
         if isinstance(self.evaporation_field, Mapping):
             names = [element.name for element in self._materials()]
             for element in self.evaporation_field:
                 check_choice(element, "element in evaporation_field", names)
+        return {"axis": None if self.axis is None else lattice.check_axis(structure, self.axis)}
 
     def _materials(self):
         """Materials that occur in the phase, without its evaporation fields."""
@@ -121,84 +132,6 @@ class Phase:
         occupants = self.order.occupants() if self.order else []
         return bool(self.solutes) or 0 < self.vacancies < 1 or any(len(each) > 1 for each in occupants)
 
-    def settings(self) -> dict[str, Any]:
-        """Parameters in plain types; a region that is a function is described by its name."""
-        solutes = [
-            [asdict(element), each if isinstance(each, float) else describe(each)]
-            for element, each in self.solutes.items()
-        ]
-        return {
-            "name": self.name,
-            "material": asdict(self.material),
-            "region": None if self.region is None else described_region(self.region),
-            "axis": None if self.axis is None else list(self.axis),
-            "rotation": self.rotation,
-            "order": None if self.order is None else describe(self.order),
-            "solutes": solutes,
-            "evaporation_field": dict(self.evaporation_field)
-            if isinstance(self.evaporation_field, Mapping)
-            else self.evaporation_field,
-            "vacancies": self.vacancies,
-        }
-
-
-def _checked_field(value):
-    """Evaporation field of a phase, a number or by element."""
-    if value is None:
-        return None
-    if not isinstance(value, Mapping):
-        return check_number(value, "evaporation_field", above=0, at_most=_HIGHEST_FIELD, unit="V/nm")
-    return {
-        str(name): check_number(each, f"evaporation_field of {name}", above=0, at_most=_HIGHEST_FIELD, unit="V/nm")
-        for name, each in value.items()
-    }
-
-
-def described_region(region: Any) -> Any:
-    """Region in plain types: a dict, or the name of a function."""
-    if callable(region) and hasattr(region, "__qualname__"):
-        return f"{region.__module__}.{region.__qualname__}"
-    return describe(region)
-
-
-def phase_from_settings(settings: Mapping[str, Any]) -> Phase:
-    """Rebuild a phase from its `Phase.settings`.
-
-    Raises
-    ------
-    ValueError
-        If its region is a function or a class of the user, which a file cannot contain.
-    """
-    arguments = dict(settings)
-    region = arguments.get("region")
-    if isinstance(region, str) or (region is not None and region.get("name") not in REGIONS):
-        raise ValueError(
-            f"phase {arguments.get('name')} cannot be rebuilt, its region is {short_text(region)}: make the tip again "
-            "with this function"
-        )
-    arguments["region"] = None if region is None else region_from_dict(region)
-    arguments["material"] = Material(**arguments["material"])
-    if arguments.get("order") is not None:
-        arguments["order"] = order_from_dict(arguments["order"])
-    arguments["solutes"] = {
-        Material(**element): segregation_from_dict(each) if isinstance(each, Mapping) else each
-        for element, each in arguments.get("solutes", ())
-    }
-    return Phase(**arguments)
-
-
-def segregation_from_dict(table: Mapping[str, Any]) -> Segregation:
-    """Make a `Segregation` from its parameters, with a region as in `region_from_dict`."""
-    parameters = {key: value for key, value in table.items() if key != "name"}
-    for key in parameters:
-        check_choice(key, "parameter of a segregation", ("bulk", "peak", "width", "region"))
-    for key in ("bulk", "peak", "width"):
-        if key not in parameters:
-            raise ValueError(f"a segregation must have bulk, peak and width, got {', '.join(parameters) or 'none'}")
-    if parameters.get("region") is not None:
-        parameters["region"] = region_from_dict(parameters["region"])
-    return Segregation(**parameters)
-
 
 def check_phases(phases: Any) -> tuple[Phase, ...]:
     """Return phases as a tuple; ValueError unless they are phases, the matrix first and the others with a region."""
@@ -212,10 +145,10 @@ def check_phases(phases: Any) -> tuple[Phase, ...]:
             f"the first of the phases is the matrix, with atoms and without a region, got {phases[0].name}"
         )
     names = [phase.name for phase in phases]
-    for number, phase in enumerate(phases):
-        if number and phase.region is None:
+    for place, phase in enumerate(phases):
+        if place and phase.region is None:
             raise ValueError(f"phase {phase.name} must have a region: only the first of the phases is everywhere")
-        if phase.name in names[:number]:
+        if phase.name in names[:place]:
             raise ValueError(f"phases must have different names, got {phase.name} twice")
     return phases
 
@@ -259,6 +192,8 @@ class Arrangement:
         Species, the material of the matrix first.
     criteria : tuple of SurfaceCriterion
         Criterion of each phase.
+    has_sites : ndarray of bool
+        Whether `labels` has met a site of each phase, also of one without atoms.
     """
 
     def __init__(
@@ -306,6 +241,7 @@ class Arrangement:
             self._species.append(numbers)
             self._sublattices.append(None if phase.order is None else phase.order.occupants())
         self.elements = tuple(elements)
+        self.has_sites = np.zeros(len(self._phases), dtype=bool)
         hosts = [phase.material if phase.vacancies < 1 else phases[0].material for phase in phases]
         self.criteria = tuple(SurfaceCriterion.of(host.structure, host.nearest_neighbour_distance) for host in hosts)
 
@@ -317,8 +253,8 @@ class Arrangement:
     def phase_of(self, points: Floats) -> NDArray[np.int8]:
         """Index of the phase at points (n, 3) [nm], int8 (n,)."""
         phase = np.zeros(len(points), dtype=np.int8)
-        for number, each in enumerate(self._phases[1:], 1):
-            phase[contains(each.region, points)] = number
+        for index, each in enumerate(self._phases[1:], 1):
+            phase[contains(each.region, points)] = index
         return phase
 
     def labels(self, number: int, points: Floats, cells: Integers, site: int) -> NDArray[np.int32]:
@@ -342,6 +278,7 @@ class Arrangement:
         """
         labels = np.full(len(points), -1, dtype=np.int32)
         phases = self.phase_of(points)
+        self.has_sites |= np.bincount(phases, minlength=len(self._phases)) > 0
         for index, phase in enumerate(self._phases):
             if self._lattice_of[index] != number or phase.vacancies == 1:
                 continue

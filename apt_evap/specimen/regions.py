@@ -5,14 +5,14 @@ z = apex_radius. A point at the depth t below the apex is (0, 0, apex_radius - t
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
 import numpy as np
 
+from apt_evap._common.codec import checked, from_plain, number, settings, vector
 from apt_evap._common.small_matrices import lengths, products
 from apt_evap._common.types import Booleans, Floats
-from apt_evap._common.validation import check_array, check_choice, check_kind, check_number, short_text
+from apt_evap._common.validation import check_array, check_kind, check_number, check_sequence, short_text
 
 _ON_BOUNDARY = 1e-7  # [nm]: sites on the boundary belong to the region, in spite of rounding
 _BISECTIONS = 60  # the position is then exact to the rounding of float64
@@ -26,15 +26,10 @@ class Region(Protocol):
         ...
 
 
-def _point(value, name):
-    return tuple(check_array(value, name, (3,)).tolist())
-
-
-def _direction(value, name):
-    vector = check_array(value, name, (3,))
-    if not 1e-6 < float(lengths(vector)) < 1e6:
-        raise ValueError(f"{name} must be a direction with a length between 1e-6 and 1e6, got {short_text(value)}")
-    return tuple(vector.tolist())
+def _direction(vector, name):
+    if not 1e-6 < float(lengths(np.array(vector))) < 1e6:
+        raise ValueError(f"{name} must be a direction with a length between 1e-6 and 1e6, got {short_text(vector)}")
+    return vector
 
 
 def _unit(direction):
@@ -43,71 +38,31 @@ def _unit(direction):
     return vector / lengths(vector)
 
 
-def _store(region, **values):
-    """Set the checked fields of a frozen region."""
-    for name, value in values.items():
-        object.__setattr__(region, name, value)
-
-
-@dataclass(frozen=True)
+@settings
 class Sphere:
-    """A ball, such as a precipitate or a bubble.
+    """A ball, such as a precipitate or a bubble."""
 
-    Parameters
-    ----------
-    centre : sequence of float
-        [nm], shape (3,).
-    radius : float
-        [nm].
-
-    Raises
-    ------
-    ValueError
-        If a number is outside its range.
-    """
-
-    centre: tuple[float, float, float]
-    radius: float
-
-    def __post_init__(self):
-        _store(
-            self, centre=_point(self.centre, "centre"), radius=check_number(self.radius, "radius", above=0, unit="nm")
-        )
+    centre: tuple[float, float, float] = vector("Its centre.", 3, unit="nm")
+    radius: float = number("Its radius.", above=0, unit="nm")
 
     def distance(self, points: Floats) -> Floats:
         """Distance from the boundary [nm], negative inside, shape (n,)."""
         return lengths(points - np.array(self.centre)) - self.radius
 
 
-@dataclass(frozen=True)
+@settings
 class Ellipsoid:
-    """An ellipsoid, such as a platelet or a needle.
+    """An ellipsoid, such as a platelet or a needle."""
 
-    Parameters
-    ----------
-    centre : sequence of float
-        [nm], shape (3,).
-    semi_axes : sequence of float
-        Half the length of the three axes [nm], shape (3,).
-    axis : sequence of float
-        Direction of the third axis in the specimen, shape (3,). For another one than +z, the first axis is turned with
-        it, along the great circle; this matters only if the first two are unequal.
-
-    Raises
-    ------
-    ValueError
-        If a number is outside its range.
-    """
-
-    centre: tuple[float, float, float]
-    semi_axes: tuple[float, float, float]
-    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
-
-    def __post_init__(self):
-        semi_axes = _point(self.semi_axes, "semi_axes")
-        for length in semi_axes:
-            check_number(length, "semi_axes", above=0, unit="nm")
-        _store(self, centre=_point(self.centre, "centre"), semi_axes=semi_axes, axis=_direction(self.axis, "axis"))
+    centre: tuple[float, float, float] = vector("Its centre.", 3, unit="nm")
+    semi_axes: tuple[float, float, float] = vector("Half the length of the three axes.", 3, above=0, unit="nm")
+    axis: tuple[float, float, float] = vector(
+        "Direction of the third axis in the specimen. For another one than +z, the first axis is turned with it, along "
+        "the great circle; this matters only if the first two are unequal.",
+        3,
+        check=_direction,
+        default=(0.0, 0.0, 1.0),
+    )
 
     def _local(self, points):
         """Coordinates along the three axes, shape (n, 3)."""
@@ -147,41 +102,16 @@ class Ellipsoid:
         return np.where(t < 0.0, -1.0, 1.0) * lengths(local - closest)
 
 
-@dataclass(frozen=True)
+@settings
 class Cylinder:
-    """A cylinder, such as a rod or a wire.
+    """A cylinder, such as a rod or a wire."""
 
-    Parameters
-    ----------
-    centre : sequence of float
-        [nm], shape (3,).
-    radius : float
-        [nm].
-    length : float, optional
-        Length [nm]; by default without ends.
-    axis : sequence of float
-        Its direction in the specimen, shape (3,).
-
-    Raises
-    ------
-    ValueError
-        If a number is outside its range.
-    """
-
-    centre: tuple[float, float, float]
-    radius: float
-    length: float | None = None
-    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
-
-    def __post_init__(self):
-        length = None if self.length is None else check_number(self.length, "length", above=0, unit="nm")
-        _store(
-            self,
-            centre=_point(self.centre, "centre"),
-            radius=check_number(self.radius, "radius", above=0, unit="nm"),
-            length=length,
-            axis=_direction(self.axis, "axis"),
-        )
+    centre: tuple[float, float, float] = vector("Its centre.", 3, unit="nm")
+    radius: float = number("Its radius.", above=0, unit="nm")
+    length: float | None = number("Its length; by default it has no ends.", default=None, above=0, unit="nm")
+    axis: tuple[float, float, float] = vector(
+        "Its direction in the specimen.", 3, check=_direction, default=(0.0, 0.0, 1.0)
+    )
 
     def distance(self, points: Floats) -> Floats:
         """Distance from the boundary [nm], negative inside, shape (n,)."""
@@ -196,60 +126,32 @@ class Cylinder:
         return np.where((side > 0.0) & (end > 0.0), beyond, np.maximum(side, end))
 
 
-@dataclass(frozen=True)
+@settings
 class HalfSpace:
-    """Everything on one side of a plane, such as the second grain of a bicrystal.
+    """Everything on one side of a plane, such as the second grain of a bicrystal."""
 
-    Parameters
-    ----------
-    point : sequence of float
-        Any point of the plane [nm], shape (3,).
-    normal : sequence of float
-        Normal of the plane, towards the region, shape (3,).
-
-    Raises
-    ------
-    ValueError
-        If a number is outside its range.
-    """
-
-    point: tuple[float, float, float]
-    normal: tuple[float, float, float]
-
-    def __post_init__(self):
-        _store(self, point=_point(self.point, "point"), normal=_direction(self.normal, "normal"))
+    point: tuple[float, float, float] = vector("Any point of the plane.", 3, unit="nm")
+    normal: tuple[float, float, float] = vector("Normal of the plane, towards the region.", 3, check=_direction)
 
     def distance(self, points: Floats) -> Floats:
         """Distance from the boundary [nm], negative inside, shape (n,)."""
         return -products(points - np.array(self.point), _unit(self.normal))
 
 
-@dataclass(frozen=True)
+@settings
 class Layer:
-    """The space between two parallel planes, such as a layer of a multilayer.
+    """The space between two parallel planes, such as a layer of a multilayer."""
 
-    Parameters
-    ----------
-    lower, upper : float
-        Positions of the planes along the normal [nm]. For the default normal they are heights z: the apex is at z =
-        apex_radius.
-    normal : sequence of float
-        Normal of the planes, shape (3,).
+    lower: float = number(
+        "Position of the lower plane along the normal. For the default normal it is the height z: the apex is at z = "
+        "apex_radius.",
+        unit="nm",
+    )
+    upper: float = number("Position of the upper plane.", unit="nm")
+    normal: tuple[float, float, float] = vector("Normal of the planes.", 3, check=_direction, default=(0.0, 0.0, 1.0))
 
-    Raises
-    ------
-    ValueError
-        If a number is outside its range, or if `upper` is not above `lower`.
-    """
-
-    lower: float
-    upper: float
-    normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
-
-    def __post_init__(self):
-        lower = check_number(self.lower, "lower", unit="nm")
-        upper = check_number(self.upper, "upper", above=lower, unit="nm")
-        _store(self, lower=lower, upper=upper, normal=_direction(self.normal, "normal"))
+    def _check(self):
+        check_number(self.upper, "upper", above=self.lower, unit="nm")
 
     def distance(self, points: Floats) -> Floats:
         """Distance from the boundary [nm], negative inside, shape (n,)."""
@@ -257,29 +159,17 @@ class Layer:
         return np.maximum(self.lower - along, along - self.upper)
 
 
-@dataclass(frozen=True)
+@settings
 class CoreShell:
-    """The shell around a core: all points outside the core, but at most a thickness away from it.
+    """The shell around a core: all points outside the core, but at most a thickness away from it."""
 
-    Parameters
-    ----------
-    core : region
-        The core, which does not belong to this region; usually the region of another phase.
-    thickness : float
-        Thickness of the shell [nm].
-
-    Raises
-    ------
-    ValueError
-        If the core has no distance, or the thickness is not positive.
-    """
-
-    core: Any
-    thickness: float
-
-    def __post_init__(self):
-        check_kind(self.core, "core", "distance", "a region with a boundary, such as Sphere((0, 0, 20), 4)")
-        _store(self, thickness=check_number(self.thickness, "thickness", above=0, unit="nm"))
+    core: Any = checked(
+        "The core, which does not belong to this region; usually the region of another phase.",
+        "region",
+        lambda core, name: with_boundary(core, name),
+        read=lambda plain, name: region_of(plain, name),
+    )
+    thickness: float = number("Thickness of the shell.", above=0, unit="nm")
 
     def contains(self, points: Floats) -> Booleans:
         """Whether points (n, 3) [nm] are in the shell, bool (n,)."""
@@ -292,33 +182,32 @@ class CoreShell:
         return np.maximum(-distance, distance - self.thickness)
 
 
+@settings
 class Union:
-    """All points that are in any of several regions.
+    """All points that are in any of several regions: ``Union(first, second)``.
 
-    Parameters
-    ----------
-    *regions : region
-        At least one region or function of points. Their union has a distance only if each of them has one.
-
-    Raises
-    ------
-    ValueError
-        If there is no region, or one is neither a region nor a function.
+    Their union has a distance only if each of them has one.
     """
+
+    regions: tuple = checked(
+        "At least one region or function of points.",
+        "regions",
+        lambda regions, name: tuple(check_region(region, name) for region in regions),
+        read=lambda plain, name: [region_of(each, name) for each in check_sequence(plain, name, "regions")],
+    )
 
     def __init__(self, *regions: Any) -> None:
         if not regions:
             raise ValueError("regions must contain at least one region, got none")
-        self.regions = tuple(check_region(region, "regions") for region in regions)
+        object.__setattr__(self, "regions", tuple(check_region(region, "regions") for region in regions))
+
+    @classmethod
+    def _from_fields(cls, regions):
+        """Union of a sequence of regions, as a file contains it."""
+        return cls(*regions)
 
     def __repr__(self) -> str:
         return f"Union({', '.join(map(repr, self.regions))})"
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Union) and self.regions == other.regions
-
-    def __hash__(self) -> int:
-        return hash(self.regions)
 
     def contains(self, points: Floats) -> Booleans:
         """Whether points (n, 3) [nm] are in any of the regions, bool (n,)."""
@@ -335,8 +224,8 @@ class Union:
         return distance
 
 
-REGIONS = {kind.__name__: kind for kind in (Sphere, Ellipsoid, Cylinder, HalfSpace, Layer, CoreShell, Union)}
-"""The regions by the name under which they are described in files."""
+REGIONS = (Sphere, Ellipsoid, Cylinder, HalfSpace, Layer, CoreShell, Union)
+"""The built-in regions, which a file can contain."""
 
 
 def check_region(region: Any, name: str = "region") -> Any:
@@ -347,6 +236,11 @@ def check_region(region: Any, name: str = "region") -> Any:
         f"{name} must be a region such as Sphere((0, 0, 20), 4), or a function of points (n, 3) [nm] that returns "
         f"booleans (n,), got {short_text(region)}"
     )
+
+
+def with_boundary(region: Any, name: str) -> Any:
+    """Return a region with a boundary; ValueError for a function of points, which has none, or anything else."""
+    return check_kind(check_region(region, name), name, "distance", "a region such as Sphere((0, 0, 20), 4)")
 
 
 def contains(region: Any, points: Floats) -> Booleans:
@@ -390,40 +284,6 @@ def boundary_distance(region: Any, points: Floats) -> Floats:
     return region.distance(points)
 
 
-def region_from_dict(table: Any, name: str = "region") -> Any:
-    """Make a region from its description.
-
-    Parameters
-    ----------
-    table : mapping
-        The name of its class under "name", and its parameters; a region in it is again such a mapping.
-    name : str
-        Name of the argument, for messages.
-
-    Returns
-    -------
-    region
-
-    Raises
-    ------
-    ValueError
-        If the name or a parameter is unknown, missing or outside its range.
-    """
-    check_kind(table, name, Mapping, "a mapping with the name and the parameters of a region")
-    kind = REGIONS[check_choice(table.get("name"), f"name of {name}", REGIONS)]
-    parameters = {key: value for key, value in table.items() if key != "name"}
-    if kind is Union:
-        if list(parameters) != ["regions"] or not isinstance(parameters["regions"], list | tuple):
-            raise ValueError(f"{name} Union must have regions, a list of regions, got {short_text(parameters)}")
-        return Union(*(region_from_dict(each, f"regions of {name}") for each in parameters["regions"]))
-    known = [item.name for item in fields(kind)]  # type: ignore[arg-type]
-    for key in parameters:
-        check_choice(key, f"parameter of {name} {kind.__name__}", known)
-    if "core" in parameters:
-        parameters["core"] = region_from_dict(parameters["core"], f"core of {name}")
-    try:
-        return kind(**parameters)
-    except TypeError:
-        raise ValueError(
-            f"{name} {kind.__name__} must have {', '.join(known)}, got {', '.join(parameters) or 'none'}"
-        ) from None
+def region_of(plain: Any, name: str = "region") -> Any:
+    """Region from its plain form; ValueError if it was a function or a class of the user, which no file contains."""
+    return from_plain(plain, *REGIONS, what=name)

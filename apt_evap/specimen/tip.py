@@ -1,7 +1,10 @@
 """The specimen: a crystal (or any arrangement of atoms) in the shape of a tip."""
 
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -9,6 +12,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
+from apt_evap._common.codec import from_plain, to_plain
 from apt_evap._common.memory import check_memory
 from apt_evap._common.small_matrices import lengths
 from apt_evap._common.types import Booleans, Floats
@@ -21,10 +25,11 @@ from apt_evap._common.validation import (
     digest,
     short_text,
 )
-from apt_evap.specimen import ase_atoms, lattice
+from apt_evap._common.warnings import DataWarning
+from apt_evap.specimen import ase_atoms, lattice, posture
 from apt_evap.specimen.alloy import check_solutes
 from apt_evap.specimen.materials import Material, as_material
-from apt_evap.specimen.phases import Arrangement, Phase, check_phases, phase_from_settings
+from apt_evap.specimen.phases import Arrangement, Phase, check_phases
 from apt_evap.specimen.shape import TaperedCap
 from apt_evap.specimen.shell import Shell
 from apt_evap.specimen.surface_criterion import SurfaceCriterion
@@ -34,6 +39,7 @@ _LAYER = 0.74  # thickness of the layer of surface atoms [d_nn]: for fcc, 0.48 a
 _WIDEST = 10  # largest neighbourhood [d_nn]: 6,000 atoms each; larger ones do not fit into memory
 _MAX_CELLS = 5e8  # neighbourhoods in the bounding box of all atoms: 2 GB for the neighbour grid
 _CLOSEST = 0.7  # [d_nn]: of two atoms of different lattices that are closer, one is left out
+_FARTHEST = 1e6  # [nm]: a coordinate beyond 1 mm is a wrong unit
 _SAMPLE = 10_000  # atoms whose nearest neighbour distance is measured
 _SHAPE_SETTINGS = (
     "apex_radius",
@@ -61,7 +67,7 @@ class Tip:
     apex_radius : float
         Radius R of the cap [nm].
     axis : sequence of float
-        Crystal direction along +z, of integers or any other numbers, see `lattice.rotation_to_axis`.
+        Crystal direction along +z, of integers or any other numbers, see `specimen.lattice.rotation_to_axis`.
     shank_angle : float
         Half the opening angle of the shank [degrees], >= 0 and < 45.
     shank_length : float, optional
@@ -87,7 +93,7 @@ class Tip:
     phases : sequence of Phase, optional
         Phases instead of `material` and `solutes`, the matrix first. Where several are, the last one is. Of two atoms
         of different lattices that are closer than 0.7 nearest neighbour distances, that of the earlier phase is left
-        out.
+        out. A phase without atoms, such as one outside the specimen, causes a warning.
 
     Attributes
     ----------
@@ -170,6 +176,7 @@ class Tip:
         check_memory(self._shell.volume() * density, shape.volume(_LAYER * d) * density)
 
         self.positions, species, self._phase = self._atoms(arrangement)
+        self._warn_of_empty_phases(arrangement)
         self._has_gaps = len(arrangement.lattices) > 1 or any(phase.vacancies for phase in self.phases)
         self._set_flags()
         self._set_elements(arrangement.elements, species)
@@ -189,13 +196,12 @@ class Tip:
             "seed": None if seed is None else int(seed),
         }
         if phases is None:
-            alloy = [[asdict(solute), fraction] for solute, fraction in self.phases[0].solutes.items()]
-            self.settings = {"material": asdict(host), **common, "solutes": alloy}
+            self.settings = {"material": to_plain(host), **common, "solutes": to_plain(self.phases[0].solutes)}
         else:
             self.settings = {
                 **common,
-                "phases": [phase.settings() for phase in self.phases],
-                "elements": [asdict(element) for element in self.elements],
+                "phases": to_plain(self.phases),
+                "elements": to_plain(self.elements),
             }
 
     def _atoms(self, arrangement):
@@ -232,6 +238,17 @@ class Tip:
         phase = (label // n_species).astype(np.int8) if len(self.phases) > 1 else None
         return places, label % n_species, phase
 
+    def _warn_of_empty_phases(self, arrangement):
+        for number, phase in enumerate(self.phases if len(self.phases) > 1 else ()):
+            is_void = phase.vacancies == 1
+            if not (arrangement.has_sites[number] if is_void else (self._phase == number).any()):
+                warnings.warn(
+                    f"phase {phase.name} has no {'sites' if is_void else 'atoms'}: its region is outside the specimen, "
+                    "covered by later phases, or too small",
+                    DataWarning,
+                    stacklevel=3,
+                )
+
     def _without_overlap(self, positions, phases):
         """Which atoms of each lattice remain: without those too close to an atom of a later phase on another one."""
         distances = np.array([each.nearest_neighbour_distance for each in self.criteria])
@@ -257,7 +274,7 @@ class Tip:
         neighbour_radius: float | None = None,
         surface_threshold: float | None = None,
         potential_point: ArrayLike | None = None,
-    ) -> "Tip":
+    ) -> Tip:
         """Make a tip from any arrangement of atoms, with its axis along +z.
 
         Parameters
@@ -284,7 +301,12 @@ class Tip:
         Raises
         ------
         ValueError
-            If shapes disagree, if an index has no element, or if two atoms are at the same place.
+            If shapes disagree, if an index has no element, or if atoms are at the same place or far away.
+
+        Warns
+        -----
+        SpecimenWarning
+            If the specimen stands upside down or lies on its side.
         """
         tip = cls.__new__(cls)
         tip._shell, tip._phase, tip._has_gaps, tip.phases = None, None, False, ()  # type: ignore[assignment]
@@ -292,6 +314,9 @@ class Tip:
         n = len(tip.positions)
         if n < 2:
             raise ValueError(f"positions must contain at least 2 atoms, got {n}")
+        farthest = float(np.abs(tip.positions).max())
+        if farthest > _FARTHEST:
+            raise ValueError(f"positions must be at most {_FARTHEST:g} nm from the origin, got {farthest:.4g} nm")
         elements = check_sequence(elements, "elements", "materials, such as ('Ni',)")
         if not elements:
             raise ValueError("elements must contain at least one material, got none")
@@ -326,6 +351,7 @@ class Tip:
                 f"{span[2]:.4g} nm: is one atom far away?"
             )
         tip.apex = float(high[2])
+        posture.warn_if_odd(tip.positions)
         if evaporable is None:
             evaporable = tip.positions[:, 2] >= (low[2] + high[2]) / 2
         tip.evaporable = check_array(evaporable, "evaporable", (n,), dtype=bool).copy()
@@ -337,7 +363,7 @@ class Tip:
         tip.settings = {
             "atoms": n,
             "sha256": digest(tip.positions, tip.species, tip.evaporable),
-            "elements": [asdict(element) for element in tip.elements],
+            "elements": to_plain(tip.elements),
             "neighbour_radius": tip.neighbour_radius,
             "surface_threshold": tip.surface_threshold,
             "potential_point": tip.potential_point.tolist(),
@@ -345,7 +371,7 @@ class Tip:
         return tip
 
     @classmethod
-    def from_atoms(cls, atoms: Any, materials: Mapping[str, Material] | None = None, **options: Any) -> "Tip":
+    def from_atoms(cls, atoms: Any, materials: Mapping[str, Material] | None = None, **options: Any) -> Tip:
         """Make a tip from an ASE Atoms object, with its axis along +z.
 
         Parameters
@@ -375,7 +401,7 @@ class Tip:
         return ase_atoms.to_atoms(self.positions, self.elements, self.species, **arrays)
 
     @classmethod
-    def from_settings(cls, settings: Mapping[str, Any]) -> "Tip":
+    def from_settings(cls, settings: Mapping[str, Any]) -> Tip:
         """Rebuild a tip from its `settings`; not possible for a tip made from positions.
 
         Raises
@@ -393,11 +419,10 @@ class Tip:
             )
         try:
             if "phases" in settings:
-                settings["phases"] = [phase_from_settings(phase) for phase in settings["phases"]]
+                settings["phases"] = [from_plain(phase, Phase, what="phase") for phase in settings["phases"]]
             else:
-                settings["material"] = Material(**settings["material"])
-                solutes = settings.get("solutes") or ()
-                settings["solutes"] = {Material(**solute): fraction for solute, fraction in solutes}
+                settings["material"] = as_material(settings["material"])
+                settings["solutes"] = {as_material(each): fraction for each, fraction in settings["solutes"] or ()}
             return cls(**settings)
         except (KeyError, TypeError) as error:
             raise ValueError(f"settings must be those of a tip, got {short_text(settings)}: {error}") from error
@@ -487,7 +512,7 @@ class Tip:
             return None
         return self._shell.shape.signed_distance(self.positions) >= -self.neighbour_radius
 
-    def deepened(self, by: float | None = None) -> "Tip":
+    def deepened(self, by: float | None = None) -> Tip:
         """Return this tip with a thicker shell.
 
         Parameters

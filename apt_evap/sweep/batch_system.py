@@ -9,9 +9,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from apt_evap._common.files import FileError, read_small_file, replace_file
+from apt_evap._common.files import FileError, read_small_file
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_choice
+from apt_evap.sweep.files import unlinked, write
 from apt_evap.sweep.plan import Sweep
 
 _MARGIN = 1.3  # of the memory: its foresight is within 30 %
@@ -20,6 +21,7 @@ _UNKNOWN_MEMORY = 4_000  # [MB], of specimens whose size is not foreseen
 _DEFAULT_HOURS = 24.0
 _MAX_ARRAY = 1_000  # tasks of an array, where the system does not tell: the default of Slurm is 1,001
 _MAX_BYTES = 1 << 20
+_JOBS = "jobs"
 
 SLURM = """\
 #!/bin/bash
@@ -31,7 +33,7 @@ SLURM = """\
 #SBATCH --signal=B:TERM@120
 #SBATCH --requeue
 #SBATCH --open-mode=append
-#SBATCH --output="@FOLDER@/jobs/%A_%a.log"
+#SBATCH --output=@LOG@
 @OPTIONS@
 KEYS=(@KEYS@)
 exec @COMMAND@ --point "${KEYS[$SLURM_ARRAY_TASK_ID]}"
@@ -44,7 +46,7 @@ PBS = """\
 #PBS -l walltime=@TIME@
 #PBS -r y
 #PBS -j oe
-#PBS -o @FOLDER@/jobs/
+#PBS -o @LOG@
 @OPTIONS@
 KEYS=(@KEYS@)
 exec @COMMAND@ --point "${KEYS[${PBS_ARRAY_INDEX:-0}]}"
@@ -63,16 +65,23 @@ class BatchSystem:
         Command that submits a script; the name of the script is added.
     directive : str
         Beginning of a line with an option.
+    log : str
+        Log files of the tasks, with "{}" for their folder.
+    forbidden : str
+        Regular expression of characters that the name of the folder of a log cannot contain.
     """
 
     template: str
     submit: tuple[str, ...]
     directive: str
+    log: str
+    forbidden: str
 
 
 SYSTEMS = {
-    "slurm": BatchSystem(SLURM, ("sbatch", "--parsable"), "#SBATCH"),
-    "pbs": BatchSystem(PBS, ("qsub",), "#PBS"),
+    # Slurm reads quotes as a shell does, but no symbols such as %A after a backslash (seen with 22.05)
+    "slurm": BatchSystem(SLURM, ("sbatch", "--parsable"), "#SBATCH", '"{}/%A_%a.log"', r"[\"\\]"),
+    "pbs": BatchSystem(PBS, ("qsub",), "#PBS", "{}/", r"[^\w/.+-]"),
 }
 
 
@@ -90,8 +99,9 @@ def scripts(
 
     Placeholders of a template: ``@KEYS@`` (the keys of the points, separated by spaces), ``@COUNT@``, ``@LAST@`` (their
     number less 1), ``@COMMAND@`` (to which ``--point KEY`` is added), ``@THREADS@``, ``@MEMORY@`` [MB], ``@TIME@``
-    (hours:minutes:seconds), ``@HOURS@``, ``@NAME@``, ``@FOLDER@``, ``@OPTIONS@``, ``@PARALLEL@`` (%N for Slurm),
-    ``@ARRAY@`` (the line of an array for PBS).
+    (hours:minutes:seconds), ``@HOURS@``, ``@NAME@``, ``@FOLDER@`` (quoted for the shell if necessary), ``@LOG@`` (of
+    the tasks, for an option of the batch system), ``@OPTIONS@``, ``@PARALLEL@`` (%N for Slurm), ``@ARRAY@`` (the line
+    of an array for PBS).
 
     Parameters
     ----------
@@ -117,7 +127,8 @@ def scripts(
     Raises
     ------
     ValueError
-        If the template cannot be read or has an unknown placeholder.
+        If the template cannot be read or has an unknown placeholder, or the batch system has no quotes for a character
+        in the name of the folder.
     """
     system = SYSTEMS[check_choice(scheduler, "scheduler", SYSTEMS)]
     text = system.template
@@ -126,14 +137,13 @@ def scripts(
     texts = []
     for first in range(0, len(keys), largest):
         values = _values(sweep, keys[first : first + largest], system, options, at_once)
-        unknown = sorted(set(re.findall(r"@([A-Z]+)@", text)) - set(values))
-        if unknown:
+        parts = re.split(r"@([A-Z]+)@", text)  # not one after the other: a value may contain the name of a placeholder
+        if unknown := sorted(set(parts[1::2]) - set(values)):
             known = ", ".join(f"@{name}@" for name in values)
             raise ValueError(f"{str(template)!r} has the unknown placeholder @{unknown[0]}@; known are {known}")
-        filled = text
-        for name, value in values.items():
-            filled = filled.replace(f"@{name}@", value)
-        texts.append("\n".join(line for line in filled.splitlines() if line) + "\n")
+        parts[1::2] = [values[name] for name in parts[1::2]]
+        filled = "".join(parts)
+        texts.append("\n".join(line for line in filled.split("\n") if line) + "\n")
     return texts
 
 
@@ -144,6 +154,11 @@ def _values(sweep, keys, system, options, at_once):
     hours = sweep.each.hours or _DEFAULT_HOURS
     seconds = round(3600 * hours)
     last = len(keys) - 1
+    logs = str(sweep.folder / _JOBS)
+    if wrong := re.search(system.forbidden, logs):
+        raise ValueError(
+            f"the folder of a sweep must have no {wrong[0]!r} in its name for this batch system, got {logs!r}"
+        )
     return {
         "KEYS": " ".join(keys),
         "COUNT": str(len(keys)),
@@ -156,7 +171,8 @@ def _values(sweep, keys, system, options, at_once):
         "TIME": f"{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}",
         "HOURS": f"{hours:g}",
         "NAME": re.sub(r"[^A-Za-z0-9_.-]", "_", sweep.folder.name)[:15],  # PBS takes at most 15 characters
-        "FOLDER": str(sweep.folder),
+        "FOLDER": shlex.quote(str(sweep.folder)),
+        "LOG": system.log.format(logs.replace("%", "%%")),
         "OPTIONS": "\n".join(f"{system.directive} {option}" for option in options),
         "PARALLEL": "" if at_once is None else f"%{at_once}",
         "ARRAY": f"#PBS -J 0-{last}" if last else "",  # an array of one task is refused
@@ -188,14 +204,13 @@ def submit(sweep: Sweep, texts: Sequence[str], scheduler: str, command: str | No
         If a file cannot be written, or the batch system refuses a script.
     """
     words = SYSTEMS[scheduler].submit if command is None else tuple(shlex.split(command))
-    folder = sweep.folder / "jobs"
+    folder = unlinked(sweep.folder / _JOBS)
     folder.mkdir(exist_ok=True)
     answers = []
     for text in texts:
-        numbers = [int(path.stem) for path in folder.glob("*.sh") if path.stem.isdigit()]
+        numbers = [int(path.stem) for path in folder.glob("*.sh") if path.stem.isdecimal()]
         path = folder / f"{max(numbers, default=0) + 1:04d}.sh"
-        with replace_file(path) as file:
-            file.write(text.encode())
+        write(path, text)
         try:
             done = subprocess.run([*words, str(path)], capture_output=True, text=True, check=False)
         except OSError as error:

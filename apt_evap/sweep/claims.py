@@ -8,12 +8,18 @@ missing (some network file systems of clusters), two processes still never work 
 While the owner works, it touches its file. When it ends, it writes 0001.end.json with the exit code. A claim without
 end is lost if its owner is dead. On the machine of the owner this is known from the process, elsewhere from the age of
 the file, measured with the clock of the file system. An owner that was suspended for longer finds the next claim, and
-ends its run.
+ends its run. A claim that cannot be read has an unknown owner, who may be elsewhere. An end that cannot be read is that
+of a killed owner.
+
+The lock of a run (`apt_evap.simulation.checkpoint`) protects its file on one machine. It does not replace a claim:
+between machines it may be missing, also without an error (if each node has locks of its own); it is taken seconds after
+the start of the program; and the try of the loser would count as failed.
 """
 
 import datetime
 import json
 import os
+import re
 import secrets
 import socket
 import time
@@ -21,9 +27,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from apt_evap._common.files import FileError, flush_folder, read_small_file, replace_file
+from apt_evap._common.files import FileError, flush_folder, read_small_file
 from apt_evap._common.processes import birth, machine
 from apt_evap._version import __version__
+from apt_evap.sweep.files import unlinked, write
 
 HEARTBEAT = 30.0
 """Time between two touches of a claim [s]."""
@@ -32,6 +39,12 @@ LOST_AFTER = 600.0
 a file server may be away for minutes."""
 _MAX_BYTES = 1 << 20
 _FOLDER = "claims"
+_NAME = re.compile(r"([0-9]{4,})\.json")
+_OWNER: dict[str, tuple[type, ...]] = dict.fromkeys(("host", "machine", "birth", "job", "version", "began"), (str,))
+_OWNER |= dict.fromkeys(("pid", "restarts", "ions"), (int,))
+_END = {"code": (int,), "ended": (str,), "seconds": (int, float), "ions": (int,), "message": (str,)}
+_LARGEST = 1 << 31  # of a number in a claim: process numbers are below it
+_KILLED = {"code": -9, "ended": "", "seconds": 0.0, "ions": 0, "message": ""}
 _JOB_IDS = ("SLURM_ARRAY_JOB_ID", "SLURM_JOB_ID", "PBS_JOBID", "LSB_JOBID", "JOB_ID")
 _TASK_IDS = ("SLURM_ARRAY_TASK_ID", "PBS_ARRAY_INDEX", "LSB_JOBINDEX")
 
@@ -71,10 +84,15 @@ class Claims:
     ----------
     folder : Path
         Folder of the point.
+
+    Raises
+    ------
+    FileError
+        If the folder of the claims is a link.
     """
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder / _FOLDER
+        self.folder = unlinked(folder / _FOLDER)
 
     def all(self) -> list[Claim]:
         """All claims, in their order, list of Claim."""
@@ -84,14 +102,15 @@ class Claims:
             return []
         except OSError as error:
             raise FileError(f"cannot read {str(self.folder)!r}: {error.strerror}") from error
-        numbers = sorted(int(name[:-5]) for name in names if name[:-5].isdigit() and name.endswith(".json"))
+        numbers = {int(match[1]) for name in names if (match := _NAME.fullmatch(name))}
         return [
             Claim(
                 number,
-                _content(self._path(number)) or {},
-                _content(self._end(number)) if self._end(number).name in names else None,
+                _read(self._path(number), _OWNER) or {},
+                (_read(self._end(number), _END) or _KILLED) if self._end(number).name in names else None,
             )
-            for number in numbers
+            for number in sorted(numbers)
+            if self._path(number).name in names
         ]
 
     def is_held(self, claim: Claim) -> bool:
@@ -102,7 +121,7 @@ class Claims:
         if owner and owner["job"] and owner["job"] == job() and owner["restarts"] < restarts():
             return False  # the batch system has started this job again, because its node failed or was needed
         try:
-            return self._now() - self._path(claim.number).stat().st_mtime < LOST_AFTER
+            return abs(self._now() - self._path(claim.number).lstat().st_mtime) < LOST_AFTER
         except OSError:
             return True  # the file system is away: not known, so the point stays with its owner
 
@@ -157,8 +176,7 @@ class Claims:
     def end(self, claim: Claim, **end: Any) -> Claim:
         """Write the end of a claim; the point is free afterwards."""
         end["ended"] = now()
-        with replace_file(self._end(claim.number)) as file:
-            file.write(json.dumps(end, indent=1).encode())
+        write(self._end(claim.number), json.dumps(end, indent=1))
         return Claim(claim.number, claim.owner, end)
 
     def _path(self, number):
@@ -181,13 +199,21 @@ class Claims:
             probe.unlink()
 
 
-def _content(path):
-    """Content of a file of a claim; None if it is not written yet, as just after its creation."""
+def _read(path, kinds):
+    """Content of a file of a claim; None if it has other keys or types, or is not written yet."""
     try:
         content = json.loads(read_small_file(path, _MAX_BYTES, "a claim"))
-    except (FileError, ValueError):
+        values = {name: content[name] for name in kinds}
+    except (FileError, ValueError, KeyError, TypeError, RecursionError):
         return None
-    return content if isinstance(content, dict) else None
+    for name, value in values.items():
+        if type(value) not in kinds[name]:
+            return None
+        if isinstance(value, str):  # it is printed
+            values[name] = "".join(letter if letter.isprintable() else " " for letter in value)
+        elif not -_LARGEST < value < _LARGEST:
+            return None
+    return values
 
 
 def job() -> str:

@@ -14,16 +14,15 @@ import h5py
 import numpy as np
 
 from apt_evap import report
-from apt_evap._common.files import replace_file
+from apt_evap._common.files import FileError, replace_file, sha256_of
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_count
 from apt_evap._version import __version__
-from apt_evap.config.simulation_file import config_of
-from apt_evap.detection.detector_map import DetectorMap
-from apt_evap.emission.perturbations import to_dict
+from apt_evap.emission.perturbations import described
 from apt_evap.energy_fit.fit_tips import TipFit, fit_tips
 from apt_evap.simulation.run import load
-from apt_evap.sweep.plan import RUN, SETTINGS, Sweep, csv_value
+from apt_evap.sweep.files import unlinked, write
+from apt_evap.sweep.plan import RUN, PointState, Sweep, csv_value
 
 INDEX, MAPS, FIT_TABLE, FIT, REPORT = "index.csv", "maps.h5", "fit.csv", "fit.json", "report.html"
 """Files of a collection."""
@@ -47,6 +46,9 @@ def collect(
     ``fit.json`` (see `fit_tips`) to the folder of the sweep. ``report.html`` has all of this on one page, with the maps
     of the points that fit best (see `report.write_sweep`).
 
+    Only runs of the settings of their points are collected. A point whose run cannot be read, or is that of another
+    point, is "damaged" or "foreign" in the tables, with the reason.
+
     Parameters
     ----------
     sweep : Sweep
@@ -65,7 +67,8 @@ def collect(
     Returns
     -------
     dict
-        points, done (numbers), files (list of str), fit (`TipFit` or None).
+        points, done (numbers), wrong (reasons by key of damaged and foreign points), files (list of str),
+        fit (`TipFit` or None).
 
     Raises
     ------
@@ -77,27 +80,47 @@ def collect(
     if bins is not None:
         check_count(bins, "bins", at_least=1)
     states = {point.key: state for point, state in sweep.states()}
-    done = [point for point in sweep.points if states[point.key].name == "done"]
-    rows, files = {}, []
-    target = Path(maps) if maps is not None else sweep.folder / MAPS
+    rows: dict[str, dict[str, Any]] = {}
+    for key, state in states.items():
+        if state.name == "done":
+            states[key], row = _read(sweep, key, state)
+            rows |= {key: row} if states[key].name == "done" else {}
+    done, fit = list(rows), None
+    note(f"{len(done):,} of {len(sweep.points):,} points are done")
+    _write_index(sweep, states, rows)
+    files = [str(sweep.folder / INDEX)]
     if done:
-        rows = write_maps(sweep, [point.key for point in done], target, bins)
+        target = Path(maps) if maps is not None else unlinked(sweep.folder / MAPS)
+        write_maps(sweep, done, target, bins)
         files.append(str(target))
-        note(f"{len(done):,} of {len(sweep.points):,} points are done")
-    fit = None
     if compare and sweep.compare is not None and done:
         note(f"comparing {len(done):,} runs with {sweep.compare.measured}")
-        fit = _compare(sweep, [point.key for point in done])
+        fit = _compare(sweep, done)
         files += [str(sweep.folder / name) for name in (FIT_TABLE, FIT)]
-    _write_index(sweep, states, rows)
     if done:
         _write_report(sweep, states, rows, fit, command)
         files.append(str(sweep.folder / REPORT))
-    return {
-        "points": len(sweep.points),
-        "done": len(done),
-        "files": [str(sweep.folder / INDEX), *files],
-        "fit": fit,
+    wrong = {key: state.message for key, state in states.items() if state.name in ("damaged", "foreign")}
+    return {"points": len(sweep.points), "done": len(done), "wrong": wrong, "files": files, "fit": fit}
+
+
+def _read(sweep, key, state):
+    """State of a finished point after its run was read completely, and its row."""
+    path = sweep.folder_of(key) / RUN
+    try:
+        run = load(path)
+    except FileError as error:
+        return PointState("damaged", state.claims, str(error)), {}
+    if run.provenance.get("settings") != key:
+        return PointState("foreign", state.claims, f"{str(path)!r} is the run of other settings"), {}
+    systems = run.provenance.get("systems") or [{}]
+    return state, {
+        "ions": len(run),
+        "ended": run.ended or "as planned",
+        "version": run.provenance.get("version", ""),
+        "created": run.provenance.get("created", ""),
+        "processor": "; ".join(dict.fromkeys(each.get("processor", "") for each in systems)),
+        "fingerprint": run.fingerprint(),
     }
 
 
@@ -110,7 +133,7 @@ def _write_index(sweep, states, rows):
         values = [csv_value(sweep.value(point, path)) for path in sweep.paths]
         of_run = [row.get(name, "") for name in ("ions", *_OF_RUN)]
         table.writerow([point.key, *values, state.name, state.tries, state.message, *of_run])
-    _replace(sweep.folder / INDEX, text.getvalue())
+    write(sweep.folder / INDEX, text.getvalue())
 
 
 def _write_report(sweep, states, rows, fit, command):
@@ -136,10 +159,11 @@ def _write_report(sweep, states, rows, fit, command):
     files = [sweep.folder / INDEX]
     if fit is not None:
         files.append(sweep.compare.measured)
-    report.write_sweep(points, sweep.folder / REPORT, title=f"Sweep {sweep.folder.name}", files=files, command=command)
+    target = unlinked(sweep.folder / REPORT)
+    report.write_sweep(points, target, title=f"Sweep {sweep.folder.name}", files=files, command=command)
 
 
-def write_maps(sweep: Sweep, keys: list[str], path: AnyPath, bins: int | None = None) -> dict[str, dict[str, Any]]:
+def write_maps(sweep: Sweep, keys: list[str], path: AnyPath, bins: int | None = None) -> None:
     """Write the maps of runs to one rectangular HDF5 file, which xarray and other readers of netCDF-4 open.
 
     The dimensions of ``maps`` are point, perturbation, y and x; its values are hits per bin, on the same bins for all
@@ -158,24 +182,15 @@ def write_maps(sweep: Sweep, keys: list[str], path: AnyPath, bins: int | None = 
     bins : int, optional
         As for `collect`.
 
-    Returns
-    -------
-    dict
-        For each key: ions, ended, version, created, processor, fingerprint.
-
     Raises
     ------
     FileError
         If a file cannot be read or written.
     """
-    points = {point.key: point for point in sweep.points}
-    configs = [config_of(points[key].document, sweep.folder_of(key) / SETTINGS) for key in keys]
+    configs = [sweep.config_of(key) for key in keys]
     panels = configs[0].maps.panels
     bins = bins or configs[0].maps.bins or DEFAULT_BINS
-    half = max(config.detector.width for config in configs) / 2  # of the largest detector
-    edges = np.linspace(-half, half, bins + 1)
-    grid = DetectorMap.from_array(np.ones((bins, bins)), edges, edges)
-    rows = {}
+    grid = max((config.detector for config in configs), key=lambda detector: detector.width).grid(bins)
     with replace_file(path) as target, h5py.File(target, "w") as file:
         file.attrs["made_by"] = f"apt_evap {__version__}"
         file.attrs["sweep"] = sweep.folder.name
@@ -189,21 +204,12 @@ def write_maps(sweep: Sweep, keys: list[str], path: AnyPath, bins: int | None = 
             for column, panel in enumerate(panels):
                 hits = run.hits(panel.perturbation)
                 counts[row, column] = hits.map(like=grid, quantum=None).values if hits.detected.any() else 0
-            systems = run.provenance.get("systems") or [{}]
-            rows[key] = {
-                "ions": len(run),
-                "ended": run.ended or "as planned",
-                "version": run.provenance.get("version", ""),
-                "created": run.provenance.get("created", ""),
-                "processor": "; ".join(dict.fromkeys(each.get("processor", "") for each in systems)),
-                "fingerprint": run.fingerprint(),
-            }
-        centres = (edges[1:] + edges[:-1]) / 2
         # dimensions are scales of their own name, as in netCDF-4
         _put(file, "point", np.arange(len(keys)))
-        _put(file, "perturbation", [json.dumps(to_dict(panel.perturbation)) for panel in panels])
+        _put(file, "perturbation", [json.dumps(described(panel.perturbation)) for panel in panels])
+        edges = grid.x_edges
         for axis in ("y", "x"):
-            _put(file, axis, centres, "mm")
+            _put(file, axis, (edges[1:] + edges[:-1]) / 2, "mm")
         for axis, name in enumerate(("point", "perturbation", "y", "x")):
             file[name].make_scale(name)
             counts.dims[axis].attach_scale(file[name])
@@ -212,11 +218,10 @@ def write_maps(sweep: Sweep, keys: list[str], path: AnyPath, bins: int | None = 
         _put(file, "title", [panel.title for panel in panels]).dims[0].attach_scale(file["perturbation"])
         columns = {"key": keys, "ions": ions}
         for path_of_setting in sweep.paths:
-            values = [sweep.value(points[key], path_of_setting) for key in keys]
+            values = [sweep.value(sweep.by_key[key], path_of_setting) for key in keys]
             columns[path_of_setting.replace(".", "_")] = _column(values)
         for name, values in columns.items():
             _put(file, name, values).dims[0].attach_scale(file["point"])
-    return rows
 
 
 def _column(values):
@@ -238,34 +243,27 @@ def _put(file, name, values, units=None):
 def _compare(sweep: Sweep, keys: list[str]) -> TipFit:
     """Compare the runs of points with the measured map; write the tables."""
     settings: Any = sweep.compare
-    fit = fit_tips(
-        {key: sweep.folder_of(key) / RUN for key in keys}, settings.read(), progress=False, **settings.options
-    )
-    points = {point.key: point for point in sweep.points}
+    runs = {key: sweep.folder_of(key) / RUN for key in keys}
+    fit = fit_tips(runs, settings.read(), settings.grid, settings.settings, progress=False)
     text = io.StringIO()
     table, rows = csv.writer(text, lineterminator="\n"), fit.rows()
     table.writerow(["key", *sweep.paths, *list(rows[0])[1:]])
     for row in rows:
-        values = [csv_value(sweep.value(points[row["run"]], path)) for path in sweep.paths]
+        values = [csv_value(sweep.value(sweep.by_key[row["run"]], path)) for path in sweep.paths]
         table.writerow([row["run"], *values, *(_cell(value) for value in list(row.values())[1:])])
-    _replace(sweep.folder / FIT_TABLE, text.getvalue())
+    write(sweep.folder / FIT_TABLE, text.getvalue())
     content = {
         "made_by": f"apt_evap {__version__}",
-        "compare": settings.to_dict() | {"sha256": settings.sha256()},
+        "compare": settings.to_table() | {"sha256": sha256_of(settings.measured)},
         "best": fit.best,
-        "settings_of_best": points[fit.best].values,
+        "settings_of_best": sweep.by_key[fit.best].values,
         "failed": fit.failed,
         "table": rows,
         "studies": {key: study.to_dict() for key, study in fit.studies.items()},
     }
-    _replace(sweep.folder / FIT, json.dumps(content, indent=1, allow_nan=False) + "\n")
+    write(sweep.folder / FIT, json.dumps(content, indent=1, allow_nan=False) + "\n")
     return fit
 
 
 def _cell(value):
     return "" if value is None else f"{value:.6g}" if isinstance(value, float) else value
-
-
-def _replace(path: Path, text: str) -> None:
-    with replace_file(path) as file:
-        file.write(text.encode())

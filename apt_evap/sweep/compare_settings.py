@@ -1,33 +1,20 @@
 """The table [compare] of a study file: a measured map, and how the runs are compared with it."""
 
-import hashlib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from apt_evap._common.files import FileError, open_for_reading
-from apt_evap._common.validation import check_choice, check_count, short_text
-from apt_evap.config.tables import check_keys
+from apt_evap._common.codec import declared, from_plain, to_plain
+from apt_evap._common.files import FileError, check_path
+from apt_evap._common.validation import check_number, short_text
+from apt_evap.config.tables import check_keys, check_table
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
-from apt_evap.energy_fit.defaults import MECHANISMS
 from apt_evap.energy_fit.grid import EnergyGrid
+from apt_evap.energy_fit.settings import FitSettings
 from apt_evap.io.formats import read
 
-_OPTIONS = (
-    "mechanism",
-    "means",
-    "rsds",
-    "rollup_fractions",
-    "bins",
-    "smoothing",
-    "flattening",
-    "temperature",
-    "replicas",
-    "resamples",
-    "seed",
-)
 _READING = ("format", "byte_order", "unit")
 
 
@@ -39,8 +26,10 @@ class CompareSettings:
     ----------
     measured : str
         Measured ions (.epos, ...) or a map (.npz).
-    options : dict
-        Parameters of `fit_tips`.
+    grid : EnergyGrid
+        Mechanism and energies.
+    settings : FitSettings
+        Bins, smoothing, draws and resamples.
     reading : dict
         Parameters of `read`: format, byte_order, unit.
     select : dict
@@ -48,7 +37,8 @@ class CompareSettings:
     """
 
     measured: str
-    options: dict
+    grid: EnergyGrid
+    settings: FitSettings
     reading: dict
     select: dict
 
@@ -56,33 +46,41 @@ class CompareSettings:
     def of(cls, table: Mapping[str, Any], folder: Path) -> "CompareSettings":
         """Settings from the table [compare]; a relative name of a file is relative to `folder`.
 
+        Its keys are measured, select, those of `EnergyGrid` and `FitSettings`, and format, byte_order and unit.
+
         Raises
         ------
         ValueError
-            If a key is unknown, the file does not exist, or a value is wrong.
+            If a key is unknown, or a value is wrong.
         """
-        check_keys(table, ("measured", "select", *_OPTIONS, *_READING), ("measured",))
+        kinds = {"grid": EnergyGrid, "settings": FitSettings}
+        known = [name for kind in kinds.values() for name in declared(kind)]
+        check_keys(table, ("measured", "select", *known, *_READING), ("measured",))
         name = table["measured"]
-        if not isinstance(name, str) or not (folder / name).is_file():
-            raise ValueError(f"[compare] measured must be an existing file, got {short_text(name)}")
-        options = {key: table[key] for key in _OPTIONS if key in table}
-        check_choice(options.get("mechanism", "roll-up"), "[compare] mechanism", MECHANISMS)
-        EnergyGrid(
-            options.get("mechanism", "roll-up"),
-            **{key: options[key] for key in ("means", "rsds", "rollup_fractions") if key in options},
-        )
-        if "resamples" in options:
-            check_count(options["resamples"], "[compare] resamples")
+        if not isinstance(name, str) or not name:
+            raise ValueError(f"[compare] measured must be a file name, got {short_text(name)}")
+        parts = {
+            part: from_plain({key: table[key] for key in declared(kind) if key in table}, kind, what="[compare]")
+            for part, kind in kinds.items()
+        }
         reading = {key: table[key] for key in _READING if key in table}
+        for key, value in reading.items():
+            if not isinstance(value, str):
+                raise ValueError(f"[compare] {key} must be a text, got {short_text(value)}")
+        check_table(table.get("select", {}), "[compare] select")
         select = dict(table.get("select", {}))
         for column, bounds in select.items():
             if not isinstance(bounds, list) or len(bounds) != 2:
                 raise ValueError(f"[compare] select.{column} must be two bounds, got {short_text(bounds)}")
-        return cls(str((folder / name).resolve()), options, reading, select)
+            for bound in bounds:
+                check_number(bound, f"[compare] select.{column}")
+        return cls(str(check_path(folder / name).resolve()), reading=reading, select=select, **parts)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the settings in plain types, dict."""
-        return asdict(self)
+    def to_table(self) -> dict[str, Any]:
+        """Return the table, dict."""
+        own = to_plain(self.grid, short=True) | to_plain(self.settings, short=True)
+        del own["name"]
+        return {"measured": self.measured, "select": self.select, **own, **self.reading}
 
     def read(self) -> Hits | DetectorMap:
         """Measured ions or map; FileError if the file cannot be read or contains neither."""
@@ -92,11 +90,3 @@ class CompareSettings:
         if not isinstance(content, Hits):
             raise FileError(f"{self.measured!r} must contain measured ions or a map, got a run")
         return content.window(**{column: tuple(bounds) for column, bounds in self.select.items()})
-
-    def sha256(self) -> str:
-        """Hash of the measured file."""
-        hashed = hashlib.sha256()
-        with open_for_reading(self.measured) as file:
-            while block := file.read(1 << 20):
-                hashed.update(block)
-        return hashed.hexdigest()

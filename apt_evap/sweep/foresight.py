@@ -1,9 +1,8 @@
 """Memory and hours that the run of a point needs, before it starts."""
 
 import math
-from dataclasses import asdict, dataclass
-from typing import Any
 
+from apt_evap._common.codec import count, number, settings
 from apt_evap._common.memory import copied_memory, needed_memory
 from apt_evap.config.simulation_file import Config
 from apt_evap.specimen.tip import foreseen_atoms
@@ -26,31 +25,33 @@ _START = 2 * 3e-5  # seconds per surface atom, from the same table
 _START_OF_PROGRAM = 3.0  # seconds, with the pictures of the maps
 
 
-@dataclass(frozen=True)
+@settings
 class Foresight:
-    """What a run needs.
+    """Foreseen needs of a run.
 
-    Parameters
-    ----------
-    ions : int
-        Requested number.
-    atoms, surface_atoms : float or None
-        Approximate numbers; None if the specimen is not a tip of this package's own shape.
-    memory : float or None
-        Peak memory [bytes], within about 30 %.
-    hours : float or None
-        Time of one thread [h], within a factor of 3; finished points correct it (`status`).
+    Approximate numbers; None if the specimen is not a tip of this package's own shape.
     """
 
-    ions: int
-    atoms: float | None
-    surface_atoms: float | None
-    memory: float | None
-    hours: float | None
+    ions: int = count("Atoms to evaporate.", at_least=1)
+    atoms: float | None = number("Atoms in memory.", default=None, at_least=0)
+    surface_atoms: float | None = number("Atoms on the surface.", default=None, at_least=0)
+    memory: float | None = number("Peak memory, within about 30 %.", default=None, at_least=0, unit="bytes")
+    hours: float | None = number(
+        "Time of one thread, within a factor of 3; finished points correct it (`status`).",
+        default=None,
+        at_least=0,
+        unit="h",
+    )
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the numbers, dict."""
-        return asdict(self)
+    def __str__(self) -> str:
+        if self.memory is None or self.hours is None:
+            return f"{self.ions:,} ions"
+        return f"{self.ions:,} ions of {self.atoms:.2g} atoms, {self.memory / 1e9:.2g} GB, {hours_text(self.hours)}"
+
+
+def hours_text(hours: float) -> str:
+    """Text of a time in hours or minutes, str."""
+    return f"{hours:.2g} h" if hours >= 1 else f"{60 * hours:.2g} min"
 
 
 def foresee(config: Config, threads: int) -> Foresight:

@@ -3,9 +3,8 @@
 import statistics
 from typing import Any
 
-from apt_evap.sweep.plan import Sweep, ions_of
-
-STATES = ("done", "running", "open", "failed")
+from apt_evap.sweep.plan import STATES, Sweep, ions_of
+from apt_evap.sweep.study_file import POINTS
 
 
 def status(sweep: Sweep) -> dict[str, Any]:
@@ -26,7 +25,7 @@ def status(sweep: Sweep) -> dict[str, Any]:
     table, speeds, left, memory = [], [], [], []
     for (point, state), needs in zip(sweep.states(), sweep.foresights, strict=True):
         seconds = sum(claim.end["seconds"] for claim in state.claims if claim.end)
-        ions = needs.ions if state.name == "done" else ions_of(sweep.folder_of(point.key))
+        ions = ions_of(sweep.folder / POINTS / point.key)
         if state.name == "done" and needs.hours and all(claim.end for claim in state.claims):
             speeds.append(seconds / (3600 * needs.hours))
         if state.name in ("open", "running"):

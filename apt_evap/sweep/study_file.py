@@ -4,57 +4,51 @@ import copy
 import hashlib
 import itertools
 import json
+import os
+import unicodedata
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from apt_evap._common.files import FileError
+from apt_evap._common.codec import count, from_plain, number, settings
+from apt_evap._common.files import FileError, check_path, sha256_of
 from apt_evap._common.types import AnyPath
-from apt_evap._common.validation import check_count, check_number, short_text
-from apt_evap.config.simulation_file import Config, config_of, read_document
+from apt_evap._common.validation import short_text
+from apt_evap.config.simulation_file import Config, config_of, key_of, read_document
 from apt_evap.config.tables import check_keys, check_table
 from apt_evap.sweep.compare_settings import CompareSettings
 from apt_evap.sweep.foresight import Foresight, foresee
 
 MAX_POINTS = 100_000  # a larger product is a typing error
-_DIGITS = 12  # of a key: two of 100,000 points have the same one with a probability of 2e-5
+POINTS = "points"
+"""Folder of the points in that of a sweep."""
 _FIXED = ("output", "maps")  # not settings of the simulation
+_LINE_ENDS = ("Cc", "Zl", "Zp")  # categories of characters that end a line of a script, and other control characters
 
 
-@dataclass(frozen=True)
+@settings
 class JobSettings:
-    """How each point is run; not part of its settings.
+    """How each point is run; not part of its settings."""
 
-    Parameters
-    ----------
-    threads : int
-        Threads of a run. Two threads are 1.65 to 1.81 times as fast as one: while memory lasts, many runs of one
-        thread finish earlier.
-    checkpoint : float
-        Time between two checkpoints [min].
-    hours : float, optional
-        Time limit of a job of a batch system [h]. An interrupted run continues in the next job.
-    tries : int
-        Number of tries in succession that are killed without a new checkpoint, after which a point counts as failed.
-
-    Raises
-    ------
-    ValueError
-        If a value is outside its range.
-    """
-
-    threads: int = 1
-    checkpoint: float = 10.0
-    hours: float | None = None
-    tries: int = 3
-
-    def __post_init__(self):
-        check_count(self.threads, "threads", at_least=1)
-        check_number(self.checkpoint, "checkpoint", at_least=0, unit="min")
-        check_count(self.tries, "tries", at_least=1)
-        if self.hours is not None:
-            check_number(self.hours, "hours", above=0, unit="h")
+    threads: int = count(
+        "Threads of a run. Two threads are 1.65 to 1.81 times as fast as one: while memory lasts, many runs of one "
+        "thread finish earlier.",
+        default=1,
+        at_least=1,
+    )
+    checkpoint: float = number("Time between two checkpoints.", default=10.0, at_least=0, unit="min")
+    hours: float | None = number(
+        "Time limit of a job of a batch system. An interrupted run continues in the next job.",
+        default=None,
+        above=0,
+        unit="h",
+    )
+    tries: int = count(
+        "Number of tries in succession that are killed without a new checkpoint, after which a point counts as failed.",
+        default=3,
+        at_least=1,
+    )
 
 
 @dataclass(frozen=True)
@@ -68,7 +62,8 @@ class Point:
     values : dict
         What this point has of its own: values by path, such as ``{"tip.axis": [1, 1, 1]}``.
     document : dict
-        Complete settings, as in a file of `apt-evap run`.
+        Complete settings, as in a file of `apt-evap run`. The file of a specimen is relative to the folder of the
+        point, and has its SHA-256.
     """
 
     key: str
@@ -76,7 +71,8 @@ class Point:
     document: dict
 
     def __str__(self):
-        return ", ".join(f"{path} = {json.dumps(value)}" for path, value in self.values.items()) or "the base"
+        texts = [f"{path} = {json.dumps(value, default=str)}" for path, value in self.values.items()]
+        return ", ".join(texts) or "the base"
 
 
 @dataclass(frozen=True)
@@ -100,7 +96,7 @@ class SweepStudy:
     compare : CompareSettings or None
         Comparison with a measured map.
     sha256 : str
-        Of the bytes of both files.
+        Of the bytes of both files, and of the files of specimens.
     """
 
     path: Path
@@ -111,6 +107,23 @@ class SweepStudy:
     each: JobSettings
     compare: CompareSettings | None
     sha256: str
+
+
+def folder_of_study(path: AnyPath) -> Path:
+    """Folder of the sweep of a study file: beside it, with its name without suffix; a folder is returned as it is.
+
+    Raises
+    ------
+    FileError
+        If it is neither of both, or the name contains control characters, which would begin a new line in a script.
+    """
+    path = check_path(path)
+    if not path.is_dir() and not path.suffix:
+        raise FileError(f"{str(path)!r} is neither a study file such as 'study.toml' nor the folder of a sweep")
+    folder = path.resolve() if path.is_dir() else path.resolve().with_suffix("")
+    if any(unicodedata.category(letter) in _LINE_ENDS for letter in str(folder)):
+        raise FileError(f"the folder of a sweep must have a name without control characters, got {str(folder)!r}")
+    return folder
 
 
 def read_study(path: AnyPath) -> SweepStudy:
@@ -144,9 +157,10 @@ def read_study(path: AnyPath) -> SweepStudy:
             raise ValueError(f"base must be a file name such as 'ni111.toml', got {short_text(base)}")
         for name in ("each", "compare", "sweep"):
             check_table(table.get(name, {}), name)
-        check_keys(table.get("each", {}), tuple(item.name for item in fields(JobSettings)))
-        each = JobSettings(**table.get("each", {}))
+        each = from_plain(table.get("each", {}), JobSettings, what="[each]")
         compare = CompareSettings.of(table["compare"], path.parent) if "compare" in table else None
+        if compare is not None and not Path(compare.measured).is_file():
+            raise ValueError(f"[compare] measured must be an existing file, got {short_text(compare.measured)}")
         choices = [*_product(table.get("sweep", {})), *_single(table.get("points", []))]
         if not table.get("sweep") and not table.get("points"):
             raise ValueError("a sweep needs a table [sweep] or points [[points]], got neither")
@@ -158,28 +172,39 @@ def read_study(path: AnyPath) -> SweepStudy:
     points: dict[str, Point] = {}
     configs: list[Config] = []
     foresights: list[Foresight] = []
+    place, digests = folder_of_study(path) / POINTS / "point", {}
     for values in choices:
         try:
             document = with_values(settings, values)
+            config = config_of(document, base_path)
+            if "path" in config.tip:
+                document["tip"] = _specimen_table(document["tip"], config.tip["path"], place, digests)
             key = key_of(document)
             if key not in points:
-                config = config_of(document, base_path)
                 _check_responses(config, compare)
                 points[key] = Point(key, values, document)
                 configs.append(config)
                 foresights.append(foresee(config, each.threads))
         except ValueError as error:
             raise FileError(f"{str(path)!r}, {Point('', values, {})}: {error}") from error
-    content = hashlib.sha256(path.read_bytes() + base_path.read_bytes()).hexdigest()
-    points_of_study = tuple(points.values())
-    return SweepStudy(path, base_path, points_of_study, tuple(configs), tuple(foresights), each, compare, content)
+    content = path.read_bytes() + base_path.read_bytes() + "".join(digests.values()).encode()
+    sha256 = hashlib.sha256(content).hexdigest()
+    return SweepStudy(path, base_path, tuple(points.values()), tuple(configs), tuple(foresights), each, compare, sha256)
+
+
+def _specimen_table(table, path, place, digests):
+    """The table [tip] of a specimen from a file, for a folder beside `place`: with its SHA-256."""
+    path = path.resolve()
+    if path not in digests:
+        digests[path] = sha256_of(path)
+    return {"sha256": digests[path]} | table | {"file": os.path.relpath(path, place)}
 
 
 def _product(table):
     """Values by path, for all combinations of the lists of a table."""
     number = 1
     for path, values in table.items():
-        _check_path(path)
+        check_setting_path(path)
         if not isinstance(values, list) or not values:
             quoted = f': write the path in quotes, "{path}.{next(iter(values))}"' if isinstance(values, dict) else ""
             raise ValueError(f"[sweep] {path} must be a list of values, got {short_text(values)}{quoted}")
@@ -197,14 +222,15 @@ def _single(points):
     for values in points:
         check_table(values, "[[points]]")
         for path, value in values.items():
-            _check_path(path)
+            check_setting_path(path)
             if path in ("tip", "simulation") and isinstance(value, Mapping):  # it would replace the complete table
                 key = f"{path}.{next(iter(value), 'key')}"
                 raise ValueError(f'[[points]] {path} must be a path in quotes, such as "{key}"')
         yield dict(values)
 
 
-def _check_path(path):
+def check_setting_path(path: str) -> None:
+    """Raise a ValueError if a path is not that of a setting that points can have of their own."""
     if path.split(".")[0] in _FIXED:
         raise ValueError(f"{path} is the same for all points: change it in the base")
     if not all(path.split(".")):
@@ -245,23 +271,3 @@ def with_values(document: dict[str, Any], values: Mapping[str, Any]) -> dict[str
                 raise ValueError(f"{path} leads through {'.'.join(names[:depth])}, which is {short_text(table)}")
         table[names[-1]] = copy.deepcopy(value)
     return document
-
-
-def key_of(document: Mapping[str, Any]) -> str:
-    """Key of a point: the first 12 digits of the SHA-256 of its settings as canonical JSON.
-
-    The name of the output does not count, nor do the maps if the run has responses: they only select pictures then.
-    Numbers that are equal have equal keys.
-    """
-    document = {name: value for name, value in document.items() if name != "output"}
-    if document.get("simulation", {}).get("responses", True):
-        document.pop("maps", None)
-    return hashlib.sha256(json.dumps(_canonical(document), sort_keys=True).encode()).hexdigest()[:_DIGITS]
-
-
-def _canonical(value):
-    if isinstance(value, Mapping):
-        return {key: _canonical(each) for key, each in value.items()}
-    if isinstance(value, list):
-        return [_canonical(each) for each in value]
-    return int(value) if isinstance(value, float) and value.is_integer() else value

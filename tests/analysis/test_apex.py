@@ -63,6 +63,14 @@ def test_a_compression_on_an_equidistant_detector():
     assert found.projection == ae.Projection(100 / found.compression)
 
 
+def test_deep_ions_do_not_move_the_spheres():
+    """5 % of the ions 0.5 nm below the others: 0.06 % of the compression, 1.1 % with algebraic spheres."""
+    run = Receding(1.5)
+    deep = np.random.default_rng(0).random(len(run)) < 0.05
+    run.emissions.positions[deep] -= 0.5 * run.emissions.normals[deep]
+    assert ae.image_compression(run).compression == pytest.approx(1.5, rel=0.003)
+
+
 def test_without_the_centre_of_the_moment_the_compression_is_wrong():
     run = Receding(1.5)
     still = [cap._replace(centre=np.zeros(3)) for cap in ae.fit_caps(run)]

@@ -1,6 +1,8 @@
 """Field-ion images: closed forms of the gases and of a sphere, the order of sites, rings, and one removed atom."""
 
+import copy
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -196,6 +198,7 @@ def test_supply_and_gas(evolved):
     )
     assert own.settings["gas"]["name"] == "Kr" and own.settings["image_field"] == 15.0
     assert own.voltage == pytest.approx(even.voltage * 15 / 35)
+    assert pickle.loads(pickle.dumps(own)).settings == copy.deepcopy(own).settings == own.settings
     weak = ae.field_ion_image(evolved, image_field=30.0, half_angle=10.0)
     assert weak.brightness.sum() < 0.15 * even.brightness.sum()  # (30 / 35)^17 = 0.07
 

@@ -37,10 +37,7 @@ def simulated(rng, n, amplitude, fold=3, gradient=0.0, pole=POLE):
 
 
 def counted(directions, bins=300):
-    half = 110.0
-    return hits_of(directions).map(
-        bins, extent=(-half, half, -half, half), quantum=None, mask=np.ones((bins, bins), bool)
-    )
+    return hits_of(directions).map(like=ae.Detector(width=220.0).grid(bins), quantum=None)
 
 
 @pytest.mark.parametrize("gradient", [0.0, 0.5])

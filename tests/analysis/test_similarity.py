@@ -1,6 +1,8 @@
+import pickle
+
 import numpy as np
 import pytest
-from skimage import metrics, morphology
+from skimage import morphology
 
 from apt_evap.analysis.similarity import half_ceiling, local_moments, local_similarity, ssim
 from apt_evap.detection.detector_map import DetectorMap
@@ -46,25 +48,28 @@ def test_the_measure_is_that_of_wang():
 
 
 @pytest.mark.parametrize("smoothing, data_range", [(0.0, 2.0), (0.5, 1.0), (1.7, 3.0)])
-def test_local_similarity_is_that_of_scikit_image(smoothing, data_range):
-    a, b = noisy(20, 1), noisy(20, 2)
-    result = ssim(a, b, smoothing=smoothing, data_range=data_range)
-    images = [np.where(INSIDE, m.smoothed(smoothing).density, 1.0) for m in (a, b)]
-    window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
-    _, local = metrics.structural_similarity(*images, data_range=data_range, full=True, **window)
-    # the same window: a disc of half width 5, from which the common mask is eroded
+def test_without_noise_the_corrected_similarity_of_stacks_is_the_uncorrected_one(smoothing, data_range):
+    """`ssim` is that of scikit-image; its window is where a disc of half width 5 fits into the common mask."""
+    measured, *others = (noisy(20, seed) for seed in range(4))
+    maps = [np.where(INSIDE, each.smoothed(smoothing).density, 1.0) for each in (measured, *others)]
+    stacked = local_similarity(local_moments(np.array(maps)), local_moments(maps[0]), data_range, 0.0)
     inside = morphology.erosion(np.pad(INSIDE, 1), morphology.disk(5))[1:-1, 1:-1]
-    assert np.array_equal(inside, np.isfinite(result.local))
-    assert result.local[inside] == pytest.approx(local[inside], abs=1e-12)
-    assert float(result) == pytest.approx(local[inside].mean(), abs=1e-12)
-
-
-def test_stacks_are_compared_one_by_one():
-    maps = np.random.default_rng(1).poisson(20 * LINES, (3, *LINES.shape)) / 20
-    stacked = local_similarity(local_moments(maps), local_moments(maps[:1]), 2.0)
-    alone = [local_similarity(local_moments(each), local_moments(maps[0]), 2.0) for each in maps]
-    assert np.array_equal(stacked, alone)
+    for values, other in zip(stacked, (measured, *others), strict=True):
+        alone = ssim(other, measured, smoothing=smoothing, data_range=data_range)
+        assert np.array_equal(inside, np.isfinite(alone.local))
+        assert values[inside] == pytest.approx(alone.local[inside], abs=1e-12)  # rounding
+        assert float(alone) == pytest.approx(values[inside].mean(), abs=1e-12)
     assert stacked[0] == pytest.approx(1, abs=1e-12)
+
+
+def test_noise_of_both_maps_counts_as_common_structure():
+    """Formula 13 of Wang et al. (2004), with the variances of the noise in the term of the structure."""
+    first, second = (local_moments(np.where(INSIDE, noisy(20, seed).density, 1.0)) for seed in (1, 2))
+    plain, corrected = (local_similarity(first, second, 2.0, noise) for noise in (0.0, 0.1))
+    both = first.mean * second.mean
+    luminance = (2 * both + 0.02**2) / (first.mean**2 + second.mean**2 + 0.02**2)
+    gain = luminance * 0.1 / (first.variance + second.variance + 0.06**2)
+    assert corrected - plain == pytest.approx(gain, abs=1e-12)
 
 
 def test_what_lies_outside_the_common_mask_does_not_matter():
@@ -130,3 +135,12 @@ def test_maps_that_cannot_be_compared():
         ssim(a, a, data_range=0)
     with pytest.raises(ValueError, match="options bins are for hits"):
         half_ceiling(a, bins=5)
+
+
+def test_a_similarity_is_a_number():
+    map = DetectorMap.from_array(np.random.default_rng(1).random((20, 20)), np.arange(21.0), np.arange(21.0))
+    similarity = ssim(map, map.smoothed(0.5))
+    assert f"{similarity:.3f}" == f"{similarity.value:.3f}" and round(similarity, 2) == round(similarity.value, 2)
+    assert isinstance(similarity, float) and 0 < similarity < 1 and max(similarity, 0.0) is similarity
+    copied = pickle.loads(pickle.dumps(similarity))
+    assert copied == similarity and copied.bins == (20, 20) and np.array_equal(copied.local, similarity.local, True)

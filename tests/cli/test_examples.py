@@ -43,10 +43,10 @@ def test_copies_are_the_originals_and_can_be_run(folder, capsys):
 def test_changed_files_are_kept(folder, capsys):
     assert main(["examples", "--to", "here", "--quiet"]) == 0
     Path("here/ni111.toml").write_text("mine")
-    Path("here/figure2.py").unlink()
+    Path("here/measured_map.py").unlink()
     assert main(["examples", "--to", "here"]) == 2
     assert "'here/ni111.toml' exists and differs from the example: --force overwrites it" in capsys.readouterr().err
-    assert Path("here/ni111.toml").read_text() == "mine" and not Path("here/figure2.py").exists()
+    assert Path("here/ni111.toml").read_text() == "mine" and not Path("here/measured_map.py").exists()
     assert main(["examples", "--to", "here", "--force", "--quiet"]) == 0
     assert {path.name: path.read_bytes() for path in Path("here").iterdir()} == originals()
 

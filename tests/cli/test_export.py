@@ -71,3 +71,35 @@ def test_reconstruct_an_instrument_file(folder):
     command = ["reconstruct", "oxcart.h5", "--element", "Al", "--distance", "110", "-o", "rec.pos", "--quiet"]
     assert main(command) == 0
     assert len(ae.read("rec.pos")) == 400
+
+
+def test_species_of_a_run_are_known(tmp_path, monkeypatch, capsys, nickel):
+    monkeypatch.chdir(tmp_path)
+    tip = ae.Tip(nickel, apex_radius=5 * nickel.a, axis=(1, 1, 1), solutes={"Cu": 0.3}, seed=1)
+    run = ae.Simulation(tip, seed=1).run(80, responses=False, progress=False)
+    run.save("alloy.h5")
+    hits = run.hits(ae.Unperturbed())
+    copper = int((run.species == run.elements.index("Cu")).sum())
+    assert 0 < copper < 80 and (hits.extra["element"] == np.array(run.elements)[run.species]).all()
+    ae.write("alloy.xyz", hits)
+    assert [line.split()[0] for line in (tmp_path / "alloy.xyz").read_text().splitlines()[2:]] == [
+        run.elements[k] for k in run.species
+    ]
+    ae.write("alloy.csv", hits)
+    titles, *rows = (line.split(",") for line in (tmp_path / "alloy.csv").read_text().splitlines())
+    assert sum(row[titles.index("element")] == "Cu" for row in rows) == copper
+    # in the shell, without ranges
+    assert main(["info", "alloy.h5", "--species", "Cu", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["ions"] == copper
+    assert main(["map", "alloy.h5", "--species", "Cu", "--bins", "8", "-o", "cu.png", "--json"]) == 0
+    (drawn,) = json.loads(capsys.readouterr().out)["maps"]
+    assert "Cu" in drawn["title"] and drawn["ions"] <= copper
+    for command in (["alloy.h5", "--species", "Al"], ["alloy.h5", "--ranges", "r.rrng"]):
+        assert main(["map", *command, "-o", "no.png"]) == 2 and not (tmp_path / "no.png").exists()
+
+
+def test_measured_ions_need_ranges_for_species(folder, capsys):
+    assert main(["map", "ions.nxs", "--species", "Cr", "-o", "no.png"]) == 2
+    assert "--ranges" in capsys.readouterr().err
+    assert main(["map", "ions.nxs", "--ranges", "a.rng", "--species", "Cr", "-o", "cr.png", "--json"]) == 0
+    assert "Cr" in json.loads(capsys.readouterr().out)["maps"][0]["title"]

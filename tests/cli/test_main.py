@@ -112,6 +112,29 @@ def test_the_output_of_the_file_is_the_default(folder):
 
 
 @NO_PICTURES
+def test_run_foretells_its_time_and_says_what_it_does_before_the_first_ion(folder, capsys, monkeypatch):
+    told_before = []
+
+    def simulation(config, **options):
+        told_before.append(capsys.readouterr().out)
+        raise ValueError("stopped here")
+
+    monkeypatch.setattr("apt_evap.config.simulation_file.Config.simulation", simulation)
+    assert main(["run", "small.toml", "--ions", "50"]) == 2
+    (told,) = told_before
+    assert "50 ions of " in told and " GB, " in told and " min" in told and "surface" in told
+
+
+def test_the_bar_of_a_run_fits_a_terminal(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    with run_command._Bar(1_000_000, 200_000) as bar:
+        bar(600_000, 1_000_000)
+        bar._bar.refresh()
+        text = str(bar._bar)
+    assert len(text) <= 80 and "60%" in text and "600000 of 1000000" in text
+    assert len(text.split("|")[1]) >= 20
+
+
 def test_the_run_is_that_of_python_whatever_the_threads(folder, made):
     assert main(["run", "small.toml", "--threads", "2", "--quiet"]) == 0
     one, two = load(made), load("small.h5")
@@ -229,7 +252,7 @@ def test_a_second_run_overwrites_the_first_but_nobody_elses_files(folder, capsys
 
 
 def test_what_cannot_be_written_is_said_before_computing(folder, capsys, monkeypatch):
-    monkeypatch.setattr(run_command, "read_config", checked := Counting(run_command.read_config))
+    monkeypatch.setattr(run_command, "config_of", checked := Counting(run_command.config_of))
     assert "cannot write 'none/a.h5': No such file or directory" in failed(
         capsys, "run", "small.toml", "-o", "none/a.h5"
     )
@@ -247,8 +270,8 @@ class Counting:
     def __init__(self, read):
         self.read, self.given = read, []
 
-    def __call__(self, path):
-        self.given.append(Noting(self.read(path)))
+    def __call__(self, *arguments):
+        self.given.append(Noting(self.read(*arguments)))
         return self.given[-1]
 
 
@@ -265,7 +288,7 @@ class Noting:
 def test_wrong_configs_are_one_sentence(folder, made, capsys):
     def wrong(old, new):
         (folder / "wrong.toml").write_text(SMALL.replace(old, new))
-        return failed(capsys, "run", "wrong.toml")
+        return failed(capsys, "run", "wrong.toml", "--quiet")
 
     assert "'wrong.toml', [tip]: no key is named 'apex' (did you mean 'apex_radius'?)" in wrong("apex_radius", "apex")
     assert "'wrong.toml', [tip]: apex_radius must be a finite number [nm] >=" in wrong("6 a", "1 a")
@@ -353,7 +376,7 @@ def test_ctrl_c_and_sigterm_keep_what_is_done(folder, sent, code):
     seen = b""
     try:
         # the bar has started once it counts ions
-        while not re.search(rb"[1-9]\d*/5000", seen):
+        while not re.search(rb"[1-9]\d* of 5000", seen):
             assert process.poll() is None
             seen += os.read(terminal, 1000)
         process.send_signal(sent)
@@ -469,7 +492,7 @@ def test_map_errors(measured, made, capsys):
         capsys, "map", "ions.epos", "--perturbation", "Unperturbed"
     )
     assert "did you mean 'RollUp'" in failed(capsys, "map", made, "--perturbation", "Rollup:0.1")
-    assert "got no parameters; an example is RollUp:0.155,0.155" in failed(
+    assert "energy, got nothing; an example is RollUp:0.155,0.155" in failed(
         capsys, "map", made, "--perturbation", "RollUp"
     )
     assert "argument --bins: must be an integer from 1 to 16384, got '0'" in failed(capsys, "map", made, "--bins", "0")
@@ -602,7 +625,7 @@ def test_ions_are_selected(mixed, monkeypatch, capsys):
     both = ["--ranges", "mixed.rrng", "--species", "Si", "--ions", "0,100", "--voltage", "3050,"]
     assert ions(*both) == 25  # the ions of the file are counted, not those of the species
     (only,), titles = drawn_by(monkeypatch, "map", "mixed.epos", *both)
-    assert only.ions <= 25 and titles == ["mixed.epos, 25 of 1,000 ions"]
+    assert only.ions <= 25 and titles == ["mixed.epos, Si, 25 of 1,000 ions"]
 
 
 @NO_PICTURES
@@ -621,7 +644,7 @@ def test_ions_of_a_run_are_selected(folder, made, monkeypatch, capsys):
     [
         (["--mass", "29,27"], "argument --mass: must be two increasing numbers, such as 27,29.5, got '29,27'"),
         (["--circle", "1,2"], "argument --circle: must be a radius, or R,X,Y, such as 15,0,-2 [mm], got '1,2'"),
-        (["--species", "Si"], "--ranges and --species must be used together"),
+        (["--species", "Si"], "--species needs --ranges"),
         (["--ranges", "mixed.rrng", "--species", "Sn"], "--species: mixed.rrng have no species 'Sn'"),
         (["--mass", "1,2"], "the options select none of the 1,000 ions of 'mixed.epos'"),
     ],

@@ -115,7 +115,7 @@ def test_ions_are_exported_as_an_instrument_would_write_them(made, tmp_path, mon
             'name = "Arhenius"',
             "[law]: law must have a name of Extremal, Arrhenius",
         ),
-        ("temperature = 80.0\n\n", "\n", "[law]: temperature is missing"),
+        ("temperature = 80.0\n\n", "\n", "[law]: law must have temperature"),
         ("rate = 0.02", "rate = -1", "[control]: rate must be a finite number > 0 and <= 1e+06, got -1"),
         ('"site"', '"apex"', "[real_units]: field_reference must be"),
         ("{ Ni = 2 }", "{ Al = 2 }", "[real_units]: flight_charges must be of the elements Ni, got 'Al'"),

@@ -7,6 +7,7 @@ import pytest
 
 import apt_evap as ae
 from apt_evap.cli.main import main
+from apt_evap.reconstruction.run_constants import run_constants
 
 
 @pytest.fixture
@@ -59,6 +60,10 @@ def test_a_run_is_compared_with_its_sites(tmp_path, monkeypatch, small_tip, nick
     assert result["settings"]["distance"] == 100.0
     assert result["settings"]["atomic_volume"] == pytest.approx(nickel.a**3 / 4)
     assert 0 < result["errors"]["lateral_rms"] < 2.1  # the radius of the tip
+    # 60 ions are too few for a sphere and for a compression: the radius of the tip, and 1.5
+    assert main(["reconstruct", "ni.h5", "--real-units", "--detector-radius", "80", "-o", "few.pos", "--json"]) == 0
+    few = json.loads(capsys.readouterr().out)["settings"]
+    assert few["compression"] == 1.5 and few["field_factor"] < 2
     assert main([*command, "--force"]) == 0 and "RMS errors: " in capsys.readouterr().out
 
 
@@ -69,7 +74,7 @@ def test_a_run_is_compared_with_its_sites(tmp_path, monkeypatch, small_tip, nick
         ("--distance 90", "--atomic-volume [nm^3] or --element is missing"),
         ("--distance 90 --element Ni --radius apex", "--radius must be voltage, shank or a number [nm], got 'apex'"),
         ("--distance 90 --element Ni --radius -1", "--radius must be a finite number [nm] > 0, got -1.0"),
-        ("--distance 90 --element Nix", "material"),
+        ("--distance 90 --element Nix", "--element"),
         ("--distance 90 --atomic-volume 0.01", 'radius="voltage" needs evaporation_field'),
         ("--distance 90 --element Ni --real-units", "--real-units needs a run (.h5)"),
         ("--distance 90 --element Ni -o ni.png", "format of 'ni.png' must be one of"),
@@ -88,3 +93,56 @@ def test_ions_without_voltages(measured, capsys):
     command = ["reconstruct", "flat.epos", "--element", "Ni", "--distance", "90"]
     assert main(command) == 2 and "has no voltages: --radius shank" in capsys.readouterr().err
     assert main([*command, "--radius", "40", "-o", "flat.xyz"]) == 0
+
+
+@pytest.fixture(scope="module")
+def radius5(tmp_path_factory):
+    """A run of 1,200 ions of a tip with a radius of 5 nm, and its file."""
+    tip = ae.Tip("Ni", apex_radius=5.0, axis=(1, 1, 1), shank_length=5.0, depth=1.5)
+    run = ae.Simulation(tip, seed=1).run(1200, progress=False)
+    path = tmp_path_factory.mktemp("radius") / "r5.h5"
+    run.save(path)
+    return run, path
+
+
+def test_the_constants_of_a_run_are_its_own(radius5, tmp_path, monkeypatch, capsys):
+    run, path = radius5
+    monkeypatch.chdir(tmp_path)
+    for k, reference in enumerate(("cap", "site")):
+        assert main(["reconstruct", str(path), "--real-units", reference, "-o", f"{k}.pos", "--json"]) == 0
+        result = json.loads(capsys.readouterr().out)
+        real = run.at_evaporation_field(field_reference=reference)
+        settings = result["settings"]
+        radii = real.voltages / (settings["field_factor"] * settings["evaporation_field"])
+        assert np.median(radii) == pytest.approx(5.0, rel=0.02)  # the cap of the first ions, between its terraces
+        assert settings["compression"] == pytest.approx(ae.image_compression(run).compression)
+        assert settings["projection"] == "compressed" and settings["atomic_volume"] == pytest.approx(0.352**3 / 4)
+        # measured 0.19 and 0.08 nm; with 3.3 and 1.5 the radius is 1.7 nm and its errors are larger
+        assert result["errors"]["lateral_rms"] < 0.25 and result["errors"]["depth_rms"] < 0.12
+    # options win
+    command = ["reconstruct", str(path), "--real-units", "--field-factor", "3", "--compression", "1.2", "-o", "2.pos"]
+    assert main([*command, "--evaporation-field", "30", "--distance", "120", "--json"]) == 0
+    settings = json.loads(capsys.readouterr().out)["settings"]
+    assert (settings["field_factor"], settings["compression"]) == (3.0, 1.2)
+    assert (settings["evaporation_field"], settings["distance"]) == (30.0, 120.0)
+
+
+def test_run_constants_follow_the_field_and_need_real_units(radius5):
+    run, _ = radius5
+    real = run.at_evaporation_field()
+    own, other = run_constants(real), run_constants(real, evaporation_field=2 * 35.0)
+    assert own["evaporation_field"] == pytest.approx(35.0)
+    assert other["field_factor"] == pytest.approx(own["field_factor"] / 2)
+    reported = run_constants(run.at_evaporation_field(field_factor=3.3))
+    assert reported["field_factor"] == pytest.approx(3.3, rel=0.02)  # R at the first ion against the fitted cap
+    rebuilt = ae.reconstruct(real.hits(ae.Unperturbed()), **own)
+    assert np.median(rebuilt.radii) == pytest.approx(5.0, rel=0.02)
+    with pytest.raises(ValueError, match="run"):
+        run_constants(run)
+
+
+def test_an_unknown_element_names_the_options_of_the_shell(measured, capsys):
+    assert main(["reconstruct", "ni.epos", "--element", "Ca", "--distance", "90"]) == 2
+    told = capsys.readouterr().err
+    assert all(name in told for name in ("--element", "'Ca'", "--atomic-volume", "--evaporation-field"))
+    assert "Material(" not in told and told.count("\n") == 1

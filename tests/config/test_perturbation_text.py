@@ -3,7 +3,8 @@
 import pytest
 
 import apt_evap as ae
-from apt_evap.config.perturbation_text import python_of, read_perturbation, title_of, write_perturbation
+from apt_evap._common.codec import to_python
+from apt_evap.config.perturbation_text import read_perturbation, title_of, write_perturbation
 
 NORMAL = ae.TruncatedNormal(0.155, 0.1)
 
@@ -23,7 +24,7 @@ NORMAL = ae.TruncatedNormal(0.155, 0.1)
         ),
         (
             ae.RollUp(0.2, ae.ChargeRatio(0.9, 0.05), height=0.05),
-            '{name = "RollUp", energy = {name = "Fixed", energy = 0.2}, '
+            '{name = "RollUp", energy = 0.2, '
             'probability = {name = "ChargeRatio", threshold = 0.9, width = 0.05}, height = 0.05}',
             "ae.RollUp(0.2, ae.ChargeRatio(0.9, 0.05), height=0.05)",
         ),
@@ -32,7 +33,7 @@ NORMAL = ae.TruncatedNormal(0.155, 0.1)
 def test_text_and_python_are_read_back(perturbation, text, python):
     assert write_perturbation(perturbation) == text
     assert read_perturbation(text) == perturbation
-    assert python_of(perturbation) == python
+    assert to_python(perturbation) == python
     assert eval(python, {"ae": ae}) == perturbation
 
 

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from apt_evap import Material, material
+from apt_evap import Material, Orientation, material
 from apt_evap.crystallography.poles import direction_normals, label, plane_normals, poles, zones
 from apt_evap.specimen.lattice import lattice_sites_in
 
@@ -107,3 +107,13 @@ def test_labels_have_bars():
 def test_what_is_refused(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_an_orientation_stands_for_its_crystal(nickel):
+    orientation = Orientation(nickel, (1, 1, 1), 20.0)
+    for find in (poles, zones):
+        expected = find(nickel)
+        for crystal in (orientation, "Ni"):
+            assert all(np.array_equal(a, b) for a, b in zip(find(crystal), expected, strict=True))
+    with pytest.raises(ValueError, match="material"):
+        poles(3)

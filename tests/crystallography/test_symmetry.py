@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 import scipy
+from scipy.spatial.transform import Rotation
 
 import apt_evap as ae
-from apt_evap.crystallography.symmetry import point_group, symmetry_about_axis
+from apt_evap.crystallography.poles import plane_normals, poles
+from apt_evap.crystallography.symmetry import point_group, rotational_symmetry, symmetry_about_axis
 from apt_evap.specimen.lattice import rotation_to_axis
 
 
@@ -45,3 +47,26 @@ def test_the_symmetry_about_an_axis_is_that_of_the_lattice(name, axis, order):
         for turn in turns:
             moved = np.column_stack([near[:, :2] @ turn.T, near[:, 2]])
             assert tree.query(moved)[0].max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("name", "plane", "order"),
+    [
+        ("Ni", (1, 1, 1), 3),
+        ("Ni", (0, 0, 2), 4),
+        ("W", (0, 1, 1), 2),
+        ("Si", (1, 1, 3), 1),
+        ("Ti", (0, 0, 0, 2), 6),
+        ("Ti", (1, 0, -1, 0), 2),
+        ("Ti", (1, 0, -1, 1), 1),
+    ],
+)
+def test_the_symmetry_about_a_direction_is_that_of_the_poles(name, plane, order):
+    material = ae.material(name)
+    direction = plane_normals(material, np.array([plane]))[0]
+    assert rotational_symmetry(material, direction) == rotational_symmetry(material, -7.0 * direction) == order
+    normals = poles(material).normals
+    for fold in range(1, 13):
+        turned = Rotation.from_rotvec(2 * np.pi / fold * direction / np.linalg.norm(direction)).apply(normals)
+        onto_itself = (turned @ normals.T).max(axis=1).min() > 1 - 1e-9
+        assert onto_itself == (order % fold == 0)

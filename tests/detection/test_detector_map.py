@@ -6,10 +6,11 @@ import pytest
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from skimage.morphology import convex_hull_image
+from matplotlib.text import Text
 
 from apt_evap import plot
-from apt_evap.detection.binning import bin_edges, convex_hull, count, field_of_view, find_quantisation
+from apt_evap.detection.binning import bin_edges, count, field_of_view, find_quantisation
+from apt_evap.detection.detector import Detector
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.io.formats import read
@@ -170,20 +171,34 @@ def test_few_hits_still_make_a_map(x, y):
     assert map.counts.sum() == len(x) and map.mask.any() and field_of_view(map.counts).any()
 
 
-@given(hnp.arrays(bool, hnp.array_shapes(min_dims=2, max_dims=2, min_side=2, max_side=12), elements=st.booleans()))
-@example(np.eye(2, 12, 3, dtype=bool) | np.eye(2, 12, dtype=bool))
-def test_convex_hull_is_that_of_scikit_image(region):
+@given(hnp.arrays(int, hnp.array_shapes(min_dims=2, max_dims=2, max_side=12), elements=st.sampled_from((0, 0, 1, 50))))
+@example(np.eye(9, dtype=int))
+@example(np.eye(2, 12, 3, dtype=int) + np.eye(2, 12, dtype=int))
+def test_the_field_of_view_of_any_counts_is_convex(counts):
+    """The bin in the middle between two others inside is inside, too."""
+    assume(counts.any())
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # bins on one line, of which it makes nothing
-        expected = convex_hull_image(region, offset_coordinates=False)
-    assume(expected.any())
-    assert np.array_equal(convex_hull(region), expected)
+        warnings.simplefilter("error")  # scikit-image warns of bins on one line, and returns none of them
+        inside = field_of_view(counts)
+    assert inside.any()
+    places = np.argwhere(inside)
+    sums = (places[:, None] + places).reshape(-1, 2)
+    assert inside[tuple(sums[(sums % 2 == 0).all(axis=1)].T // 2)].all()
 
 
-def test_convex_hull_of_bins_on_one_line():
-    line = np.zeros((5, 9), bool)
-    line[[0, 4], [0, 8]] = True
-    assert np.argwhere(convex_hull(line)).tolist() == [[k, 2 * k] for k in range(5)]
+def test_the_grid_of_a_detector_is_all_of_it():
+    x, y = disc(5_000, radius=30.0)
+    hits = Hits(x=x, y=y)
+    grid = Detector(width=77.0).grid(90)
+    assert grid.extent == (-38.5, 38.5, -38.5, 38.5) and grid.values.shape == (90, 90)
+    assert grid.mask.all() and not grid.counts.any() and grid.ions == 0
+    map = hits.map(like=grid)
+    expected = hits.map(90, extent=grid.extent, mask=np.ones((90, 90), bool))
+    for name in ("counts", "x_edges", "y_edges", "mask"):
+        assert np.array_equal(getattr(map, name), getattr(expected, name))
+    assert map.ions == 5_000 and np.array_equal(hits.map(like=grid).density, expected.density)
+    with pytest.raises(ValueError, match="bins"):
+        Detector().grid(0)
 
 
 def test_density_has_mean_one_inside_and_is_nan_outside():
@@ -237,6 +252,8 @@ def test_bad_arguments_are_named():
         (lambda: hits.map(extent=(1, 1, 2, 2)), "with a non-zero size"),
         (lambda: Hits(x=[np.nan], y=[1.0], source="f").map(), "got none of 1 in f"),
         (lambda: hits.map().smoothed(-1), "sigma must be"),
+        (lambda: hits.map().flattened(-1), "sigma must be"),
+        (lambda: hits.map().flattened(1e4), "sigma must be"),  # wider than the map: 1e9 would take all memory
         (
             lambda: DetectorMap.from_array(np.ones((3, 3)), even, uneven),
             "y_edges must increase in even steps",
@@ -254,7 +271,7 @@ def test_pictures_share_a_scale_and_state_what_they_show(tmp_path):
     x, y = disc(20_000)
     map = Hits(x=x, y=y).map(bins=64)
     ax = plot.detector_map(map, title="uniform")
-    assert ax.get_xlabel() == "x [mm]" and any("ions" in text.get_text() for text in ax.texts)
+    assert ax.get_xlabel() == "x [mm]" and any("ions" in text.get_text() for text in ax.findobj(Text))
     ax.figure.savefig(tmp_path / "a.png")
     axes = plot.detector_maps([map, map.smoothed(1.0)], ["as it is", "smoothed"])
     assert len({ax.images[0].get_clim() for ax in axes}) == 1

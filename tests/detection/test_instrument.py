@@ -194,9 +194,9 @@ def test_the_image_scales_with_the_distance(rng):
 
 
 def test_equidistant_images_are_those_of_the_detector(real):
-    curved = real.seen_by(ae.Detector(90.0, 1e6, projection="equidistant"))
+    curved = real.on_detector(ae.Detector(90.0, 1e6, projection="equidistant"))
     plain = curved.hits(ae.Unperturbed())
-    seen = real.seen_by(ae.Instrument(90.0, 1e6, projection="equidistant"), ae.Unperturbed())
+    seen = real.record(ae.Instrument(90.0, 1e6, projection="equidistant"), ae.Unperturbed())
     kept = np.isin(plain.ion, seen.ion)
     assert kept.sum() > 300
     # rounding: near the plane through the apex, tan(theta) magnifies it
@@ -233,8 +233,8 @@ def test_an_own_map(rng):
 
 
 def test_a_perfect_instrument_is_the_detector(real):
-    plain = real.seen_by(ae.Detector(real.detector.distance, 1e6)).hits(ae.Unperturbed())
-    seen = real.seen_by(ae.Instrument(real.detector.distance, 1e6))
+    plain = real.on_detector(ae.Detector(real.detector.distance, 1e6)).hits(ae.Unperturbed())
+    seen = real.record(ae.Instrument(real.detector.distance, 1e6))
     hit = plain.detected
     assert hit.sum() > 300
     for name in plain.columns:
@@ -245,7 +245,7 @@ def test_a_perfect_instrument_is_the_detector(real):
 
 def test_truth_and_counts_go_with_the_ions(real):
     instrument = ae.Instrument(field_of_view=150.0, efficiency=0.6, dead_time=50.0, dead_zone=20.0)
-    seen = real.seen_by(instrument)
+    seen = real.record(instrument)
     recording = instrument.record(real.hits(ae.Unperturbed()), real.detector.distance, seed=real.seed)
     assert np.array_equal(seen.ion, real.emissions.ions[recording.recorded])
     assert np.array_equal(seen.site, real.site[recording.recorded])
@@ -282,19 +282,19 @@ def test_the_same_ions_in_any_selection_and_order(real):
     assert np.isin(whole.ion, better.ion).all()
     other = instrument.hits(hits, seed=4)
     assert not np.array_equal(other.ion, whole.ion)
-    assert np.array_equal(real.seen_by(instrument, seed=3).ion, whole.ion)
+    assert np.array_equal(real.record(instrument, seed=3).ion, whole.ion)
 
 
 def test_the_errors_of_the_times_are_not_applied_twice(real):
-    sharp = real.seen_by(ae.Instrument(timing=ae.Timing(jitter=0.0)))
-    plain = real.seen_by(ae.Instrument())
+    sharp = real.record(ae.Instrument(timing=ae.Timing(jitter=0.0)))
+    plain = real.record(ae.Instrument())
     assert np.array_equal(sharp.time_of_flight, plain.time_of_flight)
     timed = real.simulated().at_evaporation_field(timing=ae.Timing(jitter=0.5))
     assert np.array_equal(
-        timed.seen_by(ae.Instrument(timing=ae.Timing(jitter=0.0))).time_of_flight, plain.time_of_flight
+        timed.record(ae.Instrument(timing=ae.Timing(jitter=0.0))).time_of_flight, plain.time_of_flight
     )
     assert np.array_equal(
-        timed.seen_by(ae.Instrument(field_of_view=1e6)).time_of_flight,
+        timed.record(ae.Instrument(field_of_view=1e6)).time_of_flight,
         timed.hits(ae.Unperturbed()).time_of_flight,
     )
 
@@ -310,7 +310,7 @@ def test_an_epos_is_read_as_it_was_written(real, tmp_path):
         timing=ae.Timing(temperature=50.0),
     )
     # voltages below 100 V, of a tip this small in the model, would be read as kV
-    seen = real.at_evaporation_field(field_factor=3.3).seen_by(instrument, ae.RollUp(0.1))
+    seen = real.at_evaporation_field(field_factor=3.3).record(instrument, ae.RollUp(0.1))
     ae.write(tmp_path / "seen.epos", seen)
     read = ae.read(tmp_path / "seen.epos")
     for name in ("x", "y", "time_of_flight", "voltage", "pulse_voltage", "mass_to_charge", "positions"):
@@ -320,20 +320,29 @@ def test_an_epos_is_read_as_it_was_written(real, tmp_path):
 
 
 def test_maps_of_recorded_ions_cover_the_detector(real):
-    map = real.seen_by(ae.Instrument(field_of_view=150.0)).map(bins=20)
+    map = real.record(ae.Instrument(field_of_view=150.0)).map(bins=20)
     assert map.extent == (-75.0, 75.0, -75.0, 75.0)
 
 
 def test_an_instrument_needs_real_units(real):
-    with pytest.raises(ValueError, match=r"use run\.at_evaporation_field\(\)\.seen_by"):
-        real.simulated().seen_by(ae.Instrument())
-    with pytest.raises(ValueError, match="perturbation and seed are for an Instrument"):
-        real.seen_by(ae.Detector(), seed=1)
+    with pytest.raises(ValueError, match=r"use run\.at_evaporation_field\(\)\.record"):
+        real.simulated().record(ae.Instrument())
+    with pytest.raises(ValueError, match="detector must be"):
+        real.on_detector(ae.Instrument())
+    with pytest.raises(ValueError, match="instrument must be"):
+        real.record(ae.Detector())
     hits = real.hits(ae.Unperturbed())
     with pytest.raises(ValueError, match="no column 'pulse_id'"):
         ae.Instrument().record(replace(hits, pulse_id=None))
     with pytest.raises(ValueError, match="pulse_id must not decrease"):
         ae.Instrument(field_of_view=1e6).hits(hits[::-1])
+
+
+def test_a_distance_that_is_no_flight_path_is_refused(real):
+    with pytest.raises(ValueError, match="distance"):
+        ae.Instrument(distance=1e-300)
+    with pytest.raises(ValueError, match="distance"):
+        ae.Instrument().record(real.hits(ae.Unperturbed()), distance=1e-300)
 
 
 def test_presets():

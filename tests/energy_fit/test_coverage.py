@@ -12,7 +12,7 @@ TWINS = range(100, 106)
 
 @pytest.mark.slow
 def test_hidden_energies_lie_inside_the_intervals(made_once):
-    path = Path(__file__).parents[2] / "benchmarks" / "coverage.py"
+    path = Path(__file__).parents[2] / "articles" / "intervals" / "coverage.py"
     spec = importlib.util.spec_from_file_location("coverage_of_intervals", path)
     coverage = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(coverage)

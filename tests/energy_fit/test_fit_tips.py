@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from fits import fit_energies, fit_tips
 from rough import ROUGH
 
 import apt_evap as ae
-from apt_evap.energy_fit.fit_tips import fit_tips
 
 ROLLUP = ae.RollUp(ae.TruncatedNormal(0.155, 0.155))
 HERE = ae.Registration(0.0, 1.0, (0.0, 0.0))
@@ -77,7 +77,7 @@ def test_a_single_tip_is_the_study_of_its_own_region(runs, tmp_path):
     path = tmp_path / "right.h5"
     runs["right"].save(path)
     fit = fit_tips({"right": path}, measured, registration=HERE, resamples=0, **GRID)
-    alone = ae.fit_energies(runs["right"], measured, registration=HERE, resamples=0, **GRID)
+    alone = fit_energies(runs["right"], measured, registration=HERE, resamples=0, **GRID)
     region = fit.studies["right"].measured.mask
     assert not (region & ~alone.measured.mask).any()
     assert np.isnan(fit.shares["right"]) and fit.rows()[0]["share"] is None

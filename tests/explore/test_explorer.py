@@ -55,7 +55,7 @@ def equal(first, second):
 @pytest.mark.parametrize("units", ["simulated", "cap"])
 @pytest.mark.parametrize("perturbation", PERTURBATIONS, ids=repr)
 def test_maps_have_the_bits_of_the_library(run, measured, perturbation, units):
-    run = run if units == "simulated" else run.at_evaporation_field(units)
+    run = run if units == "simulated" else run.at_evaporation_field(field_reference=units)
     explorer = Explorer(run, measured, TURNED)
     view = View(perturbation, 24, 2.0, flattening=8.0)
     for _ in range(2):  # also when everything is kept from the first time
@@ -68,6 +68,8 @@ def test_maps_have_the_bits_of_the_library(run, measured, perturbation, units):
         assert np.array_equal(shown.pictures[0].density, map.flattened(8.0).smoothed(2.0).density, equal_nan=True)
         assert shown.ions == len(run) and not shown.preview
         explorer.show(replace(view, perturbation=ae.Unperturbed()))
+    with pytest.raises(ValueError, match="sigma must be"):
+        explorer.show(replace(view, flattening=1e4))  # wider than the map
     plain = explorer.show(replace(view, flattening=0.0))
     assert plain.ceiling.value == ae.half_ceiling(like, smoothing=2.0).value
 

@@ -15,9 +15,12 @@ pytest.importorskip("bokeh")
 
 from bokeh.document import Document
 from bokeh.models import Slider
+from bokeh.util.token import generate_jwt_token, generate_session_id
+from tornado.httpclient import HTTPClientError, HTTPRequest
+from tornado.websocket import websocket_connect
 
 from apt_evap.cli.compare import read_registration
-from apt_evap.explore.page import MODES, Page
+from apt_evap.explore.page import MODES, Page, serve
 
 SECONDS = 60  # until a test gives up: the machine may be busy
 
@@ -177,8 +180,13 @@ def test_difference_and_blink(opened):
     expected = (first.density - second.density).astype(np.float32)
     assert np.array_equal(image(page.difference), expected, equal_nan=True)
     assert page.difference_colors.low == -page.difference_colors.high < 0
+    # the bar beside the difference is its own
+    (bar,) = [each for each in page.maps[1].right if getattr(each, "color_mapper", None) and each.visible]
+    assert bar.color_mapper is page.difference_image.glyph.color_mapper and bar.title
+    assert page.bars[0].visible
     page.mode.active = MODES.index("blink")
     assert not page.difference_image.visible and page.maps[1].title.text == "measured"
+    assert page.bars[1].visible and not page.difference_bar.visible
     (callback,) = page.document.session_callbacks
     titles = []
     for _ in range(4):
@@ -283,3 +291,27 @@ def test_a_slider_of_the_document_runs_the_callback(opened):
     """The widgets are in the document, where a browser finds them."""
     titles = {each.title for each in opened.page.document.select({"type": Slider})}
     assert {"mean energy [eV]", "smoothing [mm]", "bins"} <= titles
+
+
+def test_connections_of_strangers_print_no_traceback(run, caplog):
+    server, url = serve(Explorer(run))
+    own = url.split("/?")[0]
+
+    async def connect(origin, token):
+        request = HTTPRequest(own.replace("http", "ws") + "/ws", headers={"Origin": origin})
+        try:
+            connection = await websocket_connect(request, subprotocols=["bokeh", token])
+            assert await connection.read_message() is None  # closed
+        except HTTPClientError as error:
+            assert error.code == 403
+
+    async def strangers():
+        forged = generate_jwt_token(generate_session_id(b"k" * 32, signed=True), signed=True, secret_key=b"k" * 32)
+        for origin, token in (("http://other.example", "a"), (own, ""), (own, "a" * 40), (own, forged)):
+            await connect(origin, token)
+
+    try:
+        server.io_loop.run_sync(strangers)
+    finally:
+        server.stop()
+    assert not [record for record in caplog.records if record.exc_info]

@@ -1,5 +1,7 @@
 """Second roll-ups: their targets, launches and responses."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -140,7 +142,7 @@ def test_a_run_comes_back_from_its_file(run, wide_run, tmp_path):
         assert loaded.perturbations == each.perturbations
         again = loaded.hits(TWICE, by_response=True)
         np.testing.assert_array_equal(again.x, each.hits(TWICE, by_response=True).x)
-        further = loaded.seen_by(ae.Detector(distance=200.0, width=500.0))
+        further = loaded.on_detector(ae.Detector(distance=200.0, width=500.0))
         np.testing.assert_allclose(further.hits(TWICE, by_response=True).x, 2 * again.x, rtol=1e-6)
 
 
@@ -163,7 +165,7 @@ def test_bad_fits_of_second_rolls_are_flagged(run):
     residuals = run.responses.residuals.copy()
     can = np.flatnonzero(run.emissions.can_roll_twice)[3]
     residuals[can, 2] = 1.0
-    responses = type(run.responses)(**run.responses.columns | {"residuals": residuals})
+    responses = replace(run.responses, residuals=residuals)
     assert np.flatnonzero(run.response_model.flagged(responses, run.emissions)).tolist() == [can]
 
 

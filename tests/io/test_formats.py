@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from apt_evap._common.files import FileError, TruncatedFile
+from apt_evap._common.warnings import DataWarning
 from apt_evap.detection.hits import Hits, Outcome
-from apt_evap.io.formats import FORMATS, read, write
+from apt_evap.io.formats import FORMATS, chunks, read, write
 from apt_evap.simulation.run import Run
 from apt_evap.simulation.simulation import Simulation
 
@@ -48,8 +49,29 @@ def test_pos(tmp_path):
 
 
 def test_kilovolts_become_volts(tmp_path):
-    hits = read(save(tmp_path / "a.epos", epos_row(v=5.5, pulse=1.25)))
+    path = save(tmp_path / "a.epos", epos_row(v=5.5, pulse=1.25))
+    with pytest.warns(DataWarning, match=r"a\.epos': voltages of at most 5\.5 are taken for kV"):
+        hits = read(path)
     assert hits.voltage.tolist() == [5500] and hits.pulse_voltage.tolist() == [1250]
+
+
+def test_the_unit_of_voltages_can_be_given(tmp_path):
+    low = Hits(voltage=[20.0, 37.0], pulse_voltage=[5.0, 7.0], ion=[0, 1])
+    high = Hits(voltage=[20.0, 5000.0], ion=[0, 1])
+    with pytest.warns(DataWarning, match=r"low\.epos': voltages of at most 37 V"):
+        write(tmp_path / "low.epos", low)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        write(tmp_path / "high.epos", high)
+        assert np.array_equal(read(tmp_path / "high.epos").voltage, high.voltage)
+        for unit, factor in (("V", 1), ("kV", 1000)):
+            hits = read(tmp_path / "low.epos", voltage_unit=unit)
+            assert np.array_equal(hits.voltage, factor * low.voltage)
+            assert np.array_equal(hits.pulse_voltage, factor * low.pulse_voltage)
+            (part,) = chunks(tmp_path / "low.epos", 9, voltage_unit=unit)
+            assert np.array_equal(part.voltage, hits.voltage)
+    with pytest.raises(ValueError, match="voltage_unit must be"):
+        read(tmp_path / "low.epos", voltage_unit="mV")
 
 
 def test_zero_columns_are_absent_but_a_laser_has_no_pulse_voltage(tmp_path):
@@ -153,7 +175,7 @@ def test_hdf5_is_recognised_whatever_its_name(tmp_path, small_tip):
     write(tmp_path / "b.nxs", run.hits(run.first_perturbation), elements=["Ni"])
     (tmp_path / "b.nxs").rename(tmp_path / "b.epos")
     assert isinstance(read(tmp_path / "b.epos"), Hits)
-    with pytest.raises(FileError, match=r"b\.epos.*only a run can be read partially"):
+    with pytest.raises(FileError, match=r"b\.epos.*partial"):
         read(tmp_path / "b.epos", partial=True)
     with h5py.File(tmp_path / "c.h5", "w") as file:
         file["some/data"] = np.arange(5)
@@ -216,6 +238,8 @@ def test_missed_and_broken_ions_are_left_out_and_counted(tmp_path, suffix):
         write(path, hits)
     words = np.fromfile(path, ">f4")
     assert np.isfinite(words).all() and len(words) == 2 * (4 if suffix == ".pos" else 11)
+    with pytest.raises(ValueError, match=r"no ion to write to .*: the hits are empty$"):
+        write(tmp_path / "a.pos", hits[:0])
     with pytest.raises(ValueError, match=r"no ion to write .* of 1 ions 1 did not hit the detector$"):
         write(path, hits[1:2])
     with pytest.warns(UserWarning, match=r"2 of 3 ions left out of .*: 2 did not hit the detector$"):

@@ -204,6 +204,36 @@ def test_changed_specimens(tmp_path, name, changes, size):
     assert tip is None or len(tip) >= 2
 
 
+@pytest.fixture(scope="module")
+def of_ase(tmp_path_factory):
+    """A good file of some formats of ASE, by name."""
+    ase = pytest.importorskip("ase")
+    from ase.io import write as write_ase
+
+    atoms = ase.Atoms("Al6Cu2", positions=PLACES, cell=[10, 10, 10], pbc=True)
+    folder = tmp_path_factory.mktemp("ase")
+    for name, format in (("a.xyz", "xyz"), ("b.xyz", "extxyz"), ("c.cif", "cif"), ("POSCAR", "vasp")):
+        write_ase(folder / name, atoms, format=format)
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@given(
+    name=st.sampled_from(["a.xyz", "b.xyz", "c.cif", "POSCAR"]),
+    changes=st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), max_size=4),
+    removed=st.tuples(st.floats(0, 1), st.integers(0, 30)),
+)
+def test_changed_files_of_ase(of_ase, tmp_path, name, changes, removed):
+    data = bytearray(of_ase[name])
+    for place, value in changes:
+        data[int(place * len(data))] = value
+    start = int(removed[0] * len(data))
+    del data[start : start + removed[1]]
+    path = tmp_path / name
+    path.write_bytes(data)
+    tip = told(lambda: ae.read_tip(path), path)
+    assert tip is None or (len(tip) >= 2 and np.isfinite(tip.positions).all())
+
+
 @pytest.mark.parametrize("member", ["none", "format only"])
 def test_hdf5_that_is_no_run(tmp_path, member):
     path = tmp_path / "some.h5"

@@ -1,5 +1,6 @@
 """Maps in .npz files."""
 
+import tracemalloc
 import zipfile
 from pathlib import Path
 
@@ -128,3 +129,19 @@ def test_measured_maps():
     aluminium = ae.read_map(DATA / "al_oxcart_map.npz")
     assert aluminium.is_counts and aluminium.ions == pytest.approx(715_000, rel=1e-3)
     assert aluminium.x_edges[0] == pytest.approx(-26.46, abs=0.01)  # cm in the file
+
+
+def test_a_shape_larger_than_its_data_takes_no_memory(tmp_path):
+    header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (40000, 40000), }"
+    header += b" " * (53 - len(header) % 64) + b"\n"
+    with zipfile.ZipFile(tmp_path / "map.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(
+            "counts.npy", b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + bytes(1 << 20)
+        )
+    tracemalloc.start()
+    try:
+        with pytest.raises(ae.FileError, match=r"map\.npz.*\(40000, 40000\)"):
+            ae.read_map(tmp_path / "map.npz")
+        assert tracemalloc.get_traced_memory()[1] < 1 << 24  # a hundredth of the 12 GB of the shape would be too much
+    finally:
+        tracemalloc.stop()

@@ -8,6 +8,7 @@ from apt_evap._common.files import FileError
 from apt_evap._common.warnings import DataWarning
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.mass_ranges import Ranges
+from apt_evap.io import rng
 from apt_evap.io.formats import read_ranges
 
 
@@ -120,3 +121,14 @@ def test_a_molecular_ion_counts_with_all_its_atoms(save):
     hits = Hits(mass_to_charge=[26.0, 84.0, 84.1, 68.0, 1.0, np.nan])
     assert ranges.count_atoms(hits) == {"Cr": 4, "Si": 0, "O": 5}
     assert Ranges(["A"], [1.0], [2.0]).count_atoms(hits) == {}
+
+
+def test_repeated_ranges_of_an_rng_are_interpreted_once(save, monkeypatch):
+    """200,000 of them take 0.6 s instead of 4.3 s."""
+    interpreted, row = [], rng._row
+    monkeypatch.setattr(rng, "_row", lambda *given: interpreted.append(given) or row(*given))
+    text = "1 2000\nNi\nNi 0 0 0\n-- Ni\n" + ". 1 2 1\n" * 1999
+    assert len(read_ranges(save(text + ". 3 4 1\n"))) == 2
+    assert len(interpreted) == 2
+    with pytest.warns(DataWarning, match="states 2000 ranges but contains 1999"):
+        read_ranges(save(text))

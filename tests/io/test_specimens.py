@@ -1,6 +1,7 @@
 """Specimens from LAMMPS and ASE; those of TAPSim are in test_tapsim.py."""
 
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -170,8 +171,45 @@ def test_what_ase_reads(save, tmp_path):
     assert set(other.get_chemical_symbols()) == {"H", "He"}  # what is refused here
 
 
+@pytest.mark.parametrize("name", ["a@1.xyz", "a@all.xyz", "-", "a*.xyz"])
+def test_names_that_ase_would_interpret(save, tmp_path, monkeypatch, name):
+    """With "a@1.xyz", ASE reads a part of the file "a"."""
+    ase = pytest.importorskip("ase")
+    from ase.io import write
+
+    write(tmp_path / "a", ase.Atoms("Cu12", positions=PLACES), format="xyz")
+    write(tmp_path / "other.xyz", ase.Atoms("Al8Cu4", positions=PLACES))
+    (tmp_path / "other.xyz").rename(tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    tip = ae.read_tip(name)
+    assert [tip.elements[k].name for k in tip.species] == ["Al"] * 8 + ["Cu"] * 4
+
+
 def test_ase_that_is_not_installed(save, monkeypatch):
     for name in ["ase.io", *(name for name in sys.modules if name.startswith("ase."))]:
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(ImportError, match="reading this specimen needs ase, which is not installed: pip install ase"):
         ae.read_tip(save("1\n\nAl 0 0 0\n", "a.xyz"))
+
+
+def test_a_coordinate_far_away(save):
+    places = PLACES.copy()
+    places[3, 1] = 1e308
+    with pytest.raises(FileError, match=r"a\.lmp': positions must be"):
+        ae.read_tip(save(lammps_dump(places, TYPES)), NAMES)
+
+
+@pytest.mark.parametrize(
+    ("before", "repeated", "after"),
+    [
+        ("10 atoms\n0 1 xlo xhi\n\nAtoms # x", " ", "y"),
+        ("10 atoms\n0 1 xlo xhi\n\nAtoms", " A", "9"),
+        ("0 1 xlo xhi\n1", "\n", "atom"),
+    ],
+)
+def test_repeated_spaces_take_no_quadratic_time(save, before, repeated, after):
+    path = save(f"LAMMPS\n\n{before}{repeated * 60_000}{after}\n\n1 1 0 0 0\n")
+    begin = time.process_time()
+    with pytest.raises(FileError, match=r"a\.lmp"):
+        ae.read_tip(path, format="lammps-data")
+    assert time.process_time() - begin < 1.5  # 0.05 s; quadratic time: 3 s to a minute

@@ -56,6 +56,14 @@ def test_a_table_comes_back_to_the_byte(tmp_path, binary):
     assert lines[5] == "# voltage [V]" + (" (float)" if binary else "") and "startX [m]" in lines[6]
 
 
+def test_text_has_nine_digits(tmp_path):
+    values = np.random.default_rng(1).uniform(1, 9, 200)
+    ae.write(tmp_path / "a.tapsim", ae.Hits(x=values, y=-values))
+    hits = ae.read(tmp_path / "a.tapsim")
+    np.testing.assert_allclose(hits.x, values, rtol=5.1e-9)  # half a unit of the ninth digit
+    np.testing.assert_allclose(hits.y, -values, rtol=5.1e-9)
+
+
 def test_ions_of_a_run_as_a_table(tmp_path, small_tip):
     run = ae.Simulation(small_tip, seed=1).run(30, progress=False)
     hits = run.hits(ae.Unperturbed())

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 import apt_evap as ae
 from apt_evap import plot
@@ -80,6 +82,37 @@ def test_titles_are_broken_at_commas():
         ("x" * 50, ["x" * 36, "x" * 14]),
     ):
         assert plot.detector_map(map, title=title).get_title().splitlines() == lines
+
+
+def text_with(ax, words):
+    """The only text of the axes, or of an axis of theirs, with some words."""
+    (text,) = (text for text in ax.findobj(Text) if words in text.get_text())
+    return text
+
+
+def test_a_later_title_is_above_the_caption(ratios):
+    map = ae.DetectorMap.from_array(np.random.default_rng(0).random((40, 40)), np.arange(41.0), np.arange(41.0))
+    here = ae.Registration(0.0, 1.0, (0.0, 0.0))
+    for ax, words in (
+        (plot.detector_map(map), "mm bins"),
+        (plot.detector_map(map, title="first"), "mm bins"),
+        (plot.overlay(map, map, here), "as given"),
+        (plot.charge_states(ratios[0])[0], "ratio"),
+    ):
+        ax.set_title("a title in\ntwo lines")
+        ax.figure.draw_without_rendering()
+        caption = text_with(ax, words).get_window_extent()
+        assert ax.title.get_window_extent().y0 >= caption.y1 and caption.y0 > ax.get_window_extent().y1
+
+
+def test_lines_of_an_overlay_are_those_of_its_legend():
+    map = ae.DetectorMap.from_array(np.random.default_rng(0).random((40, 40)), np.arange(41.0), np.arange(41.0))
+    for own in (None, Figure().subplots()):
+        ax = plot.overlay(map, map, ae.Registration(0.0, 0.5, (0.0, 0.0)), own)
+        (legend,) = ax.figure.legends if own is None else [ax.get_legend()]
+        drawn = {tuple(each.get_edgecolor()[0]) for each in ax.collections}
+        assert {to_rgba(line.get_color()) for line in legend.get_lines()} == drawn and len(drawn) == 3
+        assert np.mean(legend.get_frame().get_facecolor()[:3]) < 0.5  # one line is white
 
 
 def test_titles_are_names_of_files(run, emitter):
@@ -422,7 +455,7 @@ def test_charge_states_side_by_side(ratios, tmp_path):
         values = np.concatenate([getattr(map, quantity)[np.isfinite(map.ratio)] for map in ratios])
         assert axes[0].images[0].get_clim() == pytest.approx(tuple(np.percentile(values, [1, 99])))
         assert axes[0].get_xlim() == axes[1].get_xlim() and axes[0].get_ylim() == axes[1].get_ylim()
-        assert f"ratio {ratios[1].total:.3g}" in axes[1].texts[0].get_text()
+        assert text_with(axes[1], f"ratio {ratios[1].total:.3g}").get_visible()
 
 
 def test_charge_states_of_a_single_map(ratios):
@@ -545,3 +578,27 @@ def test_a_notebook_shows_its_pictures():
     environment = os.environ | {"PYTHONPATH": package, "MPLBACKEND": "agg"}
     done = subprocess.run([sys.executable, "-P", "-c", code], env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_maps_of_ions_are_binned_by_themselves(run):
+    hits = run.hits(ae.Unperturbed())
+    ax = plot.detector_map(hits)
+    expected = hits.map(32)  # 250 ions
+    expected = expected.smoothed(max(expected.bin_size))
+    assert np.array_equal(ax.images[0].get_array()[expected.mask], expected.density[expected.mask])
+    assert ax.images[0].get_extent() == list(expected.extent)
+    both = plot.detector_maps([hits, expected])
+    assert np.array_equal(both[0].images[0].get_array(), both[1].images[0].get_array(), equal_nan=True)
+    with pytest.raises(ValueError, match="map"):
+        plot.detector_map(run)
+    with pytest.raises(ValueError, match="maps"):
+        plot.detector_maps([hits, "x"])
+
+
+def test_a_specimen_is_a_surface_a_simulation_or_a_tip(small_tip, emitter):
+    simulation = ae.Simulation(small_tip, seed=1)
+    drawn = [discs_of(plot.specimen(each)).get_array() for each in (emitter, simulation, small_tip)]
+    assert len(drawn[0]) > 100
+    assert np.array_equal(drawn[0], drawn[1]) and np.array_equal(drawn[0], drawn[2])
+    with pytest.raises(ValueError, match="emitter"):
+        plot.specimen("Ni")

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.crystallography.poles import ZONES, zones
+from apt_evap.crystallography.poles import ZONES, poles, zones
 
 
 @pytest.fixture
@@ -60,3 +60,29 @@ def test_parts_can_be_left_out_and_names_do_not_overlap(drawn):
     boxes = [text.get_window_extent() for text in names]
     overlapping = [a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i]]
     assert not any(overlapping)
+
+
+def test_a_fit_and_a_run_know_their_orientation_and_projection(drawn, nickel):
+    _, ax = drawn
+    crystal, orientation = poles(nickel, 6), ae.Orientation(nickel, (2, 3, 7))
+    near = orientation.directions(crystal.normals)[:, 2] > 0.75
+    projection = ae.Projection(25.0)
+    fit = ae.fit_orientation(
+        nickel, crystal.planes[near], projection.places(orientation.directions(crystal.normals[near]))
+    )
+    ae.plot.poles(ax, fit, families=3)
+    other = ae.plot.detector_map(drawn[0])
+    ae.plot.poles(other, fit.orientation, fit.projection, families=3)
+    assert len(places(ax)) > 2 and np.array_equal(places(ax), places(other))
+    for wrong in ((fit, fit), (ax, "Ni"), (ax, fit.orientation)):
+        with pytest.raises(ValueError, match=r"ax|orientation|projection"):
+            ae.plot.poles(*wrong)
+
+
+def test_the_poles_of_a_run(drawn, nickel):
+    tip = ae.Tip(nickel, apex_radius=3.5, axis=(1, 1, 1), shank_length=3.5, depth=1.2)
+    run = ae.Simulation(tip, seed=1).run(800, [ae.Unperturbed()], responses=False, progress=False)
+    ax, other = (ae.plot.detector_map(run.hits(ae.Unperturbed())) for _ in range(2))
+    ae.plot.poles(ax, run)
+    ae.plot.poles(other, ae.Orientation(nickel, (1, 1, 1)), ae.image_compression(run).projection)
+    assert len(places(ax)) > 3 and np.array_equal(places(ax), places(other))

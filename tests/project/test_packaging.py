@@ -86,7 +86,7 @@ def test_the_numbers_of_the_paper_are_those_of_the_documentation():
         assert f'"{part}": ' in (ROOT / script).read_text()
 
 
-@pytest.mark.parametrize("name", ["packaging/conda/recipe.yaml", "CITATION.cff"])
+@pytest.mark.parametrize("name", ["packaging/conda/recipe.yaml", "CITATION.cff", ".pre-commit-config.yaml"])
 def test_yaml_is_valid(name):
     yaml = pytest.importorskip("yaml")
     assert isinstance(yaml.safe_load((ROOT / name).read_text()), dict)

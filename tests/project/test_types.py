@@ -1,14 +1,17 @@
-"""Type hints: mypy agrees with them, and the stubs of the compiled modules say what these hold."""
+"""Type hints: they tell right use from wrong, and the stubs of the compiled modules say what these hold."""
 
 import ast
 import importlib
 import importlib.util
 import inspect
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+import apt_evap as ae
 
 ROOT = Path(__file__).parents[2]
 CORE = ROOT / "apt_evap" / "_core"
@@ -46,24 +49,60 @@ ae.RollUp("0.3 eV")  # error
 name: str = run.voltage  # error
 ae.write("ni.epos", hits)
 ae.plot.detector_map(hits.map(bins=64).smoothed(2.0), title="Ni")
-ae.plot.detector_map(hits)  # error
+ae.plot.detector_map(hits)
+ae.plot.detector_map(tip)  # error
 charges = simulation.emitter.charges.sum()
 simulation.emitter.charge  # error
 """
 
 
-def test_mypy(tmp_path):
-    """The package agrees with its hints, and these tell right use from wrong."""
+# a script without any hints, as users write it
+SCRIPT = """
+import apt_evap as ae
+import numpy as np
+
+nickel = ae.material("Ni")
+tip = ae.Tip(nickel, apex_radius=20 * nickel.a, axis=(1, 1, 1), shank_angle=1.5)
+simulation = ae.Simulation(tip, voltage=1000.0, seed=1)
+run = simulation.run(15_000)
+run.save("ni111.h5")
+hits = ae.load("ni111.h5").hits(ae.RollUp(ae.TruncatedNormal(0.155, 0.155)))
+inside = hits[np.hypot(hits.x, hits.y) < 50.0]
+print(len(inside), inside.x.mean(), hits.time_of_flight[:10], float(hits.y.max()))
+measured = ae.read("R5083.epos")
+map_ = measured.map(bins=128).smoothed(1.0)
+registration = ae.register(hits, map_)
+moved = registration.hits(hits).map(like=map_)
+similarity = ae.ssim(moved, map_, smoothing=1.0)
+print(f"{similarity:.3f}", round(float(similarity), 3), similarity.value > 0.2)
+ax = ae.plot.detector_map(moved, title="Ni [111]")
+ax.figure.savefig("ni111.png")
+ae.plot.detector_maps([moved, map_])[0].figure.savefig("both.png", dpi=200)
+study = ae.fit_energies(run, measured, ae.EnergyGrid("roll-up"), registration=registration)
+ae.plot.ssim_matrix(study)[0].figure.savefig("ssim.png")
+print(study.optimum.mean, study.registration.rotation, tip.positions[:, 2].max())
+ae.write("ni111.epos", hits)
+"""
+
+
+def test_hints_tell_right_use_from_wrong(tmp_path):
+    """Under strict rules and without the settings of the project, as in a project of the user."""
     pytest.importorskip("mypy")
-    use = tmp_path / "use.py"
-    use.write_text(USE)
-    command = [sys.executable, "-m", "mypy", "--cache-dir", str(tmp_path), "apt_evap", str(use)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    said = [line for line in done.stdout.splitlines() if ": error:" in line]
-    of_use = {int(line.split(":")[1]) for line in said if line.split(":")[0].endswith("use.py")}
-    assert [line for line in said if not line.split(":")[0].endswith("use.py")] == [], done.stdout
-    assert of_use == {k for k, line in enumerate(USE.splitlines(), 1) if line.endswith("# error")}, done.stdout
-    assert not done.stderr
+    (tmp_path / "script.py").write_text(SCRIPT)
+    (tmp_path / "use.py").write_text(USE)
+    command = [sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(tmp_path / "cache"), "script.py", "use.py"]
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": str(ROOT)}
+    )
+    found = {tuple(line.split(":")[:2]) for line in done.stdout.splitlines() if ": error:" in line}
+    wrong = {("use.py", str(k)) for k, line in enumerate(USE.splitlines(), 1) if line.endswith("# error")}
+    assert found == wrong and not done.stderr, done.stdout
+
+
+@pytest.mark.parametrize("name", [name for name in dir(ae) if inspect.isroutine(getattr(ae, name))])
+def test_help_shows_aliases_of_types(name):
+    """Not what they stand for, which takes four lines for each array."""
+    assert "_SupportsArray" not in str(inspect.signature(getattr(ae, name)))
 
 
 def public_functions():

@@ -1,6 +1,8 @@
 """Reconstruction of hits whose cap is known: closed forms, volumes, thinning, and files."""
 
+import copy
 import math
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -288,5 +290,5 @@ def test_files_of_a_reconstruction(cone, tmp_path):
     assert repr(result).startswith("<Reconstruction: 500 ions, ") and "cap, bas, R 30.0 to 30.0 nm (shank)" in repr(
         result
     )
-    with pytest.raises(TypeError):
-        result.settings["efficiency"] = 2.0
+    for copied in (pickle.loads(pickle.dumps(result)), copy.deepcopy(result)):
+        assert copied.settings == result.settings and np.array_equal(copied.positions, result.positions)

@@ -1,6 +1,7 @@
 """A small study, made once for all tests of reports."""
 
 import pytest
+from fits import fit_energies
 from rough import ROUGH
 
 import apt_evap as ae
@@ -13,6 +14,6 @@ def study(small_tip):
     measured = run.hits(ae.RollUp(0.2)).within_circle(60.0).map(bins=24, extent=(-60, 60, -60, 60))
     energies = {"means": (0.1, 0.2, 0.3), "rsds": (0.5, 1.0), "rollup_fractions": (0.5, 1.0)}
     here = ae.Registration(0.0, 1.0, (0.0, 0.0))
-    return ae.fit_energies(
+    return fit_energies(
         run, measured, "combined", registration=here, replicas=1, resamples=5, progress=False, **energies
     )

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fits import fit_energies
 from html_reader import Reader
 from matplotlib.figure import Figure
 from matplotlib.image import imread
@@ -56,7 +57,7 @@ def test_options_of_the_perturbation_are_in_the_report(small_tip, tmp_path):
     settings = {**ROUGH, "response_settings": ae.ResponseSettings.wide(bound=5.0)}
     run = ae.Simulation(small_tip, seed=1, **settings).run(400, progress=False)
     measured = run.hits(ae.RollUp(0.2)).within_circle(60.0).map(bins=24, extent=(-60, 60, -60, 60))
-    study = ae.fit_energies(
+    study = fit_energies(
         run,
         measured,
         means=(0.1, 0.2, 0.3),

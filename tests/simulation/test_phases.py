@@ -92,7 +92,7 @@ def test_an_ion_rolls_up_by_the_mean_distance_of_both_phases(mixed, tmp_path):
 
 
 def test_an_instrument_keeps_the_phase_as_truth(mixed):
-    hits = run_of(mixed).at_evaporation_field(smoothing=50).seen_by(ae.Instrument(efficiency=0.5))
+    hits = run_of(mixed).at_evaporation_field(smoothing=50).record(ae.Instrument(efficiency=0.5))
     assert set(hits.extra["phase"].tolist()) <= {0, 1, 2} and len(hits.extra["phase"]) == len(hits)
 
 

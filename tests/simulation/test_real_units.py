@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.simulation.real_units import pulses_of, trailing_mean
+from apt_evap.simulation.real_units import OperatingPoint, pulses_of, trailing_mean
 from apt_evap.units import FLIGHT_TIME
 
 ROLLED = ae.RollUp(ae.TruncatedNormal(0.2, 0.1))
@@ -33,7 +33,7 @@ def test_voltages_bring_the_cap_to_its_evaporation_field(run, real):
     assert cap_field == pytest.approx(35.0, rel=0.01)
     assert real.units.field_ratio == pytest.approx(np.mean(run.fields) / np.mean(run.cap.fields), rel=0.01)
     assert 1.33 < real.units.field_ratio < 1.42  # as measured on R = 8 a to 20 a
-    site = run.at_evaporation_field("site", smoothing=1)
+    site = run.at_evaporation_field(field_reference="site", smoothing=1)
     assert site.voltages * run.fields == pytest.approx(35.0 * run.voltage, rel=1e-12)
     doubled = run.at_evaporation_field(operating_field=70.0)
     assert doubled.voltages == pytest.approx(2 * real.voltages, rel=1e-12)
@@ -167,7 +167,9 @@ def test_flown_energies_are_not_taken_for_real_ones(tip12):
 
 
 def test_a_run_in_real_units_is_saved_joined_and_turned_back(real, run, tmp_path):
-    timed = run.at_evaporation_field("site", timing=ae.Timing(temperature=30.0), control=ae.VoltageControl(rate=0.02))
+    timed = run.at_evaporation_field(
+        field_reference="site", timing=ae.Timing(temperature=30.0), control=ae.VoltageControl(rate=0.02)
+    )
     timed.save(tmp_path / "real.h5")
     loaded = ae.load(tmp_path / "real.h5")
     assert loaded.units == timed.units and repr(loaded) == repr(timed) and "V/nm at the site" in repr(loaded)
@@ -180,7 +182,7 @@ def test_a_run_in_real_units_is_saved_joined_and_turned_back(real, run, tmp_path
     assert loaded.simulated().real is None and np.array_equal(loaded.simulated().voltages, run.voltages)
     assert loaded.fingerprint() == run.fingerprint()  # all of it follows from the run
     assert len(ae.Run.join([real, real]).real.voltages) == 2 * len(run)
-    assert len(real.seen_by(ae.Detector(distance=50.0)).hits(ae.Unperturbed())) == len(run)
+    assert len(real.on_detector(ae.Detector(distance=50.0)).hits(ae.Unperturbed())) == len(run)
 
 
 def test_an_epos_has_what_an_instrument_could_have_written(run, tmp_path):
@@ -209,7 +211,7 @@ def test_runs_without_fields_of_the_cap_need_the_site(run):
     old = replace(run, cap=ae.CapHistory.empty())
     with pytest.raises(ValueError, match="field_reference='site'"):
         old.at_evaporation_field()
-    assert old.at_evaporation_field("site").units.field_ratio is None
+    assert old.at_evaporation_field(field_reference="site").units.field_ratio is None
 
 
 def test_the_trailing_mean_looks_back_only():
@@ -262,7 +264,7 @@ def test_another_distance_changes_the_times(tip12):
         )
         for distance in (100.0, 40.0)
     )
-    moved = far.seen_by(ae.Detector(distance=40.0))
+    moved = far.on_detector(ae.Detector(distance=40.0))
     for by_response in (False, True):
         one, two = (run.hits(ae.Unperturbed(), by_response=by_response) for run in (near, moved))
         # the path within the field, of about 100 R, is not proportional to the distance
@@ -277,8 +279,19 @@ def test_hits_carry_the_voltage_of_their_flights(tip12):
         60, [ae.Unperturbed()], responses=False, progress=False
     )
     assert (run.hits(ae.Unperturbed()).voltage == 1000.0).all() and (run.voltages < 200).all()
-    real = run.at_evaporation_field("site", smoothing=1)
+    real = run.at_evaporation_field(field_reference="site", smoothing=1)
     assert real.voltages == pytest.approx(run.voltages, rel=1e-12)
     hits, total = real.hits(ae.Unperturbed()), real.voltages
     slower = run.hits(ae.Unperturbed()).time_of_flight * np.sqrt(1000.0 / (2 * total) * real.real.masses / 58.693)
     assert hits.time_of_flight == pytest.approx(slower, rel=1e-12, nan_ok=True)
+
+
+@pytest.mark.parametrize("factor", [1e-300, 0.0, 1e300])
+def test_a_field_factor_is_near_those_of_instruments(factor, tmp_path):
+    hits = ae.Hits(x=np.ones(9), y=np.ones(9), voltage=np.full(9, 5e3))
+    with pytest.raises(ValueError, match="field_factor"):
+        ae.reconstruct(hits, atomic_volume=0.011, distance=100.0, evaporation_field=35.0, field_factor=factor)
+    with pytest.raises(ValueError, match="field_factor"):
+        ae.polarization_energy(1e-40, 1e3, field_factor=factor, radius=10.0, step=0.3)
+    with pytest.raises(ValueError, match="field_factor"):
+        OperatingPoint(field_factor=factor)

@@ -6,6 +6,7 @@ import pytest
 
 import apt_evap as ae
 from apt_evap._core.evaporation import SWEEP_DUE
+from apt_evap.simulation.columns import columns_of
 from apt_evap.simulation.run import Run
 
 ENERGY = ae.TruncatedNormal(0.155, 0.155)
@@ -13,12 +14,7 @@ FLOWN = (ae.RollUp(0.2), ae.LateralVelocity(ENERGY))
 
 
 def columns(run):
-    named = {name: getattr(run.emissions, name) for name in vars(run.emissions)}
-    named |= {name: getattr(run, name) for name in ("site", "species", "charges", "fields")}
-    for index, flown in enumerate(run.flown):
-        named |= {f"{index} directions": flown.directions, f"{index} times": flown.times}
-    if run.responses is not None:
-        named |= run.responses.columns
+    named = columns_of(run, run.every_column)
     for perturbation in (ae.Unperturbed(), ae.RollUp(ENERGY)):
         hits = run.hits(perturbation)
         named |= {f"{perturbation} {name}": getattr(hits, name) for name in hits.columns}

@@ -218,6 +218,7 @@ PAIR = [[0, 0, 0], [0, 0, 1.0]]
         ((PAIR, [0], ["Ni"]), r"species must have shape \(2,\)"),
         (([[0, 0, 0]], [0], ["Ni"]), "at least 2 atoms, got 1"),
         (([[0, 0, 0], [0, 0, 0]], [0, 0], ["Ni"]), "two atoms at the same place"),
+        (([[0, 0, 0], [0, 0, 0.3], [0, 0.3, 1e300]], [0, 0, 0], ["Ni"]), "positions must be at most"),
         (([[0, 0, 0], [0, 0, math.nan]], [0, 0], ["Ni"]), "positions must be finite"),
         ((PAIR, [0, 0], []), "elements must contain"),
         ((PAIR, [0, 0], ["Ni"], [1, 0]), "evaporable must contain booleans"),

@@ -4,13 +4,11 @@ import json
 import h5py
 import numpy as np
 import pytest
-from sweeps import planned
+from sweeps import do, planned
 
 import apt_evap as ae
 from apt_evap.cli.main import main
-from apt_evap.config.simulation_file import read_config
 from apt_evap.sweep import collect as collect_module
-from apt_evap.sweep.claims import Claims
 from apt_evap.sweep.collect import collect
 from apt_evap.sweep.plan import open_sweep
 from apt_evap.sweep.status import status
@@ -44,17 +42,6 @@ base = "base.toml"
 "detector.width" = 200.0
 """
 ROLLUP = ae.RollUp(ae.TruncatedNormal(0.155, 0.155))
-
-
-def do(sweep, key):
-    """Run a point in this process, as a worker would."""
-    claims = Claims(sweep.folder_of(key))
-    claim = claims.take(len(claims.all()), 0)
-    config = read_config(sweep.folder_of(key) / "settings.toml")
-    run = config.simulation(n_threads=1).run(config.n_ions, progress=False)
-    run.save(sweep.folder_of(key) / "run.h5")
-    claims.end(claim, code=0, seconds=36.0, ions=len(run), message="")
-    return run
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +114,7 @@ def test_xarray_opens_the_maps(sweep, collected):
 
 def test_status_corrects_the_hours_by_those_of_finished_points(sweep):
     content = status(sweep)
-    assert content["counts"] == {"done": 4, "running": 0, "open": 1, "failed": 0}
+    assert content["counts"] == {"done": 4, "running": 0, "open": 1, "failed": 0, "damaged": 0, "foreign": 0}
     foreseen = [needs.hours for needs in sweep.foresights]
     speed = np.median([0.01 / hours for number, hours in enumerate(foreseen) if number != 1])
     assert content["hours_left"] == pytest.approx(foreseen[1] * speed)

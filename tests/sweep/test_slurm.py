@@ -31,8 +31,10 @@ def until_idle():
 
 def test_twelve_points_by_slurm(tmp_path):
     """Tasks are killed, cancelled and requeued; open points are submitted again until all are done."""
-    sweep = planned(tmp_path, TWELVE + '[[points]]\n"tip.shank_angle" = 2.5\n')
-    study, bad = str(tmp_path / "study.toml"), sweep.keys[-1]
+    folder = tmp_path / "100 % of %A, $(touch PWN) 'and' #"
+    folder.mkdir()
+    sweep = planned(folder, TWELVE + '[[points]]\n"tip.shank_angle" = 2.5\n')
+    study, bad = str(folder / "study.toml"), sweep.keys[-1]
     poison(sweep, bad)
     assert largest_array("slurm") == 1000
     assert main(["sweep", "submit", study, "--largest-array", "8"]) == 0  # two arrays
@@ -72,3 +74,5 @@ def test_twelve_points_by_slurm(tmp_path):
     assert tries >= 14 and cancelled == requeued == 1
     assert all(claim.owner["job"] for _, state in good.states() for claim in state.claims)
     check_bits(good)
+    assert len(list((sweep.folder / "jobs").glob("[0-9]*_[0-9]*.log"))) >= 13
+    assert [path.name for path in tmp_path.iterdir()] == [folder.name] and not list(tmp_path.rglob("PWN"))

@@ -2,7 +2,8 @@ import pytest
 from sweeps import BASE
 
 from apt_evap._common.files import FileError
-from apt_evap.sweep.study_file import JobSettings, key_of, read_study, with_values
+from apt_evap.config.simulation_file import key_of
+from apt_evap.sweep.study_file import JobSettings, read_study, with_values
 
 
 @pytest.fixture
@@ -80,8 +81,8 @@ def test_with_values_leaves_the_settings_alone():
         ("[[points]]\ntip.axis = [0, 0, 1]", 'must be a path in quotes, such as "tip.axis"'),
         ("points = 3", r"points must be tables \[\[points\]\], got 3"),
         ('each = {threads = 0}\n[sweep]\n"tip.axis" = [[0, 0, 1]]', "threads must be an integer >= 1, got 0"),
-        ('each = {cores = 1}\n[sweep]\n"tip.axis" = [[0, 0, 1]]', "no key is named 'cores'"),
-        ('compare = {measured = "no.epos"}\n[sweep]\n"tip.axis" = [[0, 0, 1]]', "existing file, got 'no.epos'"),
+        ('each = {cores = 1}\n[sweep]\n"tip.axis" = [[0, 0, 1]]', "'cores'"),
+        ('compare = {measured = "no.epos"}\n[sweep]\n"tip.axis" = [[0, 0, 1]]', "existing file, got .*no.epos"),
         (
             'compare = {measured = "base.toml", mechanism = "rolling"}\n[sweep]\n"tip.axis" = [[0, 0, 1]]',
             "mechanism must be one of roll-up, lateral, combined",

@@ -32,7 +32,7 @@ ions = 60
 bins = 32
 """
 TWO = 'base = "base.toml"\neach = { checkpoint = 0 }\n[sweep]\n"tip.offset_seed" = [1, 2]\n'
-LONG = SMALL.replace("ions = 60", "ions = 1_000")
+LONG = SMALL.replace("ions = 60", "ions = 600")
 
 
 def until(condition, seconds=60):
@@ -84,7 +84,7 @@ def test_a_poisoned_point_is_reported_and_the_others_are_done(tmp_path, capsys):
     assert "Unobtainium" in state.message and "settings.toml" in state.message
     out, err = capsys.readouterr()
     assert "2 points: 1 done, 0 running, 0 open, 1 failed" in out
-    assert f"point {bad} failed" in err and "--retry" in err
+    assert bad in err and good not in err and "--retry" in err
     assert main(["sweep", "work", str(tmp_path / "study.toml"), "--point", bad]) == 2  # the job of a cluster fails
     plan(tmp_path / "study.toml")  # writes correct settings
     assert sweep.state(bad).name == "failed"
@@ -131,7 +131,7 @@ def test_interrupted_work_saves_its_ions_and_continues_with_the_same_bits(tmp_pa
     state = sweep.state(key)
     assert state.name == "open" and state.claims[0].end["code"] == 130
     ions = state.claims[0].end["ions"]
-    assert 0 < ions < 1000
+    assert 0 < ions < 600
     assert status(sweep)["table"][0]["ions"] == ions
     work(sweep)
     assert sweep.state(key).claims[1].owner["ions"] == ions
@@ -225,16 +225,17 @@ def test_a_new_plan_keeps_the_runs(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("has_flock", [True, False])
-def test_twelve_points_by_workers_that_are_killed(tmp_path, monkeypatch, has_flock):
+def test_twelve_points_by_workers_and_runs_that_are_killed(tmp_path, monkeypatch, has_flock):
     if not has_flock:
         monkeypatch.setenv("PYTHONPATH", f"{no_flock(tmp_path)}:{os.environ.get('PYTHONPATH', '')}")
     sweep = planned(tmp_path)
     assert len(sweep.keys) == 12
-    with Killer(sweep, 3.0) as killer:
+    with Killer(sweep, 2.0, kinds=("worker", "run", "SIGTERM")) as killer:
         work_locally(sweep, 3)
     lost = check_journal(sweep, killer.killed)
-    print(f"{len(killer.killed)} workers killed, {lost} tries lost")
-    assert lost >= 3
+    print(f"killed {killer.count}, {lost} tries lost")
+    assert min(killer.count.values()) >= 1
+    assert 1 <= lost <= killer.count["worker"]  # a worker may write the end of its try just before it is killed
     check_bits(sweep)
     logs = "".join((sweep.folder_of(key) / "log.txt").read_text() for key in sweep.keys)
     assert ("cannot lock" in logs) is not has_flock

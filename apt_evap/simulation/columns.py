@@ -1,0 +1,130 @@
+"""The columns of a run: every array with one row per ion, its type, and its unit.
+
+A column has a path, such as "site", "emissions/positions" or "flown/0/times"; a group is a part of the run. Selection
+of ions, joining of batches, the fingerprint and the file follow from this list.
+"""
+
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from apt_evap._common.types import Floats
+from apt_evap.emission.emissions import Emissions
+from apt_evap.flight.response import Responses, ResponseSettings
+from apt_evap.simulation.real_units import RealColumns
+
+
+class Flown(NamedTuple):
+    """Results of the flights of one perturbation."""
+
+    directions: Floats
+    """Stereographic directions, shape (n, 2)."""
+    times: Floats
+    """Times of flight [ns], shape (n,)."""
+
+    def __repr__(self) -> str:
+        return f"<Flown: directions and times of {len(self.times):,} ions>"
+
+
+class Clock(NamedTuple):
+    """Course of a run with a temperature; each of shape (n,)."""
+
+    waits: Floats
+    """Time before each event [s]; with pulses, time at the top of pulses."""
+    voltages: Floats
+    """Voltage of the control at each event [V]."""
+
+    def __repr__(self) -> str:
+        return f"<Clock: {len(self.waits):,} events>"
+
+
+class Column(NamedTuple):
+    """An array with one row per ion."""
+
+    path: str
+    """Name, with the name of its group."""
+    dtype: Any
+    """Type of the numbers."""
+    row: tuple[int, ...] = ()
+    """Shape of a row."""
+    unit: str | None = None
+    """Unit of the numbers."""
+    derived: bool = False
+    """Whether it follows from the other columns, so that the fingerprint does not contain it."""
+
+
+ALWAYS = (
+    Column("emissions/ions", np.int64),
+    Column("emissions/positions", np.float64, (3,), "nm"),
+    Column("emissions/normals", np.float64, (3,)),
+    Column("emissions/neighbours", np.float64, (3,), "nm"),
+    Column("emissions/charge_states", np.int32, (), "e"),
+    Column("emissions/masses", np.float64, (), "Da"),
+    Column("site", np.int64),
+    Column("species", np.int32),
+    Column("charges", np.float64, (), "e"),
+    Column("fields", np.float64, (), "V/nm"),
+    Column("detached", np.bool_, derived=True),
+    Column("phase", np.int8, derived=True),
+)
+OPTIONAL = (
+    Column("emissions/targets", np.float64, (3, 3), "nm"),  # wide responses
+    Column("emissions/charge_ratios", np.float64, (3,)),
+    Column("emissions/second_targets", np.float64, (3, 3), "nm"),  # responses for two roll-ups
+    Column("emissions/second_charge_ratios", np.float64, (3,)),
+    Column("emissions/rollup_distances", np.float64, (), "nm"),  # phases that differ in it
+    Column("clock/waits", np.float64, (), "s"),
+    Column("clock/voltages", np.float64, (), "V"),
+    Column("real/voltages", np.float64, (), "V", derived=True),
+    Column("real/charges", np.int32, (), "e", derived=True),
+    Column("real/masses", np.float64, (), "Da", derived=True),
+    Column("real/pulse_ids", np.int64, derived=True),
+)
+_RESPONSES = ("site", "rolled", "twice")  # polynomials in the order of the designs
+
+
+def flown_columns(number: int) -> tuple[Column, ...]:
+    """Columns of the flights of the perturbation with this number."""
+    group = f"flown/{number}"
+    return Column(f"{group}/directions", np.float64, (2,)), Column(f"{group}/times", np.float64, (), "ns")
+
+
+def response_columns(settings: ResponseSettings) -> list[Column]:
+    """Columns of the responses."""
+    designs = settings.designs
+    columns = [
+        Column(f"responses/{name}", np.float32, (3, len(design.exponents)))
+        for name, design in zip(_RESPONSES, designs, strict=False)
+    ]
+    return [*columns, Column("responses/residuals", np.float32, (len(designs),), "mm")]
+
+
+def columns_of(run: Any, every: Iterable[Column]) -> dict[str, np.ndarray]:
+    """Arrays of a run by path, for those of these columns that it has."""
+    arrays = {}
+    for column in every:
+        group, _, name = column.path.rpartition("/")
+        if group.startswith("flown/"):
+            holder = run.flown[int(group.removeprefix("flown/"))]
+        else:
+            holder = getattr(run, group) if group else run
+        values = None if holder is None else getattr(holder, name)
+        if values is not None:
+            arrays[column.path] = values
+    return arrays
+
+
+def parts_of(arrays: Mapping[str, Any], nearest_neighbour_distance: float) -> dict[str, Any]:
+    """Arguments of `Run` from its arrays by path: the reverse of `columns_of`."""
+    groups: dict[str, dict[str, Any]] = {}
+    for path, values in arrays.items():
+        group, _, name = path.rpartition("/")
+        groups.setdefault(group, {})[name] = values
+    return groups[""] | {
+        "emissions": Emissions(**groups["emissions"], nearest_neighbour_distance=nearest_neighbour_distance),
+        "flown": tuple(Flown(**each) for group, each in groups.items() if group.startswith("flown/")),
+        "responses": Responses(**groups["responses"]) if "responses" in groups else None,
+        "clock": Clock(**groups["clock"]) if "clock" in groups else None,
+        "real": RealColumns(**groups["real"]) if "real" in groups else None,
+    }

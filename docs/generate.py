@@ -1,0 +1,159 @@
+"""Pages that are made from the package: the API, the commands with their options, and the keys of a settings file."""
+
+import argparse
+import importlib
+import inspect
+import re
+import tomllib
+from pathlib import Path
+
+from numpydoc.docscrape import FunctionDoc
+
+from apt_evap._common.codec import declared
+from apt_evap.cli.parser import EXIT_CODES, make_parser
+
+HERE = Path(__file__).parent
+
+
+def api(folder):
+    """Write one page for each entry of api.toml, and their table of contents."""
+    contents = [".. toctree::", "   :maxdepth: 1", ""]
+    for page in tomllib.loads((HERE / "api.toml").read_text())["page"]:
+        title = page["title"]
+        name = re.sub("[^a-z]+", "_", title.lower())
+        lines = [title, "=" * len(title), "", page["text"], "", ".. currentmodule:: apt_evap", ""]
+        lines += [".. autosummary::", "   :toctree: ..", "", *(f"   {each}" for each in page["names"])]
+        _write(folder / f"{name}.rst", lines)
+        contents.append(f"   generated/api/{name}")
+    _write(folder / "pages.inc", contents)
+
+
+def commands(path):
+    """Write a section for each command of the parser."""
+    lines = []
+    for name, parser in _subparsers(make_parser()).items():
+        lines += _command(f"apt-evap {name}", parser, "-")
+        for action, below in _subparsers(parser).items():
+            lines += _command(f"apt-evap {name} {action}", below, "~")
+    codes = re.findall(r"^  (\d+) +(.*)$", EXIT_CODES, re.MULTILINE)
+    _write(path, [*lines, "Exit codes", "----------", "", *_table("10 90", codes)])
+
+
+def settings(path):
+    """Write a section with the keys of each table in settings.toml."""
+    lines = []
+    for table in tomllib.loads((HERE / "settings.toml").read_text())["table"]:
+        module, _, name = table["object"].rpartition(".")
+        described = getattr(importlib.import_module(f"apt_evap.{module}".rstrip(".")), name)
+        rows = [("Key", "Value", "Default", "Meaning"), *_keys(described)]
+        text = f"{table['text'].strip()} In Python: `{table['object']}`."
+        lines += [table["title"], "-" * len(table["title"]), "", text, "", *_table("15 20 15 50", rows, 1)]
+    _write(path, lines)
+
+
+def _keys(described):
+    """Key, type with unit and bounds, default and text of each parameter that a file can contain."""
+    defaults = inspect.signature(described).parameters
+    known = declared(described)
+    entries = [(name, _value(each.kind, each.unit, each.bounds), each.text) for name, each in known.items()]
+    if not known:
+        entries = [
+            (name, _value(kind.removesuffix(", optional"), "", ""), " ".join(words))
+            for name, kind, words in FunctionDoc(described)["Parameters"]
+            if name != "phases"  # a table of its own
+        ]
+    return [(f"``{name}``", value, _default(defaults[name].default), text) for name, value, text in entries]
+
+
+# types as they are called in TOML
+_TYPES = {
+    r"sequence of float, shape \((\d+),\)": r"list of \1 numbers",
+    r"(sequence|tuple) of float": "list of numbers",
+    r"(sequence|tuple) of int": "list of integers",
+    r"(sequence|tuple) of (\w+)": r"list of \2",
+    r"\bfloat\b": "number",
+    r"\bint\b": "integer",
+    r"\bbool\b": "true or false",
+    r"\bstr\b": "text",
+    r"\bmapping\b": "table",
+    r" or callable\b|[{}]": "",
+}
+
+
+def _value(kind, unit, bounds):
+    for written, plain in _TYPES.items():
+        kind = re.sub(written, plain, kind)
+    return ", ".join(filter(None, (f"{kind} [{unit}]" if unit else kind, _short(bounds))))
+
+
+def _short(number):
+    """Text of numbers with exponents as a user writes them: 1e6, 1e-5."""
+    return re.sub(r"e([+-])0?", lambda found: f"e{found[1]}".rstrip("+"), number)
+
+
+def _subparsers(parser):
+    found = [action.choices for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+    return found[0] if found else {}
+
+
+def _command(title, parser, underline):
+    """Description, usage, options by group, and examples of a command."""
+    lines = [f".. program:: {title}", "", title, underline * len(title), "", _sentence(parser.description), ""]
+    if not _subparsers(parser):
+        lines += _block(parser.format_usage().removeprefix("usage: "))
+    for group in parser._action_groups:
+        actions = [each for each in group._group_actions if not isinstance(each, _NOT_SHOWN)]
+        if actions and group.title not in ("positional arguments", "options"):
+            lines += [f".. rubric:: {group.title[0].upper()}{group.title[1:]}", "", _sentence(group.description), ""]
+        for action in actions:
+            lines += [f".. option:: {_signature(action)}", "", f"   {_sentence(action.help or 'required')}", ""]
+    return lines + _block(parser.epilog or "")
+
+
+_NOT_SHOWN = (argparse._SubParsersAction, argparse._HelpAction)
+
+
+def _signature(action):
+    value = action.metavar or ("{" + ",".join(action.choices) + "}" if action.choices else action.dest)
+    value = "" if action.nargs == 0 else f"[{value}]" if action.nargs == "?" else value
+    return ", ".join(f"{name} {value}".rstrip() for name in action.option_strings) or value
+
+
+def _sentence(text):
+    """Text of the help as a sentence, with options and commands in double quotes."""
+    text = re.sub(r"([*|`\\])", r"\\\1", " ".join((text or "").split()))
+    text = re.sub(r"(?<![\w/-])(--?[a-z][\w-]*|pip install '[^']*')", r"``\1``", text)
+    return text[:1].upper() + text[1:] + ("." if text and text[-1] not in ".:," else "")
+
+
+def _block(text):
+    lines = [f"    {line}".rstrip() for line in text.rstrip().splitlines()]
+    return [".. code-block:: text", "", *lines, ""] if lines else []
+
+
+def _default(value):
+    """Default of a parameter as it is written in TOML; empty if it is None or an object."""
+    if value is inspect.Parameter.empty:
+        return "required"
+    if isinstance(value, bool):
+        return f"``{str(value).lower()}``"
+    if isinstance(value, tuple) and all(isinstance(each, int | float) for each in value):
+        return f"``{list(value)}``"
+    if isinstance(value, float):
+        return f"``{_short(repr(value) if value < 1e6 else f'{value:g}')}``"
+    return f'``"{value}"``' if isinstance(value, str) else f"``{value}``" if isinstance(value, int) else ""
+
+
+def _table(widths, rows, heads=0):
+    lines = [".. list-table::", f"   :header-rows: {heads}", f"   :widths: {widths}", ""]
+    for row in rows:
+        lines += [f"   {' ' if column else '*'} - {cell}" for column, cell in enumerate(row)]
+    return [*lines, ""]
+
+
+def _write(path, lines):
+    """Write a page that has changed: Sphinx reads only these again."""
+    text = "\n".join(lines).rstrip() + "\n"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if not path.exists() or path.read_text() != text:
+        path.write_text(text)

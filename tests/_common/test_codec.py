@@ -1,0 +1,179 @@
+"""Settings that are declared once: checks, plain form, texts and documentation follow from the declaration."""
+
+import copy
+import json
+import pickle
+from dataclasses import FrozenInstanceError
+
+import numpy as np
+import pytest
+
+import apt_evap as ae
+from apt_evap._common.codec import (
+    changed,
+    checked,
+    choice,
+    count,
+    declared,
+    for_json,
+    from_plain,
+    is_settings,
+    number,
+    part,
+    settings,
+    switch,
+    to_plain,
+    to_python,
+    vector,
+)
+
+NICKEL = ae.material("Ni")
+EXAMPLES = [
+    ae.TruncatedNormal(0.1, 0.2),
+    ae.Fixed(0.3),
+    ae.Thermal(50.0),
+    ae.Unperturbed(0.1),
+    ae.LateralVelocity(0.2),
+    ae.RollUp(ae.Thermal(20.0), ae.ChargeRatio(0.9, 0.05), others=0.1, second_roll=0.2),
+    ae.Combined(0.2, 0.75, sharpness=0.4),
+    ae.ChargeSettings(tolerance=1e-3, sweep_interval=50),
+    ae.FlightSettings(reach=2000.0),
+    ae.ResponseSettings(),
+    ae.ResponseSettings.wide(0.15, rolls=2),
+    ae.WatchSettings(interval=20),
+    ae.Detector(90.0, 80.0, "equidistant"),
+    ae.Instrument(dead_time=3.0, quantisation=(0.1, 0.2), timing=ae.Timing(0.3, 50.0)),
+    ae.PostIonisation(0.74),
+    ae.Robin(window=3),
+    ae.ConstantPotential(15.0, "gaussian", "others"),
+    ae.VoltageControl(0.02, memory=100),
+    ae.Extremal(ae.CoordinationTable({"W": {3: 47.0, 4: 57.0}})),
+    ae.Arrhenius(
+        50.0, {"Al": 0.8}, laser=ae.Laser(150.0, direction=(0, 1)), bonds=ae.PairEnergies(ordering={"A-B": 1})
+    ),
+    NICKEL,
+    ae.Orientation(NICKEL, (1, 1, 1), 10.0),
+    ae.Ellipsoid((0, 0, 1), (1, 2, 3)),
+    ae.CoreShell(ae.Union(ae.Sphere((0, 0, 2), 1.2), ae.Layer(0.0, 1.0)), 0.5),
+    ae.Segregation(0.01, 0.2, 0.4, ae.HalfSpace((2, 0, 0), (1, 0, 0))),
+    ae.Order("L1_2", {"Al": 0.8, "Ti": 0.2}),
+    ae.Basis(("Al", None, {"Al": 0.5, "Ti": 0.5}, None)),
+    ae.Phase("ball", NICKEL, ae.Sphere((0, 0, 2), 1.2), (1, 1, 1), 3.0, ae.Order("L1_2", "Al"), {"Cu": 0.1}),
+    ae.Distortion(2, (0.0, 1.0), 20.0, (1j, 0.1, 0.2 + 1j, 0.3)),
+    ae.Registration(10.0, 0.5, (1.0, 2.0), True, ties=(ae.Registration(0.0, 1.0, (0, 0)),)),
+]
+
+
+def name_of(example):
+    return type(example).__name__
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=name_of)
+def test_settings_come_back_from_json(example):
+    plain = for_json(example)
+    again = from_plain(json.loads(json.dumps(plain, allow_nan=False)), type(example))
+    assert type(again) is type(example) and for_json(again) == plain
+    assert is_settings(again) and pickle.loads(pickle.dumps(example)).__class__ is type(example)
+    assert for_json(copy.deepcopy(example)) == plain
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=name_of)
+def test_every_field_is_documented_with_its_unit(example):
+    for name, setting in declared(type(example)).items():
+        (line,) = [line for line in type(example).__doc__.splitlines() if line.strip().startswith(f"{name} : ")]
+        assert not setting.unit or f"[{setting.unit}]" in line
+        assert setting.text.split()[0] in type(example).__doc__
+
+
+@pytest.mark.parametrize("example", EXAMPLES[:20], ids=name_of)
+def test_python_text_is_the_same_object(example):
+    assert eval(to_python(example), {"ae": ae}) == example
+
+
+@settings
+class Pulse:
+    """Pulses.
+
+    Notes
+    -----
+    A note.
+    """
+
+    width: float = number("Standard deviation. Of the top.", above=0, below=5, unit="ns")
+    shots: int | None = count("Number.", default=None, at_least=1)
+    on: bool = switch("Whether.", default=True)
+    form: str = choice("Form.", ("round", "flat"), default="round")
+    place: tuple = vector("Where.", 2, default=(0.0, 1.0), at_least=0, unit="nm")
+    inner: ae.Fixed | None = part("Another.", ae.Fixed, default=None)
+    names: dict = checked("Names.", "mapping", lambda names, name: dict(names), default={})
+
+    def _check(self):
+        if self.shots == 13:
+            raise ValueError("shots must not be 13")
+        return {"names": {**self.names, "checked": 1}}
+
+
+def test_the_docstring_gains_the_parameters_before_the_notes():
+    lines = [line.strip() for line in Pulse.__doc__.splitlines()]
+    assert lines.index("Parameters") < lines.index("width : float [ns] > 0 and < 5") < lines.index("Notes")
+    assert 'form : {"round", "flat"}, default \'round\'' in lines and "shots : int >= 1, optional" in lines
+
+
+@pytest.mark.parametrize(
+    ("values", "word"),
+    [
+        ({"width": 0.0}, "width"),
+        ({"width": 5.0}, "width"),
+        ({"width": "1"}, "width"),
+        ({"width": np.nan}, "width"),
+        ({"width": 1, "shots": 0}, "shots"),
+        ({"width": 1, "shots": 13}, "13"),
+        ({"width": 1, "on": 1}, "on"),
+        ({"width": 1, "form": "square"}, "form"),
+        ({"width": 1, "place": (1, 2, 3)}, "place"),
+        ({"width": 1, "place": (1, -2)}, "place"),
+        ({"width": 1, "inner": 3}, "inner"),
+        ({"width": None}, "width"),
+    ],
+)
+def test_each_field_is_checked_with_its_name(values, word):
+    for make in (lambda: Pulse(**values), lambda: from_plain(values, Pulse)):
+        with pytest.raises(ValueError, match=word) as caught:
+            make()
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "plain", [None, 3, {}, {"width": 1, "hight": 2}, {"name": "Laser", "width": 1}, {"name": "Pulse"}]
+)
+def test_a_plain_form_that_does_not_fit_is_refused(plain):
+    with pytest.raises(ValueError):
+        from_plain(plain, Pulse)
+
+
+def test_values_are_converted_defaults_are_not_shared_and_nothing_can_be_set():
+    pulse = Pulse(np.float32(1.5), np.int64(3), place=[1, 2])
+    assert type(pulse.width) is float and type(pulse.shots) is int and pulse.place == (1.0, 2.0)
+    assert pulse.names == {"checked": 1} and Pulse(1).names is not Pulse(2).names
+    with pytest.raises(FrozenInstanceError):
+        pulse.width = 2.0
+
+
+def test_short_forms_leave_defaults_out():
+    assert to_plain(ae.RollUp(0.2), short=True) == {"name": "RollUp", "energy": 0.2}
+    assert to_python(ae.RollUp(0.2, sharpness=0.4)) == "ae.RollUp(0.2, sharpness=0.4)"
+    assert changed(ae.Detector(), {"width": 80.0}) == ae.Detector(100.0, 80.0)
+    with pytest.raises(ValueError, match="width"):
+        changed(ae.Detector(), {"widht": 80.0})
+
+
+def test_plain_forms_of_other_objects():
+    class Law:
+        def __init__(self):
+            self.power, self._hidden = np.float64(2.0), 3
+
+    assert to_plain(Law()) == {"name": "Law", "power": 2.0}
+    assert to_plain({1: np.arange(2), "a": 1 + 2j, "f": len}) == {"1": [0, 1], "a": [1.0, 2.0], "f": "builtins.len"}
+    assert for_json([np.nan, np.inf, 1.0]) == [None, None, 1.0]
+    assert to_plain({ae.Fixed(1.0): 0.5}) == [[{"name": "Fixed", "energy": 1.0}, 0.5]]
+    assert not is_settings(type("Mine", (ae.Unperturbed,), {})())

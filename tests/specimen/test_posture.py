@@ -1,0 +1,75 @@
+"""How a specimen from positions stands, and where its apex is."""
+
+import json
+import warnings
+
+import numpy as np
+import pytest
+
+import apt_evap as ae
+from apt_evap.cli.main import main
+from apt_evap.specimen.posture import apex_sphere, depths
+
+
+@pytest.fixture(scope="module")
+def needle(nickel):
+    """Positions of a tip with a flat base, R = 2.5 nm, 8.5 nm high."""
+    return ae.Tip(nickel, apex_radius=2.5, axis=(1, 1, 1), shank_length=6.0, shank_angle=6.0, base="flat").positions
+
+
+def tip_of(positions):
+    return ae.Tip.from_positions(positions, np.zeros(len(positions), int), ["Ni"])
+
+
+def test_an_upright_specimen_is_silent(needle, small_tip):
+    turned = needle @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    dome = needle[needle[:, 2] > 0.5]
+    wire = needle[(np.hypot(*needle.T[:2]) < 1.5) & (needle[:, 2] < 1.0)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for positions in (needle, turned, dome, wire, small_tip.positions, needle + 40.0):
+            tip_of(positions)
+
+
+def test_a_specimen_upside_down_or_on_its_side_is_named(needle):
+    with pytest.warns(ae.SpecimenWarning, match="upside down"):
+        tip_of(needle * [1, 1, -1])
+    for axes, name in (([2, 1, 0], "x"), ([0, 2, 1], "y")):
+        with pytest.warns(ae.SpecimenWarning, match=f"side.* {name}"):
+            tip_of(needle[:, axes])
+
+
+def test_the_sphere_of_the_apex_and_depths_below_it(needle):
+    centre, radius = apex_sphere(needle + np.array([3.0, -2.0, 7.0]))
+    assert radius == pytest.approx(2.5, abs=0.12)  # half a nearest neighbour distance: the surface is of atoms
+    assert centre == pytest.approx([3.0, -2.0, 7.0], abs=0.15)
+    places = np.array([[0.0, 0.0, 2.0], [1.0, 0.0, np.sqrt(2.5**2 - 1) - 0.7], [2.4, 0.0, 0.0]])
+    assert depths(places, np.zeros(3), 2.5) == pytest.approx([0.5, 0.7, np.nan], nan_ok=True)
+
+
+def test_info_of_a_specimen(needle, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    types = np.where(np.linalg.norm(needle - [0, 0, 1.0], axis=1) < 0.7, 2, 1)  # a particle, 0.8 nm below the apex
+    rows = "".join(
+        f"{k + 1} {t} {x} {y} {z}\n" for k, (t, (x, y, z)) in enumerate(zip(types, 10 * needle, strict=True))
+    )
+    (tmp_path / "tip.dump").write_text(
+        f"ITEM: TIMESTEP\n0\nITEM: NUMBER OF ATOMS\n{len(needle)}\nITEM: BOX BOUNDS ff ff ff\n"
+        f"-100 100\n-100 100\n-100 100\nITEM: ATOMS id type x y z\n{rows}"
+    )
+    assert main(["info", "tip.dump"]) == 2 and "types" in capsys.readouterr().err
+    assert main(["info", "tip.dump", "--types", "1=Ni,2=Al", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["atoms"] == len(needle) and told["species"] == {
+        "Ni": int((types == 1).sum()),
+        "Al": int((types == 2).sum()),
+    }
+    assert told["height"] == pytest.approx(np.ptp(needle[:, 2]), abs=1e-4)
+    assert told["apex_radius"] == pytest.approx(2.5, abs=0.12)
+    # a shell of 0.8 nm below 45 degrees of a sphere of 2.5 nm, at 91.4 atoms / nm^3
+    volume = np.pi * (2.5 * np.sin(np.pi / 4)) ** 2 * 0.8
+    assert told["atoms_above"]["Al"] == pytest.approx(91.4 * volume, rel=0.2)
+    assert main(["info", "tip.dump", "--types", "1=Ni,2=Al"]) == 0
+    text = capsys.readouterr().out
+    assert "apex radius [nm]" in text and "height [nm]" in text
+    assert main(["info", "tip.dump", "--types", "1"]) == 2 and "--types" in capsys.readouterr().err
