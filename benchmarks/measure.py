@@ -227,7 +227,7 @@ def flights(radii=(20, 40, 80, 120), shank=2.0, ions=256, group=17):
         for launches in (1, group):
             flier = flier_over(batch.tree, tip, settings)
             angle = np.tile(2 * np.pi * np.arange(launches) / launches, len(batch))
-            first, second = (np.repeat(t, launches, axis=0) for t in ae.tangent_frame(batch.normals))
+            first, second = (np.repeat(t, launches, axis=0) for t in ae.emission.tangent_frame(batch.normals))
             velocities = speed * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second)
             positions = np.repeat(tip.positions[batch.site], launches, axis=0)
             start = time.perf_counter()
@@ -310,7 +310,7 @@ def place_errors(radius=40, shank=1.0, events=5000, ions=200, n_threads=2):
 def response_errors(radii=(20, 80), shank=2.0, events=5000, ions=200, n_threads=2):
     """Hit positions from responses against flights, for energies up to 1.5 eV that are not in the design."""
     rows = []
-    energies = [ae.Fixed(energy) for energy in (0.05, 0.2, 0.5, 0.8, 1.1, 1.5)]
+    energies = [ae.emission.Fixed(energy) for energy in (0.05, 0.2, 0.5, 0.8, 1.1, 1.5)]
     for radius in radii:
         simulation = ae.Simulation(nickel_tip(radius, shank), seed=1, n_threads=n_threads)
         evaporate(simulation.emitter, events)

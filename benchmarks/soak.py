@@ -58,7 +58,7 @@ def soak(radius, n_ions, responses, n_threads):
         sampler.start()
         start = time.perf_counter()
         try:
-            checkpoint = ae.Checkpoint(Path(folder, "soak.h5"), minutes=1.0)
+            checkpoint = ae.simulation.Checkpoint(Path(folder, "soak.h5"), minutes=1.0)
             run = simulation.run(n_ions, responses=responses, checkpoint=checkpoint)
         finally:
             done.set()

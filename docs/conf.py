@@ -1,5 +1,6 @@
 """Sphinx: `sphinx-build -W docs docs/_build` in an environment with `pip install '.[docs]'`."""
 
+import re
 import shutil
 import sys
 import warnings
@@ -93,15 +94,17 @@ html_theme_options = {
 
 
 def in_package(app, env, node, contnode):
-    """Link to a public name from a docstring of a module below the package, and to the class of a field."""
+    """Link to a public name, also without its namespace or with its module, and to the class of a field."""
     if node.get("reftype") != "obj":
         return None
     node["py:module"], node["py:class"] = "apt_evap", None
-    python, target = env.domains["py"], node["reftarget"]
-    for name in filter(None, (target, target.rpartition(".")[0])):
-        found = python.resolve_xref(env, node["refdoc"], app.builder, "obj", name, node, contnode)
-        if found is not None:
-            return found
+    python, target = env.domains["py"], node["reftarget"].removeprefix("apt_evap.")
+    names = [target, target.rpartition(".")[0], re.sub(r"^([a-z_]+)\.[a-z_]+\.", r"\1.", target)]
+    for name in filter(None, names):
+        for place in ("", *(f"{space}." for space in generate.namespaces())):
+            found = python.resolve_xref(env, node["refdoc"], app.builder, "obj", place + name, node, contnode)
+            if found is not None:
+                return found
     return None
 
 

@@ -9,22 +9,58 @@ from pathlib import Path
 
 from numpydoc.docscrape import FunctionDoc
 
+import apt_evap
 from apt_evap._common.codec import declared
 from apt_evap.cli.parser import EXIT_CODES, make_parser
 
 HERE = Path(__file__).parent
 
 
+# pages that explain the names of a namespace
+_GUIDES = {
+    "analysis": "charge_states real_units field_ion_image",
+    "config": "settings",
+    "crystallography": "howto/find_orientation",
+    "detection": "instruments howto/correct_distortion",
+    "emission": "emission charge_states extending",
+    "evaporation": "charging_rules laws temperature extending_physics",
+    "explore": "howto/explore",
+    "fit": "fits howto/fit_energies",
+    "flight": "flights",
+    "io": "formats",
+    "maps": "map_measures",
+    "reconstruction": "reconstruction reconstruction_errors",
+    "registration": "howto/correct_distortion howto/find_orientation",
+    "simulation": "howto/resume real_units",
+    "specimen": "specimens howto/own_structure",
+    "sweep": "howto/sweep",
+    "units": "conventions",
+}
+
+
+def namespaces():
+    """Public modules of the package: name and module."""
+    found = {name: getattr(apt_evap, name) for name in apt_evap.__all__}
+    return {name: thing for name, thing in found.items() if inspect.ismodule(thing)}
+
+
 def api(folder):
-    """Write one page for each entry of api.toml, and their table of contents."""
+    """Write a page for the front row of names, one for each namespace, and their table of contents."""
+    spaces = namespaces()
+    front = [name for name in apt_evap.__all__ if name not in spaces and name != "__version__"]
+    pages = {"apt_evap": ("The names used most. ``import apt_evap as ae``, then ``ae.Tip``.", front)}
+    for name, module in spaces.items():
+        guides = ", ".join(f":doc:`/{page}`" for page in _GUIDES.get(name, "").split())
+        text = f"{_sentence(inspect.getdoc(module).splitlines()[0])} {f'See {guides}.' if guides else ''}".strip()
+        public = [f"{name}.{each}" for each in getattr(module, "__all__", [])]
+        pages[f"apt_evap.{name}"] = (text, public or [name])
     contents = [".. toctree::", "   :maxdepth: 1", ""]
-    for page in tomllib.loads((HERE / "api.toml").read_text())["page"]:
-        title = page["title"]
-        name = re.sub("[^a-z]+", "_", title.lower())
-        lines = [title, "=" * len(title), "", page["text"], "", ".. currentmodule:: apt_evap", ""]
-        lines += [".. autosummary::", "   :toctree: ..", "", *(f"   {each}" for each in page["names"])]
-        _write(folder / f"{name}.rst", lines)
-        contents.append(f"   generated/api/{name}")
+    for title, (text, names) in pages.items():
+        lines = [title, "=" * len(title), "", text, "", ".. currentmodule:: apt_evap", ""]
+        lines += [".. autosummary::", "   :toctree: ..", "", *(f"   {each}" for each in names)]
+        page = title.replace(".", "_")
+        _write(folder / f"{page}.rst", lines)
+        contents.append(f"   generated/api/{page}")
     _write(folder / "pages.inc", contents)
 
 

@@ -61,7 +61,7 @@ folder.mkdir(parents=True, exist_ok=True)
 npz = options.measured.endswith(".npz")
 measured = ae.read_map(options.measured) if npz else ae.read(options.measured).map(bins=options.bins or 128)
 planes, positions = zip(*options.pole, strict=True)
-fit = ae.fit_orientation(options.material, planes, positions, centre=tuple(options.centre))
+fit = ae.crystallography.fit_orientation(options.material, planes, positions, centre=tuple(options.centre))
 axis = " ".join(f"{index:.3f}" for index in fit.orientation.axis)
 print(f"axis [{axis}], rotation {fit.orientation.rotation:.1f} degrees; residual of the poles {fit.rms:.2f} mm (RMS)")
 
@@ -83,7 +83,7 @@ else:
     )
     run = ae.Simulation(tip, seed=1).run(ions)
     run.save(folder / "run.h5")
-compression = ae.image_compression(run).compression
+compression = ae.analysis.image_compression(run).compression
 distance = 100.0
 run = run.on_detector(ae.Detector(distance=distance, width=4 * distance, projection="equidistant"))
 print(run)
@@ -109,8 +109,8 @@ print(f"from poles: {start}\nfrom maps: {registration}, correlation {registratio
 
 np.set_printoptions(precision=3, suppress=True)
 for mechanism in options.mechanism or MECHANISMS:
-    settings = ae.FitSettings(bins=options.bins, smoothing=options.smoothing)
-    study = ae.fit_energies(run, measured, ae.EnergyGrid(mechanism), settings, registration=registration)
+    settings = ae.fit.FitSettings(bins=options.bins, smoothing=options.smoothing)
+    study = ae.fit_energies(run, measured, ae.fit.EnergyGrid(mechanism), settings, registration=registration)
     print(f"\n{study}\n{study.ssim}")
     study.save(folder / f"{mechanism}.json")
     ae.plot.ssim_matrix(study)[0].figure.savefig(folder / f"{mechanism}_ssim.png")

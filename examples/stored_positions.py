@@ -24,7 +24,7 @@ import numpy as np
 import scipy
 
 import apt_evap as ae
-from apt_evap.specimen.lattice import atom_density
+from apt_evap.specimen import atom_density
 
 parser = argparse.ArgumentParser(description="Reconstruction beside the positions in an .epos file.")
 parser.add_argument("file", help=".epos, with detector coordinates and positions")

@@ -46,7 +46,7 @@ print("columns:", ", ".join(measured.columns))
 
 # %%
 # Ions are selected by masks, by windows of a column, or by a circle on the detector. An .rrng file assigns species to
-# mass ranges: ``ae.read_ranges("R5083.rrng")``.
+# mass ranges: ``ae.io.read_ranges("R5083.rrng")``.
 
 centre = [(column.min() + column.max()) / 2 for column in (measured.x, measured.y)]  # not (0, 0) in every file
 late = measured.window(ion=(len(measured) // 2, None))  # measured ions are numbered by row
@@ -65,9 +65,9 @@ if measured.multiplicity is not None:
 # Measured coordinates are quantised. Bins that are not multiples of the quantisation step alias into stripes (left). By
 # default, the step is determined from the data, and the bins are multiples of it (right).
 
-arbitrary = measured.map(bins=256, quantum=None)
+arbitrary = measured.map(bins=256, position_step=None)
 aligned = measured.map(bins=256)
-print(f"quantisation step: {aligned.quantum} mm, bin size: {aligned.bin_size} mm")
+print(f"quantisation step: {aligned.position_step} mm, bin size: {aligned.bin_size} mm")
 axes = ae.plot.detector_maps([arbitrary, aligned], ["arbitrary bins", "multiples of the step"])
 axes[0].figure.savefig("measured.png")
 
@@ -77,4 +77,4 @@ axes[0].figure.savefig("measured.png")
 # have more ions than one half, and therefore a higher similarity.
 
 for smoothing in (0.0, 0.5, 1.0):
-    print(f"smoothed by {smoothing} mm:", ae.half_ceiling(measured, bins=128, smoothing=smoothing))
+    print(f"smoothed by {smoothing} mm:", ae.maps.similarity_ceiling(measured, bins=128, smoothing=smoothing))

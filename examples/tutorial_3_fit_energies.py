@@ -54,8 +54,8 @@ print(run)
 # sufficient for this step. For a [111] axis, there are three equivalent registrations, and three mirrored ones, which
 # differ only by noise. Equally good registrations are in ``ties``. Always check the overlay.
 
-guess = run.hits(ae.RollUp(0.1)).map(bins=2 * bins, quantum=None)
-measured_map = measured.map(bins=bins, quantum=None)
+guess = run.hits(ae.RollUp(0.1)).map(bins=2 * bins, position_step=None)
+measured_map = measured.map(bins=bins, position_step=None)
 registration = ae.register(guess, measured_map)
 print(f"{registration}, correlation {registration.score:.2f}, {len(registration.ties)} ties")
 ae.plot.overlay(guess, measured_map.smoothed(0.6), registration).figure.savefig("overlay.png")
@@ -65,10 +65,13 @@ ae.plot.overlay(guess, measured_map.smoothed(0.6), registration).figure.savefig(
 # copy of itself, which removes gradients across the detector, and smoothed by half a bin. The structural similarity
 # (SSIM) is 1 for equal maps and 0 for unrelated maps. The SSIM is corrected for the noise of both maps, which is known.
 # For the true energies, it is therefore about 1 within the error, although two noisy maps are never equal. In this
-# example, a small grid of energies is sufficient. Without ``means`` and ``rsds``, the grid is that of :cite:t:`Shaikh`.
+# example, a small grid of energies is sufficient. Without ``means`` and ``relative_spreads``, the grid is that of
+# :cite:t:`Shaikh`.
 
-grid = ae.EnergyGrid("roll-up", means=(0.01, 0.0825, 0.155, 0.2275, 0.3), rsds=(0.0316, 0.1, 0.316, 1.0, 3.16))
-study = ae.fit_energies(run, measured_map, grid, ae.FitSettings(resamples=100), registration=registration)
+grid = ae.fit.EnergyGrid(
+    "roll-up", means=(0.01, 0.0825, 0.155, 0.2275, 0.3), relative_spreads=(0.0316, 0.1, 0.316, 1.0, 3.16)
+)
+study = ae.fit_energies(run, measured_map, grid, ae.fit.FitSettings(resamples=100), registration=registration)
 print(study)
 
 # %%

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import apt_evap as ae
-from apt_evap.emission.surface_frame import launch_tangentially, rollup_direction
+from apt_evap.emission import launch_tangentially, rollup_direction
 from apt_evap.units import speed_from_energy
 
 n_ions = int(sys.argv[1]) if len(sys.argv) > 1 else 400
@@ -74,5 +74,5 @@ print(f"{direct}\nresponses against flights: median {np.median(error):.4f} mm, l
 # number of ions that hit the detector.
 
 probabilities = np.linspace(0, 1, 5)
-counts = [run.hits(replace(half, probability=each)).counts[ae.Outcome.HIT] for each in probabilities]
+counts = [run.hits(replace(half, probability=each)).counts[ae.detection.Outcome.HIT] for each in probabilities]
 print("hits by roll-up probability:", dict(zip(probabilities.tolist(), counts, strict=True)))

@@ -80,7 +80,7 @@ def tip12(nickel):
 @pytest.fixture(scope="session")
 def surface12(tip12):
     """Positions, normals and charges of the surface atoms of `tip12`, solved to 1e-8."""
-    emitter = ae.Emitter(tip12, 1000.0)
+    emitter = ae.evaporation.Emitter(tip12, 1000.0)
     arrays = emitter.positions, emitter.normals, emitter.charges
     for array in arrays:
         array.flags.writeable = False

@@ -6,7 +6,7 @@ from apt_evap._common.codec import declared
 
 def _parts(mechanism, options):
     parts = []
-    for kind, own in ((ae.EnergyGrid, {"mechanism": mechanism}), (ae.FitSettings, {})):
+    for kind, own in ((ae.fit.EnergyGrid, {"mechanism": mechanism}), (ae.fit.FitSettings, {})):
         parts.append(kind(**own, **{name: options.pop(name) for name in declared(kind) if name in options}))
     return parts
 
@@ -17,5 +17,5 @@ def fit_energies(run, measured, mechanism="roll-up", **options):
 
 
 def fit_tips(runs, measured, mechanism="roll-up", **options):
-    """`ae.fit_tips`, likewise."""
-    return ae.fit_tips(runs, measured, *_parts(mechanism, options), **options)
+    """`ae.fit.fit_tips`, likewise."""
+    return ae.fit.fit_tips(runs, measured, *_parts(mechanism, options), **options)

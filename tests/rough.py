@@ -6,6 +6,6 @@ import apt_evap as ae
 ROUGH = {
     "flight_settings": ae.FlightSettings(opening_angle=0.6, tolerance=1e-2),
     "response_settings": ae.ResponseSettings(
-        site=ae.Design(2, ((0.0, 1), (1.0, 6))), rolled=ae.Design(2, ((0.0, 1), (1.0, 6))), bound=1.0
+        site=ae.flight.Design(2, ((0.0, 1), (1.0, 6))), rolled=ae.flight.Design(2, ((0.0, 1), (1.0, 6))), bound=1.0
     ),
 }

@@ -13,7 +13,7 @@ import apt_evap as ae
 from apt_evap.config.simulation_file import read_config
 from apt_evap.simulation.run import load
 from apt_evap.sweep.claims import Claims
-from apt_evap.sweep.plan import plan
+from apt_evap.sweep.planning import plan
 
 BASE = """
 [tip]

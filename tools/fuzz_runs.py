@@ -39,8 +39,8 @@ SECONDS, MEMORY = 20, 6 << 30  # of one mutant
 def make_files(folder):
     """A run with all that a file may hold, and the state it ends in."""
     tip = ae.Tip("Ni", apex_radius=1.8, axis=(1, 1, 1), shank_length=1.8, depth=1.2, solutes={"Al": 0.1}, seed=1)
-    settings, watch = ae.ChargeSettings(sweep_interval=20), ae.WatchSettings(interval=20)
-    simulation = ae.Simulation(tip, seed=1, n_threads=1, charge_settings=settings, watch_settings=watch)
+    settings, monitor = ae.evaporation.ChargeSettings(sweep_interval=20), ae.simulation.Monitor(interval=20)
+    simulation = ae.Simulation(tip, seed=1, n_threads=1, charge_settings=settings, monitor=monitor)
     run = simulation.run(60, [ae.RollUp(0.2), ae.Unperturbed()], progress=False)
     run.save(folder / "run.h5")
     write_state(folder / "state.h5", run.state, run.first_event)

@@ -30,6 +30,9 @@ from dataclasses import dataclass
 import numpy as np
 
 import apt_evap as ae
+from apt_evap.emission.emissions import Launches
+from apt_evap.specimen.phases import Phase
+from apt_evap.specimen.regions import Sphere
 
 warnings.simplefilter("ignore")
 
@@ -41,7 +44,7 @@ class FromAbove:
     def launch(self, emissions, random):
         n = len(emissions)
         height = self.height * random.uniform()
-        return ae.Launches(emissions.positions + height * emissions.normals, np.zeros((n, 3)), np.zeros(n, bool))
+        return Launches(emissions.positions + height * emissions.normals, np.zeros((n, 3)), np.zeros(n, bool))
 
 
 def simulation(name):
@@ -51,9 +54,9 @@ def simulation(name):
         tip = ae.Tip(nickel, apex_radius=20 * a, axis=(1, 1, 1), shank_length=20 * a)
         return ae.Simulation(tip, seed=1, detector=ae.Detector(distance=100.0, width=300.0)), 3000, ()
     if name == "phases":
-        core = ae.Sphere((0, 0, 8 * a), 3 * a)
-        matrix = ae.Phase("matrix", nickel, solutes={"Al": 0.1})
-        phases = [matrix, ae.Phase("core", nickel, core, evaporation_field=30.0)]
+        core = Sphere((0, 0, 8 * a), 3 * a)
+        matrix = Phase("matrix", nickel, solutes={"Al": 0.1})
+        phases = [matrix, Phase("core", nickel, core, evaporation_field=30.0)]
         tip = ae.Tip(phases=phases, apex_radius=12 * a, axis=(0, 0, 1), seed=4)
         control = ae.VoltageControl(rate=0.02, memory=100)
         return ae.Simulation(tip, seed=4, law=ae.Arrhenius(60.0), control=control), 2000, ()

@@ -16,7 +16,7 @@ n_threads = int(sys.argv[2]) if len(sys.argv) > 2 else 3
 tip = ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1), shank_length=2.5, offset_seed=1, depth=1.2)
 
 # events and flights in parallel; the shell is deepened when evaporation reaches its innermost atoms
-settings = ae.ChargeSettings(sweep_interval=max(2, ions // 4))
+settings = ae.evaporation.ChargeSettings(sweep_interval=max(2, ions // 4))
 simulation = ae.Simulation(tip, seed=1, n_threads=n_threads, charge_settings=settings)
 run = simulation.run(ions, (ae.RollUp(ae.TruncatedNormal(0.155, 0.155)),), progress=False, batch_size=max(2, ions // 3))
 emitter = simulation.emitter
@@ -25,7 +25,7 @@ emitter.relax(tolerance=1e-7)  # in double precision
 batch = emitter.evaporate(3)
 
 # rates, their sums and the bonds of the neighbours, under a control of the voltage
-law = ae.Arrhenius(80.0, bonds=ae.PairEnergies(second_weight=0.5))
+law = ae.Arrhenius(80.0, bonds=ae.evaporation.PairEnergies(second_weight=0.5))
 warm = ae.Simulation(tip, seed=1, n_threads=n_threads, charge_settings=settings, law=law)
 warm = warm.run(ions, responses=False, progress=False)
 assert np.isfinite(warm.clock.waits).all()

@@ -14,6 +14,7 @@ Conditions on several fields are in a method ``_check``. It may return a dict of
 """
 
 import math
+import sys
 import textwrap
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, replace
@@ -369,7 +370,8 @@ def changed(thing: U, values: Mapping[str, Any]) -> U:
 def to_python(thing: Any, package: str = "ae.") -> str:
     """Python expression of settings, with this prefix of classes (str); fields with their default are left out.
 
-    A value with an attribute ``as_argument`` is written as this, such as a number for `Fixed`.
+    After a prefix, a class that is not in the front row of names is written with its room: ``ae.emission.Thermal``. A
+    value with an attribute ``as_argument`` is written as this, such as a number for `Fixed`.
     """
     return _python(thing, package)
 
@@ -390,4 +392,12 @@ def _python(thing, package=""):
         if not same:
             text = _python(getattr(content, "as_argument", content), package)
             parts.append(f"{item.name}={text}" if by_name else text)
-    return f"{package}{type(thing).__name__}({', '.join(parts)})"
+    return f"{_name(type(thing), package)}({', '.join(parts)})"
+
+
+def _name(kind, package):
+    """Name of a class in a Python expression."""
+    package_name, *room = kind.__module__.split(".")[:2]
+    if package and package_name == "apt_evap" and kind.__name__ not in sys.modules[package_name].__all__:
+        return f"{package}{room[0]}.{kind.__name__}"
+    return f"{package}{kind.__name__}"

@@ -18,6 +18,19 @@ _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 100
 
 
+def check_values(value: Any, name: str, *, finite: bool = True) -> NDArray[np.float64]:
+    """Return a number, or an array of numbers of any shape, as an array, or raise an error that names the argument."""
+    try:
+        values = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        values = np.empty(0, object)
+    if values.dtype.kind not in "iuf":
+        raise ValueError(f"{name} must be numbers, got {short_text(value)}")
+    if finite and not np.isfinite(values).all():
+        raise ValueError(f"{name} must be finite, got {short_text(value)}")
+    return values.astype(np.float64)
+
+
 def check_array(
     value: Any, name: str, shape: tuple[int | str, ...], *, dtype: DTypeLike = np.float64, finite: bool = True
 ) -> NDArray[Any]:

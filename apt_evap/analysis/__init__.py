@@ -1,1 +1,5 @@
-"""Analysis of maps and runs: profiles, zone lines, similarity, charge states, the apex, tracks of single ions."""
+"""Measures of runs and their hits: charge states, the cap, field factors, tracks of single ions, field-ion images."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -5,15 +5,14 @@ from __future__ import annotations  # help() then shows ArrayLike instead of its
 import math
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike
 
 from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence
+from apt_evap._common.validation import check_count, check_kind, check_sequence
 from apt_evap.detection.projection import Projection, polar_angles
 from apt_evap.emission.perturbations import Unperturbed
 from apt_evap.simulation.run import Run
@@ -26,7 +25,7 @@ _INNER = 15.0  # [degrees]: inside this angle a pole on the axis deflects its io
 _TOLERANCE = 0.05  # largest relative deviation of the median of a bin from the fit
 
 
-class Cap(NamedTuple):
+class FittedCap(NamedTuple):
     """Sphere fitted to the sites of successive ions."""
 
     first: int
@@ -64,7 +63,7 @@ class ImageCompression(NamedTuple):
         return short_repr(self)
 
 
-def fit_caps(run: Run, windows: int | None = None) -> tuple[Cap, ...]:
+def fit_caps(run: Run, windows: int | None = None) -> tuple[FittedCap, ...]:
     """Fit a sphere to the sites of the ions, in successive windows of a run.
 
     The cap recedes and changes its radius during evaporation. Angles on the specimen are therefore defined about the
@@ -79,7 +78,7 @@ def fit_caps(run: Run, windows: int | None = None) -> tuple[Cap, ...]:
 
     Returns
     -------
-    tuple of Cap
+    tuple of FittedCap
 
     Raises
     ------
@@ -99,18 +98,18 @@ def fit_caps(run: Run, windows: int | None = None) -> tuple[Cap, ...]:
             if np.count_nonzero(near) < 50:
                 raise ValueError(f"a window must have at least 50 ions near the axis, got {np.count_nonzero(near)}")
             centre, radius = _sphere(sites[near], centre, radius)
-        caps.append(Cap(int(first), int(last), centre, radius))
+        caps.append(FittedCap(int(first), int(last), centre, radius))
     return tuple(caps)
 
 
-def image_compression(run: Run, caps: Sequence[Cap] | None = None) -> ImageCompression:
+def image_compression(run: Run, caps: Sequence[FittedCap] | None = None) -> ImageCompression:
     """Determine the image compression of a run from its unperturbed hits.
 
     Parameters
     ----------
     run : Run
         A run with unperturbed flights or with responses.
-    caps : sequence of Cap, optional
+    caps : sequence of FittedCap, optional
         Spheres that define the centres of the angles on the specimen; by default those of `fit_caps`.
 
     Returns
@@ -162,63 +161,32 @@ def image_compression(run: Run, caps: Sequence[Cap] | None = None) -> ImageCompr
     return ImageCompression(compression, scatter, low, high, angles, medians, projection)
 
 
-def field_factor(voltage: ArrayLike, field: ArrayLike, radius: ArrayLike) -> Any:
-    """Field factor k_f of a specimen, in F = V / (k_f R).
-
-    Parameters
-    ----------
-    voltage : float or array_like
-        Applied voltage [V].
-    field : float or array_like
-        Field at the apex [V/nm]; for a measurement the evaporation field of the material.
-    radius : float or array_like
-        Radius of the apex [nm].
-
-    Returns
-    -------
-    float or ndarray
-        1 for a free sphere; 2 to 8 for specimens with a shank in front of an electrode.
-
-    Raises
-    ------
-    ValueError
-        If a value is not positive.
-
-    Notes
-    -----
-    Gomer, Field Emission and Field Ionization (1961).
-    """
-    values = []
-    for name, value in (("voltage", voltage), ("field", field), ("radius", radius)):
-        shape = tuple(f"n{axis}" for axis in range(np.ndim(value)))
-        values.append(check_array(value, name, shape) if shape else np.float64(check_number(value, name, above=0)))
-        if np.size(value) and values[-1].min() <= 0:
-            raise ValueError(f"{name} must be > 0, got {values[-1].min():g}")
-    factor = values[0] / (values[1] * values[2])
-    return float(factor) if factor.ndim == 0 else factor
-
-
-def run_field_factor(run: Run, caps: Sequence[Cap] | None = None) -> Floats:
+def field_factor(run: Run, caps: Sequence[FittedCap] | None = None) -> Floats:
     """Determine the field factor of a run from the fields at evaporation.
 
     Parameters
     ----------
     run : Run
         The ions.
-    caps : sequence of Cap, optional
+    caps : sequence of FittedCap, optional
         Spheres with the radii of the apex; by default those of `fit_caps`.
 
     Returns
     -------
     ndarray
-        Field factor of each cap, shape (n,): V / (R F) with the median field F just before evaporation of the atoms
-        within 20 degrees of the axis. These atoms are at the edges of terraces, where the field is higher than the mean
-        over the cap. So the factor is smaller than a factor from the mean field.
+        Field factor k_f = V / (R F) of each cap, shape (n,): 1 for a free sphere, 2 to 8 for specimens with a shank in
+        front of an electrode. F is the median field just before evaporation of the atoms within 20 degrees of the
+        axis. These atoms are at the edges of terraces, where the field is higher than the mean over the cap. So the
+        factor is smaller than a factor from the mean field.
 
     Raises
     ------
     ValueError
         If a cap has no ion near the axis.
+
+    Notes
+    -----
+    Gomer, Field Emission and Field Ionization (1961).
     """
     factors = []
     for cap in _caps_of(run, caps):
@@ -226,7 +194,7 @@ def run_field_factor(run: Run, caps: Sequence[Cap] | None = None) -> Floats:
         near = polar_angles(from_centre) < _NEAR
         if not near.any():
             raise ValueError(f"none of the ions {cap.first} to {cap.last} is within 20 degrees of the axis")
-        factors.append(field_factor(run.voltage, np.median(run.fields[cap.first : cap.last][near]), cap.radius))
+        factors.append(run.voltage / (cap.radius * np.median(run.fields[cap.first : cap.last][near])))
     return np.array(factors)
 
 
@@ -235,8 +203,8 @@ def _caps_of(run, caps):
     if caps is None:
         return fit_caps(run)
     check_kind(run, "run", "hits", "a Run")
-    caps = check_sequence(caps, "caps", "Cap, as returned by fit_caps")
-    return [check_kind(cap, "caps", Cap, "a sequence of Cap, as returned by fit_caps") for cap in caps]
+    caps = check_sequence(caps, "caps", "FittedCap, as returned by fit_caps")
+    return [check_kind(cap, "caps", FittedCap, "a sequence of FittedCap, as returned by fit_caps") for cap in caps]
 
 
 def _sphere(points, centre, radius):

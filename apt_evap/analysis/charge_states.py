@@ -224,7 +224,7 @@ def charge_state_ratio_map(
     if like is not None:
         like = like.counts if isinstance(like, ChargeStateMap) else check_kind(like, "like", DetectorMap, "a map")
         # stripes of quantised coordinates are equal for both charges
-        grid = DetectorMap.from_hits(both, like=like, quantum=None)
+        grid = DetectorMap.from_hits(both, like=like, position_step=None)
     else:
         if bins is None:
             bins = min(max(round(np.sqrt(len(both) / _PER_BIN)), 1), _MOST_BINS)

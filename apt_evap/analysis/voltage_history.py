@@ -67,7 +67,8 @@ def evaporation_voltages(run: Run) -> Floats:
 
     which is the voltage that a measurement at a constant rate would apply.
     """
-    return run.voltage * evaporation_fields(run) / run.fields
+    fields = evaporation_fields(run)
+    return run.voltage * fields / run.fields
 
 
 def course(values: ArrayLike, points: int = 200) -> Course:

@@ -13,19 +13,19 @@ import numpy as np
 from apt_evap import plot
 from apt_evap._common.codec import declared, from_plain
 from apt_evap._common.files import FileError, check_path, read_small_file, replace_file
-from apt_evap._common.warnings import RegistrationWarning, StructureWarning
 from apt_evap.cli._files import check_output, ions_of_map, read, select
 from apt_evap.cli._output import put
 from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.detection.detector_map import DetectorMap
-from apt_evap.energy_fit.fit_energies import fit_energies
-from apt_evap.energy_fit.grid import EnergyGrid
-from apt_evap.energy_fit.settings import FitSettings
+from apt_evap.fit.fit_energies import fit_energies
+from apt_evap.fit.grid import EnergyGrid
+from apt_evap.fit.settings import FitSettings
 from apt_evap.registration.register import Registration
 from apt_evap.report.origin import recorded_warnings
 from apt_evap.report.study import write_study
 from apt_evap.simulation.run import Run, load
 from apt_evap.simulation.run_hdf5 import is_run
+from apt_evap.warnings import RegistrationWarning, StructureWarning
 
 _STUDY = "study.json"
 _MAX_BYTES = 1 << 28  # bytes: a study contains three numbers for each point of its grid
@@ -164,7 +164,15 @@ def _write_table(study, path):
     with open(path, "w", newline="") as file:
         table = csv.writer(file)
         matrices = [study.ssim, study.errors, study.shares]
-        names = [*study.grid.options, "rollup_fraction", "rsd", "mean_eV", "ssim", "error", "share_of_resamples"]
+        names = [
+            *study.grid.options,
+            "rollup_fraction",
+            "relative_spread",
+            "mean_eV",
+            "ssim",
+            "error",
+            "share_of_resamples",
+        ]
         if study.structure is not None:
             matrices += [study.structure.misfit, study.structure.errors]
             names += ["ring_misfit", "ring_misfit_error"]

@@ -159,7 +159,7 @@ def _measured_code(options):
         code += f".window(x={options.box[:2]!r}, y={options.box[2:]!r})"
     if options.species is not None:
         names = ", ".join(map(repr, options.species.split(",")))
-        code = f"ae.read_ranges({options.ranges!r}).select({code}, {names})"
+        code = f"ae.io.read_ranges({options.ranges!r}).select({code}, {names})"
     return code
 
 

@@ -9,8 +9,8 @@ from apt_evap.cli._files import read, select, selects
 from apt_evap.cli._output import put
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.io.specimens import read_tip, specimen_format
-from apt_evap.simulation.ending import Ending
 from apt_evap.simulation.run import Run
+from apt_evap.simulation.stop_reason import StopReason
 from apt_evap.specimen.tip import Tip
 
 
@@ -22,7 +22,7 @@ def execute(options: argparse.Namespace) -> int:
         ions = content.hits(content.first_perturbation) if isinstance(content, Run) else content
         summary["selected_of"], content = len(ions), select(ions, options)
     summary |= describe(content)
-    if isinstance(content, Run) and content.ended == Ending.UNFINISHED:
+    if isinstance(content, Run) and content.ended == StopReason.UNFINISHED:
         summary["kind"] = f"unfinished run of {len(content):,} ions"
         summary["ended"] = "not yet: continue with the same command and --resume"
     if options.json:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from apt_evap._common.codec import from_plain
-from apt_evap.analysis.field_ion_image import field_ion_image
+from apt_evap.analysis.ion_image import field_ion_image
 from apt_evap.cli._files import (
     check_output,
     in_real_units,
@@ -114,7 +114,7 @@ def run_maps(
 ) -> tuple[list[DetectorMap], list[str]]:
     """Maps of the complete detector, for all ions or a selection, and their titles."""
     grid = run.detector.grid(settings.bins or bins_for(len(run)))
-    maps = [choose(run.hits(panel.perturbation)).map(like=grid, quantum=None) for panel in settings.panels]
+    maps = [choose(run.hits(panel.perturbation)).map(like=grid, position_step=None) for panel in settings.panels]
     return [_smooth(each, settings.smoothing) for each in maps], [panel.title for panel in settings.panels]
 
 

@@ -9,7 +9,7 @@ from apt_evap._version import __version__
 from apt_evap.analysis.gas_names import GASES
 from apt_evap.cli._output import put
 from apt_evap.detection.limits import MAX_BINS
-from apt_evap.energy_fit.defaults import MEANS, MECHANISMS, ROLLUP_FRACTIONS, RSDS
+from apt_evap.fit.defaults import MEANS, MECHANISMS, ROLLUP_FRACTIONS, RSDS
 from apt_evap.reconstruction.choices import FRAMES, PROJECTIONS, PROTOCOLS
 
 EXIT_CODES = """\
@@ -234,7 +234,7 @@ def _add_compare(commands: Any) -> None:
     command.add_argument("--mechanism", choices=MECHANISMS, help="default: roll-up")
     for name, default, what in (
         ("means", MEANS, "means of the energy [eV]"),
-        ("rsds", RSDS, "standard deviations relative to the means"),
+        ("relative_spreads", RSDS, "standard deviations relative to the means"),
         ("rollup-fractions", ROLLUP_FRACTIONS, "roll-up fractions for the mechanism combined"),
     ):
         numbers = ",".join(f"{value:g}" for value in default)

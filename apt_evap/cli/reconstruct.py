@@ -9,9 +9,9 @@ from apt_evap.cli._files import in_real_units, read, select
 from apt_evap.cli._output import tell, tell_json
 from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.detection.hits import Hits
+from apt_evap.reconstruction.constants import run_constants
 from apt_evap.reconstruction.origins import OriginTable
 from apt_evap.reconstruction.reconstruct import reconstruct
-from apt_evap.reconstruction.run_constants import run_constants
 from apt_evap.simulation.run import Run
 from apt_evap.specimen.lattice import atom_density
 from apt_evap.specimen.materials import MATERIALS, material

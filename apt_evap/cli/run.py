@@ -14,9 +14,9 @@ from apt_evap.cli._output import INTERRUPTED, say, tell, tell_json
 from apt_evap.cli.map import run_maps, summaries
 from apt_evap.config.simulation_file import config_of, read_document
 from apt_evap.simulation.checkpoint import Checkpoint
-from apt_evap.simulation.ending import Ending
 from apt_evap.simulation.recorder import RunInterrupted
 from apt_evap.simulation.run_hdf5 import is_run
+from apt_evap.simulation.stop_reason import StopReason
 from apt_evap.sweep.foresight import foresee
 
 SECONDS_BETWEEN_LINES = 60.0
@@ -73,7 +73,7 @@ def execute(options: argparse.Namespace) -> int:
     tell(options, f"wrote {picture}")
     files = {"wrote": str(output), "picture": str(picture), "maps": summaries(*maps)}
     tell_json(options, {**files, **_counts(run, seconds)})
-    return INTERRUPTED if run.ended == Ending.INTERRUPTED else 0
+    return INTERRUPTED if run.ended == StopReason.INTERRUPTED else 0
 
 
 def _simulate(options, config, simulation, checkpoint, n_ions, n_previous):
@@ -115,7 +115,7 @@ def _tell_outcomes(options, config, run, output, n_ions):
             f"{max(frequent_misses):,} of {len(run):,} ions miss the detector, which is {run.detector.width:g} mm "
             f"wide at {run.detector.distance:g} mm: use a larger width or a smaller distance in [detector]",
         )
-    if run.ended == Ending.INTERRUPTED:
+    if run.ended == StopReason.INTERRUPTED:
         say("note", f"interrupted; {len(run):,} of {n_ions:,} ions are in {str(output)!r}; {_CONTINUE}")
     elif run.ended:
         say("note", f"the run ended early: {run.ended}; its {len(run):,} ions are saved")

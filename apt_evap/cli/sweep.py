@@ -8,12 +8,12 @@ from apt_evap._common.codec import to_plain
 from apt_evap._common.files import FileError
 from apt_evap.cli._output import put, say, tell, tell_json
 from apt_evap.sweep.batch_system import largest_array, scripts, submit
-from apt_evap.sweep.collect import collect
+from apt_evap.sweep.collection import collect
 from apt_evap.sweep.foresight import hours_text
-from apt_evap.sweep.plan import STATES, open_sweep, plan
+from apt_evap.sweep.overview import status
+from apt_evap.sweep.planning import STATES, open_sweep, plan
 from apt_evap.sweep.pool import work_locally, work_with_dask
-from apt_evap.sweep.status import status
-from apt_evap.sweep.work import retry, work, work_on
+from apt_evap.sweep.worker import retry, work, work_on
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -27,7 +27,7 @@ from apt_evap.evaporation.voltage import VoltageControl, check_voltage
 from apt_evap.flight.crew import FlightSettings
 from apt_evap.flight.response import ResponseSettings
 from apt_evap.io.specimens import read_tip
-from apt_evap.simulation.monitor import WatchSettings
+from apt_evap.simulation.monitor import Monitor
 from apt_evap.simulation.real_units import OperatingPoint, check_flight_charges
 from apt_evap.simulation.run import Run
 from apt_evap.simulation.run_hdf5 import is_run
@@ -43,7 +43,7 @@ _KINDS = {
     "charge_settings": ChargeSettings,
     "flight_settings": FlightSettings,
     "response_settings": ResponseSettings,
-    "watch_settings": WatchSettings,
+    "monitor": Monitor,
     "maps": MapSettings,
 }
 _MAX_BYTES = 1 << 22  # bytes
@@ -73,7 +73,7 @@ class Config:
         The detector.
     charge_settings, flight_settings, response_settings : ChargeSettings, FlightSettings, ResponseSettings
         Accuracy of the computation.
-    watch_settings : WatchSettings
+    monitor : Monitor
         Monitoring of the run.
     maps : MapSettings
         Maps of the run.
@@ -106,7 +106,7 @@ class Config:
     charge_settings: ChargeSettings
     flight_settings: FlightSettings
     response_settings: ResponseSettings
-    watch_settings: WatchSettings
+    monitor: Monitor
     maps: MapSettings
     output: str | None
     law: Law
@@ -194,7 +194,7 @@ class Config:
                 charge_settings=self.charge_settings,
                 flight_settings=self.flight_settings,
                 response_settings=self.response_settings,
-                watch_settings=self.watch_settings,
+                monitor=self.monitor,
                 n_threads=n_threads,
                 law=self.law,
                 rule=self.rule,
@@ -228,7 +228,7 @@ def read_config(path: str | Path) -> Config:
     ``file``, relative to the folder of the settings, with ``types``, further arguments of `read_tip` and perhaps its
     ``sha256``),
     ``[simulation]`` (ions, voltage, seed, responses), ``[detector]``, ``[charges]``, ``[flights]``, ``[responses]``,
-    ``[watch]`` (fields of `Detector`, `ChargeSettings`, `FlightSettings`, `ResponseSettings`, `WatchSettings`),
+    ``[monitor]`` (fields of `Detector`, `ChargeSettings`, `FlightSettings`, `ResponseSettings`, `Monitor`),
     ``[[phases]]`` (fields of `Phase`; instead of a material in ``[tip]``), ``[law]`` and ``[rule]`` (a name and the
     fields of that class), ``[control]`` (`VoltageControl`), ``[real_units]`` (arguments of `Run.at_evaporation_field`)
     and ``[maps]`` (fields of `MapSettings`). Only ``[tip]`` with a material and an apex_radius, or with a file,
@@ -292,7 +292,7 @@ def config_of(document: dict[str, Any], path: Path) -> Config:
             "charges",
             "flights",
             "responses",
-            "watch",
+            "monitor",
             "law",
             "rule",
             "control",
@@ -328,7 +328,7 @@ def config_of(document: dict[str, Any], path: Path) -> Config:
         ("detector", Detector),
         ("charges", ChargeSettings),
         ("flights", FlightSettings),
-        ("watch", WatchSettings),
+        ("monitor", Monitor),
         ("law", Extremal, Arrhenius),
         ("rule", Robin, ConstantPotential),
         ("control", VoltageControl),
@@ -336,7 +336,7 @@ def config_of(document: dict[str, Any], path: Path) -> Config:
         with _located(path, name):
             table = document.get(name)
             sections.append(from_plain(table, *kinds, what=name) if table else kinds[0]())
-    detector, charges, flights, watch, law, rule, control = sections
+    detector, charges, flights, monitor, law, rule, control = sections
     with _located(path, "responses"):
         response_settings = ResponseSettings.of_table(document.get("responses", {}))
     with _located(path, "real_units"):
@@ -357,7 +357,7 @@ def config_of(document: dict[str, Any], path: Path) -> Config:
         charge_settings=charges,
         flight_settings=flights,
         response_settings=response_settings,
-        watch_settings=watch,
+        monitor=monitor,
         maps=maps,
         output=output,
         law=law,

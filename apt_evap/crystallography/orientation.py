@@ -16,7 +16,7 @@ from apt_evap._common.codec import checked, number, settings
 from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_sequence, check_switch, short_text
-from apt_evap.crystallography.poles import plane_normals
+from apt_evap.crystallography.directions import plane_normals
 from apt_evap.detection.projection import Projection
 from apt_evap.specimen import lattice
 from apt_evap.specimen.materials import as_material

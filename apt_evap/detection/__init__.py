@@ -1,1 +1,5 @@
 """Detection of the ions: detector, hits, detector maps, mass ranges, projections."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -61,14 +61,14 @@ def find_quantisation(values: Floats, sample: int = 100_000) -> Quantisation | N
     return Quantisation(float(spacing), float(origin))
 
 
-def find_quantisations(x: Floats, y: Floats, quantum: Any = "auto") -> tuple[Quantisation, ...] | None:
+def find_quantisations(x: Floats, y: Floats, position_step: Any = "auto") -> tuple[Quantisation, ...] | None:
     """Quantisation of both coordinates, found in the data or with known steps.
 
     Parameters
     ----------
     x, y : ndarray
         Detector coordinates [mm], shape (n,).
-    quantum : {"auto", None} or tuple of float
+    position_step : {"auto", None} or tuple of float
         Quantisation step in x and y [mm]; "auto" to find it, None for continuous coordinates.
 
     Returns
@@ -79,19 +79,21 @@ def find_quantisations(x: Floats, y: Floats, quantum: Any = "auto") -> tuple[Qua
     Raises
     ------
     ValueError
-        If `quantum` is none of these.
+        If `position_step` is none of these.
     """
-    if quantum is None:
+    if position_step is None:
         return None
-    if isinstance(quantum, str):
-        if quantum != "auto":
-            raise ValueError(f"quantum must be 'auto', None or two spacings [mm], got {short_text(quantum)}")
+    if isinstance(position_step, str):
+        if position_step != "auto":
+            raise ValueError(
+                f"position_step must be 'auto', None or two spacings [mm], got {short_text(position_step)}"
+            )
         first, second = find_quantisation(x), find_quantisation(y)
         return None if first is None or second is None else (first, second)
-    spacings = check_array(quantum, "quantum", (2,))
+    spacings = check_array(position_step, "position_step", (2,))
     quantisations = []
     for values, spacing in zip((x, y), spacings, strict=True):
-        check_number(float(spacing), "quantum", above=0, unit="mm")
+        check_number(float(spacing), "position_step", above=0, unit="mm")
         phase = np.exp(2j * np.pi / spacing * values.astype(np.float64)).mean()
         quantisations.append(Quantisation(float(spacing), float(np.angle(phase) * spacing / (2 * np.pi))))
     return tuple(quantisations)

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 
 from apt_evap._common.types import Booleans, Floats, Integers
 from apt_evap._common.validation import check_array, check_kind, check_number, check_seed, check_switch
-from apt_evap._common.warnings import MapWarning
 from apt_evap.detection.binning import bin_edges, count, field_of_view, find_quantisations
+from apt_evap.warnings import MapWarning
 
 _MAX_IONS = 2**53  # integers up to here are exact as float64, the type of sums and densities
 
@@ -60,7 +60,7 @@ class DetectorMap:
         Whether `values` are hits per bin.
     ions : int or None
         Number of hits inside the detector, None if not known.
-    quantum : tuple of float or None
+    position_step : tuple of float or None
         Quantisation step of the coordinates in x and y [mm]; None if they are continuous.
     smoothing : float
         Standard deviation of the Gaussian smoothing of the density [mm].
@@ -76,7 +76,7 @@ class DetectorMap:
     mask: np.ndarray
     is_counts: bool = False
     ions: int | None = None
-    quantum: tuple | None = None
+    position_step: tuple | None = None
     smoothing: float = 0.0
     source: str = ""
     detected: int | None = None
@@ -87,7 +87,7 @@ class DetectorMap:
         hits: MapInput,
         bins: int = 256,
         extent: tuple[float, float, float, float] | None = None,
-        quantum: str | tuple[float, float] | None = "auto",
+        position_step: str | tuple[float, float] | None = "auto",
         dither_seed: int | None = None,
         mask: ArrayLike | None = None,
         like: DetectorMap | None = None,
@@ -108,7 +108,7 @@ class DetectorMap:
         extent : tuple of float, optional
             x_min, x_max, y_min, y_max [mm]. By default that of the detector for the hits of a run, and that of the hits
             for measured ions. Bins may extend slightly beyond it.
-        quantum : {"auto", None} or tuple of float
+        position_step : {"auto", None} or tuple of float
             Quantisation step in x and y [mm]; "auto" to find it in the data, None for continuous data.
         dither_seed : int, optional
             Seed of a dither by one quantisation step, instead of bins that are multiples of it.
@@ -137,11 +137,11 @@ class DetectorMap:
             raise ValueError(f"a map needs detected ions, got none of {len(hits)} in {hits.source or 'these hits'}")
         if not detected.all():
             x, y = x[detected], y[detected]
-        quantisations = find_quantisations(x, y, quantum)
+        quantisations = find_quantisations(x, y, position_step)
         if dither_seed is not None:
             if quantisations is None:
                 raise ValueError(
-                    "dither_seed needs a quantisation step of the coordinates (quantum), but they are continuous"
+                    "dither_seed needs a quantisation step of the coordinates (position_step), but they are continuous"
                 )
             random = np.random.default_rng(dither_seed)
             x, y = (
@@ -174,7 +174,9 @@ class DetectorMap:
             None if quantisations is None else tuple(float(quantisation.spacing) for quantisation in quantisations)
         )
         ions = int(counts[mask].sum())
-        return cls(counts, x_edges, y_edges, mask, True, ions, quantum=spacings, source=hits.source, detected=len(x))
+        return cls(
+            counts, x_edges, y_edges, mask, True, ions, position_step=spacings, source=hits.source, detected=len(x)
+        )
 
     @classmethod
     def from_array(

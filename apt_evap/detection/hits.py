@@ -14,11 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from apt_evap._common.types import Booleans, Column
 from apt_evap._common.validation import check_array, check_kind, check_number, check_seed, did_you_mean, short_text
-from apt_evap._common.warnings import DataWarning
 from apt_evap.detection.binning import find_quantisations
 from apt_evap.detection.dataframe import to_dataframe
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.distortion import DistortionGrid
+from apt_evap.warnings import DataWarning
 
 if TYPE_CHECKING:
     import pandas

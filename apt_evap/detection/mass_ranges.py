@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from apt_evap._common.types import Integers
 from apt_evap._common.validation import check_array, check_kind, check_sequence, did_you_mean, short_text
-from apt_evap._common.warnings import DataWarning
 from apt_evap.detection.hits import Hits
+from apt_evap.warnings import DataWarning
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -19,7 +19,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from apt_evap._common.codec import number, settings
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_array, check_choice, check_count, check_number, check_sequence
+from apt_evap._common.validation import (
+    check_array,
+    check_choice,
+    check_count,
+    check_number,
+    check_sequence,
+    check_values,
+)
 from apt_evap._core.elementary import exponential, logarithm
 
 RATIO_PARAMETERS: dict[str, tuple[tuple[float, float], ...]] = {
@@ -99,7 +106,7 @@ def charge_state_ratio(element: str, charge: int, field: ArrayLike) -> Floats:
     CSR = (a b / (a - F) - b - 0.256)^(10/3), the inverse of the fit by Tegg et al. (2024).
     """
     a, b = _parameters(element, charge)
-    field = check_array(np.ravel(field), "field", ("n",)).reshape(np.shape(field))
+    field = check_values(field, "field")
     below = field < a
     excess = a * b / np.where(below, a - field, a) - (b + _OFFSET)
     return np.where(below, _power(np.maximum(excess, 0.0), 1 / _POWER), np.inf)[()]
@@ -132,7 +139,7 @@ def field_of_ratio(element: str, charge: int, ratio: ArrayLike) -> Floats:
     F = a (1 - b / (CSR^0.3 + b + 0.256)), Tegg et al. (2024).
     """
     a, b = _parameters(element, charge)
-    ratio = check_array(np.ravel(ratio), "ratio", ("n",), finite=False).reshape(np.shape(ratio))
+    ratio = check_values(ratio, "ratio", finite=False)
     if not (ratio >= 0).all():
         raise ValueError(f"ratio must be >= 0, got {np.min(ratio)}")
     return a * (1 - b / (_power(ratio, _POWER) + b + _OFFSET))

@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 from apt_evap._common.threads import thread_count, usable_threads
 from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_seed
-from apt_evap._common.warnings import ChargesWarning
 from apt_evap._core.evaporation import DONE, EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, Evaporation, Start
 from apt_evap._core.journal import Journal
 from apt_evap._core.neighbourhood import Neighbourhood
@@ -29,6 +28,7 @@ from apt_evap.specimen.ase_atoms import to_atoms
 from apt_evap.specimen.lattice import BOND_FACTORS, SECOND_SHELL_FACTORS
 from apt_evap.specimen.tip import Tip
 from apt_evap.units import COULOMB
+from apt_evap.warnings import ChargesWarning
 
 RECORD = 16_384  # events after which a batch contains a tree in any case, so that journals need not be kept
 BATCH = 256  # events per batch; results do not depend on it

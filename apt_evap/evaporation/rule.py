@@ -151,7 +151,7 @@ class ConstantPotential:
         unit="1/nm",
     )
     charges: str = choice("Point charges, or Gaussian charges with the same self term.", CHARGES, default="points")
-    law_sees: str = choice(
+    law_field: str = choice(
         'Field that a law sees: "charge", 4 pi k_e q / s of the charge of an atom, or "others", twice the normal field '
         "of all other charges at its place. With `Robin` the two are equal.",
         LAW_SEES,
@@ -167,7 +167,7 @@ class ConstantPotential:
     def kernel(self, tip: Tip) -> ChargingRule:
         """Return the compiled rule for a specimen."""
         return constant_potential.ConstantPotential(
-            self.self_term or 0.0, self.charges == "gaussian", self.law_sees == "others", self.tolerance
+            self.self_term or 0.0, self.charges == "gaussian", self.law_field == "others", self.tolerance
         )
 
 

@@ -40,7 +40,7 @@ class Control:
 CONTROLS = (
     # the grid of the paper ends at 0.3725 eV; for the README's tip in real units that is 0.87 eV
     Control("mean", "mean energy [eV]", 0.0, 1.0, 0.005, 0.155),
-    Control("rsd", "standard deviation / mean", 0.0, 3.2, 0.05, 1.0),
+    Control("relative_spread", "standard deviation / mean", 0.0, 3.2, 0.05, 1.0),
     Control("rollup_fraction", "roll-up fraction of the energy", 0.0, 1.0, 0.05, 0.5),
     Control("probability", "probability of a roll-up", 0.0, 1.0, 0.05, 1.0),
     Control("second_roll", "probability of a second roll-up", 0.0, 1.0, 0.05, 0.0),
@@ -50,7 +50,7 @@ CONTROLS = (
 )
 """Sliders for the emission. A mechanism has those that are fields of its perturbation; an energy has two."""
 
-ENERGY = ("mean", "rsd")
+ENERGY = ("mean", "relative_spread")
 """Controls of an energy: mean [eV], and standard deviation relative to it, both before the truncation."""
 
 _OTHERS = "others"  # their standard deviation is that of the other energy, relative to the mean
@@ -116,8 +116,8 @@ def perturbation_of(mechanism: str, values: Mapping[str, float]) -> Perturbation
     return kind(**options)
 
 
-def _distribution(mean, rsd):
-    return TruncatedNormal(mean, round(rsd * mean, _DIGITS)) if rsd * mean > 0 else Fixed(mean)
+def _distribution(mean, relative_spread):
+    return TruncatedNormal(mean, round(relative_spread * mean, _DIGITS)) if relative_spread * mean > 0 else Fixed(mean)
 
 
 def values_of(perturbation: Perturbation) -> tuple[str, dict[str, float]]:
@@ -147,7 +147,7 @@ def values_of(perturbation: Perturbation) -> tuple[str, dict[str, float]]:
     for each in controls_of(mechanism):
         if each.name in ENERGY:
             energy: Any = getattr(perturbation, "energy")  # noqa: B009  # a perturbation need not have one
-            values |= dict(zip(ENERGY, _mean_and_rsd(energy), strict=True))
+            values |= dict(zip(ENERGY, _mean_and_relative_spread(energy), strict=True))
         elif each.name == _OTHERS:
             values[_OTHERS] = _of_others(getattr(perturbation, _OTHERS), values)
         else:
@@ -163,7 +163,7 @@ def values_of(perturbation: Perturbation) -> tuple[str, dict[str, float]]:
     return mechanism, values
 
 
-def _mean_and_rsd(energy):
+def _mean_and_relative_spread(energy):
     if isinstance(energy, Fixed):
         return energy.energy, 0.0
     if isinstance(energy, TruncatedNormal) and energy.mean > 0:
@@ -178,10 +178,10 @@ def _of_others(energy, values):
     """Mean energy of the ions that do not roll up."""
     if energy is None:
         return 0.0
-    mean, rsd = _mean_and_rsd(energy)
-    if mean == 0.0 or not math.isclose(rsd, values["rsd"], rel_tol=1e-6, abs_tol=1e-6):
+    mean, relative_spread = _mean_and_relative_spread(energy)
+    if mean == 0.0 or not math.isclose(relative_spread, values["relative_spread"], rel_tol=1e-6, abs_tol=1e-6):
         raise ValueError(
             "the explorer has controls for others with a mean > 0 and the relative standard deviation of the energy, "
-            f"{values['rsd']:.3g}, got {short_text(energy)}"
+            f"{values['relative_spread']:.3g}, got {short_text(energy)}"
         )
     return mean

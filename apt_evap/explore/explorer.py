@@ -13,14 +13,10 @@ import numpy as np
 
 from apt_evap._common.codec import to_python
 from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence
-from apt_evap._common.warnings import AptWarning
 from apt_evap.analysis.apex import image_compression
-from apt_evap.analysis.profiles import Profile, Rectangle, zone_line_profile
-from apt_evap.analysis.rings import Ring, ring_statistics
-from apt_evap.analysis.similarity import WINDOW, Similarity, half_ceiling, ssim, window_fits
 from apt_evap.config.perturbation_text import write_perturbation
+from apt_evap.crystallography.directions import poles
 from apt_evap.crystallography.orientation import Orientation
-from apt_evap.crystallography.poles import poles
 from apt_evap.crystallography.symmetry import rotational_symmetry
 from apt_evap.detection.binning import bins_for, field_of_view
 from apt_evap.detection.detector_map import DetectorMap
@@ -29,10 +25,14 @@ from apt_evap.detection.limits import MAX_BINS
 from apt_evap.detection.projection import Projection
 from apt_evap.emission.kept import KeptEmissions
 from apt_evap.emission.perturbations import Perturbation, RollUp, TruncatedNormal, Unperturbed
-from apt_evap.energy_fit.fit_energies import BINS, measured_map
 from apt_evap.explore.controls import MECHANISMS, Control, controls_of, perturbation_of
+from apt_evap.fit.fit_energies import BINS, measured_map
+from apt_evap.maps.profiles import Profile, Rectangle, zone_line_profile
+from apt_evap.maps.rings import Ring, ring_statistics
+from apt_evap.maps.similarity import WINDOW, Similarity, similarity, similarity_ceiling, window_fits
 from apt_evap.registration.register import Registration, register
 from apt_evap.simulation.run import Run
+from apt_evap.warnings import AptWarning
 
 PREVIEW = 50_000
 """Ions of a preview. Measured: 22 ms for a view with this many, `RollUp`, 256 bins and one thread of an Intel Xeon."""
@@ -83,7 +83,7 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """Maps of a view.
+    """Maps of a view of the explorer.
 
     Parameters
     ----------
@@ -96,9 +96,9 @@ class Shown:
     pictures : tuple of DetectorMap
         The same maps flattened and smoothed.
     similarity : Similarity or None
-        `ssim` of both maps; None without a measured map or with too few bins.
+        `similarity` of both maps; None without a measured map or with too few bins.
     ceiling : Similarity or None
-        `half_ceiling` of the measured counts, for comparison; None for densities and for flattened maps.
+        `similarity_ceiling` of the measured counts, for comparison; None for densities and for flattened maps.
     ions : int
         Number of simulated ions, including those outside the map.
     preview : bool
@@ -295,22 +295,22 @@ class Explorer:
             warnings.simplefilter("always", AptWarning)
             hits = self.hits(view, preview)
             like = self.bins_like(view.bins)
-            simulated = hits.map(like=like, quantum=None)
+            simulated = hits.map(like=like, position_step=None)
             flat = simulated.flattened(view.flattening)
             pictures: tuple[DetectorMap, ...] = (flat.smoothed(view.smoothing),)
-            similarity = ceiling = None
+            alike = ceiling = None
             if self.measured is not None:
                 measured, picture = self._measured_picture(view)
                 pictures += (picture,)
                 if _has_window(like):
-                    similarity = ssim(flat, measured, smoothing=view.smoothing)
+                    alike = similarity(flat, measured, smoothing=view.smoothing)
                     ceiling = self._ceiling(view)
         return Shown(
             view=view,
             simulated=simulated,
             measured=None if self.measured is None else like,
             pictures=pictures,
-            similarity=similarity,
+            similarity=alike,
             ceiling=ceiling,
             ions=len(hits),
             preview=preview and self._preview_run is not self.run,
@@ -370,14 +370,14 @@ class Explorer:
 
     def _bins_of_run(self, bins):
         """Map on the complete detector, as `apt-evap map` makes it."""
-        return self.run.hits(Unperturbed()).map(like=self.run.detector.grid(bins), quantum=None)
+        return self.run.hits(Unperturbed()).map(like=self.run.detector.grid(bins), position_step=None)
 
     def _region(self, bins, registration):
         measured = measured_map(self.measured, bins)
         mask = measured.mask & field_of_view(np.where(measured.mask, measured.values, 0))
         for perturbation in (Unperturbed(), REGION):
             hits = registration.hits(self._preview_run.hits(perturbation))
-            mask &= field_of_view(hits.map(like=measured, quantum=None).counts)
+            mask &= field_of_view(hits.map(like=measured, position_step=None).counts)
         if not mask.any():
             raise ValueError(f"the simulated map, {registration}, does not cover the measured one")
         ions = int(measured.values[mask].sum()) if measured.is_counts else None
@@ -397,7 +397,7 @@ class Explorer:
             return None
         key = "ceiling", view.bins, view.smoothing, self.registration
         if key not in self._kept_maps:
-            self._kept_maps[key] = half_ceiling(like, smoothing=view.smoothing)
+            self._kept_maps[key] = similarity_ceiling(like, smoothing=view.smoothing)
         return self._kept_maps[key]
 
     # ---- what is on a map ------------------------------------------------------------------------------------------
@@ -603,24 +603,24 @@ class Explorer:
 
     def _python_maps(self, view):
         if self.measured is None:
-            lines = [f"simulated = hits.map(like=run.detector.grid({view.bins}), quantum=None)"]
+            lines = [f"simulated = hits.map(like=run.detector.grid({view.bins}), position_step=None)"]
             names = ["simulated"]
         else:
             lines = [
                 "from apt_evap.explore.explorer import Explorer",
                 f"measured = Explorer(run, {self.measured_code}, registration).bins_like({view.bins})",
-                "simulated = hits.map(like=measured, quantum=None)",
+                "simulated = hits.map(like=measured, position_step=None)",
             ]
             names = ["simulated", "measured"]
         flat = f".flattened({view.flattening!r})" if view.flattening else ""
         if self.measured is not None:
-            lines.append(f"print(ae.ssim(simulated{flat}, measured{flat}, smoothing={view.smoothing!r}))")
+            lines.append(f"print(ae.similarity(simulated{flat}, measured{flat}, smoothing={view.smoothing!r}))")
         pictures = ", ".join(f"{name}{flat}.smoothed({view.smoothing!r})" for name in names)
         return [*lines, f"ae.plot.detector_maps([{pictures}])[0].figure.savefig('maps.png')"]
 
 
 def _has_window(like):
-    """Whether `ssim` has a window within the mask."""
+    """Whether `similarity` has a window within the mask."""
     return min(like.values.shape) > 2 * WINDOW and bool(window_fits(like.mask).any())
 
 

@@ -38,15 +38,15 @@ from bokeh.plotting import figure
 from bokeh.server.server import Server
 from bokeh.util.token import generate_session_id
 
-from apt_evap._common.warnings import AptWarning
-from apt_evap.analysis.zone_line import fit_zone_line
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.explore.controls import CONTROLS, MECHANISMS, perturbation_of, values_of
 from apt_evap.explore.explorer import Commands, Explorer, Shown, View
 from apt_evap.explore.latest import Latest
-from apt_evap.explore.specimen_image import COLORED_BY, SIDES, specimen_image
+from apt_evap.explore.surface_image import COLORED_BY, SIDES, specimen_image
+from apt_evap.maps.zone_line import fit_zone_line
 from apt_evap.plot.maps import common_limits
 from apt_evap.registration.register import Registration
+from apt_evap.warnings import AptWarning
 
 MODES = ("side by side", "difference", "blink")
 """What the page shows beside the simulated map, if there is a measured one."""

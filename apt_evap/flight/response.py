@@ -24,7 +24,6 @@ from apt_evap._common.codec import count, from_plain, number, part, settings
 from apt_evap._common.small_matrices import squared_lengths
 from apt_evap._common.types import Booleans, Floats
 from apt_evap._common.validation import check_switch
-from apt_evap._common.warnings import ResponseWarning
 from apt_evap.detection.detector import Detector
 from apt_evap.emission.emissions import Emissions, TangentialLaunches
 from apt_evap.emission.energies import HIGHEST_ENERGY
@@ -41,6 +40,7 @@ from apt_evap.flight.designs import (
 )
 from apt_evap.flight.landing import Ends, land
 from apt_evap.units import FLIGHT_TIME
+from apt_evap.warnings import ResponseWarning
 
 
 @settings
@@ -182,7 +182,7 @@ class ResponseSettings:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Responses:
-    """Responses of n ions.
+    """Responses of n ions to their launch velocity.
 
     Parameters
     ----------

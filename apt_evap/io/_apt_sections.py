@@ -10,8 +10,8 @@ import numpy as np
 
 from apt_evap._common.files import FileError, TruncatedFile
 from apt_evap._common.types import AnyPath
-from apt_evap._common.warnings import DataWarning
 from apt_evap._common.wording import argument
+from apt_evap.warnings import DataWarning
 
 SIGNATURE = b"APT\0"
 _SECTION = b"SEC\0"

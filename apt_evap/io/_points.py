@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apt_evap._common.types import AnyPath, Booleans, Floats
-from apt_evap._common.warnings import DataWarning
 from apt_evap.detection.hits import Hits
+from apt_evap.warnings import DataWarning
 
 _NAMES = {"x": "detector_x", "y": "detector_y"}
 

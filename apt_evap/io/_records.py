@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from apt_evap._common.files import FileError, TruncatedFile, open_for_reading, replace_file
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_choice, check_switch, short_text
-from apt_evap._common.warnings import DataWarning
 from apt_evap._common.wording import argument
 from apt_evap.detection.hits import Hits, Outcome
+from apt_evap.warnings import DataWarning
 
 _CHUNK = 1 << 14
 _SURVEY = 1 << 16

@@ -15,11 +15,11 @@ import numpy as np
 
 from apt_evap._common.files import TruncatedFile, open_for_reading
 from apt_evap._common.types import AnyPath
-from apt_evap._common.warnings import DataWarning
 from apt_evap.detection.hits import Hits
 from apt_evap.io._apt_sections import read_sections
 from apt_evap.io._pulses import PulseCheck, first_from_every, pulses_from_first, whole_pulses
 from apt_evap.io._records import check_columns, fill
+from apt_evap.warnings import DataWarning
 
 # sections, in lower case, that are columns of Hits: name, number of values per ion, unit
 _KNOWN = {

@@ -12,11 +12,11 @@ import numpy as np
 
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_choice
-from apt_evap._common.warnings import DataWarning
 from apt_evap._common.wording import argument
 from apt_evap.detection.hits import Hits
 from apt_evap.io._pulses import PulseCheck, first_from_equal, pulses_from_first, whole_pulses
 from apt_evap.io._records import check_any, choose, choose_fields, open_words, write_words
+from apt_evap.warnings import DataWarning
 
 _ROW = 44
 _FIELDS = {

@@ -10,10 +10,10 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from apt_evap._common.types import AnyPath
-from apt_evap._common.warnings import DataWarning
 from apt_evap.detection.hits import Hits
 from apt_evap.io._pulses import first_from_equal, pulses_from_first
 from apt_evap.io._records import check_any, choose_fields, open_words
+from apt_evap.warnings import DataWarning
 
 _ROW = 32
 _FIELDS = {

@@ -10,9 +10,9 @@ import numpy as np
 
 from apt_evap._common.files import FileError
 from apt_evap._common.types import AnyPath
-from apt_evap._common.warnings import DataWarning
 from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.io._texts import atoms_of, colour, count, formula, number, read_text
+from apt_evap.warnings import DataWarning
 
 
 def read_rng(path: AnyPath) -> Ranges:

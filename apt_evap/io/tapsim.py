@@ -13,9 +13,9 @@ import numpy as np
 from apt_evap._common.files import FileError, TruncatedFile, open_for_reading, replace_file
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_switch
-from apt_evap._common.warnings import DataWarning
 from apt_evap._common.wording import argument
 from apt_evap.detection.hits import Hits
+from apt_evap.warnings import DataWarning
 
 SIGNATURE = b"TAPSIM RESULTS DATA"
 _HEADER = 1 << 16  # bytes that contain the header

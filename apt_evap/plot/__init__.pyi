@@ -1,7 +1,7 @@
 # The pictures: read by type checkers, and by the lazy loader in __init__.py.
 from ._figure import add_colorbar as add_colorbar
 from ._figure import new_figure as new_figure
-from .charge_states import charge_states as charge_states
+from .charges import charge_states as charge_states
 from .histories import history as history
 from .histories import voltage_curve as voltage_curve
 from .maps import color_limits as color_limits
@@ -9,8 +9,8 @@ from .maps import common_limits as common_limits
 from .maps import describe as describe
 from .maps import detector_map as detector_map
 from .maps import detector_maps as detector_maps
-from .overlay import overlay as overlay
-from .poles import poles as poles
+from .overlays import overlay as overlay
+from .pole_labels import poles as poles
 from .profiles import profile as profile
 from .profiles import profile_comparison as profile_comparison
 from .profiles import rectangles as rectangles

@@ -25,13 +25,12 @@ def detector_map(
     colorbar: bool = True,
     caption: bool = True,
 ) -> DrawnAxes:
-    """Draw a detector map.
+    """Draw a detector map: its density relative to the mean.
 
     Parameters
     ----------
     map : DetectorMap or Hits
-        The map; its density relative to the mean is drawn. Ions are counted in bins that suit their
-        number, and smoothed by one bin.
+        The map. Ions are counted in bins that suit their number, and smoothed by one bin.
     ax : matplotlib.axes.Axes, optional
         Where to draw; a new figure by default.
     title : str, optional
@@ -174,7 +173,17 @@ def common_limits(maps: Sequence[DetectorMap]) -> tuple[float, float]:
 
 
 def describe(map: DetectorMap) -> str:
-    """Number of ions, size of the bins and smoothing of a map, as a caption (str)."""
+    """Caption of a map: its number of ions, the size of its bins and its smoothing.
+
+    Parameters
+    ----------
+    map : DetectorMap
+        The map.
+
+    Returns
+    -------
+    str
+    """
     width, height = map.bin_size
     square = abs(width / height - 1) < 1e-3
     size = f"{width:.3g} mm bins" if square else f"{width:.3g} × {height:.3g} mm bins"

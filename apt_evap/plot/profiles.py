@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 
-from apt_evap.analysis.profiles import Profile, Rectangle, compare_profiles
-from apt_evap.analysis.zone_line import ZoneLine
+from apt_evap.maps.profiles import Profile, Rectangle, compare_profiles
+from apt_evap.maps.zone_line import ZoneLine
 from apt_evap.plot._figure import DrawnAxes, new_figure
 
 

@@ -19,7 +19,17 @@ MECHANISMS = ("lateral velocity", "roll-up")
 
 
 def ion_colors(n: int) -> list[str]:
-    """Colours of n selected ions, the same in every plot (list of str)."""
+    """Colours of selected ions, the same in every plot.
+
+    Parameters
+    ----------
+    n : int
+        Number of ions.
+
+    Returns
+    -------
+    list of str
+    """
     return [f"C{index % 10}" for index in range(n)]
 
 

@@ -9,7 +9,7 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from apt_evap._common.validation import check_array, check_number
-from apt_evap.energy_fit.study import Study
+from apt_evap.fit.study import Study
 from apt_evap.plot._figure import OUTSIDE, add_colorbar, new_figure
 from apt_evap.plot.maps import common_limits, detector_map
 
@@ -64,7 +64,7 @@ def ssim_matrix(study: Study, axes: Sequence[Axes] | None = None, *, colormap: s
             text = ax.text(column - 0.4, row + 0.38, f"{value:z.3f}", ha="left", va="top", fontsize=8, zorder=5)
             text.set(color="k" if light else "w", path_effects=[withStroke(linewidth=3, foreground=shade)])
         ax.set_xticks(range(columns), [f"{mean:.4g}" for mean in grid.means])
-        ax.set_yticks(range(rows), [f"{rsd:.3g}" for rsd in grid.rsds])
+        ax.set_yticks(range(rows), [f"{relative_spread:.3g}" for relative_spread in grid.relative_spreads])
         ax.set_title(title, fontsize="medium")
     for ax in panels[layers:]:
         ax.remove()
@@ -97,11 +97,11 @@ def _mark_optima(study, axes):
     def places(values, points):
         return np.interp(values, points, np.arange(len(points)))
 
-    x, y = places(refined.mean, grid.means), places(np.log(refined.rsd), np.log(grid.rsds))
+    x, y = places(refined.mean, grid.means), places(np.log(refined.relative_spread), np.log(grid.relative_spreads))
     errors = {}
     if refined.intervals:
         across = places(refined.intervals["mean"], grid.means)
-        along = places(np.log(refined.intervals["rsd"]), np.log(grid.rsds))
+        along = places(np.log(refined.intervals["relative_spread"]), np.log(grid.relative_spreads))
         errors = {"xerr": np.abs(across - x)[:, None], "yerr": np.abs(along - y)[:, None]}
     label = "best between its points" + ", interval of 95 %" * bool(errors)
     return frame, ax.errorbar(
@@ -148,7 +148,7 @@ def side_by_side(
         if mechanism == "combined":
             mechanism += f", roll-up fraction {best.rollup_fraction:g}"
         mechanism += "".join(f", {name} {value:g}" for name, value in best.options.items())
-        energies = f"{best.mean:g} eV, σ/mean {best.rsd:g}"
+        energies = f"{best.mean:g} eV, σ/mean {best.relative_spread:g}"
         titles = "measured", "simulated, unperturbed", f"simulated, {mechanism}\n{energies}"
     # below 2 percent may be a dark rim
     low, high = np.percentile(maps[0].density[maps[0].mask], [2, 99.5])

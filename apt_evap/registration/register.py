@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 from apt_evap._common.codec import checked, from_plain, number, part, settings, switch, vector
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence, check_switch
-from apt_evap._common.warnings import RegistrationWarning
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.registration.correlation_search import (
@@ -31,6 +30,7 @@ from apt_evap.registration.correlation_search import (
 from apt_evap.registration.patches import patch_displacements
 from apt_evap.registration.polynomial import LARGEST_DEGREE, Distortion, fit_polynomial
 from apt_evap.registration.transform import SimilarityTransform
+from apt_evap.warnings import RegistrationWarning
 
 DOUBTFUL = 0.5
 """Limit of score times square root of the overlap. Wrong transforms reach 0.25 on noise, 0.5 on maps of other poles."""

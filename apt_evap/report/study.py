@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from apt_evap import plot
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_kind
-from apt_evap.energy_fit.study import Score, Study
+from apt_evap.fit.study import Score, Study
 from apt_evap.report.origin import add_origin, origin
 from apt_evap.report.page import Page, escape, flat, folded, heading, paragraph, table, text_of
 from apt_evap.report.pictures import blinking_pictures
@@ -113,7 +113,7 @@ def doubts(content: Mapping[str, Any]) -> tuple[list[str], list[str]]:
             "the energies have no meaning."
         )
     if edges:
-        names = {"mean": "the mean", "rsd": "standard deviation / mean"}
+        names = {"mean": "the mean", "relative_spread": "standard deviation / mean"}
         labels = " and ".join(names.get(name, name) for name in edges)
         others.append(f"The best point is at the end of the grid in {labels}: better values may be beyond it.")
     if not content["refined"]["intervals"]:
@@ -140,7 +140,7 @@ def doubts(content: Mapping[str, Any]) -> tuple[list[str], list[str]]:
 
 def _energies(study):
     best, refined, mechanism = study.optimum, study.refined, study.grid.mechanism
-    names = {"mean": "mean [eV]", "rsd": "standard deviation / mean"}
+    names = {"mean": "mean [eV]", "relative_spread": "standard deviation / mean"}
     if mechanism == "combined":
         names["rollup_fraction"] = "roll-up fraction"
     after = {"true_mean": "mean", "true_standard_deviation": "standard deviation"}
@@ -203,13 +203,13 @@ def _matrix(study, title, values, errors, shares, best):
     lines = ['<table class="matrix">']
     if title:
         lines.append(f"<caption>{escape(title)}</caption>")
-    for row in reversed(range(len(grid.rsds))):  # as in the picture, upwards
+    for row in reversed(range(len(grid.relative_spreads))):  # as in the picture, upwards
         cells = []
         for column, mean in enumerate(grid.means):
             shade = shades[row, column, :3]
             light = np.dot(shade, (0.299, 0.587, 0.114)) > 0.5
             score = Score(float(values[row, column]), float(errors[row, column]))
-            details = f"mean {mean:g} eV, standard deviation / mean {grid.rsds[row]:.4g}: SSIM {score}"
+            details = f"mean {mean:g} eV, standard deviation / mean {grid.relative_spreads[row]:.4g}: SSIM {score}"
             if len(study.resampled):
                 details += f", best in {shares[row, column]:.0%} of the resamples"
             frame = ' class="best"' if (row, column) == best else ""
@@ -218,7 +218,7 @@ def _matrix(study, title, values, errors, shares, best):
                 f'<td{frame} tabindex="0" style="background:{color};color:{"#000" if light else "#fff"}">'
                 f"{score.value:z.3f}<span>{escape(details)}</span></td>"
             )
-        lines.append(f"<tr><th>{grid.rsds[row]:.3g}</th>{''.join(cells)}</tr>")
+        lines.append(f"<tr><th>{grid.relative_spreads[row]:.3g}</th>{''.join(cells)}</tr>")
     lines.append(f"<tr><th></th>{''.join(f'<th>{mean:.4g}</th>' for mean in grid.means)}</tr></table>")
     return "\n".join(lines)
 
@@ -240,7 +240,7 @@ def _registration(content):
 def _blinking(page, study):
     """The measured and the best map on one place."""
     best = study.optimum
-    energies = f"{best.mean:g} eV, σ/mean {best.rsd:g}"
+    energies = f"{best.mean:g} eV, σ/mean {best.relative_spread:g}"
     if study.grid.mechanism == "combined":
         energies += f", roll-up fraction {best.rollup_fraction:g}"
     maps = {"measured": study.measured, f"simulated: {study.grid.mechanism}, {energies}": study.maps["optimum"]}

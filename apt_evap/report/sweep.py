@@ -9,7 +9,7 @@ import numpy as np
 from apt_evap._common.codec import for_json
 from apt_evap._common.types import AnyPath
 from apt_evap.detection.detector_map import DetectorMap
-from apt_evap.energy_fit.study import bounded_text
+from apt_evap.fit.study import bounded_text
 from apt_evap.report.origin import add_origin, origin
 from apt_evap.report.page import Markup, Page, heading, paragraph, table, text_of
 from apt_evap.report.pictures import blinking_pictures
@@ -19,7 +19,7 @@ _STUDY = ("SSIM", "mean [eV]", "standard deviation / mean", "roll-up fraction", 
 
 @dataclass(frozen=True)
 class SweepRow:
-    """A point of a sweep.
+    """A point of a sweep, with its results.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ def _study_cells(content):
     open_ends = refined["open_ends"]
     energies = [
         bounded_text(refined[name], refined["intervals"].get(name), open_ends.get(name))
-        for name in ("mean", "rsd", "rollup_fraction")
+        for name in ("mean", "relative_spread", "rollup_fraction")
     ]
     reasons = [
         Markup('<span class="red">registration doubtful</span>') if content["registration"]["doubtful"] else "",

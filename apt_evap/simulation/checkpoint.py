@@ -25,13 +25,13 @@ import numpy as np
 from apt_evap._common.files import FileError, check_path, check_regular, is_unfinished, move_file
 from apt_evap._common.interrupts import uninterrupted
 from apt_evap._common.validation import check_count, check_number, check_switch
-from apt_evap._common.warnings import DataWarning, RunWarning
 from apt_evap._common.wording import argument
 from apt_evap.emission.perturbations import described
 from apt_evap.evaporation.state import EmitterState
-from apt_evap.simulation.ending import Ending
 from apt_evap.simulation.run import PART_NAME, Run, load, part_paths
 from apt_evap.simulation.run_hdf5 import count_ions, is_run, read_state, write_state
+from apt_evap.simulation.stop_reason import StopReason
+from apt_evap.warnings import DataWarning, RunWarning
 
 try:
     import fcntl
@@ -298,7 +298,7 @@ class Keeper:
             raise FileError(f"{error}; {replaces}") from error
         if differences := self._differences(run):
             raise FileError(f"{name!r} contains a run with other settings ({differences}): {replaces}")
-        if run.ended not in (Ending.COMPLETE, Ending.EXHAUSTED):
+        if run.ended not in (StopReason.COMPLETE, StopReason.EXHAUSTED):
             raise FileError(f"{name!r} contains an incomplete run of {len(run):,} ions ({run.ended}): {choices}")
         if len(run) > n_ions:
             raise FileError(

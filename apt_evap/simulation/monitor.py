@@ -8,17 +8,17 @@ import numpy as np
 
 from apt_evap._common.codec import count, number, settings
 from apt_evap._common.types import Floats
-from apt_evap._common.warnings import ChargesWarning, ResponseWarning, RunWarning
 from apt_evap.detection.hits import Outcome
 from apt_evap.evaporation.emitter import Emitter
 from apt_evap.simulation.history import History
+from apt_evap.warnings import ChargesWarning, ResponseWarning, RunWarning
 
 if TYPE_CHECKING:
     from apt_evap.simulation.run import Run
 
 
 @settings
-class WatchSettings:
+class Monitor:
     """Monitoring of a run; it does not change the results."""
 
     interval: int | None = count(
@@ -67,12 +67,12 @@ def charge_residuals(emitter: Emitter, sample: int, seed: int) -> Floats:
     return emitter.charge_residuals(selection)
 
 
-class Monitor:
-    """Monitor of a run: checks its charges at intervals and counts its ions.
+class Watch:
+    """Checks the charges of a run at intervals, and counts its ions.
 
     Parameters
     ----------
-    settings : WatchSettings
+    settings : Monitor
         Interval of the checks, and bounds of the warnings.
     interval : int
         Ions between two checks.
@@ -82,7 +82,7 @@ class Monitor:
         Existing parts of the run.
     """
 
-    def __init__(self, settings: WatchSettings, interval: int, first: int = 0, previous: "Sequence[Run]" = ()) -> None:
+    def __init__(self, settings: Monitor, interval: int, first: int = 0, previous: "Sequence[Run]" = ()) -> None:
         self._settings, self._interval = settings, interval
         self._rows = []  # complete checks that have not been taken yet
         self._open = None  # ions, RMS and largest residual of a check whose ions are not all counted

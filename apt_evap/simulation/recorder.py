@@ -11,10 +11,10 @@ from apt_evap._common.files import FileError
 from apt_evap._core.evaporation import EXHAUSTED, SWEEP_DUE
 from apt_evap.evaporation.emitter import Batch, Emitter
 from apt_evap.simulation.checkpoint import Keeper
-from apt_evap.simulation.ending import Ending
 from apt_evap.simulation.history import History
-from apt_evap.simulation.monitor import Monitor, WatchSettings
+from apt_evap.simulation.monitor import Monitor, Watch
 from apt_evap.simulation.run import Run
+from apt_evap.simulation.stop_reason import StopReason
 
 TOGETHER = 64
 """Number of parts that are joined at a time. Many small arrays between large temporary ones fragment the memory.
@@ -68,7 +68,7 @@ class Recorder:
     ----------
     emitter : Emitter
         The surface, whose state is stored with the parts.
-    settings : WatchSettings
+    settings : Monitor
         Monitoring of the run.
     n_ions : int
         Requested number of ions.
@@ -83,7 +83,7 @@ class Recorder:
     def __init__(
         self,
         emitter: Emitter,
-        settings: WatchSettings,
+        settings: Monitor,
         n_ions: int,
         n_evaporated: int,
         progress: bool | Callable[[int, int], object] | None,
@@ -95,8 +95,8 @@ class Recorder:
         self._first_event = self._stored[0].first_event if self._stored else emitter.counts["events"]
         self._started = len(self)
         interval = settings.interval or 10 * emitter.sweep_interval
-        self._monitor = Monitor(settings, interval, n_evaporated - len(self), self._stored)
-        self._ending = Ending.COMPLETE
+        self._monitor = Watch(settings, interval, n_evaporated - len(self), self._stored)
+        self._ending = StopReason.COMPLETE
         self._report = progress if callable(progress) else None
         self._bar = tqdm(
             total=n_ions,
@@ -134,7 +134,7 @@ class Recorder:
         self._flying.append(part)
         self._land(backlog)
         if batch.status == EXHAUSTED:
-            self._ending = Ending.EXHAUSTED
+            self._ending = StopReason.EXHAUSTED
         if batch.status == SWEEP_DUE and self._monitor.due(ions):
             self._land()
             self._monitor.look(self._emitter, ions)
@@ -144,8 +144,8 @@ class Recorder:
 
     def interrupt(self) -> None:
         """Record that the run ends early."""
-        if self._ending == Ending.COMPLETE and self.missing:
-            self._ending = Ending.INTERRUPTED
+        if self._ending == StopReason.COMPLETE and self.missing:
+            self._ending = StopReason.INTERRUPTED
 
     def _land(self, backlog=0):
         while len(self._flying) > backlog:

@@ -37,11 +37,11 @@ from apt_evap.simulation.columns import (
     parts_of,
     response_columns,
 )
-from apt_evap.simulation.ending import Ending
 from apt_evap.simulation.history import CapHistory, History
 from apt_evap.simulation.provenance import joined, provenance_now
 from apt_evap.simulation.real_units import OperatingPoint, RealColumns, RealUnits, in_real_units, random_of
 from apt_evap.simulation.run_hdf5 import read_run, write_run
+from apt_evap.simulation.stop_reason import StopReason
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -565,7 +565,7 @@ def _load_parts(folder):
         names.append(path.name)
     if not parts:
         raise FileError(f"{str(folder)!r} contains no run: expected files {PART_NAME.format(0)!r} and so on")
-    return Run.join(parts).ended_by(Ending.UNFINISHED)
+    return Run.join(parts).ended_by(StopReason.UNFINISHED)
 
 
 def _difference(one, other):

@@ -19,10 +19,10 @@ from apt_evap.evaporation.state import EmitterState
 from apt_evap.evaporation.voltage import check_voltage
 from apt_evap.flight.response import ResponseSettings
 from apt_evap.simulation.columns import ALWAYS, OPTIONAL, columns_of, flown_columns, parts_of, response_columns
-from apt_evap.simulation.ending import Ending
 from apt_evap.simulation.history import CapHistory, History
 from apt_evap.simulation.provenance import provenance_now
 from apt_evap.simulation.real_units import RealUnits
+from apt_evap.simulation.stop_reason import StopReason
 from apt_evap.storage.digested_hdf5 import first_line, open_hdf5, tail_of, write_hdf5
 from apt_evap.storage.nexus import ENTRY, IONS, put_field, put_group, put_nxapm, put_text
 
@@ -52,7 +52,7 @@ def _place(column):
 
 def write_run(path: AnyPath, run: Any) -> None:
     """Write a Run to a file, which is either complete or absent; FileError if it cannot be written."""
-    complete = run.ended in (Ending.COMPLETE, Ending.EXHAUSTED)
+    complete = run.ended in (StopReason.COMPLETE, StopReason.EXHAUSTED)
     with write_hdf5(path, _RUN, len(run), run.provenance.get("settings", "") if complete else "") as file:
         put_text(file, "format", FORMAT)
         _write(file, run)

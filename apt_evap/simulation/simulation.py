@@ -18,7 +18,6 @@ from apt_evap._common.memory import check_copies
 from apt_evap._common.threads import thread_count
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_count, check_kind, check_seed, check_sequence, check_switch
-from apt_evap._common.warnings import RunWarning
 from apt_evap.detection.detector import Detector
 from apt_evap.emission.emissions import SECOND_TARGET_COLUMNS, Emissions, check_launches
 from apt_evap.emission.ion_random import IonRandom
@@ -34,10 +33,11 @@ from apt_evap.flight.response import ResponseModel, ResponseSettings
 from apt_evap.simulation.checkpoint import Checkpoint, Keeper
 from apt_evap.simulation.columns import Clock, Flown
 from apt_evap.simulation.history import CapHistory
-from apt_evap.simulation.monitor import WatchSettings
+from apt_evap.simulation.monitor import Monitor
 from apt_evap.simulation.recorder import Recorder
 from apt_evap.simulation.run import Run
 from apt_evap.specimen.tip import Tip
+from apt_evap.warnings import RunWarning
 
 BACKLOG = 4  # batches whose flights may be pending during further events
 
@@ -68,7 +68,7 @@ class Simulation:
         it.
     rule : charging rule, optional
         Distribution of the charge over the surface; by default `Robin`.
-    watch_settings : WatchSettings, optional
+    monitor : Monitor, optional
         Monitoring of the run.
     control : VoltageControl, optional
         Rate, pulses and control of the voltage, for a law with a temperature (by default a usual one), and for real
@@ -92,7 +92,7 @@ class Simulation:
         response_settings: ResponseSettings | None = None,
         n_threads: int | None = None,
         rule: Rule | CompiledRule | None = None,
-        watch_settings: WatchSettings | None = None,
+        monitor: Monitor | None = None,
         control: VoltageControl | None = None,
     ) -> None:
         self.voltage = check_voltage(voltage)
@@ -105,8 +105,8 @@ class Simulation:
         check_kind(self.response_settings, "response_settings", ResponseSettings, "ResponseSettings")
         if charge_settings is not None:
             check_kind(charge_settings, "charge_settings", ChargeSettings, "ChargeSettings")
-        self.watch_settings = WatchSettings() if watch_settings is None else watch_settings
-        check_kind(self.watch_settings, "watch_settings", WatchSettings, "WatchSettings")
+        self.monitor = Monitor() if monitor is None else monitor
+        check_kind(self.monitor, "monitor", Monitor, "Monitor")
         self.n_threads = thread_count(n_threads)
         check_reach(self.flight_settings, check_kind(tip, "tip", Tip, "a Tip"), self.detector)
         self.emitter = Emitter(
@@ -226,7 +226,7 @@ class Simulation:
         with (
             self._crew.at_work(),
             interruptible() as interrupted,
-            Recorder(self.emitter, self.watch_settings, n_ions, self.n_evaporated, progress, keeper) as recorder,
+            Recorder(self.emitter, self.monitor, n_ions, self.n_evaporated, progress, keeper) as recorder,
         ):
             for batch in self.emitter.advance(recorder.missing, batch_size, self._crew.paused):
                 part = self._start_flights(batch, emissions, responses)
@@ -379,7 +379,7 @@ class Simulation:
             "charges": to_plain(self.emitter.settings),
             "flights": to_plain(self.flight_settings),
             "responses": to_plain(self.response_settings),
-            "watch": to_plain(self.watch_settings),
+            "monitor": to_plain(self.monitor),
             "control": to_plain(self.control),
             "pulse_length": self.emitter.pulse_length,
         }

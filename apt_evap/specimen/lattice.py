@@ -75,12 +75,39 @@ def cell_lengths(structure: str, a: float, c: float | None = None) -> Floats:
 
 
 def atom_density(structure: str, a: float, c: float | None = None) -> float:
-    """Atoms per volume [1/nm^3]; parameters as for `cell_lengths`."""
-    return len(BASES[structure]) / float(np.prod(cell_lengths(structure, a, c)))
+    """Number of atoms per volume of a crystal.
+
+    Parameters
+    ----------
+    structure : str
+        One of fcc, bcc, sc, diamond, hcp.
+    a, c : float
+        Lattice constants [nm]; c of hcp only.
+
+    Returns
+    -------
+    float
+        Density [1/nm^3].
+    """
+    a = check_number(a, "a", above=0, unit="nm")
+    volume = float(np.prod(cell_lengths(structure, a, c)))
+    return len(BASES[structure]) / volume
 
 
 def nearest_neighbour_distance(structure: str, a: float, c: float | None = None) -> float:
-    """Distance between nearest neighbours [nm]; parameters as for `cell_lengths`."""
+    """Distance between nearest neighbours.
+
+    Parameters
+    ----------
+    structure, a, c
+        As for `atom_density`.
+
+    Returns
+    -------
+    float
+        Distance [nm].
+    """
+    a = check_number(a, "a", above=0, unit="nm")
     if check_structure(structure) == "hcp":
         height = cell_lengths(structure, a, c)[2]
         return float(min(a, math.sqrt(a * a / 3 + height * height / 4)))

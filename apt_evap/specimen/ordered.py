@@ -72,7 +72,7 @@ def _second(given, name):
 
 
 @settings
-class Order:
+class Superlattice:
     """Order of a compound of two elements on the sites of a crystal.
 
     The first element is the material of the phase. The crystal is cubic: the small tetragonal distortion of real L1_0
@@ -120,12 +120,12 @@ def _cells(given, name):
 
 
 @settings
-class Basis:
+class UnitCell:
     """Elements on the sites of a cell of a user's own.
 
     Examples
     --------
-    L1_2 with a quarter of the corners occupied by a third element: ``Basis(({"Al": 0.75, "Ti": 0.25}, None, None,
+    L1_2 with a quarter of the corners occupied by a third element: ``UnitCell(({"Al": 0.75, "Ti": 0.25}, None, None,
     None))``.
     """
 
@@ -171,8 +171,10 @@ def check_order(order: Any, structure: str) -> None:
     """Raise a ValueError unless `order` is None, or an order that fits the structure."""
     if order is None:
         return
-    if not isinstance(order, Order | Basis):
-        raise ValueError(f'order must be an Order such as Order("L1_2", "Al") or a Basis, got {short_text(order)}')
+    if not isinstance(order, Superlattice | UnitCell):
+        raise ValueError(
+            f'order must be a Superlattice such as Superlattice("L1_2", "Al") or a UnitCell, got {short_text(order)}'
+        )
     if order.structure is not None and order.structure != structure:
         raise ValueError(f"order {order.prototype} needs the structure {order.structure}, got {structure}")  # type: ignore[union-attr]
     n_sites = int(np.prod(order.period)) * len(BASES[structure])
@@ -180,12 +182,12 @@ def check_order(order: Any, structure: str) -> None:
         raise ValueError(f"order must have {n_sites} sites for {structure}, got {len(order.occupants())}")
 
 
-def sublattice(order: Order | Basis, cells: Integers, site: int, n_sites: int) -> Integers:
+def sublattice(order: Superlattice | UnitCell, cells: Integers, site: int, n_sites: int) -> Integers:
     """Index of the sites of these cells into `occupants`.
 
     Parameters
     ----------
-    order : Order or Basis
+    order : Superlattice or UnitCell
         The order.
     cells : ndarray of int, shape (3, n)
         Cells.
@@ -202,7 +204,7 @@ def sublattice(order: Order | Basis, cells: Integers, site: int, n_sites: int) -
     return ((i * order.period[1] + j) * order.period[2] + k) * n_sites + site
 
 
-def order_of(plain: Any, name: str = "order") -> Order | Basis:
+def order_of(plain: Any, name: str = "order") -> Superlattice | UnitCell:
     """Order from its plain form; which one is known from its parameters."""
-    kind = Basis if isinstance(plain, Mapping) and "sites" in plain else Order
+    kind = UnitCell if isinstance(plain, Mapping) and "sites" in plain else Superlattice
     return from_plain(plain, kind, what=name)

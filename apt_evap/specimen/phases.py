@@ -77,7 +77,7 @@ class Phase:
     )
     order: Any = checked(
         "Order of a compound on the sites of the crystal.",
-        "Order or Basis",
+        "Superlattice or UnitCell",
         lambda order, name: order,  # checked with the structure
         default=None,
         read=order_of,

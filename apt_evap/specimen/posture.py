@@ -7,7 +7,7 @@ import scipy
 
 from apt_evap._common.sphere import fit_sphere
 from apt_evap._common.types import Floats
-from apt_evap._common.warnings import SpecimenWarning
+from apt_evap.warnings import SpecimenWarning
 
 _LEAST = 200  # atoms: fewer have no shape
 _END = 0.1  # fraction of the height at either end whose widths are compared

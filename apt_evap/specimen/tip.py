@@ -25,7 +25,6 @@ from apt_evap._common.validation import (
     digest,
     short_text,
 )
-from apt_evap._common.warnings import DataWarning
 from apt_evap.specimen import ase_atoms, lattice, posture
 from apt_evap.specimen.alloy import check_solutes
 from apt_evap.specimen.materials import Material, as_material
@@ -33,6 +32,7 @@ from apt_evap.specimen.phases import Arrangement, Phase, check_phases
 from apt_evap.specimen.shape import TaperedCap
 from apt_evap.specimen.shell import Shell
 from apt_evap.specimen.surface_criterion import SurfaceCriterion
+from apt_evap.warnings import DataWarning
 
 _ROUNDING = 1e-6  # [d_nn]: sites on the surface are all included, in spite of rounding
 _LAYER = 0.74  # thickness of the layer of surface atoms [d_nn]: for fcc, 0.48 a^2 of the surface per atom

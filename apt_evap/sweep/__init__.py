@@ -1,1 +1,5 @@
 """Sweeps: many runs from one study file, shared by any number of processes."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

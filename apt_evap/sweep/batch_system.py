@@ -13,7 +13,7 @@ from apt_evap._common.files import FileError, read_small_file
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_choice
 from apt_evap.sweep.files import unlinked, write
-from apt_evap.sweep.plan import Sweep
+from apt_evap.sweep.planning import Sweep
 
 _MARGIN = 1.3  # of the memory: its foresight is within 30 %
 _LEAST_MEMORY = 300  # [MB]

@@ -11,8 +11,8 @@ from apt_evap._common.validation import check_number, short_text
 from apt_evap.config.tables import check_keys, check_table
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
-from apt_evap.energy_fit.grid import EnergyGrid
-from apt_evap.energy_fit.settings import FitSettings
+from apt_evap.fit.grid import EnergyGrid
+from apt_evap.fit.settings import FitSettings
 from apt_evap.io.formats import read
 
 _READING = ("format", "byte_order", "unit")

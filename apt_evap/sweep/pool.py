@@ -7,8 +7,8 @@ from functools import partial
 from typing import Any
 
 from apt_evap._common.optional_imports import optional_import
-from apt_evap.sweep.plan import Sweep
-from apt_evap.sweep.work import forwarded, start, work_on
+from apt_evap.sweep.planning import Sweep
+from apt_evap.sweep.worker import forwarded, start, work_on
 
 _POLLING = 0.1  # seconds
 _WAIT = 5.0  # seconds between two looks at points that others work on

@@ -51,7 +51,9 @@ def turn(rings, measured):
 
     def sum_of(choice):
         pairs = zip(rings, measured, strict=True)
-        return sum(ae.line_amplitude(a, b, mirror=choice[0], shift=choice[1]).value * b.contrast**2 for a, b in pairs)
+        return sum(
+            ae.maps.line_amplitude(a, b, mirror=choice[0], shift=choice[1]).value * b.contrast**2 for a, b in pairs
+        )
 
     return max(choices, key=sum_of)
 
@@ -72,9 +74,11 @@ def main():
     parser.add_argument("--second-roll", type=float, default=0.0, help="part of the ions that roll which roll twice")
     parser.add_argument("--like", default="all, strongest neighbour", help="rule that gives the azimuth")
     options = parser.parse_args()
-    measured, place = ae.read_map(options.measured), ae.Projection(options.scale, centre=tuple(options.pole))
-    target = ae.ring_statistics(measured, place, rings=RINGS[options.element], fold=3)
-    print("measured", *(f"{ring.contrast:.2f}" for ring in target), ae.radial_densities(measured, place).round(2))
+    measured, place = ae.read_map(options.measured), ae.detection.Projection(options.scale, centre=tuple(options.pole))
+    target = ae.maps.ring_statistics(measured, place, rings=RINGS[options.element], fold=3)
+    print(
+        "measured", *(f"{ring.contrast:.2f}" for ring in target), ae.maps.pole_profile(measured, place).density.round(2)
+    )
 
     material = ae.material(options.element)
     size = options.radius * material.a
@@ -89,7 +93,7 @@ def main():
         pass
     run = simulation.run(options.ions, list(emissions.values()), responses=False)
     hits = {name: run.hits(each) for name, each in emissions.items()}
-    projection = ae.image_compression(run).projection
+    projection = ae.analysis.image_compression(run).projection
     poles = ae.Orientation.from_settings(run.settings["tip"]).directions(
         np.array([(a, b, c) for a in (1, -1) for b in (1, -1) for c in (1, -1)]) / np.sqrt(3)
     )
@@ -99,8 +103,8 @@ def main():
 
     def structure(x, y):
         found = counts(x, y)
-        rings = ae.ring_statistics(found, projection, pole, RINGS[options.element], fold=3)
-        return rings, ae.radial_densities(found, projection, pole)
+        rings = ae.maps.ring_statistics(found, projection, pole, RINGS[options.element], fold=3)
+        return rings, ae.maps.pole_profile(found, projection, pole).density
 
     places = {name: (each.x, each.y) for name, each in hits.items()}
     u, v = np.random.default_rng(3).random((2, len(run)))
@@ -114,10 +118,12 @@ def main():
             for name in "xy"
         )
     mirror, shift = turn(structure(*places[options.like])[0], target)
-    wanted = ae.radial_densities(measured, place)
+    wanted = ae.maps.pole_profile(measured, place).density
     for name, each in places.items():
         rings, radial = structure(*each)
-        amplitudes = [ae.line_amplitude(a, b, mirror=mirror, shift=shift) for a, b in zip(rings, target, strict=True)]
+        amplitudes = [
+            ae.maps.line_amplitude(a, b, mirror=mirror, shift=shift) for a, b in zip(rings, target, strict=True)
+        ]
         print(
             f"{name:26}",
             *(f"{ring.contrast:.2f} ± {ring.error:.2f}" for ring in rings),

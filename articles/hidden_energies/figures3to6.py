@@ -77,13 +77,15 @@ def measurement(metal, path):
     """Measured ions or map from a file, or the map of the twin."""
     if path:
         return ae.read_map(path) if path.endswith(".npz") else ae.read(path)
-    _, mechanism, mean, rsd = CASES[metal]
-    hits = evaporate(metal, "twin", seed=2).hits(MECHANISMS[mechanism](ae.TruncatedNormal(mean, rsd * mean)))
+    _, mechanism, mean, relative_spread = CASES[metal]
+    hits = evaporate(metal, "twin", seed=2).hits(
+        MECHANISMS[mechanism](ae.TruncatedNormal(mean, relative_spread * mean))
+    )
     # the edge of the field of view is known; an outline determined from few hits would extend beyond it
     centres = (np.arange(bins) + 0.5) * 2 / bins - 1
     inside = np.hypot(centres, centres[:, None]) < 1 - 2 / bins
     extent = (-FIELD_OF_VIEW, FIELD_OF_VIEW, -FIELD_OF_VIEW, FIELD_OF_VIEW)
-    return INSTRUMENT.hits(hits).map(bins=bins, extent=extent, quantum=None, mask=inside)
+    return INSTRUMENT.hits(hits).map(bins=bins, extent=extent, position_step=None, mask=inside)
 
 
 studies, sources = {}, {}
@@ -91,12 +93,12 @@ for metal, path in (("Al", options.measured_al), ("Ni", options.measured_ni)):
     measured = measurement(metal, path)
     run = evaporate(metal, "run", seed=1)
     sources[metal] = {"simulated": repr(run), "measured": path or "twin", "map": repr(measured)}
-    mechanism, settings = CASES[metal][1], ae.FitSettings(bins=bins, resamples=options.resamples)
-    study = studies[f"{metal} {mechanism}"] = ae.fit_energies(run, measured, ae.EnergyGrid(mechanism), settings)
+    mechanism, settings = CASES[metal][1], ae.fit.FitSettings(bins=bins, resamples=options.resamples)
+    study = studies[f"{metal} {mechanism}"] = ae.fit_energies(run, measured, ae.fit.EnergyGrid(mechanism), settings)
     print(f"{metal}: {run};\n measured {measured};\n {study.registration}", flush=True)
     if metal == "Ni":
         # the registration determines the compared region: both mechanisms use the same one and can be compared
-        grid = ae.EnergyGrid("combined")
+        grid = ae.fit.EnergyGrid("combined")
         studies["Ni combined"] = ae.fit_energies(run, measured, grid, settings, registration=study.registration)
 
 figure = ae.plot.new_figure((12.0, 5.0))
@@ -109,11 +111,11 @@ figure.savefig(options.output / "figure3.png")
 ae.plot.ssim_matrix(studies["Ni combined"])[0].figure.savefig(options.output / "figure4.png")
 for name, number in (("Al lateral", 5), ("Ni roll-up", 6)):
     study, (metal, mechanism) = studies[name], name.split()
-    best, (_, _, mean, rsd) = study.optimum, CASES[metal]
+    best, (_, _, mean, relative_spread) = study.optimum, CASES[metal]
     titles = (
-        "measured" if sources[metal]["measured"] != "twin" else f"twin, {mean:g} eV, σ/mean {rsd:g}",
+        "measured" if sources[metal]["measured"] != "twin" else f"twin, {mean:g} eV, σ/mean {relative_spread:g}",
         "simulated, unperturbed",
-        f"simulated, {mechanism}\n{best.mean:g} eV, σ/mean {best.rsd:g}",
+        f"simulated, {mechanism}\n{best.mean:g} eV, σ/mean {best.relative_spread:g}",
     )
     ae.plot.side_by_side(study, titles=titles)[0].figure.savefig(options.output / f"figure{number}.png")
 
@@ -122,15 +124,16 @@ print("|---|---|---|---|---|---|---|---|")
 for name, study in studies.items():
     best, refined = study.optimum, study.refined
     combined = name == "Ni combined"
-    grid = f"{best.mean:g} eV, {best.rsd:g}" + (f", f {best.rollup_fraction:g}" if combined else "")
-    optimum = f"{refined.bounded('mean')} eV, {refined.bounded('rsd')}"
+    grid = f"{best.mean:g} eV, {best.relative_spread:g}" + (f", f {best.rollup_fraction:g}" if combined else "")
+    optimum = f"{refined.bounded('mean')} eV, {refined.bounded('relative_spread')}"
     optimum += f", f {refined.bounded('rollup_fraction')}" if combined else ""
     scores = [best.score, *study.baselines.values(), study.plain["optimum"], study.ceiling or "unknown"]
     print("|", " | ".join([name, grid, optimum, *map(str, scores)]), "|")
 results = {
     "sources": sources,
     "energies of the twins": {
-        metal: dict(zip(("axis", "mechanism", "mean [eV]", "rsd"), case, strict=True)) for metal, case in CASES.items()
+        metal: dict(zip(("axis", "mechanism", "mean [eV]", "relative_spread"), case, strict=True))
+        for metal, case in CASES.items()
     },
     "studies": {name: study.to_dict() for name, study in studies.items()},
 }

@@ -55,7 +55,7 @@ def main():
         )
         print(f"\n{mechanism}: {HIDDEN[mechanism]}, {draws} draws of {len(other):,} ions\n{measured}", flush=True)
         start = time.perf_counter()
-        study = ae.fit_energies(run, measured, ae.EnergyGrid(mechanism))
+        study = ae.fit_energies(run, measured, ae.fit.EnergyGrid(mechanism))
         print(f"{study}\nthe optimum is better than the unperturbed map in {study.gain_share:.0%} of the resamples")
         print(f"{study.registration}; true {instrument}\n{time.perf_counter() - start:.0f} s")
         print(np.array2string(study.ssim[0], precision=3, suppress_small=True))

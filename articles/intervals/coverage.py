@@ -18,11 +18,11 @@ from pathlib import Path
 import numpy as np
 
 import apt_evap as ae
-from apt_evap.energy_fit.intervals import intervals
+from apt_evap.fit.intervals import intervals
 
 VARIATION = 0.2  # of radius, shank angle and surface threshold
 INSTRUMENT = ae.Registration(rotation=17.0, scale=0.4, shift=(3.0, -2.0))
-NAMES = ("mean", "rsd", "true_mean", "true_standard_deviation")
+NAMES = ("mean", "relative_spread", "true_mean", "true_standard_deviation")
 
 
 def specimen(number, radius):
@@ -54,7 +54,7 @@ def run_of(number, radius, ions, folder=None):
         # to a tenth of a bin
         flight_settings=ae.FlightSettings(opening_angle=0.6, tolerance=1e-2),
         response_settings=ae.ResponseSettings(
-            site=ae.Design(1, ((0.0, 1), (1.0, 4))), rolled=ae.Design(2, ((0.0, 1), (1.0, 6))), bound=1.0
+            site=ae.flight.Design(1, ((0.0, 1), (1.0, 4))), rolled=ae.flight.Design(2, ((0.0, 1), (1.0, 6))), bound=1.0
         ),
     )
     run = simulation.run(ions, progress=False)
@@ -66,8 +66,8 @@ def run_of(number, radius, ions, folder=None):
 def hidden_energy(number):
     """Energy distribution of a twin."""
     random = np.random.default_rng((7, number))
-    mean, rsd = np.exp(random.uniform(np.log([0.08, 0.1]), np.log([0.3, 1.5])))
-    return ae.TruncatedNormal(float(mean), float(rsd * mean))
+    mean, relative_spread = np.exp(random.uniform(np.log([0.08, 0.1]), np.log([0.3, 1.5])))
+    return ae.TruncatedNormal(float(mean), float(relative_spread * mean))
 
 
 def measured_map(run, energy, bins=48, draws=4, radius=60.0):
@@ -88,7 +88,7 @@ def truth_of(energy):
 
 def fitted(run, measured):
     """Study of a twin."""
-    settings = ae.FitSettings(replicas=4, resamples=40)
+    settings = ae.fit.FitSettings(replicas=4, resamples=40)
     return ae.fit_energies(run, measured, None, settings, registration=INSTRUMENT, n_threads=1, progress=False)
 
 
@@ -97,7 +97,7 @@ def inside(study, truth, model_error):
     refined = study.refined
     best = []
     for name, axis in study.grid.axes.items():
-        scale = np.log if name == "rsd" else np.asarray
+        scale = np.log if name == "relative_spread" else np.asarray
         value = refined.options[name] if name in refined.options else getattr(refined, name)
         best.append(np.interp(scale(value), scale(axis), np.arange(len(axis))))
     bounds = intervals(study.grid, np.concatenate([study.ssim[None], study.resampled]), best, model_error).bounds

@@ -52,7 +52,7 @@ def run_of(number, radius, ions, folder):
 
 def counts(run, bins=200):
     """Map of the complete detector."""
-    return run.hits(EMISSION).map(like=run.detector.grid(bins), quantum=None)
+    return run.hits(EMISSION).map(like=run.detector.grid(bins), position_step=None)
 
 
 def main():
@@ -69,8 +69,8 @@ def main():
     for twin in range(options.twins):
         hidden = float(np.exp(np.random.default_rng((8, twin)).uniform(np.log(LOW), np.log(HIGH))))
         run = run_of(100 + twin, hidden, round(options.layers * LAYER * hidden**2), options.folder)
-        projection = ae.image_compression(run).projection
-        fit = ae.fit_radius(family, counts(run), projection, EMISSION, (1, 1, 1), fold=3, rings=RINGS, radii=EDGES)
+        projection = ae.analysis.image_compression(run).projection
+        fit = ae.fit.fit_radius(family, counts(run), projection, EMISSION, (1, 1, 1), fold=3, rings=RINGS, radii=EDGES)
         found, (low, high) = fit.radius / 0.352, (bound / 0.352 for bound in fit.interval)
         inside += low <= hidden <= high
         bounds = f"({low:.1f} to {high:.1f})"

@@ -77,8 +77,8 @@ def main():
         study = ae.fit_energies(
             run,
             hits.map(64),
-            ae.EnergyGrid(rule, MEANS, RSDS, options=OPTIONS),
-            ae.FitSettings(replicas=4, resamples=40),
+            ae.fit.EnergyGrid(rule, MEANS, RSDS, options=OPTIONS),
+            ae.fit.FitSettings(replicas=4, resamples=40),
             registration=INSTRUMENT,
             n_threads=1,
             progress=False,

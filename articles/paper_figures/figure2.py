@@ -58,7 +58,7 @@ def respond(element, axis, radius):
     """The emitter before the run, the run in which only the chosen atoms evaporate, and its ions in order of choice."""
     metal = ae.material(element)
     tip = ae.Tip(metal, radius * metal.a, axis, shank_length=radius * metal.a, depth=8 * metal.a)
-    emitter = ae.Emitter(tip)
+    emitter = ae.evaporation.Emitter(tip)
     atoms = choose(emitter)
     run = ae.Simulation(tip, seed=1, law=ChosenFirst(atoms)).run(len(atoms))
     order = [int(np.flatnonzero(run.site == atom)[0]) for atom in atoms]  # the largest key evaporated first
@@ -92,9 +92,9 @@ for (apex_view, detector), (element, axis, mechanism) in zip(
     ae.plot.mark_atoms(run.emissions.positions[ions], apex_view, colors=colors)
     ae.plot.response(run, ions, mechanism, detector, energies=ENERGIES, zoom=1, title=f"{name}, {mechanism}")
 
-    unperturbed = ae.lateral_tracks(run, ions, [0.0], [0.0])
-    lateral = ae.lateral_tracks(run, ions, [0.5])
-    roll, roll_up = (ae.rollup_tracks(run, ions, [energy]) for energy in (0.0, 0.5))
+    unperturbed = ae.analysis.lateral_tracks(run, ions, [0.0], [0.0])
+    lateral = ae.analysis.lateral_tracks(run, ions, [0.5])
+    roll, roll_up = (ae.analysis.rollup_tracks(run, ions, [energy]) for energy in (0.0, 0.5))
     table = {
         "neighbours": list(NEIGHBOURS),
         "field [V/nm]": run.fields[ions].tolist(),

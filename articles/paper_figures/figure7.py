@@ -21,8 +21,8 @@ ROLL_UP = ae.RollUp(ae.TruncatedNormal(mean=0.155, standard_deviation=0.155))
 # The crystal is rotated such that a depleted line is along y and an enhanced line along x, as in the paper. [111] is an
 # axis with three-fold symmetry, so that each line has two equivalent ones. The profiles of all three are added.
 RECTANGLES = {
-    "depleted": ae.Rectangle(centre=(0, 52), angle=-90, length=36, width=24),
-    "enhanced": ae.Rectangle(centre=(28, 0), angle=0, length=24, width=30),
+    "depleted": ae.maps.Rectangle(centre=(0, 52), angle=-90, length=36, width=24),
+    "enhanced": ae.maps.Rectangle(centre=(28, 0), angle=0, length=24, width=30),
 }
 TURNS = (0, 120, 240)  # degrees
 
@@ -72,9 +72,9 @@ panels = figure.subplots(4, 2, width_ratios=(1, 1.15), height_ratios=(3, 1, 3, 1
 results = {}
 for row, (kind, rectangle) in enumerate(RECTANGLES.items()):
     rectangles = [rectangle.turned(angle) for angle in TURNS]
-    profiles = [ae.zone_line_profile(hit, rectangles, bins=options.bins) for hit in hits]
-    lines = [ae.fit_zone_line(profile, exponent=None) for profile in profiles]
-    comparison = ae.compare_profiles(*profiles)
+    profiles = [ae.maps.zone_line_profile(hit, rectangles, bins=options.bins) for hit in hits]
+    lines = [ae.maps.fit_zone_line(profile, exponent=None) for profile in profiles]
+    comparison = ae.maps.compare_profiles(*profiles)
     difference = (lines[0].width - lines[1].width) / (lines[0].width_error ** 2 + lines[1].width_error ** 2) ** 0.5
     for name, line in zip(names, lines, strict=True):
         print(f"{kind} line, {name}: {line}, chi-square {line.chi_square:.0f} / {line.degrees_of_freedom}")
@@ -100,7 +100,7 @@ for row, (kind, rectangle) in enumerate(RECTANGLES.items()):
     for panel in panels[2 * row : 2 * row + 2, 0]:
         panel.remove()
     map_axes = figure.add_subplot(panels[0, 0].get_gridspec()[2 * row : 2 * row + 2, 0])
-    density = hits[0].map(like=ae.Detector(width=150.0).grid(150), quantum=None).smoothed(1.0)
+    density = hits[0].map(like=ae.Detector(width=150.0).grid(150), position_step=None).smoothed(1.0)
     ae.plot.detector_map(density, map_axes, title=f"{kind} lines, {names[0]}")
     ae.plot.rectangles(rectangles, map_axes)
     axes = panels[2 * row : 2 * row + 2, 1]

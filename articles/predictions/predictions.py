@@ -72,10 +72,12 @@ def evaporate(element, axis, rules, radius, ions, path):
 def draw(axis, name, run, emission, bins):
     """Map of a run with its indexed poles, in an equidistant projection and without the broad gradient."""
     seen = run.on_detector(ae.Detector(distance=100.0, width=160.0, projection="equidistant"))
-    counts = seen.hits(emission).map(like=seen.detector.grid(bins), quantum=None)
+    counts = seen.hits(emission).map(like=seen.detector.grid(bins), position_step=None)
     ae.plot.detector_map(counts.flattened(25.0).smoothed(1.0), axis, title=name, colorbar=False, caption=False)
     orientation = Orientation.from_settings(run.settings["tip"])
-    ae.plot.poles(axis, orientation, ae.image_compression(seen).projection, families=6, zone_families=(), size=7)
+    ae.plot.poles(
+        axis, orientation, ae.analysis.image_compression(seen).projection, families=6, zone_families=(), size=7
+    )
 
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

@@ -42,7 +42,7 @@ def evaporate(radius, ions):
 
 def counts(run, perturbation, bins=400):
     """Map of the complete detector."""
-    return run.hits(perturbation).map(like=run.detector.grid(bins), quantum=None)
+    return run.hits(perturbation).map(like=run.detector.grid(bins), position_step=None)
 
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -52,13 +52,13 @@ parser.add_argument("-o", "--output", metavar="PICTURE.png", help="picture of fo
 options = parser.parse_args()
 run = ae.load(options.run) if options.run else evaporate(*((40, 50_000) if options.full else (12, 3_000)))
 
-projection = ae.image_compression(run).projection
+projection = ae.analysis.image_compression(run).projection
 print("contrast in rings of 5-9, 9-14 and 14-20 degrees; density within 1, 2, 3 and 6 degrees over the mean")
 for name, perturbation in RULES.items():
     counted = counts(run, perturbation)
-    rings = ae.ring_statistics(counted, projection, fold=3)
+    rings = ae.maps.ring_statistics(counted, projection, fold=3)
     contrasts = ", ".join(f"{ring.contrast:.2f} ± {ring.error:.2f}" for ring in rings)
-    densities = " ".join(f"{density:.2f}" for density in ae.radial_densities(counted, projection))
+    densities = " ".join(f"{density:.2f}" for density in ae.maps.pole_profile(counted, projection).density)
     print(f"{name:38}: {contrasts}; {densities}")
 
 maps = [counts(run, RULES[name], 160).smoothed(2.0) for name in DRAWN]

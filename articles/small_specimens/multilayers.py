@@ -24,11 +24,11 @@ FIT = ("shift", "rotation", "depth_scale", "radius", "compression")
 
 def evaporate(normal, bounds, field, ions, radius):
     """Run of a tip with layers between bounds along a normal [nm]."""
-    region = ae.Union(*(ae.Layer(lower, upper, normal=normal) for lower, upper in bounds))
-    layers = ae.Phase("layers", ae.material("Al", a=NICKEL.a), region, evaporation_field=field)
+    region = ae.specimen.Union(*(ae.specimen.Layer(lower, upper, normal=normal) for lower, upper in bounds))
+    layers = ae.specimen.Phase("layers", ae.material("Al", a=NICKEL.a), region, evaporation_field=field)
     tip = ae.Tip(
-        phases=[ae.Phase("Ni", NICKEL), layers], apex_radius=radius, axis=(0, 0, 1), shank_length=2 * radius, depth=4.0,
-        offset_seed=1,
+        phases=[ae.specimen.Phase("Ni", NICKEL), layers], apex_radius=radius, axis=(0, 0, 1), shank_length=2 * radius,
+        depth=4.0, offset_seed=1,
     )  # fmt: skip
     return ae.Simulation(tip, seed=1).run(ions, [ae.Unperturbed()], responses=False, progress=False)
 
@@ -96,7 +96,9 @@ for row, (name, (normal, bounds, ions)) in zip(panels, CASES.items(), strict=Tru
             widths = []
             for positions in (sites[chosen], found[chosen]):
                 try:
-                    widths.append(ae.interface_profile(positions @ along - place, layer[chosen], reach=0.6 * scale))
+                    widths.append(
+                        ae.reconstruction.interface_profile(positions @ along - place, layer[chosen], reach=0.6 * scale)
+                    )
                 except ValueError:  # too few ions on one side
                     break
             else:

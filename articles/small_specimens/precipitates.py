@@ -28,9 +28,9 @@ CASES = {"low": (0.85, (0.8, 1.2, 1.6)), "equal": (1.0, (1.2,)), "high": (1.2, (
 def evaporate(ratio, r, radius):
     """Run of a tip with a sphere of radius r [nm], until the apex is 1.2 nm below the sphere."""
     field = ratio * ALUMINIUM.evaporation_field
-    region = ae.Sphere((0, 0, radius - COVER - r), r)
-    sphere = ae.Phase("sphere", ALUMINIUM, region, solutes={"Cu": 0.5}, evaporation_field=field)
-    matrix = ae.Phase("matrix", ALUMINIUM)
+    region = ae.specimen.Sphere((0, 0, radius - COVER - r), r)
+    sphere = ae.specimen.Phase("sphere", ALUMINIUM, region, solutes={"Cu": 0.5}, evaporation_field=field)
+    matrix = ae.specimen.Phase("matrix", ALUMINIUM)
     tip = ae.Tip(
         phases=[matrix, sphere], apex_radius=radius, axis=(0, 1, 2), shank_length=2 * radius, depth=4.0, seed=1
     )
@@ -102,7 +102,7 @@ for row, (name, (ratio, sizes)) in zip(panels, CASES.items(), strict=True):
         hits = reconstruction.hits
         inside = hits.extra["phase"] == 1
         copper = np.array(run.elements)[hits.extra["species"]] == "Cu"
-        found = ae.precipitate_errors(reconstruction, inside, run, copper, fit=FIT)
+        found = ae.reconstruction.precipitate_errors(reconstruction, inside, run, copper, fit=FIT)
         errors = reconstruction.errors(run, FIT, groups=hits.extra["phase"])
         print(
             f"{name} field, r = {r:g} nm: {len(run):,} ions, {np.count_nonzero(run.phase == 1)} of the sphere, "

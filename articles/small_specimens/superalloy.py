@@ -34,16 +34,18 @@ radius, r = 5.5 * scale, 1.3 * scale
 # %%
 # The specimen. Both grains have the same solutes, with a segregation to their boundary.
 
-boundary = ae.HalfSpace(point=(1.2 * scale, 0, 0), normal=(1, 0, 0))
-sphere = ae.Sphere((-1.2 * scale, 0, radius - 0.6 * scale - r), r)
-segregation = ae.Segregation(bulk=0.01, peak=0.15, width=0.35, region=boundary)
+boundary = ae.specimen.HalfSpace(point=(1.2 * scale, 0, 0), normal=(1, 0, 0))
+sphere = ae.specimen.Sphere((-1.2 * scale, 0, radius - 0.6 * scale - r), r)
+segregation = ae.specimen.Segregation(bulk=0.01, peak=0.15, width=0.35, region=boundary)
 solutes, fields = {"Al": 0.05, "Ti": segregation}, {"Al": 28.0}
 phases = [
-    ae.Phase("gamma", NICKEL, solutes=solutes, evaporation_field=fields),
-    ae.Phase(
+    ae.specimen.Phase("gamma", NICKEL, solutes=solutes, evaporation_field=fields),
+    ae.specimen.Phase(
         "second grain", NICKEL, boundary, axis=(0, 0, 1), rotation=30.0, solutes=solutes, evaporation_field=fields
     ),
-    ae.Phase("gamma prime", NICKEL, sphere, order=ae.Order("L1_2", "Al"), evaporation_field=fields),
+    ae.specimen.Phase(
+        "gamma prime", NICKEL, sphere, order=ae.specimen.Superlattice("L1_2", "Al"), evaporation_field=fields
+    ),
 ]
 path = options.output / "superalloy.h5"
 if options.redraw:
@@ -76,7 +78,7 @@ for number, name in enumerate(run.phase_names):
     row = np.flatnonzero(errors.by_group.groups == number)[0]
     print(f"{name}: lateral {errors.by_group.lateral[row]:.2f}, depth {errors.by_group.depth[row]:.2f} nm")
 
-particle = ae.precipitate_errors(reconstruction, phase == 2, run, species == "Al", fit=FIT)
+particle = ae.reconstruction.precipitate_errors(reconstruction, phase == 2, run, species == "Al", fit=FIT)
 print(
     f"gamma prime: {particle.ions} ions; semi-axes true {particle.true.lateral:.2f} x {particle.true.depth:.2f} nm, "
     f"apparent {particle.apparent.lateral:.2f} x {particle.apparent.depth:.2f} nm; Al true "
@@ -85,13 +87,15 @@ print(
 )
 for name, positions in (("sites", sites), ("reconstruction", found)):
     for label, chosen in (("all ions", phase == 2), ("Al", (phase == 2) & (species == "Al"))):
-        planes = ae.distribution_map(positions[chosen])
+        planes = ae.reconstruction.distribution_map(positions[chosen])
         print(f"planes of {label} in gamma prime, {name}: {planes.spacing:.3f} nm")
 
 profiles = {}
 for name, positions in (("sites", sites), ("reconstruction", found)):
     away = phase != 2  # the precipitate has no Ti
-    profiles[name] = ae.segregation_profile(boundary.distance(positions[away]), species[away] == "Ti", reach=2.0)
+    profiles[name] = ae.reconstruction.segregation_profile(
+        boundary.distance(positions[away]), species[away] == "Ti", reach=2.0
+    )
     peak = profiles[name]
     print(
         f"Ti at the boundary, {name}: bulk {peak.bulk:.1%}, peak {peak.peak:.1%}, width {peak.width:.2f} ± "

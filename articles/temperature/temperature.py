@@ -28,7 +28,7 @@ def evaporate(temperature, radius, ions):
 
 def counts(run, perturbation):
     """Map of the complete detector, in bins of 0.75 mm."""
-    return run.hits(perturbation).map(like=run.detector.grid(400), quantum=None)
+    return run.hits(perturbation).map(like=run.detector.grid(400), position_step=None)
 
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -43,8 +43,8 @@ ions = options.ions or (60_000 if options.full else 8_000)
 print("temperature, perturbation: contrast in rings of 5-9, 9-14 and 14-20 degrees")
 for temperature in options.temperatures:
     run = evaporate(temperature, radius, ions)
-    projection = ae.image_compression(run).projection
+    projection = ae.analysis.image_compression(run).projection
     for name, perturbation in (("unperturbed", ae.Unperturbed()), ("roll-up", ROLL_UP)):
-        rings = ae.ring_statistics(counts(run, perturbation), projection, fold=3)
+        rings = ae.maps.ring_statistics(counts(run, perturbation), projection, fold=3)
         numbers = ", ".join(f"{ring.contrast:.2f} ± {ring.error:.2f}" for ring in rings)
         print(f"{temperature:3g} K, {name:11}: {numbers}")

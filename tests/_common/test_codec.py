@@ -30,36 +30,47 @@ from apt_evap._common.codec import (
 NICKEL = ae.material("Ni")
 EXAMPLES = [
     ae.TruncatedNormal(0.1, 0.2),
-    ae.Fixed(0.3),
-    ae.Thermal(50.0),
+    ae.emission.Fixed(0.3),
+    ae.emission.Thermal(50.0),
     ae.Unperturbed(0.1),
     ae.LateralVelocity(0.2),
-    ae.RollUp(ae.Thermal(20.0), ae.ChargeRatio(0.9, 0.05), others=0.1, second_roll=0.2),
+    ae.RollUp(ae.emission.Thermal(20.0), ae.emission.ChargeRatio(0.9, 0.05), others=0.1, second_roll=0.2),
     ae.Combined(0.2, 0.75, sharpness=0.4),
-    ae.ChargeSettings(tolerance=1e-3, sweep_interval=50),
+    ae.evaporation.ChargeSettings(tolerance=1e-3, sweep_interval=50),
     ae.FlightSettings(reach=2000.0),
     ae.ResponseSettings(),
     ae.ResponseSettings.wide(0.15, rolls=2),
-    ae.WatchSettings(interval=20),
+    ae.simulation.Monitor(interval=20),
     ae.Detector(90.0, 80.0, "equidistant"),
-    ae.Instrument(dead_time=3.0, quantisation=(0.1, 0.2), timing=ae.Timing(0.3, 50.0)),
-    ae.PostIonisation(0.74),
+    ae.Instrument(dead_time=3.0, quantisation=(0.1, 0.2), timing=ae.detection.Timing(0.3, 50.0)),
+    ae.emission.PostIonisation(0.74),
     ae.Robin(window=3),
     ae.ConstantPotential(15.0, "gaussian", "others"),
     ae.VoltageControl(0.02, memory=100),
-    ae.Extremal(ae.CoordinationTable({"W": {3: 47.0, 4: 57.0}})),
+    ae.Extremal(ae.evaporation.CoordinationTable({"W": {3: 47.0, 4: 57.0}})),
     ae.Arrhenius(
-        50.0, {"Al": 0.8}, laser=ae.Laser(150.0, direction=(0, 1)), bonds=ae.PairEnergies(ordering={"A-B": 1})
+        50.0,
+        {"Al": 0.8},
+        laser=ae.evaporation.Laser(150.0, direction=(0, 1)),
+        bonds=ae.evaporation.PairEnergies(ordering={"A-B": 1}),
     ),
     NICKEL,
     ae.Orientation(NICKEL, (1, 1, 1), 10.0),
-    ae.Ellipsoid((0, 0, 1), (1, 2, 3)),
-    ae.CoreShell(ae.Union(ae.Sphere((0, 0, 2), 1.2), ae.Layer(0.0, 1.0)), 0.5),
-    ae.Segregation(0.01, 0.2, 0.4, ae.HalfSpace((2, 0, 0), (1, 0, 0))),
-    ae.Order("L1_2", {"Al": 0.8, "Ti": 0.2}),
-    ae.Basis(("Al", None, {"Al": 0.5, "Ti": 0.5}, None)),
-    ae.Phase("ball", NICKEL, ae.Sphere((0, 0, 2), 1.2), (1, 1, 1), 3.0, ae.Order("L1_2", "Al"), {"Cu": 0.1}),
-    ae.Distortion(2, (0.0, 1.0), 20.0, (1j, 0.1, 0.2 + 1j, 0.3)),
+    ae.specimen.Ellipsoid((0, 0, 1), (1, 2, 3)),
+    ae.specimen.CoreShell(ae.specimen.Union(ae.specimen.Sphere((0, 0, 2), 1.2), ae.specimen.Layer(0.0, 1.0)), 0.5),
+    ae.specimen.Segregation(0.01, 0.2, 0.4, ae.specimen.HalfSpace((2, 0, 0), (1, 0, 0))),
+    ae.specimen.Superlattice("L1_2", {"Al": 0.8, "Ti": 0.2}),
+    ae.specimen.UnitCell(("Al", None, {"Al": 0.5, "Ti": 0.5}, None)),
+    ae.specimen.Phase(
+        "ball",
+        NICKEL,
+        ae.specimen.Sphere((0, 0, 2), 1.2),
+        (1, 1, 1),
+        3.0,
+        ae.specimen.Superlattice("L1_2", "Al"),
+        {"Cu": 0.1},
+    ),
+    ae.registration.Distortion(2, (0.0, 1.0), 20.0, (1j, 0.1, 0.2 + 1j, 0.3)),
     ae.Registration(10.0, 0.5, (1.0, 2.0), True, ties=(ae.Registration(0.0, 1.0, (0, 0)),)),
 ]
 
@@ -104,7 +115,7 @@ class Pulse:
     on: bool = switch("Whether.", default=True)
     form: str = choice("Form.", ("round", "flat"), default="round")
     place: tuple = vector("Where.", 2, default=(0.0, 1.0), at_least=0, unit="nm")
-    inner: ae.Fixed | None = part("Another.", ae.Fixed, default=None)
+    inner: ae.emission.Fixed | None = part("Another.", ae.emission.Fixed, default=None)
     names: dict = checked("Names.", "mapping", lambda names, name: dict(names), default={})
 
     def _check(self):
@@ -175,5 +186,5 @@ def test_plain_forms_of_other_objects():
     assert to_plain(Law()) == {"name": "Law", "power": 2.0}
     assert to_plain({1: np.arange(2), "a": 1 + 2j, "f": len}) == {"1": [0, 1], "a": [1.0, 2.0], "f": "builtins.len"}
     assert for_json([np.nan, np.inf, 1.0]) == [None, None, 1.0]
-    assert to_plain({ae.Fixed(1.0): 0.5}) == [[{"name": "Fixed", "energy": 1.0}, 0.5]]
+    assert to_plain({ae.emission.Fixed(1.0): 0.5}) == [[{"name": "Fixed", "energy": 1.0}, 0.5]]
     assert not is_settings(type("Mine", (ae.Unperturbed,), {})())

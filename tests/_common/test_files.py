@@ -28,7 +28,7 @@ def write(path, content=b"new"):
 @pytest.mark.parametrize("name", ["a.epos", "a.pos", "a.apt", "a.raw", "a.rrng", "a.npz", "a.h5"])
 def test_a_pipe_is_refused_and_not_waited_for(tmp_path, name):
     os.mkfifo(tmp_path / name)
-    reader = ae.read_ranges if name.endswith("rrng") else ae.read
+    reader = ae.io.read_ranges if name.endswith("rrng") else ae.read
     with pytest.raises(FileError, match=rf"cannot read .*{name}': Not a regular file"):
         reader(tmp_path / name)
 

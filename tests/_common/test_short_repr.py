@@ -2,20 +2,20 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.analysis.apex import Cap, ImageCompression
-from apt_evap.analysis.profiles import Profile, ProfileComparison
+from apt_evap.analysis.apex import FittedCap, ImageCompression
 from apt_evap.analysis.response_tracks import Tracks
 from apt_evap.analysis.voltage_history import Course
+from apt_evap.crystallography.directions import Poles, Zones, poles
 from apt_evap.crystallography.orientation import FittedOrientation
-from apt_evap.crystallography.poles import Poles, Zones, poles
 from apt_evap.emission.emissions import TangentialLaunches
-from apt_evap.energy_fit.structure import StructureScores
-from apt_evap.explore.specimen_image import SpecimenImage
+from apt_evap.explore.surface_image import SpecimenImage
+from apt_evap.fit.structure import StructureScores
+from apt_evap.maps.profiles import Profile, ProfileComparison
 from apt_evap.reconstruction.errors import ErrorBins, GroupErrors
 from apt_evap.simulation.history import CapHistory, History
 
 WITH_ARRAYS = (
-    Cap, ImageCompression, Profile, ProfileComparison, Tracks, Course, FittedOrientation, Poles, Zones,
+    FittedCap, ImageCompression, Profile, ProfileComparison, Tracks, Course, FittedOrientation, Poles, Zones,
     TangentialLaunches, StructureScores, SpecimenImage, ErrorBins, GroupErrors, CapHistory, History,
 )  # fmt: skip
 
@@ -45,5 +45,5 @@ def test_the_repr_of_a_fitted_orientation_is_short(nickel):
     tilt = ae.Orientation(nickel, (2, 3, 7))
     near = tilt.directions(crystal.normals)[:, 2] > 0.7
     places = np.column_stack(tilt.directions(crystal.normals[near]).T[:2])
-    fit = ae.fit_orientation(nickel, crystal.planes[near], places)
+    fit = ae.crystallography.fit_orientation(nickel, crystal.planes[near], places)
     assert is_short(repr(fit)) and "rms=" in repr(fit)

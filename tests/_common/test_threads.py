@@ -11,13 +11,13 @@ import apt_evap as ae
 
 
 def charges(tip, queue):
-    queue.put(ae.Emitter(tip, n_threads=2).charges.sum())
+    queue.put(ae.evaporation.Emitter(tip, n_threads=2).charges.sum())
 
 
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork here")
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_a_child_forked_after_threads_were_used_does_not_hang(small_tip):
-    parent = ae.Emitter(small_tip, n_threads=2)
+    parent = ae.evaporation.Emitter(small_tip, n_threads=2)
     context = multiprocessing.get_context("fork")
     queue = context.Queue()
     child = context.Process(target=charges, args=(small_tip, queue), daemon=True)
@@ -64,7 +64,7 @@ def interrupted(tip):
     ae.Simulation(tip, n_threads=1).run(20, [Breaking()], responses=False, progress=False, batch_size=10)
 
 
-@pytest.mark.parametrize("error", [ae.RunInterrupted, ae.RunNotSaved])
+@pytest.mark.parametrize("error", [ae.simulation.RunInterrupted, ae.simulation.RunNotSaved])
 def test_errors_with_a_run_can_be_pickled(small_tip, error):
     run = ae.Simulation(small_tip, n_threads=1).run(5, responses=False, progress=False)
     copy = pickle.loads(pickle.dumps(error("a message", run)))
@@ -77,11 +77,11 @@ def test_errors_with_a_run_can_be_pickled(small_tip, error):
 def test_an_interrupted_run_does_not_stop_a_pool(small_tip):
     with multiprocessing.get_context("fork").Pool(1) as pool:
         waiting = pool.apply_async(interrupted, [small_tip])
-        with pytest.raises(ae.RunInterrupted, match="on purpose"):
+        with pytest.raises(ae.simulation.RunInterrupted, match="on purpose"):
             waiting.get(timeout=60)
 
 
-@pytest.mark.parametrize("make", [ae.Simulation, ae.Emitter])
+@pytest.mark.parametrize("make", [ae.Simulation, ae.evaporation.Emitter])
 def test_what_cannot_be_pickled_says_what_to_do(small_tip, make):
     with pytest.raises(TypeError, match=r"cannot be pickled or copied: .*make a new"):
         pickle.dumps(make(small_tip))

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap._common import warnings as classes
 from apt_evap._common.wording import argument, options_of_a_shell
 
 PACKAGE = Path(ae.__file__).parent
@@ -24,7 +23,9 @@ def test_every_warning_has_a_class_of_the_package(room):
     for path in (PACKAGE / room).glob("*.py"):
         for node in warn_calls(path):
             names = [ast.unparse(argument) for argument in node.args[1:]]
-            assert names and issubclass(getattr(classes, names[0], int), ae.AptWarning), f"{path}:{node.lineno}"
+            assert names and issubclass(getattr(ae.warnings, names[0], int), ae.warnings.AptWarning), (
+                f"{path}:{node.lineno}"
+            )
 
 
 def test_warnings_are_found():
@@ -40,11 +41,11 @@ def test_no_module_filters_warnings_by_their_text():
 
 def test_a_class_of_warnings_can_be_ignored(tmp_path):
     hits = ae.Hits(x=np.array([1.0, np.nan]), y=np.array([1.0, 2.0]), pulse_id=np.arange(2))
-    with pytest.warns(ae.DataWarning, match="1 of 2 ions left out of"):
+    with pytest.warns(ae.warnings.DataWarning, match="1 of 2 ions left out of"):
         ae.write(tmp_path / "ions.epos", hits)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warnings.simplefilter("ignore", ae.AptWarning)
+        warnings.simplefilter("ignore", ae.warnings.AptWarning)
         ae.write(tmp_path / "ions.epos", hits)
 
 

@@ -132,7 +132,9 @@ def test_the_limit_of_a_low_temperature_is_the_largest_key(rng):
 
 
 def test_the_sum_at_the_root_does_not_drift(tip12):
-    emitter = ae.Emitter(tip12, law=ae.Arrhenius(50.0), settings=ae.ChargeSettings(sweep_interval=100_000))
+    emitter = ae.evaporation.Emitter(
+        tip12, law=ae.Arrhenius(50.0), settings=ae.evaporation.ChargeSettings(sweep_interval=100_000)
+    )
     batch = emitter.evaporate(5000)  # until there is no more room for exposed atoms: no sum is ever rebuilt
     assert batch.status == SWEEP_DUE and emitter._core.since_relaxation == len(batch) > 500
     # 240 slots change per event: 2e5 updates, of rates that differ by many orders of magnitude. 13 levels of sums,
@@ -142,7 +144,7 @@ def test_the_sum_at_the_root_does_not_drift(tip12):
 
 @pytest.mark.parametrize("temperature", [50.0, 300.0])
 def test_frequencies_on_a_frozen_surface_are_the_probabilities(tip12, temperature):
-    emitter = ae.Emitter(tip12, law=ae.Arrhenius(temperature), seed=1)
+    emitter = ae.evaporation.Emitter(tip12, law=ae.Arrhenius(temperature), seed=1)
     assert sum(map(len, emitter.advance(400))) == 400
     x = emitter.fields * emitter._core.voltage_factor / tip12.evaporation_fields[tip12.species[emitter.atoms]]
     keys = np.where(tip12.evaporable[emitter.atoms], -(1 - x) / (BOLTZMANN * temperature), -np.inf)

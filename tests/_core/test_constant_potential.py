@@ -13,7 +13,7 @@ from apt_evap._core.octree import Octree
 from apt_evap._core.potentials import Potentials
 from apt_evap.units import COULOMB
 
-EXACT = ae.ChargeSettings(opening_angle=0.0, relaxation_angle=0.0, start_tolerance=1e-9)
+EXACT = ae.evaporation.ChargeSettings(opening_angle=0.0, relaxation_angle=0.0, start_tolerance=1e-9)
 
 
 def solved(positions, normals, self_term=0.0, gaussian=False, opening_angle=0.0, tolerance=1e-9, known=False):
@@ -136,7 +136,7 @@ def test_smooth_surfaces_have_the_charges_of_robin():
 @pytest.mark.parametrize("gaussian", [False, True])
 def test_charges_are_those_of_the_dense_matrix(small_tip, gaussian):
     rule = ae.ConstantPotential(self_term=None if not gaussian else 9.0, charges="gaussian" if gaussian else "points")
-    emitter = ae.Emitter(small_tip, 1000.0, settings=EXACT, rule=rule)
+    emitter = ae.evaporation.Emitter(small_tip, 1000.0, settings=EXACT, rule=rule)
     self_term = emitter._core.rule.self_term
     eta = self_term * np.sqrt(np.pi / 2) if gaussian else None
     twin = twins.constant_potential(emitter.positions, self_term, eta) * 1000.0 / COULOMB
@@ -148,7 +148,7 @@ def test_charges_are_those_of_the_dense_matrix(small_tip, gaussian):
 
 
 def test_all_atoms_have_the_potential_of_the_specimen(small_tip):
-    emitter = ae.Emitter(small_tip, 1000.0, settings=EXACT, rule=ae.ConstantPotential())
+    emitter = ae.evaporation.Emitter(small_tip, 1000.0, settings=EXACT, rule=ae.ConstantPotential())
     at_atoms = COULOMB * twins.potential_of_others(emitter.positions, emitter.charges)
     potentials = at_atoms + COULOMB * emitter._core.rule.self_term * emitter.charges
     assert potentials == pytest.approx(1000.0, rel=1e-6)
@@ -160,8 +160,8 @@ def test_all_atoms_have_the_potential_of_the_specimen(small_tip):
 
 
 def test_the_self_term_follows_from_the_area_per_atom(small_tip):
-    emitter = ae.Emitter(small_tip, 1000.0, rule=ae.ConstantPotential())
-    robin = ae.Emitter(small_tip, 1000.0)
+    emitter = ae.evaporation.Emitter(small_tip, 1000.0, rule=ae.ConstantPotential())
+    robin = ae.evaporation.Emitter(small_tip, 1000.0)
     # the first estimate stops at a change of 1e-2
     assert emitter._core.rule.self_term == pytest.approx(LATTICE_SUM / np.sqrt(robin.area_per_atom), rel=2e-3)
     # the total charge is that of Robin's rule to 0.5 %, its contrast larger
@@ -203,7 +203,7 @@ def test_warm_starts_and_few_iterations(surface12):
 @pytest.mark.parametrize("self_term", [1.0, 5.0])
 def test_a_self_term_that_is_too_small_is_refused(small_tip, self_term):
     with pytest.raises(ValueError, match="self_term must be larger, got"):
-        ae.Emitter(small_tip, rule=ae.ConstantPotential(self_term=self_term))
+        ae.evaporation.Emitter(small_tip, rule=ae.ConstantPotential(self_term=self_term))
 
 
 # ---- sums of charges of either sign --------------------------------------------------------------------------------

@@ -34,7 +34,7 @@ def drift(emitter):
 @pytest.fixture(scope="module")
 def thousand(tip20):
     """R = 20 a after 1,000 events at the default settings: counts and drift up to then, and the emitter, relaxed."""
-    emitter = ae.Emitter(tip20, 1000.0)
+    emitter = ae.evaporation.Emitter(tip20, 1000.0)
     evaporate(emitter, 1000)
     return emitter.counts, drift(emitter), emitter
 
@@ -66,7 +66,9 @@ def test_interior_is_free_of_field(thousand):
 def test_a_larger_patch_is_better(tip12):
     errors = []
     for radius in (2.5, 4.5, 7.07):
-        emitter = ae.Emitter(tip12, settings=ae.ChargeSettings(patch_radius=radius, sweep_interval=10_000))
+        emitter = ae.evaporation.Emitter(
+            tip12, settings=ae.evaporation.ChargeSettings(patch_radius=radius, sweep_interval=10_000)
+        )
         evaporate(emitter, 150)
         errors.append(drift(emitter))
     assert errors == sorted(errors, reverse=True)
@@ -76,7 +78,7 @@ def test_a_larger_patch_is_better(tip12):
 def test_relaxing_more_often_is_better(tip12):
     errors = []
     for interval in (300, 50, 10):
-        emitter = ae.Emitter(tip12, settings=ae.ChargeSettings(sweep_interval=interval))
+        emitter = ae.evaporation.Emitter(tip12, settings=ae.evaporation.ChargeSettings(sweep_interval=interval))
         evaporate(emitter, 299)
         errors.append(drift(emitter)[0])
     assert errors == sorted(errors, reverse=True)
@@ -138,7 +140,7 @@ def test_targets_are_the_strongest_neighbours_of_the_shells(element, shells, rea
 
     material = ae.material(element)
     tip = ae.Tip(material, apex_radius=8 * material.a, axis=(1, 1, 0), shank_length=4 * material.a)
-    emitter = ae.Emitter(tip, target_shells=shells)
+    emitter = ae.evaporation.Emitter(tip, target_shells=shells)
     second = beyond = 0
     for _ in range(60):
         atoms, charges, positions = emitter.atoms, emitter.charges, emitter.positions
@@ -165,7 +167,7 @@ def test_targets_are_the_strongest_neighbours_of_the_shells(element, shells, rea
 
 
 def test_extremal_choice(tip12):
-    check_choices(ae.Emitter(tip12, settings=ae.ChargeSettings(sweep_interval=60)), 150)
+    check_choices(ae.evaporation.Emitter(tip12, settings=ae.evaporation.ChargeSettings(sweep_interval=60)), 150)
 
 
 class Given:
@@ -180,7 +182,7 @@ class Given:
 
 def test_ties_go_by_number(small_tip):
     """Weights of one over the charge, to the last bit, make all of some atoms equal."""
-    emitter = ae.Emitter(small_tip)
+    emitter = ae.evaporation.Emitter(small_tip)
     atoms, charges = emitter.atoms, emitter.charges
     weight = 1 / charges
     equal = (charges * weight == 1.0) & small_tip.evaporable[atoms]
@@ -188,27 +190,29 @@ def test_ties_go_by_number(small_tip):
     for chosen in np.random.default_rng(3).choice(np.flatnonzero(equal), (5, 8), replace=False):
         weights = np.zeros(len(small_tip))
         weights[atoms[chosen]] = weight[chosen]
-        assert ae.Emitter(small_tip, law=Given(weights)).evaporate(1).site[0] == atoms[chosen].min()
+        assert ae.evaporation.Emitter(small_tip, law=Given(weights)).evaporate(1).site[0] == atoms[chosen].min()
 
 
 def test_the_order_is_the_same_every_time(small_tip):
     """On a tip as symmetric as the crystal atoms tie but for rounding."""
-    check_choices(ae.Emitter(small_tip), 60)
-    assert np.array_equal(evaporate(ae.Emitter(small_tip), 100), evaporate(ae.Emitter(small_tip), 100))
+    check_choices(ae.evaporation.Emitter(small_tip), 60)
+    assert np.array_equal(
+        evaporate(ae.evaporation.Emitter(small_tip), 100), evaporate(ae.evaporation.Emitter(small_tip), 100)
+    )
 
 
 def test_extremal_choice_in_an_alloy(nickel):
     tip = ae.Tip(nickel, apex_radius=6 * nickel.a, axis=(0, 0, 1), solutes={"Al": 0.3}, seed=4)
-    emitter = ae.Emitter(tip)
+    emitter = ae.evaporation.Emitter(tip)
     check_choices(emitter, 150)
     # aluminium needs the lower field, so it leaves first (later on the surface is poor in it)
     assert tip.evaporation_fields[1] < tip.evaporation_fields[0]
-    sites = evaporate(ae.Emitter(tip), 50)
+    sites = evaporate(ae.evaporation.Emitter(tip), 50)
     assert (tip.species[sites] == 1).mean() > 0.3 + 4 * np.sqrt(0.3 * 0.7 / 50)  # four standard deviations
 
 
 def test_only_evaporable_atoms_leave(small_tip):
-    emitter = ae.Emitter(small_tip)
+    emitter = ae.evaporation.Emitter(small_tip)
     sites = evaporate(emitter, 400)
     assert small_tip.evaporable[sites].all()
     assert len(np.unique(sites)) == 400
@@ -227,7 +231,7 @@ def same(one, other):
 
 
 def test_journal_replays_to_the_bit(tip12):
-    emitter = ae.Emitter(tip12)
+    emitter = ae.evaporation.Emitter(tip12)
     copy, events, grown = None, 0, False
     while events < 400:
         batch = emitter.evaporate(64)
@@ -248,7 +252,7 @@ def test_journal_replays_to_the_bit(tip12):
 
 
 def test_moments_kept_up_are_those_worked_out_anew(tip12):
-    emitter = ae.Emitter(tip12, settings=ae.ChargeSettings(sweep_interval=1000))
+    emitter = ae.evaporation.Emitter(tip12, settings=ae.evaporation.ChargeSettings(sweep_interval=1000))
     evaporate(emitter, 120)
     tree = emitter._core.tree.copy()
     kept = state(tree)
@@ -261,7 +265,7 @@ def test_moments_kept_up_are_those_worked_out_anew(tip12):
 
 
 def test_journal_refuses_an_event_it_has_not(small_tip):
-    emitter = ae.Emitter(small_tip)
+    emitter = ae.evaporation.Emitter(small_tip)
     batch = emitter.evaporate(3)
     for event in (-1, 3):
         with pytest.raises(IndexError, match="from 0 to 2"):
@@ -270,7 +274,7 @@ def test_journal_refuses_an_event_it_has_not(small_tip):
 
 def test_fields_kept_up_are_those_of_all_others(tip12):
     """Two emitters, one relaxed just before: the fresh one's charges and field differ by the smooth remainder only."""
-    emitter = ae.Emitter(tip12, settings=ae.ChargeSettings(sweep_interval=1000))
+    emitter = ae.evaporation.Emitter(tip12, settings=ae.evaporation.ChargeSettings(sweep_interval=1000))
     evaporate(emitter, 100)
     positions, normals, charges = emitter.positions, emitter.normals, emitter.charges
     cap = positions[:, 2] > 8 * tip12.nearest_neighbour_distance
@@ -290,7 +294,7 @@ def test_exhausted(nickel, small_tip):
     may = np.zeros(len(small_tip), bool)
     may[top] = True
     tip = ae.Tip.from_positions(small_tip.positions, small_tip.species, [nickel], evaporable=may)
-    emitter = ae.Emitter(tip)
+    emitter = ae.evaporation.Emitter(tip)
     batch = emitter.evaporate(100)
     while batch.status == SWEEP_DUE:
         emitter.relax()
@@ -302,7 +306,7 @@ def test_exhausted(nickel, small_tip):
 
 def test_too_shallow(nickel):
     tip = ae.Tip(nickel, apex_radius=7 * nickel.a, axis=(1, 1, 1), depth=4 * nickel.a)
-    emitter = ae.Emitter(tip)
+    emitter = ae.evaporation.Emitter(tip)
     sites, status = [], DONE
     while status in (DONE, SWEEP_DUE):
         batch = emitter.evaporate(200)
@@ -313,7 +317,7 @@ def test_too_shallow(nickel):
     assert status == TOO_SHALLOW
     sites = np.concatenate(sites)
     # up to then the events are those of the whole specimen: what is not held is never asked for
-    whole = ae.Emitter(ae.Tip(nickel, apex_radius=7 * nickel.a, axis=(1, 1, 1)))
+    whole = ae.evaporation.Emitter(ae.Tip(nickel, apex_radius=7 * nickel.a, axis=(1, 1, 1)))
     assert len(sites) > 300
     assert np.array_equal(tip.positions[sites], whole.tip.positions[evaporate(whole, len(sites))])
 
@@ -324,7 +328,7 @@ def test_a_random_arrangement_evaporates(nickel, small_tip):
     d = small_tip.nearest_neighbour_distance
     positions = small_tip.positions + generator.uniform(-0.05, 0.05, small_tip.positions.shape) * d
     tip = ae.Tip.from_positions(positions, small_tip.species, [nickel])
-    emitter = ae.Emitter(tip, settings=ae.ChargeSettings(sweep_interval=100))
+    emitter = ae.evaporation.Emitter(tip, settings=ae.evaporation.ChargeSettings(sweep_interval=100))
     check_choices(emitter, 50)
     sites = evaporate(emitter, 300)
     assert len(np.unique(sites)) == 300
@@ -338,11 +342,11 @@ def test_refuses_a_specimen_from_which_nothing_may_leave(nickel, small_tip):
         small_tip.positions, small_tip.species, [nickel], evaporable=np.zeros(len(small_tip), bool)
     )
     with pytest.raises(ValueError, match="has no evaporable surface atom"):
-        ae.Emitter(tip)
+        ae.evaporation.Emitter(tip)
 
 
 def test_counts_of_events(tip12):
-    emitter = ae.Emitter(tip12)
+    emitter = ae.evaporation.Emitter(tip12)
     evaporate(emitter, 200)
     # a smooth metal tip: every patch settles, no charge comes out negative
     assert emitter.counts == {"events": 200, "detached": 0, "clipped": 0, "negative": 0, "unsettled": 0}

@@ -9,7 +9,7 @@ from apt_evap._core.interactions import InteractionLists
 from apt_evap._core.morton import morton_order, split
 from apt_evap._core.octree import Octree
 
-DEFAULT_ANGLE = ae.ChargeSettings().opening_angle
+DEFAULT_ANGLE = ae.evaporation.ChargeSettings().opening_angle
 
 
 def rms(error, reference):

@@ -9,7 +9,7 @@ from apt_evap._core.octree import Octree
 from apt_evap._core.robin import Robin
 from apt_evap.units import COULOMB
 
-DEFAULT_ANGLE = ae.ChargeSettings().opening_angle
+DEFAULT_ANGLE = ae.evaporation.ChargeSettings().opening_angle
 
 
 def solved(positions, normals, opening_angle=0.0, tolerance=1e-10, start=None, **options):
@@ -76,7 +76,9 @@ def ball(nickel, radius=5):
     grid = grid[grid.sum(axis=1) % 2 == 0]
     grid = grid[(grid**2).sum(axis=1) <= (2 * radius) ** 2]
     tip = ae.Tip.from_positions(grid * nickel.a / 2, np.zeros(len(grid), int), [nickel], potential_point=(0, 0, 0))
-    emitter = ae.Emitter(tip, 1000.0, settings=ae.ChargeSettings(opening_angle=0.0, start_tolerance=1e-10))
+    emitter = ae.evaporation.Emitter(
+        tip, 1000.0, settings=ae.evaporation.ChargeSettings(opening_angle=0.0, start_tolerance=1e-10)
+    )
     return emitter, grid[emitter.atoms]
 
 
@@ -193,6 +195,6 @@ def test_too_few_sweeps_are_reported(surface12):
 
 
 def test_threads_give_the_same_bits(small_tip):
-    one, two = (ae.Emitter(small_tip, n_threads=threads) for threads in (1, 2))
+    one, two = (ae.evaporation.Emitter(small_tip, n_threads=threads) for threads in (1, 2))
     assert np.array_equal(one.charges, two.charges)
     assert np.array_equal(one.normals, two.normals)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.crystallography.poles import poles
+from apt_evap.crystallography.directions import poles
 
 
 class Receding:
@@ -20,12 +20,12 @@ class Receding:
         sites = around * (self.radius + rng.uniform(-0.1, 0.1, n))[:, None] - np.outer(self.depth, [0, 0, 1])
         self.fields = self.voltage / (2.5 * self.radius)
         zeros = np.zeros(n)
-        self.emissions = ae.Emissions(
+        self.emissions = ae.emission.Emissions(
             sites, around, np.full((n, 3), np.nan), zeros + 1, zeros + 58.7, np.arange(n), 0.25
         )
         seen = 100.0 * (np.tan(angle / compression) if projection == "plane" else angle / compression)
         inside = np.maximum(np.abs(seen * np.cos(azimuth)), np.abs(seen * np.sin(azimuth))) <= 100
-        outcome = np.where(inside, ae.Outcome.HIT, ae.Outcome.MISSED)
+        outcome = np.where(inside, ae.detection.Outcome.HIT, ae.detection.Outcome.MISSED)
         self._hits = ae.Hits(x=seen * np.cos(azimuth), y=seen * np.sin(azimuth), outcome=outcome)
 
     def __len__(self):
@@ -38,7 +38,7 @@ class Receding:
 
 def test_spheres_follow_a_receding_cap():
     run = Receding(1.5)
-    caps = ae.fit_caps(run)
+    caps = ae.analysis.fit_caps(run)
     assert len(caps) == 10 and caps[0].first == 0 and caps[-1].last == len(run)
     for cap in caps:
         # within a window of 2,000 ions the centre moves by 0.4 nm, the sites stray by 0.06 nm
@@ -49,18 +49,18 @@ def test_spheres_follow_a_receding_cap():
 
 @pytest.mark.parametrize("compression", [1.0, 1.5])
 def test_a_known_compression_comes_back(compression):
-    found = ae.image_compression(Receding(compression))
+    found = ae.analysis.image_compression(Receding(compression))
     assert found.compression == pytest.approx(compression, rel=0.01)
     assert found.valid_from <= 6 and found.scatter < 0.03  # the sites stray by 0.5 degrees, which is much near the axis
     # the rim of the detector is at 45 degrees, the ions end at 69 degrees on the specimen
     assert min(45 * compression, 68.8) - 4 <= found.valid_to <= 45 * compression
-    assert found.projection == ae.Projection(100 / found.compression, compression=found.compression)
+    assert found.projection == ae.detection.Projection(100 / found.compression, compression=found.compression)
 
 
 def test_a_compression_on_an_equidistant_detector():
-    found = ae.image_compression(Receding(1.5, "equidistant"))
+    found = ae.analysis.image_compression(Receding(1.5, "equidistant"))
     assert found.compression == pytest.approx(1.5, rel=0.01)
-    assert found.projection == ae.Projection(100 / found.compression)
+    assert found.projection == ae.detection.Projection(100 / found.compression)
 
 
 def test_deep_ions_do_not_move_the_spheres():
@@ -68,32 +68,23 @@ def test_deep_ions_do_not_move_the_spheres():
     run = Receding(1.5)
     deep = np.random.default_rng(0).random(len(run)) < 0.05
     run.emissions.positions[deep] -= 0.5 * run.emissions.normals[deep]
-    assert ae.image_compression(run).compression == pytest.approx(1.5, rel=0.003)
+    assert ae.analysis.image_compression(run).compression == pytest.approx(1.5, rel=0.003)
 
 
 def test_without_the_centre_of_the_moment_the_compression_is_wrong():
     run = Receding(1.5)
-    still = [cap._replace(centre=np.zeros(3)) for cap in ae.fit_caps(run)]
-    assert ae.image_compression(run, still).compression > 1.6
+    still = [cap._replace(centre=np.zeros(3)) for cap in ae.analysis.fit_caps(run)]
+    assert ae.analysis.image_compression(run, still).compression > 1.6
 
 
 def test_the_field_factor_of_a_run_is_that_of_its_apex():
     run = Receding(1.5)
-    np.testing.assert_allclose(ae.run_field_factor(run), 2.5, rtol=0.01)  # the radii are known to 0.08 of 14 nm
-
-
-def test_field_factor():
-    assert ae.field_factor(1000.0, 20.0, 50.0) == 1.0
-    np.testing.assert_array_equal(ae.field_factor([1000, 2000], 20, 25), [2, 4])
-    with pytest.raises(ValueError, match=r"radius must be a finite number > 0, got 0\.0"):
-        ae.field_factor(1000.0, 20.0, 0.0)
-    with pytest.raises(ValueError, match="a window must have at least 50 ions near the axis"):
-        ae.fit_caps(Receding(1.5), windows=2000)
+    np.testing.assert_allclose(ae.analysis.field_factor(run), 2.5, rtol=0.01)  # the radii are known to 0.08 of 14 nm
 
 
 def test_poles_fall_on_the_dark_spots_of_a_simulated_map(run20):
     """Fewer ions land within 3 degrees of the {024} and {135} poles, which lie off the dark zone lines, than around."""
-    found = ae.image_compression(run20)
+    found = ae.analysis.image_compression(run20)
     # 1.04 to 1.06 for caps of R = 20 a and 40 a of Ni and Al on shanks of 1 to 2 R
     assert 1.0 < found.compression < 1.1 and found.scatter < 0.05
     orientation = ae.Orientation.from_settings(run20.settings["tip"])
@@ -107,7 +98,7 @@ def test_poles_fall_on_the_dark_spots_of_a_simulated_map(run20):
 
     def density(compression):
         """Ions per solid angle within 3 degrees of the poles, relative to that within 8 degrees."""
-        ions = ae.Projection(100 / compression, compression=compression).directions(seen)
+        ions = ae.detection.Projection(100 / compression, compression=compression).directions(seen)
         within = [np.count_nonzero(ions @ normals.T > math.cos(math.radians(angle))) for angle in (3, 8)]
         areas = [1 - math.cos(math.radians(angle)) for angle in (3, 8)]
         return within[0] / within[1] * areas[1] / areas[0]

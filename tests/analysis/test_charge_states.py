@@ -205,7 +205,7 @@ def test_ranges_of_a_file_give_the_map_of_the_run(real, tmp_path):
     own = charge_state_ratio_map(hits, "Ni", 1, bins=4, least=5)
     ae.write(tmp_path / "ni.epos", hits[hits.detected])
     (tmp_path / "ni.rrng").write_text(NICKEL)
-    measured, ranges = ae.read(tmp_path / "ni.epos"), ae.read_ranges(tmp_path / "ni.rrng")
+    measured, ranges = ae.read(tmp_path / "ni.epos"), ae.io.read_ranges(tmp_path / "ni.rrng")
     assert "charge_state" not in measured.extra
     by_ranges = charge_state_ratio_map(measured, "Ni", 1, ranges=ranges, like=own, least=5)
     np.testing.assert_array_equal(by_ranges.lower, own.lower)
@@ -220,9 +220,9 @@ def test_ranges_of_a_file_give_the_map_of_the_run(real, tmp_path):
 
 def test_a_spectrum_with_tails_gives_nearly_the_same_ratio(real):
     """Energy deficits shift ions out of their ranges, by the same fraction of the mass for both charges."""
-    units = replace(real.units, timing=ae.Timing(temperature=50.0))
+    units = replace(real.units, timing=ae.detection.Timing(temperature=50.0))
     hits = replace(real, units=units).hits(ae.Unperturbed())
-    ranges = ae.Ranges(["Ni", "Ni"], [28.9, 57.8], [32.2, 64.4])
+    ranges = ae.detection.Ranges(["Ni", "Ni"], [28.9, 57.8], [32.2, 64.4])
     charges = ion_charges(hits, "Ni", ranges)
     assert set(charges) <= {0, 1, 2} and np.mean(charges[hits.detected] == 0) < 0.02
     inside = charges > 0
@@ -231,7 +231,7 @@ def test_a_spectrum_with_tails_gives_nearly_the_same_ratio(real):
 
 @pytest.mark.skipif(not DATA.exists(), reason="the measured Si.epos and Si.rrng are not there")
 def test_charges_of_a_measured_file():
-    ranges = ae.read_ranges(DATA / "Si.rrng")
+    ranges = ae.io.read_ranges(DATA / "Si.rrng")
     hits = ae.read(DATA / "Si.epos", columns=("mass_to_charge", "x", "y"))
     charges, mass = ion_charges(hits, "Si", ranges), hits.mass_to_charge
     assert np.array_equal(charges == 2, ((mass < 15.5) & (charges > 0)))
@@ -248,7 +248,7 @@ def test_charges_of_a_measured_file():
 def test_every_isotope_has_its_charge(element):
     for mass, _ in ISOTOPES[element]:
         for charge in (1, 2, 3, 4):
-            ranges = ae.Ranges([element], [mass / charge - 0.1], [mass / charge + 0.3])
+            ranges = ae.detection.Ranges([element], [mass / charge - 0.1], [mass / charge + 0.3])
             assert ion_charges(ae.Hits(mass_to_charge=[mass / charge, 1.0]), element, ranges).tolist() == [charge, 0]
 
 
@@ -256,7 +256,7 @@ def test_only_single_atoms_have_charges():
     names = ["Ni", "Ni+", "Ni ++", "Ni2+", "NiO", "Ni2", "Ni"]
     low = [60.0, 57.9, 28.9, 30.0, 73.9, 115.8, 58.9]
     composition = [{}, {}, {}, {}, {}, {}, {"Ni": 1, "H": 1}]
-    ranges = ae.Ranges(names, low, np.add(low, 0.2), composition=composition)
+    ranges = ae.detection.Ranges(names, low, np.add(low, 0.2), composition=composition)
     charges = ion_charges(ae.Hits(mass_to_charge=np.add(low, 0.1)), "Ni", ranges)
     assert charges.tolist() == [1, 1, 2, 2, 0, 0, 0]
 
@@ -264,7 +264,7 @@ def test_only_single_atoms_have_charges():
 def test_a_dimer_is_not_an_atom():
     for name in ("Ni", "Ni2+"):
         with pytest.raises(ValueError, match=r"115\.8 to 116 Da is not a range of Ni, whose isotopes have 57\.9"):
-            ion_charges(ae.Hits(mass_to_charge=[116.0]), "Ni", ae.Ranges([name], [115.8], [116.0]))
+            ion_charges(ae.Hits(mass_to_charge=[116.0]), "Ni", ae.detection.Ranges([name], [115.8], [116.0]))
 
 
 # ---- errors --------------------------------------------------------------------------------------------------------
@@ -273,7 +273,7 @@ def test_a_dimer_is_not_an_atom():
 def test_what_is_refused():
     hits = ions_in(lambda x, y: np.full(len(x), 24.5), "Ni", 1, 1000, 7)
     bare = replace(hits, extra={})
-    ranges = ae.Ranges(["Ni"], [57.0], [60.0])
+    ranges = ae.detection.Ranges(["Ni"], [57.0], [60.0])
     for ions, element, options, message in (
         (bare, "Ni", {}, "these hits have no charges: pass ranges=read_ranges"),
         (bare, "Fe", {"ranges": ranges}, "ranges have no range of single atoms of Fe, only of Ni"),

@@ -44,9 +44,11 @@ def fitted(x, y, z, chosen, weights=None):
 def tip_with_ball(ratio):
     """Aluminium with a ball below the apex, whose evaporation field has this ratio to that of the matrix."""
     aluminium = ae.material("Al")
-    ball = ae.Phase("ball", aluminium, ae.Sphere((0, 0, R - 0.3 * RADIUS), RADIUS), evaporation_field=19.0 * ratio)
+    ball = ae.specimen.Phase(
+        "ball", aluminium, ae.specimen.Sphere((0, 0, R - 0.3 * RADIUS), RADIUS), evaporation_field=19.0 * ratio
+    )
     return ae.Tip(
-        phases=[ae.Phase("matrix", aluminium), ball], apex_radius=R, axis=(0, 1, 2), shank_length=R, depth=5.0,
+        phases=[ae.specimen.Phase("matrix", aluminium), ball], apex_radius=R, axis=(0, 1, 2), shank_length=R, depth=5.0,
         offset_seed=1,
     )  # fmt: skip
 
@@ -54,7 +56,7 @@ def tip_with_ball(ratio):
 def measured(ratio, first, snapshots, step):
     """The same of a simulated surface, the mean of several times."""
     tip = tip_with_ball(ratio)
-    emitter = ae.Emitter(tip, n_threads=1, settings=ae.ChargeSettings(sweep_interval=300))
+    emitter = ae.evaporation.Emitter(tip, n_threads=1, settings=ae.evaporation.ChargeSettings(sweep_interval=300))
     ratios = []
     for events in [first, *[step] * (snapshots - 1)]:
         for _ in emitter.advance(events):
@@ -84,7 +86,9 @@ def test_the_surface_over_a_particle_adjusts_to_its_evaporation_field(ratio, fir
 
 def density(ratio):
     """Hits in the image of the ball over those of the matrix between 30 and 45 degrees, and its relative error."""
-    simulation = ae.Simulation(tip_with_ball(ratio), n_threads=1, charge_settings=ae.ChargeSettings(sweep_interval=300))
+    simulation = ae.Simulation(
+        tip_with_ball(ratio), n_threads=1, charge_settings=ae.evaporation.ChargeSettings(sweep_interval=300)
+    )
     for _ in simulation.emitter.advance(2500):  # until the shape has adjusted
         pass
     run = simulation.run(4500, responses=False, progress=False)

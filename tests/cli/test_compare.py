@@ -21,7 +21,7 @@ from apt_evap.cli.main import main
 
 ROLLUP = ae.RollUp(ae.TruncatedNormal(0.2, 0.1))
 FILES = {"study.json", "ssim.csv", "ssim.png", "maps.png", "registration.png", "report.html"}
-QUICK = ["--means", "0.1,0.2,0.3", "--rsds", "0.5,1", "--replicas", "1", "--resamples", "4", "--bins", "24"]
+QUICK = ["--means", "0.1,0.2,0.3", "--relative_spreads", "0.5,1", "--replicas", "1", "--resamples", "4", "--bins", "24"]
 HERE = ["--registration", "0,1,0,0"]
 NO_PICTURES = pytest.mark.usefixtures("blank_pictures")
 
@@ -106,8 +106,8 @@ def test_everything_is_written(folder, capsys):
     assert [(each["name"], each["sha256"]) for each in report["origin"]["files"]] == sums
     # it is what Python gives
     study = fit_energies(
-        ae.load("run.h5"), ae.read_map("map.npz"), means=(0.1, 0.2, 0.3), rsds=(0.5, 1), replicas=1, resamples=4,
-        bins=24, registration=ae.Registration(0, 1, (0, 0)), progress=False,
+        ae.load("run.h5"), ae.read_map("map.npz"), means=(0.1, 0.2, 0.3), relative_spreads=(0.5, 1),
+        replicas=1, resamples=4, bins=24, registration=ae.Registration(0, 1, (0, 0)), progress=False,
     )  # fmt: skip
     assert held == study.to_dict()
 

@@ -456,7 +456,7 @@ def test_a_run_is_drawn_with_the_maps_of_its_config(folder, monkeypatch):
 @NO_PICTURES
 def test_map_of_measured_ions_keeps_to_their_comb(measured, monkeypatch):
     (only,), titles = drawn_by(monkeypatch, "map", measured)
-    assert titles == ["ions.epos"] and only.quantum == pytest.approx((0.5, 0.5))
+    assert titles == ["ions.epos"] and only.position_step == pytest.approx((0.5, 0.5))
     # 4,000 ions: 64 bins over 81 teeth, so a tooth each
     assert only.bin_size == pytest.approx((0.5, 0.5)) and only.smoothing == pytest.approx(0.5)
 

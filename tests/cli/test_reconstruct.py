@@ -7,7 +7,7 @@ import pytest
 
 import apt_evap as ae
 from apt_evap.cli.main import main
-from apt_evap.reconstruction.run_constants import run_constants
+from apt_evap.reconstruction.constants import run_constants
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def test_measured_ions(measured, nickel, capsys):
     assert main(command) == 2 and "'ni_reconstructed.pos' exists: --force" in capsys.readouterr().err
     # a table without shifts changes nothing but the direction of z
     places = np.random.default_rng(1).random((500, 2)) * 2 - 1
-    ae.OriginTable(places, np.zeros((500, 2))).save("table.npz")
+    ae.reconstruction.OriginTable(places, np.zeros((500, 2))).save("table.npz")
     corrected = ["--compression", "1.6", "--origins", "table.npz", "--frame", "specimen", "-o", "corrected.pos"]
     assert main([*command, *corrected]) == 0 and capsys.readouterr()
     assert ae.read("corrected.pos").positions == pytest.approx(expected.specimen_positions, rel=1e-6, abs=1e-5)
@@ -115,7 +115,7 @@ def test_the_constants_of_a_run_are_its_own(radius5, tmp_path, monkeypatch, caps
         settings = result["settings"]
         radii = real.voltages / (settings["field_factor"] * settings["evaporation_field"])
         assert np.median(radii) == pytest.approx(5.0, rel=0.02)  # the cap of the first ions, between its terraces
-        assert settings["compression"] == pytest.approx(ae.image_compression(run).compression)
+        assert settings["compression"] == pytest.approx(ae.analysis.image_compression(run).compression)
         assert settings["projection"] == "compressed" and settings["atomic_volume"] == pytest.approx(0.352**3 / 4)
         # measured 0.19 and 0.08 nm; with 3.3 and 1.5 the radius is 1.7 nm and its errors are larger
         assert result["errors"]["lateral_rms"] < 0.25 and result["errors"]["depth_rms"] < 0.12

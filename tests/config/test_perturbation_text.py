@@ -18,15 +18,15 @@ NORMAL = ae.TruncatedNormal(0.155, 0.1)
         (ae.Combined(NORMAL, 0.75), "Combined:0.155,0.1,0.75", "ae.Combined(ae.TruncatedNormal(0.155, 0.1), 0.75)"),
         (ae.Combined(1 / 3, 0.1), "Combined:0.3333333333333333,0.1", "ae.Combined(0.3333333333333333, 0.1)"),
         (
-            ae.RollUp(ae.Thermal(50)),
+            ae.RollUp(ae.emission.Thermal(50)),
             '{name = "RollUp", energy = {name = "Thermal", temperature = 50.0}}',
-            "ae.RollUp(ae.Thermal(50.0))",
+            "ae.RollUp(ae.emission.Thermal(50.0))",
         ),
         (
-            ae.RollUp(0.2, ae.ChargeRatio(0.9, 0.05), height=0.05),
+            ae.RollUp(0.2, ae.emission.ChargeRatio(0.9, 0.05), height=0.05),
             '{name = "RollUp", energy = 0.2, '
             'probability = {name = "ChargeRatio", threshold = 0.9, width = 0.05}, height = 0.05}',
-            "ae.RollUp(0.2, ae.ChargeRatio(0.9, 0.05), height=0.05)",
+            "ae.RollUp(0.2, ae.emission.ChargeRatio(0.9, 0.05), height=0.05)",
         ),
     ],
 )
@@ -43,8 +43,11 @@ def test_text_and_python_are_read_back(perturbation, text, python):
         (ae.RollUp(NORMAL), "roll-up, 0.155 ± 0.1 eV"),
         (ae.RollUp(0.2, second_roll=0.3), "roll-up, 0.2 eV, second roll-up 0.3"),
         (ae.RollUp(NORMAL, 0.5, 0.1, 0.05), "roll-up, 0.155 ± 0.1 eV, probability 0.5, sharpness 0.1, height 0.05 nm"),
-        (ae.RollUp(0.2, 0.5, others=ae.Thermal(50)), "roll-up, 0.2 eV, probability 0.5, others 50 K"),
-        (ae.RollUp(0.2, ae.ChargeRatio(0.9)), "roll-up, 0.2 eV, probability ChargeRatio(threshold=0.9, width=0.0)"),
+        (ae.RollUp(0.2, 0.5, others=ae.emission.Thermal(50)), "roll-up, 0.2 eV, probability 0.5, others 50 K"),
+        (
+            ae.RollUp(0.2, ae.emission.ChargeRatio(0.9)),
+            "roll-up, 0.2 eV, probability ChargeRatio(threshold=0.9, width=0.0)",
+        ),
         (ae.Unperturbed(0.1), "unperturbed, height 0.1 nm"),
     ],
 )

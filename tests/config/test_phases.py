@@ -50,23 +50,25 @@ def write(path, text):
 def test_phases_of_a_file_are_those_of_the_script(tmp_path):
     config = read_config(write(tmp_path / "run.toml", TEXT))
     nickel = ae.material("Ni", a=0.356)
-    core = ae.Sphere((0, 0, -2), 0.5)
+    core = ae.specimen.Sphere((0, 0, -2), 0.5)
     phases = [
-        ae.Phase("gamma", nickel, solutes={"Al": 0.1, "Ti": ae.Segregation(0.01, 0.2, 0.4)}, vacancies=0.01),
-        ae.Phase(
+        ae.specimen.Phase(
+            "gamma", nickel, solutes={"Al": 0.1, "Ti": ae.specimen.Segregation(0.01, 0.2, 0.4)}, vacancies=0.01
+        ),
+        ae.specimen.Phase(
             "gamma prime",
             nickel,
-            region=ae.Union(ae.Sphere((0, 0, 2), 1.2), ae.CoreShell(core, 0.5)),
-            order=ae.Order("L1_2", {"Al": 0.8, "Ti": 0.2}),
+            region=ae.specimen.Union(ae.specimen.Sphere((0, 0, 2), 1.2), ae.specimen.CoreShell(core, 0.5)),
+            order=ae.specimen.Superlattice("L1_2", {"Al": 0.8, "Ti": 0.2}),
             evaporation_field={"Al": 28.0},
         ),
-        ae.Phase(
+        ae.specimen.Phase(
             "grain",
             "Ni",
-            region=ae.HalfSpace((2, 0, 0), (1, 0, 0)),
+            region=ae.specimen.HalfSpace((2, 0, 0), (1, 0, 0)),
             axis=(0, 0, 1),
             rotation=10,
-            order=ae.Basis(("Al", None, None, None)),
+            order=ae.specimen.UnitCell(("Al", None, None, None)),
         ),
     ]
     tip = ae.Tip(phases=phases, apex_radius=10 * 0.356, axis=(1, 1, 1), seed=3)

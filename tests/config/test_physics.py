@@ -16,7 +16,7 @@ def read(text, *kinds):
 
 
 def test_laws():
-    assert read('name = "Extremal"\nbonds = "TUNGSTEN_TABLE"', *LAWS) == ae.Extremal(ae.TUNGSTEN_TABLE)
+    assert read('name = "Extremal"\nbonds = "TUNGSTEN_TABLE"', *LAWS) == ae.Extremal(ae.evaporation.TUNGSTEN_TABLE)
     text = """
     name = "Arrhenius"
     temperature = 25
@@ -29,16 +29,16 @@ def test_laws():
         25.0,
         {"Al": 0.8, "Cu": 1.2},
         barrier="parabolic",
-        laser=ae.Laser(150.0, direction=(0.0, 1.0), asymmetry=0.4),
-        bonds=ae.PairEnergies(ordering={"Al-Cu": 0.05}),
+        laser=ae.evaporation.Laser(150.0, direction=(0.0, 1.0), asymmetry=0.4),
+        bonds=ae.evaporation.PairEnergies(ordering={"Al-Cu": 0.05}),
     )
     bonds = 'name = "Extremal"\nbonds = { name = "CoordinationTable", table = { W = { 3 = 47, 4 = 57.0 } } }'
-    assert read(bonds, *LAWS) == ae.Extremal(ae.CoordinationTable({"W": {3: 47.0, 4: 57.0}}))
+    assert read(bonds, *LAWS) == ae.Extremal(ae.evaporation.CoordinationTable({"W": {3: 47.0, 4: 57.0}}))
 
 
 def test_rules():
     assert read('name = "Robin"', *RULES) == ae.Robin()
-    text = 'name = "ConstantPotential"\nself_term = 15\ncharges = "gaussian"\nlaw_sees = "others"'
+    text = 'name = "ConstantPotential"\nself_term = 15\ncharges = "gaussian"\nlaw_field = "others"'
     assert read(text, *RULES) == ae.ConstantPotential(15.0, "gaussian", "others")
 
 
@@ -52,7 +52,7 @@ def test_control_and_real_units():
     smoothing = 100
     """
     assert read(text, OperatingPoint) == OperatingPoint(
-        "site", 33.0, ae.PostIonisation(0.74), timing=ae.Timing(temperature=50.0), smoothing=100
+        "site", 33.0, ae.emission.PostIonisation(0.74), timing=ae.detection.Timing(temperature=50.0), smoothing=100
     )
     assert read("flight_charges = { Ni = 2 }", OperatingPoint).flight_charges == {"Ni": 2}
 

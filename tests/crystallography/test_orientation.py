@@ -8,8 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from apt_evap import DetectorMap, Orientation, Projection, Tip, fit_orientation, material
-from apt_evap.crystallography.poles import plane_normals
+from apt_evap import DetectorMap, Orientation, Tip, material
+from apt_evap.crystallography import fit_orientation
+from apt_evap.crystallography.directions import plane_normals
+from apt_evap.detection import Projection
 
 MEASURED = Path(__file__).parents[3] / "shared" / "data"
 PLANES = {

@@ -6,7 +6,7 @@ import scipy
 from scipy.spatial.transform import Rotation
 
 import apt_evap as ae
-from apt_evap.crystallography.poles import plane_normals, poles
+from apt_evap.crystallography.directions import plane_normals, poles
 from apt_evap.crystallography.symmetry import point_group, rotational_symmetry, symmetry_about_axis
 from apt_evap.specimen.lattice import rotation_to_axis
 

@@ -67,7 +67,7 @@ def test_bins_are_square_and_hold_every_hit(single, bins):
     y = y / 2
     hits = Hits(x=x.astype("f4"), y=y.astype("f4")) if single else Hits(x=x, y=y)
     map = hits.map(bins=bins)
-    assert map.quantum is None and map.counts.sum() == 20_000
+    assert map.position_step is None and map.counts.sum() == 20_000
     assert map.counts.shape[1] == bins and map.bin_size[0] == pytest.approx(map.bin_size[1], rel=1e-9)
 
 
@@ -100,12 +100,12 @@ def test_continuous_coordinates_have_no_comb(seed, dtype, n, repeated):
 def test_bins_respect_the_comb(bins):
     x, y = combed(400_000)
     hits = Hits(x=x, y=y)
-    fitted, naive, dithered = (hits.map(bins=bins, **how) for how in ({}, {"quantum": None}, {"dither_seed": 5}))
-    assert np.allclose(fitted.quantum, (0.02725, 0.02602), rtol=1e-5)
-    multiples = np.array(fitted.bin_size) / fitted.quantum
+    fitted, naive, dithered = (hits.map(bins=bins, **how) for how in ({}, {"position_step": None}, {"dither_seed": 5}))
+    assert np.allclose(fitted.position_step, (0.02725, 0.02602), rtol=1e-5)
+    multiples = np.array(fitted.bin_size) / fitted.position_step
     np.testing.assert_allclose(multiples, np.rint(multiples), atol=1e-6)
     # half quanta: every edge lies midway between two teeth
-    phase = (fitted.x_edges - 0.013) / fitted.quantum[0] % 1
+    phase = (fitted.x_edges - 0.013) / fitted.position_step[0] % 1
     np.testing.assert_allclose(phase, 0.5, atol=0.02)
     assert fitted.counts.sum() == 400_000
     # 1 for Poisson; it scatters by 12 % for 30 totals, so 4 standard deviations
@@ -116,11 +116,11 @@ def test_bins_respect_the_comb(bins):
 
 def test_quantum_can_be_given():
     x, y = combed(5000)
-    map = Hits(x=x, y=y).map(bins=50, quantum=(0.02725, 0.02602))
+    map = Hits(x=x, y=y).map(bins=50, position_step=(0.02725, 0.02602))
     assert (map.x_edges[0] - 0.013) / 0.02725 % 1 == pytest.approx(0.5, abs=0.02)
     for wrong in ("automatic", (0.1, -1.0), 3.0):
-        with pytest.raises(ValueError, match="quantum"):
-            Hits(x=x, y=y).map(quantum=wrong)
+        with pytest.raises(ValueError, match="position_step"):
+            Hits(x=x, y=y).map(position_step=wrong)
 
 
 def test_dither_is_keyed_by_its_seed_and_needs_a_comb():
@@ -303,4 +303,4 @@ def test_measured_map_shows_no_stripes():
 
     # some 100 totals: the scatter of a standard deviation is 7 %, plus what structure is left
     assert stripes(hits.map()) < 1.3 and stripes(hits.map(dither_seed=1)) < 1.3
-    assert stripes(hits.map(quantum=None)) > 5
+    assert stripes(hits.map(position_step=None)) > 5

@@ -35,14 +35,14 @@ def similar(grid):
 def similarity(first, second):
     """Registration without polynomial terms, which the distortion calls for."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ae.RegistrationWarning)
-        return ae.register_points(first, second, mirror=False)
+        warnings.simplefilter("ignore", ae.warnings.RegistrationWarning)
+        return ae.registration.register_points(first, second, mirror=False)
 
 
 def test_a_distortion_is_removed(rng):
     """Places between the crossings: within what a piecewise affine map leaves, an eighth of h^2 f'' (0.03 mm)."""
     grid = crossings()
-    distortion = ae.DistortionGrid(distorted(grid), grid)
+    distortion = ae.detection.DistortionGrid(distorted(grid), grid)
     inside = rng.uniform(-1.2, 1.2, (2000, 2))
     x, y = distortion.undistorted(*distorted(inside).T)
     # up to the similarity transform that fits the crossings best
@@ -59,12 +59,12 @@ def test_crossings_stay_crossings(seed, mirror):
     grid = crossings(7)
     flipped = grid * [1, -1 if mirror else 1]
     places = distorted(grid, 0.002)
-    distortion = ae.DistortionGrid(places, flipped)
+    distortion = ae.detection.DistortionGrid(places, flipped)
     rng = np.random.default_rng(seed)
     middle = places[np.hypot(*grid.T) < 0.6]
     x, y = distortion.undistorted(*middle.T)
-    assert ae.register_points(grid[np.hypot(*grid.T) < 0.6], np.column_stack([x, y])).residual < 1e-12
-    straight = ae.DistortionGrid(similar(grid), flipped)
+    assert ae.registration.register_points(grid[np.hypot(*grid.T) < 0.6], np.column_stack([x, y])).residual < 1e-12
+    straight = ae.detection.DistortionGrid(similar(grid), flipped)
     some = similar(rng.uniform(-0.5, 0.5, (20, 2)))
     assert np.column_stack(straight.undistorted(*some.T)) == pytest.approx(some, abs=1e-12)
     assert straight.residual < 1e-12
@@ -72,11 +72,11 @@ def test_crossings_stay_crossings(seed, mirror):
 
 def test_ions_outside_are_counted(rng):
     grid = crossings()
-    distortion = ae.DistortionGrid(distorted(grid), grid)
+    distortion = ae.detection.DistortionGrid(distorted(grid), grid)
     places = distorted(rng.uniform(-1.9, 1.9, (1000, 2)))
     far = np.hypot(*(places - [1.5, -0.8]).T) > 24
     hits = ae.Hits(x=places[:, 0], y=places[:, 1], voltage=np.arange(1000.0))
-    with pytest.warns(ae.DataWarning, match=r"(\d+) of 1,000 ions are outside the calibration grid") as caught:
+    with pytest.warns(ae.warnings.DataWarning, match=r"(\d+) of 1,000 ions are outside the calibration grid") as caught:
         corrected = hits.undistorted(distortion)
     number = int(str(caught[0].message).split()[0])
     assert number == 1000 - np.count_nonzero(corrected.detected) >= np.count_nonzero(far) > 50
@@ -93,12 +93,12 @@ def test_ions_outside_are_counted(rng):
 def test_quantised_coordinates_become_continuous(rng):
     """With steps of 0.1 mm: no steps and no empty bins afterwards, the same for the same seed."""
     grid = crossings()
-    distortion = ae.DistortionGrid(distorted(grid), grid)
+    distortion = ae.detection.DistortionGrid(distorted(grid), grid)
     x, y = (np.round(rng.uniform(-8, 8, 100_000) / 0.1) * 0.1 for _ in "xy")
     hits = ae.Hits(x=x, y=y)
-    assert hits.map(64).quantum == pytest.approx((0.1, 0.1))
+    assert hits.map(64).position_step == pytest.approx((0.1, 0.1))
     one, two, other = (hits.undistorted(distortion, dither_seed=seed) for seed in (0, 0, 1))
-    assert one.map(64).quantum is None
+    assert one.map(64).position_step is None
     assert np.array_equal(one.x, two.x) and not np.array_equal(one.x, other.x)
     assert np.hypot(one.x - other.x, one.y - other.y).max() < 0.2
 
@@ -117,4 +117,4 @@ def test_quantised_coordinates_become_continuous(rng):
 )
 def test_bad_grids_are_refused(change, words):
     with pytest.raises(ValueError, match=words):
-        ae.DistortionGrid(*change(distorted(crossings()), crossings()))
+        ae.detection.DistortionGrid(*change(distorted(crossings()), crossings()))

@@ -177,7 +177,7 @@ def test_the_field_of_view_is_a_circle(rng):
 def test_timing_errors_are_those_of_the_instrument(rng):
     n = 20_000
     hits = ions(n, rng)
-    seen = ae.Instrument(timing=ae.Timing(jitter=0.3), field_of_view=200.0).hits(hits)
+    seen = ae.Instrument(timing=ae.detection.Timing(jitter=0.3), field_of_view=200.0).hits(hits)
     late = seen.time_of_flight - hits.time_of_flight
     assert late.std() == pytest.approx(0.3, rel=4 / np.sqrt(2 * n))  # standard error
     assert seen.mass_to_charge == pytest.approx(26.98 * (seen.time_of_flight / hits.time_of_flight) ** 2, rel=1e-14)
@@ -267,7 +267,7 @@ def test_truth_and_counts_go_with_the_ions(real):
 
 
 def test_the_same_ions_in_any_selection_and_order(real):
-    instrument = ae.Instrument(efficiency=0.5, resolution=0.1, timing=ae.Timing(), field_of_view=200.0)
+    instrument = ae.Instrument(efficiency=0.5, resolution=0.1, timing=ae.detection.Timing(), field_of_view=200.0)
     hits = real.hits(ae.Unperturbed())
     whole = instrument.hits(hits, seed=3)
     parts = [instrument.hits(hits[part], seed=3) for part in (slice(250, None), slice(0, 250))]
@@ -286,12 +286,12 @@ def test_the_same_ions_in_any_selection_and_order(real):
 
 
 def test_the_errors_of_the_times_are_not_applied_twice(real):
-    sharp = real.record(ae.Instrument(timing=ae.Timing(jitter=0.0)))
+    sharp = real.record(ae.Instrument(timing=ae.detection.Timing(jitter=0.0)))
     plain = real.record(ae.Instrument())
     assert np.array_equal(sharp.time_of_flight, plain.time_of_flight)
-    timed = real.simulated().at_evaporation_field(timing=ae.Timing(jitter=0.5))
+    timed = real.simulated().at_evaporation_field(timing=ae.detection.Timing(jitter=0.5))
     assert np.array_equal(
-        timed.record(ae.Instrument(timing=ae.Timing(jitter=0.0))).time_of_flight, plain.time_of_flight
+        timed.record(ae.Instrument(timing=ae.detection.Timing(jitter=0.0))).time_of_flight, plain.time_of_flight
     )
     assert np.array_equal(
         timed.record(ae.Instrument(field_of_view=1e6)).time_of_flight,
@@ -307,7 +307,7 @@ def test_an_epos_is_read_as_it_was_written(real, tmp_path):
         dead_zone=2.0,
         resolution=0.1,
         quantisation=STEPS,
-        timing=ae.Timing(temperature=50.0),
+        timing=ae.detection.Timing(temperature=50.0),
     )
     # voltages below 100 V, of a tip this small in the model, would be read as kV
     seen = real.at_evaporation_field(field_factor=3.3).record(instrument, ae.RollUp(0.1))
@@ -366,7 +366,8 @@ INSTRUMENTS = st.builds(
     dead_zone=st.floats(0.0, 30.0),
     resolution=st.just(0.0) | st.floats(0.01, 1.0),
     quantisation=st.none() | st.tuples(st.floats(0.01, 1.0), st.floats(0.01, 1.0)),
-    timing=st.none() | st.builds(ae.Timing, jitter=st.floats(0.0, 1.0), temperature=st.none() | st.floats(20.0, 100.0)),
+    timing=st.none()
+    | st.builds(ae.detection.Timing, jitter=st.floats(0.0, 1.0), temperature=st.none() | st.floats(20.0, 100.0)),
 )
 
 

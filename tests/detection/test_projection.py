@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from apt_evap import Detector, Projection
+from apt_evap import Detector
 from apt_evap._core.elementary import arctangent
+from apt_evap.detection import Projection
 from apt_evap.detection.projection import along_axis, polar_angles, stereographic, stereographic_stretch
 
 PROJECTIONS = st.builds(

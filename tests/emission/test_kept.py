@@ -16,7 +16,7 @@ def emissions(rng):
     positions = 5 * normals
     neighbours = positions + rng.normal(size=(n, 3)) * 0.2
     neighbours[::7] = np.nan
-    return ae.Emissions(
+    return ae.emission.Emissions(
         positions=positions,
         normals=normals,
         neighbours=neighbours,
@@ -30,7 +30,7 @@ def emissions(rng):
 def test_random_numbers_are_those_of_ions(emissions):
     random = KeptRandom(7, emissions.ions)
     for _ in range(3):
-        expected = ae.IonRandom(7, emissions.ions)
+        expected = ae.emission.IonRandom(7, emissions.ions)
         again = random.rewound()
         for columns in (2, 1, 3):
             assert np.array_equal(again.uniform(columns), expected.uniform(columns))
@@ -44,7 +44,7 @@ def test_random_numbers_are_those_of_ions(emissions):
 def test_launches_have_the_same_bits(emissions, perturbation):
     same = KeptEmissions.of(emissions)
     for seed in (1, 2, 1):
-        expected = perturbation.tangential(emissions, ae.IonRandom(seed, emissions.ions))
+        expected = perturbation.tangential(emissions, ae.emission.IonRandom(seed, emissions.ions))
         for _ in range(2):
             for one, other in zip(perturbation.tangential(same, same.random(seed)), expected, strict=True):
                 assert np.array_equal(one, other)

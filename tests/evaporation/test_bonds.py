@@ -51,7 +51,7 @@ def decoded(codes, n_species, second):
 
 
 def evaporated(tip, bonds, events=250, law=ae.Extremal, **options):
-    emitter = ae.Emitter(tip, law=law(bonds=bonds, **options), n_threads=1, seed=1)
+    emitter = ae.evaporation.Emitter(tip, law=law(bonds=bonds, **options), n_threads=1, seed=1)
     sites = np.concatenate([batch.site for batch in emitter.advance(events)])
     assert len(sites) == events
     return emitter, sites, np.setdiff1d(np.arange(len(tip)), sites)
@@ -86,7 +86,7 @@ class Constant:
 )
 def test_bonds_by_species_are_those_of_the_atoms_left(request, name, weight):
     tip = request.getfixturevalue(name)
-    emitter, _, left = evaporated(tip, ae.PairEnergies(second_weight=weight), 500)
+    emitter, _, left = evaporated(tip, ae.evaporation.PairEnergies(second_weight=weight), 500)
     nearest, second = counted(tip, left, left)
     found = decoded(emitter._core.atoms.bond_codes[left], 2, weight > 0)
     assert np.array_equal(found[0], nearest)
@@ -104,7 +104,7 @@ def test_without_species_all_bonds_are_counted_together(iron_tungsten):
 def test_bonds_of_a_shell_that_is_deepened_are_those_of_the_whole_specimen():
     options = {"solutes": {"Cu": 0.2}, "seed": 1}
     tip = ae.Tip("Al", apex_radius=2.5, axis=(1, 1, 1), depth=1.4, **options)
-    emitter, _, left = evaporated(tip, ae.PairEnergies(), 500)
+    emitter, _, left = evaporated(tip, ae.evaporation.PairEnergies(), 500)
     deep = emitter.tip
     assert len(deep) > len(tip)
     left = np.union1d(left, np.arange(len(tip), len(deep)))
@@ -136,7 +136,7 @@ def slow_fields(tip, atoms, nearest, second, weight=0.0, ordering=0.0):
 def test_keys_are_those_of_the_fields_of_all_remaining_bonds(request, name, weight, ordering, temperature):
     tip = request.getfixturevalue(name)
     pair = "-".join(element.name for element in reversed(tip.elements))  # the order of the two does not matter
-    bonds = ae.PairEnergies(second_weight=weight, ordering={pair: ordering})
+    bonds = ae.evaporation.PairEnergies(second_weight=weight, ordering={pair: ordering})
     emitter, _, left = evaporated(tip, bonds, law=lambda bonds: ae.Arrhenius(temperature, bonds=bonds))
     atoms, fields = emitter.atoms, emitter.fields
     field = slow_fields(tip, atoms, *counted(tip, left, atoms), weight, ordering)
@@ -156,8 +156,8 @@ def test_keys_are_those_of_the_fields_of_all_remaining_bonds(request, name, weig
 def test_atoms_with_few_bonds_leave_before_atoms_with_many(aluminium_copper):
     """The mean number of bonds at the removal is lower than without the law of bonds."""
     means = []
-    for bonds in (None, ae.CoordinationTable({name: {0: 5.0, 12: 60.0} for name in ("Al", "Cu")})):
-        emitter = ae.Emitter(aluminium_copper, law=ae.Extremal(bonds), n_threads=1)
+    for bonds in (None, ae.evaporation.CoordinationTable({name: {0: 5.0, 12: 60.0} for name in ("Al", "Cu")})):
+        emitter = ae.evaporation.Emitter(aluminium_copper, law=ae.Extremal(bonds), n_threads=1)
         counts, done = [], 0
         while done < 300:
             before = dict(zip(emitter.atoms.tolist(), emitter.bonds.tolist(), strict=True))
@@ -174,7 +174,7 @@ def test_constant_fields_leave_the_bits_of_the_law(aluminium_copper):
     """The factor of the table is exactly 1."""
 
     def columns(bonds):
-        emitter = ae.Emitter(aluminium_copper, law=ae.Extremal(bonds), n_threads=1)
+        emitter = ae.evaporation.Emitter(aluminium_copper, law=ae.Extremal(bonds), n_threads=1)
         sites = np.concatenate([batch.site for batch in emitter.advance(150)])
         return sites, emitter.charges
 
@@ -191,7 +191,7 @@ def test_constant_fields_leave_the_bits_of_the_law(aluminium_copper):
 @pytest.mark.parametrize("name", sorted(MATERIALS))
 def test_an_atom_at_a_kink_has_the_evaporation_field_of_its_species(name, weight):
     near, far = BULK[ae.material(name).structure]
-    (field,) = field_of(ae.PairEnergies(second_weight=weight), name, near // 2, far // 2)
+    (field,) = field_of(ae.evaporation.PairEnergies(second_weight=weight), name, near // 2, far // 2)
     assert field == pytest.approx(ae.material(name).evaporation_field, rel=1e-14)  # a few roundings
 
 
@@ -210,7 +210,7 @@ def test_an_atom_at_a_kink_has_the_evaporation_field_of_its_species(name, weight
 )
 def test_change_of_the_field_per_bond_at_a_kink(name, per_bond):
     kink = BULK[ae.material(name).structure][0] // 2
-    low, middle, high = field_of(ae.PairEnergies(), name, [kink - 1, kink, kink + 1])
+    low, middle, high = field_of(ae.evaporation.PairEnergies(), name, [kink - 1, kink, kink + 1])
     # the field is a square, whose central difference is exact; half of the last digit
     assert (high - low) / (2 * middle) == pytest.approx(per_bond, abs=0.0005 if per_bond < 0.1 else 0.005)
     assert 0 < low < middle < high
@@ -223,7 +223,7 @@ def test_change_of_the_field_per_bond_at_a_kink(name, per_bond):
 def test_bond_energies_of_the_atoms_add_up_to_that_of_the_specimen(request, name, weight, ordering):
     """Each bond is broken once: the energy of an atom at its removal, summed, is that of all bonds that are gone."""
     tip = request.getfixturevalue(name)
-    bonds = ae.PairEnergies(second_weight=weight, ordering=ordering)
+    bonds = ae.evaporation.PairEnergies(second_weight=weight, ordering=ordering)
     emitter, sites, left = evaporated(tip, bonds, 300)
     # the code of an atom does not change after its removal
     nearest, second = decoded(emitter._core.atoms.bond_codes[sites], 2, weight > 0)
@@ -252,31 +252,31 @@ def test_cohesive_energies_are_the_energy_of_a_crystal():
     """Half of the bonds of an atom in the bulk: the cohesive energy."""
     tip = pair_of("Cu")
     for weight in (0.0, 0.7):
-        bonds = ae.PairEnergies(second_weight=weight)
+        bonds = ae.evaporation.PairEnergies(second_weight=weight)
         (energy,) = bonds.energies(tip, 0, np.array([[12]]), np.array([[6]]))
         assert energy / 2 == pytest.approx(3.49, rel=1e-15)
 
 
 def test_energies_and_works_of_a_users_own():
-    own = ae.PairEnergies({"Cu": 4.0}, {"Cu": 2.0})
+    own = ae.evaporation.PairEnergies({"Cu": 4.0}, {"Cu": 2.0})
     low, high = field_of(own, "Cu", [5, 6])
     assert low / high == pytest.approx(((4.0 * 5 / 6 + 2.0) / 6.0) ** 2, rel=1e-14)  # a few roundings
-    assert np.array_equal(field_of(own, "Ni", [3, 9]), field_of(ae.PairEnergies(), "Ni", [3, 9]))
+    assert np.array_equal(field_of(own, "Ni", [3, 9]), field_of(ae.evaporation.PairEnergies(), "Ni", [3, 9]))
     magnesium = ae.Material("Mg", "hcp", 0.321, 21.0, 2, 24.305, c=0.521)
     tip = ae.Tip.from_positions([[0, 0, 0], [0, 0, 0.32]], [0, 0], [magnesium])
-    given = ae.PairEnergies({"Mg": 1.51}, {"Mg": 15.3})
+    given = ae.evaporation.PairEnergies({"Mg": 1.51}, {"Mg": 15.3})
     assert given.fields(tip, 0, np.array([[6]]), np.zeros((1, 1), int)) == pytest.approx(21.0, rel=1e-14)
     with pytest.raises(ValueError, match="cohesive_energies must have a value for Mg, got Al, Si, Ti"):
-        ae.PairEnergies().fields(tip, 0, np.array([[6]]), np.zeros((1, 1), int))
+        ae.evaporation.PairEnergies().fields(tip, 0, np.array([[6]]), np.zeros((1, 1), int))
     with pytest.raises(ValueError, match="ionisation_works must have a value for Mg, got Al, Si, Ti"):
-        ae.PairEnergies({"Mg": 1.51}).fields(tip, 0, np.array([[6]]), np.zeros((1, 1), int))
+        ae.evaporation.PairEnergies({"Mg": 1.51}).fields(tip, 0, np.array([[6]]), np.zeros((1, 1), int))
 
 
 # ---- tables --------------------------------------------------------------------------------------------------------
 
 
 def test_fields_of_a_table_are_interpolated():
-    table = ae.CoordinationTable({"Ni": {4: 20.0, 8: 40.0, 9: 100.0}})
+    table = ae.evaporation.CoordinationTable({"Ni": {4: 20.0, 8: 40.0, 9: 100.0}})
     assert field_of(table, "Ni", [0, 4, 5, 7, 8, 9, 15]).tolist() == [20, 20, 25, 35, 40, 100, 100]
     assert field_of(table, "Cu", [0, 6, 12]).tolist() == [ae.material("Cu").evaporation_field] * 3
     assert not table.by_species and not table.second_shell
@@ -284,12 +284,12 @@ def test_fields_of_a_table_are_interpolated():
 
 def test_the_table_of_tungsten():
     # 10 V/nm per bond from 27 for one bond, and 57 without any
-    assert field_of(ae.TUNGSTEN_TABLE, "W", range(10)).tolist() == [57, 27, 37, 47, 57, 67, 77, 87, 97, 107]
+    assert field_of(ae.evaporation.TUNGSTEN_TABLE, "W", range(10)).tolist() == [57, 27, 37, 47, 57, 67, 77, 87, 97, 107]
 
 
 def test_a_table_in_the_law():
     tip = ae.Tip("W", apex_radius=2.0, axis=(1, 1, 0), shank_length=2.0)
-    emitter, _, left = evaporated(tip, ae.TUNGSTEN_TABLE, 200)
+    emitter, _, left = evaporated(tip, ae.evaporation.TUNGSTEN_TABLE, 200)
     atoms, fields = emitter.atoms, emitter.fields
     nearest = counted(tip, left, atoms)[0].sum(axis=1)
     assert np.array_equal(emitter._core.atoms.bond_codes[atoms], nearest)
@@ -325,7 +325,7 @@ def test_a_class_of_a_users_own_is_called_once_for_each_element(aluminium_copper
     ("bonds", "settings"),
     [
         (
-            ae.PairEnergies({"Al": 3.4}, ordering={"Al-Cu": 0.05}),
+            ae.evaporation.PairEnergies({"Al": 3.4}, ordering={"Al-Cu": 0.05}),
             {
                 "cohesive_energies": {"Al": 3.4},
                 "ionisation_works": None,
@@ -333,7 +333,7 @@ def test_a_class_of_a_users_own_is_called_once_for_each_element(aluminium_copper
                 "second_weight": 0.0,
             },
         ),
-        (ae.CoordinationTable({"Al": {3: 15.0, 9: 25.0}}), {"table": {"Al": {"3": 15.0, "9": 25.0}}}),
+        (ae.evaporation.CoordinationTable({"Al": {3: 15.0, 9: 25.0}}), {"table": {"Al": {"3": 15.0, "9": 25.0}}}),
     ],
     ids=["PairEnergies", "CoordinationTable"],
 )
@@ -344,9 +344,9 @@ def test_a_run_with_bonds_is_saved_resumed_and_described(aluminium_copper, tmp_p
             seed=2,
             n_threads=1,
             law=ae.Extremal(bonds),
-            charge_settings=ae.ChargeSettings(sweep_interval=30),
+            charge_settings=ae.evaporation.ChargeSettings(sweep_interval=30),
         )
-        checkpoint = None if path is None else ae.Checkpoint(path, resume=True)
+        checkpoint = None if path is None else ae.simulation.Checkpoint(path, resume=True)
         return simulation.run(n_ions, responses=False, progress=False, checkpoint=checkpoint)
 
     run(50, tmp_path / "run.h5")
@@ -365,27 +365,45 @@ def test_a_run_with_bonds_is_saved_resumed_and_described(aluminium_copper, tmp_p
             lambda: ae.Extremal(bonds=3),
             "bonds must be an evaporation field by bonds with by_species, .* a method fields, .*, got 3",
         ),
-        (lambda: ae.Extremal(ae.PairEnergies), "bonds must be an evaporation field by bonds"),
+        (lambda: ae.Extremal(ae.evaporation.PairEnergies), "bonds must be an evaporation field by bonds"),
         (lambda: ae.Extremal({"Al": {3: 20.0}}), "bonds must be an evaporation field by bonds"),
-        (lambda: ae.CoordinationTable({}), "table must be fields by element and number of bonds, .*, got {}"),
-        (lambda: ae.CoordinationTable(57.0), "table must be fields by element and number of bonds, .*, got 57.0"),
-        (lambda: ae.CoordinationTable({"W": 57.0}), "table of W must be fields by number of bonds, got 57.0"),
         (
-            lambda: ae.CoordinationTable({"W": {16: 57.0}}),
+            lambda: ae.evaporation.CoordinationTable({}),
+            "table must be fields by element and number of bonds, .*, got {}",
+        ),
+        (
+            lambda: ae.evaporation.CoordinationTable(57.0),
+            "table must be fields by element and number of bonds, .*, got 57.0",
+        ),
+        (
+            lambda: ae.evaporation.CoordinationTable({"W": 57.0}),
+            "table of W must be fields by number of bonds, got 57.0",
+        ),
+        (
+            lambda: ae.evaporation.CoordinationTable({"W": {16: 57.0}}),
             "bonds in the table of W must be an integer from 0 to 15, got 16",
         ),
         (
-            lambda: ae.CoordinationTable({"W": {-1: 57.0}}),
+            lambda: ae.evaporation.CoordinationTable({"W": {-1: 57.0}}),
             "bonds in the table of W must be an integer from 0 to 15, got -1",
         ),
-        (lambda: ae.CoordinationTable({"W": {4: 0.0}}), "field in the table of W must be a finite number .V/nm. > 0"),
-        (lambda: ae.PairEnergies(second_weight=1.5), "second_weight must be .* >= 0 and <= 1, got 1.5"),
-        (lambda: ae.PairEnergies({"Al": -3.0}), "cohesive_energies of Al must be a finite number .eV. > 0"),
-        (lambda: ae.PairEnergies(3.4), "cohesive_energies must be numbers .eV. by element, got 3.4"),
-        (lambda: ae.PairEnergies(None, {"Al": 0.0}), "ionisation_works of Al must be a finite number .eV. > 0"),
-        (lambda: ae.PairEnergies(ordering={"AlCu": 0.1}), "ordering must be by pair such as 'Al-Cu', got 'AlCu'"),
-        (lambda: ae.PairEnergies(ordering={"Al-Cu": 20.0}), "ordering of Al-Cu must be .* <= 10, got 20.0"),
-        (lambda: ae.PairEnergies(ordering=0.1), "ordering must be energies .eV. by pair .*, got 0.1"),
+        (
+            lambda: ae.evaporation.CoordinationTable({"W": {4: 0.0}}),
+            "field in the table of W must be a finite number .V/nm. > 0",
+        ),
+        (lambda: ae.evaporation.PairEnergies(second_weight=1.5), "second_weight must be .* >= 0 and <= 1, got 1.5"),
+        (lambda: ae.evaporation.PairEnergies({"Al": -3.0}), "cohesive_energies of Al must be a finite number .eV. > 0"),
+        (lambda: ae.evaporation.PairEnergies(3.4), "cohesive_energies must be numbers .eV. by element, got 3.4"),
+        (
+            lambda: ae.evaporation.PairEnergies(None, {"Al": 0.0}),
+            "ionisation_works of Al must be a finite number .eV. > 0",
+        ),
+        (
+            lambda: ae.evaporation.PairEnergies(ordering={"AlCu": 0.1}),
+            "ordering must be by pair such as 'Al-Cu', got 'AlCu'",
+        ),
+        (lambda: ae.evaporation.PairEnergies(ordering={"Al-Cu": 20.0}), "ordering of Al-Cu must be .* <= 10, got 20.0"),
+        (lambda: ae.evaporation.PairEnergies(ordering=0.1), "ordering must be energies .eV. by pair .*, got 0.1"),
     ],
 )
 def test_bad_bonds_are_refused(make, message):
@@ -407,7 +425,7 @@ class Returning:
 def test_fields_that_are_no_fields_are_refused(small_tip, value):
     message = r"fields of Returning must be 16 numbers > 0 \[V/nm\] for Ni, got "
     with pytest.raises(ValueError, match=message):
-        ae.Emitter(small_tip, law=ae.Extremal(Returning(value)))
+        ae.evaporation.Emitter(small_tip, law=ae.Extremal(Returning(value)))
 
 
 @pytest.mark.parametrize(("solutes", "weight", "n"), [(2, 0.5, 3), (4, 0.0, 5)])
@@ -415,15 +433,15 @@ def test_too_many_species_are_refused(solutes, weight, n):
     names = ("Cu", "Ni", "Au", "Pt")[:solutes]
     tip = ae.Tip("Al", apex_radius=1.5, shank_length=1.5, solutes=dict.fromkeys(names, 0.1), seed=1)
     with pytest.raises(ValueError, match=rf"up to 4 species \(half with second neighbours\), got {n}"):
-        ae.Emitter(tip, law=ae.Extremal(ae.PairEnergies(second_weight=weight)))
+        ae.evaporation.Emitter(tip, law=ae.Extremal(ae.evaporation.PairEnergies(second_weight=weight)))
     # their number alone is always possible
-    assert len(ae.Emitter(tip, law=ae.Extremal(Constant(second_shell=True))).evaporate(5)) == 5
+    assert len(ae.evaporation.Emitter(tip, law=ae.Extremal(Constant(second_shell=True))).evaporate(5)) == 5
 
 
 @pytest.mark.parametrize("number", ["a", None, 4.5])
 def test_numbers_of_bonds_in_a_table_are_integers(number):
     with pytest.raises(ValueError, match="bonds in the table of W must be"):
-        ae.CoordinationTable({"W": {number: 57.0}})
+        ae.evaporation.CoordinationTable({"W": {number: 57.0}})
 
 
 def test_more_neighbours_than_can_be_counted_are_refused(nickel):
@@ -437,4 +455,4 @@ def test_more_neighbours_than_can_be_counted_are_refused(nickel):
     tip = ae.Tip.from_positions(positions, np.zeros(len(positions), int), [nickel])
     assert max(map(len, cKDTree(positions).query_ball_point(compressed, tip.bond_length))) == 19  # with itself
     with pytest.raises(ValueError, match="15"):
-        ae.Emitter(tip, law=ae.Extremal(Constant()))
+        ae.evaporation.Emitter(tip, law=ae.Extremal(Constant()))

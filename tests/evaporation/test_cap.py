@@ -113,7 +113,7 @@ def test_too_few_atoms_have_no_cap(n, known):
 
 
 def test_the_cap_of_an_emitter_is_that_of_its_evaporable_atoms(tip12):
-    emitter = ae.Emitter(tip12, n_threads=1)
+    emitter = ae.evaporation.Emitter(tip12, n_threads=1)
     assert sum(map(len, emitter.advance(150))) == 150
     may = tip12.evaporable[emitter.atoms]
     assert not may.all()
@@ -127,7 +127,7 @@ def test_the_cap_of_an_emitter_is_that_of_its_evaporable_atoms(tip12):
 def test_atoms_that_never_evaporate_are_not_of_the_cap(nickel, small_tip):
     may = (small_tip.positions[:, 2] > 0) & (small_tip.positions[:, 0] > -0.3)
     tip = ae.Tip.from_positions(small_tip.positions, small_tip.species, [nickel], evaporable=may)
-    emitter = ae.Emitter(tip, n_threads=1)
+    emitter = ae.evaporation.Emitter(tip, n_threads=1)
     chosen = may[emitter.atoms]
     arrays = emitter.positions, emitter.normals, emitter.fields, np.full(len(emitter), 35.0)
     assert emitter.cap == pytest.approx(slow_cap(*(array[chosen] for array in arrays)), rel=1e-9)
@@ -135,14 +135,14 @@ def test_atoms_that_never_evaporate_are_not_of_the_cap(nickel, small_tip):
 
 
 def test_fields_of_the_cap_are_in_proportion_to_the_voltage(small_tip):
-    one, two = (ae.Emitter(small_tip, voltage, n_threads=1).cap for voltage in (500.0, 1500.0))
+    one, two = (ae.evaporation.Emitter(small_tip, voltage, n_threads=1).cap for voltage in (500.0, 1500.0))
     # charges converge to rounding in the same steps
     assert two == pytest.approx((3 * one.field, 3 * one.ratio, one.radius), rel=1e-9)
 
 
 def test_the_ratio_of_an_alloy_is_that_of_each_species():
     tip = ae.Tip("Al", apex_radius=3.0, shank_length=3.0, solutes={"Cu": 0.3}, seed=1)
-    emitter = ae.Emitter(tip, n_threads=1)
+    emitter = ae.evaporation.Emitter(tip, n_threads=1)
     may = tip.evaporable[emitter.atoms]
     evaporation_fields = tip.evaporation_fields[tip.species[emitter.atoms[may]]]
     assert len(np.unique(evaporation_fields)) == 2
@@ -162,7 +162,7 @@ def free_sphere(nickel, radius):
     tip = ae.Tip.from_positions(
         positions, np.zeros(n, int), [nickel], evaporable=np.ones(n, bool), potential_point=np.zeros(3)
     )
-    return ae.Emitter(tip, 1000.0, n_threads=1)
+    return ae.evaporation.Emitter(tip, 1000.0, n_threads=1)
 
 
 def test_fields_of_a_free_sphere_of_atoms(nickel):
@@ -184,18 +184,18 @@ def test_fields_of_a_free_sphere_of_atoms(nickel):
 
 
 def test_the_history_of_a_run_has_the_cap_after_each_relaxation(small_tip, tmp_path):
-    settings = ae.ChargeSettings(sweep_interval=40)
+    settings = ae.evaporation.ChargeSettings(sweep_interval=40)
     run = ae.Simulation(small_tip, charge_settings=settings, n_threads=1).run(
         130, responses=False, progress=False, batch_size=25
     )
     assert run.cap.ions.tolist() == [0, 40, 80, 120]
-    emitter, caps, n = ae.Emitter(small_tip, settings=settings, n_threads=1), [], 0
+    emitter, caps, n = ae.evaporation.Emitter(small_tip, settings=settings, n_threads=1), [], 0
     for batch in emitter.advance(130):
         if n % 40 == 0 and len(batch):
             caps.append(batch.cap)
         n += len(batch)
     assert np.array_equal(np.array(caps).T, [run.cap.fields, run.cap.ratios, run.cap.radii])
-    first = ae.Emitter(small_tip, n_threads=1).cap
+    first = ae.evaporation.Emitter(small_tip, n_threads=1).cap
     assert tuple(values[0] for values in run.cap[1:]) == first
     run.save(tmp_path / "run.h5")
     loaded = ae.load(tmp_path / "run.h5").cap
@@ -204,7 +204,7 @@ def test_the_history_of_a_run_has_the_cap_after_each_relaxation(small_tip, tmp_p
 
 def test_the_cap_of_a_shrinking_specimen(tip12):
     """While the first cap rounds off, the radius changes little and the field follows it at constant voltage."""
-    emitter = ae.Emitter(tip12, n_threads=1)
+    emitter = ae.evaporation.Emitter(tip12, n_threads=1)
     caps = [batch.cap for batch in emitter.advance(1000) if batch.cap is not None]
     assert len(caps) == 10
     radii, fields = (np.array([getattr(cap, name) for cap in caps]) for name in ("radius", "field"))

@@ -29,7 +29,7 @@ def floating(tip, removed):
 
 def check_alloy(name, n_events, step):
     tip = ae.Tip(apex_radius=3.0, axis=(1, 1, 1), shank_length=9.0, seed=1, **ALLOYS[name])
-    emitter = ae.Emitter(tip, n_threads=1)
+    emitter = ae.evaporation.Emitter(tip, n_threads=1)
     removed, detached = [], []
     while sum(map(len, removed)) < n_events:
         for batch in emitter.advance(step):
@@ -39,7 +39,7 @@ def check_alloy(name, n_events, step):
         assert np.array_equal(floating(tip, np.concatenate(removed)), emitter._core.atoms.waiting_atoms)
     detached = np.concatenate(detached)
     assert emitter.counts["detached"] == detached.sum() > 0
-    fresh = ae.Emitter(tip, n_threads=1, settings=ae.ChargeSettings(start_tolerance=1e-6))
+    fresh = ae.evaporation.Emitter(tip, n_threads=1, settings=ae.evaporation.ChargeSettings(start_tolerance=1e-6))
     fresh._core.atoms.remove_atoms(np.concatenate(removed))
     fresh.relax(1e-6), emitter.relax(1e-6)
     return emitter, fresh
@@ -92,7 +92,7 @@ def test_parts_that_meet_elsewhere_stay():
 def test_a_run_with_detached_atoms_is_resumed_with_the_same_bits(tmp_path):
     tip = ae.Tip("Al", 2.0, (1, 1, 1), shank_length=5.0, solutes={"W": 0.1}, seed=1)
     whole = ae.Simulation(tip, n_threads=1).run(600, responses=False, progress=False)
-    checkpoint = ae.Checkpoint(tmp_path / "run.h5", resume=True)
+    checkpoint = ae.simulation.Checkpoint(tmp_path / "run.h5", resume=True)
     for ions in (151, 320, 600):
         run = ae.Simulation(tip, n_threads=1).run(ions, responses=False, progress=False, checkpoint=checkpoint)
         run.save(tmp_path / "run.h5")

@@ -28,7 +28,7 @@ def by_hand(emitter, n):
 @pytest.mark.parametrize("batch_size", [1, 7, 256])
 def test_advance_is_the_loop(nickel, batch_size):
     tip = ae.Tip(nickel, apex_radius=6 * nickel.a, axis=(1, 1, 1), depth=3.5 * nickel.a)
-    hand, emitter = ae.Emitter(tip), ae.Emitter(tip)
+    hand, emitter = ae.evaporation.Emitter(tip), ae.evaporation.Emitter(tip)
     statuses, sites = [], []
     for batch in emitter.advance(500, batch_size):
         statuses.append(batch.status)
@@ -40,7 +40,7 @@ def test_advance_is_the_loop(nickel, batch_size):
 
 def test_relaxations_and_deepening_are_paused_for(nickel):
     tip = ae.Tip(nickel, apex_radius=6 * nickel.a, axis=(1, 1, 1), depth=3.5 * nickel.a)
-    emitter, paused = ae.Emitter(tip), []
+    emitter, paused = ae.evaporation.Emitter(tip), []
 
     @contextmanager
     def pause():
@@ -57,13 +57,13 @@ def test_advance_ends_when_no_atom_is_left(nickel, small_tip):
     may = np.zeros(len(small_tip), bool)
     may[np.argsort(-small_tip.positions[:, 2], kind="stable")[:20]] = True
     tip = ae.Tip.from_positions(small_tip.positions, small_tip.species, [nickel], evaporable=may)
-    batches = list(ae.Emitter(tip).advance(10_000))
+    batches = list(ae.evaporation.Emitter(tip).advance(10_000))
     assert batches[-1].status == EXHAUSTED
     assert sum(map(len, batches)) <= 20
 
 
 def test_bonds_are_those_of_the_atoms_left(tip12):
-    emitter = ae.Emitter(tip12)
+    emitter = ae.evaporation.Emitter(tip12)
     gone = np.concatenate([batch.site for batch in emitter.advance(80)])
     left = np.setdiff1d(np.arange(len(tip12)), gone)
     some = np.random.default_rng(1).choice(len(emitter.atoms), 200, replace=False)

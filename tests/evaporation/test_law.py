@@ -31,7 +31,7 @@ class WeaklyBound:
 
 
 def test_a_law_in_python_gives_the_sequence_of_the_compiled_one(tip12):
-    compiled, slow = ae.Emitter(tip12), ae.Emitter(tip12, law=InPython())
+    compiled, slow = ae.evaporation.Emitter(tip12), ae.evaporation.Emitter(tip12, law=InPython())
     assert isinstance(compiled._core.law, WeightedField) and isinstance(slow._core.law, PythonLaw)
     assert np.array_equal(sequence(compiled), sequence(slow))
 
@@ -52,7 +52,7 @@ def test_a_law_sees_field_and_bonds_of_the_atoms_around_every_hole(tip12):
             seen.update(zip(atoms.tolist(), zip(fields.tolist(), bonds.tolist(), strict=True), strict=True))
             return super().keys(tip, atoms, fields, bonds)
 
-    emitter = ae.Emitter(tip12, law=Seeing())
+    emitter = ae.evaporation.Emitter(tip12, law=Seeing())
     sequence(emitter, 40)
     assert len(emitter) > 4000
     for atom, field, bonds in zip(emitter.atoms, emitter.fields, emitter.bonds, strict=True):
@@ -60,7 +60,7 @@ def test_a_law_sees_field_and_bonds_of_the_atoms_around_every_hole(tip12):
 
 
 def test_bonds_change_the_order(tip12):
-    plain, bound = ae.Emitter(tip12), ae.Emitter(tip12, law=WeaklyBound(0.2))
+    plain, bound = ae.evaporation.Emitter(tip12), ae.evaporation.Emitter(tip12, law=WeaklyBound(0.2))
     first = int(np.argmax(WeaklyBound(0.2).keys(tip12, bound.atoms, bound.fields, bound.bonds)))
     first = bound.atoms[first]
     assert bound.evaporate(1).site[0] == first
@@ -93,4 +93,4 @@ class Bad:
 )
 def test_bad_laws_are_refused(small_tip, law, message):
     with pytest.raises(ValueError, match=message):
-        ae.Emitter(small_tip, law=law)
+        ae.evaporation.Emitter(small_tip, law=law)

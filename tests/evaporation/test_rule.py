@@ -46,8 +46,8 @@ def by_atom(emitter):
 
 
 def test_a_rule_in_python_is_the_twin_of_robin(tip12):
-    compiled = ae.Emitter(tip12, settings=ae.ChargeSettings(start_tolerance=1e-6))
-    slow = ae.Emitter(tip12, settings=ae.ChargeSettings(start_tolerance=1e-6), rule=SlowRobin())
+    compiled = ae.evaporation.Emitter(tip12, settings=ae.evaporation.ChargeSettings(start_tolerance=1e-6))
+    slow = ae.evaporation.Emitter(tip12, settings=ae.evaporation.ChargeSettings(start_tolerance=1e-6), rule=SlowRobin())
     assert isinstance(slow._core.rule, PythonRule)
     for events in (0, 12):
         first = np.concatenate([np.empty(0, int), *(batch.site for batch in compiled.advance(events))])
@@ -61,7 +61,7 @@ def test_a_rule_in_python_is_the_twin_of_robin(tip12):
 
 
 def test_a_rule_without_residuals_is_not_warned_of(small_tip):
-    run = ae.Simulation(small_tip, rule=SlowRobin(), watch_settings=ae.WatchSettings(interval=10)).run(
+    run = ae.Simulation(small_tip, rule=SlowRobin(), monitor=ae.simulation.Monitor(interval=10)).run(
         30, responses=False, progress=False
     )
     assert run.settings["rule"] == {"name": "SlowRobin", "sweeps": 200}
@@ -70,9 +70,9 @@ def test_a_rule_without_residuals_is_not_warned_of(small_tip):
 
 def test_two_emitters_may_share_a_rule(small_tip):
     rule = ae.Robin(tolerance=1e-4)
-    first, second = ae.Emitter(small_tip, rule=rule), ae.Emitter(small_tip, 500.0, rule=rule)
+    first, second = ae.evaporation.Emitter(small_tip, rule=rule), ae.evaporation.Emitter(small_tip, 500.0, rule=rule)
     assert first.rule is rule is second.rule
-    alone = ae.Emitter(small_tip, rule=ae.Robin(tolerance=1e-4))
+    alone = ae.evaporation.Emitter(small_tip, rule=ae.Robin(tolerance=1e-4))
     for emitter in (first, second, alone):
         assert len(list(emitter.advance(50))) > 0
     assert np.array_equal(first.charges, alone.charges)
@@ -80,7 +80,7 @@ def test_two_emitters_may_share_a_rule(small_tip):
 
 @pytest.mark.parametrize("other", [ae.Robin(tolerance=1e-1), ae.Robin(window=0)])
 def test_a_run_is_not_resumed_by_another_rule(small_tip, tmp_path, other):
-    checkpoint = ae.Checkpoint(tmp_path / "a.h5", resume=True)
+    checkpoint = ae.simulation.Checkpoint(tmp_path / "a.h5", resume=True)
     ae.Simulation(small_tip).run(20, responses=False, progress=False, checkpoint=checkpoint)
     with pytest.raises(ae.FileError, match=r"other settings: rule\."):
         ae.Simulation(small_tip, rule=other).run(40, responses=False, progress=False, checkpoint=checkpoint)
@@ -100,7 +100,7 @@ class NoCharges(SlowRobin):
 )
 def test_bad_rules_are_refused(small_tip, rule, message):
     with pytest.raises(ValueError, match=message):
-        ae.Emitter(small_tip, rule=rule)
+        ae.evaporation.Emitter(small_tip, rule=rule)
 
 
 @pytest.mark.parametrize("bad", [{"tolerance": 0.0}, {"tolerance": 2.0}, {"window": -1}, {"window": 100}])
@@ -114,7 +114,7 @@ def test_bad_parameters_of_robin_are_refused(bad):
 
 CONSTANT = [
     ae.ConstantPotential(),
-    ae.ConstantPotential(law_sees="others"),
+    ae.ConstantPotential(law_field="others"),
     ae.ConstantPotential(charges="gaussian", self_term=10.0),
     ae.ConstantPotential(self_term=4.0 / 0.352),  # some charges are negative
 ]
@@ -135,8 +135,8 @@ def potentials_of(emitter):
 
 @pytest.mark.parametrize("rule", CONSTANT, ids=NAMES)
 def test_potentials_are_kept_during_the_events(small_tip, rule):
-    settings = ae.ChargeSettings(opening_angle=0.2, update_radius=40.0)  # the whole specimen
-    emitter = ae.Emitter(small_tip, 1000.0, rule=rule, settings=settings)
+    settings = ae.evaporation.ChargeSettings(opening_angle=0.2, update_radius=40.0)  # the whole specimen
+    emitter = ae.evaporation.Emitter(small_tip, 1000.0, rule=rule, settings=settings)
     for number, batch in enumerate(emitter.advance(60, batch_size=20)):
         top = emitter.tip.positions[batch.site[-1]]
         near = np.linalg.norm(emitter.positions - top, axis=1) < 8 * 0.249
@@ -160,23 +160,25 @@ def test_potentials_are_kept_during_the_events(small_tip, rule):
 
 
 def test_negative_charges_are_counted_and_do_not_leave(small_tip):
-    emitter = ae.Emitter(small_tip, rule=CONSTANT[3])
+    emitter = ae.evaporation.Emitter(small_tip, rule=CONSTANT[3])
     assert emitter.counts["negative"] == np.count_nonzero(emitter.charges < 0) > 5
-    assert ae.Emitter(small_tip, rule=ae.ConstantPotential()).counts["negative"] <= 5
+    assert ae.evaporation.Emitter(small_tip, rule=ae.ConstantPotential()).counts["negative"] <= 5
     assert all((batch.charges > 0).all() for batch in emitter.advance(40))
     points = 5.0 * np.eye(3) + [0.0, 0.0, 2.0]
     assert emitter.field_at(points, 0.3) == pytest.approx(emitter.field_at(points, 0.0), rel=1e-3, abs=0.1)
 
 
 def test_a_law_can_see_the_field_of_the_others(small_tip):
-    emitter = ae.Emitter(small_tip, rule=CONSTANT[1], settings=ae.ChargeSettings(opening_angle=0.2))
+    emitter = ae.evaporation.Emitter(
+        small_tip, rule=CONSTANT[1], settings=ae.evaporation.ChargeSettings(opening_angle=0.2)
+    )
     list(emitter.advance(20))
     chosen = np.argsort(emitter.fields)[-30:]
     direct = COULOMB * direct_field(emitter.positions[chosen], emitter.positions, emitter.charges)
     exact = 2 * np.einsum("ij,ij->i", direct, emitter.normals[chosen])
     assert emitter.fields[chosen] == pytest.approx(exact, rel=2e-3)  # cells, and patches of single precision
-    of_charge = ae.Emitter(small_tip, rule=CONSTANT[0])
-    of_others = ae.Emitter(small_tip, rule=CONSTANT[1])
+    of_charge = ae.evaporation.Emitter(small_tip, rule=CONSTANT[0])
+    of_others = ae.evaporation.Emitter(small_tip, rule=CONSTANT[1])
     assert np.allclose(of_charge.charges, of_others.charges, rtol=0, atol=1e-12)
     # the same weighted mean, another contrast
     weights = of_charge.charges / of_charge.charges.sum()
@@ -186,23 +188,23 @@ def test_a_law_can_see_the_field_of_the_others(small_tip):
 
 @pytest.mark.parametrize("rule", CONSTANT, ids=NAMES)
 def test_bits_do_not_depend_on_threads_batches_and_resumes(small_tip, tmp_path, rule):
-    settings = ae.ChargeSettings(sweep_interval=15)
+    settings = ae.evaporation.ChargeSettings(sweep_interval=15)
 
     def simulation(**options):
         return ae.Simulation(small_tip, rule=rule, charge_settings=settings, seed=1, **options)
 
     whole = simulation(n_threads=1).run(50, progress=False)
     assert whole.fingerprint() == simulation(n_threads=2).run(50, progress=False).fingerprint()
-    checkpoint = ae.Checkpoint(tmp_path / "a.h5", resume=True)
+    checkpoint = ae.simulation.Checkpoint(tmp_path / "a.h5", resume=True)
     simulation().run(20, progress=False, checkpoint=checkpoint)
     again = simulation().run(50, progress=False, checkpoint=checkpoint)
     assert again.fingerprint() == whole.fingerprint()
     assert whole.settings["rule"]["name"] == "ConstantPotential"
     # the polynomials of the responses give the hits
     hits = whole.hits(ae.RollUp(ae.TruncatedNormal(0.155, 0.155)))
-    assert np.isfinite(hits.x[hits.outcome == ae.Outcome.HIT]).all()
-    assert hits.counts[ae.Outcome.HIT] > 40
-    emitters = [ae.Emitter(small_tip, rule=rule, settings=settings) for _ in range(2)]
+    assert np.isfinite(hits.x[hits.outcome == ae.detection.Outcome.HIT]).all()
+    assert hits.counts[ae.detection.Outcome.HIT] > 40
+    emitters = [ae.evaporation.Emitter(small_tip, rule=rule, settings=settings) for _ in range(2)]
     for emitter, size in zip(emitters, (1, 40), strict=True):
         list(emitter.advance(40, batch_size=size))
     assert np.array_equal(*(emitter.charges for emitter in emitters))
@@ -213,7 +215,7 @@ def test_bits_do_not_depend_on_threads_batches_and_resumes(small_tip, tmp_path, 
     [
         ({"self_term": 0}, "^self_term must be .* got"),
         ({"charges": "spheres"}, "^charges must be one of points, gaussian, got"),
-        ({"law_sees": "all"}, "^law_sees must be one of charge, others, got"),
+        ({"law_field": "all"}, "^law_field must be one of charge, others, got"),
         ({"tolerance": 1e-9}, "^tolerance must be .* got"),
     ],
 )
@@ -224,6 +226,6 @@ def test_bad_parameters_of_the_constant_potential_are_refused(bad, message):
 
 def test_the_tolerance_of_relaxations_is_that_of_the_rule(tip12):
     for rule, expected in ((None, 3e-3), (ae.Robin(), 3e-3), (ae.ConstantPotential(), 8e-3)):
-        assert ae.Emitter(tip12, rule=rule).settings.tolerance == expected
-    given = ae.ChargeSettings(tolerance=1e-3)
-    assert ae.Emitter(tip12, rule=ae.ConstantPotential(), settings=given).settings == given
+        assert ae.evaporation.Emitter(tip12, rule=rule).settings.tolerance == expected
+    given = ae.evaporation.ChargeSettings(tolerance=1e-3)
+    assert ae.evaporation.Emitter(tip12, rule=ae.ConstantPotential(), settings=given).settings == given

@@ -18,7 +18,7 @@ CHANCE = 1e-3
 
 def emitter_of(tip, law, **options):
     """An emitter of one thread: tests run side by side."""
-    return ae.Emitter(tip, law=law, **{"n_threads": 1} | options)
+    return ae.evaporation.Emitter(tip, law=law, **{"n_threads": 1} | options)
 
 
 def course(emitter, n, batch_size=256):
@@ -281,7 +281,7 @@ def test_events_and_the_starts_of_ions_have_different_random_numbers(tip12):
     emitter = emitter_of(tip12, ae.Arrhenius(300.0), seed=5)
     alike = 0
     for ion in range(40):
-        slot = emitter._core.chooser.chosen(ae.IonRandom(5, [ion]).uniform()[0, 0])
+        slot = emitter._core.chooser.chosen(ae.emission.IonRandom(5, [ion]).uniform()[0, 0])
         alike += int(emitter._core.tree.atoms[slot] == emitter.evaporate(1).site[0])
     assert alike < 10  # one of about 180 candidates is the same by chance once in 100 events
 
@@ -319,7 +319,7 @@ def test_the_voltage_follows_the_waits(tip12):
 def test_a_relaxation_keeps_the_rate(tip12, barrier):
     """The new factor of the voltage gives the rate that the control had reached, on the surface before."""
     law = ae.Arrhenius(50.0, barrier=barrier)
-    emitter = emitter_of(tip12, law, settings=ae.ChargeSettings(sweep_interval=60), seed=2)
+    emitter = emitter_of(tip12, law, settings=ae.evaporation.ChargeSettings(sweep_interval=60), seed=2)
     kernel = law.kernel(tip12)
     for _ in range(2):
         assert emitter.evaporate(60).status != TOO_SHALLOW
@@ -368,8 +368,8 @@ def test_a_longer_memory_is_a_smoother_voltage(small_tip):
 
 def test_the_voltage_does_not_depend_on_the_applied_one(tip12):
     """Charges are in proportion to the voltage, so the control finds the same one from any."""
-    one = course(ae.Emitter(tip12, 1000.0, law=ae.Arrhenius(50.0), seed=1, n_threads=1), 100)
-    two = course(ae.Emitter(tip12, 2000.0, law=ae.Arrhenius(50.0), seed=1, n_threads=1), 100)
+    one = course(ae.evaporation.Emitter(tip12, 1000.0, law=ae.Arrhenius(50.0), seed=1, n_threads=1), 100)
+    two = course(ae.evaporation.Emitter(tip12, 2000.0, law=ae.Arrhenius(50.0), seed=1, n_threads=1), 100)
     assert np.array_equal(one[0], two[0])
     assert two[1] == pytest.approx(2 * one[1], rel=1e-9)  # charges converge to rounding in the same steps
     assert two[3] == pytest.approx(one[3], rel=1e-9)
@@ -463,15 +463,15 @@ def test_sensitivities_that_do_not_fit_the_specimen(alloy, sensitivity, message)
 
 def test_temperatures_of_both_sides():
     positions = np.array([[5.0, 0, 0], [0, 0, 5.0], [-5.0, 0, 0], [0, 5.0, 0], [8.0, 0, -9.0]])
-    laser = ae.Laser(100.0, direction=(3.0, 0.0), asymmetry=1.0)
+    laser = ae.evaporation.Laser(100.0, direction=(3.0, 0.0), asymmetry=1.0)
     assert laser.temperatures(positions, 5.0, 40.0) == pytest.approx([140, 90, 40, 90, 140], rel=1e-15)  # one rounding
-    laser = ae.Laser(100.0, direction=(0.0, -0.1), asymmetry=0.25)
+    laser = ae.evaporation.Laser(100.0, direction=(0.0, -0.1), asymmetry=0.25)
     assert laser.temperatures(positions, 5.0, 40.0)[[1, 3]] == pytest.approx([120, 100], rel=1e-15)
-    assert (ae.Laser(100.0).temperatures(positions, 5.0, 40.0) == 140.0).all()
+    assert (ae.evaporation.Laser(100.0).temperatures(positions, 5.0, 40.0) == 140.0).all()
 
 
 def test_an_even_laser_is_a_higher_temperature(tip12):
-    law, rate = ae.Arrhenius(30.0, laser=ae.Laser(100.0, 100.0)), 1e-6
+    law, rate = ae.Arrhenius(30.0, laser=ae.evaporation.Laser(100.0, 100.0)), 1e-6
     heated = emitter_of(tip12, law, control=ae.VoltageControl(rate=rate, pulse_fraction=0.0), seed=3)
     assert heated.pulse_length == law.working_point(1.0, heated.control)[1]
     per_second = ae.VoltageControl(rate=rate / heated.pulse_length, pulse_fraction=0.0)
@@ -483,7 +483,7 @@ def test_an_even_laser_is_a_higher_temperature(tip12):
 def test_more_ions_come_from_the_hot_side(tip12):
     fractions = []
     for asymmetry in (0.0, 1.0):
-        laser = ae.Laser(100.0, 1.0, direction=(1.0, 1.0), asymmetry=asymmetry)
+        laser = ae.evaporation.Laser(100.0, 1.0, direction=(1.0, 1.0), asymmetry=asymmetry)
         sites = course(emitter_of(tip12, ae.Arrhenius(30.0, laser=laser), seed=1), 700)[0]
         fractions.append((tip12.positions[sites][:, :2] @ [1.0, 1.0] > 0).mean())
     # 1.9 % is a standard deviation of 700 draws; neighbouring events are correlated, so four times of it
@@ -494,7 +494,7 @@ def test_more_ions_come_from_the_hot_side(tip12):
 @pytest.mark.parametrize(("base", "rise", "decay"), [(30.0, 100.0, 1.0), (50.0, 200.0, 0.5)])
 def test_time_of_a_laser_pulse(base, rise, decay):
     """The first order of 1/T against an integral of the rate while the specimen cools."""
-    law = ae.Arrhenius(base, laser=ae.Laser(rise, decay))
+    law = ae.Arrhenius(base, laser=ae.evaporation.Laser(rise, decay))
     barrier, length = law.working_point(1.0, law.default_control())
     t = np.linspace(0, 5 * decay, 100_001)
     temperature = base + rise * np.exp(-t / decay)
@@ -508,7 +508,7 @@ def test_time_of_a_laser_pulse(base, rise, decay):
 
 def test_light_on_one_side_of_a_cold_specimen(small_tip):
     """The far side stays at 0 K: its atoms do not leave, those of the hot side do."""
-    laser = ae.Laser(100.0, asymmetry=1.0)
+    laser = ae.evaporation.Laser(100.0, asymmetry=1.0)
     emitter = emitter_of(small_tip, ae.Arrhenius(5.0, laser=laser), seed=1)
     sites, _, waits, voltages = course(emitter, 100)
     assert np.isfinite(waits).all() and np.isfinite(voltages).all()
@@ -517,7 +517,7 @@ def test_light_on_one_side_of_a_cold_specimen(small_tip):
 
 def test_a_laser_needs_a_temperature():
     with pytest.raises(ValueError, match=r"temperature must be .* > 0 \(the far side stays at it\), got 0"):
-        ae.Arrhenius(0.0, laser=ae.Laser(100.0))
+        ae.Arrhenius(0.0, laser=ae.evaporation.Laser(100.0))
 
 
 # ---- continuing ----------------------------------------------------------------------------------------------------
@@ -525,7 +525,9 @@ def test_a_laser_needs_a_temperature():
 
 def test_a_restored_emitter_continues_with_the_same_bits(shell):
     def emitter(seed=4):
-        return emitter_of(shell, ae.Arrhenius(60.0), settings=ae.ChargeSettings(sweep_interval=80), seed=seed)
+        return emitter_of(
+            shell, ae.Arrhenius(60.0), settings=ae.evaporation.ChargeSettings(sweep_interval=80), seed=seed
+        )
 
     first = emitter()
     course(first, 275)  # deepened once, and 35 events after a relaxation
@@ -542,12 +544,16 @@ def test_a_restored_emitter_continues_with_the_same_bits(shell):
 
 def simulation(**options):
     tip = ae.Tip("Ni", apex_radius=1.5, axis=(1, 1, 1), shank_length=1.5)
-    options = {"law": ae.Arrhenius(60.0), "charge_settings": ae.ChargeSettings(sweep_interval=40), "seed": 5} | options
+    options = {
+        "law": ae.Arrhenius(60.0),
+        "charge_settings": ae.evaporation.ChargeSettings(sweep_interval=40),
+        "seed": 5,
+    } | options
     return ae.Simulation(tip, n_threads=1, **options)
 
 
 def run(n_ions, path=None, **options):
-    checkpoint = None if path is None else ae.Checkpoint(path, minutes=0, resume=True)
+    checkpoint = None if path is None else ae.simulation.Checkpoint(path, minutes=0, resume=True)
     return simulation(**options).run(n_ions, responses=False, progress=False, batch_size=25, checkpoint=checkpoint)
 
 
@@ -572,7 +578,7 @@ def test_times_and_voltages_are_in_the_fingerprint():
 
 
 def test_law_control_and_pulse_length_are_in_the_settings():
-    law = ae.Arrhenius(60.0, {"Ni": 0.8}, 1e12, "parabolic", ae.Laser(50.0, 2.0, (0.0, 1.0), 0.5))
+    law = ae.Arrhenius(60.0, {"Ni": 0.8}, 1e12, "parabolic", ae.evaporation.Laser(50.0, 2.0, (0.0, 1.0), 0.5))
     settings = run(5, law=law, control=ae.VoltageControl(rate=0.02, pulse_fraction=0.0)).settings
     assert settings["law"] == {
         "name": "Arrhenius",
@@ -607,11 +613,14 @@ def test_a_run_without_a_temperature_has_no_times(small_tip):
         (lambda: ae.Arrhenius(50.0, barrier="cubic"), "barrier must be one of linear, image_hump, .*, got 'cubic'"),
         (lambda: ae.Arrhenius(50.0, laser=50.0), "laser must be a Laser or None, got 50.0"),
         (lambda: ae.Arrhenius(50.0, bonds=3), "bonds must be an evaporation field by bonds .*, got 3"),
-        (lambda: ae.Laser(0.0), "temperature_rise must be a finite number .K. > 0"),
-        (lambda: ae.Laser(50.0, decay=0.0), "decay must be a finite number .ns. > 0"),
-        (lambda: ae.Laser(50.0, asymmetry=1.5), "asymmetry must be a finite number >= 0 and <= 1, got 1.5"),
-        (lambda: ae.Laser(50.0, direction=(0.0, 0.0)), r"direction must not be zero, got \(0.0, 0.0\)"),
-        (lambda: ae.Laser(50.0, direction=(1.0, 0.0, 0.0)), r"direction must have shape \(2,\), got \(3,\)"),
+        (lambda: ae.evaporation.Laser(0.0), "temperature_rise must be a finite number .K. > 0"),
+        (lambda: ae.evaporation.Laser(50.0, decay=0.0), "decay must be a finite number .ns. > 0"),
+        (lambda: ae.evaporation.Laser(50.0, asymmetry=1.5), "asymmetry must be a finite number >= 0 and <= 1, got 1.5"),
+        (lambda: ae.evaporation.Laser(50.0, direction=(0.0, 0.0)), r"direction must not be zero, got \(0.0, 0.0\)"),
+        (
+            lambda: ae.evaporation.Laser(50.0, direction=(1.0, 0.0, 0.0)),
+            r"direction must have shape \(2,\), got \(3,\)",
+        ),
     ],
 )
 def test_bad_laws_are_refused(make, message):

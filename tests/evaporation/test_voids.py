@@ -12,21 +12,25 @@ from apt_evap._core.neighbourhood import Neighbourhood
 AL = ae.material("Al")
 D = AL.nearest_neighbour_distance
 SHAPE = {"apex_radius": 4.0, "shank_length": 4.0, "axis": (1, 1, 1)}
-VOID = ae.Sphere((0.3, 0, 1.2), 1.3)
+VOID = ae.specimen.Sphere((0.3, 0, 1.2), 1.3)
 
 
 def with_void(**more):
-    return ae.Tip(phases=[ae.Phase("matrix", AL), ae.Phase("void", AL, VOID, vacancies=1)], **SHAPE, **more)
+    return ae.Tip(
+        phases=[ae.specimen.Phase("matrix", AL), ae.specimen.Phase("void", AL, VOID, vacancies=1)], **SHAPE, **more
+    )
 
 
 def grains(**more):
-    second = ae.Phase("second", AL, ae.HalfSpace((0.1, 0, 0), (1, 0, 0.3)), axis=(0, 0, 1), evaporation_field=16.0)
-    return ae.Tip(phases=[ae.Phase("first", AL), second], **SHAPE, **more)
+    second = ae.specimen.Phase(
+        "second", AL, ae.specimen.HalfSpace((0.1, 0, 0), (1, 0, 0.3)), axis=(0, 0, 1), evaporation_field=16.0
+    )
+    return ae.Tip(phases=[ae.specimen.Phase("first", AL), second], **SHAPE, **more)
 
 
 def precipitate(**more):
-    ball = ae.Phase("ball", "W", ae.Sphere((0, 0, 2.5), 1.6), axis=(0, 1, 1))
-    return ae.Tip(phases=[ae.Phase("matrix", AL, vacancies=0.03), ball], seed=2, **SHAPE, **more)
+    ball = ae.specimen.Phase("ball", "W", ae.specimen.Sphere((0, 0, 2.5), 1.6), axis=(0, 1, 1))
+    return ae.Tip(phases=[ae.specimen.Phase("matrix", AL, vacancies=0.03), ball], seed=2, **SHAPE, **more)
 
 
 def depth_of_surface(emitter):
@@ -35,17 +39,17 @@ def depth_of_surface(emitter):
 
 @pytest.mark.parametrize("fraction", [0.001, 0.01, 0.05])
 def test_vacancies_expose_nothing_deep(fraction):
-    tip = ae.Tip(phases=[ae.Phase("matrix", AL, vacancies=fraction)], seed=1, **SHAPE)
-    assert depth_of_surface(ae.Emitter(tip, n_threads=1)) < 3 * D
+    tip = ae.Tip(phases=[ae.specimen.Phase("matrix", AL, vacancies=fraction)], seed=1, **SHAPE)
+    assert depth_of_surface(ae.evaporation.Emitter(tip, n_threads=1)) < 3 * D
 
 
 def test_a_boundary_exposes_nothing_deep():
-    assert depth_of_surface(ae.Emitter(grains(), n_threads=1)) < 3 * D
+    assert depth_of_surface(ae.evaporation.Emitter(grains(), n_threads=1)) < 3 * D
 
 
 def test_the_wall_of_a_closed_void_is_no_surface_until_it_opens():
     tip = with_void()
-    emitter = ae.Emitter(tip, n_threads=1)
+    emitter = ae.evaporation.Emitter(tip, n_threads=1)
     assert depth_of_surface(emitter) < 3 * D
     wall = np.flatnonzero((np.abs(VOID.distance(tip.positions)) < 0.3 * D) & (tip.positions[:, 2] < 1.0))
     sizes, opened = [], None
@@ -68,7 +72,7 @@ def test_a_void_that_opens_is_the_same_in_a_deeper_shell_and_after_a_resume(tmp_
     simulation = ae.Simulation(tip, n_threads=1)
     whole = simulation.run(3500, responses=False, progress=False)
     assert whole.state.deepened
-    checkpoint = ae.Checkpoint(tmp_path / "run.h5", resume=True)
+    checkpoint = ae.simulation.Checkpoint(tmp_path / "run.h5", resume=True)
     for ions in (1900, 3500):
         run = ae.Simulation(tip, n_threads=1).run(ions, responses=False, progress=False, checkpoint=checkpoint)
     assert run.fingerprint() == whole.fingerprint()
@@ -89,7 +93,7 @@ def floating(tip, removed):
 
 
 def check_hold(tip, n_events, step):
-    emitter = ae.Emitter(tip, n_threads=1)
+    emitter = ae.evaporation.Emitter(tip, n_threads=1)
     removed = [np.empty(0, np.int64)]
     assert np.array_equal(floating(tip, removed[0]), emitter._core.atoms.waiting_atoms)
     while sum(map(len, removed)) < n_events:
@@ -110,10 +114,10 @@ def test_nothing_floats_after_many_events(make):
 
 
 def test_a_part_that_has_no_hold_from_the_beginning_leaves_first():
-    gap = ae.Phase("gap", AL, ae.Layer(3.2, 3.6), vacancies=1)  # the top of the cap floats above it
-    tip = ae.Tip(phases=[ae.Phase("matrix", AL), gap], **SHAPE)
+    gap = ae.specimen.Phase("gap", AL, ae.specimen.Layer(3.2, 3.6), vacancies=1)  # the top of the cap floats above it
+    tip = ae.Tip(phases=[ae.specimen.Phase("matrix", AL), gap], **SHAPE)
     top = np.flatnonzero(tip.positions[:, 2] > 3.4)
-    emitter = ae.Emitter(tip, n_threads=1)
+    emitter = ae.evaporation.Emitter(tip, n_threads=1)
     batches = list(emitter.advance(len(top)))
     assert len(top) > 20 and all(batch.detached.all() for batch in batches)
     assert sorted(site for batch in batches for site in batch.site) == top.tolist()

@@ -15,7 +15,7 @@ from apt_evap.cli.main import main
 from apt_evap.cli.parser import make_parser
 from apt_evap.explore.controls import MECHANISMS, controls_of, perturbation_of, values_of
 from apt_evap.explore.explorer import Explorer, View
-from apt_evap.explore.specimen_image import SIDES, specimen_image
+from apt_evap.explore.surface_image import SIDES, specimen_image
 
 TURNED = ae.Registration(20.0, 0.5, (1.0, -2.0), True)
 ENERGY = ae.TruncatedNormal(0.2, 0.1)
@@ -63,7 +63,7 @@ def test_maps_have_the_bits_of_the_library(run, measured, perturbation, units):
         like = explorer.bins_like(24)
         map = TURNED.hits(run.hits(perturbation)).map(like=like)
         assert equal(shown.simulated, map) and shown.measured is like
-        similarity = ae.ssim(map.flattened(8.0), like.flattened(8.0), smoothing=2.0)
+        similarity = ae.similarity(map.flattened(8.0), like.flattened(8.0), smoothing=2.0)
         assert shown.similarity.value == similarity.value
         assert np.array_equal(shown.pictures[0].density, map.flattened(8.0).smoothed(2.0).density, equal_nan=True)
         assert shown.ions == len(run) and not shown.preview
@@ -71,7 +71,7 @@ def test_maps_have_the_bits_of_the_library(run, measured, perturbation, units):
     with pytest.raises(ValueError, match="sigma must be"):
         explorer.show(replace(view, flattening=1e4))  # wider than the map
     plain = explorer.show(replace(view, flattening=0.0))
-    assert plain.ceiling.value == ae.half_ceiling(like, smoothing=2.0).value
+    assert plain.ceiling.value == ae.maps.similarity_ceiling(like, smoothing=2.0).value
 
 
 def test_a_flown_perturbation_has_the_bits_of_its_flights(small_tip):
@@ -225,7 +225,7 @@ def test_profiles_across_a_line(explorer):
     assert rectangle.centre == (0.0, 0.0) and rectangle.angle == pytest.approx(45)
     assert rectangle.length == pytest.approx(20 * np.sqrt(2)) and rectangle.width == 12.0
     for map, profile in zip((shown.simulated, shown.measured), profiles, strict=True):
-        expected = ae.zone_line_profile(map, rectangle, bins=len(profile.position))
+        expected = ae.maps.zone_line_profile(map, rectangle, bins=len(profile.position))
         assert np.array_equal(profile.density, expected.density, equal_nan=True)
     with pytest.raises(ValueError, match="length"):
         explorer.profiles(shown, [[1.0, 1.0], [1.0, 1.0]], 3.0)
@@ -236,13 +236,13 @@ def test_rings_about_the_pole(made_once, tip20):
     make = lambda: ae.Simulation(tip20, seed=1, **ROUGH).run(6000, progress=False)  # noqa: E731
     run = made_once("explored20", make)
     registration = ae.Registration(33.0, 0.4, (4.0, -3.0))
-    projection = ae.image_compression(run).projection
+    projection = ae.analysis.image_compression(run).projection
     alone = Explorer(run)
     assert alone.pole.label == "$111$" and alone.pole.fold == 3
     assert alone.pole.place == pytest.approx((0.0, 0.0), abs=1e-9)  # mm: rounding
     shown = alone.show(View(ae.Unperturbed(), 256, 0.0))
     (rings,) = alone.rings(shown)
-    for ring, expected in zip(rings, ae.ring_statistics(shown.simulated, projection, fold=3), strict=True):
+    for ring, expected in zip(rings, ae.maps.ring_statistics(shown.simulated, projection, fold=3), strict=True):
         assert ring.contrast == pytest.approx(expected.contrast, rel=1e-9)
     measured = registration.hits(run.hits(ae.Unperturbed())).within_circle(30.0, registration.shift)
     explorer = Explorer(run, ae.Hits(x=measured.x, y=measured.y), registration)
@@ -301,8 +301,8 @@ def test_controls_and_perturbations_are_the_same(mechanism):
     assert name == mechanism and back == pytest.approx(values, rel=1e-8)  # standard deviations have 9 digits
     assert perturbation_of(name, back) == perturbation
     if "mean" in values:  # an unperturbed ion has a height, but no energy
-        equal_energies = perturbation_of(mechanism, values | {"rsd": 0.0})
-        assert equal_energies.energy == ae.Fixed(values["mean"])
+        equal_energies = perturbation_of(mechanism, values | {"relative_spread": 0.0})
+        assert equal_energies.energy == ae.emission.Fixed(values["mean"])
         with pytest.raises(ValueError, match="'mean'"):
             perturbation_of(mechanism, {})
 
@@ -321,8 +321,8 @@ def test_controls_are_those_that_the_run_serves(run):
 
 def test_perturbations_without_controls():
     widths = ae.RollUp(ae.TruncatedNormal(0.2, 0.1), 0.5, others=ae.TruncatedNormal(0.1, 0.1))
-    others = widths, ae.RollUp(0.2, ae.ChargeRatio(0.9)), ae.Combined(0.2, 0.5, others=0.1)
-    energies = ae.RollUp(ae.Thermal(50.0)), ae.LateralVelocity(ae.TruncatedNormal(0.0, 0.1))
+    others = widths, ae.RollUp(0.2, ae.emission.ChargeRatio(0.9)), ae.Combined(0.2, 0.5, others=0.1)
+    energies = ae.RollUp(ae.emission.Thermal(50.0)), ae.LateralVelocity(ae.TruncatedNormal(0.0, 0.1))
     for perturbation in (*others, *energies, "RollUp"):
         with pytest.raises(ValueError, match="the explorer has controls for"):
             values_of(perturbation)

@@ -279,7 +279,7 @@ def test_one_map_without_a_measurement(run):
     opened = Opened(Explorer(run), view=View(ae.LateralVelocity(0.2), 32, 4.0))
     page = opened.page
     assert len(page.maps) == 1 and not page.mode.visible and not page.registration.visible
-    assert page.mechanism.active == 1 and page.sliders["rsd"].value == 0.0
+    assert page.mechanism.active == 1 and page.sliders["relative_spread"].value == 0.0
     throttled(page.sliders["mean"], 0.3)
     opened.settle(opened.shows)
     assert "similarity" not in page.readout.text and page.shell.text.startswith("apt-evap map RUN.h5")

@@ -315,7 +315,7 @@ def test_flights_that_share_their_steps(scene, tip12):
 
 def test_flights_follow_the_events(tip12):
     """Each ion flies in the field that its own event left behind: in a copy of the surface, replayed so far."""
-    emitter = ae.Emitter(tip12)
+    emitter = ae.evaporation.Emitter(tip12)
     batch = emitter.evaporate(30)
     starts = tip12.positions[batch.site]
     flights = Flights(batch.tree, coulomb=COULOMB, opening_angle=0.3, tolerance=1e-3, max_steps=500, **options(tip12))
@@ -340,7 +340,7 @@ def test_flights_follow_the_events(tip12):
 
 def test_flights_halt_and_go_on(tip12):
     """Halted, they take no ion; batch by batch the surface is followed to the state it has after all events."""
-    emitter = ae.Emitter(tip12)
+    emitter = ae.evaporation.Emitter(tip12)
     first, second = emitter.evaporate(10), emitter.evaporate(10)
     flights = Flights(first.tree, coulomb=COULOMB, opening_angle=0.3, tolerance=1e-3, max_steps=500, **options(tip12))
     expected = Flights(first.tree, coulomb=COULOMB, opening_angle=0.3, tolerance=1e-3, max_steps=500, **options(tip12))

@@ -39,10 +39,10 @@ def test_designs_fix_their_polynomials(name):
 
 def test_a_design_that_fixes_nothing_is_refused():
     with pytest.raises(ValueError, match="must determine the 6 coefficients of degree 2"):
-        ae.Design(2, ((0.0, 1), (1.0, 4)))  # five launches for six numbers
+        ae.flight.Design(2, ((0.0, 1), (1.0, 4)))  # five launches for six numbers
     with pytest.raises(ValueError, match="must determine"):
-        ae.Design(2, ((1.0, 12),))  # on a circle u^2 + v^2 = 1 is no news
-    ae.Design(2, ((0.0, 1), (1.0, 5)))
+        ae.flight.Design(2, ((1.0, 12),))  # on a circle u^2 + v^2 = 1 is no news
+    ae.flight.Design(2, ((0.0, 1), (1.0, 5)))
 
 
 @given(
@@ -51,7 +51,7 @@ def test_a_design_that_fixes_nothing_is_refused():
     seed=st.integers(0, 1000),
 )
 def test_polynomials_are_found_again(degree, coefficients, seed):
-    design = ae.Design(degree, ((0.0, 1), (0.5, 11), (1.0, 13)))
+    design = ae.flight.Design(degree, ((0.0, 1), (0.5, 11), (1.0, 13)))
     coefficients = coefficients[:, :, : (degree + 1) * (degree + 2) // 2]
     values = np.einsum("mc,nkc->nmk", design.monomials(design.launches), coefficients)
     fitted, residual = design.fit(values)
@@ -70,7 +70,7 @@ def test_polynomials_are_found_again(degree, coefficients, seed):
 
 
 def test_the_residual_is_that_of_the_fit():
-    design = ae.Design(1, ((0.0, 1), (1.0, 8)))
+    design = ae.flight.Design(1, ((0.0, 1), (1.0, 8)))
     u, v = design.launches.T
     values = np.stack([u * u - v * v, 2 * u * v, u], axis=1)[None]  # the first two are none of 1, u, v
     _, residual = design.fit(values)
@@ -163,7 +163,7 @@ def test_higher_degree_is_better(tip12):
     perturbation = ae.Combined(WIDE, 0.25)
     errors = []
     for degree in (1, 2, 3):
-        design = ae.Design(degree, ((0.0, 1), (0.55, 7), (1.0, 9)))
+        design = ae.flight.Design(degree, ((0.0, 1), (0.55, 7), (1.0, 9)))
         settings = ae.ResponseSettings(site=design, rolled=design)
         run = ae.Simulation(tip12, seed=3, response_settings=settings).run(100, [perturbation], progress=False)
         flown, by_response = run.hits(perturbation), replace(run, perturbations=(), flown=()).hits(perturbation)
@@ -182,7 +182,7 @@ def test_bad_fits_are_flagged(run):
 
 def test_a_launch_that_never_meets_the_plane_leaves_no_infinite_time():
     """Ions at a wide angle meet an equidistant detector though one of their launches flies away from its plane."""
-    design = ae.Design(1, ((0.0, 1), (1.0, 4)))
+    design = ae.flight.Design(1, ((0.0, 1), (1.0, 4)))
     values = np.zeros((2, 5, 3))
     values[:, :, 0] = design.launches[:, 0]
     values[:, :, 2] = 100.0

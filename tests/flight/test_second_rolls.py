@@ -50,14 +50,14 @@ def line_of_atoms():
 
 def test_launches_by_hand():
     emissions = line_of_atoms()
-    launches = ae.RollUp(0.3, second_roll=1.0).launch(emissions, ae.IonRandom(1, emissions.ions))
+    launches = ae.RollUp(0.3, second_roll=1.0).launch(emissions, ae.emission.IonRandom(1, emissions.ions))
     np.testing.assert_allclose(launches.positions, [[D, D, D], [5 + D, 0, D]], rtol=0, atol=1e-15)
     speed = np.linalg.norm(launches.velocities, axis=1)
     # the first one moves in the direction of its second step, the other in that of its only one
     np.testing.assert_allclose(launches.velocities / speed[:, None], [[0, 1, 0], [1, 0, 0]], atol=1e-15)
     np.testing.assert_allclose(speed, speed[0], rtol=1e-15)
     # means: (D, D)/2 first, then (D, D) and (2 D, 0) with the weights 1 and exp(-1/2 / 0.5)
-    soft = ae.RollUp(0.3, sharpness=0.5, second_roll=1.0).launch(emissions, ae.IonRandom(1, emissions.ions))
+    soft = ae.RollUp(0.3, sharpness=0.5, second_roll=1.0).launch(emissions, ae.emission.IonRandom(1, emissions.ions))
     weight = np.exp(-1.0) / (1 + np.exp(-1.0))
     place = np.array([D + weight * D, D - weight * D, D])
     np.testing.assert_allclose(soft.positions[0], place, rtol=1e-14)
@@ -70,7 +70,7 @@ def test_launches_by_hand():
 def test_no_second_roll_is_the_usual_roll_up():
     emissions = line_of_atoms()
     one, other = (
-        each.tangential(emissions, ae.IonRandom(1, emissions.ions))
+        each.tangential(emissions, ae.emission.IonRandom(1, emissions.ions))
         for each in (ae.RollUp(ENERGY, 0.5), ae.RollUp(ENERGY, 0.5, second_roll=1e-12))
     )
     for name in ("rolled", "first", "second"):
@@ -87,7 +87,7 @@ def test_the_share_of_second_rolls_is_the_probability():
         ions=np.arange(n),
         nearest_neighbour_distance=D,
     )
-    launches = ae.RollUp(0.1, 0.6, second_roll=0.3).tangential(many, ae.IonRandom(3, many.ions))
+    launches = ae.RollUp(0.1, 0.6, second_roll=0.3).tangential(many, ae.emission.IonRandom(3, many.ions))
     # four standard deviations; the two decisions are independent
     assert abs(launches.rolled.mean() - 0.6) < 4 * np.sqrt(0.24 / n)
     assert abs(launches.twice.mean() - 0.18) < 4 * np.sqrt(0.15 / n)

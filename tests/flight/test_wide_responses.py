@@ -12,7 +12,7 @@ ENERGY = ae.TruncatedNormal(0.155, 0.155)
 FLOWN = (
     ae.RollUp(ENERGY, sharpness=0.15, height=0.1),
     ae.RollUp(0.5, probability=0.6, sharpness=0.5, others=0.3),
-    ae.RollUp(0.2, ae.ChargeRatio(0.9, 0.05), height=0.05),
+    ae.RollUp(0.2, ae.emission.ChargeRatio(0.9, 0.05), height=0.05),
     ae.Combined(1.0, 0.6, probability=0.5, sharpness=0.05, height=0.2),
     ae.LateralVelocity(0.4, height=0.15),
     ae.Unperturbed(height=0.1),
@@ -42,15 +42,15 @@ def test_hits_are_those_of_flights(run, perturbation):
 
 
 def test_the_limits_of_the_options_are_the_usual_launches(run):
-    usual = ae.RollUp(ENERGY).tangential(run.emissions, ae.IonRandom(1, run.emissions.ions))
-    soft = ae.RollUp(ENERGY, sharpness=1e-6).tangential(run.emissions, ae.IonRandom(1, run.emissions.ions))
+    usual = ae.RollUp(ENERGY).tangential(run.emissions, ae.emission.IonRandom(1, run.emissions.ions))
+    soft = ae.RollUp(ENERGY, sharpness=1e-6).tangential(run.emissions, ae.emission.IonRandom(1, run.emissions.ions))
     # equal charges are the only neighbours with a share
     ratios = run.emissions.charge_ratios
     unequal = ~(ratios[:, 1] > ratios[:, 0] * (1 - 1e-4))
     assert unequal.sum() > 100
     np.testing.assert_allclose(soft.first[unequal], usual.first[unequal], rtol=1e-9, atol=1e-12)
     assert (soft.shares[unequal, 0] > 1 - 1e-9).all()
-    never = ae.RollUp(ENERGY, probability=0.0).tangential(run.emissions, ae.IonRandom(1, run.emissions.ions))
+    never = ae.RollUp(ENERGY, probability=0.0).tangential(run.emissions, ae.emission.IonRandom(1, run.emissions.ions))
     assert not never.rolled.any() and not np.hypot(never.first, never.second).any()
     others = ae.RollUp(0.7, probability=0.0, others=ENERGY)
     lateral = run.hits(ae.LateralVelocity(ENERGY))
@@ -64,7 +64,7 @@ def test_shares_and_targets(run):
     ratios = emissions.charge_ratios
     known = np.isfinite(ratios).all(axis=1)
     assert known.sum() > 90 and (np.diff(ratios[known], axis=1) <= 0).all()
-    shares = ae.target_shares(emissions, 0.2)
+    shares = ae.emission.target_shares(emissions, 0.2)
     np.testing.assert_allclose(shares.sum(axis=1), 1.0, rtol=1e-14)
     np.testing.assert_allclose(
         shares[known, 1] / shares[known, 0], np.exp((ratios[known, 1] / ratios[known, 0] - 1) / 0.2), rtol=1e-12
@@ -75,14 +75,14 @@ def test_shares_and_targets(run):
 
 
 def test_the_probability_is_that_of_the_ions(run):
-    random = ae.IonRandom(3, run.emissions.ions)
-    p = ae.ChargeRatio(0.85, 0.1).probabilities(run.emissions)
+    random = ae.emission.IonRandom(3, run.emissions.ions)
+    p = ae.emission.ChargeRatio(0.85, 0.1).probabilities(run.emissions)
     ratios = np.nan_to_num(run.emissions.charge_ratios[:, 0])
     np.testing.assert_allclose(p, 1 / (1 + np.exp(-(ratios - 0.85) / 0.1)), rtol=1e-12)
-    rolled = ae.RollUp(0.1, ae.ChargeRatio(0.85, 0.1)).tangential(run.emissions, random).rolled
-    u = ae.IonRandom(3, run.emissions.ions).uniform(3)[:, 2]
+    rolled = ae.RollUp(0.1, ae.emission.ChargeRatio(0.85, 0.1)).tangential(run.emissions, random).rolled
+    u = ae.emission.IonRandom(3, run.emissions.ions).uniform(3)[:, 2]
     np.testing.assert_array_equal(rolled, (u < p) & run.emissions.can_roll)
-    step = ae.ChargeRatio(0.85).probabilities(run.emissions)
+    step = ae.emission.ChargeRatio(0.85).probabilities(run.emissions)
     np.testing.assert_array_equal(step, (ratios > 0.85).astype(float))
 
 
@@ -102,7 +102,11 @@ def test_a_run_comes_back_from_its_file(run, tmp_path):
 
 def test_runs_without_wide_responses_say_so(tip12):
     run = ae.Simulation(tip12, seed=5).run(20, progress=False)
-    for perturbation in (ae.RollUp(0.1, sharpness=0.1), ae.RollUp(0.1, ae.ChargeRatio(0.9)), ae.Unperturbed(0.1)):
+    for perturbation in (
+        ae.RollUp(0.1, sharpness=0.1),
+        ae.RollUp(0.1, ae.emission.ChargeRatio(0.9)),
+        ae.Unperturbed(0.1),
+    ):
         with pytest.raises(ValueError, match=r"ResponseSettings\.wide"):
             run.hits(perturbation)
     assert run.hits(ae.RollUp(ENERGY, probability=0.5)).detected.any()  # served by the usual responses
@@ -115,10 +119,13 @@ def test_runs_without_wide_responses_say_so(tip12):
         (lambda: ae.RollUp(0.1, sharpness=-1), "sharpness must be .*>= 0 .*, got -1"),
         (lambda: ae.RollUp(0.1, height=5), "height must be .* <= 1.*, got 5"),
         (lambda: ae.ResponseSettings(height=0.1), "height needs wide designs"),
-        (lambda: ae.ResponseSettings(site=ae.WideDesign(0, 2, 1, 2)), "must both be a Design or both a WideDesign"),
+        (
+            lambda: ae.ResponseSettings(site=ae.flight.WideDesign(0, 2, 1, 2)),
+            "must both be a Design or both a WideDesign",
+        ),
         (lambda: ae.ResponseSettings.wide(height=0.0), "wide designs need a height > 0 nm"),
         (lambda: ae.ResponseSettings.wide(shells=3), "shells must be .*2, got 3"),
-        (lambda: ae.WideDesign(0, 9, 1, 2), "velocity must be .*6, got 9"),
+        (lambda: ae.flight.WideDesign(0, 9, 1, 2), "velocity must be .*6, got 9"),
     ],
 )
 def test_bad_options_are_refused(make, message):

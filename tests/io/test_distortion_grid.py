@@ -15,11 +15,11 @@ def write(path, rows, header="detectorX,detectorY,gridX,gridY"):
 
 
 def test_columns_are_found_by_name(tmp_path):
-    grid = ae.read_grid(write(tmp_path / "a.csv", ROWS))
+    grid = ae.io.read_grid(write(tmp_path / "a.csv", ROWS))
     assert np.array_equal(grid.detector, np.array(ROWS)[:, :2]) and np.array_equal(grid.grid, np.array(ROWS)[:, 2:])
     assert str(tmp_path) in repr(grid) and "16 crossings" in repr(grid)
     swapped = [(d, b, 7, a, c) for a, b, c, d in ROWS]
-    other = ae.read_grid(write(tmp_path / "b.csv", swapped, "\ufeffGridY, detectory ,node,DETECTORX,gridx"))
+    other = ae.io.read_grid(write(tmp_path / "b.csv", swapped, "\ufeffGridY, detectory ,node,DETECTORX,gridx"))
     assert np.array_equal(other.detector, grid.detector) and np.array_equal(other.grid, grid.grid)
 
 
@@ -36,7 +36,7 @@ def test_columns_are_found_by_name(tmp_path):
 def test_files_that_are_no_grid(tmp_path, rows, header, words):
     path = write(tmp_path / "bad.csv", rows, *([] if header is None else [header]))
     with pytest.raises(ae.FileError, match=words):
-        ae.read_grid(path)
+        ae.io.read_grid(path)
 
 
 def test_commands_undistort(tmp_path, capsys, rng):

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from apt_evap._common.files import FileError, TruncatedFile
-from apt_evap._common.warnings import DataWarning
 from apt_evap.detection.hits import Hits, Outcome
 from apt_evap.io.formats import FORMATS, chunks, read, write
 from apt_evap.simulation.run import Run
 from apt_evap.simulation.simulation import Simulation
+from apt_evap.warnings import DataWarning
 
 SILICON = Path(__file__).parents[3] / "shared" / "data" / "Si.epos"
 

@@ -16,14 +16,14 @@ from matplotlib.text import Text
 import apt_evap as ae
 from apt_evap import plot
 from apt_evap.analysis.charge_states import charge_state_ratio_map, course_of_charges, ion_charges
-from apt_evap.analysis.profiles import Profile
 from apt_evap.analysis.voltage_history import course, evaporation_voltages
+from apt_evap.maps.profiles import Profile
 from apt_evap.plot._figure import set_log_ticks
 
 
 @pytest.fixture(scope="module")
 def emitter(small_tip):
-    return ae.Emitter(small_tip)
+    return ae.evaporation.Emitter(small_tip)
 
 
 @pytest.fixture(scope="module")
@@ -161,7 +161,7 @@ def test_specimen_from_above(emitter, color, label, tmp_path):
 
 def test_the_rim_of_the_foot_does_not_set_the_colours(small_tip, nickel):
     tip = ae.Tip(nickel, apex_radius=6 * nickel.a, axis=(1, 1, 1), shank_length=6 * nickel.a, base="flat")
-    flat = ae.Emitter(tip)
+    flat = ae.evaporation.Emitter(tip)
     low, high = discs_of(plot.specimen(flat, elevation=10, azimuth=-60)).get_clim()
     shown = flat.normals @ [
         np.cos(np.radians(10)) * 0.5,
@@ -206,8 +206,8 @@ def test_specimen_by_numbers_of_ones_own(emitter):
 
 
 def test_a_slice_shows_the_atoms_of_each_phase(tmp_path):
-    ball = ae.Phase("ball", "Cu", region=ae.Sphere((0, 0, 1), 1.0))
-    gamma = ae.Phase("matrix", "Ni", order=ae.Order("L1_2", "Al"))
+    ball = ae.specimen.Phase("ball", "Cu", region=ae.specimen.Sphere((0, 0, 1), 1.0))
+    gamma = ae.specimen.Phase("matrix", "Ni", order=ae.specimen.Superlattice("L1_2", "Al"))
     tip = ae.Tip(phases=[gamma, ball], apex_radius=2.5, shank_length=2.0)
     for color, names in (("phase", ["matrix", "ball"]), ("species", ["Ni", "Al", "Cu"])):
         ax = plot.cut(tip, color, thickness=0.4, colors={"ball": "red", "Cu": "red"})
@@ -274,7 +274,9 @@ def test_history_of_a_measurement():
 @pytest.fixture(scope="module")
 def real(run):
     """The run in real units, with ions of two charges."""
-    return run.at_evaporation_field(timing=ae.Timing(temperature=50.0), flight_charges=ae.PostIonisation(0.7))
+    return run.at_evaporation_field(
+        timing=ae.detection.Timing(temperature=50.0), flight_charges=ae.emission.PostIonisation(0.7)
+    )
 
 
 def labels_of(axes):
@@ -324,7 +326,7 @@ def test_voltage_curve_of_ions(real):
     np.testing.assert_allclose(axes[0].lines[0].get_ydata(), course(real.voltages / 1.2, 4).median)
     expected = hits.detected[125:].sum() / hits.pulses[125:].sum()
     assert axes[1].patches[0].get_data().values[-1] == pytest.approx(expected)
-    ranges = ae.Ranges(["Ni", "Ni"], [28.9, 57.8], [32.2, 64.4])
+    ranges = ae.detection.Ranges(["Ni", "Ni"], [28.9, 57.8], [32.2, 64.4])
     measured = ae.Hits(voltage=hits.voltage, mass_to_charge=hits.mass_to_charge)
     axes = plot.voltage_curve(measured, element="Ni", ranges=ranges)
     assert labels_of(axes) == ["voltage [V]", "Ni$^{2{+}}$ / Ni$^{{+}}$"]
@@ -338,7 +340,7 @@ def test_voltage_curves_that_cannot_be_drawn(run, real):
     with pytest.raises(ValueError, match="axes must be 4 for <Run"):
         plot.voltage_curve(real, [plot.new_figure((3, 2)).subplots()])
     with pytest.raises(ValueError, match="ranges need the element"):
-        plot.voltage_curve(ae.Hits(voltage=[1.0]), ranges=ae.Ranges(["Ni"], [28.9], [32.2]))
+        plot.voltage_curve(ae.Hits(voltage=[1.0]), ranges=ae.detection.Ranges(["Ni"], [28.9], [32.2]))
     with pytest.raises(ValueError, match="no column 'voltage'"):
         plot.voltage_curve(ae.Hits(x=[0.0], y=[0.0]))
     with pytest.raises(ValueError, match="run must be a Run or Hits"):
@@ -431,7 +433,7 @@ def charged(n, slope, seed, half=30.0):
     rng = np.random.default_rng(seed)
     x, y = rng.uniform(-half, half, (2, n))
     fields = 24.4 * (1 + slope * x / half)
-    charges = ae.PostIonisation().draw(["Ni"], np.zeros(n, int), [1], fields, rng.random(n))
+    charges = ae.emission.PostIonisation().draw(["Ni"], np.zeros(n, int), [1], fields, rng.random(n))
     return ae.Hits(x=x, y=y, extra={"charge_state": charges})
 
 
@@ -493,7 +495,7 @@ def test_response_to_lateral_velocities(run, tmp_path):
     np.testing.assert_array_equal(np.unique(cloud.get_array()), [0, 0.5, 1])
     still = run.hits(ae.Unperturbed())[ions]
     np.testing.assert_allclose(dots.get_offsets(), np.column_stack([still.x, still.y]), atol=1e-9)
-    tracks = ae.lateral_tracks(run, ions, [1.0], np.arange(0, 360, 2))
+    tracks = ae.analysis.lateral_tracks(run, ions, [1.0], np.arange(0, 360, 2))
     farthest = cloud.get_offsets()[cloud.get_array() == 1]
     np.testing.assert_allclose(farthest[:, 0], tracks.x.ravel(), atol=1e-9)
     np.testing.assert_array_equal(dots.get_facecolors(), [to_rgba(color) for color in plot.ion_colors(3)])
@@ -510,7 +512,7 @@ def test_response_to_rollup(run, tmp_path):
     ax.figure.savefig(tmp_path / "a.png")
     lines = [c for c in ax.collections if isinstance(c, LineCollection)]
     assert len(lines) == 2
-    tracks = ae.rollup_tracks(run, ions, energies)
+    tracks = ae.analysis.rollup_tracks(run, ions, energies)
     for line, x, y in zip(lines, tracks.x, tracks.y, strict=True):
         segments = np.array([path.vertices for path in line.get_paths()])
         np.testing.assert_allclose(segments[:, 0], np.column_stack([x, y])[:-1])
@@ -534,7 +536,7 @@ def two_profiles():
 
 
 def test_profiles_with_their_lines(two_profiles, tmp_path):
-    lines = [ae.fit_zone_line(profile) for profile in two_profiles]
+    lines = [ae.maps.fit_zone_line(profile) for profile in two_profiles]
     ax = plot.profile(two_profiles, ["first", "second"], lines=lines)
     ax.figure.savefig(tmp_path / "a.png")
     texts = [text.get_text() for text in ax.get_legend().get_texts()]
@@ -552,7 +554,7 @@ def test_profiles_with_their_lines(two_profiles, tmp_path):
 def test_profiles_compared(two_profiles, tmp_path):
     upper, lower = plot.profile_comparison(*two_profiles, ["first", "second"])
     upper.figure.savefig(tmp_path / "a.png")
-    compared = ae.compare_profiles(*two_profiles)
+    compared = ae.maps.compare_profiles(*two_profiles)
     heights = [bar.get_height() for bar in lower.containers[0]]
     np.testing.assert_array_equal(heights, compared.difference)
     assert f"= {compared.chi_square:.0f} for 19" in lower.texts[0].get_text()
@@ -562,7 +564,7 @@ def test_profiles_compared(two_profiles, tmp_path):
 def test_rectangles_on_a_map():
     random = np.random.default_rng(1)
     ax = plot.detector_map(ae.Hits(x=random.uniform(-9, 9, 4000), y=random.uniform(-9, 9, 4000)).map(bins=20))
-    chosen = ae.Rectangle((1, 2), 30, 6, 4)
+    chosen = ae.maps.Rectangle((1, 2), 30, 6, 4)
     plot.rectangles([chosen, chosen.turned(120)], ax, labels=["a", "b"])
     assert [text.get_text() for text in ax.texts[-2:]] == ["a", "b"]
     np.testing.assert_allclose(ax.patches[-2].get_xy()[:4], chosen.corners)

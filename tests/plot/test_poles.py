@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.crystallography.poles import ZONES, poles, zones
+from apt_evap.crystallography.directions import ZONES, poles, zones
 
 
 @pytest.fixture
@@ -22,7 +22,7 @@ def places(ax):
 def test_the_pole_of_the_axis_is_at_the_centre_and_zone_lines_go_through_it(drawn, name, axis):
     _, ax = drawn
     limits = ax.axis()
-    projection = ae.Projection(30.0, (3.0, -2.0))
+    projection = ae.detection.Projection(30.0, (3.0, -2.0))
     assert ae.plot.poles(ax, ae.Orientation(name, axis), projection, families=5) is ax
     assert ax.axis() == limits
     assert np.linalg.norm(places(ax) - projection.centre, axis=1).min() < 1e-9
@@ -40,7 +40,7 @@ def test_only_what_is_inside_the_detector_is_drawn(drawn):
     map, ax = drawn
     x, y = np.meshgrid(*map.centres)
     round_map = ae.DetectorMap.from_array(map.values, map.x_edges, map.y_edges, mask=np.hypot(x, y) < 12)
-    ae.plot.poles(ax, ae.Orientation("Ni", (1, 1, 1)), ae.Projection(20.0), families=8, region=round_map)
+    ae.plot.poles(ax, ae.Orientation("Ni", (1, 1, 1)), ae.detection.Projection(20.0), families=8, region=round_map)
     radii = np.linalg.norm(places(ax), axis=1)
     assert len(radii) == 10 and radii.max() < 12.6  # half a diagonal of the bins more
     for line in ax.lines:
@@ -49,7 +49,7 @@ def test_only_what_is_inside_the_detector_is_drawn(drawn):
 
 def test_parts_can_be_left_out_and_names_do_not_overlap(drawn):
     _, ax = drawn
-    orientation, projection = ae.Orientation("Ni", (1, 1, 1)), ae.Projection(12.0)
+    orientation, projection = ae.Orientation("Ni", (1, 1, 1)), ae.detection.Projection(12.0)
     ae.plot.poles(ax, orientation, projection, families=0, zone_families=[(1, 1, 0)], labels=False)
     assert len(ax.lines) == 6 and not ax.collections
     before = len(ax.texts)
@@ -66,8 +66,8 @@ def test_a_fit_and_a_run_know_their_orientation_and_projection(drawn, nickel):
     _, ax = drawn
     crystal, orientation = poles(nickel, 6), ae.Orientation(nickel, (2, 3, 7))
     near = orientation.directions(crystal.normals)[:, 2] > 0.75
-    projection = ae.Projection(25.0)
-    fit = ae.fit_orientation(
+    projection = ae.detection.Projection(25.0)
+    fit = ae.crystallography.fit_orientation(
         nickel, crystal.planes[near], projection.places(orientation.directions(crystal.normals[near]))
     )
     ae.plot.poles(ax, fit, families=3)
@@ -84,5 +84,5 @@ def test_the_poles_of_a_run(drawn, nickel):
     run = ae.Simulation(tip, seed=1).run(800, [ae.Unperturbed()], responses=False, progress=False)
     ax, other = (ae.plot.detector_map(run.hits(ae.Unperturbed())) for _ in range(2))
     ae.plot.poles(ax, run)
-    ae.plot.poles(other, ae.Orientation(nickel, (1, 1, 1)), ae.image_compression(run).projection)
+    ae.plot.poles(other, ae.Orientation(nickel, (1, 1, 1)), ae.analysis.image_compression(run).projection)
     assert len(places(ax)) > 3 and np.array_equal(places(ax), places(other))

@@ -55,10 +55,10 @@ def test_what_a_map_loads():
     lines = (
         "import numpy as np, apt_evap as ae",
         "hits = ae.Hits(x=np.tile(np.linspace(-9, 9, 40), 40), y=np.repeat(np.linspace(-9, 9, 40), 40))",
-        "map = hits.map(bins=20, quantum=None, mask=np.ones((20, 20), bool))",
+        "map = hits.map(bins=20, position_step=None, mask=np.ones((20, 20), bool))",
     )
     assert not loaded("\n".join(lines)).intersection(IMAGES)
-    assert loaded("\n".join((*lines, "ae.ssim(map, map)"))).intersection(IMAGES) == {"skimage.metrics"}
+    assert loaded("\n".join((*lines, "ae.similarity(map, map)"))).intersection(IMAGES) == {"skimage.metrics"}
     assert "skimage.morphology" in loaded("\n".join((*lines, "hits.map(bins=20)")))
 
 

@@ -29,9 +29,9 @@ import apt_evap as ae
 class FromAbove:
     height: float
 
-    def launch(self, emissions: ae.Emissions, random: ae.IonRandom) -> ae.Launches:
+    def launch(self, emissions: ae.emission.Emissions, random: ae.emission.IonRandom) -> ae.emission.Launches:
         n = len(emissions)
-        return ae.Launches(emissions.positions + self.height, np.zeros((n, 3)), np.zeros(n, bool))
+        return ae.emission.Launches(emissions.positions + self.height, np.zeros((n, 3)), np.zeros(n, bool))
 
 class NoPerturbation:
     pass
@@ -73,12 +73,12 @@ measured = ae.read("R5083.epos")
 map_ = measured.map(bins=128).smoothed(1.0)
 registration = ae.register(hits, map_)
 moved = registration.hits(hits).map(like=map_)
-similarity = ae.ssim(moved, map_, smoothing=1.0)
+similarity = ae.similarity(moved, map_, smoothing=1.0)
 print(f"{similarity:.3f}", round(float(similarity), 3), similarity.value > 0.2)
 ax = ae.plot.detector_map(moved, title="Ni [111]")
 ax.figure.savefig("ni111.png")
 ae.plot.detector_maps([moved, map_])[0].figure.savefig("both.png", dpi=200)
-study = ae.fit_energies(run, measured, ae.EnergyGrid("roll-up"), registration=registration)
+study = ae.fit_energies(run, measured, ae.fit.EnergyGrid("roll-up"), registration=registration)
 ae.plot.ssim_matrix(study)[0].figure.savefig("ssim.png")
 print(study.optimum.mean, study.registration.rotation, tip.positions[:, 2].max())
 ae.write("ni111.epos", hits)

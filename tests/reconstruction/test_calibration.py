@@ -37,23 +37,25 @@ def test_the_spacing_of_planes(aluminium):
     sites, hits = aluminium
     known = {"atomic_volume": A**3 / 4, "distance": DISTANCE, "compression": XI, "detector_radius": RIM}
     result = ae.reconstruct(hits, **known, radius=RADIUS, efficiency=ETA)
-    found = ae.distribution_map(result.positions)
+    found = ae.reconstruction.distribution_map(result.positions)
     # Hits are exact; the depth is that of n ions where n (1 - eta) / eta was drawn: 0.3 % of 40,000 ions, three times.
     assert found.spacing == pytest.approx(A / 2, rel=0.01)
     assert found.depth_resolution < 0.03  # terraces leave at once here: the planes are sharp
     assert result.errors(sites).order_correlation > 0.99
     # a wrong efficiency is found by the planes
     wrong = ae.reconstruct(hits, **known, radius=RADIUS, efficiency=0.8 * ETA)
-    observed = ae.distribution_map(wrong.positions).spacing
+    observed = ae.reconstruction.distribution_map(wrong.positions).spacing
     assert 0.8 * ETA * observed / (A / 2) == pytest.approx(ETA, rel=0.01)
     # and so is a wrong field factor: d is proportional to the square of 1 / R, with the projection
     wide = ae.reconstruct(hits, **known, radius=1.1 * RADIUS, efficiency=ETA)
-    assert ae.distribution_map(wide.positions, radius=2.0).spacing * 1.21 == pytest.approx(A / 2, rel=0.02)
+    assert ae.reconstruction.distribution_map(wide.positions, radius=2.0).spacing * 1.21 == pytest.approx(
+        A / 2, rel=0.02
+    )
 
 
 def test_the_spacing_of_a_perfect_crystal(aluminium):
     sites, _ = aluminium
-    found = ae.distribution_map(sites, bins=500)
+    found = ae.reconstruction.distribution_map(sites, bins=500)
     assert found.spacing == pytest.approx(A / 2, rel=2e-3)  # a bin is 4e-3 nm, the map 2 nm
     assert found.amplitude > 0.97 and found.depth_resolution < 0.006  # of a bin
     assert found.counts.sum() >= 1e6
@@ -64,7 +66,7 @@ def test_the_spacing_of_a_perfect_crystal(aluminium):
 @pytest.mark.parametrize(("axis", "planes"), [((1, 1, 1), A / math.sqrt(3)), ((0, 2, 2), A / math.sqrt(8)), (0, A / 2)])
 def test_planes_along_a_direction(aluminium, axis, planes):
     sites, _ = aluminium
-    found = ae.distribution_map(sites, axis, max_pairs=300_000)
+    found = ae.reconstruction.distribution_map(sites, axis, max_pairs=300_000)
     assert found.spacing == pytest.approx(planes, rel=5e-3)
     assert found.references < len(sites) and found.counts.sum() >= 300_000
 
@@ -73,16 +75,16 @@ def test_the_depth_resolution(aluminium, rng):
     sites, _ = aluminium
     for deviation in (0.02, 0.05):
         blurred = sites + rng.normal(size=sites.shape) * [0.2, 0.2, deviation]
-        found = ae.distribution_map(blurred)
+        found = ae.reconstruction.distribution_map(blurred)
         assert found.depth_resolution == pytest.approx(deviation, rel=0.05)  # amplitude to 2 %: pairs at the edges
         assert found.spacing == pytest.approx(A / 2, rel=5e-3)
 
 
 def test_ions_without_planes(rng):
     points = rng.random((20_000, 3)) * [10, 10, 4]
-    assert ae.distribution_map(points).amplitude < 0.1
+    assert ae.reconstruction.distribution_map(points).amplitude < 0.1
     with pytest.raises(ValueError, match=r"no two ions are within 0\.001 nm across"):
-        ae.distribution_map(points[:50], lateral=1e-3)
+        ae.reconstruction.distribution_map(points[:50], lateral=1e-3)
 
 
 def test_a_map_counts_the_pairs_of_a_cylinder(rng):
@@ -91,11 +93,13 @@ def test_a_map_counts_the_pairs_of_a_cylinder(rng):
     difference = inside[:, None] - inside[None]
     close = (np.hypot(difference[..., 0], difference[..., 1]) <= 0.4) & ~np.eye(len(inside), dtype=bool)
     expected = np.histogram(difference[..., 2][close], 20, (-0.9, 0.9))[0]
-    found = ae.distribution_map(points, lateral=0.4, reach=0.9, bins=20, centre=(1, 2, 0), radius=1.5)
+    found = ae.reconstruction.distribution_map(points, lateral=0.4, reach=0.9, bins=20, centre=(1, 2, 0), radius=1.5)
     assert np.array_equal(found.counts, expected)
 
 
 def test_the_compression_from_poles():
-    assert ae.compression_from_poles([54.74, 35.26], [36.0, 22.0]) == pytest.approx((54.74 / 36 + 35.26 / 22) / 2)
+    assert ae.reconstruction.compression_from_poles([54.74, 35.26], [36.0, 22.0]) == pytest.approx(
+        (54.74 / 36 + 35.26 / 22) / 2
+    )
     with pytest.raises(ValueError, match="observed_angles must be > 0 and <= 180 degrees, got 0"):
-        ae.compression_from_poles([54.74], [0.0])
+        ae.reconstruction.compression_from_poles([54.74], [0.0])

@@ -20,7 +20,7 @@ def ions(model, seed=1):
 
 @pytest.mark.parametrize(("sigma", "before", "after"), [(0.1, 0.95, 0.05), (0.4, 0.2, 0.7)])
 def test_the_width_of_a_step(sigma, before, after):
-    found = ae.interface_profile(
+    found = ae.reconstruction.interface_profile(
         *ions(lambda d: before + (after - before) * ndtr((d - 0.2) / sigma)), reach=2.0, bin_width=0.25
     )
     # four standard errors: one of 16,000 fits fails
@@ -34,7 +34,7 @@ def test_the_width_of_a_step(sigma, before, after):
 
 def test_errors_are_those_of_repeated_measurements():
     def once(seed):
-        return ae.interface_profile(*ions(lambda d: 0.1 + 0.8 * ndtr(d / 0.3), seed), reach=1.5)
+        return ae.reconstruction.interface_profile(*ions(lambda d: 0.1 + 0.8 * ndtr(d / 0.3), seed), reach=1.5)
 
     found = [once(seed) for seed in range(30)]
     spread = np.std([each.sigma for each in found], ddof=1)
@@ -44,13 +44,15 @@ def test_errors_are_those_of_repeated_measurements():
 
 def test_a_sharp_step_has_no_width():
     distances = np.linspace(-1.005, 1.005, 202)
-    found = ae.interface_profile(distances, distances > 0)
+    found = ae.reconstruction.interface_profile(distances, distances > 0)
     assert found.width < 0.02  # two distances of the ions
     assert (found.before, found.after) == pytest.approx((0, 1), abs=0.02)
 
 
 def test_the_excess_of_a_segregated_element():
-    found = ae.segregation_profile(*ions(lambda d: 0.02 + 0.2 * np.exp(-(d**2) / (2 * 0.35**2))), reach=2.5)
+    found = ae.reconstruction.segregation_profile(
+        *ions(lambda d: 0.02 + 0.2 * np.exp(-(d**2) / (2 * 0.35**2))), reach=2.5
+    )
     assert abs(found.width - 0.35) < 4 * found.width_error < 0.1
     assert abs(found.centre) < 4 * found.centre_error < 0.1
     assert (found.bulk, found.peak) == pytest.approx((0.02, 0.22), abs=0.03)
@@ -59,7 +61,7 @@ def test_the_excess_of_a_segregated_element():
 
 
 def test_results_are_json():
-    found = ae.segregation_profile(*ions(lambda d: 0.05 + 0.2 * np.exp(-(d**2))))
+    found = ae.reconstruction.segregation_profile(*ions(lambda d: 0.05 + 0.2 * np.exp(-(d**2))))
     content = json.loads(json.dumps(found.to_dict()))
     assert content["excess"] == found.excess and len(content["fraction"]) == len(content["edges"]) - 1
 
@@ -67,10 +69,10 @@ def test_results_are_json():
 def test_refusals():
     distances, chosen = ions(lambda d: 0.5 + 0 * d)
     with pytest.raises(ValueError, match="at least 10 ions on each side within 1 nm, got 0 and"):
-        ae.interface_profile(np.abs(distances), chosen)
+        ae.reconstruction.interface_profile(np.abs(distances), chosen)
     with pytest.raises(ValueError, match="chosen must mark a part of the ions within 1 nm, got 0 of"):
-        ae.interface_profile(distances, np.zeros(N, bool))
+        ae.reconstruction.interface_profile(distances, np.zeros(N, bool))
     with pytest.raises(ValueError, match="reach must be"):
-        ae.segregation_profile(distances, chosen, reach=0)
+        ae.reconstruction.segregation_profile(distances, chosen, reach=0)
     with pytest.raises(ValueError, match="bin_width must be"):
-        ae.interface_profile(distances, chosen, bin_width=3.0)
+        ae.reconstruction.interface_profile(distances, chosen, bin_width=3.0)

@@ -22,7 +22,7 @@ def table():
     rng = np.random.default_rng(8)
     places = 1.6 * rng.random((60_000, 2)) - 0.8
     shifts = shift_of(places) + rng.multivariate_normal([0, 0], NOISE, len(places))
-    return ae.OriginTable(places, shifts, neighbours=40, compression=1.1)
+    return ae.reconstruction.OriginTable(places, shifts, neighbours=40, compression=1.1)
 
 
 def test_mean_and_covariance_of_a_known_field(table, rng):
@@ -52,23 +52,23 @@ def test_a_rotated_table(table):
 def test_a_table_is_saved(table, tmp_path):
     path = tmp_path / "ni.npz"
     table.save(path)
-    copy = ae.OriginTable.load(path)
+    copy = ae.reconstruction.OriginTable.load(path)
     assert np.array_equal(copy.places, table.places) and np.array_equal(copy.shifts, table.shifts)
     assert (copy.neighbours, copy.compression, copy.symmetry) == (40, 1.1, 1)
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(ae.FileError, match="is not a table of origins"):
-        ae.OriginTable.load(path)
+        ae.reconstruction.OriginTable.load(path)
 
 
 def test_what_a_table_does_not_cover(table):
     with pytest.raises(ValueError, match=r"places must be within 1\.\d+ R of the axis|places must be within 1\.000 R"):
         table.shifts_at([[1.2, 0.0]])
     with pytest.raises(ValueError, match="a table needs at least 16 ions, got 15"):
-        ae.OriginTable(table.places[:15], table.shifts[:15])
+        ae.reconstruction.OriginTable(table.places[:15], table.shifts[:15])
     with pytest.raises(ValueError, match="places and shifts must have equal lengths"):
-        ae.OriginTable(table.places[:20], table.shifts[:21])
+        ae.reconstruction.OriginTable(table.places[:20], table.shifts[:21])
     with pytest.raises(ValueError, match="runs must contain at least one run"):
-        ae.origin_table([])
+        ae.reconstruction.origin_table([])
 
 
 def test_a_shift_is_added_on_the_cap(table):
@@ -100,9 +100,9 @@ def twins(nickel, made_once):
 
 
 def reconstructed(run, nickel, origins=None):
-    caps = ae.fit_caps(run)
+    caps = ae.analysis.fit_caps(run)
     radii = np.concatenate([np.full(cap.last - cap.first, cap.radius) for cap in caps])
-    compression = ae.image_compression(run, caps).compression
+    compression = ae.analysis.image_compression(run, caps).compression
     hits = run.hits(ae.Unperturbed())
     known = {"atomic_volume": nickel.a**3 / 4, "distance": 100.0, "detector_radius": 90.0, "radius": radii}
     return ae.reconstruct(hits, **known, projection="compressed", compression=compression, origins=origins)
@@ -111,8 +111,8 @@ def reconstructed(run, nickel, origins=None):
 def test_the_errors_of_a_twin_run(twins, nickel):
     first, second = twins
     plain = reconstructed(second, nickel).errors(second)
-    alone = ae.origin_table(first, symmetry=False)
-    table = ae.origin_table(first)
+    alone = ae.reconstruction.origin_table(first, symmetry=False)
+    table = ae.reconstruction.origin_table(first)
     assert table.symmetry == 6 and len(table) == 6 * len(alone) and repr(table).startswith("<OriginTable: ")
     result = reconstructed(second, nickel, table)
     corrected = result.errors(second)
@@ -131,12 +131,12 @@ def test_the_errors_of_a_twin_run(twins, nickel):
         other = ae.Run(
             **{**vars(first), "settings": {**first.settings, "tip": {**first.settings["tip"], "axis": [0, 0, 1]}}}
         )
-        ae.origin_table([first, other])
+        ae.reconstruction.origin_table([first, other])
 
 
 def test_symmetric_copies(twins):
     """Every symmetry of the crystal maps the table onto itself."""
-    table = ae.origin_table(twins[0])
+    table = ae.reconstruction.origin_table(twins[0])
     turned = table.rotated(120.0)
     order, other = (np.lexsort(np.round(each.places, 9).T) for each in (table, turned))
     assert turned.places[other] == pytest.approx(table.places[order], abs=1e-9)

@@ -31,7 +31,7 @@ def alloy():
 
 def test_a_perfect_reconstruction(alloy):
     sites, inside, species = alloy
-    found = ae.precipitate_errors(reconstruction_of(sites * [1, 1, -1]), inside, sites, species)
+    found = ae.reconstruction.precipitate_errors(reconstruction_of(sites * [1, 1, -1]), inside, sites, species)
     n = np.count_nonzero(inside)
     # moments of n uniform deviates: the standard deviation of a semi-axis is 0.33 / sqrt(n), times four
     assert found.true.lateral == pytest.approx(RADIUS, rel=1.3 / math.sqrt(n))
@@ -49,7 +49,7 @@ def test_a_compressed_precipitate(alloy, squeeze):
     """The lateral positions of the sphere alone are multiplied, as by a local magnification."""
     sites, inside, species = alloy
     moved = np.where(inside[:, None], sites * [squeeze, squeeze, 1], sites)
-    found = ae.precipitate_errors(reconstruction_of(moved * [1, 1, -1]), inside, sites, species)
+    found = ae.reconstruction.precipitate_errors(reconstruction_of(moved * [1, 1, -1]), inside, sites, species)
     assert found.magnification == pytest.approx(squeeze, rel=1e-12)
     assert found.depth_magnification == pytest.approx(1, rel=1e-12)
     assert found.apparent.ratio == pytest.approx(squeeze, rel=0.02)
@@ -79,7 +79,7 @@ def test_an_overlap_with_the_matrix(alloy):
     places = rng.normal(size=(len(strangers), 3))
     places *= (RADIUS * rng.random(len(strangers)) ** (1 / 3) / np.linalg.norm(places, axis=1))[:, None]
     moved[strangers] = places
-    found = ae.precipitate_errors(reconstruction_of(moved * [1, 1, -1]), inside, sites, species)
+    found = ae.reconstruction.precipitate_errors(reconstruction_of(moved * [1, 1, -1]), inside, sites, species)
     share = len(strangers) / (len(strangers) + n)
     assert found.overlap == pytest.approx(share, abs=4 / math.sqrt(n))
     # 80 % in the sphere, 5 % in the matrix: the composition is that of the mixture
@@ -94,7 +94,7 @@ def test_an_overlap_with_the_matrix(alloy):
 
 def test_without_species_the_matrix_is_the_second(alloy):
     sites, inside, _ = alloy
-    found = ae.precipitate_errors(reconstruction_of(sites * [1, 1, -1]), inside, sites)
+    found = ae.reconstruction.precipitate_errors(reconstruction_of(sites * [1, 1, -1]), inside, sites)
     assert found.species.tolist() == [0, 1] and found.true_composition.tolist() == [0.0, 1.0]
     assert found.apparent_composition[0] == pytest.approx(found.overlap)
 
@@ -104,21 +104,21 @@ def test_what_is_no_precipitate(alloy):
     few = np.zeros(len(sites), bool)
     few[:9] = True
     with pytest.raises(ValueError, match="inside must mark at least 10 ions, got 9"):
-        ae.precipitate_errors(reconstruction_of(sites), few, sites)
+        ae.reconstruction.precipitate_errors(reconstruction_of(sites), few, sites)
     with pytest.raises(ValueError, match=r"inside must have shape"):
-        ae.precipitate_errors(reconstruction_of(sites), inside[:-1], sites)
+        ae.reconstruction.precipitate_errors(reconstruction_of(sites), inside[:-1], sites)
     with pytest.raises(ValueError, match="must have an extent in all directions"):
-        ae.precipitate_errors(reconstruction_of(sites * [1, 1, 0]), inside, sites)
+        ae.reconstruction.precipitate_errors(reconstruction_of(sites * [1, 1, 0]), inside, sites)
 
 
 def test_constants_are_fitted_before(alloy):
     """A reconstruction with a wrong scale of the depth is right after the fit of this scale."""
     sites, inside, species = alloy
     wrong = replace(reconstruction_of((sites + 1) * [1, 1, -1.3]), settings={"compression": 1.0})
-    as_it_is = ae.precipitate_errors(wrong, inside, sites, species)
+    as_it_is = ae.reconstruction.precipitate_errors(wrong, inside, sites, species)
     assert as_it_is.depth_magnification == pytest.approx(1.3)
-    other = ae.precipitate_errors(wrong, inside, sites, species, fit=("shift", "lateral_scale"))
+    other = ae.reconstruction.precipitate_errors(wrong, inside, sites, species, fit=("shift", "lateral_scale"))
     assert other.depth_magnification == pytest.approx(1.3)
     # the cap with R = 100 nm is nearly a plane: the fit leaves the depth below its apex, up to r^2 / 2R = 0.7 nm
-    fitted = ae.precipitate_errors(wrong, inside, sites, species, fit=("shift", "depth_scale"))
+    fitted = ae.reconstruction.precipitate_errors(wrong, inside, sites, species, fit=("shift", "depth_scale"))
     assert fitted.depth_magnification == pytest.approx(1, rel=0.02)

@@ -199,10 +199,10 @@ def test_the_frame_with_the_depth_is_a_mirror_image(rng):
     tilt = math.radians(20)
     turn = np.array([[math.cos(tilt), 0, math.sin(tilt)], [0, 1, 0], [-math.sin(tilt), 0, math.cos(tilt)]])
     crystal = replace(result, positions=grid @ turn.T * [1, 1, -1])
-    assert ae.distribution_map(crystal.specimen_positions, turn[:, 2], lateral=0.2).spacing == pytest.approx(
-        a, rel=1e-3
-    )
-    assert abs(ae.distribution_map(crystal.positions, turn[:, 2], lateral=0.2).spacing / a - 1) > 0.1
+    assert ae.reconstruction.distribution_map(
+        crystal.specimen_positions, turn[:, 2], lateral=0.2
+    ).spacing == pytest.approx(a, rel=1e-3)
+    assert abs(ae.reconstruction.distribution_map(crystal.positions, turn[:, 2], lateral=0.2).spacing / a - 1) > 0.1
 
 
 def test_the_density_of_the_cap(cone, rng):

@@ -11,7 +11,7 @@ from apt_evap.registration.polynomial import fit_polynomial, terms_of
 
 TRUE = ae.Registration(
     17.0, 0.4, (3.0, -2.0),
-    distortion=ae.Distortion(2, (2.5, -1.5), 20.0, (0.3 + 0.1j, 0.9 - 0.5j, -0.6 + 0.4j, 0.2j)),
+    distortion=ae.registration.Distortion(2, (2.5, -1.5), 20.0, (0.3 + 0.1j, 0.9 - 0.5j, -0.6 + 0.4j, 0.2j)),
 )  # fmt: skip
 
 
@@ -26,7 +26,7 @@ def points_of(rng, n, noise=0.0, registration=TRUE, mirror=False):
 @pytest.mark.parametrize("degree", [2, 3, None])
 def test_exact_points_give_the_exact_map(rng, degree, mirror):
     simulated, measured = points_of(rng, 30, mirror=mirror)
-    found = ae.register_points(simulated, measured, degree=degree)
+    found = ae.registration.register_points(simulated, measured, degree=degree)
     assert found.mirror == mirror and found.distortion.degree == (degree or 2)
     other, places = points_of(rng, 50, mirror=mirror)
     assert np.column_stack(found.points(*other.T)) == pytest.approx(places, abs=1e-9)
@@ -38,7 +38,8 @@ def test_errors_are_those_of_new_measurements(rng):
     """50 sets of 25 points with an error of 0.3 mm; a similarity leaves 0.8 mm."""
     simulated, exact = points_of(rng, 25)
     found = [
-        ae.register_points(simulated, exact + 0.3 * rng.normal(size=(25, 2)), degree=2).distortion for _ in range(50)
+        ae.registration.register_points(simulated, exact + 0.3 * rng.normal(size=(25, 2)), degree=2).distortion
+        for _ in range(50)
     ]
     coefficients = np.array([each.coefficients for each in found])
     scatter = np.sqrt((coefficients.real.var(axis=0, ddof=1) + coefficients.imag.var(axis=0, ddof=1)) / 2)
@@ -52,7 +53,8 @@ def test_noise_is_not_fitted(rng, n, noise):
     """Of 200 sets of points without a distortion, 1 % per degree pass the test; the second guard lets fewer pass."""
     straight = ae.Registration(17.0, 0.4, (3.0, -2.0))
     fitted = sum(
-        ae.register_points(*points_of(rng, n, noise, straight), mirror=False, degree=None).distortion is not None
+        ae.registration.register_points(*points_of(rng, n, noise, straight), mirror=False, degree=None).distortion
+        is not None
         for _ in range(200)
     )
     assert fitted <= 14  # 3 degrees of 1 %: 6 expected, three standard deviations of a binomial number
@@ -61,7 +63,7 @@ def test_noise_is_not_fitted(rng, n, noise):
 def test_a_degree_is_chosen_by_its_significance(rng):
     """The quadratic map is found where it matters, and predicts points that were not fitted."""
     simulated, measured = points_of(rng, 30, 0.15)
-    chosen, plain = (ae.register_points(simulated, measured, mirror=False, degree=d) for d in (None, 1))
+    chosen, plain = (ae.registration.register_points(simulated, measured, mirror=False, degree=d) for d in (None, 1))
     assert chosen.distortion.degree == 2
     other, places = points_of(rng, 500)
     errors = [np.sqrt(np.mean((np.column_stack(each.points(*other.T)) - places) ** 2)) for each in (chosen, plain)]
@@ -72,18 +74,20 @@ def test_a_degree_is_chosen_by_its_significance(rng):
 
 def test_distorted_poles_are_warned_of(rng):
     simulated, measured = points_of(rng, 12, 0.05)
-    with pytest.warns(ae.RegistrationWarning, match="has a systematic part: terms of degree 2 reduce it to 0.0"):
-        ae.register_points(simulated, measured, mirror=False)
+    with pytest.warns(
+        ae.warnings.RegistrationWarning, match="has a systematic part: terms of degree 2 reduce it to 0.0"
+    ):
+        ae.registration.register_points(simulated, measured, mirror=False)
 
 
 def test_too_few_points(rng):
     for degree, n in ((1, 3), (2, 6), (3, 10)):
         simulated, measured = points_of(rng, n)
         with pytest.raises(ValueError, match=f"degree {degree} needs more than {n} points, got {n}"):
-            ae.register_points(simulated, measured, degree=degree)
-        assert ae.register_points(simulated, measured, mirror=False, degree=None).residual >= 0
+            ae.registration.register_points(simulated, measured, degree=degree)
+        assert ae.registration.register_points(simulated, measured, mirror=False, degree=None).residual >= 0
     with pytest.raises(ValueError, match="degree must be an integer from 0 to 3, got 4"):
-        ae.register_points(simulated, measured, degree=4)
+        ae.registration.register_points(simulated, measured, degree=4)
 
 
 @given(st.integers(0, 1000))
@@ -92,7 +96,7 @@ def test_back_is_the_inverse(seed):
     coefficients = 0.4 * (rng.normal(size=8) + 1j * rng.normal(size=8))
     registration = ae.Registration(
         rng.uniform(-180, 180), 0.5, (1.0, 2.0), bool(seed % 2),
-        distortion=ae.Distortion(3, (0.0, 0.0), 20.0, tuple(coefficients)),
+        distortion=ae.registration.Distortion(3, (0.0, 0.0), 20.0, tuple(coefficients)),
     )  # fmt: skip
     x, y = rng.uniform(-12, 12, (2, 100))
     u, v = registration.back(*registration.points(x, y))
@@ -108,7 +112,7 @@ def test_back_is_the_inverse(seed):
 def test_terms():
     assert len(terms_of(0)) == 0 and len(terms_of(1)) == 1 and len(terms_of(2)) == 4 and len(terms_of(3)) == 8
     with pytest.raises(ValueError, match="coefficients must be 4 finite numbers for degree 2"):
-        ae.Distortion(2, (0, 0), 1.0, (1.0,))
+        ae.registration.Distortion(2, (0, 0), 1.0, (1.0,))
 
 
 def test_a_distortion_is_found_from_maps(run20):
@@ -117,7 +121,7 @@ def test_a_distortion_is_found_from_maps(run20):
     first, second = hits[: len(hits) // 2], hits[len(hits) // 2 :]
     measured = TRUE.hits(second).within_circle(24.0, (3.0, -2.0))
     start = ae.register(first, measured, rotations=(10, 24), scales=(0.38, 0.42), mirrors=(False,))
-    found = ae.register_distortion(start, first, measured)
+    found = ae.registration.register_distortion(start, first, measured)
     x, y = np.random.default_rng(0).uniform(-36, 36, (2, 500))
     off = [np.sqrt(np.mean(np.sum((np.array(each.points(x, y)) - TRUE.points(x, y)) ** 2, axis=0)))
            for each in (start, found)]  # fmt: skip
@@ -127,6 +131,6 @@ def test_a_distortion_is_found_from_maps(run20):
     assert off[1] < fit_polynomial(source, target[0] + 1j * target[1], 0).residual
     # maps without a distortion of their own: what is fitted is no larger than the error of the registration
     straight = ae.Registration(17.0, 0.4, (3.0, -2.0))
-    plain = ae.register_distortion(straight, first, straight.hits(second).within_circle(24.0, (3.0, -2.0)))
+    plain = ae.registration.register_distortion(straight, first, straight.hits(second).within_circle(24.0, (3.0, -2.0)))
     off = np.array(plain.points(x, y)) - straight.points(x, y)
     assert np.sqrt(np.mean(np.sum(off**2, axis=0))) < 0.4

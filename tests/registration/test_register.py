@@ -15,10 +15,10 @@ from scipy import ndimage
 import apt_evap as ae
 from apt_evap import plot
 from apt_evap._common.codec import for_json, from_plain
-from apt_evap._common.warnings import RegistrationWarning
 from apt_evap.registration import correlation_search
 from apt_evap.registration.register import register, register_points
 from apt_evap.registration.transform import SimilarityTransform
+from apt_evap.warnings import RegistrationWarning
 
 NICKEL = Path(__file__).parents[3] / "shared" / "data" / "ni111_map.npz"
 ROLLED = ae.RollUp(ae.TruncatedNormal(0.155, 0.155))

@@ -61,7 +61,7 @@ def test_options_of_the_perturbation_are_in_the_report(small_tip, tmp_path):
         run,
         measured,
         means=(0.1, 0.2, 0.3),
-        rsds=(1.0,),
+        relative_spreads=(1.0,),
         options={"probability": (0.3, 0.6, 1.0), "sharpness": (0.0, 0.3)},
         registration=ae.Registration(0.0, 1.0, (0.0, 0.0)),
         replicas=1,
@@ -155,7 +155,10 @@ def test_doubts(study):
     sure["optimum"] |= {"at_edge": []}
     assert ae.report.doubts(sure) == ([], [])
     for change, text in (
-        ({"optimum": {"at_edge": ["mean", "rsd"]}}, "end of the grid in the mean and standard deviation / mean"),
+        (
+            {"optimum": {"at_edge": ["mean", "relative_spread"]}},
+            "end of the grid in the mean and standard deviation / mean",
+        ),
         ({"refined": {"intervals": {}}}, "errors are not known"),
         ({"gain_share": 0.7}, "in only 70% of the resamples"),
         ({"settings": {"share_above_energy_limit": [[[0.0, 0.3]]]}}, "30% of the energies are above the limit"),
@@ -205,8 +208,8 @@ def test_what_is_refused(study, tmp_path):
 
 
 def test_warnings_are_recorded_and_shown():
-    with pytest.warns(ae.AptWarning) as shown, recorded_warnings() as messages:
-        warnings.warn("a\nb", ae.AptWarning, stacklevel=1)
+    with pytest.warns(ae.warnings.AptWarning) as shown, recorded_warnings() as messages:
+        warnings.warn("a\nb", ae.warnings.AptWarning, stacklevel=1)
     assert [str(each) for each in messages] == ["a\nb"] and len(shown) == 1
 
 

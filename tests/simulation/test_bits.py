@@ -25,7 +25,7 @@ nickel = ae.material("Ni")
 tip = ae.Tip(
     nickel, 5 * nickel.a, (1, 2, 3), solutes={"Al": 0.1}, seed=3, offset_seed=4, shank_angle=2.3, rotation=17.0
 )
-flown = ae.LateralVelocity(ae.TruncatedNormal(0.3, 0.2)), ae.Combined(ae.Thermal(300.0), 0.4)
+flown = ae.LateralVelocity(ae.TruncatedNormal(0.3, 0.2)), ae.Combined(ae.emission.Thermal(300.0), 0.4)
 simulation = ae.Simulation(tip, seed=2, detector=ae.Detector(100.0, 300.0, "equidistant"))
 print(simulation.run(80, emissions=flown, progress=False).fingerprint())
 """

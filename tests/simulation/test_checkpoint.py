@@ -61,8 +61,8 @@ def simulation(**options):
     """A shell that deepens within the run, watched from its first relaxation."""
     nickel = ae.material("Ni")
     tip = ae.Tip(nickel, apex_radius=6 * nickel.a, axis=(1, 1, 1), depth=3.5 * nickel.a)
-    watch = ae.WatchSettings(interval=150)
-    return ae.Simulation(tip, **{"seed": 5, "n_threads": 1, "watch_settings": watch} | options)
+    monitor = ae.simulation.Monitor(interval=150)
+    return ae.Simulation(tip, **{"seed": 5, "n_threads": 1, "monitor": monitor} | options)
 
 
 def small(**options):
@@ -71,7 +71,7 @@ def small(**options):
 
 
 def run_small(path, n_ions=90, resume=False, **options):
-    checkpoint = ae.Checkpoint(path, minutes=0, resume=resume)
+    checkpoint = ae.simulation.Checkpoint(path, minutes=0, resume=resume)
     return small(**options).run(n_ions, responses=False, progress=False, batch_size=30, checkpoint=checkpoint)
 
 
@@ -107,7 +107,7 @@ def work(path):
         [ae.RollUp(ENERGY)],
         progress=False,
         batch_size=20,
-        checkpoint=ae.Checkpoint(path, minutes=0, resume=True),
+        checkpoint=ae.simulation.Checkpoint(path, minutes=0, resume=True),
     )
 
 
@@ -195,7 +195,7 @@ class Interrupting(ae.Unperturbed):
 def interrupted(path, at, **options):
     flown = Interrupting()
     object.__setattr__(flown, "at", at)
-    checkpoint = ae.Checkpoint(path, **options)
+    checkpoint = ae.simulation.Checkpoint(path, **options)
     return small().run(90, [flown], responses=False, progress=False, batch_size=30, checkpoint=checkpoint)
 
 
@@ -239,7 +239,7 @@ def test_an_error_keeps_what_is_done(tmp_path):
                 raise RuntimeError("broken on purpose")
             return super().launch(emissions, random)
 
-    with pytest.raises(ae.RunInterrupted, match="on purpose") as caught:
+    with pytest.raises(ae.simulation.RunInterrupted, match="on purpose") as caught:
         small().run(90, [Breaking()], responses=False, progress=False, batch_size=30, checkpoint=tmp_path / "run.h5")
     assert len(caught.value.run) == 60
     assert len(ae.load(tmp_path / "run.h5.unfinished")) == 60
@@ -255,7 +255,7 @@ def test_a_full_disk_loses_nothing(tmp_path):
     try:
         with (
             pytest.warns(UserWarning, match=r"no checkpoint: cannot write .*File too large; the run continues"),
-            pytest.raises(ae.RunNotSaved, match=r"cannot write .*File too large") as caught,
+            pytest.raises(ae.simulation.RunNotSaved, match=r"cannot write .*File too large") as caught,
         ):
             run_small(tmp_path / "run.h5")
     finally:
@@ -287,7 +287,7 @@ def test_a_file_of_somebody_else_is_not_overwritten(tmp_path):
 
 
 def test_one_process_at_a_time(tmp_path):
-    checkpoint = ae.Checkpoint(tmp_path / "run.h5")
+    checkpoint = ae.simulation.Checkpoint(tmp_path / "run.h5")
     with Keeper(checkpoint, {}, (), True, 90):
         with pytest.raises(ae.FileError, match=rf"run\.h5' is being written by process {os.getpid()} on "):
             run_small(tmp_path / "run.h5")
@@ -312,7 +312,7 @@ def test_an_unfinished_run_is_not_thrown_away_unasked(unfinished):
 
 
 def test_other_settings_are_refused(unfinished):
-    checkpoint = ae.Checkpoint(unfinished, resume=True)
+    checkpoint = ae.simulation.Checkpoint(unfinished, resume=True)
     options = {"responses": False, "progress": False, "checkpoint": checkpoint}
     with pytest.raises(ae.FileError, match=r"detector\.distance is 100\.0 in the stored run, 50\.0 in the new"):
         small(detector=ae.Detector(distance=50.0)).run(90, [Interrupting()], **options)
@@ -349,7 +349,9 @@ def test_a_run_that_would_not_come_out_again_is_not_replaced(tmp_path, there, me
         run_small(tmp_path / "run.h5", 60)
     assert (tmp_path / "run.h5").read_bytes() == before
     assert [item.name for item in tmp_path.iterdir()] == ["run.h5"]
-    small().run(60, responses=False, progress=False, checkpoint=ae.Checkpoint(tmp_path / "run.h5", overwrite=True))
+    small().run(
+        60, responses=False, progress=False, checkpoint=ae.simulation.Checkpoint(tmp_path / "run.h5", overwrite=True)
+    )
     assert len(run_small(tmp_path / "run.h5", 60)) == 60  # the same again, and a longer one, may take its place
     assert len(run_small(tmp_path / "run.h5", 90)) == 90
 
@@ -361,7 +363,9 @@ def test_a_refused_resume_leaves_nothing_behind(tmp_path):
     used = small()
     used.run(5, responses=False, progress=False)
     with pytest.raises(ValueError, match="resume needs a new Simulation"):
-        used.run(120, responses=False, progress=False, checkpoint=ae.Checkpoint(tmp_path / "run.h5", resume=True))
+        used.run(
+            120, responses=False, progress=False, checkpoint=ae.simulation.Checkpoint(tmp_path / "run.h5", resume=True)
+        )
     assert [item.name for item in tmp_path.iterdir()] == ["run.h5"]
 
 
@@ -369,7 +373,7 @@ def test_a_complete_run_is_not_written_again_by_resume(tmp_path):
     run_small(tmp_path / "run.h5", 90)
     before = os.stat(tmp_path / "run.h5")
     simulation = small()
-    checkpoint = ae.Checkpoint(tmp_path / "run.h5", resume=True)
+    checkpoint = ae.simulation.Checkpoint(tmp_path / "run.h5", resume=True)
     assert checkpoint.ions_there() == 90
     assert len(simulation.run(90, responses=False, progress=False, checkpoint=checkpoint)) == 90
     after = os.stat(tmp_path / "run.h5")
@@ -390,7 +394,7 @@ def test_ctrl_c_waits_for_files(tmp_path, monkeypatch, at, kept):
     monkeypatch.setattr(os, "replace", pressing)
     with pytest.raises(KeyboardInterrupt):
         interrupted(tmp_path / "run.h5", at)
-    assert ae.Checkpoint(tmp_path / "run.h5").ions_there() == kept
+    assert ae.simulation.Checkpoint(tmp_path / "run.h5").ions_there() == kept
     assert [item.name for item in tmp_path.iterdir()] == (["run.h5.unfinished"] if kept else [])
 
 
@@ -410,7 +414,7 @@ def test_the_progress_may_be_told_to_a_function():
 )
 def test_settings_that_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
-        ae.Checkpoint(**options)
+        ae.simulation.Checkpoint(**options)
 
 
 # ---- files and folders of others -----------------------------------------------------------------------------------
@@ -450,7 +454,7 @@ def test_what_is_not_a_folder_is_refused(tmp_path, kind):
     (tmp_path / "other" / "ions-000000000000.h5").write_text("precious")
     folder.write_text("precious") if kind == "file" else folder.symlink_to("other")
     with pytest.raises(ae.FileError, match=r"cannot write .*run\.h5\.unfinished': Not a folder"):
-        small().run(30, responses=False, checkpoint=ae.Checkpoint(tmp_path / "run.h5", overwrite=True))
+        small().run(30, responses=False, checkpoint=ae.simulation.Checkpoint(tmp_path / "run.h5", overwrite=True))
     assert (tmp_path / "other" / "ions-000000000000.h5").read_text() == "precious"
 
 
@@ -587,7 +591,7 @@ def test_a_state_that_would_crash_hdf5_is_made_again(unfinished):
             run_hdf5.read_state(path)
     whole[0x6EB : 0x6EB + 47] = bytes(47)
     path.write_bytes(whole)
-    with pytest.warns(ae.DataWarning, match=r"state\.h5' is damaged.*all events are recomputed"):
+    with pytest.warns(ae.warnings.DataWarning, match=r"state\.h5' is damaged.*all events are recomputed"):
         interrupted(unfinished, (), resume=True)
     interrupted(unfinished.with_name("whole.h5"), ())
     assert differing(unfinished, unfinished.with_name("whole.h5")) == []

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap._common.warnings import ChargesWarning, ResponseWarning, RunWarning
 from apt_evap.simulation.monitor import charge_residuals
+from apt_evap.warnings import ChargesWarning, ResponseWarning, RunWarning
 
 
 def simulate(tip, n=400, responses=False, batch_size=256, n_threads=1, emissions=(), **options):
-    watch = ae.WatchSettings(**{"interval": 100} | options.pop("watch", {}))
-    simulation = ae.Simulation(tip, seed=3, n_threads=n_threads, watch_settings=watch, **options)
+    monitor = ae.simulation.Monitor(**{"interval": 100} | options.pop("monitor", {}))
+    simulation = ae.Simulation(tip, seed=3, n_threads=n_threads, monitor=monitor, **options)
     return simulation.run(n, emissions, responses=responses, progress=False, batch_size=batch_size)
 
 
@@ -18,7 +18,7 @@ def simulate(tip, n=400, responses=False, batch_size=256, n_threads=1, emissions
 
 
 def test_residuals_are_those_of_robins_equation(small_tip):
-    emitter = ae.Emitter(small_tip, n_threads=1)
+    emitter = ae.evaporation.Emitter(small_tip, n_threads=1)
     emitter.evaporate(50)
     positions, normals, charges = emitter.positions, emitter.normals, emitter.charges
     expected = []
@@ -34,8 +34,10 @@ def test_residuals_are_those_of_robins_equation(small_tip):
 
 def test_residuals_tell_settled_charges_from_others(small_tip):
     """Relaxed with direct sums they are as small as the tolerance, a thousand times less than after events."""
-    exact = ae.ChargeSettings(opening_angle=0.0, relaxation_angle=0.0, start_tolerance=1e-8, sweep_interval=10_000)
-    emitter = ae.Emitter(small_tip, settings=exact, n_threads=1)
+    exact = ae.evaporation.ChargeSettings(
+        opening_angle=0.0, relaxation_angle=0.0, start_tolerance=1e-8, sweep_interval=10_000
+    )
+    emitter = ae.evaporation.Emitter(small_tip, settings=exact, n_threads=1)
     seen = []
     for _ in range(4):
         seen.append(np.sqrt(np.mean(charge_residuals(emitter, 500, seed=0) ** 2)))
@@ -48,7 +50,7 @@ def test_residuals_tell_settled_charges_from_others(small_tip):
 
 def test_residuals_are_about_the_error(small_tip):
     """RMS error of the charges, against converged ones, from half to three times the residual (0.8 to 2.5 measured)."""
-    emitter = ae.Emitter(small_tip, n_threads=1)
+    emitter = ae.evaporation.Emitter(small_tip, n_threads=1)
     assert sum(len(batch) for batch in emitter.advance(300, batch_size=300)) == 300
     residual = np.sqrt(np.mean(charge_residuals(emitter, 128, seed=0) ** 2))
     may, before = small_tip.evaporable[emitter.atoms], dict(zip(emitter.atoms, emitter.charges, strict=True))
@@ -74,7 +76,7 @@ def test_the_history_is_that_of_the_ions(small_tip, tmp_path):
     outcome = run.hits(ae.Unperturbed()).outcome
     for row, end in enumerate(history.ions):
         since = slice(end - 100, end)
-        assert history.missed[row] == np.mean(outcome[since] == ae.Outcome.MISSED)
+        assert history.missed[row] == np.mean(outcome[since] == ae.detection.Outcome.MISSED)
         assert history.never_left[row] == 0
         assert history.flagged[row] == np.mean(run.flagged[since])
         assert history.field[row] == pytest.approx(run.fields[since].mean(), rel=1e-14)
@@ -85,7 +87,7 @@ def test_the_history_is_that_of_the_ions(small_tip, tmp_path):
 
 
 def test_watching_changes_no_bit_and_depends_on_no_batch_or_thread(small_tip):
-    plain = simulate(small_tip, watch={"interval": 10**6})
+    plain = simulate(small_tip, monitor={"interval": 10**6})
     assert len(plain.history.ions) == 0
     watched = simulate(small_tip)
     assert np.array_equal(plain.site, watched.site) and np.array_equal(plain.charges, watched.charges)
@@ -95,7 +97,7 @@ def test_watching_changes_no_bit_and_depends_on_no_batch_or_thread(small_tip):
 
 
 def test_a_run_after_a_run_has_its_own_history(small_tip):
-    simulation = ae.Simulation(small_tip, n_threads=1, watch_settings=ae.WatchSettings(interval=100))
+    simulation = ae.Simulation(small_tip, n_threads=1, monitor=ae.simulation.Monitor(interval=100))
     first, second = (simulation.run(250, responses=False, progress=False) for _ in range(2))
     assert first.history.ions.tolist() == [100, 200]
     assert second.history.ions.tolist() == [400]  # the first relaxation at which 100 ions of this run have left
@@ -118,7 +120,7 @@ def warned(tip, **options):
 
 def test_one_warning_past_each_bound(small_tip):
     assert warned(small_tip) == []
-    ((kind, text),) = warned(small_tip, watch={"charge_bound": 1e-6})
+    ((kind, text),) = warned(small_tip, monitor={"charge_bound": 1e-6})
     assert kind is ChargesWarning and "after 100 ions" in text and "bound of 1e-06" in text
     flights = ae.FlightSettings(max_steps=3)
     ((kind, text),) = warned(small_tip, flight_settings=flights)
@@ -129,14 +131,14 @@ def test_one_warning_past_each_bound(small_tip):
 
 def test_charges_that_are_let_go_are_noticed(small_tip):
     """A bound that is not too wide: patches too small to carry the change of charge run past it."""
-    loose = ae.ChargeSettings(patch_radius=1.5, update_radius=1.5, sweep_interval=400, tolerance=0.5)
+    loose = ae.evaporation.ChargeSettings(patch_radius=1.5, update_radius=1.5, sweep_interval=400, tolerance=0.5)
     ((kind, _),) = warned(small_tip, n=900, charge_settings=loose)
     assert kind is ChargesWarning
 
 
 def test_the_progress_line_shows_it(small_tip, capsys):
-    watch = ae.WatchSettings(interval=100)
-    ae.Simulation(small_tip, n_threads=1, watch_settings=watch).run(250, responses=False, progress=True)
+    monitor = ae.simulation.Monitor(interval=100)
+    ae.Simulation(small_tip, n_threads=1, monitor=monitor).run(250, responses=False, progress=True)
     line = capsys.readouterr().err.split("\r")[-1]
     assert "charges=" in line and "missed=" in line and "never left=0.0%" in line
 
@@ -144,4 +146,4 @@ def test_the_progress_line_shows_it(small_tip, capsys):
 @pytest.mark.parametrize("bad", [{"interval": 0}, {"sample": 0}, {"charge_bound": 0.0}, {"fraction_bound": 2.0}])
 def test_bad_settings_are_refused(bad):
     with pytest.raises(ValueError, match=f"{next(iter(bad))} must be "):
-        ae.WatchSettings(**bad)
+        ae.simulation.Monitor(**bad)

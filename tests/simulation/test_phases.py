@@ -19,9 +19,11 @@ def run_of(tip, n=250, **options):
 def mixed():
     """A tip of three phases on two lattices, with a void."""
     phases = [
-        ae.Phase("matrix", AL, solutes={"Cu": 0.05}),
-        ae.Phase("tungsten", "W", ae.Sphere((0, 0, 3), 1.5), axis=(0, 1, 1), evaporation_field=21.0),
-        ae.Phase("soft", AL, ae.HalfSpace((0, 1, 0), (0, 1, 0)), evaporation_field=17.0, vacancies=0.02),
+        ae.specimen.Phase("matrix", AL, solutes={"Cu": 0.05}),
+        ae.specimen.Phase("tungsten", "W", ae.specimen.Sphere((0, 0, 3), 1.5), axis=(0, 1, 1), evaporation_field=21.0),
+        ae.specimen.Phase(
+            "soft", AL, ae.specimen.HalfSpace((0, 1, 0), (0, 1, 0)), evaporation_field=17.0, vacancies=0.02
+        ),
     ]
     return ae.Tip(phases=phases, seed=3, depth=1.6, **SHAPE)
 
@@ -30,7 +32,10 @@ def test_equal_phases_have_the_bits_of_one_phase():
     one = ae.Tip(AL, solutes={"Cu": 0.1}, seed=1, depth=1.5, **SHAPE)
     alloy = {"material": AL, "solutes": {"Cu": 0.1}}
     two = ae.Tip(
-        phases=[ae.Phase("matrix", **alloy), ae.Phase("ball", region=ae.Sphere((0.5, 0, 3), 1.5), **alloy)],
+        phases=[
+            ae.specimen.Phase("matrix", **alloy),
+            ae.specimen.Phase("ball", region=ae.specimen.Sphere((0.5, 0, 3), 1.5), **alloy),
+        ],
         seed=1,
         depth=1.5,
         **SHAPE,
@@ -64,7 +69,7 @@ def test_a_run_knows_the_phase_of_every_ion_through_a_file(mixed, tmp_path):
 def test_a_resumed_run_has_the_same_bits(mixed, tmp_path):
     whole = run_of(mixed, 700)
     assert len(whole.state.deepened) == 0 or whole.state.deepened  # of a shell
-    checkpoint = ae.Checkpoint(tmp_path / "run.h5", resume=True)
+    checkpoint = ae.simulation.Checkpoint(tmp_path / "run.h5", resume=True)
     for ions in (201, 480, 700):
         run = run_of(mixed, ions, checkpoint=checkpoint)
     assert run.fingerprint() == whole.fingerprint()
@@ -81,7 +86,7 @@ def test_an_ion_rolls_up_by_the_mean_distance_of_both_phases(mixed, tmp_path):
     expected = 0.5 * (distances[run.phase[rolling]] + distances[of_neighbour])
     np.testing.assert_array_equal(run.emissions.rollup_distances[rolling], expected)
     assert len(set(expected.tolist())) == 3
-    launches = ae.RollUp(0.1).launch(run.emissions, ae.IonRandom(1, run.emissions.ions))
+    launches = ae.RollUp(0.1).launch(run.emissions, ae.emission.IonRandom(1, run.emissions.ions))
     height = np.linalg.norm(launches.positions[rolling] - neighbour, axis=1)
     np.testing.assert_allclose(height, expected, rtol=1e-12)
     run.save(tmp_path / "run.h5")
@@ -98,8 +103,8 @@ def test_an_instrument_keeps_the_phase_as_truth(mixed):
 
 def test_atoms_with_a_higher_evaporation_field_leave_later():
     """Retention: among atoms of equal height, those of the phase with the high field have the later numbers."""
-    hard = ae.Phase("hard", AL, ae.HalfSpace((0, 0, 0), (1, 0, 0)), evaporation_field=21.0)
-    tip = ae.Tip(phases=[ae.Phase("matrix", AL), hard], **SHAPE)
+    hard = ae.specimen.Phase("hard", AL, ae.specimen.HalfSpace((0, 0, 0), (1, 0, 0)), evaporation_field=21.0)
+    tip = ae.Tip(phases=[ae.specimen.Phase("matrix", AL), hard], **SHAPE)
     run = run_of(tip, 1500)
     apex = run.emissions.positions[:, 2] > 2.5
     assert np.median(run.emissions.ions[apex & (run.phase == 1)]) > np.median(

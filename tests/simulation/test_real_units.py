@@ -94,13 +94,13 @@ def test_times_voltages_and_masses_belong_together(real):
 
 
 def test_timing_errors_make_a_spectrum(run):
-    sharp = run.at_evaporation_field(timing=ae.Timing(jitter=0.0)).hits(ae.Unperturbed())
-    timing = ae.Timing(jitter=0.0, temperature=50.0)
+    sharp = run.at_evaporation_field(timing=ae.detection.Timing(jitter=0.0)).hits(ae.Unperturbed())
+    timing = ae.detection.Timing(jitter=0.0, temperature=50.0)
     tailed = run.at_evaporation_field(timing=timing).hits(ae.Unperturbed())
     seen = sharp.detected & (np.hypot(sharp.x, sharp.y) < 60)
     exact = run.at_evaporation_field().hits(ae.Unperturbed()).mass_to_charge
     assert sharp.mass_to_charge[seen] == pytest.approx(exact[seen], rel=1e-12)  # calibrated
-    jitter = run.at_evaporation_field(timing=ae.Timing(jitter=1.0)).hits(ae.Unperturbed())
+    jitter = run.at_evaporation_field(timing=ae.detection.Timing(jitter=1.0)).hits(ae.Unperturbed())
     delays = jitter.time_of_flight[seen] - sharp.time_of_flight[seen]
     assert np.std(delays) == pytest.approx(1.0, rel=0.15)  # about 300 ions
     excess = tailed.mass_to_charge[seen] / sharp.mass_to_charge[seen] - 1
@@ -109,13 +109,13 @@ def test_timing_errors_make_a_spectrum(run):
 
 
 def test_charges_are_drawn_from_the_local_field(run):
-    drawn = run.at_evaporation_field(flight_charges=ae.PostIonisation(26.0 / 35.0))
+    drawn = run.at_evaporation_field(flight_charges=ae.emission.PostIonisation(26.0 / 35.0))
     share = np.mean(drawn.flight_charges == 2)
     # N(2+) / N(1+) is 10 at 26 V/nm; the fields at the atoms differ by 2 %, dlnCSR/dlnF is about 30
     assert 0.8 < share < 0.97 and set(drawn.flight_charges.tolist()) == {1, 2}
-    again = run.at_evaporation_field(flight_charges=ae.PostIonisation(26.0 / 35.0))
+    again = run.at_evaporation_field(flight_charges=ae.emission.PostIonisation(26.0 / 35.0))
     assert np.array_equal(drawn.flight_charges, again.flight_charges)
-    other = run.at_evaporation_field(flight_charges=ae.PostIonisation(26.0 / 35.0), seed=9)
+    other = run.at_evaporation_field(flight_charges=ae.emission.PostIonisation(26.0 / 35.0), seed=9)
     assert not np.array_equal(drawn.flight_charges, other.flight_charges)
     assert (run.at_evaporation_field(flight_charges={"Ni": 3}).flight_charges == 3).all()
 
@@ -168,7 +168,7 @@ def test_flown_energies_are_not_taken_for_real_ones(tip12):
 
 def test_a_run_in_real_units_is_saved_joined_and_turned_back(real, run, tmp_path):
     timed = run.at_evaporation_field(
-        field_reference="site", timing=ae.Timing(temperature=30.0), control=ae.VoltageControl(rate=0.02)
+        field_reference="site", timing=ae.detection.Timing(temperature=30.0), control=ae.VoltageControl(rate=0.02)
     )
     timed.save(tmp_path / "real.h5")
     loaded = ae.load(tmp_path / "real.h5")
@@ -186,7 +186,7 @@ def test_a_run_in_real_units_is_saved_joined_and_turned_back(real, run, tmp_path
 
 
 def test_an_epos_has_what_an_instrument_could_have_written(run, tmp_path):
-    hits = run.at_evaporation_field(timing=ae.Timing(temperature=50.0)).hits(ROLLED)
+    hits = run.at_evaporation_field(timing=ae.detection.Timing(temperature=50.0)).hits(ROLLED)
     hits = hits[hits.detected]
     ae.write(tmp_path / "real.epos", hits)
     read = ae.read(tmp_path / "real.epos")
@@ -200,7 +200,7 @@ def test_a_run_in_real_units_is_resumed_as_simulated(tip12, tmp_path):
     short = ae.Simulation(tip12, seed=3, n_threads=1).run(150, progress=False, checkpoint=path)
     short.at_evaporation_field().save(path)
     resumed = ae.Simulation(tip12, seed=3, n_threads=1).run(
-        260, progress=False, checkpoint=ae.Checkpoint(path, resume=True)
+        260, progress=False, checkpoint=ae.simulation.Checkpoint(path, resume=True)
     )
     whole = simulate(tip12, 260)
     assert resumed.units is None and resumed.fingerprint() == whole.fingerprint()
@@ -208,7 +208,7 @@ def test_a_run_in_real_units_is_resumed_as_simulated(tip12, tmp_path):
 
 
 def test_runs_without_fields_of_the_cap_need_the_site(run):
-    old = replace(run, cap=ae.CapHistory.empty())
+    old = replace(run, cap=ae.simulation.CapHistory.empty())
     with pytest.raises(ValueError, match="field_reference='site'"):
         old.at_evaporation_field()
     assert old.at_evaporation_field(field_reference="site").units.field_ratio is None
@@ -227,7 +227,7 @@ def test_the_voltage_is_proportional_to_the_radius(nickel, factor):
     for radius in (10.0, 10.0 * factor):
         size = radius * nickel.a
         tip = ae.Tip(nickel, size, axis=(1, 1, 1), shank_angle=10.0, shank_length=size, offset_seed=3)
-        cap = ae.Emitter(tip).cap
+        cap = ae.evaporation.Emitter(tip).cap
         assert cap.radius == pytest.approx(size, rel=0.1)  # through the atoms, which are inside the smooth cap
         voltages.append(1000.0 / cap.ratio)
     assert voltages[1] / voltages[0] == pytest.approx(factor, rel=0.015)
@@ -242,7 +242,7 @@ def test_the_voltage_follows_the_radius_of_a_cone(nickel):
     """
     size = 10 * nickel.a
     tip = ae.Tip(nickel, size, axis=(1, 1, 1), shank_angle=12.0, shank_length=3 * size, offset_seed=3)
-    emitter, rows, ions = ae.Emitter(tip), [], 0
+    emitter, rows, ions = ae.evaporation.Emitter(tip), [], 0
     for batch in emitter.advance(12_000):
         if batch.cap is not None:
             rows.append((ions, batch.cap.ratio, batch.cap.radius, emitter.positions[:, 2].max()))
@@ -292,6 +292,6 @@ def test_a_field_factor_is_near_those_of_instruments(factor, tmp_path):
     with pytest.raises(ValueError, match="field_factor"):
         ae.reconstruct(hits, atomic_volume=0.011, distance=100.0, evaporation_field=35.0, field_factor=factor)
     with pytest.raises(ValueError, match="field_factor"):
-        ae.polarization_energy(1e-40, 1e3, field_factor=factor, radius=10.0, step=0.3)
+        ae.specimen.polarization_energy(1e-40, 1e3, field_factor=factor, radius=10.0, step=0.3)
     with pytest.raises(ValueError, match="field_factor"):
         OperatingPoint(field_factor=factor)

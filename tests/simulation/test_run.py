@@ -10,9 +10,9 @@ from apt_evap.simulation.columns import columns_of
 ENERGY = ae.TruncatedNormal(0.155, 0.155)
 BUILT_IN = (
     ae.Unperturbed(),
-    ae.LateralVelocity(ae.Thermal(60.0)),
+    ae.LateralVelocity(ae.emission.Thermal(60.0)),
     ae.RollUp(ENERGY),
-    ae.Combined(ae.Fixed(0.3), 0.75),
+    ae.Combined(ae.emission.Fixed(0.3), 0.75),
 )
 
 
@@ -25,7 +25,7 @@ class Hop:
     def launch(self, emissions, random):
         push = random.normal(3) * 50.0
         where = emissions.positions + self.height * emissions.normals
-        return ae.Launches(where, push, np.zeros(len(emissions), bool))
+        return ae.emission.Launches(where, push, np.zeros(len(emissions), bool))
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +141,7 @@ def test_save_and_load(run, tmp_path):
     for name in ("seed", "voltage", "detector", "response_settings", "elements", "ended", "provenance"):
         assert getattr(loaded, name) == getattr(run, name), name
     assert loaded.settings["tip"] == run.settings["tip"]
-    others = (ae.RollUp(ae.Fixed(0.2)), ae.Combined(ENERGY, 0.5), ae.LateralVelocity(0.1))
+    others = (ae.RollUp(ae.emission.Fixed(0.2)), ae.Combined(ENERGY, 0.5), ae.LateralVelocity(0.1))
     for perturbation in (*BUILT_IN, *others):
         assert same_hits(run.hits(perturbation), loaded.hits(perturbation))
     # a user's own comes back as what is known of it, and can be asked for by that
@@ -215,7 +215,7 @@ def test_maps_of_its_ions_cover_the_detector(run):
     hits = run.hits(ae.RollUp(ENERGY))
     map = hits.map(bins=30)
     assert map.extent == hits.extent == (-150, 150, -150, 150) and map.values.shape == (30, 30)
-    assert map.mask.all() and map.ions == hits.counts[ae.Outcome.HIT] == map.detected
+    assert map.mask.all() and map.ions == hits.counts[ae.detection.Outcome.HIT] == map.detected
     # a part of the detector, and what lies beside it
     part = hits.map(bins=40, extent=(-200, 0, -200, 0))
     x, y = np.meshgrid(*part.centres)

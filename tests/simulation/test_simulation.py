@@ -86,7 +86,7 @@ def test_what_is_flown_besides_changes_nothing(small_tip, plain):
 
 def test_the_sequence_is_that_of_the_emitter(small_tip, plain):
     """The simulation relaxes when the emitter asks for it, and not otherwise: the same atoms at the same charges."""
-    emitter = ae.Emitter(small_tip)
+    emitter = ae.evaporation.Emitter(small_tip)
     sites, charges, sweeps = [], [], 0
     for batch in emitter.advance(200, batch_size=200):
         sites.append(batch.site)
@@ -109,7 +109,7 @@ def test_ions_that_miss_are_counted(small_tip, plain):
     assert 20 < on.sum() < 40
     summary = replace(tiny, perturbations=(), flown=()).summary()
     assert (summary["hit"], summary["missed"], summary["never_left"]) == (on.sum(), 60 - on.sum(), 0)
-    assert hits.counts[ae.Outcome.MISSED] == 60 - on.sum()
+    assert hits.counts[ae.detection.Outcome.MISSED] == 60 - on.sum()
     assert len(hits[hits.detected]) == on.sum()
     # where they land is not changed by how large the detector is
     assert np.array_equal(hits.x, landed.x, equal_nan=True)
@@ -126,11 +126,11 @@ def test_ions_that_never_leave_are_counted(small_tip):
     run = simulate(small_tip, 20, flight_settings=ae.FlightSettings(max_steps=3), emissions=[ae.Unperturbed()])
     assert run.summary()["never_left"] == 20
     hits = run.hits(ae.Unperturbed())
-    assert (hits.outcome == ae.Outcome.NEVER_LEFT).all()
+    assert (hits.outcome == ae.detection.Outcome.NEVER_LEFT).all()
     assert np.isnan(hits.x).all()
     assert not hits.detected.any()
     assert run.flagged.all()  # there is nothing to fit
-    assert run.hits(ae.LateralVelocity(0.1)).counts[ae.Outcome.NEVER_LEFT] == 20
+    assert run.hits(ae.LateralVelocity(0.1)).counts[ae.detection.Outcome.NEVER_LEFT] == 20
 
 
 @pytest.fixture(scope="module")
@@ -216,7 +216,7 @@ def test_ctrl_c_keeps_what_is_done(small_tip):
 class Half:
     def launch(self, emissions, random):
         n = len(emissions) // 2
-        return ae.Launches(emissions.positions[:n], np.zeros((n, 3)), np.zeros(n, bool))
+        return ae.emission.Launches(emissions.positions[:n], np.zeros((n, 3)), np.zeros(n, bool))
 
 
 @pytest.mark.parametrize(
@@ -235,9 +235,9 @@ class Half:
         (lambda s: ae.Simulation(s.tip, n_threads=0), "n_threads must be an integer"),
         (lambda s: ae.FlightSettings(opening_angle=2.0), "opening_angle must be a finite number"),
         (lambda s: ae.FlightSettings(tolerance=0.0), "tolerance must be a finite number"),
-        (lambda s: ae.ChargeSettings(patch_radius=0.5), "patch_radius must be a finite number"),
-        (lambda s: ae.ChargeSettings(update_radius=3.0), "update_radius must be a finite number"),
-        (lambda s: ae.ChargeSettings(sweep_interval=0), "sweep_interval must be an integer"),
+        (lambda s: ae.evaporation.ChargeSettings(patch_radius=0.5), "patch_radius must be a finite number"),
+        (lambda s: ae.evaporation.ChargeSettings(update_radius=3.0), "update_radius must be a finite number"),
+        (lambda s: ae.evaporation.ChargeSettings(sweep_interval=0), "sweep_interval must be an integer"),
     ],
 )
 def test_bad_input_gets_one_clear_sentence(small_tip, call, message):
@@ -264,7 +264,7 @@ def test_the_names_users_rely_on(tmp_path):
     ae.write(tmp_path / "ni.epos", rolled)
     measured = ae.read(tmp_path / "ni.epos")
     assert isinstance(measured, ae.Hits)
-    assert len(measured) == rolled.counts[ae.Outcome.HIT]
+    assert len(measured) == rolled.counts[ae.detection.Outcome.HIT]
     emitter = simulation.emitter
     n = len(emitter)
     assert emitter.positions.shape == emitter.normals.shape == (n, 3)
@@ -289,7 +289,7 @@ INNER, OUTER = 10.0, 40.0  # mm, on a detector at 100 mm
 
 def fourier(hits, most=12):
     """Amplitudes and phases [degrees] of the azimuthal profile, and the Poisson error of an amplitude."""
-    profile = ae.azimuthal_profile(hits, inner=INNER, outer=OUTER, bins=72)
+    profile = ae.maps.azimuthal_profile(hits, inner=INNER, outer=OUTER, bins=72)
     angle = np.radians(profile.position)
     parts = np.array([2 * np.mean(profile.density * np.exp(-1j * m * angle)) for m in range(most + 1)])
     # each of both parts of an amplitude has the variance 2/N: N hits of weight 2/N cos(m angle)
@@ -298,7 +298,7 @@ def fourier(hits, most=12):
 
 def test_the_pole_is_dark(run20):
     plain = run20.hits(ae.Unperturbed())
-    profile = ae.radial_profile(plain, outer=60.0, bins=12)
+    profile = ae.maps.radial_profile(plain, outer=60.0, bins=12)
     ring = (profile.position > 25) & (profile.position < 50)
     assert (profile.density[0] + 3 * profile.error[0]) < 0.6 * profile.density[ring].mean()
     assert profile.density[1] + 3 * profile.error[1] < 0.6 * profile.density[ring].mean()
@@ -319,7 +319,7 @@ def test_the_lines_are_dark_without_perturbation(run20):
     assert abs((phase[6] / 6 + 30) % 60 - 30) < 5.0  # bright between the lines, dark on them
     lines = []
     for perturbation in (ae.Unperturbed(), ae.RollUp(ENERGY)):
-        profile = ae.azimuthal_profile(run20.hits(perturbation), inner=INNER, outer=OUTER, bins=36)
+        profile = ae.maps.azimuthal_profile(run20.hits(perturbation), inner=INNER, outer=OUTER, bins=36)
         on = np.abs((profile.position % 60) - 30) <= 5.0  # twelve sectors, two on each line
         n = on.sum()
         lines.append((profile.density[on].mean(), np.sqrt((profile.error[on] ** 2).sum()) / n))
@@ -392,7 +392,7 @@ class Breaking:
 
 def test_an_exception_keeps_what_is_done(small_tip):
     with pytest.raises(
-        ae.RunInterrupted, match="broken on purpose; the attribute `run` contains the 100 ions"
+        ae.simulation.RunInterrupted, match="broken on purpose; the attribute `run` contains the 100 ions"
     ) as caught:
         ae.Simulation(small_tip, seed=1).run(200, [Breaking()], responses=False, progress=False, batch_size=50)
     assert len(caught.value.run) == 100

@@ -10,13 +10,13 @@ from apt_evap.simulation.surface import surface_after
 
 
 def test_the_surface_of_a_file_is_that_of_the_simulation(small_tip, tmp_path):
-    simulation = ae.Simulation(small_tip, seed=1, charge_settings=ae.ChargeSettings(sweep_interval=50))
+    simulation = ae.Simulation(small_tip, seed=1, charge_settings=ae.evaporation.ChargeSettings(sweep_interval=50))
     run = simulation.run(120, [ae.Unperturbed()], responses=False, progress=False)
     run.save(tmp_path / "ni.h5")
     emitter = surface_after(ae.load(tmp_path / "ni.h5"))
     # the last relaxation was before the 101st event
     assert emitter.counts["events"] == 100
-    again = ae.Simulation(small_tip, seed=1, charge_settings=ae.ChargeSettings(sweep_interval=50))
+    again = ae.Simulation(small_tip, seed=1, charge_settings=ae.evaporation.ChargeSettings(sweep_interval=50))
     again.run(100, [ae.Unperturbed()], responses=False, progress=False)
     again.emitter.relax()
     here, there = np.argsort(emitter.atoms), np.argsort(again.emitter.atoms)

@@ -57,7 +57,7 @@ class TestAse:
         # atoms in the ball times the volume of one
         assert len(tip) * 0.361**3 / 4 == pytest.approx(4 / 3 * np.pi * 1.5**3, rel=0.1)
         assert tip.nearest_neighbour_distance == pytest.approx(0.361 / 2**0.5, rel=1e-9)
-        batch = ae.Emitter(tip).evaporate(5)
+        batch = ae.evaporation.Emitter(tip).evaporate(5)
         assert len(batch) == 5
 
     def test_elements_begin_with_the_most_frequent(self, ase):
@@ -86,7 +86,7 @@ class TestAse:
             ae.Tip.from_atoms(shell.to_atoms())
 
     def test_the_surface(self, alloy):
-        emitter = ae.Emitter(alloy)
+        emitter = ae.evaporation.Emitter(alloy)
         atoms = emitter.to_atoms()
         np.testing.assert_allclose(atoms.positions / 10, emitter.positions, rtol=0, atol=EXACT)
         for name in ("charge", "field", "normal", "atom"):
@@ -97,7 +97,7 @@ class TestAse:
     def test_the_surface_through_a_file(self, alloy, tmp_path):
         from ase.io import read, write
 
-        atoms = ae.Emitter(alloy).to_atoms()
+        atoms = ae.evaporation.Emitter(alloy).to_atoms()
         write(tmp_path / "surface.xyz", atoms)
         again = read(tmp_path / "surface.xyz")
         # ASE writes eight decimals

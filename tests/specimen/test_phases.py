@@ -8,17 +8,17 @@ import pytest
 from scipy.spatial import cKDTree
 
 import apt_evap as ae
-from apt_evap._common.warnings import DataWarning
 from apt_evap.specimen.alloy import SOLUTE, VACANCY, site_numbers
+from apt_evap.warnings import DataWarning
 
 AL = ae.material("Al")
-BALL = ae.Sphere((0, 0, 3), 2.0)
+BALL = ae.specimen.Sphere((0, 0, 3), 2.0)
 SHAPE = {"apex_radius": 5.0, "shank_length": 5.0}
 D = AL.nearest_neighbour_distance
 
 
 def tip_of(*phases, **more):
-    return ae.Tip(phases=[ae.Phase("matrix", AL), *phases], **(SHAPE | more))
+    return ae.Tip(phases=[ae.specimen.Phase("matrix", AL), *phases], **(SHAPE | more))
 
 
 def sites(tip):
@@ -39,7 +39,7 @@ def fraction_error(n, fraction):
 def test_equal_phases_are_one_phase(alloy):
     one = ae.Tip(AL, axis=(1, 1, 1), offset_seed=2, seed=5, **SHAPE, **alloy)
     two = ae.Tip(
-        phases=[ae.Phase("matrix", AL, **alloy), ae.Phase("ball", AL, region=BALL, **alloy)],
+        phases=[ae.specimen.Phase("matrix", AL, **alloy), ae.specimen.Phase("ball", AL, region=BALL, **alloy)],
         axis=(1, 1, 1),
         offset_seed=2,
         seed=5,
@@ -53,18 +53,18 @@ def test_equal_phases_are_one_phase(alloy):
 
 
 def test_the_last_phase_is_where_several_are():
-    core = ae.Phase("core", AL, region=ae.Sphere((0, 0, 3), 1.0))
-    shell = ae.Phase("shell", AL, region=BALL)
+    core = ae.specimen.Phase("core", AL, region=ae.specimen.Sphere((0, 0, 3), 1.0))
+    shell = ae.specimen.Phase("shell", AL, region=BALL)
     tip = tip_of(shell, core)
     radius = np.linalg.norm(tip.positions - [0, 0, 3], axis=1)
     expected = np.where(radius <= 1, 2, np.where(radius <= 2, 1, 0))
     np.testing.assert_array_equal(tip.phase, expected)
-    nested = tip_of(core, ae.Phase("shell", AL, region=ae.CoreShell(core.region, 1.0)))
+    nested = tip_of(core, ae.specimen.Phase("shell", AL, region=ae.specimen.CoreShell(core.region, 1.0)))
     np.testing.assert_array_equal(np.array([0, 2, 1])[nested.phase], expected)
 
 
 def test_a_function_of_points_is_a_region():
-    tip = tip_of(ae.Phase("half", "Al", region=lambda points: points[:, 0] > 0.01))
+    tip = tip_of(ae.specimen.Phase("half", "Al", region=lambda points: points[:, 0] > 0.01))
     np.testing.assert_array_equal(tip.phase == 1, tip.positions[:, 0] > 0.01)
     json.dumps(tip.settings)
     with pytest.raises(ValueError, match="region"):
@@ -77,9 +77,11 @@ def test_a_function_of_points_is_a_region():
 def test_evaporation_fields_of_a_phase_replace_those_of_the_materials():
     tip = ae.Tip(
         phases=[
-            ae.Phase("matrix", AL, solutes={"Cu": 0.1}),
-            ae.Phase("ball", AL, region=BALL, solutes={"Cu": 0.3}, evaporation_field={"Al": 15.0}),
-            ae.Phase("layer", AL, region=ae.Layer(-3, -2), solutes={"Cu": 0.3}, evaporation_field=25.0),
+            ae.specimen.Phase("matrix", AL, solutes={"Cu": 0.1}),
+            ae.specimen.Phase("ball", AL, region=BALL, solutes={"Cu": 0.3}, evaporation_field={"Al": 15.0}),
+            ae.specimen.Phase(
+                "layer", AL, region=ae.specimen.Layer(-3, -2), solutes={"Cu": 0.3}, evaporation_field=25.0
+            ),
         ],
         seed=1,
         **SHAPE,
@@ -106,7 +108,7 @@ def test_numbers_of_the_sites_are_uniform_and_independent():
 
 @pytest.mark.parametrize("depth", [None, 2.0])
 def test_fractions_of_solutes_and_vacancies(depth):
-    matrix = ae.Phase("matrix", AL, solutes={"Cu": 0.2, "Si": 0.05}, vacancies=0.1)
+    matrix = ae.specimen.Phase("matrix", AL, solutes={"Cu": 0.2, "Si": 0.05}, vacancies=0.1)
     whole = ae.Tip(AL, depth=depth, **SHAPE)
     tip = ae.Tip(phases=[matrix], seed=3, depth=depth, **SHAPE)
     assert len(tip) / len(whole) == pytest.approx(0.9, abs=fraction_error(len(whole), 0.1))
@@ -116,9 +118,9 @@ def test_fractions_of_solutes_and_vacancies(depth):
 
 
 def test_segregation_about_the_boundary_of_a_phase():
-    profile = ae.Segregation(0.02, 0.3, 0.6)
-    ball = ae.Phase("ball", AL, region=ae.Sphere((0, 0, 2), 2.5), solutes={"Cu": profile})
-    tip = ae.Tip(phases=[ae.Phase("matrix", AL, solutes={"Cu": profile}), ball], seed=4, **SHAPE)
+    profile = ae.specimen.Segregation(0.02, 0.3, 0.6)
+    ball = ae.specimen.Phase("ball", AL, region=ae.specimen.Sphere((0, 0, 2), 2.5), solutes={"Cu": profile})
+    tip = ae.Tip(phases=[ae.specimen.Phase("matrix", AL, solutes={"Cu": profile}), ball], seed=4, **SHAPE)
     distance = np.linalg.norm(tip.positions - [0, 0, 2], axis=1) - 2.5
     bins = np.digitize(distance, np.arange(-2.5, 3.6, 0.25))
     for number in range(1, 24):
@@ -129,8 +131,8 @@ def test_segregation_about_the_boundary_of_a_phase():
 
 
 def test_segregation_about_another_region():
-    profile = ae.Segregation(0.0, 0.5, 0.4, region=ae.Layer(-1, 1))
-    tip = ae.Tip(phases=[ae.Phase("matrix", AL, solutes={"Cu": profile})], seed=4, **SHAPE)
+    profile = ae.specimen.Segregation(0.0, 0.5, 0.4, region=ae.specimen.Layer(-1, 1))
+    tip = ae.Tip(phases=[ae.specimen.Phase("matrix", AL, solutes={"Cu": profile})], seed=4, **SHAPE)
     copper = np.abs(np.abs(tip.positions[tip.species == 1, 2]) - 1)
     expected = profile.fractions(np.abs(np.abs(tip.positions[:, 2]) - 1)).sum()
     assert copper.max() < 5 * 0.4 and len(copper) == pytest.approx(expected, abs=4 * np.sqrt(expected))
@@ -156,7 +158,7 @@ def interior(tip):
 )
 def test_neighbours_in_ordered_compounds(prototype, structure, fraction, like, unlike):
     host = ae.material({"fcc": "Ni", "bcc": "Fe"}[structure])
-    phase = ae.Phase("compound", host, order=ae.Order(prototype, "Al"))
+    phase = ae.specimen.Phase("compound", host, order=ae.specimen.Superlattice(prototype, "Al"))
     tip = ae.Tip(phases=[phase], apex_radius=4.0, shank_length=4.0, axis=(1, 1, 1))
     inside = interior(tip)
     second = tip.species == 1
@@ -175,7 +177,7 @@ def test_neighbours_in_ordered_compounds(prototype, structure, fraction, like, u
 
 def test_l1_2_has_alternate_planes_and_a_quarter_of_the_second_element():
     a = ae.material("Ni").a
-    tip = ae.Tip(phases=[ae.Phase("gamma prime", "Ni", order=ae.Order("L1_2", "Al"))], **SHAPE)
+    tip = ae.Tip(phases=[ae.specimen.Phase("gamma prime", "Ni", order=ae.specimen.Superlattice("L1_2", "Al"))], **SHAPE)
     planes = np.rint(tip.positions[:, 2] / (a / 2)).astype(int)
     pure = planes % 2 == 1
     assert not (tip.species[pure] == 1).any()  # pure (002) planes alternate with mixed ones
@@ -187,15 +189,19 @@ def test_l1_2_has_alternate_planes_and_a_quarter_of_the_second_element():
 
 def test_a_basis_of_a_users_own():
     quarter = {"Al": 0.75, "Ti": 0.25}
-    own = ae.Basis((quarter, None, None, None))
-    shared = ae.Order("L1_2", quarter)
-    tips = [ae.Tip(phases=[ae.Phase("gamma prime", "Ni", order=order)], seed=2, **SHAPE) for order in (own, shared)]
+    own = ae.specimen.UnitCell((quarter, None, None, None))
+    shared = ae.specimen.Superlattice("L1_2", quarter)
+    tips = [
+        ae.Tip(phases=[ae.specimen.Phase("gamma prime", "Ni", order=order)], seed=2, **SHAPE) for order in (own, shared)
+    ]
     np.testing.assert_array_equal(tips[0].species, tips[1].species)
     counts = np.bincount(tips[0].species)
     n = counts[1] + counts[2]
     assert counts[2] / n == pytest.approx(0.25, abs=fraction_error(n, 0.25))
-    doubled = ae.Basis(("Al", None, None, "Al"), cells=(2, 1, 1))  # layers of bcc cells along x: corner, then centre
-    tip = ae.Tip(phases=[ae.Phase("own", "Fe", order=doubled)], **SHAPE)
+    doubled = ae.specimen.UnitCell(
+        ("Al", None, None, "Al"), cells=(2, 1, 1)
+    )  # layers of bcc cells along x: corner, then centre
+    tip = ae.Tip(phases=[ae.specimen.Phase("own", "Fe", order=doubled)], **SHAPE)
     cell = np.floor(tip.positions[:, 0] / 0.287 + 1e-6).astype(int) % 2
     centre = np.rint(2 * tip.positions[:, 0] / 0.287).astype(int) % 2 == 1
     np.testing.assert_array_equal(tip.species == 1, cell == centre)
@@ -206,8 +212,10 @@ def test_a_basis_of_a_users_own():
 
 def bicrystal(**more):
     grains = [
-        ae.Phase("first", AL, axis=(0, 0, 1)),
-        ae.Phase("second", AL, region=ae.HalfSpace((0.1, 0, 0), (1, 0, 0.2)), axis=(1, 1, 1), rotation=7.0),
+        ae.specimen.Phase("first", AL, axis=(0, 0, 1)),
+        ae.specimen.Phase(
+            "second", AL, region=ae.specimen.HalfSpace((0.1, 0, 0), (1, 0, 0.2)), axis=(1, 1, 1), rotation=7.0
+        ),
     ]
     return ae.Tip(phases=grains, **(SHAPE | more))
 
@@ -216,7 +224,7 @@ def bicrystal(**more):
 def test_grains_do_not_overlap_and_leave_no_gap(depth):
     tip = bicrystal(depth=depth)
     assert cKDTree(tip.positions).query(tip.positions, k=2)[0][:, 1].min() >= 0.7 * D
-    boundary = ae.HalfSpace((0.1, 0, 0), (1, 0, 0.2)).distance(tip.positions)
+    boundary = ae.specimen.HalfSpace((0.1, 0, 0), (1, 0, 0.2)).distance(tip.positions)
     np.testing.assert_array_equal(tip.phase == 1, boundary <= 1e-7)
     # each grain is a perfect crystal away from the boundary
     for phase in (0, 1):
@@ -231,7 +239,7 @@ def test_grains_do_not_overlap_and_leave_no_gap(depth):
 
 
 def test_a_precipitate_on_its_own_lattice():
-    tungsten = ae.Phase("tungsten", "W", region=BALL, axis=(0, 1, 1))
+    tungsten = ae.specimen.Phase("tungsten", "W", region=BALL, axis=(0, 1, 1))
     tip = tip_of(tungsten)
     assert cKDTree(tip.positions).query(tip.positions, k=2)[0][:, 1].min() > 0.7 * 0.5 * (D + 0.2737) - 1e-3
     assert set(tip.species[tip.phase == 1].tolist()) == {1}
@@ -248,10 +256,16 @@ SPECIMENS = {
     "bicrystal": bicrystal,
     "everything": lambda **more: ae.Tip(
         phases=[
-            ae.Phase("matrix", "Ni", solutes={"Al": ae.Segregation(0.05, 0.3, 0.5)}, vacancies=0.02),
-            ae.Phase("gamma prime", "Ni", BALL, order=ae.Order("L1_2", {"Al": 0.7, "Ti": 0.3}), evaporation_field=33.0),
-            ae.Phase("void", "Ni", ae.Sphere((2, 0, 0), 0.8), vacancies=1),
-            ae.Phase("tungsten", "W", ae.Layer(-4, -2), axis=(0, 1, 1)),
+            ae.specimen.Phase("matrix", "Ni", solutes={"Al": ae.specimen.Segregation(0.05, 0.3, 0.5)}, vacancies=0.02),
+            ae.specimen.Phase(
+                "gamma prime",
+                "Ni",
+                BALL,
+                order=ae.specimen.Superlattice("L1_2", {"Al": 0.7, "Ti": 0.3}),
+                evaporation_field=33.0,
+            ),
+            ae.specimen.Phase("void", "Ni", ae.specimen.Sphere((2, 0, 0), 0.8), vacancies=1),
+            ae.specimen.Phase("tungsten", "W", ae.specimen.Layer(-4, -2), axis=(0, 1, 1)),
         ],
         seed=3,
         offset_seed=1,
@@ -296,30 +310,45 @@ def test_another_seed_is_another_alloy():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ae.Phase("", AL), "name must be text"),
-        (lambda: ae.Phase("p", "Xx"), "no material is named 'Xx'"),
-        (lambda: ae.Phase("p", AL, region=3), "region must be a region such as Sphere"),
-        (lambda: ae.Phase("p", AL, axis=(0, 0, 0)), "axis must not be zero"),
-        (lambda: ae.Phase("p", AL, order="L1_2"), "order must be an Order"),
-        (lambda: ae.Phase("p", AL, order=ae.Order("B2", "Cu")), "order B2 needs the structure bcc, got fcc"),
-        (lambda: ae.Phase("p", AL, order=ae.Basis(("Cu",))), "order must have 4 sites for fcc, got 1"),
-        (lambda: ae.Phase("p", AL, vacancies=1.5), "vacancies must be"),
-        (lambda: ae.Phase("p", AL, evaporation_field={"Cu": 30}), "element in evaporation_field must be one of Al"),
-        (lambda: ae.Phase("p", AL, evaporation_field=-1), "evaporation_field must be"),
-        (lambda: ae.Phase("p", AL, solutes={"Cu": 0.5, "Si": ae.Segregation(0.1, 0.6, 1)}), "a sum <= 1, got 1.1"),
-        (lambda: ae.Order("L1_3", "Al"), "prototype must be one of L1_2"),
-        (lambda: ae.Order("L1_2", {"Al": 0.5}), "fractions with a sum of 1, got 0.5"),
-        (lambda: ae.Basis(("Al", None, None), cells=(2, 1, 1)), "a multiple of 2 cells"),
-        (lambda: ae.Segregation(0.1, 1.5, 1), "peak must be"),
-        (lambda: ae.Segregation(0.1, 0.5, 1, region=lambda points: points), "region"),
+        (lambda: ae.specimen.Phase("", AL), "name must be text"),
+        (lambda: ae.specimen.Phase("p", "Xx"), "no material is named 'Xx'"),
+        (lambda: ae.specimen.Phase("p", AL, region=3), "region must be a region such as Sphere"),
+        (lambda: ae.specimen.Phase("p", AL, axis=(0, 0, 0)), "axis must not be zero"),
+        (lambda: ae.specimen.Phase("p", AL, order="L1_2"), "order must be a Superlattice"),
+        (
+            lambda: ae.specimen.Phase("p", AL, order=ae.specimen.Superlattice("B2", "Cu")),
+            "order B2 needs the structure bcc, got fcc",
+        ),
+        (
+            lambda: ae.specimen.Phase("p", AL, order=ae.specimen.UnitCell(("Cu",))),
+            "order must have 4 sites for fcc, got 1",
+        ),
+        (lambda: ae.specimen.Phase("p", AL, vacancies=1.5), "vacancies must be"),
+        (
+            lambda: ae.specimen.Phase("p", AL, evaporation_field={"Cu": 30}),
+            "element in evaporation_field must be one of Al",
+        ),
+        (lambda: ae.specimen.Phase("p", AL, evaporation_field=-1), "evaporation_field must be"),
+        (
+            lambda: ae.specimen.Phase("p", AL, solutes={"Cu": 0.5, "Si": ae.specimen.Segregation(0.1, 0.6, 1)}),
+            "a sum <= 1, got 1.1",
+        ),
+        (lambda: ae.specimen.Superlattice("L1_3", "Al"), "prototype must be one of L1_2"),
+        (lambda: ae.specimen.Superlattice("L1_2", {"Al": 0.5}), "fractions with a sum of 1, got 0.5"),
+        (lambda: ae.specimen.UnitCell(("Al", None, None), cells=(2, 1, 1)), "a multiple of 2 cells"),
+        (lambda: ae.specimen.Segregation(0.1, 1.5, 1), "peak must be"),
+        (lambda: ae.specimen.Segregation(0.1, 0.5, 1, region=lambda points: points), "region"),
         (lambda: ae.Tip(**SHAPE), "material or phases must be given"),
-        (lambda: ae.Tip(AL, phases=[ae.Phase("m", AL)], **SHAPE), "material or phases must be given, not both"),
+        (
+            lambda: ae.Tip(AL, phases=[ae.specimen.Phase("m", AL)], **SHAPE),
+            "material or phases must be given, not both",
+        ),
         (lambda: ae.Tip(phases=[], **SHAPE), "phases must be 1 to 127 phases, got 0"),
         (lambda: ae.Tip(phases=[AL], **SHAPE), "phases must be phases"),
-        (lambda: ae.Tip(phases=[ae.Phase("m", AL, BALL)], **SHAPE), "the first of the phases is the matrix"),
-        (lambda: tip_of(ae.Phase("p", AL)), "phase p must have a region"),
-        (lambda: tip_of(ae.Phase("matrix", AL, BALL)), "different names, got matrix twice"),
-        (lambda: tip_of(ae.Phase("p", AL, BALL, vacancies=0.5)), "seed .* must be an integer"),
+        (lambda: ae.Tip(phases=[ae.specimen.Phase("m", AL, BALL)], **SHAPE), "the first of the phases is the matrix"),
+        (lambda: tip_of(ae.specimen.Phase("p", AL)), "phase p must have a region"),
+        (lambda: tip_of(ae.specimen.Phase("matrix", AL, BALL)), "different names, got matrix twice"),
+        (lambda: tip_of(ae.specimen.Phase("p", AL, BALL, vacancies=0.5)), "seed .* must be an integer"),
         (lambda: tip_of(seed=1, solutes={"Cu": 0.1}), "solutes must be those of a phase"),
         (lambda: ae.Tip(AL, solutes={"Al": 0.1}, seed=1, **SHAPE), "solutes must differ from the material, got Al"),
     ],
@@ -332,18 +361,21 @@ def test_wrong_arguments_are_refused(make, message):
 @pytest.mark.parametrize(
     ("region", "vacancies", "later"),
     [
-        (ae.Sphere((50, 0, 0), 1.0), 0.0, []),
-        (ae.Sphere((50, 0, 0), 1.0), 1.0, []),
-        (ae.Sphere((0, 0, 3), 1.0), 0.0, [ae.Phase("later", AL, region=BALL)]),
+        (ae.specimen.Sphere((50, 0, 0), 1.0), 0.0, []),
+        (ae.specimen.Sphere((50, 0, 0), 1.0), 1.0, []),
+        (ae.specimen.Sphere((0, 0, 3), 1.0), 0.0, [ae.specimen.Phase("later", AL, region=BALL)]),
     ],
     ids=["outside", "void outside", "covered"],
 )
 def test_a_phase_without_atoms_causes_a_warning(region, vacancies, later):
     with pytest.warns(DataWarning, match="phase lost "):
-        tip_of(ae.Phase("lost", AL, region=region, vacancies=vacancies), *later)
+        tip_of(ae.specimen.Phase("lost", AL, region=region, vacancies=vacancies), *later)
 
 
 def test_a_void_in_the_specimen_and_a_thin_layer_cause_no_warning():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        tip_of(ae.Phase("void", AL, region=BALL, vacancies=1.0), ae.Phase("copper", "Cu", region=ae.Layer(-0.2, 0.2)))
+        tip_of(
+            ae.specimen.Phase("void", AL, region=BALL, vacancies=1.0),
+            ae.specimen.Phase("copper", "Cu", region=ae.specimen.Layer(-0.2, 0.2)),
+        )

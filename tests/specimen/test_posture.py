@@ -32,10 +32,10 @@ def test_an_upright_specimen_is_silent(needle, small_tip):
 
 
 def test_a_specimen_upside_down_or_on_its_side_is_named(needle):
-    with pytest.warns(ae.SpecimenWarning, match="upside down"):
+    with pytest.warns(ae.warnings.SpecimenWarning, match="upside down"):
         tip_of(needle * [1, 1, -1])
     for axes, name in (([2, 1, 0], "x"), ([0, 2, 1], "y")):
-        with pytest.warns(ae.SpecimenWarning, match=f"side.* {name}"):
+        with pytest.warns(ae.warnings.SpecimenWarning, match=f"side.* {name}"):
             tip_of(needle[:, axes])
 
 

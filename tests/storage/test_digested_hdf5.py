@@ -20,9 +20,9 @@ SIMULATION = "entry1/simulation"
 @pytest.fixture(scope="module")
 def run():
     tip = ae.Tip("Ni", apex_radius=1.5, axis=(1, 1, 1), shank_length=1.5)
-    settings = ae.ChargeSettings(sweep_interval=20)
-    watch = ae.WatchSettings(interval=20)
-    simulation = ae.Simulation(tip, seed=5, n_threads=1, charge_settings=settings, watch_settings=watch)
+    settings = ae.evaporation.ChargeSettings(sweep_interval=20)
+    monitor = ae.simulation.Monitor(interval=20)
+    simulation = ae.Simulation(tip, seed=5, n_threads=1, charge_settings=settings, monitor=monitor)
     return simulation.run(60, [ae.RollUp(0.2)], progress=False)
 
 

@@ -11,11 +11,11 @@ from sweeps import do, planned
 
 from apt_evap._common.files import FileError
 from apt_evap.sweep.batch_system import scripts
-from apt_evap.sweep.collect import collect
+from apt_evap.sweep.collection import collect
 from apt_evap.sweep.files import append_to
-from apt_evap.sweep.plan import open_sweep, plan
-from apt_evap.sweep.status import status
-from apt_evap.sweep.work import retry, work
+from apt_evap.sweep.overview import status
+from apt_evap.sweep.planning import open_sweep, plan
+from apt_evap.sweep.worker import retry, work
 
 BASE = """
 [tip]
@@ -132,7 +132,7 @@ def test_damaged_sweeps(tmp_path, monkeypatch, mutants, seed):
     (tmp_path / "good").mkdir()
     sweep = planned(tmp_path / "good", STUDY, BASE)
     right = {key: do(sweep, key).fingerprint() for key in sweep.keys}
-    monkeypatch.setattr("apt_evap.sweep.work._run", run_that_fails)
+    monkeypatch.setattr("apt_evap.sweep.worker._run", run_that_fails)
     victim, place = tmp_path / "victim", tmp_path / "place"
     victim.mkdir()
     (victim / "file").write_text("mine")

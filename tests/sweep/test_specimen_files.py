@@ -7,8 +7,8 @@ import apt_evap as ae
 from apt_evap._common.files import FileError
 from apt_evap.cli.main import main
 from apt_evap.config.simulation_file import read_config
-from apt_evap.sweep.plan import open_sweep, plan
-from apt_evap.sweep.work import work
+from apt_evap.sweep.planning import open_sweep, plan
+from apt_evap.sweep.worker import work
 
 BASE = """
 [tip]

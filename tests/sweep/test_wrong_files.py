@@ -19,10 +19,10 @@ from apt_evap.cli.main import main
 from apt_evap.config.simulation_file import key_of
 from apt_evap.sweep.batch_system import scripts
 from apt_evap.sweep.claims import Claims
-from apt_evap.sweep.collect import collect
-from apt_evap.sweep.plan import open_sweep, plan
-from apt_evap.sweep.status import status
-from apt_evap.sweep.work import retry, work
+from apt_evap.sweep.collection import collect
+from apt_evap.sweep.overview import status
+from apt_evap.sweep.planning import open_sweep, plan
+from apt_evap.sweep.worker import retry, work
 
 SMALL = """
 [tip]

@@ -1,1 +1,0 @@
-"""Fit of the emission energies to a measured map."""

@@ -1,0 +1,307 @@
+"""Fit of the emission energies: the simulated map with the largest similarity to a measured one."""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+
+from apt_evap._common.codec import for_json
+from apt_evap._common.threads import thread_count
+from apt_evap._common.validation import check_count, check_kind
+from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.detection.hits import Hits
+from apt_evap.emission.energies import Thermal
+from apt_evap.emission.perturbations import LateralVelocity, Unperturbed
+from apt_evap.fit.grid import EnergyGrid, maxima
+from apt_evap.fit.intervals import intervals as intervals_of
+from apt_evap.fit.search import EnergySearch, register_repeatedly
+from apt_evap.fit.settings import FitSettings
+from apt_evap.fit.structure import PoleMeasure, StructureScores
+from apt_evap.fit.study import Score, Study
+from apt_evap.maps.similarity import WINDOW
+from apt_evap.registration.register import Registration
+from apt_evap.simulation.real_units import RealUnits
+from apt_evap.simulation.run import Run
+from apt_evap.warnings import MapWarning, RegistrationWarning, ResponseWarning, StructureWarning
+
+BINS = 128
+DRAWN = 10
+"""Target ratio of simulated (all draws) to measured ions, with `FEWEST` to `MOST` draws per ion."""
+FEWEST, MOST = 4, 16
+FEWEST_IONS = 0.5
+"""Warning below this number of simulated ions per bin; studies of tutorials and twins have 1 to 10."""
+
+
+def fit_energies(
+    run: Run,
+    measured: Hits | DetectorMap,
+    grid: EnergyGrid | None = None,
+    settings: FitSettings | None = None,
+    *,
+    registration: Registration | None = None,
+    pole: Sequence[int] | None = None,
+    n_threads: int | None = None,
+    progress: bool | None = None,
+) -> Study:
+    r"""Find the emission energies with the largest similarity of a run to a measurement.
+
+    The maps for all energies follow from the responses of one run. They are transformed into the measured frame, binned
+    on the measured bins and compared by structural similarity in the common region: the mask of the measured map,
+    within the convex outlines (as in `DetectorMap.from_hits`) of the measured map, of the unperturbed map and of the
+    map in the middle of the grid. The region is the same for all energies.
+
+    Parameters
+    ----------
+    run : Run
+        A run with responses.
+    measured : Hits or DetectorMap
+        Measured ions, or a map of counts or of densities. The noise of densities is not known.
+    grid : EnergyGrid, optional
+        Mechanism of emission and energies; by default ``EnergyGrid("roll-up")`` with the energies of the paper.
+    settings : FitSettings, optional
+        Bins, smoothing, draws and resamples.
+    registration : Registration, optional
+        Carries simulated hits into the measured frame. By default found by `register` with the middle of the
+        grid, repeated with the best point until this is stable, and then refined to the largest similarity of this
+        point.
+    pole : sequence of int, optional
+        Miller indices of the pole for the second objective (`Study.structure`); by default the one with the most
+        complete rings inside the compared region.
+    n_threads : int, optional
+        Number of threads; by default the number of processors that this process may use. Results do not depend on it.
+    progress : bool, optional
+        Whether to show a progress bar; by default if the output is a terminal or a notebook.
+
+    Returns
+    -------
+    Study
+
+    Raises
+    ------
+    ValueError
+        If the run has no responses, the common region is too small, or an argument is outside its range.
+
+    Warns
+    -----
+    UserWarning
+        If the registration is doubtful, the run has too few ions for the bins, or the best map by similarity has lost
+        the structure of the measured one (`StructureWarning`).
+
+    Notes
+    -----
+    The method is that of Shaikh et al., arXiv 2509.13744, with additional errors. A resample draws every measured bin
+    from a Poisson distribution and uses random weights of the ions of the run (see `Sampler`). The draws are the same
+    for all energies and baselines. The registration is fixed.
+
+    Noise adds variance, which would count as contrast: the energies of the map with the highest contrast would seem
+    best. So the similarity of a window of densities x and y is (`local_similarity`)
+
+    .. math:: \frac{2 μ_x μ_y + C_1}{μ_x^2 + μ_y^2 + C_1} \; \frac{2 σ_{xy} + ν_x + ν_y + C_2}{σ_x^2 + σ_y^2 + C_2}
+
+    with the noise variances ν: Poisson noise for measured counts, and the noise of several draws per ion. The true
+    energies have a similarity of about 1. `Study.plain` contains similarities without ν, for comparison with the
+    ceiling. The noise of measured densities is not known and not corrected: their best energies have slightly more
+    contrast than the true ones.
+    """
+    grid = check_kind(EnergyGrid() if grid is None else grid, "grid", EnergyGrid, "an EnergyGrid")
+    settings = check_kind(FitSettings() if settings is None else settings, "settings", FitSettings, "FitSettings")
+    if check_kind(run, "run", Run, "a Run").responses is None:
+        raise ValueError(f"run must have responses for fit_energies, got {run!r}")
+    measured = measured_map(measured, settings.bins)
+    bin_size = max(measured.bin_size) * (0.5 if measured.is_counts else 1)
+    settings = replace(
+        settings,
+        smoothing=bin_size if settings.smoothing is None else settings.smoothing,
+        replicas=settings.replicas or _replicas(measured, run),
+    )
+    search = EnergySearch(run, measured, grid, settings, thread_count(n_threads), progress)
+    with warnings.catch_warnings():
+        # once per energy; the settings contain the same information
+        warnings.simplefilter("ignore", ResponseWarning)
+        rounds: list[Any] = []
+        if registration is None:
+            warnings.simplefilter("ignore", RegistrationWarning)  # given once, for the last registration
+            registration, rounds = register_repeatedly(search)
+        search.place(registration, settings.resamples)
+        measure, missing = _pole_measure(search, registration, pole)
+        values, structures = search.matrix("energies", measure=measure)
+        cells = maxima(values)
+        best = search.refine(values, cells)[0]
+        bounds = intervals_of(grid, values, best, settings.model_error) if settings.resamples else None
+        optimum = search.optimum(cells[0], bounds)
+        refined = search.optimum(best, bounds)
+        scores, plain_scores, maps = {}, {}, {}
+        for name, perturbation in (
+            ("unperturbed", Unperturbed()),
+            ("thermal", LateralVelocity(Thermal(settings.temperature))),
+            ("optimum", optimum.perturbation),
+        ):
+            maps[name], scores[name], plain_scores[name] = search.map_and_scores(perturbation)
+        gain = scores.pop("optimum") - scores["unperturbed"]
+        structure = _structure_scores(measure, search, structures, maps, cells[0])
+    registration.warn_if_doubtful()
+    if structure is not None and structure.lost:
+        warnings.warn(
+            "the best map by SSIM has lost the zone lines of the measured map: contrasts "
+            f"{_contrasts(structure.optimum)} in the rings about a pole, measured {_contrasts(structure.measured)}; "
+            "SSIM rewards blur if the lines of both maps differ, see Study.structure",
+            StructureWarning,
+            stacklevel=2,
+        )
+    density = maps["unperturbed"].ions / search.comparison.mask.sum()
+    if density < FEWEST_IONS:
+        warnings.warn(
+            f"the run has {density:.2g} ions per compared bin, but a map needs at least {FEWEST_IONS:g}: "
+            f"use fewer bins than {max(measured.values.shape)}, or simulate more ions",
+            MapWarning,
+            stacklevel=2,
+        )
+    resampled = values[1:]
+    wins = np.ravel_multi_index(cells[1:].T, grid.shape)
+    energy_limit = run.response_settings.energy_limit / np.median(run.energy_scales)  # [eV] of this run
+    provenance = {
+        "map_bins": measured.values.shape[::-1],
+        "bin_size": measured.bin_size,
+        "bins_compared": search.comparison.inside.sum(),
+        "measured": repr(measured),
+        "measured_noise": "Poisson" if measured.is_counts else "not known",
+        "registered": rounds or "given",
+        "share_above_energy_limit": grid.share_above(energy_limit),
+        "run": {"ions": len(run), "provenance": run.provenance, **run.settings},
+        "real_units": real_units_of(run),
+        "structure": missing,
+    }
+    return Study(
+        grid=grid,
+        ssim=values[0],
+        errors=resampled.std(axis=0, ddof=1) if settings.resamples > 1 else np.full(grid.shape, np.nan),
+        shares=np.bincount(wins, minlength=values[0].size).reshape(grid.shape) / max(settings.resamples, 1),
+        resampled=resampled,
+        optimum=optimum,
+        refined=refined,
+        baselines={name: Score.of_resamples(each) for name, each in scores.items()},
+        plain={name: Score.of_resamples(each) for name, each in plain_scores.items()},
+        gain=Score.of_resamples(gain),
+        gain_share=float((gain[1:] > 0).mean()) if settings.resamples else float("nan"),
+        ceiling=search.ceiling(),
+        registration=registration,
+        measured=search.region,
+        maps=maps,
+        structure=structure,
+        settings=search.comparison.settings,
+        provenance=for_json(provenance),
+    )
+
+
+def _pole_measure(search, registration, pole):
+    """Measure of the structure about a pole, or None and the reason."""
+    try:
+        return PoleMeasure(search.run, registration, search.region, pole), None
+    except ValueError as error:
+        if pole is not None:
+            raise
+        return None, str(error)
+
+
+def _structure_scores(measure, search, structures, maps, cell):
+    if measure is None:
+        return None
+    measured = measure.structure(search.region)
+    misfits = np.array([structure.misfit(measured) for structure in structures])
+    misfit, errors = (column.reshape(search.grid.shape) for column in misfits.T)
+    at = tuple(int(index) for index in cell)
+    return StructureScores(
+        plane=measure.plane,
+        measured=measured,
+        unperturbed=measure.structure(maps["unperturbed"]),
+        optimum=structures[int(np.ravel_multi_index(at, search.grid.shape))],
+        misfit=misfit,
+        errors=errors,
+        best=tuple(int(index) for index in np.unravel_index(misfit.argmin(), misfit.shape)),
+        at_optimum=at,
+    )
+
+
+def _contrasts(structure):
+    return ", ".join(f"{ring.contrast:.2f}" for ring in structure.rings)
+
+
+def real_units_of(run: Run) -> dict[str, Any] | None:
+    """Operating point of a run, and the factors from the energies of a study to real and simulated ones.
+
+    Parameters
+    ----------
+    run : Run
+        At its simulated voltage or in real units.
+
+    Returns
+    -------
+    dict or None
+        None if the fields of the cap, which real units need, are not in the run.
+    """
+    try:
+        real = run if run.units is not None else run.at_evaporation_field()
+    except ValueError:
+        return None
+    units = cast(RealUnits, real.units)
+    scale = float(np.median(real.energy_scales))  # simulated energy per real one
+    charges, counts = np.unique(real.flight_charges, return_counts=True)
+    return {
+        "real_per_study": 1.0 if run.units is not None else 1.0 / scale,
+        "simulated_per_study": scale if run.units is not None else 1.0,
+        "operating_field": units.operating_field,
+        "field_reference": units.field_reference,
+        "flight_charge": int(charges[counts.argmax()]),
+        "barrier_charge": int(np.median(real.emissions.charge_states)),
+    }
+
+
+def _replicas(measured, run):
+    """Number of draws per ion for `DRAWN` times the measured ions; their number is not known for densities."""
+    number = DRAWN * measured.values.sum() / len(run) if measured.is_counts else 2 * FEWEST
+    return int(np.clip(np.ceil(number), FEWEST, MOST))
+
+
+def measured_map(measured: Hits | DetectorMap, bins: int | None = None) -> DetectorMap:
+    """Measured map, with about the requested number of bins along the longer side.
+
+    Parameters
+    ----------
+    measured : Hits or DetectorMap
+        Measured ions, or a map, whose bins are merged by an integer factor.
+    bins : int, optional
+        Number of bins, at least 11; by default 128 for ions, and those of a map.
+
+    Returns
+    -------
+    DetectorMap
+
+    Raises
+    ------
+    ValueError
+        If the number is too small or leaves no bin.
+    """
+    if bins is not None:
+        bins = check_count(bins, "bins", at_least=2 * WINDOW + 1)
+    if isinstance(measured, Hits):
+        return DetectorMap.from_hits(measured, bins=bins or BINS)
+    check_kind(measured, "measured", DetectorMap, "Hits or a DetectorMap")
+    if bins is None:
+        return measured
+    ny, nx = measured.values.shape
+    factor = max(1, round(max(nx, ny) / bins))
+    rows, columns = ny - ny % factor, nx - nx % factor
+
+    def blocks(values):
+        return values[:rows, :columns].reshape(rows // factor, factor, columns // factor, factor)
+
+    inside = blocks(measured.mask)
+    # a bin partly outside counts as outside
+    mask, values = inside.all(axis=(1, 3)), blocks(np.where(measured.mask, measured.values, 0)).sum(axis=(1, 3))
+    if not mask.any():
+        raise ValueError(f"bins={bins} leaves no bin inside {measured!r}")
+    x_edges, y_edges = measured.x_edges[: columns + 1 : factor], measured.y_edges[: rows + 1 : factor]
+    ions = int(values[mask].sum()) if measured.is_counts else None
+    return replace(measured, values=values, mask=mask, ions=ions, detected=None, x_edges=x_edges, y_edges=y_edges)

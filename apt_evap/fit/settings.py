@@ -1,0 +1,64 @@
+"""Settings of a fit: comparison, random draws and resampling of maps."""
+
+from apt_evap._common.codec import checked, count, number, settings, switch
+from apt_evap._common.validation import check_seed
+from apt_evap.fit.defaults import MODEL_ERROR
+
+
+@settings
+class FitSettings:
+    """Comparison, random draws and resampling of maps in `fit_energies`.
+
+    The default None of a setting is replaced by a value that follows from the maps.
+    """
+
+    bins: int | None = count(
+        "Bins along the longer side. For measured hits 128 by default. The bins of a map are merged by an integer "
+        "factor to come closest to this number, or unchanged by default.",
+        default=None,
+        at_least=11,
+    )
+    smoothing: float | None = number(
+        "Standard deviation of the Gaussian that smooths both maps. By default half a bin for counts, and one bin for "
+        "densities, whose noise is not known.",
+        default=None,
+        at_least=0,
+        unit="mm",
+    )
+    flattening: float | None = number(
+        "Standard deviation of the Gaussian that flattens both maps: each map is divided by a smoothed copy; 0 for no "
+        "flattening. By default 0.15 of the square root of the compared area. This removes gradients from the "
+        "instrument or from the shape of the specimen, which do not depend on the energy.",
+        default=None,
+        at_least=0,
+        unit="mm",
+    )
+    data_range: float = number("Range of densities, as for `similarity`.", default=2.0, above=0)
+    allow_noise: bool = switch(
+        "Whether the similarity is corrected for the noise of both maps: the Poisson noise of measured counts, and the "
+        "noise of the random draws of simulated ions. False for the standard `similarity`.",
+        default=True,
+    )
+    replicas: int | None = count(
+        "Number of draws of energy and direction per ion, which are summed to reduce the noise of a map. By default "
+        "ten times as many simulated as measured ions, with 4 to 16 draws.",
+        default=None,
+        at_least=1,
+    )
+    resamples: int = count(
+        "Number of resamples of all measured and simulated ions, for the errors; 0 for none.", default=200
+    )
+    seed: int = checked("Seed of the resamples.", "int", check_seed, default=0)
+    temperature: float = number(
+        "Temperature of the thermal baseline, Maxwell-Boltzmann lateral velocities.",
+        default=50.0,
+        above=0,
+        at_most=1e5,
+        unit="K",
+    )
+    model_error: float = number(
+        "Relative increase of the misfit 1 - SSIM that the difference of the simulated from the measured specimen "
+        "explains, for the intervals; 0 for intervals by noise alone. The default was measured with twins.",
+        default=MODEL_ERROR,
+        at_least=0,
+    )

@@ -1,0 +1,227 @@
+"""Second objective of a fit of energies: the contrast of zone lines and the darkness of a pole, which blur cannot win.
+
+Structural similarity compares maps place by place. If lines of both maps differ in place or width, a blurred map can be
+more similar than a sharp one. The contrast of rings about a pole and the radial densities do not depend on places: blur
+reduces the contrast, and fills the pole.
+"""
+
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from apt_evap._common.short_repr import short_repr
+from apt_evap._common.types import Floats
+from apt_evap.analysis.apex import image_compression
+from apt_evap.crystallography.directions import plane_normals, poles
+from apt_evap.crystallography.orientation import Orientation
+from apt_evap.crystallography.symmetry import rotational_symmetry
+from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.detection.projection import Projection
+from apt_evap.maps.pole_frame import pole_frame
+from apt_evap.maps.pole_profiles import pole_profile
+from apt_evap.maps.profiles import Profile
+from apt_evap.maps.rings import RINGS, Ring, ring_statistics
+from apt_evap.registration.register import Registration
+from apt_evap.simulation.run import Run
+
+LOST = 0.5
+"""A ring has lost its structure if its contrast is below this fraction of the measured one."""
+SIGNIFICANT = 2.0
+"""A measured contrast above this number of its errors, or a difference of misfits, is significant."""
+_FAMILIES = 3  # of largest spacing: their poles have wide dark facets
+_COVERED = 0.7  # fraction of the circle of the outermost ring inside the compared region
+_SECTORS = (72, 36, 24)  # of a ring: the most that its bins fill, and multiples of all folds
+
+
+@dataclass(frozen=True)
+class RegisteredProjection:
+    """Projection of directions in the simulated specimen onto the measured detector.
+
+    Parameters
+    ----------
+    projection : Projection
+        Onto the detector of the run.
+    registration : Registration
+        From there into the measured frame.
+    """
+
+    projection: Projection
+    registration: Registration
+
+    def places(self, directions: ArrayLike) -> Floats:
+        """Positions of directions on the detector [mm], shape (n, 2), as `Projection.places`."""
+        return np.column_stack(self.registration.points(*self.projection.places(directions).T))
+
+    def directions(self, places: ArrayLike) -> Floats:
+        """Unit vectors at positions on the detector, shape (n, 3), as `Projection.directions`."""
+        x, y = np.asarray(places, float).T
+        return self.projection.directions(np.column_stack(self.registration.back(x, y)))
+
+
+class Structure(NamedTuple):
+    """Rings and radial densities about a pole."""
+
+    rings: tuple[Ring, ...]
+    """Statistics of the rings."""
+    radial: Profile
+    """Density against the angle from the pole."""
+
+    @property
+    def values(self) -> Floats:
+        """Contrasts of the rings and radial densities, shape (n,)."""
+        return np.array([*(ring.contrast for ring in self.rings), *self.radial.density])
+
+    @property
+    def errors(self) -> Floats:
+        """Their errors, NaN for unknown noise, shape (n,)."""
+        return np.array([*(ring.error for ring in self.rings), *self.radial.error])
+
+    def misfit(self, measured: Structure) -> tuple[float, float]:
+        """Root mean square difference of the values from measured ones, and its error by noise.
+
+        All values are relative to the mean density: 0.1 is a difference by 10 % of the mean. A ring without hits lacks
+        all of it: its difference is 1.
+        """
+        known = np.isfinite(measured.values)
+        difference = np.nan_to_num(self.values - measured.values, nan=1.0)
+        difference = difference[known]
+        error = np.hypot(np.nan_to_num(self.errors[known]), np.nan_to_num(measured.errors[known]))
+        misfit = float(np.sqrt(np.mean(difference**2)))
+        if misfit == 0.0:
+            return 0.0, float(np.sqrt(np.mean(error**2)))
+        return misfit, float(np.sqrt(np.sum((difference * error) ** 2)) / (len(difference) * misfit))
+
+    def lost(self, measured: Structure) -> bool:
+        """Whether all rings with a significant measured contrast have lost it."""
+        pairs = [
+            (own.contrast, other.contrast)
+            for own, other in zip(self.rings, measured.rings, strict=True)
+            if other.contrast > SIGNIFICANT * np.nan_to_num(other.error) and other.contrast > 0
+        ]
+        return bool(pairs) and all(own < LOST * other for own, other in pairs)
+
+
+class PoleMeasure:
+    """Measures the structure about one pole on maps in the measured frame.
+
+    Parameters
+    ----------
+    run : Run
+        Run of a crystal; its orientation and image compression give the place of the poles.
+    registration : Registration
+        Into the measured frame.
+    region : DetectorMap
+        Measured map, whose mask is the compared region.
+    plane : sequence of int, optional
+        Miller indices of the pole; by default of the one with the most complete rings among those of the three
+        families of largest spacing.
+
+    Raises
+    ------
+    ValueError
+        If the run has no crystal orientation, or no pole has its rings inside the region.
+    """
+
+    def __init__(
+        self, run: Run, registration: Registration, region: DetectorMap, plane: Sequence[int] | None = None
+    ) -> None:
+        orientation = Orientation.from_settings(run.settings["tip"])
+        self.projection = RegisteredProjection(image_compression(run).projection, registration)
+        if plane is None:
+            found = poles(orientation.material, _FAMILIES)
+            planes, normals = found.planes, found.normals
+        else:
+            planes = np.atleast_2d(np.asarray(plane))
+            normals = plane_normals(orientation.material, planes)
+        directions = orientation.directions(normals)
+        covered = [self._covered(region, direction) for direction in directions]
+        best = int(np.argmax(np.round(covered, 1)))  # of equal ones the first, of the largest spacing
+        if covered[best] < _COVERED:
+            raise ValueError(
+                f"no pole has {_COVERED:.0%} of a ring at {RINGS[-1][0]:g} degrees inside the compared region, "
+                f"at most {covered[best]:.0%}"
+            )
+        self.plane = tuple(int(index) for index in planes[best])
+        self.pole = directions[best]
+        self.fold = rotational_symmetry(orientation.material, normals[best])
+        sectors = [self._sectors(region, ring) for ring in RINGS]
+        self.rings = [(ring, number) for ring, number in zip(RINGS, sectors, strict=True) if number]
+        if not self.rings:
+            raise ValueError(f"the bins of {region!r} are too wide for rings about a pole")
+
+    def structure(self, map: DetectorMap, ions: float | None = None) -> Structure:
+        """Structure of a map in the measured frame; `ions` as for `ring_statistics`."""
+        rings = tuple(self._ring(map, ring, sectors, ions) for ring, sectors in self.rings)
+        return Structure(rings, pole_profile(map, self.projection, self.pole, ions=ions))
+
+    def _ring(self, map, ring, sectors, ions):
+        """A ring; one without hits has no contrast: its values are NaN."""
+        try:
+            return ring_statistics(
+                map, self.projection, self.pole, (ring,), fold=self.fold, sectors=sectors, ions=ions
+            )[0]
+        except ValueError:  # not too few bins: the number of sectors is chosen for them
+            unknown, profile = float("nan"), np.full(sectors // self.fold, np.nan)
+            return Ring(*ring, profile, profile, *[unknown] * 6, ions=0.0)
+
+    def _sectors(self, region, ring):
+        """Largest number of sectors of a ring for the bins of the region, 0 if there are too few bins."""
+        for sectors in _SECTORS:
+            try:
+                ring_statistics(
+                    region, self.projection, self.pole, (ring,), fold=self.fold, sectors=sectors, ions=np.inf
+                )
+            except ValueError:
+                continue
+            return sectors
+        return 0
+
+    def _covered(self, region, direction):
+        """Fraction of the sectors of the outermost ring with bins inside the region."""
+        if not np.isfinite(self.projection.places(direction[None])).all():
+            return 0.0
+        frame = pole_frame(region, self.projection, direction, np.inf)
+        inner, outer = RINGS[-1]
+        ring = (frame.angle >= inner) & (frame.angle < outer)
+        return len(np.unique((frame.azimuth[ring] * 36).astype(int))) / 36
+
+
+class StructureScores(NamedTuple):
+    """Second objective of a study: misfit of the contrasts of rings and of the radial densities about a pole."""
+
+    plane: tuple[int, ...]
+    """Miller indices of the pole."""
+    measured: Structure
+    """Structure of the measured map."""
+    unperturbed: Structure
+    """Structure of the unperturbed map."""
+    optimum: Structure
+    """Structure of the map that is best by similarity."""
+    misfit: np.ndarray
+    """Root mean square difference from the measured values on the grid, shape of the grid."""
+    errors: np.ndarray
+    """Error of the misfit by noise, shape of the grid."""
+    best: tuple[int, ...]
+    """Index of the point with the smallest misfit."""
+    at_optimum: tuple[int, ...]
+    """Index of the point that is best by similarity."""
+
+    def __repr__(self) -> str:
+        return short_repr(self)
+
+    @property
+    def disagrees(self) -> bool:
+        """Whether the point that is best by similarity has a significantly larger misfit than the best one."""
+        excess = self.misfit[self.at_optimum] - self.misfit[self.best]
+        error = np.hypot(self.errors[self.at_optimum], self.errors[self.best])
+        return bool(excess > SIGNIFICANT * error)
+
+    @property
+    def lost(self) -> bool:
+        """Whether the map that is best by similarity has lost the structure of the measured one."""
+        return self.optimum.lost(self.measured)

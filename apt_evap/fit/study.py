@@ -1,0 +1,335 @@
+"""Result of a fit of emission energies: similarities, the best energies, their errors."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from apt_evap._common.codec import for_json, to_plain
+from apt_evap._common.files import replace_file
+from apt_evap._common.types import AnyPath, Floats
+from apt_evap._version import __version__
+from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.emission.perturbations import described
+from apt_evap.fit.grid import EnergyGrid
+from apt_evap.fit.settings import FitSettings
+from apt_evap.fit.structure import StructureScores
+from apt_evap.registration.register import Registration
+from apt_evap.registration.verdict import Likeness, likeness
+
+
+class Score(NamedTuple):
+    """A similarity and its standard deviation over the resamples (NaN without resamples)."""
+
+    value: float
+    """Similarity of all ions."""
+    error: float
+    """Standard deviation over the resamples."""
+
+    @classmethod
+    def of_resamples(cls, similarities: Floats) -> "Score":
+        """Return the first similarity, for all ions, with the standard deviation of the others, for resamples."""
+        error = similarities[1:].std(ddof=1) if len(similarities) > 2 else np.nan
+        return cls(float(similarities[0]), float(error))
+
+    def __str__(self):
+        return f"{self.value:z.3f}" + (f" ± {self.error:.3f}" if np.isfinite(self.error) else "")
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """Energies with the largest similarity of simulated and measured map.
+
+    Parameters
+    ----------
+    perturbation : perturbation
+        Perturbation of the ions.
+    mean : float
+        Mean of the energy before the truncation [eV].
+    relative_spread : float
+        Standard deviation before the truncation, relative to the mean.
+    rollup_fraction : float
+        Fraction of the energy for the roll-up.
+    true_mean, true_standard_deviation : float
+        Mean and standard deviation after the truncation [eV].
+    score : Score
+        Similarity with the measured map.
+    intervals : dict
+        Bounds of 95 %, for each of these five numbers and for each option by name. They contain the noise of the ions
+        and the error of the model, and follow the ridge of equal true means (`energy_fit.intervals`). Empty without
+        resamples.
+    at_edge : tuple of str
+        "mean", "relative_spread" and options that are at an end of the grid: the best value may then be beyond it.
+    options : dict
+        Options of the perturbation that are axes of the grid, by name.
+    open_ends : dict
+        Whether the lower and the upper bound of an interval are at an end of the grid, two bools by name: the interval
+        may then continue beyond it.
+    """
+
+    perturbation: object
+    mean: float
+    relative_spread: float
+    rollup_fraction: float
+    true_mean: float
+    true_standard_deviation: float
+    score: Score
+    intervals: dict
+    at_edge: tuple
+    options: dict = field(default_factory=dict)
+    open_ends: dict = field(default_factory=dict)
+
+    def bounded(self, name: str) -> str:
+        """Text of one of the numbers and its interval, str."""
+        return self.scaled(name, 1.0)
+
+    def scaled(self, name: str, factor: float) -> str:
+        """Text of one of the numbers and its interval, times a factor, str."""
+        value = self.options[name] if name in self.options else getattr(self, name)
+        return bounded_text(value, self.intervals.get(name), self.open_ends.get(name), factor)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Study:
+    """Similarity of simulated maps with a measured one for a grid of energies; result of `fit_energies`.
+
+    Matrices have the shape (options, rollup fractions, relative standard deviations, means); without options the last
+    three.
+
+    Parameters
+    ----------
+    grid : EnergyGrid
+        Mechanism and energies.
+    ssim, errors : ndarray
+        Structural similarity at every point of the grid (noise-corrected unless switched off in `settings`), and its
+        standard deviation over the resamples. With the correction it is about 1 for the true energies: 0.97 to 1.06 in
+        twin experiments, and larger if both maps have common noise, such as two maps of one run.
+    shares : ndarray
+        Fraction of the resamples in which a point is the best.
+    resampled : ndarray
+        Similarities in every resample, shape (resamples, ...).
+    optimum, refined : Optimum
+        The best point of the grid, and the maximum of a spline around it.
+    baselines : dict of Score
+        Similarity of "unperturbed" and "thermal" maps.
+    plain : dict of Score
+        Uncorrected structural similarity of "unperturbed", "thermal" and "optimum", for comparison with the ceiling.
+    gain : Score
+        Similarity of the optimum minus that of the unperturbed map, for paired resamples.
+    gain_share : float
+        Fraction of the resamples in which the optimum is better than the unperturbed map.
+    ceiling : Score or None
+        Uncorrected structural similarity of two random halves of the measured ions; None for a map of densities.
+    registration : Registration
+        Transform of simulated hits into the measured frame.
+    measured : DetectorMap
+        The measured map; its mask is the compared region.
+    maps : dict of DetectorMap
+        Simulated maps in the measured frame: "unperturbed", "thermal", "optimum".
+    structure : StructureScores or None
+        Second objective, which blur cannot win: contrast of the zone lines and darkness of a pole. None if no pole with
+        its rings is inside the compared region; ``provenance["structure"]`` contains the reason.
+    settings : FitSettings
+        Settings of the comparison, the random draws and the resampling.
+    provenance : dict
+        All other input of the study, in plain types: run, measured map, bins, rounds of the registration.
+    """
+
+    grid: EnergyGrid
+    ssim: np.ndarray
+    errors: np.ndarray
+    shares: np.ndarray
+    resampled: np.ndarray
+    optimum: Optimum
+    refined: Optimum
+    baselines: dict
+    plain: dict
+    gain: Score
+    gain_share: float
+    ceiling: Score | None
+    registration: Registration
+    measured: DetectorMap
+    maps: dict
+    structure: StructureScores | None
+    settings: FitSettings
+    provenance: dict
+
+    @cached_property
+    def likeness(self) -> Likeness:
+        """Whether the best simulated map and the measured one show the same crystal along the same axis."""
+        return likeness(self.maps["optimum"], self.measured, self.registration)
+
+    def compared(self, map: DetectorMap) -> DetectorMap:
+        """Prepare a map of the measured frame as for the comparison: common region, flattened and smoothed."""
+        flat = replace(map, mask=self.measured.mask).flattened(self.settings.flattening or 0.0)
+        return flat.smoothed(self.settings.smoothing or 0.0)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return results and settings in plain types, NaN as None, dict."""
+        names = ("ssim", "errors", "shares", "gain_share", "optimum", "refined", "registration", "gain", "ceiling")
+        names += ("baselines", "plain", "real_energies", "likeness")
+        results = to_plain({name: getattr(self, name) for name in names})
+        results["made_by"] = f"apt_evap {__version__}"
+        results["grid"] = to_plain(self.grid) | {"mechanism": self.grid.name}
+        for name in ("optimum", "refined"):
+            results[name]["perturbation"] = described(getattr(self, name).perturbation)
+        results["registration"]["doubtful"] = bool(self.registration.doubtful)
+        scores = self.structure
+        results["structure"] = scores and to_plain(scores) | {"disagrees": scores.disagrees, "lost": scores.lost}
+        return for_json(results | {"settings": to_plain(self.settings) | self.provenance})
+
+    def save(self, path: AnyPath) -> None:
+        """Write results and settings to a JSON file; the file is replaced only when complete.
+
+        Parameters
+        ----------
+        path : str or path-like
+            File to write or replace.
+
+        Raises
+        ------
+        FileError
+            If the file cannot be written.
+        """
+        with replace_file(path) as file:
+            file.write((json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n").encode())
+
+    @property
+    def best_cell(self) -> tuple[int, ...]:
+        """Index of the best point of the grid."""
+        best = self.optimum
+        values = {
+            **best.options,
+            "rollup_fraction": best.rollup_fraction,
+            "relative_spread": best.relative_spread,
+            "mean": best.mean,
+        }
+        return tuple(axis.index(values[name]) for name, axis in self.grid.axes.items())
+
+    def __repr__(self) -> str:
+        best, refined = self.optimum, self.refined
+        combined = self.grid.mechanism == "combined"
+        fraction = f", roll-up fraction {best.rollup_fraction:g}" if combined else ""
+        fraction += "".join(f", {name} {value:g}" for name, value in best.options.items())
+        edge = f" (at the end of the grid in {' and '.join(best.at_edge)})" if best.at_edge else ""
+        others = [f"{name} {score}" for name, score in self.baselines.items()]
+        uncorrected = f";\n uncorrected {self.plain['optimum']}, " if self.settings.allow_noise else ", "
+        others = f"{', '.join(others)}, gain over unperturbed {self.gain}" + (uncorrected if self.ceiling else "")
+        others += f"two halves of the measured ions {self.ceiling}" if self.ceiling else ""
+        between = f"{refined.bounded('mean')} eV, sigma/mean {refined.bounded('relative_spread')}"
+        between += f", roll-up fraction {refined.bounded('rollup_fraction')}" if combined else ""
+        between += "".join(f", {name} {refined.bounded(name)}" for name in refined.options)
+        doubtful = ", registration doubtful" if self.registration.doubtful else ""
+        return (
+            f"<Study: maps {self.likeness.verdict}; {self.grid.name}{doubtful}, "
+            f"best at {best.mean:g} eV, sigma/mean {best.relative_spread:g}{fraction}"
+            f"{edge}, SSIM {best.score}; {others};\n between points {between}; {self._structure()}{self._energies()}>"
+        )
+
+    def lines(self) -> list[str]:
+        """Result, similarity, and doubts if there are any: at most three lines, list of str."""
+        best, likeness = self.optimum, self.likeness
+        verdict = {"alike": "the maps are alike", "doubtful": "it is doubtful that the maps are alike"}
+        first = f"{verdict.get(likeness.verdict, 'the maps are not alike')} ({likeness.reason}); {self.grid.name}, "
+        first += f"best at {self.point(self.best_cell)}"
+        second = f"similarity {best.score}, unperturbed {self.baselines['unperturbed']}"
+        if self.settings.allow_noise:
+            second += f"; uncorrected for noise {self.plain['optimum']}"
+        second += f", two halves of the measured ions {self.ceiling}" if self.ceiling else ", ceiling not known"
+        doubts = []
+        if likeness.verdict != "alike":
+            doubts.append("the energies have no meaning if the maps are not alike")
+        if self.registration.doubtful:
+            doubts.append(f"the registration, correlation {self.registration.score:.2f}")
+        if best.at_edge:
+            doubts.append(f"best at the end of the grid in {' and '.join(best.at_edge)}")
+        if self.structure is not None and self.structure.lost:
+            doubts.append("the best map has lost the zone lines")
+        elif self.structure is not None and self.structure.disagrees:
+            doubts.append(f"the rings about the pole are best at {self.point(self.structure.best)}")
+        return [first, second, *([f"doubt: {'; '.join(doubts)}"] if doubts else [])]
+
+    def point(self, index: tuple[int, ...]) -> str:
+        """Text of the energies and options at an index of the grid, str."""
+        values = dict(zip(self.grid.axes, self.grid.values_at(np.asarray(index)).tolist(), strict=True))
+        fraction = values.pop("rollup_fraction")
+        text = f"{values.pop('mean'):g} eV, sigma/mean {values.pop('relative_spread'):.3g}"
+        text += f", roll-up fraction {fraction:g}" if self.grid.mechanism == "combined" else ""
+        return text + "".join(f", {name} {value:g}" for name, value in values.items())
+
+    def _structure(self):
+        """Text of the second objective."""
+        scores = self.structure
+        if scores is None:
+            return ""
+        plane = "".join(map(str, scores.plane)) if min(scores.plane) >= 0 else " ".join(map(str, scores.plane))
+        contrasts, measured = (
+            " ".join(f"{ring.contrast:.2f}" for ring in each.rings) for each in (scores.optimum, scores.measured)
+        )
+        text = f"rings about ({plane}): contrasts {contrasts}, measured {measured}, misfit "
+        text += f"{scores.misfit[scores.at_optimum]:.2f} ± {scores.errors[scores.at_optimum]:.2f}"
+        if scores.disagrees:
+            text += f"; rings and SSIM disagree: rings are best at {self.point(scores.best)}, misfit "
+            text += f"{scores.misfit[scores.best]:.2f} ± {scores.errors[scores.best]:.2f}"
+        return f"{text};\n "
+
+    @property
+    def real_energies(self) -> tuple[float, float] | None:
+        """Mean and standard deviation of the refined optimum in real units [eV]; None if these are not known.
+
+        Real units are those of `Run.at_evaporation_field`: of the run if it was converted, otherwise with its defaults.
+        """
+        real = self.provenance.get("real_units")
+        if real is None:
+            return None
+        factor = real["real_per_study"]
+        return self.refined.true_mean * factor, self.refined.true_standard_deviation * factor
+
+    def _energies(self):
+        """Text of the refined energies: in real units first, then at the simulated voltage."""
+        refined, run, real = self.refined, self.provenance["run"], self.provenance.get("real_units")
+        radius = run["tip"].get("apex_radius")
+        place = f" at {run['voltage']:g} V" + (f" and R = {radius:.3g} nm" if radius else "")
+
+        def text(factor):
+            mean, deviation = (refined.scaled(name, factor) for name in ("true_mean", "true_standard_deviation"))
+            return f"{mean} ± {deviation} eV"
+
+        if real is None:
+            return f"energies {text(1.0)}{place}"
+        field, charge = f"{real['operating_field']:.3g} V/nm", f"{real['flight_charge']}+"
+        return (
+            f"energies {text(real['real_per_study'])} at {field} and {charge}; "
+            f"simulated {text(real['simulated_per_study'])}{place}, {real['barrier_charge']}+"
+        )
+
+
+def bounded_text(
+    value: float,
+    interval: Sequence[float] | None,
+    open_ends: Sequence[bool] | None = None,
+    factor: float = 1.0,
+) -> str:
+    """Text of a number and its interval, times a factor; open ends are "at most" and "at least".
+
+    Parameters
+    ----------
+    value : float
+        The number.
+    interval, open_ends : sequence, optional
+        Its lower and upper bound, and whether each of them is at an end of the grid.
+    factor : float
+        Of all numbers.
+
+    Returns
+    -------
+    str
+    """
+    if interval is None:
+        return f"{value * factor:.3g}"
+    low, high = (bound * factor for bound in interval)
+    below, above = open_ends or (False, False)
+    return f"{value * factor:.3g} ({'at most ' * below}{low:.3g} to {'at least ' * above}{high:.3g})"

@@ -1,0 +1,7 @@
+# The public names of this room: read by type checkers, and by the lazy loader in __init__.py.
+from .distortion_grid import read_grid as read_grid
+from .formats import TruncatedFile as TruncatedFile
+from .formats import chunks as chunks
+from .formats import read_ranges as read_ranges
+from .tapsim_nodes import write_nodes as write_nodes
+from .tapsim_nodes import write_types as write_types

@@ -1,0 +1,19 @@
+# The public names of this room: read by type checkers, and by the lazy loader in __init__.py.
+from .noise import effective_ions as effective_ions
+from .pole_profiles import pole_line_profile as pole_line_profile
+from .pole_profiles import pole_profile as pole_profile
+from .profiles import Profile as Profile
+from .profiles import ProfileComparison as ProfileComparison
+from .profiles import Rectangle as Rectangle
+from .profiles import azimuthal_profile as azimuthal_profile
+from .profiles import compare_profiles as compare_profiles
+from .profiles import radial_profile as radial_profile
+from .profiles import zone_line_profile as zone_line_profile
+from .rings import LineAmplitude as LineAmplitude
+from .rings import Ring as Ring
+from .rings import line_amplitude as line_amplitude
+from .rings import ring_statistics as ring_statistics
+from .similarity import Similarity as Similarity
+from .similarity import similarity_ceiling as similarity_ceiling
+from .zone_line import ZoneLine as ZoneLine
+from .zone_line import fit_zone_line as fit_zone_line

@@ -1,0 +1,118 @@
+"""Poles and zone lines over a detector map."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.patheffects import withStroke
+
+from apt_evap._common.validation import check_kind
+from apt_evap.analysis.apex import image_compression
+from apt_evap.crystallography.directions import poles as poles_of
+from apt_evap.crystallography.directions import zones
+from apt_evap.crystallography.orientation import FittedOrientation, Orientation
+from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.detection.projection import Projection
+from apt_evap.plot._figure import DrawnAxes
+from apt_evap.simulation.run import Run
+
+_COLORS = ("#35b6ff", "#ff9d3b", "#7be07b", "#e58cff")
+_AZIMUTHS = np.radians(np.arange(0.0, 360.5, 0.5))
+_APART = 30  # smallest distance between labels [points], at font size 9
+
+
+def poles(
+    ax: Axes,
+    orientation: Orientation | FittedOrientation | Run,
+    projection: Projection | None = None,
+    *,
+    families: int = 6,
+    zone_families: Sequence[Any] | None = None,
+    labels: bool = True,
+    region: DetectorMap | None = None,
+    size: float = 9,
+) -> DrawnAxes:
+    """Draw the poles and zone lines of a specimen over a map.
+
+    Parameters
+    ----------
+    ax : matplotlib.axes.Axes
+        Axes of a map in mm, such as `detector_map` returns; only points within their limits are drawn.
+    orientation : Orientation or FittedOrientation or Run
+        Orientation of the crystal; a fit and a run have theirs.
+    projection : Projection, optional
+        Projection of directions onto the map; by default that of the fit, or of the run by `image_compression`.
+    families : int
+        Number of families of poles, see `poles.poles`; 0 for none.
+    zone_families : sequence, optional
+        Families of zone axes whose lines are drawn, by default those of `poles.ZONES`; () for none.
+    labels : bool
+        Whether to label the poles. Of overlapping labels only that of the larger spacing is drawn.
+    region : DetectorMap, optional
+        The map, to draw only inside its detector.
+    size : float
+        Font size of the labels [points].
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+    """
+    check_kind(ax, "ax", Axes, "axes of a map, such as detector_map(map)")
+    orientation, projection = _oriented(orientation, projection)
+    x_limits, y_limits = sorted(ax.get_xlim()), sorted(ax.get_ylim())
+    material = orientation.material
+
+    def is_visible(places):
+        with np.errstate(invalid="ignore"):
+            inside = (places[:, 0] > x_limits[0]) & (places[:, 0] < x_limits[1])
+            inside &= (places[:, 1] > y_limits[0]) & (places[:, 1] < y_limits[1])
+        if region is not None:
+            columns = np.searchsorted(region.x_edges, places[inside, 0]) - 1
+            rows = np.searchsorted(region.y_edges, places[inside, 1]) - 1
+            ny, nx = region.mask.shape
+            visible = (columns >= 0) & (columns < nx) & (rows >= 0) & (rows < ny)
+            visible[visible] = region.mask[rows[visible], columns[visible]]
+            inside[inside] = visible
+        return inside
+
+    if zone_families is None or len(zone_families):
+        axes = zones(material, zone_families)
+        for axis, family in zip(orientation.directions(axes.directions), axes.families, strict=True):
+            first, second = np.linalg.svd(axis[None])[2][1:]
+            circle = np.cos(_AZIMUTHS)[:, None] * first + np.sin(_AZIMUTHS)[:, None] * second
+            places = projection.places(circle)
+            places[~is_visible(places)] = np.nan
+            ax.plot(*places.T, color=_COLORS[family % len(_COLORS)], linewidth=0.8, alpha=0.9, zorder=2.5)
+    if families:
+        crystal_poles = poles_of(material, families)
+        places = projection.places(orientation.directions(crystal_poles.normals))
+        selection = np.flatnonzero(is_visible(places))
+        areas = 60 * (crystal_poles.spacings[selection] / crystal_poles.spacings.max()) ** 2
+        outline = [withStroke(linewidth=2, foreground="black")]
+        ax.scatter(*places[selection].T, s=areas, facecolors="none", edgecolors="white", linewidths=1.2, zorder=3,
+                   path_effects=outline)  # fmt: skip
+        label_points = []
+        box = ax.get_window_extent()  # equal scales in x and y, as the axes have only after drawing
+        scale = min(box.width / np.ptp(x_limits), box.height / np.ptp(y_limits)) * 72 / ax.figure.dpi
+        for index in selection if labels else ():
+            point = places[index] * scale
+            if all(np.hypot(*(point - other)) > _APART * size / 9 for other in label_points):
+                label_points.append(point)
+                at_edge = places[index, 0] > x_limits[1] - 0.07 * (x_limits[1] - x_limits[0])
+                ax.annotate(crystal_poles.labels[index], places[index], xytext=(-4 if at_edge else 4, 4), size=size,
+                            textcoords="offset points", ha="right" if at_edge else "left", color="white",
+                            path_effects=outline, clip_on=True)  # fmt: skip
+    ax.set(xlim=x_limits, ylim=y_limits)
+    return ax
+
+
+def _oriented(orientation, projection):
+    """Orientation of the crystal and projection onto the map."""
+    if isinstance(orientation, FittedOrientation):
+        return orientation.orientation, projection or orientation.projection
+    if isinstance(orientation, Run):
+        projection = projection or image_compression(orientation).projection
+        return Orientation.from_settings(orientation.settings["tip"]), projection
+    check_kind(orientation, "orientation", Orientation, "an Orientation, the result of fit_orientation, or a Run")
+    return orientation, check_kind(projection, "projection", Projection, "a Projection")

@@ -1,0 +1,750 @@
+"""Searches for emission energies: they compare what `similarity` compares, and hidden energies are found again."""
+
+import json
+import re
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from fits import fit_energies
+from matplotlib.image import imread
+from rough import ROUGH
+from scipy.stats import truncnorm
+
+import apt_evap as ae
+from apt_evap._common.codec import declared, to_plain
+from apt_evap.emission.perturbations import Combined, launch_tangentially
+from apt_evap.fit.comparison import Comparison
+from apt_evap.fit.fit_energies import real_units_of
+from apt_evap.fit.grid import EnergyGrid, maxima, spline_maxima
+from apt_evap.fit.intervals import intervals
+from apt_evap.fit.resampling import NOISE, Sampler
+from apt_evap.fit.search import EnergySearch
+from apt_evap.fit.settings import FitSettings
+from apt_evap.fit.structure import PoleMeasure
+from apt_evap.maps.pole_frame import pole_frame
+
+EDGES = np.linspace(-60, 60, 49)
+ROLLUP = ae.RollUp(ae.TruncatedNormal(0.155, 0.155))
+LATERAL = ae.LateralVelocity(ae.TruncatedNormal(0.3, 0.316 * 0.3))
+
+
+@pytest.fixture(scope="module")
+def run(run20):
+    """15,000 ions of Ni[111], R = 20 a, with responses alone."""
+    return replace(run20, perturbations=(), flown=())
+
+
+@pytest.fixture(scope="module")
+def other(nickel, made_once):
+    """Of a tip with another origin of the lattice, and with other random numbers: no ion is one of `run`."""
+
+    def make():
+        tip = ae.Tip(nickel, apex_radius=20 * nickel.a, axis=(1, 1, 1), shank_length=20 * nickel.a, offset_seed=5)
+        return ae.Simulation(tip, seed=2, **ROUGH).run(15_000, progress=False)
+
+    return made_once("other", make)
+
+
+HERE = ae.Registration(0.0, 1.0, (0.0, 0.0))
+
+
+def seen(run, perturbation):
+    """Map of the middle of the detector."""
+    counts = np.zeros((48, 48), int)
+    frame = ae.DetectorMap.from_array(counts + 1, EDGES, EDGES, is_counts=True)
+    return ae.DetectorMap.from_hits(run.hits(perturbation), like=frame)
+
+
+# ---- the grid ------------------------------------------------------------------------------------------------------
+
+
+def test_the_grid_of_the_paper():
+    grid = EnergyGrid("combined")
+    assert grid.shape == (5, 6, 6) and len(grid.cells) == 180
+    assert EnergyGrid("roll-up").shape == EnergyGrid("lateral").shape == (1, 6, 6)
+    # evenly spaced means, relative standard deviations of two per decade as the paper rounds them
+    assert np.allclose(np.diff(grid.means), 0.0725) and np.allclose(
+        np.diff(np.log10(grid.relative_spreads)), 0.5, atol=2e-3
+    )
+    assert grid.perturbation(*grid.values_at((3, 3, 4))) == Combined(ae.TruncatedNormal(0.3, 0.316 * 0.3), 0.75)
+    assert EnergyGrid("roll-up").perturbation(*EnergyGrid("roll-up").values_at((0, 4, 2))) == ROLLUP
+    assert EnergyGrid("lateral").perturbation(*EnergyGrid("lateral").values_at((0, 3, 4))) == LATERAL
+
+
+def test_places_between_points():
+    grid = EnergyGrid("combined")
+    fraction, relative_spread, mean = grid.values_at((0.5, 4.5, 1.5))
+    assert fraction == 0.125
+    assert relative_spread == pytest.approx(np.sqrt(3.16), rel=1e-14)
+    assert mean == pytest.approx((0.0825 + 0.155) / 2, rel=1e-14)
+
+
+def test_share_above_an_energy():
+    grid = EnergyGrid("lateral")
+    share = grid.share_above(1.5)
+    for cell in ((0, 5, 5), (0, 4, 3), (0, 0, 0)):
+        _, relative_spread, mean = grid.values_at(cell)
+        assert share[cell] == pytest.approx(
+            truncnorm.sf(1.5, -1 / relative_spread, np.inf, mean, relative_spread * mean), rel=1e-9
+        )
+    assert 0.1 < share[0, 5, 5] < 0.3
+
+
+@pytest.mark.parametrize("free", [(1, 5, 5), (5, 5, 5), (1, 1, 5)])
+def test_maxima_between_points(free):
+    """Of functions with a maximum anywhere in the box, as wide as those of similarities."""
+    places = [np.arange(-1, 1.5, 0.5) + 3 if number == 5 else np.array([2.0]) for number in free]
+    peaks = np.random.default_rng(1).uniform(2.1, 3.9, (30, 3))
+    peaks[:, [number == 1 for number in free]] = 2.0
+    z, y, x = np.meshgrid(*places, indexing="ij")
+    values = np.array([np.exp(-((x - c) ** 2 + (y - b) ** 2 + (z - a) ** 2) / 4) for a, b, c in peaks])
+    found = spline_maxima(places, values)
+    # a 20th of a step from point to point, so half of that; as much again for what a cubic misses
+    assert np.abs(found - peaks).max() < 0.05
+    assert (
+        np.abs(np.array(places, dtype=object)[2][maxima(values)[:, 2]] - peaks[:, 2]).max() > 0.2
+    )  # the points do not
+
+
+def test_the_box_around_a_point_stays_on_the_grid():
+    grid = EnergyGrid("roll-up")
+    fraction, relative_spread, mean = grid.around((0, 5, 0))
+    assert fraction.tolist() == [0.0]
+    assert relative_spread.tolist() == [3.0, 3.5, 4.0, 4.5, 5.0]
+    assert mean.tolist() == [0.0, 0.5, 1.0, 1.5, 2.0]
+
+
+@pytest.mark.parametrize(
+    "wrong, words",
+    [
+        (
+            {"mechanism": "rollup"},
+            "mechanism must be one of roll-up, lateral, combined, got 'rollup'",
+        ),
+        ({"means": (0.1, 0.1)}, "means must be increasing numbers"),
+        ({"means": (0.0, 0.1)}, "means must be increasing numbers"),
+        ({"relative_spreads": ()}, "relative_spreads must be increasing numbers"),
+        ({"rollup_fractions": (0.5,)}, "rollup_fractions are only for the mechanism 'combined'"),
+        ({"mechanism": "combined", "rollup_fractions": (0.5, 1.5)}, "rollup_fractions must be .* from 0 to 1"),
+    ],
+)
+def test_grids_that_are_none(wrong, words):
+    with pytest.raises(ValueError, match=words):
+        EnergyGrid(**{"mechanism": "roll-up"} | wrong)
+
+
+@dataclass(frozen=True)
+class PartlyRolled:
+    """Roll-up of a fraction of the ions; the others start at rest. A perturbation of a user, with an option."""
+
+    energy: ae.TruncatedNormal
+    probability: float
+
+    def __post_init__(self):
+        if not 0 <= self.probability <= 1:
+            raise ValueError(f"probability must be from 0 to 1, got {self.probability}")
+
+    def tangential(self, emissions, random):
+        rolled, first, second, *_ = ae.RollUp(self.energy).tangential(emissions, random)
+        rolls = rolled & (random.uniform(3)[:, 2] < self.probability)
+        return rolls, np.where(rolls, first, 0.0), np.where(rolls, second, 0.0)
+
+    def launch(self, emissions, random):
+        return launch_tangentially(emissions, *self.tangential(emissions, random))
+
+
+def test_options_are_axes():
+    grid = EnergyGrid(PartlyRolled, (0.1, 0.2), (0.5, 1.0, 2.0), options={"probability": (0.0, 0.5, 1.0)})
+    assert grid.shape == (3, 1, 3, 2) and list(grid.axes) == [
+        "probability",
+        "rollup_fraction",
+        "relative_spread",
+        "mean",
+    ]
+    assert grid.perturbation(*grid.values_at((1, 0, 1, 1))) == PartlyRolled(ae.TruncatedNormal(0.2, 0.2), 0.5)
+    assert grid.values_at((0.5, 0, 0, 0.5)).tolist() == [0.25, 1.0, 0.5, pytest.approx(0.15)]
+    assert grid.name == "PartlyRolled" and len(grid.cells) == 18
+    with pytest.raises(ValueError, match="option probability"):
+        EnergyGrid(PartlyRolled, options={"probability": (0.5, 0.5)})
+    with pytest.raises(ValueError, match=r"probability must be from 0 to 1, got 1\.5"):
+        EnergyGrid(PartlyRolled, options={"probability": (0.5, 1.5)})
+    with pytest.raises(ValueError, match=r"options must be those of the mechanism 'roll-up': .*probably"):
+        EnergyGrid("roll-up", options={"probably": (0.5,)})
+    with pytest.raises(ValueError, match="options must not contain 'mean'"):
+        EnergyGrid("roll-up", options={"mean": (0.5,)})
+
+
+def test_a_hidden_fraction_is_found(run, other):
+    """A map of which 0.6 of the ions roll: the fraction is found, and its interval ends at 1 at the latest."""
+    hidden = PartlyRolled(ae.TruncatedNormal(0.155, 0.155), 0.6)
+    study = fit_energies(
+        run, measured_map(other, hidden), PartlyRolled, means=(0.0825, 0.155, 0.2275), relative_spreads=(1.0,),
+        options={"probability": (0.2, 0.4, 0.6, 0.8, 1.0)}, registration=HERE, replicas=4, resamples=20, progress=False,
+    )  # fmt: skip
+    assert study.ssim.shape == (5, 1, 1, 3)
+    # between two specimens of 20 a, half a step of the grid
+    assert study.refined.options["probability"] == pytest.approx(0.6, abs=0.12)
+    low, high = study.refined.intervals["probability"]
+    assert low <= 0.6 <= high
+    assert study.structure.misfit.shape == study.ssim.shape
+    # and what blur cannot win finds it, too
+    assert abs(study.structure.best[0] - 2) <= 1
+    assert f"probability {study.optimum.options['probability']:g}" in repr(study)
+    assert len(ae.plot.ssim_matrix(study)) == 5
+    json.dumps(study.to_dict(), allow_nan=False)
+
+
+@pytest.mark.slow
+def test_hidden_second_rolls_are_found(nickel):
+    """0.8 of the ions roll, and 0.7 of these twice: both numbers are found on another specimen."""
+    runs = []
+    for number in (1, 2):
+        tip = ae.Tip(nickel, apex_radius=20 * nickel.a, axis=(1, 1, 1), shank_length=20 * nickel.a, offset_seed=number)
+        settings = ae.ResponseSettings(rolls=2)
+        runs.append(ae.Simulation(tip, seed=number, response_settings=settings).run(15_000, progress=False))
+    energy = ae.TruncatedNormal(0.155, 0.155)
+    study = fit_energies(
+        runs[0], seen(runs[1], ae.RollUp(energy, 0.8, others=energy, second_roll=0.7)),
+        lambda energy, **options: ae.RollUp(energy, others=energy, **options),
+        means=(0.155,), relative_spreads=(1.0,), registration=HERE, replicas=4, resamples=20, progress=False,
+        options={"probability": (0.0, 0.2, 0.4, 0.6, 0.8, 1.0), "second_roll": (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)},
+    )  # fmt: skip
+    for name, value in (("probability", 0.8), ("second_roll", 0.7)):
+        # half a step of the grid; measured 0.75 and 0.65
+        assert study.refined.options[name] == pytest.approx(value, abs=0.1)
+        low, high = study.refined.intervals[name]
+        assert low <= value <= high
+
+
+# ---- intervals -----------------------------------------------------------------------------------------------------
+
+
+def ridge(grid, true_mean=0.2, deviation=0.1, height=0.8):
+    """Similarities that depend on the true mean alone, and slightly on the relative deviation."""
+    means = np.array([
+        [ae.TruncatedNormal(m, r * m).true_mean for m in grid.means] for r in grid.relative_spreads
+    ])  # fmt: skip
+    tilt = 0.01 * np.arange(len(grid.relative_spreads))[:, None]
+    # bounded, as a similarity is: across the last step of the deviation the true mean grows by up to 0.6 eV
+    return (height * np.exp(-(((means - true_mean) / deviation) ** 2) / 30 / height) - tilt / 5)[None, None]
+
+
+def test_intervals_follow_the_ridge():
+    """Of a similarity that sees the true mean alone: any deviation is possible, the true mean is not."""
+    grid = EnergyGrid("roll-up")
+    values = ridge(grid)
+    best = np.unravel_index(values[0].argmax(), grid.shape)
+    bounds, ends = intervals(grid, values, best, 0.2)
+    assert bounds["relative_spread"] == (0.01, 3.16) and ends["relative_spread"] == (
+        False,
+        True,
+    )  # below 0.1 nothing changes
+    low, high = bounds["true_mean"]
+    # 0.8 (1 - exp(-(d / 0.1)^2 / 24)) = 0.2 (1 - 0.8): d = 0.11, less by the tilt. A tenth of a step is 0.02 eV at the
+    # widest; the spline is up to 0.005 too high at its maximum, where the slope at the bounds is 0.7 / eV: 0.007 eV
+    assert low == pytest.approx(0.2 - 0.11, abs=0.025) and high == pytest.approx(0.2 + 0.11, abs=0.025)
+    assert bounds["mean"][1] - bounds["mean"][0] > high - low
+
+
+def test_ends_of_the_grid_are_told():
+    grid = EnergyGrid("roll-up", means=(0.1, 0.2, 0.3, 0.4), relative_spreads=(1.0,))
+    values = np.array([0.5, 0.6, 0.7, 0.8]).reshape(1, 1, 1, 4)
+    bounds, ends = intervals(grid, values, (0, 0, 3), 0.2)
+    assert bounds["mean"][1] == 0.4 and ends["mean"] == (False, True)
+    assert ends["relative_spread"] == (False, False)  # an axis of one point is fixed
+    assert ends["true_mean"] == (False, True)
+    assert intervals(grid, values, (0, 0, 3), 0.0).bounds["mean"] == (0.4, 0.4)  # without any error
+    limited = EnergyGrid(PartlyRolled, (0.1,), (1.0,), options={"probability": (0.5, 0.75, 1.0)})
+    bounds, ends = intervals(limited, np.array([0.5, 0.6, 0.7]).reshape(1, 3, 1, 1, 1), (2, 0, 0, 0), 5.0)
+    assert bounds["probability"] == (0.5, 1.0) and ends["probability"] == (True, False)  # there is no 1.1
+
+
+def test_intervals_by_noise_are_those_of_a_quadratic_maximum():
+    """S = -(m - m0)^2 with m0 of each resample: 1.96 of its standard deviations to each side."""
+    grid = EnergyGrid("roll-up", means=tuple(np.linspace(0.1, 0.9, 9)), relative_spreads=(0.01,))
+    means = np.array(grid.means)
+    places = np.concatenate([[0.5], 0.5 + 0.05 * np.random.default_rng(0).normal(size=400)])
+    values = (1.0 - (means - places[:, None]) ** 2).reshape(401, 1, 1, 9)
+    low, high = intervals(grid, values, (0, 0, 4), 0.0).bounds["mean"]
+    # a tenth of a step is 0.01; 400 resamples: 3.5 % of the deviation
+    assert (high - low) / 2 == pytest.approx(1.96 * 0.05, abs=0.012)
+
+
+def test_a_misfit_that_is_0_by_accident_is_not_certain():
+    """S = 1 - (m - m0)^2 + d, each resample with a common deviation d: 0.2 * 1.96 of its standard deviations remain."""
+    grid = EnergyGrid("roll-up", means=tuple(np.linspace(0.1, 0.9, 9)), relative_spreads=(0.01,))
+    common = np.concatenate([[0.0], 0.1 * np.random.default_rng(0).normal(size=400)])
+    values = (1.0 - (np.array(grid.means) - 0.5) ** 2 + common[:, None]).reshape(401, 1, 1, 9)
+    low, high = intervals(grid, values, (0, 0, 4), 0.2).bounds["mean"]
+    # a tenth of a step is 0.01; 400 resamples: 3.5 % of the deviation
+    assert (high - low) / 2 == pytest.approx(np.sqrt(0.2 * 1.96 * 0.1), abs=0.012)
+
+
+# ---- rings ---------------------------------------------------------------------------------------------------------
+
+
+def test_rings_of_a_study(twin):
+    """The misfit excludes the map with other lines, and does not exclude the hidden energies."""
+    study, _, truth = twin
+    scores = study.structure
+    assert scores.plane == (1, 1, 1) and scores.misfit.shape == study.ssim.shape == scores.errors.shape
+    assert scores.misfit[scores.best] == scores.misfit.min()
+    # with 15,000 ions the smallest misfit is 0.17, and the errors at the best map by SSIM are 0.13
+    hidden = tuple(axis.index(value) for axis, value in zip(
+        (study.grid.rollup_fractions, study.grid.relative_spreads, study.grid.means), truth, strict=True
+    ))  # fmt: skip
+    excess = scores.misfit[hidden] - scores.misfit.min()
+    assert excess < 2 * np.hypot(scores.errors[hidden], scores.errors[scores.best])
+    assert scores.unperturbed.misfit(scores.measured)[0] > 3 * scores.misfit.min()
+    assert scores.measured.misfit(scores.measured)[0] == 0
+    assert not scores.lost and "rings about (111): contrasts" in repr(study)
+    saved = study.to_dict()["structure"]
+    assert saved["plane"] == [1, 1, 1] and len(saved["measured"]["rings"]) == len(scores.measured.rings)
+
+
+def test_blur_is_warned_of(run, other):
+    """A grid of broad lateral energies only, for a map with lines: the best map has lost them."""
+    sharp = measured_map(other, ROLLUP)
+    with pytest.warns(
+        ae.warnings.StructureWarning, match="the best map by SSIM has lost the zone lines of the measured map"
+    ):
+        study = fit_energies(
+            run, sharp, "lateral", means=(1.2,), relative_spreads=(0.5, 1.0), registration=HERE, replicas=4,
+            resamples=0, progress=False,
+        )  # fmt: skip
+    assert study.structure.lost
+    for own, measured in zip(study.structure.optimum.rings, study.structure.measured.rings, strict=True):
+        assert own.contrast < 0.5 * measured.contrast
+
+
+def test_a_ring_without_hits_has_no_contrast(run, other):
+    """Such a simulated map is a result, and the fit goes on."""
+    region = seen(other, ROLLUP)
+    measure = PoleMeasure(run, HERE, region, (1, 1, 1))
+    (inner, outer), _ = measure.rings[0]
+    frame = pole_frame(region, measure.projection, measure.pole, np.inf)
+    empty = region.values.copy()
+    empty[region.mask] = np.where((frame.angle >= inner) & (frame.angle < outer), 0, region.values[region.mask])
+    found, measured = measure.structure(replace(region, values=empty)), measure.structure(region)
+    assert np.isnan(found.rings[0].contrast) and np.isfinite(found.rings[1].contrast)
+    misfit, error = found.misfit(measured)
+    assert misfit > np.sqrt(1 / len(found.values)) and np.isfinite(error)  # its difference is 1
+
+
+def test_no_pole_is_no_error(run, other):
+    """A region too small for rings: the second objective is missing, and the reason is stored."""
+    measured = seen(other, ROLLUP)
+    x, y = np.meshgrid(EDGES[1:], EDGES[1:])
+    small = replace(measured, mask=np.hypot(x - 30, y - 30) < 22)
+    options = {"means": (0.1, 0.2), "relative_spreads": (1.0,), "registration": HERE, "replicas": 1, "resamples": 0}
+    study = fit_energies(run, small, progress=False, **options)
+    assert study.structure is None and "inside the compared region" in study.provenance["structure"]
+    assert study.to_dict()["structure"] is None
+    with pytest.raises(ValueError, match="no pole has 70% of a ring"):
+        fit_energies(run, small, pole=(1, 1, 1), progress=False, **options)
+
+
+# ---- many maps at a time -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("smoothing, flattening", [(0.0, 0.0), (2.5, 0.0), (0.0, 15.0), (3.0, 20.0)])
+def test_what_is_compared_is_what_ssim_compares(run, other, smoothing, flattening):
+    x, y = np.meshgrid(EDGES[1:], EDGES[1:])
+    measured = replace(seen(other, ROLLUP), mask=(x**2 + y**2 < 50**2) & (x < 30))
+    comparison = Comparison(measured, FitSettings(smoothing=smoothing, flattening=flattening, resamples=0))
+    sampler = Sampler(run, HERE, measured, comparison.box, 0, 0)
+    simulated = replace(seen(run, LATERAL), mask=measured.mask)
+    maps, noise = sampler.maps(LATERAL, 1)
+    assert noise is None
+    assert np.array_equal(maps[0], simulated.counts[comparison.box])
+    flat = [each.flattened(flattening) for each in (measured, simulated)]
+    # the same sums in another order
+    assert comparison.similarities(maps, plain=True)[0] == pytest.approx(
+        float(ae.similarity(*flat, smoothing=smoothing)), abs=1e-12
+    )
+
+
+@pytest.mark.parametrize(("smoothing", "flattening"), [(1e4, 0.0), (0.0, 1e4)])
+def test_widths_beyond_the_map_are_refused(other, smoothing, flattening):
+    """A Gaussian of 1e9 mm would take all memory."""
+    with pytest.raises(ValueError, match="smoothing must be" if smoothing else "flattening must be"):
+        Comparison(seen(other, ROLLUP), FitSettings(smoothing=smoothing, flattening=flattening, resamples=0))
+
+
+def test_flattening_takes_gradients_away():
+    x, y = np.meshgrid(EDGES[1:], EDGES[1:])
+    pattern = 1 + 0.4 * np.cos(x / 3) * np.cos(y / 3)
+    a = ae.DetectorMap.from_array(pattern, EDGES, EDGES)
+    b = ae.DetectorMap.from_array(pattern * (1 + 0.5 * x / 60), EDGES, EDGES)
+    assert float(ae.similarity(a, b)) < 0.97
+    # what is left is what the Gaussian cannot follow at the rim
+    assert float(ae.similarity(a.flattened(12.0), b.flattened(12.0))) > 0.995
+    assert a.flattened(0) is a
+
+
+def test_errors_of_measured_maps_are_those_of_new_measurements(run, other):
+    """The error told from one measured map, against the scatter of 200 that are truly independent."""
+    random = np.random.default_rng(4)
+    truth = seen(other, ROLLUP).smoothed(2.5)
+    simulated = run.hits(ROLLUP)
+    frame = ae.DetectorMap.from_array(np.ones((48, 48), int), EDGES, EDGES, is_counts=True)
+    counts = ae.DetectorMap.from_hits(simulated, like=frame).counts.astype(float)
+    values, errors = [], []
+    for seed in range(200):
+        measured = replace(frame, values=random.poisson(3 * truth.values))
+        resamples = 300 if seed < 6 else 0
+        comparison = Comparison(measured, FitSettings(smoothing=2.5, flattening=0.0, resamples=resamples, seed=seed))
+        found = comparison.similarities(np.repeat(counts[None], resamples + 1, axis=0))
+        values.append(found[0])
+        if resamples:
+            errors.append(found[1:].std(ddof=1))
+    # resampled maps are noisier than measured ones: errors 13 % too large (of 1,000 measurements, each error +- 7 %); a
+    # standard deviation from 200 has an error of 5 %, the mean of six one of 3 %: three times both
+    assert np.mean(errors) / np.std(values, ddof=1) == pytest.approx(1.13, abs=0.18)
+
+
+def test_noise_of_simulated_maps_is_that_of_their_ions(run, other):
+    """In every bin as many ions as Poisson's distribution says, and bins independent of each other."""
+    measured = seen(other, ROLLUP)
+    sampler = Sampler(run, HERE, measured, (slice(0, 48), slice(0, 48)), 400, 7)
+    maps, _ = sampler.maps(ROLLUP, 1)
+    noise = (maps[1:] - maps[0]) / NOISE
+    assert np.array_equal(maps[0], seen(run, ROLLUP).counts)
+    # mean over 2,304 bins of a variance from 400 resamples: 7 % / sqrt(2304), and of 4-th moments as much
+    assert noise.var(axis=0).sum() == pytest.approx(maps[0].sum(), rel=0.01)
+    assert noise.sum(axis=(1, 2)).var() == pytest.approx(maps[0].sum(), rel=3 * np.sqrt(2 / 400))
+    # replicas of an ion are one ion: nothing is gained for the errors of the run by drawing often
+    twice, _ = sampler.maps(ROLLUP, 2)
+    together = (twice.sum(axis=(1, 2))[1:] - twice[0].sum()) / NOISE / 2
+    assert together.std() == pytest.approx(noise.sum(axis=(1, 2)).std(), rel=0.05)
+
+
+def test_replicas_have_less_noise(run, other):
+    """Maps of two disjoint sets of draws are the more alike the more draws there are."""
+    measured = seen(other, ROLLUP)
+    sampler = Sampler(run, HERE, measured, (slice(0, 48), slice(0, 48)), 0, 0)
+    again = Sampler(replace(run, seed=99), HERE, measured, (slice(0, 48), slice(0, 48)), 0, 0)
+    alike, one = [], seen(run, LATERAL).ions
+    for replicas in (1, 4):
+        maps = [each.maps(LATERAL, replicas)[0][0].astype(int) for each in (sampler, again)]
+        assert maps[0].sum() == pytest.approx(replicas * one, rel=0.05)  # 3 / sqrt(one), rounded up
+        alike.append(
+            float(ae.similarity(*(ae.DetectorMap.from_array(map, EDGES, EDGES, is_counts=True) for map in maps)))
+        )
+    assert alike[1] > alike[0] + 0.1
+
+
+def test_noise_that_is_allowed_for_is_that_of_the_maps(run, other):
+    """What is added to the numerator is the variance that noise adds to windows: of measured counts and of draws."""
+    measured, draws = seen(other, ROLLUP), 6
+    comparison = Comparison(measured, FitSettings(smoothing=2.5, flattening=15.0, resamples=0, seed=3))
+    whole = (slice(0, 48), slice(0, 48))
+    sampler = Sampler(run, HERE, measured, whole, 0, 0)
+    maps, noise = sampler.maps(LATERAL, draws)
+    variance = comparison.variance_of(noise[None], maps)[comparison.inside].mean()
+    # the same ions drawn anew, forty times: their mean is free of noise
+    again = [Sampler(replace(run, seed=s), HERE, measured, whole, 0, 0).maps(LATERAL, draws)[0] for s in range(40)]
+    again = np.concatenate(again)
+    scatter = comparison.variance_of((again - again.mean(axis=0)) * np.sqrt(40 / 39), again.mean(axis=0, keepdims=True))
+    # one estimate from about (48 / 6)^2 windows of ten degrees of freedom: 6 %
+    assert variance == pytest.approx(scatter[comparison.inside].mean(), rel=0.2)
+    drawn = np.random.default_rng(8).poisson(measured.values, (200, 48, 48)) - measured.values
+    poisson = comparison.variance_of(drawn, measured.values[None].astype(float))[comparison.inside].mean()
+    assert comparison.measured_noise[comparison.inside].mean() == pytest.approx(poisson, rel=0.05)
+
+
+def test_noise_does_not_draw_to_more_contrast():
+    """A pattern under Poisson noise: of the same pattern with more or less contrast, its own is most alike."""
+    random = np.random.default_rng(2)
+    x, y = np.meshgrid(EDGES[1:], EDGES[1:])
+    pattern = np.cos(x / 3) * np.cos(y / 4)
+    contrasts = np.array([0.1, 0.15, 0.2, 0.25, 0.3])
+    frame = ae.DetectorMap.from_array(np.ones((48, 48), int), EDGES, EDGES, is_counts=True)
+    alike = {True: [], False: []}
+    for seed in range(20):
+        measured = replace(frame, values=random.poisson(20 * (1 + 0.2 * pattern)))
+        for allowed, found in alike.items():
+            comparison = Comparison(
+                measured, FitSettings(smoothing=2.5, flattening=0.0, allow_noise=allowed, resamples=0, seed=seed)
+            )
+            found.append([float(comparison.similarities(1 + c * pattern[None])[0]) for c in contrasts])
+    allowed, plain = (np.mean(alike[key], axis=0) for key in (True, False))
+    assert contrasts[allowed.argmax()] == 0.2 and allowed[2] == pytest.approx(1, abs=0.02)
+    assert contrasts[plain.argmax()] > 0.2
+
+
+# ---- the study -----------------------------------------------------------------------------------------------------
+
+
+def steps_off(study, truth):
+    """Steps of the grid between the optimum and (fraction, relative_spread, mean)."""
+    best = study.optimum
+    axes = (study.grid.rollup_fractions, study.grid.relative_spreads, study.grid.means)
+    found = (best.rollup_fraction, best.relative_spread, best.mean)
+    return [abs(axis.index(a) - axis.index(b)) for axis, a, b in zip(axes, found, truth, strict=True)]
+
+
+TWINS = {"roll-up": (ROLLUP, (1.0, 1.0, 0.155)), "lateral": (LATERAL, (0.0, 0.316, 0.3))}
+
+
+def measured_map(other, perturbation):
+    """Eight draws of the ions of another tip, in bins of 1.25 mm."""
+    edges = np.linspace(-60, 60, 97)
+    frame = ae.DetectorMap.from_array(np.ones((96, 96), int), edges, edges, is_counts=True)
+    runs = [replace(other, seed=seed) for seed in range(10, 18)]
+    draws = [ae.DetectorMap.from_hits(run.hits(perturbation), like=frame).counts for run in runs]
+    return replace(frame, values=sum(draws))
+
+
+@pytest.fixture(scope="module", params=["roll-up", pytest.param("lateral", marks=pytest.mark.slow)])
+def twin(request, run, other):
+    """A study of a map with hidden energies."""
+    hidden, truth = TWINS[request.param]
+    measured = measured_map(other, hidden)
+    study = fit_energies(run, measured, request.param, registration=HERE, resamples=40, progress=False)
+    return study, hidden, truth
+
+
+def test_hidden_energies_are_found(twin):
+    study, hidden, truth = twin
+    _, spread_off, mean_off = steps_off(study, truth)
+    assert mean_off <= 1
+    assert spread_off <= 1
+    axes, found = (study.grid.rollup_fractions, study.grid.relative_spreads, study.grid.means), study.optimum
+    best, hidden_cell = (
+        tuple(axis.index(value) for axis, value in zip(axes, values, strict=True))
+        for values in ((found.rollup_fraction, found.relative_spread, found.mean), truth)
+    )
+    missed = study.ssim[best] - study.ssim[hidden_cell]
+    error = np.std(study.resampled[(..., *best)] - study.resampled[(..., *hidden_cell)], ddof=1)
+    assert missed <= 3 * error
+    assert study.optimum.score.value == study.ssim.max()
+    # energies after the cut, which the map sees: within half a step of the grid
+    assert abs(study.refined.true_mean - hidden.energy.true_mean) < 0.04
+    for name, value in (("mean", truth[2]), ("relative_spread", truth[1]), ("true_mean", hidden.energy.true_mean)):
+        low, high = study.refined.intervals[name]
+        assert low <= getattr(study.refined, name) <= high
+        assert low <= value <= high and high > low
+    # the ridge: mean and deviation before the cut are known less well than the mean after it
+    assert high - low < 0.3
+
+
+def test_a_registration_is_refined(run, other):
+    """From 1.5 degrees, 3 % and 1 mm off, back to the frame in which the map was made."""
+    search = EnergySearch(
+        run, measured_map(other, ROLLUP), EnergyGrid("roll-up"), FitSettings(smoothing=0.6, replicas=4), 1, False
+    )
+    rough = ae.Registration(1.5, 1.03, (1.0, -0.5), score=0.8, overlap=1.0)
+    search.place(rough, 0)
+    found = search.refine_registration(rough, (0, 4, 2))
+    assert abs(found.rotation) < 0.3 and found.scale == pytest.approx(1, abs=0.006)
+    assert np.hypot(*found.shift) < 0.3
+    assert (found.score, found.overlap) == (0.8, 1.0)
+
+
+def test_unperturbed_is_clearly_less_alike(twin):
+    study, _, _ = twin
+    unperturbed, best = study.baselines["unperturbed"], study.optimum.score
+    assert unperturbed.error > 0 and best.error > 0
+    assert unperturbed.value + 5 * unperturbed.error < best.value - 5 * best.error
+    assert study.gain.value > 5 * study.gain.error > 0
+    assert study.gain_share == 1
+    assert study.baselines["thermal"].value < best.value - 5 * best.error
+
+
+def test_what_a_study_holds(twin):
+    study, _, _ = twin
+    assert study.ssim.shape == study.errors.shape == study.shares.shape == (1, 6, 6)
+    assert study.resampled.shape == (40, 1, 6, 6)
+    assert study.shares.sum() == pytest.approx(1)
+    assert study.errors == pytest.approx(study.resampled.std(axis=0, ddof=1))
+    # a matrix says what the public functions say
+    draws = study.maps["optimum"]
+    assert float(ae.similarity(study.compared(draws), study.compared(study.measured))) == pytest.approx(
+        study.plain["optimum"].value, abs=1e-9
+    )
+    assert study.settings.replicas == 16
+    assert 0 < study.plain["optimum"].value < study.optimum.score.value < 1.05
+    assert 0 < study.ceiling.value < 1
+    text = repr(study)
+    for part in (study.grid.mechanism, f"{study.optimum.score.value:.3f}", "unperturbed", "thermal", "halves"):
+        assert part in text
+
+
+def test_settings_are_recorded(twin, tmp_path):
+    study, _, _ = twin
+    study.save(tmp_path / "study.json")
+    saved = json.loads((tmp_path / "study.json").read_text())
+    assert np.array(saved["ssim"]) == pytest.approx(study.ssim)
+    assert saved["grid"]["means"] == list(study.grid.means)
+    assert saved["optimum"]["perturbation"]["energy"]["mean"] == study.optimum.mean
+    assert saved["registration"]["scale"] == 1
+    names = "map_bins bin_size bins_compared measured measured_noise registered share_above_energy_limit run real_units"
+    assert {*names.split(), "structure", *declared(ae.fit.FitSettings)} <= saved["settings"].keys()
+    assert saved["settings"] | to_plain(study.settings) == saved["settings"]
+    assert study.settings.temperature == 50 and study.settings.flattening > 0
+
+
+def test_energies_are_reported_in_real_units_first(twin, run):
+    """The factor is n V of the flight over n V of the simulation."""
+    study, _, _ = twin
+    real = run.at_evaporation_field()
+    factor = float(np.median(2 * real.voltages / 1000.0))  # nickel flies as 2+
+    assert study.real_energies == pytest.approx(
+        (study.refined.true_mean * factor, study.refined.true_standard_deviation * factor), rel=1e-12
+    )
+    text = repr(study).rpartition(" energies ")[2]
+    numbers = r"(?:[\d. ()±]|to|at most|at least)+"  # bounds at an end of the grid are "at least"
+    assert re.fullmatch(rf"{numbers} eV at 35 V/nm and 2\+; simulated {numbers} eV at 1000 V .*, 1\+>", text), text
+    assert f"{study.real_energies[0]:.3g}" in text.partition(" eV")[0]
+    assert real_units_of(real)["real_per_study"] == 1.0
+    assert real_units_of(real)["simulated_per_study"] == pytest.approx(1 / factor, rel=1e-12)
+    assert real_units_of(replace(run, cap=ae.simulation.CapHistory.empty())) is None
+
+
+def test_a_study_of_a_run_in_real_units_finds_real_energies(run):
+    """The same measured map: the energies of the grid are multiplied by the factor."""
+    real = run.at_evaporation_field(smoothing=100_000)
+    factor = float(np.median(1 / real.energy_scales))
+    measured = run.hits(ae.RollUp(ae.TruncatedNormal(0.2, 0.1))).map(64)
+    options = {"relative_spreads": (0.5,), "registration": HERE, "replicas": 1, "resamples": 0, "progress": False}
+    one = fit_energies(run, measured, means=(0.1, 0.2, 0.4), **options)
+    two = fit_energies(real, measured, means=tuple(factor * np.array([0.1, 0.2, 0.4])), **options)
+    assert one.optimum.mean == 0.2 and two.optimum.mean == pytest.approx(0.2 * factor, rel=1e-12)
+    assert two.ssim == pytest.approx(one.ssim, abs=0.02)  # voltages differ by 1 % along the run
+    assert two.real_energies[0] == pytest.approx(two.refined.true_mean, rel=1e-12)
+    # the limit of the responses is a simulated energy: the same fractions are above it
+    above = [np.array(each.provenance["share_above_energy_limit"]) for each in (one, two)]
+    assert above[1] == pytest.approx(above[0], rel=1e-9) and above[0].max() > 0
+
+
+def test_study_settings_are_checked():
+    assert FitSettings(smoothing=1, flattening=0).flattening == 0.0
+    for wrong, words in (
+        ({"smoothing": -1.0}, r"smoothing must be a finite number \[mm\] >= 0, got -1.0"),
+        ({"flattening": -1.0}, "flattening must be"),
+        ({"data_range": 0}, "data_range must be"),
+        ({"allow_noise": "no"}, "allow_noise must be True or False"),
+        ({"replicas": 0}, "replicas must be"),
+        ({"resamples": 1.5}, "resamples must be"),
+        ({"seed": -1}, "seed must be"),
+        ({"model_error": -0.1}, "model_error must be"),
+        ({"temperature": -1}, "temperature must be"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            FitSettings(**{"smoothing": 1.0} | wrong)
+    with pytest.raises(AttributeError):
+        FitSettings().seed = 3
+
+
+def test_results_do_not_depend_on_threads(run, other):
+    measured = seen(other, ROLLUP)
+    options = {
+        "means": (0.1, 0.2, 0.3),
+        "relative_spreads": (0.3, 1.0),
+        "registration": HERE,
+        "replicas": 1,
+        "resamples": 5,
+    }
+    one, two = (fit_energies(run, measured, n_threads=n, progress=False, **options) for n in (1, 2))
+    assert np.array_equal(one.ssim, two.ssim) and np.array_equal(one.resampled, two.resampled)
+    assert one.to_dict() == two.to_dict()
+
+
+def test_densities_have_no_noise_of_their_own(run, other):
+    counts = seen(other, ROLLUP)
+    densities = ae.DetectorMap.from_array(counts.values / 3.7, EDGES, EDGES, counts.mask)
+    options = {
+        "means": (0.1, 0.2, 0.3),
+        "relative_spreads": (1.0,),
+        "registration": HERE,
+        "replicas": 1,
+        "resamples": 30,
+    }
+    options |= {"smoothing": 2.0, "progress": False}
+    a, b = (fit_energies(run, each, allow_noise=False, **options) for each in (counts, densities))
+    noisy = fit_energies(run, densities, **options)
+    assert np.array_equal(noisy.ssim, b.ssim)  # with one draw there is no other noise
+    assert b.ceiling is None and a.ceiling is not None
+    assert a.ssim == pytest.approx(b.ssim, abs=1e-12)
+    assert (b.errors < a.errors).all() and (b.errors > 0).all()
+
+
+def test_the_axis_of_the_rollup_fraction(run, other):
+    measured = seen(other, ae.Combined(ae.TruncatedNormal(0.2, 0.1), 0.9))
+    study = fit_energies(
+        run, measured, "combined", means=(0.1, 0.2, 0.3), relative_spreads=(0.5,), rollup_fractions=(0.0, 0.5, 0.9),
+        registration=HERE, replicas=1, resamples=0, progress=False,
+    )  # fmt: skip
+    assert study.ssim.shape == (3, 1, 3)
+    assert max(steps_off(study, (0.9, 0.5, 0.2))) <= 1
+    assert np.isnan(study.errors).all() and study.refined.intervals == {} and np.isnan(study.gain.error)
+    assert "±" not in repr(study).split(";")[0]
+    json.dumps(study.to_dict(), allow_nan=False)
+
+
+def test_bins_of_a_map_are_merged(run, other):
+    measured = seen(other, ROLLUP)
+    options = {"means": (0.2,), "relative_spreads": (1.0,), "registration": HERE, "replicas": 1, "resamples": 0}
+    study = fit_energies(run, measured, bins=24, progress=False, **options)
+    assert study.measured.values.shape == (24, 24)
+    assert study.measured.counts[5, 7] == measured.counts[10:12, 14:16].sum()
+    assert study.measured.bin_size == (5.0, 5.0)
+
+
+def test_gradients_of_the_instrument_do_not_move_the_energies(run, other):
+    """A measured map that is three times as bright on one side as on the other."""
+    measured = measured_map(other, ROLLUP)
+    x, _ = measured.centres
+    kept = np.random.default_rng(3).binomial(measured.counts, np.broadcast_to(0.66 + 0.33 * x / 60, (96, 96)))
+    tilted = replace(measured, values=kept)
+    options = {"registration": HERE, "replicas": 2, "resamples": 0, "progress": False}
+    flat = fit_energies(run, tilted, **options)
+    assert max(steps_off(flat, (1.0, 1.0, 0.155))) <= 1
+    assert flat.ssim.max() > fit_energies(run, tilted, flattening=0, **options).ssim.max()
+
+
+def test_studies_that_cannot_be(run, other):
+    measured = seen(other, ROLLUP)
+    with pytest.raises(ValueError, match="run must have responses for fit_energies"):
+        fit_energies(replace(run, responses=None), measured, registration=HERE)
+    with pytest.raises(ValueError, match="measured must be Hits or a DetectorMap, got 3"):
+        fit_energies(run, 3, registration=HERE)
+    with pytest.raises(ValueError, match="replicas"):
+        fit_energies(run, measured, registration=HERE, replicas=0)
+    with pytest.raises(ValueError, match="smoothing"):
+        fit_energies(run, measured, registration=HERE, smoothing=-1)
+    with pytest.raises(ValueError, match=r"none of [\d,]+ hits is in"):
+        fit_energies(run, measured, registration=ae.Registration(0.0, 1.0, (1e6, 0.0)))
+    with pytest.raises(ValueError, match="must contain a window of 11 bins"):
+        small = replace(measured, mask=np.add.outer(np.arange(48), np.arange(48)) < 9)
+        fit_energies(run, small, registration=HERE)
+
+
+@pytest.mark.parametrize("twin", ["roll-up"], indirect=True)
+def test_pictures(twin, tmp_path):
+    study, _, _ = twin
+    axes = ae.plot.ssim_matrix(study)
+    assert len(axes) == 1
+    assert len(axes[0].texts) == 36
+    (legend,) = axes[0].figure.legends
+    labels = [text.get_text() for text in legend.get_texts()]
+    assert labels == ["best on the grid", "best between its points, interval of 95 %"]
+    given = axes[0].figure.add_subplot()
+    assert ae.plot.ssim_matrix(study, [given])[0] is given
+    given.remove()
+    with pytest.raises(ValueError, match="axes must be 1, one per roll-up fraction and option, got 2"):
+        ae.plot.ssim_matrix(study, [given, given])
+    parts = ae.plot.side_by_side(study, circle=(5, -5, 20))
+    assert parts[3].get_xlim() == (-15, 25)
+    # the measured map has a scale of its own, which its structure fills
+    scales = [ax.images[0].get_clim() for ax in parts]
+    assert scales[0] == scales[3] != scales[1] == scales[2] == scales[4]
+    density = study.compared(study.measured).density
+    assert scales[0] == pytest.approx(np.nanpercentile(density, [2, 99.5]))
+    for name, ax in (("matrix.png", axes[0]), ("maps.png", parts[0])):
+        ax.figure.savefig(tmp_path / name)
+        assert imread(tmp_path / name)[..., :3].std() > 0.1
+    with pytest.raises(ValueError, match="circle"):
+        ae.plot.side_by_side(study, circle=(0, 0, -1))
