@@ -23,7 +23,16 @@ _ABANDONED_AFTER = 60.0  # seconds: a new file may not be locked yet
 
 
 class FileError(ValueError):
-    """Error for a file that cannot be read or written; the message gives its name and the reason."""
+    """Error for a file that cannot be read or written; the message gives its name and the reason.
+
+    Examples
+    --------
+    >>> try:
+    ...     ae.read("missing.epos")
+    ... except ae.FileError as error:
+    ...     print(error)
+    cannot read 'missing.epos': No such file or directory
+    """
 
 
 class TruncatedFile(FileError):

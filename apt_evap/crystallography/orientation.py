@@ -26,7 +26,15 @@ _SAME = math.radians(0.1)  # directions closer than this count as one
 
 @settings
 class Orientation:
-    """Orientation of a crystal in the frame of the specimen, as for `Tip`."""
+    """Orientation of a crystal in the frame of the specimen, as for `Tip`.
+
+    Examples
+    --------
+    >>> orientation = ae.Orientation("Ni", axis=(1, 1, 1), rotation=20.0)
+    >>> (direction,) = orientation.directions([[0, 0, 1]])
+    >>> print(f"[001] is {np.degrees(np.arccos(direction[2])):.2f} degrees from the axis")
+    [001] is 54.74 degrees from the axis
+    """
 
     material: Any = checked("The crystal; a str is looked up by `material`.", "Material or str", as_material)
     axis: tuple = checked(

@@ -18,7 +18,17 @@ PROJECTIONS = {"plane": 1.0, "equidistant": None}
 
 @settings
 class Detector:
-    """Square detector, centred on the axis of the specimen."""
+    """Square detector, centred on the axis of the specimen.
+
+    Examples
+    --------
+    >>> detector = ae.Detector(distance=90.0, width=80.0)
+    >>> detector.extent  # mm
+    (-40.0, 40.0, -40.0, 40.0)
+    >>> run = ae.Simulation(ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1)), seed=1).run(100)
+    >>> run.on_detector(detector).hits(ae.Unperturbed())  # without new flights
+    <Hits: 100 ions, 22 detected from 'simulation, Unperturbed()'; x, y, time_of_flight, ...>
+    """
 
     # more than 1 km is a wrong unit
     distance: float = number("Distance from the apex to the detector.", default=100.0, above=0, at_most=1e6, unit="mm")
@@ -52,8 +62,7 @@ class Detector:
 
         Examples
         --------
-        >>> grid = Detector(width=80.0).grid(200)
-        >>> grid
+        >>> ae.Detector(width=80.0).grid(200)
         <DetectorMap: 0 ions, 200 x 200 bins of 0.4 x 0.4 mm>
         """
         x_edges, y_edges = bin_edges(np.empty(0), np.empty(0), bins, self.extent)

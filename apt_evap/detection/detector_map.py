@@ -68,6 +68,15 @@ class DetectorMap:
         Origin of the map.
     detected : int or None
         Number of hits in the input of `from_hits`, including those outside the map or its mask; None if not known.
+
+    Examples
+    --------
+    >>> x, y = np.random.default_rng(1).uniform(-20, 20, (2, 1000))
+    >>> hit_map = ae.Hits(x=x, y=y).map(bins=32, extent=(-20, 20, -20, 20))
+    >>> hit_map
+    <DetectorMap: 1,000 ions, 32 x 32 bins of 1.25 x 1.25 mm>
+    >>> hit_map.smoothed(2.0)
+    <DetectorMap: 1,000 ions, 32 x 32 bins of 1.25 x 1.25 mm, smoothed by 2 mm>
     """
 
     values: np.ndarray

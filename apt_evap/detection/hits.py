@@ -92,6 +92,14 @@ class Hits:
     ------
     ValueError
         If there is no column, a column has the wrong shape or type, lengths differ, or an outcome is unknown.
+
+    Examples
+    --------
+    >>> hits = ae.Hits(x=[1.0, -2.0, 12.0], y=[0.5, 3.0, 5.0], mass_to_charge=[29.0, 58.0, 29.1])
+    >>> hits
+    <Hits: 3 ions, 3 detected; x, y, mass_to_charge>
+    >>> hits.window(mass_to_charge=(28, 30)).within_circle(10).x  # mm
+    array([1.])
     """
 
     x: Column = None

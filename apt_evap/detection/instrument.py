@@ -72,6 +72,13 @@ class Instrument:
 
     A dead time with a dead zone is a simple description of a delay-line detector, whose signals of two ions overlap.
     Its limits differ between instruments, and have no default here.
+
+    Examples
+    --------
+    >>> run = ae.Simulation(ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1)), seed=1).run(100)
+    >>> instrument = ae.Instrument(distance=50.0, field_of_view=80.0, efficiency=0.5, resolution=0.1)
+    >>> run.at_evaporation_field().record(instrument, ae.RollUp(0.2))
+    <Hits: 28 ions, 28 detected from 'simulation, RollUp(0.2); 28 recorded, 45 outside, 27 not detected, ...>
     """
 
     # less than 1 mm or more than 1 km is a wrong unit

@@ -55,7 +55,16 @@ def normal_probability(x: float) -> float:
 
 @settings
 class TruncatedNormal:
-    """Normal distribution of the energy, truncated below zero."""
+    """Normal distribution of the energy, truncated below zero.
+
+    Examples
+    --------
+    >>> energy = ae.TruncatedNormal(mean=0.1, standard_deviation=0.1)
+    >>> round(energy.true_mean, 3)  # eV, after the truncation
+    0.129
+    >>> ae.RollUp(energy)
+    RollUp(TruncatedNormal(0.1, 0.1))
+    """
 
     mean: float = number("Mean before the truncation.", at_least=0, at_most=HIGHEST_ENERGY, unit="eV")
     standard_deviation: float = number(

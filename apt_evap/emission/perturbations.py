@@ -236,7 +236,15 @@ class _Rolling(_Tangential):
 
 @settings
 class Unperturbed(_Tangential):
-    """Every ion starts at rest from its site."""
+    """Every ion starts at rest from its site.
+
+    Examples
+    --------
+    >>> run = ae.Simulation(ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1)), seed=1).run(100)
+    >>> hits = run.hits(ae.Unperturbed())
+    >>> print(f"first ion at ({hits.x[0]:.0f}, {hits.y[0]:.0f}) mm")
+    first ion at (57, 33) mm
+    """
 
     height: float = number(_HEIGHT, default=0.0, at_least=0, at_most=1.0, unit="nm")
 
@@ -248,7 +256,15 @@ class Unperturbed(_Tangential):
 
 @settings
 class LateralVelocity(_Tangential, _Energetic):
-    """Every ion starts from its site, with |v| = sqrt(2 E/m) in a random direction along the surface."""
+    """Every ion starts from its site, with |v| = sqrt(2 E/m) in a random direction along the surface.
+
+    Examples
+    --------
+    >>> run = ae.Simulation(ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1)), seed=1).run(100)
+    >>> rest, hits = run.hits(ae.Unperturbed()), run.hits(ae.LateralVelocity(0.2))
+    >>> print(f"displaced by {np.nanmedian(np.hypot(hits.x - rest.x, hits.y - rest.y)):.1f} mm")
+    displaced by 3.8 mm
+    """
 
     height: float = number(_HEIGHT, default=0.0, at_least=0, at_most=1.0, unit="nm")
 
@@ -267,6 +283,17 @@ class RollUp(_Rolling, _Energetic):
     They start at p_r = s + d n, with |v| = sqrt(2 E/m) along the component of p_r - p perpendicular to n. By default
     every ion rolls up, and s is its surface nearest neighbour of highest charge, as in the paper. An ion that does not
     roll up, as it has no neighbour or by the probability, starts from its site.
+
+    Examples
+    --------
+    >>> run = ae.Simulation(ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1)), seed=1).run(100)
+    >>> rest = run.hits(ae.Unperturbed())
+    >>> for energy in (0.0, 0.2, 0.4):
+    ...     hits = run.hits(ae.RollUp(energy))
+    ...     print(f"{energy} eV: displaced by {np.nanmedian(np.hypot(hits.x - rest.x, hits.y - rest.y)):.0f} mm")
+    0.0 eV: displaced by 15 mm
+    0.2 eV: displaced by 18 mm
+    0.4 eV: displaced by 19 mm
     """
 
     def tangential(self, emissions: Emissions, random: IonRandom) -> TangentialLaunches:
@@ -289,6 +316,16 @@ class Combined(_Rolling, _Divided):
 
     An ion that does not roll up, as it has no neighbour or by the probability, starts from its site with the random
     part only.
+
+    Examples
+    --------
+    >>> run = ae.Simulation(ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1)), seed=1).run(100)
+    >>> rolled = run.hits(ae.RollUp(0.2))
+    >>> for fraction in (1.0, 0.5):
+    ...     hits = run.hits(ae.Combined(0.2, rollup_fraction=fraction))
+    ...     print(f"{fraction}: {np.nanmedian(np.hypot(hits.x - rolled.x, hits.y - rolled.y)):.0f} mm from the roll-up")
+    1.0: 0 mm from the roll-up
+    0.5: 3 mm from the roll-up
     """
 
     def tangential(self, emissions: Emissions, random: IonRandom) -> TangentialLaunches:

@@ -74,6 +74,13 @@ class Extremal:
 
     Equal ratios are ordered by the index of the atom. This is the low-temperature limit of the Arrhenius rate nu_0
     exp(-C (1 - F/F_evap)/kT) (Vurpillot et al., 2013).
+
+    Examples
+    --------
+    >>> tip = ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1))
+    >>> run = ae.Simulation(tip, law=ae.Extremal()).run(3)
+    >>> run.site  # index of each atom, in the sequence of evaporation
+    array([8101, 7922, 8099])
     """
 
     bonds: BondField | None = bonds_field()

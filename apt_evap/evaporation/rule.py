@@ -93,6 +93,13 @@ class Robin:
     -----
     ``q_i <- (s/2 pi) sum_{k != i} q_k n_i . (r_i - r_k)/|r_i - r_k|^3``, where s, the area per atom, is chosen in every
     sweep such that the total charge is conserved (Robin, 1886; Rolland et al., Microsc. Microanal. 21, 1649, 2015).
+
+    Examples
+    --------
+    >>> tip = ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1))
+    >>> run = ae.Simulation(tip, voltage=1000.0, rule=ae.Robin(tolerance=1e-6)).run(100)
+    >>> print(f"{np.median(run.charges):.2f} e")
+    1.98 e
     """
 
     RELAXATION_TOLERANCE: ClassVar[float] = 3e-3
@@ -134,6 +141,13 @@ class ConstantPotential:
     ``sum_{j != i} q_j u(r_ij) + S q_i = V / k_e``, with ``u(r) = 1/r`` for points and ``u(r) = erf(eta r/sqrt 2)/r``,
     ``eta = S sqrt(pi/2)``, for Gaussian charges. Charges may be negative at atoms deep below a step.
     :doc:`/charging_rules` derives the self term.
+
+    Examples
+    --------
+    >>> tip = ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1))
+    >>> run = ae.Simulation(tip, voltage=1000.0, rule=ae.ConstantPotential()).run(100)
+    >>> print(f"{np.median(run.charges):.2f} e")
+    2.43 e
     """
 
     RELAXATION_TOLERANCE: ClassVar[float] = 8e-3

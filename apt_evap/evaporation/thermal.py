@@ -102,6 +102,15 @@ class Arrhenius:
     The sequence is drawn by the residence-time algorithm: the next atom i has the probability k_i / sum(k), and its
     time is exponential with the rate sum(k), which `VoltageControl` steers. Random numbers depend on the seed and the
     number of the event only.
+
+    Examples
+    --------
+    >>> tip = ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1))
+    >>> for temperature in (50.0, 300.0):
+    ...     run = ae.Simulation(tip, seed=1, law=ae.Arrhenius(temperature)).run(50)
+    ...     print(f"{temperature} K: {np.median(run.clock.voltages):.0f} V")
+    50.0 K: 56 V
+    300.0 K: 34 V
     """
 
     temperature: float = number(

@@ -35,6 +35,17 @@ class VoltageControl:
     The voltage V that the atoms see at the top of a pulse is V_dc + V_p. The control of a law with a temperature raises
     the logarithm of all rates by 1/memory in the mean time between two ions, and lowers it by 1/memory with every ion:
     the mean rate is the wanted one. This changes V by dlnV = dlnK s, with s = dlnV/dlnK of the sum of the rates.
+
+    Examples
+    --------
+    >>> tip = ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1))
+    >>> control = ae.VoltageControl(rate=0.01, pulse_fraction=0.2)
+    >>> run = ae.Simulation(tip, seed=1, control=control).run(100)
+    >>> hits = run.at_evaporation_field().hits(ae.Unperturbed())
+    >>> print(f"{hits.voltage[0]:.0f} V and pulses of {hits.pulse_voltage[0]:.0f} V")
+    67 V and pulses of 13 V
+    >>> print(f"{len(hits) / hits.pulses.sum():.2f} ions per pulse")
+    0.01 ions per pulse
     """
 
     rate: float = number(

@@ -104,6 +104,16 @@ def fit_energies(
     energies have a similarity of about 1. `Study.plain` contains similarities without ν, for comparison with the
     ceiling. The noise of measured densities is not known and not corrected: their best energies have slightly more
     contrast than the true ones.
+
+    Examples
+    --------
+    >>> run = ae.Simulation(ae.Tip("Ni", apex_radius=2.5, axis=(1, 1, 1)), seed=1).run(400)
+    >>> measured = run.hits(ae.RollUp(0.2)).map(bins=16, extent=(-60, 60, -60, 60))  # energy to be found
+    >>> identity = ae.Registration(rotation=0.0, scale=1.0, shift=(0.0, 0.0))
+    >>> grid = ae.fit.EnergyGrid("roll-up", means=(0.1, 0.2, 0.3))
+    >>> study = ae.fit_energies(run, measured, grid, ae.fit.FitSettings(resamples=0), registration=identity)
+    >>> print(f"{study.optimum.mean} eV")
+    0.2 eV
     """
     grid = check_kind(EnergyGrid() if grid is None else grid, "grid", EnergyGrid, "an EnergyGrid")
     settings = check_kind(FitSettings() if settings is None else settings, "settings", FitSettings, "FitSettings")

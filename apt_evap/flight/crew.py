@@ -26,7 +26,18 @@ _MAX_STEPS = 1_000_000  # flights take a few tens
 
 @settings
 class FlightSettings:
-    """Accuracy and end of the flights."""
+    """Accuracy and end of the flights.
+
+    Examples
+    --------
+    >>> tip = ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1))
+    >>> hits = []
+    >>> for settings in (ae.FlightSettings(), ae.FlightSettings(opening_angle=0.6, tolerance=1e-2)):
+    ...     hits.append(ae.Simulation(tip, flight_settings=settings).run(30).hits(ae.Unperturbed()))
+    >>> deviation = np.hypot(hits[1].x - hits[0].x, hits[1].y - hits[0].y)
+    >>> print(f"median {np.nanmedian(deviation):.3f}, largest {np.nanmax(deviation):.3f} mm")
+    median 0.026, largest 0.130 mm
+    """
 
     opening_angle: float = number(
         "Largest full angle of an octree cell that replaces its atoms. Measured on Ni[111], R = 20 a: with 0.3, hits "

@@ -48,6 +48,14 @@ class ResponseSettings:
     """Flights and polynomials of the responses.
 
     Both designs are `Design`, or both `WideDesign`, see `wide`.
+
+    Examples
+    --------
+    >>> tip = ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1))
+    >>> settings = ae.ResponseSettings(energy_limit=3.0)
+    >>> run = ae.Simulation(tip, seed=1, response_settings=settings).run(50)
+    >>> run.hits(ae.RollUp(2.5))
+    <Hits: 50 ions, 46 detected from 'simulation, RollUp(2.5)'; x, y, time_of_flight, ...>
     """
 
     energy_limit: float = number(

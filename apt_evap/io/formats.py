@@ -110,6 +110,16 @@ def read(path: AnyPath, *, format: str | None = None, columns: Sequence[str] | N
         If the file is missing, unreadable, empty or of unknown format, or if an option or column does not exist.
     TruncatedFile
         If it ends in the middle of an ion.
+
+    Examples
+    --------
+    >>> ions = ae.Hits(positions=np.zeros((3, 3)), mass_to_charge=[29.0, 29.0, 58.0])
+    >>> ae.write("ni.pos", ions)
+    >>> hits = ae.read("ni.pos")
+    >>> hits
+    <Hits: 3 ions, 3 detected from 'ni.pos'; mass_to_charge, positions>
+    >>> hits.mass_to_charge  # Da
+    array([29., 29., 58.], dtype=float32)
     """
     chosen = _to_read(path, format)
     return chosen.read(path, **_options(path, chosen, chosen.read, columns, options))
@@ -175,6 +185,14 @@ def write(path: AnyPath, hits: Hits, *, format: str | None = None, **options: An
         If the format is unknown or cannot be written, or the file cannot be written.
     ValueError
         If a column that the format requires is missing, or there is no ion to write.
+
+    Examples
+    --------
+    >>> run = ae.Simulation(ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1)), seed=1).run(100)
+    >>> hits = run.hits(ae.RollUp(0.2)).window(x=(-40, 40), y=(-40, 40))  # mm
+    >>> ae.write("ni.pos", hits)
+    >>> ae.read("ni.pos")
+    <Hits: 20 ions, 20 detected from 'ni.pos'; mass_to_charge, positions>
     """
     chosen = _by_suffix(path, format, "write")
     if chosen.write is None:

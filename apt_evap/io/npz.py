@@ -47,6 +47,13 @@ def read_map(
     ------
     FileError
         If the file is missing, damaged or not an .npz, or if an array is missing, not unique or invalid.
+
+    Examples
+    --------
+    >>> edges = np.linspace(-20, 20, 41)
+    >>> np.savez("measured.npz", counts=np.ones((40, 40), int), x_edges_mm=edges, y_edges_mm=edges)
+    >>> ae.read_map("measured.npz")
+    <DetectorMap: 1,600 ions from 'measured.npz', 40 x 40 bins of 1 x 1 mm>
     """
     with open_for_reading(path) as file:
         if file.read(2) != b"PK":

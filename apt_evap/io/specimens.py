@@ -32,7 +32,7 @@ def read_tip(
     style: str | None = None,
     **options: Any,
 ) -> Tip:
-    """Read a specimen from a file, with its axis along +z.
+    r"""Read a specimen from a file, with its axis along +z.
 
     Text dumps and data files of LAMMPS and node files of TAPSim are recognised by their content. All other files are
     read by ASE, if it is installed.
@@ -66,6 +66,16 @@ def read_tip(
         If the file is missing, unreadable or of unknown format, or if a type has no name.
     ValueError
         As in `Tip.from_positions`.
+
+    Examples
+    --------
+    >>> tip = ae.Tip("Ni", apex_radius=2.0)
+    >>> with open("tip.dump", "w") as file:  # a dump of LAMMPS, in units of 0.1 nm
+    ...     print("ITEM: TIMESTEP\n0\nITEM: NUMBER OF ATOMS", len(tip), sep="\n", file=file)
+    ...     print("ITEM: BOX BOUNDS ff ff ff", *["-100 100"] * 3, "ITEM: ATOMS type x y z", sep="\n", file=file)
+    ...     np.savetxt(file, np.column_stack([tip.species + 1, 10 * tip.positions]), fmt="%d %.4f %.4f %.4f")
+    >>> ae.read_tip("tip.dump", {1: "Ni"})
+    <Tip: 8,179 atoms of Ni from positions>
     """
     name = str(check_path(path))
     names = {str(key): value for key, value in check_kind(types or {}, "types", Mapping, "a mapping").items()}

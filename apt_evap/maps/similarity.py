@@ -149,6 +149,17 @@ def similarity(
     -----
     Wang, Bovik, Sheikh and Simoncelli, IEEE Trans. Image Process. 13, 600 (2004): Gaussian windows of
     1.5 bins, K1 = 0.01, K2 = 0.03, computed by ``skimage.metrics.structural_similarity``.
+
+    Examples
+    --------
+    >>> run = ae.Simulation(ae.Tip("Ni", apex_radius=2.5, axis=(1, 1, 1)), seed=1).run(300)
+    >>> first = run.hits(ae.RollUp(0.2)).map(bins=40)
+    >>> for energy in (0.2, 0.3, 0.5):
+    ...     second = run.hits(ae.RollUp(energy)).map(bins=40)
+    ...     print(f"{energy} eV: {ae.similarity(first, second, smoothing=5.0):.2f}")
+    0.2 eV: 1.00
+    0.3 eV: 0.94
+    0.5 eV: 0.83
     """
     smoothing = check_number(smoothing, "smoothing", at_least=0, unit="mm")
     data_range = check_number(data_range, "data_range", above=0)

@@ -82,7 +82,7 @@ def compression_from_poles(crystal_angles: ArrayLike, observed_angles: ArrayLike
     --------
     The (002) and (111) poles of a cubic crystal, 54.7 degrees apart, seen at 35.1 degrees:
 
-    >>> round(compression_from_poles([54.74], [35.1]), 2)
+    >>> round(ae.reconstruction.compression_from_poles([54.74], [35.1]), 2)
     1.56
     """
     crystal = check_array(crystal_angles, "crystal_angles", ("n",))

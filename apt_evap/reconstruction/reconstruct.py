@@ -66,6 +66,16 @@ class Reconstruction:
         Correction of x / R and y / R of each ion by a table of origins, shape (n, 2).
     covariances : ndarray or None
         Covariance of x and y of each ion by this table [nm^2], shape (n, 2, 2).
+
+    Examples
+    --------
+    >>> run = ae.Simulation(ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1)), seed=1).run(200)
+    >>> constants = {"atomic_volume": 0.0109, "distance": 100.0, "detector_radius": 80.0, "compression": 1.13}
+    >>> reconstruction = ae.reconstruct(run.hits(ae.Unperturbed()), radius=2.0, projection="compressed", **constants)
+    >>> print(f"{len(reconstruction)} ions, {np.ptp(reconstruction.positions[:, 2]):.1f} nm deep")
+    129 ions, 0.6 nm deep
+    >>> print(f"lateral error {reconstruction.errors(run).lateral_rms:.2f} nm")
+    lateral error 0.09 nm
     """
 
     positions: Floats
@@ -353,6 +363,16 @@ def reconstruct(
     Ultramicroscopy 111, 448 (2011) use the area A of the detector:
     :math:`\Omega/\eta = A \xi^2 R^2 dz / L^2`. On a shank of half angle alpha,
     :math:`dR = dz \sin\alpha/(1-\sin\alpha)`.
+
+    Examples
+    --------
+    >>> nickel = ae.material("Ni")
+    >>> run = ae.Simulation(ae.Tip(nickel, apex_radius=2.0, axis=(1, 1, 1)), seed=1).run(200)
+    >>> hits = run.at_evaporation_field(field_factor=3.3).hits(ae.Unperturbed())
+    >>> constants = {"atomic_volume": nickel.a**3 / 4, "distance": 100.0, "detector_radius": 80.0}
+    >>> ae.reconstruct(hits, **constants, evaporation_field=35.0, projection="compressed", compression=1.13)
+    <Reconstruction: 129 ions, 2.5 x 2.5 x 0.6 nm, cap, compressed, R 1.9 to 2.0 nm (voltage); field_factor 3.3,
+    evaporation_field 35, compression 1.13, efficiency 1>
     """
     check_kind(hits, "hits", Hits, "Hits, such as read(path) or run.hits(perturbation)")
     if protocol == "geiser":

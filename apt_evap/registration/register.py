@@ -55,6 +55,15 @@ class Registration:
     -----
     With z = x + iy, a point moves to z' = scale exp(i rotation) z + shift, with the conjugate of z if mirrored, and
     then by the distortion.
+
+    Examples
+    --------
+    >>> registration = ae.Registration(rotation=30.0, scale=0.5, shift=(1.0, 2.0))
+    >>> x, y = registration.points([10.0], [0.0])
+    >>> print(f"({x[0]:.2f}, {y[0]:.2f}) mm")
+    (5.33, 4.50) mm
+    >>> print(registration.inverse)
+    rotated by -30.00°, scaled by 2, shifted by (-3.73, -2.46) mm
     """
 
     rotation: float = number("Rotation, anticlockwise.", unit="degrees")
@@ -282,6 +291,16 @@ def register(
 
     Wrong transforms reach scores of 0.5 on maps of other poles, and 0.6 to 0.7 on maps of the same crystal along
     another axis, with similar poles.
+
+    Examples
+    --------
+    >>> run = ae.Simulation(ae.Tip("Ni", apex_radius=2.5, axis=(1, 1, 1)), seed=1).run(400)
+    >>> simulated = run.hits(ae.RollUp(0.2))
+    >>> measured = ae.Registration(rotation=20.0, scale=0.3, shift=(1.0, 2.0)).hits(simulated)
+    >>> maps = simulated.map(bins=32), measured.map(bins=32)
+    >>> found = ae.register(*maps, rotations=(0, 40), scales=(0.25, 0.35), mirrors=[False])
+    >>> print(f"rotated by {found.rotation:.0f} degrees, scaled by {found.scale:.2f}")
+    rotated by 20 degrees, scaled by 0.30
     """
     simulated, measured = (_view(value, name) for value, name in ((simulated, "simulated"), (measured, "measured")))
     if start is not None and not isinstance(start, Registration):

@@ -100,6 +100,15 @@ class Run:
         Operating point of a run in real units, see `at_evaporation_field`.
     real : RealColumns or None
         Its voltages, charges, masses and pulses.
+
+    Examples
+    --------
+    >>> run = ae.Simulation(ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1)), seed=1).run(100)
+    >>> run.hits(ae.RollUp(0.2))  # any perturbation, without new flights
+    <Hits: 100 ions, 99 detected from 'simulation, RollUp(0.2)'; x, y, time_of_flight, ...>
+    >>> real = run.at_evaporation_field()
+    >>> print(f"{real.voltages[0]:.0f} V")
+    81 V
     """
 
     emissions: Emissions
@@ -550,6 +559,13 @@ def load(path: AnyPath) -> Run:
     ------
     FileError
         If it is missing, unreadable, damaged or not a run.
+
+    Examples
+    --------
+    >>> run = ae.Simulation(ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1)), seed=1).run(100)
+    >>> run.save("ni111.h5")
+    >>> ae.load("ni111.h5")
+    <Run: 100 ions of Ni at 1000 V; responses, 0 of them flagged>
     """
     path = check_path(path)
     return _load_parts(path) if path.is_dir() else Run(**read_run(path))

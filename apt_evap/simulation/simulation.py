@@ -78,6 +78,17 @@ class Simulation:
     ------
     ValueError
         If a setting is outside its range.
+
+    Examples
+    --------
+    >>> tip = ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1))
+    >>> simulation = ae.Simulation(tip, seed=1, detector=ae.Detector(distance=90.0, width=80.0))
+    >>> simulation.run(100)
+    <Run: 100 ions of Ni at 1000 V; responses, 0 of them flagged>
+    >>> simulation.run(50)  # the next atoms of the same specimen
+    <Run: 50 ions of Ni at 1000 V; responses, 0 of them flagged>
+    >>> simulation.n_evaporated
+    150
     """
 
     def __init__(

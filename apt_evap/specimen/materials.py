@@ -31,7 +31,16 @@ def _sources(given, name):
 
 @settings
 class Material:
-    """A pure element (or the host of an alloy) as a field emitter."""
+    """A pure element (or the host of an alloy) as a field emitter.
+
+    Examples
+    --------
+    >>> metal = ae.Material("M", structure="bcc", a=0.3, evaporation_field=40.0, charge_state=2, mass=60.0)
+    >>> round(metal.nearest_neighbour_distance, 4)  # nm
+    0.2598
+    >>> ae.Tip(metal, apex_radius=2.0)
+    <Tip: 6,583 atoms of M [0 0 1], apex radius 2 nm, shank 4 nm at 1.5 degrees, rounded base>
+    """
 
     name: str = checked("Chemical symbol, or any name.", "str", _name)
     structure: str = choice("Crystal structure.", BASES)
@@ -133,6 +142,14 @@ def material(name: str, **changes: Any) -> Material:
     ------
     ValueError
         If the name or a field is unknown, or a new value is outside its range.
+
+    Examples
+    --------
+    >>> nickel = ae.material("Ni")
+    >>> nickel.structure, nickel.a, nickel.evaporation_field  # nm, V/nm
+    ('fcc', 0.352, 35.0)
+    >>> ae.material("Ni", evaporation_field=36.0).evaporation_field
+    36.0
     """
     known = [item.name for item in fields(Material) if item.name not in ("name", "sources")]
     for change in changes:

@@ -124,6 +124,19 @@ class Tip:
     ------
     ValueError
         If the shape is impossible, or needs more memory than is free.
+
+    Examples
+    --------
+    >>> ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1))
+    <Tip: 8,159 atoms of Ni [1 1 1], apex radius 2 nm, shank 4 nm at 1.5 degrees, rounded base>
+
+    A random alloy:
+
+    >>> alloy = ae.Tip("Ni", apex_radius=2.0, solutes={"Al": 0.1}, seed=1)
+    >>> for element, atoms in zip(alloy.elements, np.bincount(alloy.species)):
+    ...     print(element.name, atoms)
+    Ni 7304
+    Al 875
     """
 
     def __init__(

@@ -1,6 +1,8 @@
 """Settings that are declared once: checks, plain form, texts and documentation follow from the declaration."""
 
 import copy
+import doctest
+import inspect
 import json
 import pickle
 from dataclasses import FrozenInstanceError
@@ -128,6 +130,26 @@ def test_the_docstring_gains_the_parameters_before_the_notes():
     lines = [line.strip() for line in Pulse.__doc__.splitlines()]
     assert lines.index("Parameters") < lines.index("width : float [ns] > 0 and < 5") < lines.index("Notes")
     assert 'form : {"round", "flat"}, default \'round\'' in lines and "shots : int >= 1, optional" in lines
+
+
+def test_examples_stay_after_the_parameters():
+    @settings
+    class Shot:
+        """One pulse.
+
+        Examples
+        --------
+        >>> Shot(width=2.0).width  # ns
+        2.0
+        """
+
+        width: float = number("Standard deviation.", above=0, unit="ns")
+
+    lines = inspect.getdoc(Shot).splitlines()
+    assert lines[:3] == ["One pulse.", "", "Parameters"]
+    assert lines.index("width : float [ns] > 0") < lines.index("Examples")
+    (test,) = doctest.DocTestFinder().find(Shot, "Shot", globs={"Shot": Shot})
+    assert doctest.DocTestRunner().run(test) == (0, 1)
 
 
 @pytest.mark.parametrize(
