@@ -26,7 +26,7 @@ def fit_sphere(points: Floats) -> tuple[Floats, float]:
     Notes
     -----
     The sphere minimises the sum of (|r - c|^2 - R^2)^2, a linear problem for c and R^2 - |c|^2. On a rough cap it is a
-    little too small, and single points far inside make it smaller: `analysis.apex.fit_caps` is robust against them.
+    little too small, and single points far inside make it smaller: `analysis.fit_caps` is robust against them.
     """
     middle = points.mean(axis=0)
     shifted = points - middle

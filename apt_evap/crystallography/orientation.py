@@ -38,7 +38,7 @@ class Orientation:
 
     material: Any = checked("The crystal; a str is looked up by `material`.", "Material or str", as_material)
     axis: tuple = checked(
-        "Crystal direction along +z, see `specimen.lattice.rotation_to_axis`.",
+        "Crystal direction along +z, see `specimen.rotation_to_axis`.",
         "sequence of float",
         lambda axis, name: axis,  # checked with the structure
         default=(0, 0, 1),

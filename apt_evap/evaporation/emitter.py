@@ -115,13 +115,13 @@ class Emitter:
     voltage : float
         Applied voltage [V].
     law : law, optional
-        Selects the next atom to evaporate; by default `Extremal`. Interface: `apt_evap.evaporation.law.Law`.
+        Selects the next atom to evaporate; by default `Extremal`. Interface: `evaporation.Law`.
     settings : ChargeSettings
         Accuracy of the charges.
     n_threads : int, optional
         Number of threads; by default the number of processors that this process may use.
     rule : charging rule, optional
-        Distribution of the charge over the surface; by default `Robin`. Interface: `apt_evap.evaporation.rule.Rule`.
+        Distribution of the charge over the surface; by default `Robin`. Interface: `evaporation.Rule`.
     control : VoltageControl, optional
         Control of the voltage for a law with a temperature, such as `Arrhenius`. Charges and fields of the emitter
         remain those at `voltage`; the law sees them in proportion to `control_voltage`.

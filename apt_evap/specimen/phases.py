@@ -67,7 +67,7 @@ class Phase:
         read=region_of,
     )
     axis: Sequence[float] | None = checked(
-        "Crystal direction along +z, see `specimen.lattice.rotation_to_axis`; by default that of the tip.",
+        "Crystal direction along +z, see `specimen.rotation_to_axis`; by default that of the tip.",
         "sequence of float",
         lambda axis, name: axis,  # checked with the structure
         default=None,

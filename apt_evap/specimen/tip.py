@@ -67,7 +67,7 @@ class Tip:
     apex_radius : float
         Radius R of the cap [nm].
     axis : sequence of float
-        Crystal direction along +z, of integers or any other numbers, see `specimen.lattice.rotation_to_axis`.
+        Crystal direction along +z, of integers or any other numbers, see `specimen.rotation_to_axis`.
     shank_angle : float
         Half the opening angle of the shank [degrees], >= 0 and < 45.
     shank_length : float, optional
