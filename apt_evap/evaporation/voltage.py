@@ -1,16 +1,17 @@
 """The applied voltage, and its control to a constant rate of evaporation."""
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from apt_evap._common.codec import count, number, settings
+from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_number
 from apt_evap._core.elementary import exponential, logarithm
 from apt_evap._core.evaporation import Evaporation
+from apt_evap._core.law import LawKernel
 from apt_evap.units import BOLTZMANN
 
 if TYPE_CHECKING:
-    from apt_evap.evaporation.law import ThermalLaw
     from apt_evap.specimen.tip import Tip
 
 _STEP = 1e-6  # relative, for the slope of the rate: 1e-3 of what changes the rate by a factor of e at 20 K
@@ -83,6 +84,32 @@ class VoltageControl:
         return 1e-9 * self.pulse_width * math.sqrt(2.0 * math.pi * softness * (1.0 + p) / p)
 
 
+@runtime_checkable
+class ThermalLaw(Protocol):
+    """Interface of a law with rates, whose events take time: the voltage is controlled (`RateControl`)."""
+
+    @property
+    def peak_temperature(self) -> float:
+        """Temperature at which most events happen [K]; 0 for a law without rates."""
+        ...
+
+    def default_control(self) -> VoltageControl:
+        """Control of the voltage if none is given."""
+        ...
+
+    def sensitivities(self, tip: "Tip") -> Floats:
+        """Sensitivity C of each species [eV], shape (n_species,)."""
+        ...
+
+    def working_point(self, sensitivity: float, control: VoltageControl) -> tuple[float, float]:
+        """Barrier over kT at the wanted rate, and the time at the top of a pulse [s], 0 without pulses."""
+        ...
+
+    def kernel(self, tip: "Tip", control: VoltageControl | None = None) -> LawKernel:
+        """Return the compiled law for a specimen, whose keys are logarithms of rates."""
+        ...
+
+
 class RateControl:
     """Control of the voltage of an emitter during its events, for a law with a temperature.
 
@@ -107,7 +134,7 @@ class RateControl:
         self._slope = math.nan  # dlnV/dlnK at the last relaxation
 
     @classmethod
-    def of(cls, law: "ThermalLaw", tip: "Tip", control: VoltageControl | None) -> "RateControl":
+    def of(cls, law: ThermalLaw, tip: "Tip", control: VoltageControl | None) -> "RateControl":
         """Return the control for a law on a specimen; by default the usual one of the law."""
         control = law.default_control() if control is None else control
         sensitivity = float(law.sensitivities(tip)[0])
