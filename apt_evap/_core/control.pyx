@@ -13,18 +13,20 @@ cdef class Control:
         self.voltage_factor = 1.0
 
     def before_relaxation(self, double log_rate, log_rate_at):
-        """Include `rise` in `voltage_factor`.
+        """Voltage factor that includes `rise` (float).
 
         Parameters
         ----------
         log_rate : float
             Natural logarithm of the sum of the rates [1/s] after the last event, without `rise`.
         log_rate_at : callable
-            Returns it for the fields of the present surface and a voltage factor.
+            Takes a voltage factor, returns this logarithm for the fields of the present surface.
         """
+        return self.voltage_factor
 
     def after_relaxation(self, log_rate_at):
-        """Adapt `voltage_factor` to the new surface, on which `log_rate_at` is as in `before_relaxation`."""
+        """Voltage factor for the new surface (float), whose rates `log_rate_at` returns."""
+        return self.voltage_factor
 
     cdef double wait(self, double u, double log_rate) noexcept nogil:
         # Time to the next event [s], from a random number u in (0, 1) and the natural logarithm of the sum of the rates

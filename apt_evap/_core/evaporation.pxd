@@ -38,6 +38,7 @@ cdef class Evaporation:
     cdef int[::1] key_bonds
 
     cdef void make_room(self, long room)
+    cdef Chooser ranked(self, double voltage_factor, int n_threads)
     cdef void strongest_neighbours(self, long atom, long leaving, long long* neighbour, double* charge) noexcept nogil
     cdef void join(self, int slot, double dx, double dy, double dz) noexcept nogil
     cdef int surroundings(self, long atom) noexcept nogil

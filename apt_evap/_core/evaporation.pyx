@@ -159,10 +159,10 @@ cdef class Evaporation:
             raise ValueError("the specimen has no surface atoms")
         builders = n_threads if len(surface) > FEW else 1
         self.since_relaxation = NOT_RELAXED   # after an interruption below no atom can evaporate
-        log_rate_at = partial(self.rank, n_threads=n_threads)
+        log_rate_at, factor = partial(self.log_rate_at, n_threads=n_threads), self.control.voltage_factor
         if start is None:
             if self.tree is not None:
-                self.control.before_relaxation(self.chooser.log_total(), log_rate_at)
+                factor = self.control.before_relaxation(self.chooser.log_total(), log_rate_at)
             start = self.start_here(surface, builders)
         elif len(start.charges) != len(surface):
             raise ValueError(f"start must have the charges of {len(surface)} surface atoms, got {len(start.charges)}")
@@ -181,17 +181,25 @@ cdef class Evaporation:
                                   max_sweeps=max_sweeps, double_precision=double_precision, n_threads=n_threads)
         self.field_unit = self.rule.field_unit(self.coulomb)
         self.tree, self.normals, self.slot_of = tree, normals, slot_of
-        self.control.rise = 0.0
-        self.control.after_relaxation(log_rate_at)
-        self.rank(self.control.voltage_factor, builders)
+        self.control.voltage_factor, self.control.rise = factor, 0.0
+        self.chooser = self.ranked(factor, builders)
+        self.control.voltage_factor = self.control.after_relaxation(log_rate_at)
+        if self.control.voltage_factor != factor:
+            self.chooser = self.ranked(self.control.voltage_factor, builders)
         self.since_relaxation, self.atoms.opened = 0, False
         return outcome
 
-    def rank(self, double voltage_factor, int n_threads=1):
-        """Recompute the keys of all slots, for a voltage over that of the charges.
+    def log_rate_at(self, double voltage_factor, int n_threads=1):
+        """Natural logarithm of the sum of all rates [1/s] for a voltage over that of the charges; the keys are kept.
 
-        Returns the natural logarithm of the sum of rates [1/s]; -inf for a law without rates.
+        -inf for a law without rates.
         """
+        cdef double total = self.ranked(voltage_factor, n_threads).log_total()
+        self.law.begin(self.field_unit * self.control.voltage_factor)
+        return total
+
+    cdef Chooser ranked(self, double voltage_factor, int n_threads):
+        # The chooser for recomputed keys of all slots, for a voltage over that of the charges.
         cdef long n = self.tree.n_slots, slot
         cdef int[::1] bonds = np.zeros(n, np.int32)
         cdef long long[::1] atom = np.maximum(self.tree.atoms[:n], 0)   # empty slots get a key, which is removed below
@@ -203,8 +211,7 @@ cdef class Evaporation:
         for slot in range(n):
             if self.tree.atom[slot] < 0:
                 key[slot] = -INFINITY
-        self.chooser = self.law.chooser(self.tree, key)
-        return self.chooser.log_total()
+        return self.law.chooser(self.tree, key)
 
     def start_here(self, const long long[::1] surface, int n_threads=1):
         """Start values of a relaxation of the current surface; equal charges if it has none yet."""
@@ -224,9 +231,8 @@ cdef class Evaporation:
     # ---- one event -------------------------------------------------------------------------------------------------
 
     cdef void strongest_neighbours(self, long atom, long leaving, long long* neighbour, double* charge) noexcept nogil:
-        # The TARGETS surface neighbours of an atom with the highest charges, in falling order; -1 if there are fewer,
-        # or no atom (-1).
-        # Nearest neighbours, and with a `target_stretch` also those of the second shell. Those of another atom than the
+        # The TARGETS surface neighbours of an atom with the highest charges, in falling order; -1 if there are fewer or
+        # the atom is -1. Nearest neighbours, and with a `target_stretch` also those of the second shell. Those of another atom than the
         # leaving one are neither it nor its neighbours.
         cdef int[MAX_NEAR] others
         cdef int n, i, k, m
@@ -374,9 +380,9 @@ cdef class Evaporation:
         return 0
 
     def evaporate(self, Events events, long sweep_interval):
-        """Evaporate atoms until the table of events is full; stops early if a relaxation or deepening is needed, or no atom is left.
+        """Evaporate atoms until the table of events is full.
 
-        Atoms that have lost all chains of bonds to the body leave at once, before the law selects the next atom.
+        Stops early if a relaxation or deepening is needed, or no atom is left. Atoms that have lost all chains of bonds to the body leave at once, before the law selects the next atom.
 
         Parameters
         ----------

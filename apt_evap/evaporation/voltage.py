@@ -143,8 +143,8 @@ class RateControl(SteadyRate):
         """Voltage over that of the charges, from the logarithm of the factor of the rates since the relaxation."""
         return self.voltage_factor * exponential(self._slope * rises)
 
-    def before_relaxation(self, log_rate: float, log_rate_at: Callable[[float], float]) -> None:
-        """Include the changes of the voltage since the last relaxation in its factor.
+    def before_relaxation(self, log_rate: float, log_rate_at: Callable[[float], float]) -> float:
+        """Voltage factor with the changes since the last relaxation.
 
         The first guess of the factor is linear in the logarithm of the rate; it is then corrected.
         """
@@ -156,14 +156,14 @@ class RateControl(SteadyRate):
                 break
             step = _STEP / max(logs[0] - logs[1], 1e-12) * (goal - logs[1])
             factor *= float(exponential(min(max(step, -_LARGEST_STEP), _LARGEST_STEP)))
-        self.voltage_factor = factor
+        return factor
 
-    def after_relaxation(self, log_rate_at: Callable[[float], float]) -> None:
+    def after_relaxation(self, log_rate_at: Callable[[float], float]) -> float:
         """Determine the slope of the rate; on the first surface, find the voltage of the wanted rate."""
-        if math.isnan(self._slope):
-            self.voltage_factor = self._solve(log_rate_at)
-        logs = self._logs(log_rate_at, self.voltage_factor)
+        factor = self._solve(log_rate_at) if math.isnan(self._slope) else self.voltage_factor
+        logs = self._logs(log_rate_at, factor)
         self._slope = min(_STEP / max(logs[0] - logs[1], 1e-12), self._largest_slope)
+        return factor
 
     def _logs(self, log_rate_at, factor):
         """Logarithm of the rate at a slightly higher voltage, and at this one."""

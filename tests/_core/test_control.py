@@ -5,7 +5,7 @@ import pytest
 
 import apt_evap as ae
 from apt_evap._core.control import Control, SteadyRate
-from apt_evap._core.evaporation import Evaporation
+from apt_evap._core.evaporation import SWEEP_DUE, Evaporation
 from apt_evap._core.events import Events
 from apt_evap.units import COULOMB
 
@@ -19,10 +19,12 @@ class Stepwise(SteadyRate):
 
     def before_relaxation(self, log_rate, log_rate_at):
         self.calls.append(("before", log_rate, self.rise, log_rate_at(self.voltage_factor)))
+        return self.voltage_factor
 
     def after_relaxation(self, log_rate_at):
-        self.voltage_factor *= 1.01
-        self.calls.append(("after", log_rate_at(self.voltage_factor), log_rate_at(1.1 * self.voltage_factor)))
+        factor = 1.01 * self.voltage_factor
+        self.calls.append(("after", log_rate_at(factor), log_rate_at(1.1 * factor)))
+        return factor
 
 
 def surface(tip, control=None):
@@ -65,7 +67,25 @@ def test_keys_have_the_voltage_that_the_control_leaves(small_tip):
         assert control.voltage_factor == factor
         assert here < higher  # the last one asked for was another voltage
         assert np.log(core.chooser.rate) == pytest.approx(here, rel=1e-13)
+        core.evaporate(Events(small_tip.positions, 5), 1000)
+        # the keys around the holes, computed after the events, have the same voltage
+        assert np.log(core.chooser.rate) == pytest.approx(core.log_rate_at(factor), rel=1e-13)
         core.relax()
+
+
+def test_an_interrupted_relaxation_does_not_change_the_voltage(small_tip):
+    def voltage(interrupted):
+        emitter = ae.Emitter(small_tip, law=ae.Arrhenius(80.0), seed=1, n_threads=1)
+        assert len(emitter.evaporate(20)) == 20
+        assert emitter._core.control.rise != 0
+        if interrupted:
+            with pytest.raises(ValueError, match="negative"):
+                emitter._core.relax(extra=-1_000_000)
+            assert emitter.evaporate(1).status == SWEEP_DUE
+        emitter.relax()
+        return emitter.control_voltage
+
+    assert voltage(True) == voltage(False)
 
 
 def test_without_a_control_events_take_no_time(small_tip):
