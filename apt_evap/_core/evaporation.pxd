@@ -1,6 +1,7 @@
 """The sequence of events."""
 
 from apt_evap._core.chooser cimport Chooser
+from apt_evap._core.control cimport Control
 from apt_evap._core.journal cimport Journal
 from apt_evap._core.law cimport LawKernel
 from apt_evap._core.neighbourhood cimport Neighbourhood
@@ -18,11 +19,8 @@ cdef class Evaporation:
     cdef readonly long n_removed, since_relaxation
     cdef public long n_clipped          # negative charges that were set to 0
     cdef public long n_unsettled        # patches that did not converge
-    cdef public double voltage_factor   # voltage over that of the charges, for a law with a temperature
-    cdef public double rate             # wanted sum of rates [1/s]
-    cdef public double memory           # number of events over which the control averages
-    cdef readonly double rise           # logarithm of the rate by the control since the last relaxation
-    cdef public double target_stretch   # squared reach of a roll-up over that of a nearest neighbour
+    cdef readonly Control control       # of the voltage
+    cdef readonly double target_stretch # squared reach of a roll-up over that of a nearest neighbour
     cdef readonly unsigned long long seed
     cdef bint has_support
     cdef int[::1] slot_of               # (n_atoms,) -1 for atoms not at the surface
@@ -40,9 +38,9 @@ cdef class Evaporation:
     cdef int[::1] key_bonds
 
     cdef void make_room(self, long room)
+    cdef Chooser ranked(self, double voltage_factor, int n_threads)
     cdef void strongest_neighbours(self, long atom, long leaving, long long* neighbour, double* charge) noexcept nogil
     cdef void join(self, int slot, double dx, double dy, double dz) noexcept nogil
-    cdef double wait(self, double u) noexcept nogil
     cdef int surroundings(self, long atom) noexcept nogil
     cdef int judge(self, const int* slots, long n) except -1 nogil
     cdef int event(self, long atom, Journal journal) except -1 nogil

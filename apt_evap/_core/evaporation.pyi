@@ -4,7 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apt_evap._core.chooser import Chooser
-from apt_evap._core.journal import Journal
+from apt_evap._core.control import Control
+from apt_evap._core.events import Events
 from apt_evap._core.law import LawKernel
 from apt_evap._core.neighbourhood import Neighbourhood
 from apt_evap._core.octree import Octree
@@ -47,6 +48,8 @@ class Evaporation:
         update_radius: float,
         opening_angle: float,
         seed: int = 0,
+        control: Control | None = None,
+        target_stretch: float = 1.0,
     ) -> None: ...
     @property
     def atoms(self) -> Neighbourhood: ...
@@ -72,17 +75,15 @@ class Evaporation:
     def n_removed(self) -> int: ...
     @property
     def since_relaxation(self) -> int: ...
-    voltage_factor: float
-    rate: float
-    memory: float
     @property
-    def rise(self) -> float: ...
-    target_stretch: float
+    def control(self) -> Control: ...
+    @property
+    def target_stretch(self) -> float: ...
     @property
     def seed(self) -> int: ...
     @property
     def chooser(self) -> Chooser: ...
-    def rank(self, n_threads: int = 1) -> float: ...
+    def log_rate_at(self, voltage_factor: float, n_threads: int = 1) -> float: ...
     n_clipped: int
     n_unsettled: int
     @property
@@ -100,23 +101,7 @@ class Evaporation:
         start: Start | None = None,
     ) -> tuple[int, float]: ...
     def start_here(self, surface: NDArray[np.int64], n_threads: int = 1) -> Start: ...
-    def evaporate(
-        self,
-        journal: Journal,
-        max_events: int,
-        sweep_interval: int,
-        atom: NDArray[np.int64],
-        charge: NDArray[np.float64],
-        field: NDArray[np.float64],
-        normal: NDArray[np.float64],
-        neighbour: NDArray[np.int64],
-        neighbour_charge: NDArray[np.float64],
-        detached: NDArray[np.int8],
-        wait: NDArray[np.float64],
-        rise: NDArray[np.float64],
-    ) -> int: ...
-    @property
-    def log_rate(self) -> float: ...
+    def evaporate(self, events: Events, sweep_interval: int) -> int: ...
     @property
     def next_slot(self) -> int: ...
     @property

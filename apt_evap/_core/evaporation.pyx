@@ -6,11 +6,15 @@ distance. The remaining error is smooth; `relax`, a solution for the whole surfa
 cost of an event does not depend on the size of the specimen.
 """
 
+from functools import partial
+
 from cython.parallel cimport prange
 from libc.math cimport INFINITY
 
 import numpy as np
 
+from apt_evap._core.control cimport Control
+from apt_evap._core.events cimport TARGETS, Event, Events
 from apt_evap._core.interactions cimport InteractionLists
 from apt_evap._core.journal cimport Journal
 from apt_evap._core.neighbourhood cimport MAX_NEAR
@@ -21,11 +25,6 @@ cdef extern from "kernels.h":
     const int GROUP, PATCH_LANES
 
 
-cdef extern from "elementary.h":
-    double natural_logarithm(double) noexcept nogil
-    double exponential_of(double) noexcept nogil
-
-
 cdef extern from "random_numbers.h":
     double uniform_number(unsigned long long, unsigned long long, unsigned long long) noexcept nogil
 
@@ -34,7 +33,6 @@ cdef enum:
     NOT_RELAXED = 1 << 30   # number of events since the last relaxation before the first one
     FEW = 16384             # number of surface atoms up to which one thread is faster than several
     ROOM = 4096             # initial number of slots within the update radius; 18 d_nn of fcc contain about 1,000
-    TARGETS = 3   # neighbours onto which an atom may roll
     STATUS_DONE = 0
     STATUS_SWEEP_DUE = 1
     STATUS_EXHAUSTED = 2
@@ -81,18 +79,22 @@ cdef class Evaporation:
         Opening angle of relaxations, and of fields at newly exposed atoms [rad].
     seed : int
         Seed of the random numbers of a stochastic law: the choice of event k depends on (seed, k) only.
+    control : Control, optional
+        Control of the voltage, for a law with rates; by default the voltage is constant.
+    target_stretch : float
+        Squared reach of a roll-up over that of a nearest neighbour.
     """
 
     def __init__(self, Neighbourhood atoms, ChargingRule rule, LawKernel law, double potential, double coulomb,
                  double patch_radius, double update_radius, double opening_angle,
-                 unsigned long long seed=0):
+                 unsigned long long seed=0, Control control=None, double target_stretch=1.0):
         self.atoms, self.rule, self.law = atoms, rule, law
         self.potential, self.coulomb = potential, coulomb
         self.patch_radius, self.update_radius, self.opening_angle = patch_radius, update_radius, opening_angle
         self.n_removed = self.n_clipped = self.n_unsettled = 0
         self.since_relaxation = NOT_RELAXED
-        self.voltage_factor, self.seed, self.rate, self.memory, self.rise = 1.0, seed, 1.0, 1.0, 0.0
-        self.target_stretch = 1.0
+        self.seed, self.target_stretch = seed, target_stretch
+        self.control = Control() if control is None else control
         self.has_support = bool(np.asarray(atoms.support).any())
         self.slot_of = np.full(atoms.n_atoms, -1, np.int32)
         self.make_room(ROOM)
@@ -157,7 +159,10 @@ cdef class Evaporation:
             raise ValueError("the specimen has no surface atoms")
         builders = n_threads if len(surface) > FEW else 1
         self.since_relaxation = NOT_RELAXED   # after an interruption below no atom can evaporate
+        log_rate_at, factor = partial(self.log_rate_at, n_threads=n_threads), self.control.voltage_factor
         if start is None:
+            if self.tree is not None:
+                factor = self.control.before_relaxation(self.chooser.log_total(), log_rate_at)
             start = self.start_here(surface, builders)
         elif len(start.charges) != len(surface):
             raise ValueError(f"start must have the charges of {len(surface)} surface atoms, got {len(start.charges)}")
@@ -176,29 +181,37 @@ cdef class Evaporation:
                                   max_sweeps=max_sweeps, double_precision=double_precision, n_threads=n_threads)
         self.field_unit = self.rule.field_unit(self.coulomb)
         self.tree, self.normals, self.slot_of = tree, normals, slot_of
-        self.rank(builders)
+        self.control.voltage_factor, self.control.rise = factor, 0.0
+        self.chooser = self.ranked(factor, builders)
+        self.control.voltage_factor = self.control.after_relaxation(log_rate_at)
+        if self.control.voltage_factor != factor:
+            self.chooser = self.ranked(self.control.voltage_factor, builders)
         self.since_relaxation, self.atoms.opened = 0, False
         return outcome
 
-    def rank(self, int n_threads=1):
-        """Recompute the keys of all slots, such as after a change of the voltage.
+    def log_rate_at(self, double voltage_factor, int n_threads=1):
+        """Natural logarithm of the sum of all rates [1/s] for a voltage over that of the charges; the keys are kept.
 
-        Returns the natural logarithm of the sum of rates [1/s]; -inf for a law without rates.
+        -inf for a law without rates.
         """
+        cdef double total = self.ranked(voltage_factor, n_threads).log_total()
+        self.law.begin(self.field_unit * self.control.voltage_factor)
+        return total
+
+    cdef Chooser ranked(self, double voltage_factor, int n_threads):
+        # The chooser for recomputed keys of all slots, for a voltage over that of the charges.
         cdef long n = self.tree.n_slots, slot
         cdef int[::1] bonds = np.zeros(n, np.int32)
         cdef long long[::1] atom = np.maximum(self.tree.atoms[:n], 0)   # empty slots get a key, which is removed below
         cdef double[::1] key = np.full(self.tree.capacity, -INFINITY), strength = self.rule.strengths(self.tree)
         for slot in prange(n, nogil=True, schedule="static", num_threads=n_threads):
             bonds[slot] = self.surroundings(atom[slot])
-        self.law.begin(self.field_unit * self.voltage_factor)
+        self.law.begin(self.field_unit * voltage_factor)
         self.law.keys(n, &strength[0], &atom[0], &bonds[0], &key[0])
         for slot in range(n):
             if self.tree.atom[slot] < 0:
                 key[slot] = -INFINITY
-        self.chooser = self.law.chooser(self.tree, key)
-        self.rise = 0.0
-        return self.chooser.log_total()
+        return self.law.chooser(self.tree, key)
 
     def start_here(self, const long long[::1] surface, int n_threads=1):
         """Start values of a relaxation of the current surface; equal charges if it has none yet."""
@@ -218,16 +231,19 @@ cdef class Evaporation:
     # ---- one event -------------------------------------------------------------------------------------------------
 
     cdef void strongest_neighbours(self, long atom, long leaving, long long* neighbour, double* charge) noexcept nogil:
-        # The TARGETS surface neighbours of an atom with the highest charges, in falling order; -1 if there are fewer.
-        # Nearest neighbours, and with a `target_stretch` also those of the second shell. Those of another atom than the
+        # The TARGETS surface neighbours of an atom with the highest charges, in falling order; -1 if there are fewer or
+        # the atom is -1. Nearest neighbours, and with a `target_stretch` also those of the second shell. Those of another atom than the
         # leaving one are neither it nor its neighbours.
         cdef int[MAX_NEAR] others
-        cdef int n = self.atoms.near(atom, others), i, k, m
+        cdef int n, i, k, m
         cdef long other
         cdef double q
         for k in range(TARGETS):
             neighbour[k] = -1
             charge[k] = 0.0
+        if atom < 0:
+            return
+        n = self.atoms.near(atom, others)
         for i in range(n):
             other = others[i]
             if self.slot_of[other] < 0 or not self.atoms.bonded(atom, other, self.target_stretch):
@@ -249,21 +265,6 @@ cdef class Evaporation:
         self.patch.x[n], self.patch.y[n], self.patch.z[n] = <float>dx, <float>dy, <float>dz
         self.atoms.normal(self.tree.atom[slot], &self.normals[slot, 0])
         self.patch.n = n + 1
-
-    cdef double wait(self, double u) noexcept nogil:
-        # Time to the next event [s]. While no event happens, the control lets the logarithm of the rates rise by
-        # 1 / memory in the mean time between events: K exp(rise + t rate / memory) integrates to -ln(u).
-        cdef double speed = self.rate / self.memory, excess, time
-        excess = natural_logarithm(-natural_logarithm(u) * speed) - self.chooser.log_total() - self.rise
-        if excess > 40.0:               # log(1 + exp(x)) = x to the last bit
-            time = excess
-        elif excess < -20.0:            # exp(x) (1 - exp(x) / 2), to the last bit
-            time = exponential_of(excess)
-            time -= 0.5 * time * time
-        else:
-            time = natural_logarithm(1.0 + exponential_of(excess))
-        self.rise += time
-        return time / speed
 
     cdef int surroundings(self, long atom) noexcept nogil:
         # What the law learns of the bonds of an atom: their number, or their code.
@@ -378,26 +379,17 @@ cdef class Evaporation:
             self.join(slot, px - hole.x, py - hole.y, pz - hole.z)
         return 0
 
-    def evaporate(self, Journal journal, long max_events, long sweep_interval, long long[::1] atom,
-                  double[::1] charge, double[::1] field, double[:, ::1] normal, long long[:, ::1] neighbour,
-                  double[:, ::1] neighbour_charge, signed char[::1] detached, double[::1] wait, double[::1] rise):
-        """Evaporate up to `max_events` atoms; stops early if a relaxation or deepening is needed, or no atom is left.
+    def evaporate(self, Events events, long sweep_interval):
+        """Evaporate atoms until the table of events is full.
 
-        Atoms that have lost all chains of bonds to the body leave at once, before the law selects the next atom.
+        Stops early if a relaxation or deepening is needed, or no atom is left. Atoms that have lost all chains of bonds to the body leave at once, before the law selects the next atom.
 
         Parameters
         ----------
-        journal : Journal
-            A new journal; it is filled.
-        max_events : int
-            Maximum number of events.
+        events : Events
+            Table to fill.
         sweep_interval : int
             Events after which a relaxation is due.
-        atom, charge, field, normal, neighbour, neighbour_charge, detached, wait, rise : ndarray, first axis m
-            Filled, for each event, with the evaporated atom, its charge [e], the field just outside before evaporation
-            [V/nm], its normal, the targets of a roll-up and of a second one (see `Batch`; -1: fewer), their charges
-            [e], and 1 for an atom that left because it was detached, the time since the previous event [s] (0: a law without a time, or detached), and
-            the logarithm of the factor by which the control had increased the rates since the last relaxation.
 
         Returns
         -------
@@ -405,17 +397,15 @@ cdef class Evaporation:
             DONE; SWEEP_DUE (call `relax`); EXHAUSTED (no atom can evaporate); TOO_SHALLOW (the next event would reach
             support atoms).
         """
-        cdef long n, leaving
+        cdef Journal journal = events.journal
+        cdef Event* event
+        cdef long leaving
         cdef int status = STATUS_DONE, best, axis
         cdef double u = 0.5
         cdef bint drawn
-        if journal.start.shape[0] <= max_events:
-            raise ValueError(f"journal must have room for {max_events} events")
-        neighbour[:, :] = -1
-        neighbour_charge[:, :] = 0.0
         with nogil:
-            while journal.n_events < max_events:
-                n = journal.n_events
+            while journal.n_events < events.rows.shape[0]:
+                event = &events.rows[journal.n_events]
                 leaving = self.atoms.next_detached(&self.slot_of[0]) if self.atoms.n_waiting else -1
                 if self.chooser.draws:
                     u = uniform_number(self.seed, self.n_removed, 0)
@@ -428,30 +418,27 @@ cdef class Evaporation:
                     break
                 drawn = self.chooser.draws and leaving < 0
                 leaving = self.tree.atom[best]
-                detached[n] = self.atoms.detached[leaving]
+                event.detached = self.atoms.detached[leaving]
                 if self.has_support and self.atoms.reaches_support(leaving):
                     status = STATUS_TOO_SHALLOW
                     break
-                wait[n] = self.wait(uniform_number(self.seed, self.n_removed, 1)) if drawn else 0.0
-                rise[n] = self.rise
+                event.waits = 0.0
                 if drawn:
-                    self.rise -= 1.0 / self.memory   # every event lets the control lower the voltage
-                atom[n] = leaving
-                charge[n] = self.tree.q[best]
-                field[n] = self.field_unit * self.rule.strength(self.tree, best)
+                    event.waits = self.control.wait(uniform_number(self.seed, self.n_removed, 1),
+                                                    self.chooser.log_total())
+                event.rises = self.control.rise
+                if drawn:
+                    self.control.evaporated()
+                event.site = leaving
+                event.charges = self.tree.q[best]
+                event.fields = self.field_unit * self.rule.strength(self.tree, best)
                 for axis in range(3):
-                    normal[n, axis] = self.normals[best, axis]
-                self.strongest_neighbours(leaving, leaving, &neighbour[n, 0], &neighbour_charge[n, 0])
-                if neighbour[n, 0] >= 0:
-                    self.strongest_neighbours(neighbour[n, 0], leaving, &neighbour[n, TARGETS],
-                                              &neighbour_charge[n, TARGETS])
+                    event.normals[axis] = self.normals[best, axis]
+                self.strongest_neighbours(leaving, leaving, event.targets, event.target_charges)
+                self.strongest_neighbours(event.targets[0], leaving, event.second_targets,
+                                          event.second_target_charges)
                 self.event(leaving, journal)
         return status
-
-    @property
-    def log_rate(self):
-        """Natural logarithm of the sum of the rates [1/s] at `voltage_factor`; -inf for a law without rates."""
-        return self.chooser.log_total()
 
     @property
     def next_slot(self):

@@ -7,9 +7,9 @@ from .cap import Cap as Cap
 from .emitter import Batch as Batch
 from .emitter import Emitter as Emitter
 from .law import Law as Law
-from .law import ThermalLaw as ThermalLaw
 from .rule import CompiledRule as CompiledRule
 from .rule import Rule as Rule
 from .settings import ChargeSettings as ChargeSettings
 from .state import EmitterState as EmitterState
 from .thermal import Laser as Laser
+from .voltage import ThermalLaw as ThermalLaw

@@ -6,7 +6,8 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
-from typing import Any
+from textwrap import fill, indent
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +16,7 @@ from apt_evap._common.threads import thread_count, usable_threads
 from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_seed
 from apt_evap._core.evaporation import DONE, EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, Evaporation, Start
+from apt_evap._core.events import COLUMNS, Events
 from apt_evap._core.journal import Journal
 from apt_evap._core.neighbourhood import Neighbourhood
 from apt_evap._core.octree import Octree
@@ -35,37 +37,34 @@ BATCH = 256  # events per batch; results do not depend on it
 
 __all__ = ["BATCH", "DONE", "EXHAUSTED", "SWEEP_DUE", "TOO_SHALLOW", "Batch", "Emitter"]
 
+T = TypeVar("T")
+
 _SEED_STEP = 0x9FB21C651E98DF25  # events have other random numbers than the ions of the same seed
 
-_MAX_EVENTS = 10_000_000  # per call: 720 MB of results
+_MAX_EVENTS = 10_000_000  # per call: 1.7 GB of results
 
 
+def _with_columns(cls: type[T]) -> type[T]:
+    """Add the columns of the events to the section Parameters of a docstring, before the journal."""
+    entries = ""
+    for column in COLUMNS:
+        if column.name in cls.__annotations__:
+            kind = "" if column.dtype is np.float64 else f" of {column.dtype.__name__}"
+            unit = f" [{column.unit}]" if column.unit else ""
+            shape = ("n", *column.row)
+            entries += f"{column.name} : ndarray{kind}{unit}, shape {shape}\n".replace("'", "")
+            entries += indent(fill(column.meaning, 110), "    ") + "\n"
+    cls.__doc__ = (cls.__doc__ or "").replace("    journal :", f"{indent(entries, '    ')}    journal :", 1)
+    return cls
+
+
+@_with_columns
 @dataclass(frozen=True, eq=False, repr=False)
 class Batch:
-    """A sequence of evaporated atoms.
+    """A sequence of evaporated atoms: the columns of ``_core/events.pyx``, and what the flights need.
 
     Parameters
     ----------
-    site : ndarray of int64, shape (n,)
-        Index of each atom in the specimen.
-    charges : ndarray, shape (n,)
-        Charge before evaporation [e].
-    fields : ndarray, shape (n,)
-        Field just outside the surface before evaporation [V/nm].
-    normals : ndarray, shape (n, 3)
-        Outward unit normal.
-    targets : ndarray of int64, shape (n, 3)
-        Indices of the three surface nearest neighbours with the highest charges, in falling order; -1 if there are
-        fewer. An atom may roll onto them.
-    target_charges : ndarray, shape (n, 3)
-        Their charges [e]; 0 if there are fewer.
-    second_targets : ndarray of int64, shape (n, 3)
-        The same for the first of them: its three surface neighbours with the highest charges that are neither the atom
-        nor neighbours of it. An atom may roll onto them in a second step.
-    second_target_charges : ndarray, shape (n, 3)
-        Their charges [e].
-    detached : ndarray of bool, shape (n,)
-        Atoms that left because they had lost all chains of bonds to the body.
     journal : Journal
         Changes of the tree by each event.
     tree : Octree or None
@@ -74,11 +73,8 @@ class Batch:
         DONE, SWEEP_DUE, EXHAUSTED or TOO_SHALLOW.
     cap : Cap or None
         The cap before the first event, if the surface was relaxed after the previous batch.
-    waits : ndarray or None
-        Time before each event [s], shape (n,); with pulses, time at the top of pulses. None for a law without a
-        temperature.
     voltages : ndarray or None
-        Voltage of the control at each event [V], shape (n,); None without one.
+        Voltage of the control at each event [V], shape (n,). As `waits`, None for a law without a temperature.
     """
 
     site: np.ndarray
@@ -165,6 +161,11 @@ class Emitter:
         self._rate_control = RateControl.of(self.law, tip, control) if has_temperature(self.law) else None
         kernel = self._kernel_of(tip)
         distance = tip.nearest_neighbour_distance
+        stretch = 1.0
+        if check_count(target_shells, "target_shells", at_least=1, at_most=2) == 2:
+            structure = tip.elements[0].structure
+            reach = SECOND_SHELL_FACTORS[structure] / BOND_FACTORS[structure]
+            stretch = reach * reach
         self._core = Evaporation(
             self._neighbourhood_of(tip, kernel),
             rules.kernel_of(self.rule, tip),
@@ -175,13 +176,9 @@ class Emitter:
             self.settings.update_radius * distance,
             self.settings.opening_angle,
             (check_seed(seed) + _SEED_STEP) % (1 << 64),
+            self._rate_control,
+            stretch,
         )
-        if check_count(target_shells, "target_shells", at_least=1, at_most=2) == 2:
-            structure = tip.elements[0].structure
-            reach = SECOND_SHELL_FACTORS[structure] / BOND_FACTORS[structure]
-            self._core.target_stretch = reach * reach
-        if self._rate_control:
-            self._rate_control.begin(self._core)
         self._sites, self._deepened = [], []  # evaporated atoms of each batch; numbers of events before each deepening
         if not tip.evaporable[self._core.atoms.surface].any():
             raise ValueError(f"{tip!r} has no evaporable surface atom")
@@ -207,7 +204,7 @@ class Emitter:
         """Voltage of the control [V]; without one, the applied voltage of the charges."""
         if self._rate_control is None:
             return self.voltage
-        return self.voltage * float(self._rate_control.voltage_factors(self._core, self._core.rise))
+        return self.voltage * float(self._rate_control.voltage_factors(self._rate_control.rise))
 
     def _kernel_of(self, tip):
         return kernel_of(self.law, tip, self.control)
@@ -386,8 +383,6 @@ class Emitter:
     def _relax(self, tolerance, angle, start=None):
         counts = self.counts
         self._relaxed = (tolerance, angle, counts["clipped"], counts["unsettled"])
-        if self._rate_control and start is None:
-            self._rate_control.keep(self._core, usable_threads(self.n_threads))
         outcome = self._core.relax(
             tolerance=tolerance,
             opening_angle=angle,
@@ -396,8 +391,6 @@ class Emitter:
             start=start,
         )
         self._recorded, self._is_new = RECORD, True
-        if self._rate_control:
-            self._rate_control.look(self._core, usable_threads(self.n_threads), restored=start is not None)
         if not outcome[1] < tolerance:
             warnings.warn(
                 f"charges did not converge in {outcome[0]} sweeps: largest relative change {outcome[1]:.1g} "
@@ -429,7 +422,7 @@ class Emitter:
             clipped=clipped,
             unsettled=unsettled,
             rule_state=start.rule_state,
-            voltage_factor=self._core.voltage_factor,
+            voltage_factor=self._core.control.voltage_factor,
         )
 
     def restore(self, state: EmitterState) -> None:
@@ -457,7 +450,7 @@ class Emitter:
             raise ValueError("lonely must be surface atoms, each with a normal: the state is of another specimen")
         self._sites, self._deepened = [state.sites], list(state.deepened)
         self._core.n_clipped, self._core.n_unsettled = state.clipped, state.unsettled
-        self._core.voltage_factor = state.voltage_factor
+        self._core.control.voltage_factor = state.voltage_factor
         start = Start(len(state.sites), state.charges, state.lonely, state.lonely_normals, state.rule_state)
         self._relax(state.tolerance, state.opening_angle, start)
 
@@ -507,47 +500,23 @@ class Emitter:
             (call `deepen` and continue).
         """
         n = check_count(max_events, "max_events", at_least=1, at_most=_MAX_EVENTS)
-        journal = Journal(self.tip.positions, n)
-        site, targets, target_charges = np.empty(n, np.int64), np.empty((n, 6), np.int64), np.empty((n, 6))
-        charges, fields, normals, detached = np.empty(n), np.empty(n), np.empty((n, 3)), np.empty(n, np.int8)
-        waits, rise = np.empty(n), np.empty(n)
+        events, control = Events(self.tip.positions, n), self._rate_control
         tree = self._core.tree.copy() if self._recorded >= RECORD else None
         cap, self._is_new = self.cap if self._is_new else None, False
-        status = self._core.evaporate(
-            journal,
-            n,
-            self.sweep_interval,
-            site,
-            charges,
-            fields,
-            normals,
-            targets,
-            target_charges,
-            detached,
-            waits,
-            rise,
-        )
-        n = journal.n_events
+        status = self._core.evaporate(events, self.sweep_interval)
+        n = events.journal.n_events
         self._recorded = n if tree is not None else self._recorded + n
-        self._sites.append(site[:n].copy())
+        columns = events.columns()
+        self._sites.append(columns["site"].copy())
+        waits, rises = columns.pop("waits"), columns.pop("rises")
         return Batch(
-            site=site[:n],
-            charges=charges[:n],
-            fields=fields[:n],
-            normals=normals[:n],
-            targets=targets[:n, :3],
-            target_charges=target_charges[:n, :3],
-            second_targets=targets[:n, 3:],
-            second_target_charges=target_charges[:n, 3:],
-            detached=detached[:n].view(bool),
-            journal=journal,
+            **columns,
+            journal=events.journal,
             tree=tree,
             status=status,
             cap=cap,
-            waits=waits[:n] if self._rate_control else None,
-            voltages=self.voltage * self._rate_control.voltage_factors(self._core, rise[:n])
-            if self._rate_control
-            else None,
+            waits=None if control is None else waits,
+            voltages=None if control is None else self.voltage * control.voltage_factors(rises),
         )
 
     def advance(

@@ -1,7 +1,7 @@
 """Evaporation laws: the choice of the next atom to evaporate."""
 
 from collections.abc import Mapping
-from typing import Any, Protocol, TypeGuard, runtime_checkable
+from typing import Any, Protocol, TypeGuard
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from apt_evap._common.codec import settings
 from apt_evap._common.types import Floats, Integers
 from apt_evap._core.law import LawKernel, PythonLaw, WeightedField
 from apt_evap.evaporation.bonds import BondField, bond_table, bonds_field
-from apt_evap.evaporation.voltage import VoltageControl
+from apt_evap.evaporation.voltage import ThermalLaw, VoltageControl
 from apt_evap.specimen.tip import Tip
 
 
@@ -39,32 +39,6 @@ class Law(Protocol):
         ndarray, shape (n,)
             Keys; <= 0 for atoms that cannot evaporate. Equal keys are ordered by the index of the atom.
         """
-        ...
-
-
-@runtime_checkable
-class ThermalLaw(Protocol):
-    """Interface of a law with rates, whose events take time: the voltage is controlled (`RateControl`)."""
-
-    @property
-    def peak_temperature(self) -> float:
-        """Temperature at which most events happen [K]; 0 for a law without rates."""
-        ...
-
-    def default_control(self) -> VoltageControl:
-        """Control of the voltage if none is given."""
-        ...
-
-    def sensitivities(self, tip: Tip) -> Floats:
-        """Sensitivity C of each species [eV], shape (n_species,)."""
-        ...
-
-    def working_point(self, sensitivity: float, control: VoltageControl) -> tuple[float, float]:
-        """Barrier over kT at the wanted rate, and the time at the top of a pulse [s], 0 without pulses."""
-        ...
-
-    def kernel(self, tip: Tip, control: VoltageControl | None = None) -> LawKernel:
-        """Return the compiled law for a specimen, whose keys are logarithms of rates."""
         ...
 
 

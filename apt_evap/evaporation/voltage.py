@@ -1,16 +1,18 @@
 """The applied voltage, and its control to a constant rate of evaporation."""
 
 import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from apt_evap._common.codec import count, number, settings
+from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_number
+from apt_evap._core.control import SteadyRate
 from apt_evap._core.elementary import exponential, logarithm
-from apt_evap._core.evaporation import Evaporation
+from apt_evap._core.law import LawKernel
 from apt_evap.units import BOLTZMANN
 
 if TYPE_CHECKING:
-    from apt_evap.evaporation.law import ThermalLaw
     from apt_evap.specimen.tip import Tip
 
 _STEP = 1e-6  # relative, for the slope of the rate: 1e-3 of what changes the rate by a factor of e at 20 K
@@ -94,12 +96,34 @@ class VoltageControl:
         return 1e-9 * self.pulse_width * math.sqrt(2.0 * math.pi * softness * (1.0 + p) / p)
 
 
-class RateControl:
-    """Control of the voltage of an emitter during its events, for a law with a temperature.
+@runtime_checkable
+class ThermalLaw(Protocol):
+    """Interface of a law with rates, whose events take time: the voltage is controlled (`RateControl`)."""
 
-    Before the first event, `begin` sets the wanted ``rate`` and the ``memory`` of the compiled events, which then keep
-    the logarithm ``rise`` of the factor of all rates since the last relaxation. `keep` and `look` are called before and
-    after each relaxation; they change its ``voltage_factor``, the voltage that the law sees over that of the charges.
+    @property
+    def peak_temperature(self) -> float:
+        """Temperature at which most events happen [K]; 0 for a law without rates."""
+        ...
+
+    def default_control(self) -> VoltageControl:
+        """Control of the voltage if none is given."""
+        ...
+
+    def sensitivities(self, tip: "Tip") -> Floats:
+        """Sensitivity C of each species [eV], shape (n_species,)."""
+        ...
+
+    def working_point(self, sensitivity: float, control: VoltageControl) -> tuple[float, float]:
+        """Barrier over kT at the wanted rate, and the time at the top of a pulse [s], 0 without pulses."""
+        ...
+
+    def kernel(self, tip: "Tip", control: VoltageControl | None = None) -> LawKernel:
+        """Return the compiled law for a specimen, whose keys are logarithms of rates."""
+        ...
+
+
+class RateControl(SteadyRate):
+    """Control of the voltage of an emitter, for a law with a temperature: see ``_core/control.pxd`` for the interface.
 
     Parameters
     ----------
@@ -112,13 +136,13 @@ class RateControl:
     """
 
     def __init__(self, control: VoltageControl, pulse_length: float, softness: float) -> None:
+        super().__init__(control.rate / (pulse_length or 1.0), control.memory)
         self.control, self.pulse_length = control, pulse_length
         self._largest_slope = _LARGEST_SLOPE * softness
-        self.rate = control.rate / (pulse_length or 1.0)
         self._slope = math.nan  # dlnV/dlnK at the last relaxation
 
     @classmethod
-    def of(cls, law: "ThermalLaw", tip: "Tip", control: VoltageControl | None) -> "RateControl":
+    def of(cls, law: ThermalLaw, tip: "Tip", control: VoltageControl | None) -> "RateControl":
         """Return the control for a law on a specimen; by default the usual one of the law."""
         control = law.default_control() if control is None else control
         sensitivity = float(law.sensitivities(tip)[0])
@@ -126,70 +150,49 @@ class RateControl:
         thermal = BOLTZMANN * law.peak_temperature / sensitivity
         return cls(control, pulse_length, thermal / max(1.0 - barrier * thermal, 0.3))
 
-    def begin(self, core: Evaporation) -> None:
-        """Pass the wanted rate to the events."""
-        core.rate, core.memory = self.rate, float(self.control.memory)
-
-    def voltage_factors(self, core: Evaporation, rise: Any) -> Any:
+    def voltage_factors(self, rises: Any) -> Any:
         """Voltage over that of the charges, from the logarithm of the factor of the rates since the relaxation."""
-        return core.voltage_factor * exponential(self._slope * rise)
+        return self.voltage_factor * exponential(self._slope * rises)
 
-    def keep(self, core: Evaporation, n_threads: int) -> None:
-        """Before a relaxation: include the changes of the voltage since the last one in its factor.
+    def before_relaxation(self, log_rate: float, log_rate_at: Callable[[float], float]) -> float:
+        """Voltage factor with the changes since the last relaxation.
 
         The first guess of the factor is linear in the logarithm of the rate; it is then corrected.
         """
-        if math.isnan(self._slope):
-            return
-        goal = core.log_rate + core.rise
-        factor = float(self.voltage_factors(core, core.rise))
+        goal = log_rate + self.rise
+        factor = float(self.voltage_factors(self.rise))
         for _ in range(_ITERATIONS):
-            logs = self._logs(core, factor, n_threads)
+            logs = self._logs(log_rate_at, factor)
             if not (math.isfinite(goal) and abs(goal - logs[1]) > _CLOSE):
                 break
             step = _STEP / max(logs[0] - logs[1], 1e-12) * (goal - logs[1])
             factor *= float(exponential(min(max(step, -_LARGEST_STEP), _LARGEST_STEP)))
-        core.voltage_factor = factor
+        return factor
 
-    def look(self, core: Evaporation, n_threads: int, restored: bool = False) -> None:
-        """After a relaxation: determine the slope of the rate; on a new surface, set the wanted rate.
-
-        Parameters
-        ----------
-        core : Evaporation
-            The surface.
-        n_threads : int
-            Number of threads.
-        restored : bool
-            Whether the voltage factor is known also for a new surface.
-        """
-        factor = core.voltage_factor
-        if math.isnan(self._slope) and not restored and core.start.n_removed == 0:
-            factor = self._solve(core, n_threads)
-        logs = self._logs(core, factor, n_threads)
+    def after_relaxation(self, log_rate_at: Callable[[float], float]) -> float:
+        """Determine the slope of the rate; on the first surface, find the voltage of the wanted rate."""
+        factor = self._solve(log_rate_at) if math.isnan(self._slope) else self.voltage_factor
+        logs = self._logs(log_rate_at, factor)
         self._slope = min(_STEP / max(logs[0] - logs[1], 1e-12), self._largest_slope)
+        return factor
 
-    def _logs(self, core, factor, n_threads):
-        """Logarithm of the rate at a slightly higher voltage, and at this one, which remains set."""
-        return [self._log_rate(core, factor * part, n_threads) for part in (1.0 + _STEP, 1.0)]
+    def _logs(self, log_rate_at, factor):
+        """Logarithm of the rate at a slightly higher voltage, and at this one."""
+        return [log_rate_at(factor * part) for part in (1.0 + _STEP, 1.0)]
 
-    def _solve(self, core, n_threads):
+    def _solve(self, log_rate_at):
         """Factor of the voltage at which the sum of the rates is the wanted one, by bisection."""
         goal = float(logarithm(self.rate))
         low, high = math.log(1e-3), math.log(1e3)
         for _ in range(_BISECTIONS):
             middle = 0.5 * (low + high)
-            if self._log_rate(core, float(exponential(middle)), n_threads) < goal:
+            if log_rate_at(float(exponential(middle))) < goal:
                 low = middle
             else:
                 high = middle
-        if abs(self._log_rate(core, float(exponential(middle)), n_threads) - goal) > 0.1:
+        if abs(log_rate_at(float(exponential(middle))) - goal) > 0.1:
             raise ValueError(
                 f"no voltage gives the rate of {self.control.rate:g} of the control: at this temperature atoms leave "
                 "faster or slower at any field; choose another rate, temperature or barrier"
             )
         return float(exponential(middle))
-
-    def _log_rate(self, core, factor, n_threads):
-        core.voltage_factor = factor
-        return core.rank(n_threads)

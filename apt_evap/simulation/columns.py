@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from apt_evap._common.types import Floats
+from apt_evap._core import events
 from apt_evap.emission.emissions import Emissions
 from apt_evap.flight.response import Responses, ResponseSettings
 from apt_evap.simulation.real_units import RealColumns
@@ -54,18 +55,27 @@ class Column(NamedTuple):
     """Whether it follows from the other columns, so that the fingerprint does not contain it."""
 
 
+_EVENTS = {column.name: column for column in events.COLUMNS}
+
+
+def _of_events(path, derived=False):
+    """A column that the events fill."""
+    column = _EVENTS[path.rpartition("/")[2]]
+    return Column(path, column.dtype, column.row, column.unit, derived)
+
+
 ALWAYS = (
     Column("emissions/ions", np.int64),
     Column("emissions/positions", np.float64, (3,), "nm"),
-    Column("emissions/normals", np.float64, (3,)),
+    _of_events("emissions/normals"),
     Column("emissions/neighbours", np.float64, (3,), "nm"),
     Column("emissions/charge_states", np.int32, (), "e"),
     Column("emissions/masses", np.float64, (), "Da"),
-    Column("site", np.int64),
+    _of_events("site"),
     Column("species", np.int32),
-    Column("charges", np.float64, (), "e"),
-    Column("fields", np.float64, (), "V/nm"),
-    Column("detached", np.bool_, derived=True),
+    _of_events("charges"),
+    _of_events("fields"),
+    _of_events("detached", derived=True),
     Column("phase", np.int8, derived=True),
 )
 OPTIONAL = (
@@ -74,7 +84,7 @@ OPTIONAL = (
     Column("emissions/second_targets", np.float64, (3, 3), "nm"),  # responses for two roll-ups
     Column("emissions/second_charge_ratios", np.float64, (3,)),
     Column("emissions/rollup_distances", np.float64, (), "nm"),  # phases that differ in it
-    Column("clock/waits", np.float64, (), "s"),
+    _of_events("clock/waits"),
     Column("clock/voltages", np.float64, (), "V"),
     Column("real/voltages", np.float64, (), "V", derived=True),
     Column("real/charges", np.int32, (), "e", derived=True),

@@ -146,7 +146,7 @@ def test_the_sum_at_the_root_does_not_drift(tip12):
 def test_frequencies_on_a_frozen_surface_are_the_probabilities(tip12, temperature):
     emitter = ae.evaporation.Emitter(tip12, law=ae.Arrhenius(temperature), seed=1)
     assert sum(map(len, emitter.advance(400))) == 400
-    x = emitter.fields * emitter._core.voltage_factor / tip12.evaporation_fields[tip12.species[emitter.atoms]]
+    x = emitter.fields * emitter._core.control.voltage_factor / tip12.evaporation_fields[tip12.species[emitter.atoms]]
     keys = np.where(tip12.evaporable[emitter.atoms], -(1 - x) / (BOLTZMANN * temperature), -np.inf)
     probability = np.exp(keys - keys.max())
     probability /= probability.sum()

@@ -37,7 +37,7 @@ def one_by_one(emitter, n):
     """Yield before each of n events what the twins need; the event follows when the batch is asked for."""
     done = 0
     while done < n:
-        before = emitter._core.chooser.rate, emitter._core.rise, emitter.atoms, emitter.fields
+        before = emitter._core.chooser.rate, emitter._core.control.rise, emitter.atoms, emitter.fields
         batch = emitter.evaporate(1)
         done += len(batch)
         if len(batch):
@@ -232,7 +232,7 @@ def test_atoms_are_drawn_from_the_rates_of_all_atoms(tip12, rng):
     s, parts = 1.0 / (BOLTZMANN * 80.0), []
     emitter = emitter_of(tip12, ae.Arrhenius(80.0), seed=9)
     for rate, _, atoms, fields, batch in one_by_one(emitter, 500):
-        x = fields * emitter._core.voltage_factor / 35.0
+        x = fields * emitter._core.control.voltage_factor / 35.0
         rates = np.where(tip12.evaporable[atoms], FREQUENCY * np.exp(-s * (1 - x)), 0.0)
         # keys of up to s = 145 are rounded to 145 * 2^-53 each, and every step of the twin's as well
         assert rate == pytest.approx(rates.sum(), rel=1e-12)
@@ -296,14 +296,14 @@ def test_the_first_voltage_gives_the_wanted_rate(tip12, temperature, rate):
     emitter = emitter_of(tip12, ae.Arrhenius(temperature), control=control)
     # 1e-15 of the voltage, where a bisection ends, is 4e-13 of the rate at 25 K
     assert emitter._core.chooser.rate * emitter.pulse_length == pytest.approx(rate, rel=2e-12)
-    assert emitter.control_voltage == emitter.voltage * emitter._core.voltage_factor
+    assert emitter.control_voltage == emitter.voltage * emitter._core.control.voltage_factor
 
 
 def test_the_voltage_follows_the_waits(tip12):
     """Between two relaxations dlnV = s (wait over its mean - 1)/memory, with s = dlnV/dlnK = kT/(C <x>)."""
     control = ae.VoltageControl(memory=40)
     emitter = emitter_of(tip12, ae.Arrhenius(50.0), control=control, seed=2)
-    x = np.where(tip12.evaporable[emitter.atoms], emitter.fields * emitter._core.voltage_factor / 35.0, -np.inf)
+    x = np.where(tip12.evaporable[emitter.atoms], emitter.fields * emitter._core.control.voltage_factor / 35.0, -np.inf)
     weights = np.exp((x - x.max()) / (BOLTZMANN * 50.0))
     slope = BOLTZMANN * 50.0 / np.average(np.maximum(x, 0.0), weights=weights)
     batch = emitter.evaporate(90)
@@ -312,7 +312,7 @@ def test_the_voltage_follows_the_waits(tip12):
     # the compiled slope is a difference over 1e-6 of the voltage; its error is half of that times the variance of
     # ln k over its slope, about 1/220
     assert np.diff(np.log(batch.voltages)) == pytest.approx(slope * steps, rel=1e-6, abs=1e-13)
-    assert batch.voltages[0] > emitter.voltage * emitter._core.voltage_factor  # it rose until the first event
+    assert batch.voltages[0] > emitter.voltage * emitter._core.control.voltage_factor  # it rose until the first event
 
 
 @pytest.mark.parametrize("barrier", BARRIERS)
@@ -323,10 +323,10 @@ def test_a_relaxation_keeps_the_rate(tip12, barrier):
     kernel = law.kernel(tip12)
     for _ in range(2):
         assert emitter.evaporate(60).status != TOO_SHALLOW
-        reached = np.log(emitter._core.chooser.rate) + emitter._core.rise
+        reached = np.log(emitter._core.chooser.rate) + emitter._core.control.rise
         atoms, fields = emitter.atoms, emitter.fields
         emitter.relax()
-        factor = emitter._core.voltage_factor
+        factor = emitter._core.control.voltage_factor
         rates = np.exp(kernel.evaluate(fields * factor, atoms, np.zeros(len(atoms), np.int32)))
         assert np.log(rates.sum()) == pytest.approx(reached, abs=1e-3)  # where the iteration stops
         assert emitter.control_voltage == emitter.voltage * factor
@@ -338,7 +338,7 @@ def test_a_relaxation_changes_the_voltage_only_to_the_second_order(tip12):
     control = ae.VoltageControl(memory=1000)
     emitter = emitter_of(tip12, ae.Arrhenius(50.0), control=control, seed=2)
     assert sum(map(len, emitter.advance(350))) == 350
-    before, after = emitter._core.voltage_factor * emitter.voltage, emitter.control_voltage
+    before, after = emitter._core.control.voltage_factor * emitter.voltage, emitter.control_voltage
     emitter.relax()
     assert abs(after / before - 1) > 2e-3
     # measured 2e-5, of a change of 0.6 of the logarithm; 5e-6 is where the iteration stops

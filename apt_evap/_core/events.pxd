@@ -1,0 +1,29 @@
+"""The table of events, for the sequence that fills it."""
+
+from apt_evap._core.journal cimport Journal
+
+
+cdef enum:
+    TARGETS = 3   # neighbours onto which an atom may roll
+
+
+cdef struct Event:
+    # One row, for the compiled code. `COLUMNS` of events.pyx has the units and meanings; the import checks that both
+    # have the same fields.
+    long long site
+    double charges
+    double fields
+    double[3] normals
+    long long[TARGETS] targets
+    double[TARGETS] target_charges
+    long long[TARGETS] second_targets
+    double[TARGETS] second_target_charges
+    double waits
+    double rises
+    unsigned char detached
+
+
+cdef class Events:
+    cdef readonly Journal journal
+    cdef Event[::1] rows                # (max_events,)
+    cdef object table                   # the same memory as an array of NumPy
