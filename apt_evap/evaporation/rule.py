@@ -3,9 +3,10 @@
 from collections.abc import Callable
 from typing import ClassVar, Protocol
 
+import apt_evap._core.constant_potential as constant_potential
+import apt_evap._core.robin as robin
 from apt_evap._common.codec import choice, count, number, settings
 from apt_evap._common.types import Floats
-from apt_evap._core import constant_potential, robin
 from apt_evap._core.rule import ChargingRule, PythonRule
 from apt_evap.specimen.tip import Tip
 

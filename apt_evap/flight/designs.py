@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+import apt_evap._core.polynomials as polynomials
 from apt_evap._common.codec import checked, count, number, settings
 from apt_evap._common.small_matrices import pseudo_inverse
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_count, check_number, check_sequence, short_text
-from apt_evap._core import polynomials
 from apt_evap._core.elementary import sine_and_cosine
 
 SECOND, THIRD, FIRST_VELOCITY, SECOND_VELOCITY, HEIGHT = VARIABLES = range(5)

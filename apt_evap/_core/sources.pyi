@@ -1,1 +1,0 @@
-"""Used only by compiled modules."""
