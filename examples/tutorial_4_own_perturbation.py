@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import apt_evap as ae
-from apt_evap.emission.surface_frame import launch_tangentially, rollup_direction
+from apt_evap.emission.emissions import launch_tangentially
+from apt_evap.emission.surface_frame import rollup_direction
 from apt_evap.units import speed_from_energy
 
 n_ions = int(sys.argv[1]) if len(sys.argv) > 1 else 400

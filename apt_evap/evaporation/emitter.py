@@ -54,16 +54,12 @@ class Batch:
         Field just outside the surface before evaporation [V/nm].
     normals : ndarray, shape (n, 3)
         Outward unit normal.
-    targets : ndarray of int64, shape (n, 3)
-        Indices of the three surface nearest neighbours with the highest charges, in falling order; -1 if there are
-        fewer. An atom may roll onto them.
-    target_charges : ndarray, shape (n, 3)
+    targets : ndarray of int64, shape (n, 2, 3)
+        Indices of the atoms onto which an atom may roll in a first and in a second step; -1 if there are fewer. First:
+        its three surface nearest neighbours with the highest charges, in falling order. Second: the same for the
+        strongest of them, without the atom and its neighbours.
+    target_charges : ndarray, shape (n, 2, 3)
         Their charges [e]; 0 if there are fewer.
-    second_targets : ndarray of int64, shape (n, 3)
-        The same for the first of them: its three surface neighbours with the highest charges that are neither the atom
-        nor neighbours of it. An atom may roll onto them in a second step.
-    second_target_charges : ndarray, shape (n, 3)
-        Their charges [e].
     detached : ndarray of bool, shape (n,)
         Atoms that left because they had lost all chains of bonds to the body.
     journal : Journal
@@ -87,8 +83,6 @@ class Batch:
     normals: np.ndarray
     targets: np.ndarray
     target_charges: np.ndarray
-    second_targets: np.ndarray
-    second_target_charges: np.ndarray
     detached: np.ndarray
     journal: Journal
     tree: Octree | None
@@ -508,7 +502,7 @@ class Emitter:
         """
         n = check_count(max_events, "max_events", at_least=1, at_most=_MAX_EVENTS)
         journal = Journal(self.tip.positions, n)
-        site, targets, target_charges = np.empty(n, np.int64), np.empty((n, 6), np.int64), np.empty((n, 6))
+        site, targets, target_charges = np.empty(n, np.int64), np.empty((n, 2, 3), np.int64), np.empty((n, 2, 3))
         charges, fields, normals, detached = np.empty(n), np.empty(n), np.empty((n, 3)), np.empty(n, np.int8)
         waits, rise = np.empty(n), np.empty(n)
         tree = self._core.tree.copy() if self._recorded >= RECORD else None
@@ -521,8 +515,8 @@ class Emitter:
             charges,
             fields,
             normals,
-            targets,
-            target_charges,
+            targets.reshape(n, -1),
+            target_charges.reshape(n, -1),
             detached,
             waits,
             rise,
@@ -535,10 +529,8 @@ class Emitter:
             charges=charges[:n],
             fields=fields[:n],
             normals=normals[:n],
-            targets=targets[:n, :3],
-            target_charges=target_charges[:n, :3],
-            second_targets=targets[:n, 3:],
-            second_target_charges=target_charges[:n, 3:],
+            targets=targets[:n],
+            target_charges=target_charges[:n],
             detached=detached[:n].view(bool),
             journal=journal,
             tree=tree,
