@@ -79,6 +79,8 @@ class Emissions:
             raise ValueError("targets and charge_ratios must be given together, got one of them")
         if self.targets is not None:
             targets = check_array(self.targets, "targets", (n, "rolls", 3, 3), finite=False)
+            if targets.shape[1] not in (1, 2):
+                raise ValueError(f"targets must be those of 1 or 2 roll-ups, got {targets.shape[1]}")
             ratios = check_array(self.charge_ratios, "charge_ratios", (n, targets.shape[1], 3), finite=False)
             values |= {"targets": targets, "charge_ratios": ratios}
         if self.rollup_distances is not None:
@@ -145,6 +147,8 @@ class Emissions:
 
     def roll_ups(self, sharpness: float = 0.0, rolls: int = 1) -> RollUps:
         """Roll-ups of these atoms, computed once as long as the arguments stay the same.
+
+        The result takes 17 bytes per atom and roll-up, and 24 more with a sharpness.
 
         Parameters
         ----------

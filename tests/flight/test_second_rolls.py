@@ -225,6 +225,10 @@ def test_launches_that_the_responses_do_not_serve_are_refused(tip12):
             ),
             "targets and charge_ratios must be given together",
         ),
+        (
+            lambda: replace(line_of_atoms(), targets=np.zeros((2, 3, 3, 3)), charge_ratios=np.zeros((2, 3, 3))),
+            "targets must be .*2 roll-ups, got 3",
+        ),
     ],
 )
 def test_bad_options_are_refused(make, message):
