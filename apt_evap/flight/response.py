@@ -245,11 +245,10 @@ class ResponseModel:
         settings, n = self.settings, len(emissions)
         fastest = np.sqrt(2.0 * settings.energy_limit / emissions.charge_states)[:, None]
         groups = []
-        for group, design in enumerate(settings.designs):
-            roll = group - 1
+        for roll, design in enumerate(settings.designs, -1):  # -1: from the site
             launches = np.zeros((len(design.launches), len(VARIABLES)))
             launches[:, list(design.columns)] = design.launches
-            if group == 0:
+            if roll < 0:
                 starts = np.broadcast_to(emissions.positions[:, None], (n, len(launches), 3))
             elif settings.is_wide:
                 second, third = launches[:, SECOND], launches[:, THIRD]
