@@ -434,9 +434,8 @@ cdef class Evaporation:
                 event.fields = self.field_unit * self.rule.strength(self.tree, best)
                 for axis in range(3):
                     event.normals[axis] = self.normals[best, axis]
-                self.strongest_neighbours(leaving, leaving, event.targets, event.target_charges)
-                self.strongest_neighbours(event.targets[0], leaving, event.second_targets,
-                                          event.second_target_charges)
+                self.strongest_neighbours(leaving, leaving, event.targets[0], event.target_charges[0])
+                self.strongest_neighbours(event.targets[0][0], leaving, event.targets[1], event.target_charges[1])
                 self.event(leaving, journal)
         return status
 

@@ -4,7 +4,8 @@ from apt_evap._core.journal cimport Journal
 
 
 cdef enum:
-    TARGETS = 3   # neighbours onto which an atom may roll
+    ROLLS = 2     # steps of an atom before its flight
+    TARGETS = 3   # neighbours onto which an atom may roll in each
 
 
 cdef struct Event:
@@ -14,10 +15,8 @@ cdef struct Event:
     double charges
     double fields
     double[3] normals
-    long long[TARGETS] targets
-    double[TARGETS] target_charges
-    long long[TARGETS] second_targets
-    double[TARGETS] second_target_charges
+    long long[ROLLS][TARGETS] targets
+    double[ROLLS][TARGETS] target_charges
     double waits
     double rises
     unsigned char detached

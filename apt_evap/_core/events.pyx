@@ -21,17 +21,12 @@ COLUMNS = (
     Column("fields", np.float64, (), "V/nm", "Field just outside the surface before evaporation."),
     Column("normals", np.float64, (3,), None, "Outward unit normal."),
     Column(
-        "targets", np.int64, (TARGETS,), None,
-        "Indices of the surface nearest neighbours with the highest charges, in falling order; -1 if there are fewer. "
-        "An atom may roll onto them.",
+        "targets", np.int64, (ROLLS, TARGETS), None,
+        "Indices of the atoms onto which an atom may roll in a first and in a second step; -1 if there are fewer. "
+        "First: its surface nearest neighbours with the highest charges, in falling order. Second: the same for the "
+        "strongest of them, without the atom and its neighbours.",
     ),
-    Column("target_charges", np.float64, (TARGETS,), "e", "Their charges; 0 if there are fewer."),
-    Column(
-        "second_targets", np.int64, (TARGETS,), None,
-        "The same for the first of them: its surface neighbours with the highest charges that are neither the atom nor "
-        "neighbours of it. An atom may roll onto them in a second step.",
-    ),
-    Column("second_target_charges", np.float64, (TARGETS,), "e", "Their charges; 0 if there are fewer."),
+    Column("target_charges", np.float64, (ROLLS, TARGETS), "e", "Their charges; 0 if there are fewer."),
     Column(
         "waits", np.float64, (), "s",
         "Time before the event; with pulses, time at the top of pulses. 0 for a detached atom.",

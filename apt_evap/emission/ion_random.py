@@ -2,6 +2,8 @@
 
 from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
 
+from copy import copy
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -14,7 +16,8 @@ from apt_evap._core.elementary import normal_quantile
 class IonRandom:
     """Random numbers of a batch of ions, with a separate stream for each ion.
 
-    Number `j` of an ion depends only on (seed, ion, j). Each call continues with new columns.
+    Number `j` of an ion depends only on (seed, ion, j). Each call continues with new columns. Every column is computed
+    once, also for the copies by `from_start`.
 
     Parameters
     ----------
@@ -40,16 +43,28 @@ class IonRandom:
         start = mix(np.array([self.seed], dtype=np.uint64) + GAMMA)
         self._state = mix(start + (ions + np.uint64(1)) * GAMMA)
         self._column = 0
+        self._columns: dict[int, Floats] = {}  # by their index, each of shape (n,)
 
     def __repr__(self) -> str:
         return f"IonRandom(seed={self.seed}, {len(self._state)} ions)"
 
+    def from_start(self) -> IonRandom:
+        """Return the same random numbers from the first column on."""
+        other = copy(self)  # with the same columns
+        other._column = 0
+        return other
+
     def uniform(self, columns: int = 1) -> Floats:
         """Return the next uniform numbers in (0, 1), shape (n, columns)."""
-        first = self._column + 1
+        first = self._column
         self._column += check_count(columns, "columns", at_least=1)
-        steps = np.arange(first, self._column + 1, dtype=np.uint64) * GAMMA
-        return open_interval(mix(self._state[:, None] + steps))
+        return np.stack([self._uniform(column) for column in range(first, self._column)], axis=1)
+
+    def _uniform(self, column):
+        if column not in self._columns:
+            step = np.array([column + 1], dtype=np.uint64) * GAMMA
+            self._columns[column] = open_interval(mix(self._state + step))
+        return self._columns[column]
 
     def normal(self, columns: int = 1) -> Floats:
         """Return the next normal numbers of mean 0 and variance 1, shape (n, columns)."""

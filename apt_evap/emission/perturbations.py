@@ -15,7 +15,7 @@ from apt_evap._common.codec import from_plain, is_settings, number, part, settin
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_number
 from apt_evap._core.elementary import exponential, sine_and_cosine
-from apt_evap.emission.emissions import Emissions, Launches, TangentialLaunches
+from apt_evap.emission.emissions import Emissions, Launches, TangentialLaunches, launch_tangentially
 from apt_evap.emission.energies import (
     DISTRIBUTIONS,
     Distribution,
@@ -26,13 +26,7 @@ from apt_evap.emission.energies import (
     draw_energies,
 )
 from apt_evap.emission.ion_random import IonRandom
-from apt_evap.emission.surface_frame import (
-    launch_tangentially,
-    rollup_direction,
-    second_direction,
-    tangent_frame,
-    target_shares,
-)
+from apt_evap.emission.surface_frame import rollup_direction, tangent_frame, target_shares
 from apt_evap.units import speed_from_energy
 
 __all__ = [
@@ -113,7 +107,7 @@ class ChargeRatio:
                 "ChargeRatio needs the charges of the neighbours, which this run does not have: run with "
                 "response_settings=ResponseSettings.wide()"
             )
-        ratios = emissions.charge_ratios[:, 0]
+        ratios = emissions.charge_ratios[:, 0, 0]
         excess = np.where(np.isfinite(ratios), ratios, 0.0) - self.threshold
         if self.width == 0.0:
             return (excess > 0).astype(float)
@@ -209,19 +203,16 @@ class _Rolling(_Tangential):
         n = len(emissions)
         certain = self.probability == 1.0
         u = random.uniform(4 if self.second_roll else 2 if certain else 3)
-        shares = None if self.sharpness == 0.0 else target_shares(emissions, self.sharpness)
-        rolled, first, second = rollup_direction(emissions, shares)
+        possible, along, across, shares = emissions.roll_ups(self.sharpness, 2 if self.second_roll else 1)
+        rolled, first, second = possible[:, 0].copy(), along[:, 0], across[:, 0]
         if not certain:
             given = self.probability
             wanted = u[:, 2] < (given if isinstance(given, float) else given.probabilities(emissions))
             rolled = rolled & wanted
-        twice = second_shares = None
+        twice = None
         if self.second_roll:
-            if shares is not None:
-                second_shares = target_shares(emissions, self.sharpness, second=True)
-            can_roll_twice, onward, aside = second_direction(emissions, shares, second_shares)
-            twice = rolled & can_roll_twice & (u[:, 3] < self.second_roll)
-            first, second = np.where(twice, onward, first), np.where(twice, aside, second)
+            twice = rolled & possible[:, 1] & (u[:, 3] < self.second_roll)
+            first, second = np.where(twice, along[:, 1], first), np.where(twice, across[:, 1], second)
         energies = draw_energies(self.energy, u[:, 0])
         fraction = getattr(self, "rollup_fraction", 1.0)
         rolling = np.where(rolled, fraction * energies, 0.0)
@@ -231,7 +222,7 @@ class _Rolling(_Tangential):
         random_speed = speed_from_energy(lateral, emissions.masses)
         sine, cosine = sine_and_cosine(2 * np.pi * u[:, 1])
         first, second = speed * first + random_speed * cosine, speed * second + random_speed * sine
-        return TangentialLaunches(rolled, first, second, shares, self._heights(n), twice, second_shares)
+        return TangentialLaunches(rolled, first, second, shares, self._heights(n), twice)
 
 
 @settings

@@ -1,6 +1,8 @@
-"""Start position and direction of an ion on the surface: the tangent frame, the roll-up, the launch."""
+"""Start position and direction of an ion on the surface: the tangent frame and the roll-ups."""
 
 from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -9,8 +11,9 @@ from apt_evap._common.small_matrices import products
 from apt_evap._common.types import Booleans, Floats
 from apt_evap._common.validation import check_array, check_kind
 from apt_evap._core.elementary import exponential
-from apt_evap.emission.emissions import Emissions, Launches
-from apt_evap.emission.kept import kept
+
+if TYPE_CHECKING:
+    from apt_evap.emission.emissions import Emissions
 
 
 def tangent_frame(normals: ArrayLike) -> tuple[Floats, Floats]:
@@ -42,54 +45,60 @@ def tangent_frame(normals: ArrayLike) -> tuple[Floats, Floats]:
     return first, np.stack([b, sign + y * y * a, -y], axis=1)
 
 
-@kept
-def rollup_direction(emissions: Emissions, shares: Floats | None = None) -> tuple[Booleans, Floats, Floats]:
+class RollUps(NamedTuple):
+    """Directions of the successive roll-ups of n atoms, and the shares of their targets."""
+
+    possible: Booleans
+    """Whether there is a target to roll onto, shape (n, rolls)."""
+    first: Floats
+    """Components of the directions along t1 of `tangent_frame`, see `rollup_direction`, shape (n, rolls)."""
+    second: Floats
+    """Components along t2, shape (n, rolls)."""
+    shares: Floats | None
+    """Shares of the targets, see `target_shares`, shape (n, rolls, 3); None for the strongest ones only."""
+
+
+def roll_ups(emissions: Emissions, sharpness: float, rolls: int) -> RollUps:
+    """Roll-ups of a batch, see `Emissions.roll_ups`, which computes them once; the arrays are read-only."""
+    shares = None if sharpness == 0.0 else target_shares(emissions, sharpness, rolls)
+    directions = [rollup_direction(emissions, shares, roll) for roll in range(rolls)]
+    possible, first, second = (np.stack(each, axis=1) for each in zip(*directions, strict=True))
+    found = RollUps(possible, first, second, shares)
+    for array in found:
+        if array is not None:
+            array.flags.writeable = False
+    return found
+
+
+def rollup_direction(
+    emissions: Emissions, shares: Floats | None = None, roll: int = 0
+) -> tuple[Booleans, Floats, Floats]:
     """Ions that can roll up, and the direction of their roll-up.
 
     Parameters
     ----------
     emissions : Emissions
         A batch of n.
-    shares : ndarray, shape (n, 3), optional
-        Shares of the targets, see `target_shares`; by default the strongest one only.
+    shares : ndarray, shape (n, rolls, 3), optional
+        Shares of the targets, see `target_shares`; by default the strongest ones only.
+    roll : int
+        0 for the first roll-up, from the site, or 1 for the second one, from the first rolled-up position.
 
     Returns
     -------
     tuple of ndarray
-        Whether there is a neighbour to roll onto, shape (n,). Then the components along t1 and t2, each of shape (n,),
-        of the unit vector from the site to the rolled-up position, projected perpendicular to the normal; zero if there
-        is no neighbour, or if it lies along the normal.
-    """
-    rolled = emissions.can_roll
-    return rolled, *_direction(emissions, rolled, _place(emissions, shares) - emissions.positions)
-
-
-@kept
-def second_direction(
-    emissions: Emissions, shares: Floats | None = None, second_shares: Floats | None = None
-) -> tuple[Booleans, Floats, Floats]:
-    """Ions that can roll up twice, and the direction of the second roll-up.
-
-    Parameters
-    ----------
-    emissions : Emissions
-        A batch of n, with the targets of a second roll-up.
-    shares, second_shares : ndarray, shape (n, 3), optional
-        Shares of the targets of both, see `target_shares`; by default the strongest ones only.
-
-    Returns
-    -------
-    tuple of ndarray
-        As of `rollup_direction`, for the step from the first to the second rolled-up position.
+        Whether there is a target to roll onto, shape (n,). Then the components along t1 and t2, each of shape (n,), of
+        the unit vector to the rolled-up position, projected perpendicular to the normal; zero if there is no target, or
+        if it lies along the normal.
 
     Raises
     ------
     ValueError
-        If the emissions have no targets of a second roll-up.
+        If the targets that this needs are not known.
     """
-    twice = emissions.can_roll_twice
-    step = _place(emissions, second_shares, second=True) - _place(emissions, shares)
-    return twice, *_direction(emissions, twice, step)
+    there = emissions.can_roll_twice if roll else emissions.can_roll
+    before = _place(emissions, shares, roll - 1) if roll else emissions.positions
+    return there, *_direction(emissions, there, _place(emissions, shares, roll) - before)
 
 
 def _direction(emissions, there, steps):
@@ -103,15 +112,15 @@ def _direction(emissions, there, steps):
     return along[0] * scale, along[1] * scale
 
 
-def _place(emissions, shares, second=False):
+def _place(emissions, shares, roll):
     """The target of a roll-up, or the mean of the targets with these shares; shape (n, 3)."""
     if shares is None:
-        return emissions.known_second_targets()[:, 0] if second else emissions.neighbours
-    return _mean_targets(emissions, shares[:, None], second)[:, 0]
+        return emissions.strongest_targets(roll)
+    return _mean_targets(emissions, shares[:, roll, None], roll)[:, 0]
 
 
-def rolled_positions(emissions: Emissions, second: bool = False) -> Floats:
-    """Positions p_r = s + d n, one nearest neighbour distance d above the neighbour s that each ion rolls onto.
+def rolled_positions(emissions: Emissions, shares: Floats | None = None, roll: int = 0) -> Floats:
+    """Positions p_r = s + d n, one nearest neighbour distance d above the place s that each ion rolls onto.
 
     Between two phases, d is the mean of their distances.
 
@@ -119,15 +128,17 @@ def rolled_positions(emissions: Emissions, second: bool = False) -> Floats:
     ----------
     emissions : Emissions
         A batch of n.
-    second : bool
-        Whether after a second roll-up, with the same d.
+    shares : ndarray, shape (n, rolls, 3), optional
+        Shares of the targets; by default s is the strongest neighbour.
+    roll : int
+        0 after the first roll-up, 1 after the second one, with the same d.
 
     Returns
     -------
     ndarray, shape (n, 3)
         Positions [nm]; NaN for an ion without a neighbour.
     """
-    return _place(emissions, None, second) + _lift(emissions)
+    return _place(emissions, shares, roll) + _lift(emissions)
 
 
 def _lift(emissions):
@@ -137,7 +148,7 @@ def _lift(emissions):
     return emissions.rollup_distances[:, None] * emissions.normals
 
 
-def target_shares(emissions: Emissions, sharpness: float, second: bool = False) -> Floats:
+def target_shares(emissions: Emissions, sharpness: float, rolls: int = 1) -> Floats:
     r"""Shares of the three strongest surface nearest neighbours in the place onto which an atom rolls.
 
     Parameters
@@ -146,12 +157,12 @@ def target_shares(emissions: Emissions, sharpness: float, second: bool = False) 
         A batch of n, with its targets.
     sharpness : float
         :math:`\tau`; 0 for the strongest neighbour only.
-    second : bool
-        Whether for a second roll-up.
+    rolls : int
+        Number of successive roll-ups, 1 or 2.
 
     Returns
     -------
-    ndarray, shape (n, 3)
+    ndarray, shape (n, rolls, 3)
         0 for missing neighbours; the first is 1 for an atom without any.
 
     Raises
@@ -166,24 +177,10 @@ def target_shares(emissions: Emissions, sharpness: float, second: bool = False) 
     with the charges :math:`q_j` of the neighbours in falling order. Where two of them are nearly equal, an atom moves
     onto the bridge or hollow between them.
     """
-    check_kind(emissions, "emissions", Emissions, "Emissions")
-    return _second_shares(emissions, sharpness) if second else _first_shares(emissions, sharpness)
-
-
-# two functions, as each one keeps its last result only
-@kept
-def _first_shares(emissions, sharpness):
-    return _shares(emissions.charge_ratios, len(emissions), sharpness)
-
-
-@kept
-def _second_shares(emissions, sharpness):
-    return _shares(emissions.second_charge_ratios, len(emissions), sharpness)
-
-
-def _shares(ratios, n, sharpness):
-    shares = np.zeros((n, 3))
-    shares[:, 0] = 1.0
+    check_kind(emissions, "emissions", "roll_ups", "Emissions")
+    n, ratios = len(emissions), emissions.charge_ratios
+    shares = np.zeros((n, rolls, 3))
+    shares[..., 0] = 1.0
     if sharpness == 0.0 or n == 0:
         return shares
     if ratios is None:
@@ -191,15 +188,17 @@ def _shares(ratios, n, sharpness):
             "a sharpness > 0 needs the targets of the roll-up, which this run does not have: run with "
             "response_settings=ResponseSettings.wide()"
         )
-    there = np.isfinite(ratios[:, 1:])
-    relative = np.where(there, ratios[:, 1:], 0.0) / np.where(ratios[:, :1] > 0, ratios[:, :1], 1.0)
-    shares[:, 1:] = np.where(there, exponential(np.ascontiguousarray((relative - 1.0) / sharpness)), 0.0)
-    return shares / (shares[:, 0] + shares[:, 1] + shares[:, 2])[:, None]
+    emissions.targets_of(rolls - 1)  # ValueError if they are not known
+    ratios = ratios[:, :rolls]
+    there = np.isfinite(ratios[..., 1:])
+    relative = np.where(there, ratios[..., 1:], 0.0) / np.where(ratios[..., :1] > 0, ratios[..., :1], 1.0)
+    shares[..., 1:] = np.where(there, exponential((relative - 1.0) / sharpness), 0.0)
+    return shares / (shares[..., 0] + shares[..., 1] + shares[..., 2])[..., None]
 
 
-def _mean_targets(emissions, shares, second=False):
+def _mean_targets(emissions, shares, roll):
     """Weighted means of the targets, shares (n or 1, m, 3) -> (n, m, 3); a missing target is replaced by the first."""
-    targets = emissions.known_second_targets() if second else emissions.targets
+    targets = emissions.targets_of(roll)
     targets = np.where(np.isfinite(targets), targets, targets[:, :1])
     mean = shares[..., 0, None] * targets[:, None, 0]
     for k in (1, 2):
@@ -207,7 +206,7 @@ def _mean_targets(emissions, shares, second=False):
     return mean
 
 
-def shared_positions(emissions: Emissions, shares: Floats, second: bool = False) -> Floats:
+def shared_positions(emissions: Emissions, shares: Floats, roll: int = 0) -> Floats:
     """Positions one nearest neighbour distance above weighted means of the targets.
 
     Parameters
@@ -216,15 +215,15 @@ def shared_positions(emissions: Emissions, shares: Floats, second: bool = False)
         A batch of n, with its targets.
     shares : ndarray, shape (n or 1, m, 3)
         Shares of the targets.
-    second : bool
-        Whether of those of a second roll-up.
+    roll : int
+        0 for targets of the first roll-up, 1 for those of the second one.
 
     Returns
     -------
     ndarray, shape (n, m, 3)
         Positions [nm]; NaN for an ion without a neighbour.
     """
-    return _mean_targets(emissions, shares, second) + _lift(emissions)[:, None]
+    return _mean_targets(emissions, shares, roll) + _lift(emissions)[:, None]
 
 
 def along_surface(normals: ArrayLike, first: Floats, second: Floats) -> Floats:
@@ -245,47 +244,3 @@ def along_surface(normals: ArrayLike, first: Floats, second: Floats) -> Floats:
     if np.ndim(first) == 2:
         frame = frame[0][:, None], frame[1][:, None]
     return first[..., None] * frame[0] + second[..., None] * frame[1]
-
-
-def launch_tangentially(
-    emissions: Emissions,
-    rolled: Booleans,
-    first: Floats,
-    second: Floats,
-    shares: Floats | None = None,
-    heights: Floats | None = None,
-    twice: Booleans | None = None,
-    second_shares: Floats | None = None,
-) -> Launches:
-    """Launches with velocities along the surface.
-
-    Parameters
-    ----------
-    emissions : Emissions
-        A batch of n.
-    rolled : array_like of bool
-        Whether an ion starts at its rolled-up position, see `rolled_positions`, or at its site, shape (n,).
-    first, second : array_like
-        Velocity along t1 and t2 of `tangent_frame` [nm/ns], shape (n,).
-    shares, heights, twice, second_shares : ndarray, optional
-        As in `TangentialLaunches`.
-
-    Returns
-    -------
-    Launches
-    """
-    up = rolled_positions(emissions) if shares is None else shared_positions(emissions, shares[:, None])[:, 0]
-    positions = np.where(np.asarray(rolled)[:, None], up, emissions.positions)
-    if twice is not None:
-        if second_shares is None:
-            up = rolled_positions(emissions, second=True)
-        else:
-            up = shared_positions(emissions, second_shares[:, None], second=True)[:, 0]
-        positions = np.where(np.asarray(twice)[:, None], up, positions)
-    if heights is not None:
-        positions = positions + np.asarray(heights)[:, None] * emissions.normals
-    return Launches(
-        positions=positions,
-        velocities=along_surface(emissions.normals, np.asarray(first), np.asarray(second)),
-        rolled=rolled,
-    )

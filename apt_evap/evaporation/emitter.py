@@ -83,8 +83,6 @@ class Batch:
     normals: np.ndarray
     targets: np.ndarray
     target_charges: np.ndarray
-    second_targets: np.ndarray
-    second_target_charges: np.ndarray
     detached: np.ndarray
     journal: Journal
     tree: Octree | None

@@ -23,7 +23,6 @@ from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.limits import MAX_BINS
 from apt_evap.detection.projection import Projection
-from apt_evap.emission.kept import KeptEmissions
 from apt_evap.emission.perturbations import Perturbation, RollUp, TruncatedNormal, Unperturbed
 from apt_evap.explore.controls import MECHANISMS, Control, controls_of, perturbation_of
 from apt_evap.fit.fit_energies import BINS, measured_map
@@ -144,8 +143,7 @@ class Commands(NamedTuple):
 class Explorer:
     """Maps of a run for any emission, fast enough to follow a slider.
 
-    The frames, random numbers and roll-up directions of all ions are computed once. All maps have the same bits as
-    those of `Run.hits` and `Hits.map`.
+    All maps have the same bits as those of `Run.hits` and `Hits.map`.
 
     Parameters
     ----------
@@ -188,13 +186,13 @@ class Explorer:
             if measured is None:
                 raise ValueError("registration needs measured ions or a measured map, got none")
         preview = check_count(preview, "preview", at_least=1)
-        self.run = replace(run, emissions=KeptEmissions.of(run.emissions))
+        self.run = run
         self.measured = measured
         self.run_code, self.measured_code = run_code, measured_code
         self._run_arguments = list(run_arguments)
         self._measured_arguments = [] if measured is None else list(measured_arguments)
         step = math.ceil(len(run) / preview)
-        self._preview_run = _every(self.run, step) if step > 1 else self.run
+        self._preview_run = self.run[::step] if step > 1 else self.run
         self._kept_places: list[tuple[Any, Hits]] = []
         self._kept_maps: dict[Any, Any] = {}
         self._kept_picture: tuple[Any, Any] = (None, None)
@@ -626,9 +624,3 @@ def _has_window(like):
 
 def _starting_values(mechanism):
     return {each.name: each.value for each in controls_of(mechanism)}
-
-
-def _every(run: Run, step: int) -> Run:
-    """Run of every `step`-th ion, for `Run.places`."""
-    thinned = run[::step]
-    return replace(thinned, emissions=KeptEmissions.of(thinned.emissions))

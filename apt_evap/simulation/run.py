@@ -4,6 +4,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from apt_evap.detection.detector import Detector
 from apt_evap.detection.hits import Hits, Outcome
 from apt_evap.detection.instrument import Instrument
 from apt_evap.emission.emissions import Emissions, TangentialLaunches
+from apt_evap.emission.ion_random import IonRandom
 from apt_evap.emission.perturbations import Perturbation, Unperturbed, described
 from apt_evap.evaporation.state import EmitterState
 from apt_evap.flight.response import ResponseModel, Responses, ResponseSettings
@@ -34,8 +36,10 @@ from apt_evap.simulation.columns import (
     Flown,
     columns_of,
     flown_columns,
+    hashed_columns_of,
     parts_of,
     response_columns,
+    target_columns,
 )
 from apt_evap.simulation.history import CapHistory, History
 from apt_evap.simulation.provenance import joined, provenance_now
@@ -154,7 +158,8 @@ class Run:
     @property
     def every_column(self) -> list[Column]:
         """The columns of this run, see `apt_evap.simulation.columns`."""
-        columns = [*ALWAYS, *OPTIONAL, *(each for k in range(len(self.flown)) for each in flown_columns(k))]
+        columns = [*ALWAYS, *OPTIONAL, *target_columns(self.response_settings)]
+        columns += [each for k in range(len(self.flown)) for each in flown_columns(k)]
         if self.responses is not None:
             columns += response_columns(self.response_settings)
         there = columns_of(self, columns)
@@ -236,7 +241,7 @@ class Run:
             and voltages of a control, flown perturbations and responses, but not the real units, which follow from
             them. By design it does not depend on the machine.
         """
-        columns = columns_of(self, [column for column in self.every_column if not column.derived])
+        columns = hashed_columns_of(self, self.every_column)
         hashed = hashlib.sha256()
         for name in sorted(columns):
             values = np.array(columns[name], order="C")
@@ -299,6 +304,11 @@ class Run:
         x, y, _, outcome = self.detector.impacts(*self._landed(perturbation, False))
         return x, y, outcome
 
+    @cached_property
+    def _random(self):
+        """Random numbers of the ions, the same for every perturbation."""
+        return IonRandom(self.seed, self.emissions.ions)
+
     def _landed(self, perturbation, by_response):
         """Stereographic directions (n, 2) and times of flight (n,) for a perturbation."""
         for flown_as, flown in zip(self.perturbations, self.flown, strict=True):
@@ -315,7 +325,7 @@ class Run:
         if self.responses is None:
             raise ValueError(f"this run has no responses and {short_text(perturbation)} was not flown in it")
         emissions = self.emissions
-        launches = TangentialLaunches(*perturbation.tangential(emissions, emissions.random(self.seed)))  # type: ignore[attr-defined]
+        launches = TangentialLaunches(*perturbation.tangential(emissions, self._random.from_start()))  # type: ignore[attr-defined]
         scale = 1.0
         if self.real is not None and len(self):
             scales = self.energy_scales
@@ -446,8 +456,8 @@ class Run:
             flown = tuple(Flown(each.directions, each.times * ratio) for each in flown)
             if responses is not None:
                 factors = np.array([1.0, 1.0, ratio], np.float32)[:, None]  # directions and time
-                site, rolled, *twice = (each * factors for each in responses.polynomials)
-                responses = Responses(site, rolled, responses.residuals * ratio, *twice)
+                site, rolled = responses.site * factors, responses.rolled * factors
+                responses = Responses(site, rolled, responses.residuals * ratio)
         settings = self.settings | {"detector": to_plain(detector)}
         return replace(self, detector=detector, settings=settings, flown=flown, responses=responses)
 

@@ -18,7 +18,15 @@ from apt_evap.emission.perturbations import described, perturbation_of
 from apt_evap.evaporation.state import EmitterState
 from apt_evap.evaporation.voltage import check_voltage
 from apt_evap.flight.response import ResponseSettings
-from apt_evap.simulation.columns import ALWAYS, OPTIONAL, columns_of, flown_columns, parts_of, response_columns
+from apt_evap.simulation.columns import (
+    ALWAYS,
+    OPTIONAL,
+    columns_of,
+    flown_columns,
+    parts_of,
+    response_columns,
+    target_columns,
+)
 from apt_evap.simulation.history import CapHistory, History
 from apt_evap.simulation.provenance import provenance_now
 from apt_evap.simulation.real_units import RealUnits
@@ -177,7 +185,8 @@ def _read(file):
     settings = json.loads(file.text("settings"))
     elements = tuple(json.loads(file.text("elements")))
     response_settings = from_plain(settings["responses"], ResponseSettings, what="responses")
-    perturbations, columns = [], [*ALWAYS, *(column for column in OPTIONAL if _place(column) in file)]
+    optional = (*OPTIONAL, *target_columns(response_settings))
+    perturbations, columns = [], [*ALWAYS, *(column for column in optional if _place(column) in file)]
     while (group := f"{_SIMULATION}/flown/{len(perturbations)}") in file:
         columns += flown_columns(len(perturbations))
         perturbations.append(_known(json.loads(file.text("perturbation", group))))

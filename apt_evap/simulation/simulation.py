@@ -19,7 +19,7 @@ from apt_evap._common.threads import thread_count
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_count, check_kind, check_seed, check_sequence, check_switch
 from apt_evap.detection.detector import Detector
-from apt_evap.emission.emissions import SECOND_TARGET_COLUMNS, Emissions, check_launches
+from apt_evap.emission.emissions import Emissions, check_launches
 from apt_evap.emission.ion_random import IonRandom
 from apt_evap.emission.perturbations import Perturbation, Unperturbed
 from apt_evap.evaporation.emitter import BATCH, Emitter
@@ -333,23 +333,19 @@ class Simulation:
     def _emissions(self, batch, ions):
         species = self.tip.species[batch.site]
         positions = self.tip.positions
-
-        def places_and_ratios(atoms, charges):
-            """Positions of targets [nm], and their charges over that of the evaporating atom; NaN if there are none."""
-            there = atoms >= 0
+        settings = self.response_settings
+        atoms, charges = batch.targets[:, : settings.rolls], batch.target_charges[:, : settings.rolls]
+        there = atoms >= 0
+        targets = np.where(there[..., None], positions[atoms], np.nan)
+        columns = {}
+        if settings.has_targets:
             with np.errstate(divide="ignore", invalid="ignore"):
-                ratios = charges / batch.charges[:, None]
-            return np.where(there[..., None], positions[atoms], np.nan), np.where(there, ratios, np.nan)
-
-        targets, ratios = places_and_ratios(batch.targets, batch.target_charges)
-        columns = {"targets": targets, "charge_ratios": ratios} if self.response_settings.is_wide else {}
-        if self.response_settings.rolls == 2:
-            second = places_and_ratios(batch.second_targets, batch.second_target_charges)
-            columns |= dict(zip(SECOND_TARGET_COLUMNS, second, strict=True))
+                ratios = charges / batch.charges[:, None, None]
+            columns = {"targets": targets, "charge_ratios": np.where(there, ratios, np.nan)}
         return Emissions(
             positions=positions[batch.site],
             normals=batch.normals,
-            neighbours=np.ascontiguousarray(targets[:, 0]),
+            neighbours=np.ascontiguousarray(targets[:, 0, 0]),
             charge_states=self.tip.charge_states[species],
             masses=self.tip.masses[species],
             ions=ions,
@@ -364,7 +360,8 @@ class Simulation:
         if (distances == distances[0]).all():
             return None
         own = self.tip.phase_at(batch.site)
-        other = np.where(batch.targets[:, 0] >= 0, self.tip.phase_at(batch.targets[:, 0]), own)
+        target = batch.targets[:, 0, 0]
+        other = np.where(target >= 0, self.tip.phase_at(target), own)
         return 0.5 * (distances[own] + distances[other])
 
     def _check_atoms(self, n_ions):

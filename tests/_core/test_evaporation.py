@@ -116,7 +116,7 @@ def check_choices(emitter, events):
         near = (distance > 0) & (distance < 1.2 * tip.nearest_neighbour_distance)
         if near.any():
             strongest = near & (charges == charges[near].max())
-            assert batch.targets[0, 0] == atoms[strongest].min()
+            assert batch.targets[0, 0, 0] == atoms[strongest].min()
         else:
             assert (batch.targets[0] == -1).all()
 
@@ -151,16 +151,16 @@ def test_targets_are_the_strongest_neighbours_of_the_shells(element, shells, rea
         distance = np.linalg.norm(positions - tip.positions[batch.site[0]], axis=1) / tip.nearest_neighbour_distance
         near = np.flatnonzero((distance > 0) & (distance < reach))
         expected, order = strongest(near)
-        np.testing.assert_array_equal(batch.targets[0], expected)
-        np.testing.assert_array_equal(batch.target_charges[0, : len(order)], charges[order])
+        np.testing.assert_array_equal(batch.targets[0, 0], expected)
+        np.testing.assert_array_equal(batch.target_charges[0, 0, : len(order)], charges[order])
         second += int((distance[order] > 1.1).sum())
         expected, order = np.full(3, -1), order[:0]
-        if batch.targets[0, 0] >= 0:
-            from_target = np.linalg.norm(positions - tip.positions[batch.targets[0, 0]], axis=1)
+        if batch.targets[0, 0, 0] >= 0:
+            from_target = np.linalg.norm(positions - tip.positions[batch.targets[0, 0, 0]], axis=1)
             reached = (from_target > 1e-9) & (from_target < reach * tip.nearest_neighbour_distance)
             expected, order = strongest(np.flatnonzero(reached & (distance > reach)))
-        np.testing.assert_array_equal(batch.second_targets[0], expected)
-        np.testing.assert_array_equal(batch.second_target_charges[0, : len(order)], charges[order])
+        np.testing.assert_array_equal(batch.targets[0, 1], expected)
+        np.testing.assert_array_equal(batch.target_charges[0, 1, : len(order)], charges[order])
         beyond += len(order)
     assert (second > 20) == (shells == 2)
     assert beyond > 30

@@ -319,6 +319,16 @@ def test_controls_are_those_that_the_run_serves(run):
         assert names & options == served
 
 
+def test_maps_follow_every_option(small_tip):
+    settings = ae.ResponseSettings.wide(rolls=2)
+    run = ae.Simulation(small_tip, seed=2, response_settings=settings).run(60, progress=False)
+    explorer = Explorer(run)
+    for options in ({}, {"sharpness": 0.15}, {"sharpness": 0.15, "second_roll": 0.5}, {"second_roll": 0.5}, {}):
+        perturbation = ae.RollUp(ENERGY, **options)
+        expected = run[:].hits(perturbation)  # a new run, which knows nothing of the previous ones
+        assert np.array_equal(explorer.hits(View(perturbation, 24, 0.0)).x, expected.x, equal_nan=True)
+
+
 def test_perturbations_without_controls():
     widths = ae.RollUp(ae.TruncatedNormal(0.2, 0.1), 0.5, others=ae.TruncatedNormal(0.1, 0.1))
     others = widths, ae.RollUp(0.2, ae.emission.ChargeRatio(0.9)), ae.Combined(0.2, 0.5, others=0.1)

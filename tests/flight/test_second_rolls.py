@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.emission.emissions import Emissions, TangentialLaunches
-from apt_evap.emission.surface_frame import launch_tangentially, rolled_positions, second_direction
+from apt_evap.emission.emissions import Emissions, TangentialLaunches, launch_tangentially
+from apt_evap.emission.surface_frame import rolled_positions, rollup_direction
+from apt_evap.simulation.columns import hashed_columns_of
 
 ENERGY = ae.TruncatedNormal(0.155, 0.155)
 TWICE = ae.RollUp(ENERGY, second_roll=1.0)
@@ -36,16 +37,14 @@ def line_of_atoms():
     """Two atoms with normal z: one rolls along x and then along y, one has no second target."""
     up = np.tile([0.0, 0.0, 1.0], (2, 1))
     positions = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]])
-    targets, second = np.full((2, 3, 3), np.nan), np.full((2, 3, 3), np.nan)
-    targets[:, 0] = positions + np.array([D, 0.0, 0.0])
-    targets[0, 1] = [0.0, D, 0.0]
-    second[0, 0], second[0, 1] = [D, D, 0.0], [2 * D, 0.0, 0.0]
-    ratios, second_ratios = np.full((2, 3), np.nan), np.full((2, 3), np.nan)
-    ratios[:, 0], ratios[0, 1] = 0.9, 0.9
-    second_ratios[0, :2] = 0.8, 0.4
-    columns = {"targets": targets, "charge_ratios": ratios}
-    columns |= {"second_targets": second, "second_charge_ratios": second_ratios}
-    return Emissions(positions, up, targets[:, 0], [1, 1], [58.7, 58.7], [0, 1], D, **columns)
+    targets, ratios = np.full((2, 2, 3, 3), np.nan), np.full((2, 2, 3), np.nan)
+    targets[:, 0, 0] = positions + np.array([D, 0.0, 0.0])
+    targets[0, 0, 1] = [0.0, D, 0.0]
+    targets[0, 1, :2] = [D, D, 0.0], [2 * D, 0.0, 0.0]
+    ratios[:, 0, 0], ratios[0, 0, 1] = 0.9, 0.9
+    ratios[0, 1, :2] = 0.8, 0.4
+    neighbours = targets[:, 0, 0]
+    return Emissions(positions, up, neighbours, [1, 1], [58.7, 58.7], [0, 1], D, targets, ratios)
 
 
 def test_launches_by_hand():
@@ -120,16 +119,17 @@ def test_wide_hits_are_those_of_flights(wide_run, perturbation):
 
 def test_places_after_the_second_roll(run):
     emissions = run.emissions
-    assert emissions.second_targets.shape == (120, 3, 3) and emissions.targets is None
-    twice, first, second = second_direction(emissions)
+    assert emissions.targets.shape == (120, 2, 3, 3) and emissions.charge_ratios.shape == (120, 2, 3)
+    np.testing.assert_array_equal(emissions.targets[:, 0, 0], emissions.neighbours)
+    twice, first, second = rollup_direction(emissions, roll=1)
     assert twice.sum() > 100
     np.testing.assert_allclose(np.hypot(first, second)[twice], 1.0, rtol=1e-12)
     # the last step of the path is one nearest neighbour distance long
-    step = rolled_positions(emissions, second=True) - rolled_positions(emissions)
+    step = rolled_positions(emissions, roll=1) - rolled_positions(emissions)
     d = emissions.nearest_neighbour_distance
     np.testing.assert_allclose(np.linalg.norm(step[twice], axis=1), d, rtol=1e-6)
     # no neighbour of the site: the next shell of fcc is at 1.41 d
-    distance = np.linalg.norm(emissions.second_targets[:, 0] - emissions.positions, axis=1)
+    distance = np.linalg.norm(emissions.targets[:, 1, 0] - emissions.positions, axis=1)
     assert distance[twice].min() > 1.4 * d
 
 
@@ -146,6 +146,18 @@ def test_a_run_comes_back_from_its_file(run, wide_run, tmp_path):
         np.testing.assert_allclose(further.hits(TWICE, by_response=True).x, 2 * again.x, rtol=1e-6)
 
 
+def test_the_fingerprint_has_one_array_for_each_roll_up(run, wide_run):
+    hashed, of_wide = (hashed_columns_of(each, each.every_column) for each in (run, wide_run))
+    both = {"emissions/second_targets", "emissions/second_charge_ratios", "responses/rolled", "responses/twice"}
+    assert both < set(hashed) < set(of_wide)
+    more = {"emissions/targets", "emissions/charge_ratios"}
+    assert more < set(of_wide) and more.isdisjoint(hashed)
+    np.testing.assert_array_equal(of_wide["emissions/second_targets"], wide_run.emissions.targets[:, 1])
+    np.testing.assert_array_equal(hashed["responses/twice"], run.responses.rolled[:, 1])
+    other = replace(run.emissions, targets=run.emissions.targets + np.array([0.0, 1e-9])[:, None, None])
+    assert replace(run, emissions=other).fingerprint() != run.fingerprint()
+
+
 def test_bits_depend_neither_on_batches_nor_on_threads(tip12, run):
     settings = ae.ResponseSettings(rolls=2)
     other = ae.Simulation(tip12, seed=5, response_settings=settings, n_threads=2).run(
@@ -156,7 +168,9 @@ def test_bits_depend_neither_on_batches_nor_on_threads(tip12, run):
 
 def test_the_first_roll_is_that_of_a_run_for_one_roll_up(tip12, run):
     once = ae.Simulation(tip12, seed=5).run(120, FLOWN[:0], progress=False)
-    np.testing.assert_array_equal(once.responses.rolled, run.responses.rolled)
+    assert once.responses.rolled.shape == (120, 1, 3, 10) and run.responses.rolled.shape == (120, 2, 3, 10)
+    assert once.emissions.targets is None
+    np.testing.assert_array_equal(once.responses.rolled[:, 0], run.responses.rolled[:, 0])
     np.testing.assert_array_equal(once.hits(ae.RollUp(ENERGY)).x, run.hits(ae.RollUp(ENERGY)).x)
     assert once.responses.residuals.shape == (120, 2) and run.responses.residuals.shape == (120, 3)
 
@@ -207,9 +221,13 @@ def test_launches_that_the_responses_do_not_serve_are_refused(tip12):
                 [1.0],
                 [0],
                 D,
-                second_targets=np.zeros((1, 3, 3)),
+                targets=np.zeros((1, 2, 3, 3)),
             ),
-            "second_targets and second_charge_ratios must be given together",
+            "targets and charge_ratios must be given together",
+        ),
+        (
+            lambda: replace(line_of_atoms(), targets=np.zeros((2, 3, 3, 3)), charge_ratios=np.zeros((2, 3, 3))),
+            "targets must be .*2 roll-ups, got 3",
         ),
     ],
 )
