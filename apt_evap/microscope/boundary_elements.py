@@ -115,7 +115,7 @@ class ChargedPanels:
     points, for the panel itself with nodes that become denser towards its middle, as t^3.
     """
 
-    def __init__(self, panels: Panels):
+    def __init__(self, panels: Panels) -> None:
         self.panels = panels
         self.lengths = panels.lengths
         self.middles = panels.places(np.zeros(1))[:, 0]

@@ -75,7 +75,7 @@ class Lens:
         aperture: float,
         electrode_angle: float,
         refinement: int = 1,
-    ):
+    ) -> None:
         self.radius, self.distance, self.aperture = radius, distance, aperture
         self._charged = ChargedPanels(
             joined(specimen(radius, flank, refinement), electrode(distance, aperture, electrode_angle, refinement))
