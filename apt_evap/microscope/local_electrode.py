@@ -122,7 +122,9 @@ class LocalElectrode:
     distance: float = number(
         "Distance from the apex to the plane of the aperture.", at_least=1e4, at_most=1e9, unit="nm"
     )
-    aperture: float = number("Radius of the aperture.", at_least=1e3, at_most=1e9, unit="nm")
+    aperture: float = number(
+        "Radius of the aperture, 1/8 to 10 times the distance.", at_least=1e3, at_most=1e9, unit="nm"
+    )
     shank_angle: float = number(
         "Half the opening angle of the shank; with a profile, below it.", at_least=0.1, at_most=30, unit="degrees"
     )
@@ -158,9 +160,11 @@ class LocalElectrode:
     )
 
     def _check(self):
-        if self.aperture > 10 * self.distance:
+        # measured: through narrower apertures, the few angles that pass do not determine the projection
+        if not self.distance / 8 <= self.aperture <= 10 * self.distance:
             raise ValueError(
-                f"aperture must be at most 10 times the distance of {self.distance:g} nm, got {self.aperture:g} nm"
+                f"aperture must be from one eighth to 10 times the distance of {self.distance:g} nm, got "
+                f"{self.aperture:g} nm"
             )
 
     @classmethod
