@@ -10,6 +10,7 @@ from . import fit as fit
 from . import flight as flight
 from . import io as io
 from . import maps as maps
+from . import microscope as microscope
 from . import plot as plot
 from . import reconstruction as reconstruction
 from . import registration as registration

@@ -29,6 +29,7 @@ _GUIDES = {
     "flight": "flights",
     "io": "formats",
     "maps": "map_measures",
+    "microscope": "microscope",
     "reconstruction": "reconstruction reconstruction_errors",
     "registration": "howto/correct_distortion howto/find_orientation",
     "simulation": "howto/resume real_units",

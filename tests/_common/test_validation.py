@@ -628,6 +628,11 @@ CASES = [
         {"voltage": 5e3, "time_of_flight": 600.0, "x": 0.0, "y": 0.0, "distance": 90.0},
         {"distance": POSITIVE, "curved": SWITCH},
     ),
+    (
+        ae.microscope.LocalElectrode,
+        {"distance": 40e3, "aperture": 20e3, "shank_angle": 5.0},
+        {"profile": [3, "x", [1.0], [(0.0, 20.0)], [(0.0, 20.0), (0.0, 30.0)], [(0.0, 20.0), (50.0, 10.0)]]},
+    ),
     (ae.simulation.RealUnits, {"field_reference": "cap", "operating_field": 35.0}, {}),
     (ae.sweep.Foresight, {"ions": 10}, {}),
 ]
@@ -815,7 +820,7 @@ OTHER_ROOMS = (ae.plot, ae.report, ae.explore, ae.sweep, ae.config)
 # made by the package
 MADE = {"FileError", "TruncatedFile", "Outcome", "StopReason", "RunInterrupted", "RunNotSaved", "Run", "EmitterState"}
 MADE |= {"Reconstruction", "Study", "ZoneLine", "History", "CapHistory", "Ring", "RadiusFit", "TipFit", "Distortion"}
-MADE |= {"DistortionGrid", "FittedOrientation", "Similarity", "Batch"}
+MADE |= {"DistortionGrid", "FittedOrientation", "Similarity", "Batch", "Lens"}
 # for extensions, which call them with arrays of the package
 ARRAYS = {"charge_probabilities", "course", "course_of_charges", "draw_isotopes", "field_of_counts", "ion_charges"}
 ARRAYS |= {"launch_tangentially", "ratio_of_counts", "rollup_direction", "lattice_sites_in", "BondField"}
