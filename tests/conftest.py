@@ -1,6 +1,7 @@
 """Small specimens, made once for all tests, and runs, made once for all processes that test."""
 
 import fcntl
+import gc
 import os
 import signal
 import sys
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 sys.path.append(str(Path(__file__).parent))  # for twins.py, whatever the import mode
 
@@ -29,6 +31,17 @@ untimed = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow, Hea
 settings.register_profile("quick", max_examples=25, derandomize=True, **untimed)
 settings.register_profile("thorough", max_examples=300, **untimed)
 settings.load_profile("quick")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """Collect tests without the collector of garbage: what is made then stays, and to look through it takes seconds."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def read_only(thing):
@@ -109,7 +122,13 @@ def run20(tip20, made_once):
 
 
 @pytest.fixture
-def blank_pictures(monkeypatch):
+def rough_layout(monkeypatch):
+    """Pictures are laid out once instead of three times: for tests that do not look where their labels are."""
+    monkeypatch.setattr("apt_evap.plot._figure._Layout.execute", ConstrainedLayoutEngine.execute)
+
+
+@pytest.fixture
+def blank_pictures(monkeypatch, rough_layout):
     """Pictures are written with nothing on them: for tests of all but pictures, which take a second each."""
     save = Figure.savefig
     monkeypatch.setattr(Figure, "savefig", lambda figure, *args, **options: save(Figure((1, 1)), *args, **options))

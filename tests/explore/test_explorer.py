@@ -231,10 +231,9 @@ def test_profiles_across_a_line(explorer):
         explorer.profiles(shown, [[1.0, 1.0], [1.0, 1.0]], 3.0)
 
 
-def test_rings_about_the_pole(made_once, tip20):
+def test_rings_about_the_pole(run20):
     """[111] has three-fold symmetry; the ring statistic is that of the library, in the frame of the measured map."""
-    make = lambda: ae.Simulation(tip20, seed=1, **ROUGH).run(6000, progress=False)  # noqa: E731
-    run = made_once("explored20", make)
+    run = replace(run20, perturbations=(), flown=())  # its responses alone
     registration = ae.Registration(33.0, 0.4, (4.0, -3.0))
     projection = ae.analysis.image_compression(run).projection
     alone = Explorer(run)

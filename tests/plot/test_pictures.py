@@ -39,6 +39,7 @@ def label_of_bar(ax):
 
 def assert_nothing_cut_off(figure):
     figure.draw_without_rendering()
+    figure.set_layout_engine("none")  # it is laid out; to save it does not do so again
     boxes = [ax.get_tightbbox().transformed(figure.transFigure.inverted()) for ax in figure.axes]
     assert min(box.min.min() for box in boxes) > 0 and max(box.max.max() for box in boxes) < 1
 
@@ -90,7 +91,7 @@ def text_with(ax, words):
     return text
 
 
-def test_a_later_title_is_above_the_caption(ratios):
+def test_a_later_title_is_above_the_caption(ratios, rough_layout):
     map = ae.DetectorMap.from_array(np.random.default_rng(0).random((40, 40)), np.arange(41.0), np.arange(41.0))
     here = ae.Registration(0.0, 1.0, (0.0, 0.0))
     for ax, words in (

@@ -2,6 +2,7 @@
 
 import ast
 import re
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -21,9 +22,11 @@ def room_of(module):
     return module.split(".")[0]
 
 
+@cache  # the copies of the package differ in one file
 def imports(source, package):
     """Dotted names, without "apt_evap.", that a Python source imports; those for type hints only do not count."""
     tree = ast.parse(source)
+    found = []
     hints = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
@@ -38,7 +41,8 @@ def imports(source, package):
             names = [f"{start}.{item.name}" for item in node.names]
         for name in names:
             if name.split(".")[0] == "apt_evap":
-                yield name.partition(".")[2]
+                found.append(name.partition(".")[2])
+    return found
 
 
 def cython_imports(source):

@@ -49,7 +49,7 @@ def python_blocks(path):
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
+def folder(tmp_path, monkeypatch, rough_layout):
     """A folder to work in, with a measured file as the pages name it: hits on a comb, two in every fifth pulse."""
     monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(1)

@@ -3,6 +3,7 @@
 import json
 import warnings
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -73,6 +74,12 @@ def draws(run, perturbation, seed, part=slice(None)):
         yield replace(run, seed=1000 * seed + number).hits(perturbation)[part]
 
 
+@pytest.fixture(scope="module")
+def map_of(low):
+    """`measured` of draws of `low`, made once for each registration, radius and seed."""
+    return cache(lambda true, radius, seed: measured(draws(low, FASTER, seed), true, radius, seed))
+
+
 def off(found, true, radius):
     """By how many degrees, what share of the scale and, at the middle of the map, of the radius a transform is off."""
     middle = true.inverse.points(0.05 * radius, 0.0)
@@ -92,10 +99,10 @@ def off(found, true, radius):
         pytest.param(1.5, False, 110, (20.0, -30.0), 3, None, marks=pytest.mark.slow),
     ],
 )
-def test_a_known_transform(low, simulated, scale, mirror, radius, shift, seed, scales):
+def test_a_known_transform(map_of, simulated, scale, mirror, radius, shift, seed, scales):
     """Other energies, a gradient, an off-centre circle, 1e5 ions: within 1 degree and 1 %, as asked for."""
     true = ae.Registration(17.0, scale, shift, mirror)
-    map = measured(draws(low, FASTER, seed), true, radius, seed)
+    map = map_of(true, radius, seed)
     assert map.ions > 85_000  # of 100,000 some are too thinly spread to be in the mask
     found = register(simulated, map, scales=scales)
     assert found.mirror == mirror and found.method == "search"
@@ -115,9 +122,9 @@ def test_layers_of_their_own(low):
 
 
 @pytest.mark.filterwarnings("ignore:the registration is doubtful")
-def test_what_is_known_is_kept(low, simulated):
+def test_what_is_known_is_kept(map_of, simulated):
     true = ae.Registration(17.0, 0.45, (8.0, 3.0), True)
-    map = measured(draws(low, FASTER, 2), true, 30, 2)
+    map = map_of(true, 30, 2)
     start = ae.Registration(8.0, 0.5, (11.0, 1.0), True)
     found = register(simulated, map, start=start)
     rotation, stretch, distance = off(found, true, 30)
