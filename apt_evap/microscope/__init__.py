@@ -2,5 +2,4 @@
 
 import lazy_loader
 
-# scipy.integrate and scipy.interpolate are imported with the first name
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -7,7 +7,7 @@ straight panel, or an arc about a point on the axis. Units: a charge q at the di
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import ellipe, ellipkm1
+import scipy
 
 from apt_evap._common.types import Floats
 
@@ -79,7 +79,7 @@ def ring_potential(rho: Floats, z: Floats, radius: Floats, height: Floats) -> Fl
     far = (rho + radius) ** 2 + (z - height) ** 2
     near = (rho - radius) ** 2 + (z - height) ** 2
     # 1 - m from the distances: m itself loses all digits at the ring
-    return 2 / np.pi * ellipkm1(near / far) / np.sqrt(far)
+    return 2 / np.pi * scipy.special.ellipkm1(near / far) / np.sqrt(far)
 
 
 def ring_field(rho: Floats, z: Floats, radius: Floats, height: Floats) -> tuple[Floats, Floats, Floats]:
@@ -91,7 +91,7 @@ def ring_field(rho: Floats, z: Floats, radius: Floats, height: Floats) -> tuple[
     far = (rho + radius) ** 2 + above**2
     near = (rho - radius) ** 2 + above**2
     complement, distance = near / far, np.sqrt(far)
-    first, second = ellipkm1(complement), ellipe(1 - complement)
+    first, second = scipy.special.ellipkm1(complement), scipy.special.ellipe(1 - complement)
     axial = 2 / np.pi * above * second / (near * distance)
     across = np.maximum(rho, _ON_AXIS * distance)
     radial = (first - (radius**2 - rho**2 + above**2) / near * second) / (np.pi * across * distance)

@@ -4,7 +4,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
+import scipy
 
 from apt_evap._common.types import Floats
 from apt_evap.microscope.boundary_elements import Panels
@@ -51,7 +51,7 @@ def measured_flank(radius: float, profile: Floats, angle: float, length: float) 
         Length of the shank [nm].
     """
     depths, radii = profile.T
-    curve = PchipInterpolator(depths, radii)
+    curve = scipy.interpolate.PchipInterpolator(depths, radii)
     fine = np.unique(np.concatenate([depths, np.linspace(depths[0], depths[-1], 400)]))
     slopes = np.arctan(curve(fine, 1))
     # radii and centres of the spheres that touch the profile; below and above it they touch cones

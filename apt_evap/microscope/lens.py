@@ -5,7 +5,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy.integrate import solve_ivp
+import scipy
 
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array
@@ -183,7 +183,7 @@ class Lens:
         before_electrode.terminal = to_electrode  # type: ignore[attr-defined]
         size = max(self.distance, self.aperture)
         last = math.log((self.distance + _END * size) / math.sqrt(2) / time.min())
-        solved = solve_ivp(
+        solved = scipy.integrate.solve_ivp(
             change,
             (0.0, last),
             state,

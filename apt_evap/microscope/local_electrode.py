@@ -5,8 +5,8 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicSpline, PPoly
 
 from apt_evap._common.codec import checked, number, settings
 from apt_evap._common.types import Floats
@@ -304,7 +304,7 @@ class LocalElectrode:
             )
         # the radius is nearly proportional to the ratio: knots that are 5 % apart suffice (measured: 1e-7)
         radii = np.geomspace(low * 0.999, high * 1.001, 4 + math.ceil(math.log(high / low) / 0.05))
-        return _plain(CubicSpline(radii * self._table.field_factors(radii), radii)(ratio))
+        return _plain(scipy.interpolate.CubicSpline(radii * self._table.field_factors(radii), radii)(ratio))
 
     def distance_from_axis(
         self, angle: ArrayLike, radius: ArrayLike, voltage: ArrayLike, flight_length: ArrayLike
@@ -331,6 +331,38 @@ class LocalElectrode:
         flown = np.radians(self.projection(radius).flight_angles(angle))
         length = _numbers(flight_length, "flight_length", above=0.0)
         return _plain(length * np.tan(flown) * self._drift(flown, _numbers(voltage, "voltage", above=0.0)))
+
+    def cap_angle(
+        self, distance_from_axis: ArrayLike, radius: ArrayLike, voltage: ArrayLike, flight_length: ArrayLike
+    ) -> Any:
+        """Angle of the launch on the cap from the hit on a plane detector: the inverse of `distance_from_axis`.
+
+        Parameters
+        ----------
+        distance_from_axis : float or array_like
+            Distance of the hit from the axis [mm].
+        radius : float or array_like
+            Radius of the apex [nm].
+        voltage : float or array_like
+            Voltage between specimen and electrode [V]; it matters with a potential of the detector only.
+        flight_length : float or array_like
+            Distance of the detector [mm].
+
+        Returns
+        -------
+        float or ndarray
+            [degrees], 0 to 50; NaN for hits from no such angle.
+        """
+        ratio = _numbers(distance_from_axis, "distance_from_axis", at_least=0.0)
+        ratio = ratio / _numbers(flight_length, "flight_length", above=0.0)
+        # in the uniform field k c^2 + s c + k - 1 = 0, with s = r / L, k = U s^2 / (4 V) and c = 1 / tan(theta')
+        k = self.detector_potential * ratio**2 / (4 * _numbers(voltage, "voltage", above=0.0))
+        with np.errstate(invalid="ignore"):
+            root = ratio + np.sqrt(ratio**2 + 4 * k * (1 - k))
+        flown = np.arctan2(root, 2 * (1 - k))
+        known = np.isfinite(flown)
+        angles = self.projection(radius).cap_angles(np.degrees(np.where(known, flown, 0.0)))
+        return _plain(np.where(known, angles, np.nan))
 
     def flight_time(
         self,
@@ -459,7 +491,7 @@ class _Table:
         values = np.array([quantity(self._node(index)) for index in range(first - 1, last + 3)])
         windows = np.stack([values[shift : shift + last - first + 1] for shift in range(4)])
         cubic = np.tensordot(_CUBIC, windows, axes=1)
-        return PPoly(cubic, np.arange(first, last + 2, dtype=float))(place)
+        return scipy.interpolate.PPoly(cubic, np.arange(first, last + 2, dtype=float))(place)
 
     def _node(self, index):
         if index not in self._lenses:

@@ -26,6 +26,8 @@ from apt_evap._common.validation import (
 )
 from apt_evap.detection.hits import Hits
 from apt_evap.io.formats import write
+from apt_evap.microscope.lens import LAST_ANGLE
+from apt_evap.microscope.local_electrode import LocalElectrode
 from apt_evap.reconstruction.choices import FRAMES, PROJECTIONS, PROTOCOLS
 from apt_evap.reconstruction.density import CapDensity, density_of
 from apt_evap.reconstruction.errors import (
@@ -43,6 +45,7 @@ from apt_evap.simulation.run import Run
 
 _RIGHT_ANGLE = math.pi / 2
 _WIDEST = math.radians(89.0)  # rim of the field of view, at the largest compression that is fitted
+_LAST_ON_LENS = math.radians(LAST_ANGLE)
 _FIT_IONS = 100_000  # of which radius and compression are fitted: errors of 1e-3 of those of an ion
 
 
@@ -61,7 +64,8 @@ class Reconstruction:
     radii : ndarray
         Radius of the cap at the evaporation of each ion [nm], shape (n,).
     settings : mapping
-        Protocol, projection and constants of the reconstruction.
+        Protocol, projection and constants of the reconstruction. With a lens, the compression is a factor of the angles
+        that the lens gives, 1 before a fit.
     shifts : ndarray or None
         Correction of x / R and y / R of each ion by a table of origins, shape (n, 2).
     covariances : ndarray or None
@@ -221,11 +225,14 @@ class Reconstruction:
 
     def _largest_compression(self):
         """Twice the compression; less if the angle at the rim would exceed 89 degrees."""
-        known, projection = self.settings["compression"], self.settings["projection"]
+        known = self.settings["compression"]
         rim = max(float(np.hypot(self.hits.x, self.hits.y).max()), self.settings["field_of_view"])
 
         def excess(compression):
-            return float(_cap_angles(np.array(rim / self.settings["distance"]), projection, compression)) - _WIDEST
+            settings = {**self.settings, "compression": compression}
+            return (
+                float(np.max(_angles_on_cap(rim, self.radii, _lens_voltages(self.hits, settings), settings))) - _WIDEST
+            )
 
         if excess(2 * known) <= 0:
             return 2 * known
@@ -248,12 +255,9 @@ class Reconstruction:
         depths = self.depths
         swept = float(depths[-1] - depths[0])
         widening = float(self.radii[-1] - self.radii[0]) / swept if swept > 0 else 0.0
-        rim = _cap_angles(
-            np.array(self.settings["field_of_view"] / self.settings["distance"]),
-            self.settings["projection"],
-            self.settings["compression"],
-        )
-        return density_of(self.positions[:, :2] / self.radii[:, None], math.sin(float(rim)), widening, bins)
+        voltages = _lens_voltages(self.hits, self.settings)
+        rim = float(np.mean(_angles_on_cap(self.settings["field_of_view"], self.radii, voltages, self.settings)))
+        return density_of(self.positions[:, :2] / self.radii[:, None], math.sin(rim), widening, bins)
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -263,7 +267,9 @@ class Reconstruction:
         low, high = self.radii.min(), self.radii.max()
         radius = f"R {low:.1f} nm" if low == high else f"R {low:.1f} to {high:.1f} nm"
         constants = self.settings
-        names = ("field_factor", "evaporation_field", "initial_radius", "shank_angle", "compression", "efficiency")
+        names = ["field_factor", "evaporation_field", "initial_radius", "shank_angle", "compression", "efficiency"]
+        if "lens" in constants:
+            names.remove("compression")
         listed = ", ".join(f"{name} {constants[name]:g}" for name in names if constants.get(name) is not None)
         protocol = f"{constants['protocol']}, {constants['projection']}, {radius} ({constants['radius']})"
         return f"<Reconstruction: {len(self):,} ions, {extents} nm, {protocol}; {listed}>"
@@ -275,11 +281,11 @@ def reconstruct(
     atomic_volume: float,
     distance: float,
     protocol: str = "cap",
-    projection: str = "bas",
+    projection: str | None = None,
     radius: str | float | ArrayLike = "voltage",
     evaporation_field: float | None = None,
-    field_factor: float = 3.3,
-    compression: float = 1.5,
+    field_factor: float | None = None,
+    compression: float | None = None,
     efficiency: float = 1.0,
     detector_radius: float | None = None,
     area: float | None = None,
@@ -287,6 +293,7 @@ def reconstruct(
     shank_angle: float | None = None,
     smoothing: int = 1,
     origins: OriginTable | None = None,
+    lens: LocalElectrode | None = None,
 ) -> Reconstruction:
     r"""Reconstruct the positions of ions from their hits.
 
@@ -300,17 +307,17 @@ def reconstruct(
         Flight length [mm]; of an instrument with a reflectron the virtual one.
     protocol : str
         Depth increment: "cap", exact for a spherical cap, or "bas", with the area of the detector.
-    projection : str
-        Angle on the cap: "bas", "equidistant" or "compressed", see the notes.
+    projection : str, optional
+        Angle on the cap: "bas" (default), "equidistant" or "compressed", see the notes.
     radius : str, float or array_like
         Radius of the cap: "voltage", from the voltage of each ion; "shank", from the volume and the angle of the shank;
         or radii [nm], a number or one for each of the hits.
     evaporation_field : float, optional
         F [V/nm], for ``radius="voltage"``.
-    field_factor : float
-        k_f in V = k_f F R, for ``radius="voltage"``.
-    compression : float
-        Image compression xi.
+    field_factor : float, optional
+        k_f in V = k_f F R, for ``radius="voltage"``; 3.3 by default.
+    compression : float, optional
+        Image compression xi; 1.5 by default.
     efficiency : float
         Fraction of the ions that the detector detects.
     detector_radius : float, optional
@@ -328,6 +335,9 @@ def reconstruct(
     origins : OriginTable, optional
         Table of where the ions of simulated hits came from. Lateral positions are corrected by it, and get covariances.
         The hits must have the axes of the simulated specimen.
+    lens : LocalElectrode, optional
+        The lens of specimen and electrode in place of projection, field factor and compression: they then follow from
+        the radius of each ion. For radii from the voltage, or given ones.
 
     Returns
     -------
@@ -383,7 +393,21 @@ def reconstruct(
     check_choice(protocol, "protocol", PROTOCOLS)
     if origins is not None:
         check_kind(origins, "origins", OriginTable, "an OriginTable, such as origin_table(runs)")
-    check_choice(projection, "projection", PROJECTIONS)
+    if lens is not None:
+        check_kind(lens, "lens", LocalElectrode, "a LocalElectrode")
+        by_lens = {"projection": projection, "field_factor": field_factor, "compression": compression}
+        for name, value in by_lens.items():
+            if value is not None:
+                raise ValueError(f"{name} follows from the lens, got {name}={short_text(value)} and a lens")
+        if isinstance(radius, str) and radius == "shank":
+            raise ValueError('radius must be "voltage" or radii with a lens, got "shank"')
+        projection, field_factor, compression = "lens", 1.0, 1.0
+    else:
+        projection = check_choice("bas" if projection is None else projection, "projection", PROJECTIONS)
+    field_factor, compression = (
+        3.3 if field_factor is None else field_factor,
+        1.5 if compression is None else compression,
+    )
     volume = check_number(atomic_volume, "atomic_volume", above=0, unit="nm^3")
     distance = check_number(distance, "distance", above=0, unit="mm")
     compression = check_number(compression, "compression", above=0)
@@ -421,13 +445,6 @@ def reconstruct(
         rim = float(rho.max()) if detector_radius is None else detector_radius
     if rim == 0:
         raise ValueError("all ions hit the centre of the detector: detector_radius or area is needed, got neither")
-    rim_angle = float(_cap_angles(np.array(rim / distance), projection, compression))
-    widest = max(rim_angle, float(_cap_angles(rho.max() / distance, projection, compression)))
-    if not widest < _RIGHT_ANGLE:
-        raise ValueError(
-            f"all angles on the cap must be < 90 degrees, got {math.degrees(widest):.0f} degrees at the rim: "
-            "reduce detector_radius or compression"
-        )
 
     settings: dict[str, Any] = {
         "protocol": protocol,
@@ -439,14 +456,28 @@ def reconstruct(
         "distance": distance,
         "field_of_view": rim,
     }
-    swept, widening = _cross_sections(settings)
-    per_ion = volume / efficiency
+    if lens is not None:
+        settings["lens"] = lens
     if mode == "voltage":
         field = check_number(evaporation_field, "evaporation_field", above=0, unit="V/nm")
         field_factor = check_number(field_factor, "field_factor", at_least=0.1, at_most=100)
-        radii = trailing_mean(_voltages(selection), check_count(smoothing, "smoothing", at_least=1))
-        radii /= field_factor * field
-    elif mode == "shank":
+        mean = trailing_mean(_voltages(selection), check_count(smoothing, "smoothing", at_least=1))
+        radii = mean / (field_factor * field) if lens is None else lens.radius(mean, field)
+    elif mode == "given":
+        radii = radii[chosen]
+    # the angle at the rim depends on the radius with a lens only
+    at_rim = _angles_on_cap(max(rim, float(rho.max())), radii, _lens_voltages(selection, settings), settings)
+    widest, limit = float(np.max(at_rim)), _RIGHT_ANGLE if lens is None else _LAST_ON_LENS
+    if not widest < limit:  # also NaN
+        got = f"{math.degrees(widest):.0f} degrees" if widest >= limit else "a larger one"
+        raise ValueError(
+            f"all angles on the cap must be < {math.degrees(limit):.0f} degrees, got {got} at the rim: reduce "
+            f"detector_radius{'' if lens else ' or compression'}"
+        )
+    if mode == "shank":
+        swept, widening = _cross_sections(settings)
+        rim_angle = float(_angles_on_cap(rim, radii, None, settings))
+        per_ion = volume / efficiency
         start = check_number(initial_radius, "initial_radius", above=0, unit="nm")
         sine = math.sin(math.radians(check_number(shank_angle, "shank_angle", at_least=0, below=45, unit="degrees")))
         slope = sine / (1 - sine)
@@ -457,49 +488,61 @@ def reconstruct(
                 f"got shank_angle={shank_angle:g}"
             )
         radii = np.cbrt(start**3 + 3 * slope * per_ion / net * np.arange(len(selection)))
-    else:
-        radii = radii[chosen]
 
     settings |= {name: float(value) for name, value in needs.get(mode, {}).items()}  # type: ignore[arg-type]
     if mode == "voltage":
-        settings |= {"field_factor": field_factor, "smoothing": smoothing}
+        settings |= {"smoothing": smoothing} if lens else {"field_factor": field_factor, "smoothing": smoothing}
     shifts = covariances = None
     if origins is not None:
-        shifts, covariances = origins.shifts_at(_on_cap(selection, settings)[0])
+        shifts, covariances = origins.shifts_at(_on_cap(selection, radii, settings)[0])
         covariances *= (radii * radii)[:, None, None]
     positions = _placed(selection, radii, settings, shifts)
     return Reconstruction(positions, selection, radii, settings, shifts, covariances)
 
 
-def _on_cap(hits, settings):
+def _lens_voltages(hits, settings):
+    """Voltage of each ion [V] for a detector with a potential; None if the lens does not need it."""
+    return _voltages(hits) if "lens" in settings and settings["lens"].detector_potential else None
+
+
+def _angles_on_cap(rho, radii, voltages, settings):
+    """Angles on the cap [rad] for distances on the detector [mm]; with a lens for each radius and voltage."""
+    if "lens" not in settings:
+        return _cap_angles(np.asarray(rho) / settings["distance"], settings["projection"], settings["compression"])
+    lens, voltages = settings["lens"], 1.0 if voltages is None else voltages
+    return settings["compression"] * np.radians(lens.cap_angle(rho, radii, voltages, settings["distance"]))
+
+
+def _on_cap(hits, radii, settings):
     """Place of each ion, x / R and y / R, shape (n, 2), and its angle on the cap [rad]."""
     x, y = (column.astype(np.float64) for column in hits.require("x", "y"))
     rho = np.hypot(x, y)
-    angles = _cap_angles(rho / settings["distance"], settings["projection"], settings["compression"])
+    angles = _angles_on_cap(rho, radii, _lens_voltages(hits, settings), settings)
     sine_over_rho = np.divide(np.sin(angles), rho, out=np.zeros_like(rho), where=rho > 0)
     return np.column_stack([sine_over_rho * x, sine_over_rho * y]), angles
 
 
 def _placed(hits, radii, settings, shifts=None):
     """Positions [nm] of ions on caps of known radii; `shifts` of x / R and y / R are added."""
-    places, angles = _on_cap(hits, settings)
+    places, angles = _on_cap(hits, radii, settings)
     below = 2 * np.sin(angles / 2) ** 2
     if shifts is not None:
         places = places + shifts
         squares = np.minimum((places**2).sum(axis=1), 1.0)
         below = squares / (1 + np.sqrt(1 - squares))
-    swept, widening = _cross_sections(settings)
+    swept, widening = _cross_sections(settings, radii, _lens_voltages(hits, settings))
     depths = _apex_depths(radii, settings["atomic_volume"] / settings["efficiency"], swept, widening)
     return np.column_stack([radii[:, None] * places, depths + radii * below])
 
 
-def _cross_sections(settings):
-    """Areas in units of R^2 that the cap sweeps by its recession, and loses by its widening."""
-    ratio = np.array(settings["field_of_view"] / settings["distance"])
-    if settings["protocol"] == "bas":
-        return math.pi * float(settings["compression"] * ratio) ** 2, 0.0
-    rim = float(_cap_angles(ratio, settings["projection"], settings["compression"]))
-    return math.pi * math.sin(rim) ** 2, math.pi * (1 - math.cos(rim)) ** 2
+def _cross_sections(settings, radii=None, voltages=None):
+    """Areas in units of R^2 that the cap sweeps by its recession, and loses by its widening; arrays with a lens."""
+    if settings["protocol"] == "bas" and "lens" not in settings:
+        return math.pi * (settings["compression"] * settings["field_of_view"] / settings["distance"]) ** 2, 0.0
+    rim = _angles_on_cap(settings["field_of_view"], radii, voltages, settings)
+    if settings["protocol"] == "bas":  # xi = theta_m L / r
+        return math.pi * rim**2, 0.0
+    return math.pi * np.sin(rim) ** 2, math.pi * (1 - np.cos(rim)) ** 2
 
 
 def _below(positions, radii):
@@ -551,6 +594,7 @@ def _given_radii(radius, n):
 def _apex_depths(radii, volume, swept, widening):
     """Depth of the apex at each ion [nm]: volume = <R^2> (swept dz - widening dR) between two ions."""
     before, after = radii[:-1], radii[1:]
+    swept, widening = (each if np.ndim(each) == 0 else (each[:-1] + each[1:]) / 2 for each in (swept, widening))
     squares = (before * before + before * after + after * after) / 3  # exact for dR proportional to dz
     depths = np.zeros(len(radii))
     np.cumsum((volume / squares + widening * (after - before)) / swept, out=depths[1:])

@@ -202,7 +202,7 @@ def test_warm_starts_and_few_iterations(surface12):
 
 @pytest.mark.parametrize("self_term", [1.0, 5.0])
 def test_a_self_term_that_is_too_small_is_refused(small_tip, self_term):
-    with pytest.raises(ValueError, match="self_term must be larger, got"):
+    with pytest.raises(ValueError, match="self_term"):
         ae.evaporation.Emitter(small_tip, rule=ae.ConstantPotential(self_term=self_term))
 
 

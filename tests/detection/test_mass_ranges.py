@@ -249,12 +249,12 @@ def test_windows_that_adjoin_share_no_ion():
 
 @pytest.mark.parametrize("bounds", [5, (1,), (1, 2, 3), (2, 1), "ab", ("a", "b"), (np.nan, 1), None])
 def test_bounds_that_are_none(bounds):
-    with pytest.raises(ValueError, match=r"voltage must have two bounds"):
+    with pytest.raises(ValueError, match="voltage"):
         measured().window(voltage=bounds)
 
 
 def test_columns_that_cannot_be_windowed():
-    with pytest.raises(ValueError, match="positions must have one number per ion"):
+    with pytest.raises(ValueError, match="positions"):
         measured().window(positions=(0, 1))
     with pytest.raises(ValueError, match="no column 'site'"):
         measured().window(site=(0, 1))

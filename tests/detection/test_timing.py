@@ -132,7 +132,7 @@ def test_deficits_stay_below_the_voltage():
     deficits, delays = Timing(temperature=highest * (1 - 1e-12)).errors([[2.0**-53, 2.0**-53], [1 - 2.0**-53] * 2])
     assert 0 < deficits[1] < deficits[0] < 1
     assert np.isfinite(delays).all()
-    with pytest.raises(ValueError, match=r"temperature must be .*k T <= sensitivity / 37"):
+    with pytest.raises(ValueError, match="temperature"):
         Timing(temperature=highest * 1.001)
 
 

@@ -266,9 +266,9 @@ def test_energies_and_works_of_a_users_own():
     tip = ae.Tip.from_positions([[0, 0, 0], [0, 0, 0.32]], [0, 0], [magnesium])
     given = ae.evaporation.PairEnergies({"Mg": 1.51}, {"Mg": 15.3})
     assert given.fields(tip, 0, np.array([[6]]), np.zeros((1, 1), int)) == pytest.approx(21.0, rel=1e-14)
-    with pytest.raises(ValueError, match="cohesive_energies must have a value for Mg, got Al, Si, Ti"):
+    with pytest.raises(ValueError, match="cohesive_energies"):
         ae.evaporation.PairEnergies().fields(tip, 0, np.array([[6]]), np.zeros((1, 1), int))
-    with pytest.raises(ValueError, match="ionisation_works must have a value for Mg, got Al, Si, Ti"):
+    with pytest.raises(ValueError, match="ionisation_works"):
         ae.evaporation.PairEnergies({"Mg": 1.51}).fields(tip, 0, np.array([[6]]), np.zeros((1, 1), int))
 
 

@@ -516,7 +516,7 @@ def test_light_on_one_side_of_a_cold_specimen(small_tip):
 
 
 def test_a_laser_needs_a_temperature():
-    with pytest.raises(ValueError, match=r"temperature must be .* > 0 \(the far side stays at it\), got 0"):
+    with pytest.raises(ValueError, match="temperature"):
         ae.Arrhenius(0.0, laser=ae.evaporation.Laser(100.0))
 
 

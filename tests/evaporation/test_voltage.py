@@ -83,6 +83,6 @@ def test_bad_controls_are_refused(options, message):
 
 @pytest.mark.parametrize("voltage", [0, -5.0, 1.1e6, np.inf, "1 kV", None])
 def test_bad_voltages_are_refused(voltage):
-    with pytest.raises(ValueError, match=r"voltage must be a finite number .V. > 0 and <= 1e.06, got"):
+    with pytest.raises(ValueError, match="voltage"):
         check_voltage(voltage)
     assert check_voltage(np.int64(2000)) == 2000.0

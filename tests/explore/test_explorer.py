@@ -68,7 +68,7 @@ def test_maps_have_the_bits_of_the_library(run, measured, perturbation, units):
         assert np.array_equal(shown.pictures[0].density, map.flattened(8.0).smoothed(2.0).density, equal_nan=True)
         assert shown.ions == len(run) and not shown.preview
         explorer.show(replace(view, perturbation=ae.Unperturbed()))
-    with pytest.raises(ValueError, match="sigma must be"):
+    with pytest.raises(ValueError, match="sigma"):
         explorer.show(replace(view, flattening=1e4))  # wider than the map
     plain = explorer.show(replace(view, flattening=0.0))
     assert plain.ceiling.value == ae.maps.similarity_ceiling(like, smoothing=2.0).value
@@ -367,7 +367,7 @@ def test_colours_of_the_specimen(run):
         image = specimen_image(run, color)
         drawn = image.values[np.isfinite(image.values)]
         assert np.isin(drawn, values.astype(np.float32)).all() and len(np.unique(drawn)) > 100
-    with pytest.raises(ValueError, match="color must be one of"):
+    with pytest.raises(ValueError, match="color"):
         specimen_image(run, "mass")
 
 

@@ -162,10 +162,10 @@ def test_few_columns(tmp_path):
 def test_refusals(tmp_path):
     hits = measured(4)
     for elements in ((), "Si", ["si"], ["Si", 5]):
-        with pytest.raises(ValueError, match="elements must be"):
+        with pytest.raises(ValueError, match="elements"):
             ae.write(tmp_path / "a.nxs", hits, elements=elements)
     for time in ("yesterday", "2026-05-04T09:30:00", 5):
-        with pytest.raises(ValueError, match="start_time must be"):
+        with pytest.raises(ValueError, match="start_time"):
             ae.write(tmp_path / "a.nxs", hits, elements=["Si"], start_time=time)
     assert not (tmp_path / "a.nxs").exists()
     with h5py.File(tmp_path / "b.nxs", "w") as file:

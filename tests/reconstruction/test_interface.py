@@ -70,9 +70,9 @@ def test_refusals():
     distances, chosen = ions(lambda d: 0.5 + 0 * d)
     with pytest.raises(ValueError, match="at least 10 ions on each side within 1 nm, got 0 and"):
         ae.reconstruction.interface_profile(np.abs(distances), chosen)
-    with pytest.raises(ValueError, match="chosen must mark a part of the ions within 1 nm, got 0 of"):
+    with pytest.raises(ValueError, match="chosen"):
         ae.reconstruction.interface_profile(distances, np.zeros(N, bool))
-    with pytest.raises(ValueError, match="reach must be"):
+    with pytest.raises(ValueError, match="reach"):
         ae.reconstruction.segregation_profile(distances, chosen, reach=0)
-    with pytest.raises(ValueError, match="bin_width must be"):
+    with pytest.raises(ValueError, match="bin_width"):
         ae.reconstruction.interface_profile(distances, chosen, bin_width=3.0)

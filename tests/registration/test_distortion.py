@@ -86,7 +86,7 @@ def test_too_few_points(rng):
         with pytest.raises(ValueError, match=f"degree {degree} needs more than {n} points, got {n}"):
             ae.registration.register_points(simulated, measured, degree=degree)
         assert ae.registration.register_points(simulated, measured, mirror=False, degree=None).residual >= 0
-    with pytest.raises(ValueError, match="degree must be an integer from 0 to 3, got 4"):
+    with pytest.raises(ValueError, match="degree"):
         ae.registration.register_points(simulated, measured, degree=4)
 
 
@@ -111,7 +111,7 @@ def test_back_is_the_inverse(seed):
 
 def test_terms():
     assert len(terms_of(0)) == 0 and len(terms_of(1)) == 1 and len(terms_of(2)) == 4 and len(terms_of(3)) == 8
-    with pytest.raises(ValueError, match="coefficients must be 4 finite numbers for degree 2"):
+    with pytest.raises(ValueError, match="coefficients"):
         ae.registration.Distortion(2, (0, 0), 1.0, (1.0,))
 
 

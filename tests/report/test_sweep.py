@@ -54,7 +54,7 @@ def test_points_without_a_study(tmp_path):
 
 
 def test_a_sweep_without_points_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="rows must contain a point of the sweep, got none"):
+    with pytest.raises(ValueError, match="rows"):
         ae.report.write_sweep([], tmp_path / "s.html")
 
 

@@ -401,6 +401,6 @@ def test_an_exception_keeps_what_is_done(small_tip):
 
 
 def test_reach_must_be_beyond_the_specimen(small_tip):
-    with pytest.raises(ValueError, match="reach must be >= 3 times the"):
+    with pytest.raises(ValueError, match="reach"):
         tip = ae.Tip("Ni", apex_radius=10.0, shank_length=60.0, depth=1.5)
         ae.Simulation(tip, flight_settings=ae.FlightSettings(reach=120.0))
