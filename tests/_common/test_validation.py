@@ -492,10 +492,11 @@ CASES = [
         {
             "hits": [*OBJECT, None],
             **dict.fromkeys(("atomic_volume", "distance", "evaporation_field"), POSITIVE),
-            **dict.fromkeys(("field_factor", "compression"), POSITIVE),
+            **dict.fromkeys(("field_factor", "compression"), POSITIVE[1:]),
             "efficiency": [*POSITIVE, 1.1],
             "protocol": WORD,
-            "projection": WORD,
+            "projection": WORD[1:],
+            "lens": OBJECT,
             "radius": [*POSITIVE, "no such", [1.0, NAN, 1.0], [1.0, 0.0, 1.0]],
             "detector_radius": [value for value in POSITIVE if value is not None] + [0.1],
             "area": [value for value in POSITIVE if value is not None],

@@ -62,6 +62,7 @@ def test_an_independent_code_without_an_electrode():
     np.testing.assert_allclose(found, [2.56, 3.37, 4.59, 6.12], rtol=0.02)
 
 
+@pytest.mark.slow
 def test_a_table_of_a_prototype():
     """R = 20, 40, 80 nm and shanks of 2, 5, 10 degrees; its shank of 50 micrometres was found by comparison: 2 %."""
     factors, compressions = [], []
@@ -250,6 +251,7 @@ def test_the_radius_from_the_voltage(lens):
     assert lens.radius(np.empty(0), 35.0).shape == (0,)
 
 
+@pytest.mark.slow
 def test_radii_of_ten_million_ions_take_a_second(lens):
     voltage = np.random.default_rng(1).uniform(3000.0, 9000.0, 10_000_000)
     lens.radius(voltage[:2], 35.0)
