@@ -2,7 +2,6 @@
 from .emissions import Emissions as Emissions
 from .emissions import Launches as Launches
 from .emissions import TangentialLaunches as TangentialLaunches
-from .emissions import launch_tangentially as launch_tangentially
 from .energies import Distribution as Distribution
 from .energies import Fixed as Fixed
 from .energies import Thermal as Thermal
@@ -15,6 +14,8 @@ from .post_ionisation import PostIonisation as PostIonisation
 from .post_ionisation import charge_probabilities as charge_probabilities
 from .post_ionisation import charge_state_ratio as charge_state_ratio
 from .post_ionisation import field_of_ratio as field_of_ratio
+from .surface_frame import launch_tangentially as launch_tangentially
+from .surface_frame import roll_ups as roll_ups
 from .surface_frame import rollup_direction as rollup_direction
 from .surface_frame import tangent_frame as tangent_frame
 from .surface_frame import target_shares as target_shares

@@ -1,16 +1,17 @@
 """A batch of emissions, and the launches of their ions."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import Booleans, Floats
 from apt_evap._common.validation import check_array, check_number
-from apt_evap.emission.surface_frame import RollUps, along_surface, roll_ups, rolled_positions
 from apt_evap.units import FLIGHT_TIME
+
+T = TypeVar("T")
 
 COLUMNS = ("positions", "normals", "neighbours", "charge_states", "masses", "ions")
 OPTIONAL_COLUMNS = ("targets", "charge_ratios", "rollup_distances")
@@ -60,7 +61,7 @@ class Emissions:
     targets: Any = None
     charge_ratios: Any = None
     rollup_distances: np.ndarray | None = None
-    _kept_roll_ups: Any = field(default=None, init=False)  # arguments and result of the last call of `roll_ups`
+    _kept: Any = field(default=None, init=False)  # key and result of the last call of `kept`
 
     def __post_init__(self):
         positions = check_array(self.positions, "positions", ("n", 3))
@@ -145,33 +146,19 @@ class Emissions:
         """The strongest of `targets_of` each atom [nm], shape (n, 3); NaN if there is none."""
         return self.targets_of(roll)[:, 0] if roll else self.neighbours
 
-    def roll_ups(self, sharpness: float = 0.0, rolls: int = 1) -> RollUps:
-        """Roll-ups of these atoms, computed once as long as the arguments stay the same.
-
-        The result takes 17 bytes per atom and roll-up, and 24 more with a sharpness.
+    def kept(self, key: Hashable, compute: Callable[[], T]) -> T:
+        """Result of a function of these emissions: that of the last call if the key is the same, computed otherwise.
 
         Parameters
         ----------
-        sharpness : float
-            See `target_shares`.
-        rolls : int
-            Number of successive roll-ups, 1 or 2.
-
-        Returns
-        -------
-        RollUps
-            Its arrays are read-only.
-
-        Raises
-        ------
-        ValueError
-            If the targets that this needs are not known.
+        key : hashable
+            Name and arguments of the function.
+        compute : callable
+            Returns the result.
         """
-        kept = self._kept_roll_ups
-        if kept is None or kept[0] != (sharpness, rolls):
-            kept = (sharpness, rolls), roll_ups(self, sharpness, rolls)
-            object.__setattr__(self, "_kept_roll_ups", kept)
-        return kept[1]
+        if self._kept is None or self._kept[0] != key:
+            object.__setattr__(self, "_kept", (key, compute()))
+        return self._kept[1]
 
     @property
     def slowness(self) -> Floats:
@@ -247,41 +234,3 @@ def check_launches(perturbation: Any, launches: Any, n: int) -> Launches:
     if len(launches) != n:
         raise ValueError(f"{perturbation!r} must launch {n} ions, one per emission, got {len(launches)}")
     return launches
-
-
-def launch_tangentially(
-    emissions: Emissions,
-    rolled: Booleans,
-    first: Floats,
-    second: Floats,
-    shares: Floats | None = None,
-    heights: Floats | None = None,
-    twice: Booleans | None = None,
-) -> Launches:
-    """Launches with velocities along the surface.
-
-    Parameters
-    ----------
-    emissions : Emissions
-        A batch of n.
-    rolled : array_like of bool
-        Whether an ion starts at its rolled-up position, see `rolled_positions`, or at its site, shape (n,).
-    first, second : array_like
-        Velocity along t1 and t2 of `tangent_frame` [nm/ns], shape (n,).
-    shares, heights, twice : ndarray, optional
-        As in `TangentialLaunches`.
-
-    Returns
-    -------
-    Launches
-    """
-    positions = np.where(np.asarray(rolled)[:, None], rolled_positions(emissions, shares), emissions.positions)
-    if twice is not None:
-        positions = np.where(np.asarray(twice)[:, None], rolled_positions(emissions, shares, roll=1), positions)
-    if heights is not None:
-        positions = positions + np.asarray(heights)[:, None] * emissions.normals
-    return Launches(
-        positions=positions,
-        velocities=along_surface(emissions.normals, np.asarray(first), np.asarray(second)),
-        rolled=rolled,
-    )

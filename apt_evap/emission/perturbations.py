@@ -15,7 +15,7 @@ from apt_evap._common.codec import from_plain, is_settings, number, part, settin
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_number
 from apt_evap._core.elementary import exponential, sine_and_cosine
-from apt_evap.emission.emissions import Emissions, Launches, TangentialLaunches, launch_tangentially
+from apt_evap.emission.emissions import Emissions, Launches, TangentialLaunches
 from apt_evap.emission.energies import (
     DISTRIBUTIONS,
     Distribution,
@@ -26,7 +26,13 @@ from apt_evap.emission.energies import (
     draw_energies,
 )
 from apt_evap.emission.ion_random import IonRandom
-from apt_evap.emission.surface_frame import rollup_direction, tangent_frame, target_shares
+from apt_evap.emission.surface_frame import (
+    launch_tangentially,
+    roll_ups,
+    rollup_direction,
+    tangent_frame,
+    target_shares,
+)
 from apt_evap.units import speed_from_energy
 
 __all__ = [
@@ -203,7 +209,7 @@ class _Rolling(_Tangential):
         n = len(emissions)
         certain = self.probability == 1.0
         u = random.uniform(4 if self.second_roll else 2 if certain else 3)
-        possible, along, across, shares = emissions.roll_ups(self.sharpness, 2 if self.second_roll else 1)
+        possible, along, across, shares = roll_ups(emissions, self.sharpness, 2 if self.second_roll else 1)
         rolled, first, second = possible[:, 0].copy(), along[:, 0], across[:, 0]
         if not certain:
             given = self.probability

@@ -2,7 +2,7 @@
 
 from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,9 +11,7 @@ from apt_evap._common.small_matrices import products
 from apt_evap._common.types import Booleans, Floats
 from apt_evap._common.validation import check_array, check_kind
 from apt_evap._core.elementary import exponential
-
-if TYPE_CHECKING:
-    from apt_evap.emission.emissions import Emissions
+from apt_evap.emission.emissions import Emissions, Launches
 
 
 def tangent_frame(normals: ArrayLike) -> tuple[Floats, Floats]:
@@ -58,8 +56,34 @@ class RollUps(NamedTuple):
     """Shares of the targets, see `target_shares`, shape (n, rolls, 3); None for the strongest ones only."""
 
 
-def roll_ups(emissions: Emissions, sharpness: float, rolls: int) -> RollUps:
-    """Roll-ups of a batch, see `Emissions.roll_ups`, which computes them once; the arrays are read-only."""
+def roll_ups(emissions: Emissions, sharpness: float = 0.0, rolls: int = 1) -> RollUps:
+    """Roll-ups of a batch, computed once as long as the arguments stay the same.
+
+    The result takes 17 bytes per atom and roll-up, and 24 more with a sharpness.
+
+    Parameters
+    ----------
+    emissions : Emissions
+        A batch of n.
+    sharpness : float
+        See `target_shares`.
+    rolls : int
+        Number of successive roll-ups, 1 or 2.
+
+    Returns
+    -------
+    RollUps
+        Its arrays are read-only.
+
+    Raises
+    ------
+    ValueError
+        If the targets that this needs are not known.
+    """
+    return emissions.kept(("roll_ups", sharpness, rolls), lambda: _roll_ups(emissions, sharpness, rolls))
+
+
+def _roll_ups(emissions, sharpness, rolls):
     shares = None if sharpness == 0.0 else target_shares(emissions, sharpness, rolls)
     directions = [rollup_direction(emissions, shares, roll) for roll in range(rolls)]
     possible, first, second = (np.stack(each, axis=1) for each in zip(*directions, strict=True))
@@ -177,7 +201,7 @@ def target_shares(emissions: Emissions, sharpness: float, rolls: int = 1) -> Flo
     with the charges :math:`q_j` of the neighbours in falling order. Where two of them are nearly equal, an atom moves
     onto the bridge or hollow between them.
     """
-    check_kind(emissions, "emissions", "roll_ups", "Emissions")
+    check_kind(emissions, "emissions", "targets_of", "Emissions")
     n, ratios = len(emissions), emissions.charge_ratios
     shares = np.zeros((n, rolls, 3))
     shares[..., 0] = 1.0
@@ -244,3 +268,41 @@ def along_surface(normals: ArrayLike, first: Floats, second: Floats) -> Floats:
     if np.ndim(first) == 2:
         frame = frame[0][:, None], frame[1][:, None]
     return first[..., None] * frame[0] + second[..., None] * frame[1]
+
+
+def launch_tangentially(
+    emissions: Emissions,
+    rolled: Booleans,
+    first: Floats,
+    second: Floats,
+    shares: Floats | None = None,
+    heights: Floats | None = None,
+    twice: Booleans | None = None,
+) -> Launches:
+    """Launches with velocities along the surface.
+
+    Parameters
+    ----------
+    emissions : Emissions
+        A batch of n.
+    rolled : array_like of bool
+        Whether an ion starts at its rolled-up position, see `rolled_positions`, or at its site, shape (n,).
+    first, second : array_like
+        Velocity along t1 and t2 of `tangent_frame` [nm/ns], shape (n,).
+    shares, heights, twice : ndarray, optional
+        As in `TangentialLaunches`.
+
+    Returns
+    -------
+    Launches
+    """
+    positions = np.where(np.asarray(rolled)[:, None], rolled_positions(emissions, shares), emissions.positions)
+    if twice is not None:
+        positions = np.where(np.asarray(twice)[:, None], rolled_positions(emissions, shares, roll=1), positions)
+    if heights is not None:
+        positions = positions + np.asarray(heights)[:, None] * emissions.normals
+    return Launches(
+        positions=positions,
+        velocities=along_surface(emissions.normals, np.asarray(first), np.asarray(second)),
+        rolled=rolled,
+    )

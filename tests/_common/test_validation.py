@@ -825,7 +825,7 @@ MADE |= {"DistortionGrid", "FittedOrientation", "Similarity", "Batch", "Lens"}
 # for extensions, which call them with arrays of the package
 ARRAYS = {"charge_probabilities", "course", "course_of_charges", "draw_isotopes", "field_of_counts", "ion_charges"}
 ARRAYS |= {"launch_tangentially", "ratio_of_counts", "rollup_direction", "lattice_sites_in", "BondField"}
-ARRAYS |= {"Detection", "charge_residuals", "surface_after"}
+ARRAYS |= {"Detection", "charge_residuals", "surface_after", "roll_ups"}
 
 
 def is_result(thing):

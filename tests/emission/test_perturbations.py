@@ -7,11 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from apt_evap.emission.emissions import Emissions, Launches, launch_tangentially
+from apt_evap.emission.emissions import Emissions, Launches
 from apt_evap.emission.energies import Fixed, Thermal, TruncatedNormal
 from apt_evap.emission.ion_random import IonRandom
 from apt_evap.emission.perturbations import Combined, LateralVelocity, RollUp, Unperturbed, described, perturbation_of
-from apt_evap.emission.surface_frame import rollup_direction, tangent_frame
+from apt_evap.emission.surface_frame import launch_tangentially, rollup_direction, tangent_frame
 from apt_evap.units import SPEED
 
 D = 0.249

@@ -48,9 +48,9 @@ def test_launches_follow_every_option(emissions):
 
 
 def test_roll_ups_are_computed_once(emissions):
-    kept = emissions.roll_ups(0.2, 2)
-    assert emissions.roll_ups(0.2, 2) is kept
-    assert emissions.roll_ups(0.3, 2) is not kept and emissions.roll_ups(0.2, 2) is not kept
+    kept = ae.emission.roll_ups(emissions, 0.2, 2)
+    assert ae.emission.roll_ups(emissions, 0.2, 2) is kept
+    assert ae.emission.roll_ups(emissions, 0.3, 2) is not kept and ae.emission.roll_ups(emissions, 0.2, 2) is not kept
     for array in kept:
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 0
@@ -59,7 +59,7 @@ def test_roll_ups_are_computed_once(emissions):
 def test_roll_ups_have_an_axis(emissions):
     shares = target_shares(emissions, 0.2, rolls=2)
     assert shares.shape == (500, 2, 3)
-    possible, first, second, kept = emissions.roll_ups(0.2, 2)
+    possible, first, second, kept = ae.emission.roll_ups(emissions, 0.2, 2)
     np.testing.assert_array_equal(kept, shares)
     for roll in (0, 1):
         there, *along = rollup_direction(emissions, shares, roll)
@@ -67,7 +67,9 @@ def test_roll_ups_have_an_axis(emissions):
         np.testing.assert_array_equal(np.stack([first[:, roll], second[:, roll]]), along)
     np.testing.assert_array_equal(possible, np.isfinite(emissions.targets[:, :, 0]).all(axis=2))
     assert 0 < possible[:, 1].sum() < possible[:, 0].sum() < 500
-    assert emissions.roll_ups(0.2).first.shape == (500, 1) and emissions.roll_ups().shares is None
+    assert (
+        ae.emission.roll_ups(emissions, 0.2).first.shape == (500, 1) and ae.emission.roll_ups(emissions).shares is None
+    )
 
 
 def test_unknown_targets_are_refused(emissions):
@@ -83,7 +85,7 @@ def test_unknown_targets_are_refused(emissions):
         (none, (0.0, 2), "rolls=2"),
     ):
         with pytest.raises(ValueError, match=name):
-            few.roll_ups(*arguments)
+            ae.emission.roll_ups(few, *arguments)
     with pytest.raises(ValueError, match="wide"):
         rollup_direction(none, np.full((500, 1, 3), 1 / 3))
 

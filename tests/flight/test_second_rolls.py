@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.emission.emissions import Emissions, TangentialLaunches, launch_tangentially
-from apt_evap.emission.surface_frame import rolled_positions, rollup_direction
+from apt_evap.emission.emissions import Emissions, TangentialLaunches
+from apt_evap.emission.surface_frame import launch_tangentially, rolled_positions, rollup_direction
 from apt_evap.simulation.columns import hashed_columns_of
 
 ENERGY = ae.TruncatedNormal(0.155, 0.155)
