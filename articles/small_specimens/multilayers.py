@@ -14,12 +14,11 @@ import argparse
 from pathlib import Path
 
 import numpy as np
+from recorded import FIT, reconstruct
 
 import apt_evap as ae
 
 NICKEL = ae.material("Ni")
-INSTRUMENT = ae.Instrument(distance=100.0, field_of_view=160.0, efficiency=0.8)
-FIT = ("shift", "rotation", "depth_scale", "radius", "compression")
 
 
 def evaporate(normal, bounds, field, ions, radius):
@@ -31,20 +30,6 @@ def evaporate(normal, bounds, field, ions, radius):
         depth=4.0, offset_seed=1,
     )  # fmt: skip
     return ae.Simulation(tip, seed=1).run(ions, [ae.Unperturbed()], responses=False, progress=False)
-
-
-def reconstruct(run, radius):
-    """Reconstruction of the ions that the instrument records."""
-    return ae.reconstruct(
-        run.at_evaporation_field().record(INSTRUMENT),
-        atomic_volume=NICKEL.a**3 / 4,
-        distance=INSTRUMENT.distance,
-        detector_radius=INSTRUMENT.field_of_view / 2,
-        efficiency=INSTRUMENT.efficiency,
-        radius=radius,
-        projection="compressed",
-        compression=1.2,  # where the fit against the true sites starts
-    )
 
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -80,7 +65,7 @@ for row, (name, (normal, bounds, ions)) in zip(panels, CASES.items(), strict=Tru
     else:
         run = evaporate(normal, bounds, options.field, round(ions * scale**3), radius)
         run.save(path)
-    reconstruction = reconstruct(run, radius)
+    reconstruction = reconstruct(run, radius, NICKEL)
     layer = reconstruction.hits.extra["phase"] == 1
     sites, found = reconstruction.hits.positions, reconstruction.fitted_positions(run, FIT)
     print(

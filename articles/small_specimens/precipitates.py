@@ -15,13 +15,12 @@ import argparse
 from pathlib import Path
 
 import numpy as np
+from recorded import FIT, reconstruct
 
 import apt_evap as ae
 
 ALUMINIUM = ae.material("Al")
-INSTRUMENT = ae.Instrument(distance=100.0, field_of_view=160.0, efficiency=0.8)
 COVER = 0.3  # nm of matrix between the apex and the sphere
-FIT = ("shift", "rotation", "depth_scale", "radius", "compression")
 CASES = {"low": (0.85, (0.8, 1.2, 1.6)), "equal": (1.0, (1.2,)), "high": (1.2, (0.8, 1.2, 1.6))}  # ratio, radii [nm]
 
 
@@ -37,20 +36,6 @@ def evaporate(ratio, r, radius):
     # what the cap sweeps until its apex is 1.2 nm below the sphere
     ions = round((COVER + 2 * r + 1.2) * np.pi * radius**2 / (ALUMINIUM.a**3 / 4), -3)
     return ae.Simulation(tip, seed=1).run(int(ions), [ae.Unperturbed()], responses=False, progress=False)
-
-
-def reconstruct(run, radius):
-    """Reconstruction of the ions that the instrument records."""
-    return ae.reconstruct(
-        run.at_evaporation_field().record(INSTRUMENT),
-        atomic_volume=ALUMINIUM.a**3 / 4,
-        distance=INSTRUMENT.distance,
-        detector_radius=INSTRUMENT.field_of_view / 2,
-        efficiency=INSTRUMENT.efficiency,
-        radius=radius,
-        projection="compressed",
-        compression=1.2,  # where the fit against the true sites starts
-    )
 
 
 def draw(axes, run, reconstruction, name):
@@ -98,7 +83,7 @@ for row, (name, (ratio, sizes)) in zip(panels, CASES.items(), strict=True):
         else:
             run = evaporate(ratio, r, radius)
             run.save(path)
-        reconstruction = reconstruct(run, radius)
+        reconstruction = reconstruct(run, radius, ALUMINIUM)
         hits = reconstruction.hits
         inside = hits.extra["phase"] == 1
         copper = np.array(run.elements)[hits.extra["species"]] == "Cu"

@@ -14,12 +14,11 @@ import argparse
 from pathlib import Path
 
 import numpy as np
+from recorded import FIT, reconstruct
 
 import apt_evap as ae
 
 NICKEL = ae.material("Ni")
-INSTRUMENT = ae.Instrument(distance=100.0, field_of_view=160.0, efficiency=0.8)
-FIT = ("shift", "rotation", "depth_scale", "radius", "compression")
 COLORS = {"Ni": "0.8", "Al": "C0", "Ti": "C3"}
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -59,16 +58,7 @@ else:
 # %%
 # What the instrument records, and its reconstruction.
 
-reconstruction = ae.reconstruct(
-    run.at_evaporation_field().record(INSTRUMENT),
-    atomic_volume=NICKEL.a**3 / 4,
-    distance=INSTRUMENT.distance,
-    detector_radius=INSTRUMENT.field_of_view / 2,
-    efficiency=INSTRUMENT.efficiency,
-    radius=radius,
-    projection="compressed",
-    compression=1.2,  # where the fit against the true sites starts
-)
+reconstruction = reconstruct(run, radius, NICKEL)
 hits = reconstruction.hits
 phase, species = hits.extra["phase"], np.array(run.elements)[hits.extra["species"]]
 sites, found = hits.positions, reconstruction.fitted_positions(run, FIT)
