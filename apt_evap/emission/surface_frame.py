@@ -112,8 +112,8 @@ def rollup_direction(
     -------
     tuple of ndarray
         Whether there is a target to roll onto, shape (n,). Then the components along t1 and t2, each of shape (n,), of
-        the unit vector to the rolled-up position, projected perpendicular to the normal; zero if there is no target, or
-        if it lies along the normal.
+        the unit vector to the rolled-up position, projected perpendicular to the normal; zero without a target, or if
+        it lies along the normal.
 
     Raises
     ------

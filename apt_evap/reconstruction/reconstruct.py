@@ -225,14 +225,13 @@ class Reconstruction:
 
     def _largest_compression(self):
         """Twice the compression; less if the angle at the rim would exceed 89 degrees."""
-        known = self.settings["compression"]
+        known, voltages = self.settings["compression"], _lens_voltages(self.hits, self.settings)
         rim = max(float(np.hypot(self.hits.x, self.hits.y).max()), self.settings["field_of_view"])
 
         def excess(compression):
             settings = {**self.settings, "compression": compression}
-            return (
-                float(np.max(_angles_on_cap(rim, self.radii, _lens_voltages(self.hits, settings), settings))) - _WIDEST
-            )
+            angles = _angles_on_cap(rim, self.radii, voltages, settings)
+            return float(np.max(angles)) - _WIDEST
 
         if excess(2 * known) <= 0:
             return 2 * known
@@ -404,10 +403,8 @@ def reconstruct(
         projection, field_factor, compression = "lens", 1.0, 1.0
     else:
         projection = check_choice("bas" if projection is None else projection, "projection", PROJECTIONS)
-    field_factor, compression = (
-        3.3 if field_factor is None else field_factor,
-        1.5 if compression is None else compression,
-    )
+    field_factor = 3.3 if field_factor is None else field_factor
+    compression = 1.5 if compression is None else compression
     volume = check_number(atomic_volume, "atomic_volume", above=0, unit="nm^3")
     distance = check_number(distance, "distance", above=0, unit="mm")
     compression = check_number(compression, "compression", above=0)

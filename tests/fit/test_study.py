@@ -167,11 +167,11 @@ def test_options_are_axes():
     assert grid.name == "PartlyRolled" and len(grid.cells) == 18
     with pytest.raises(ValueError, match="option probability"):
         EnergyGrid(PartlyRolled, options={"probability": (0.5, 0.5)})
-    with pytest.raises(ValueError, match="probability"):
+    with pytest.raises(ValueError, match=r"probability must be from 0 to 1, got 1\.5"):
         EnergyGrid(PartlyRolled, options={"probability": (0.5, 1.5)})
-    with pytest.raises(ValueError, match="options"):
+    with pytest.raises(ValueError, match=r"options must be those of the mechanism 'roll-up': .*probably"):
         EnergyGrid("roll-up", options={"probably": (0.5,)})
-    with pytest.raises(ValueError, match="options"):
+    with pytest.raises(ValueError, match="options must not contain 'mean'"):
         EnergyGrid("roll-up", options={"mean": (0.5,)})
 
 

@@ -41,7 +41,7 @@ def test_a_design_that_fixes_nothing_is_refused():
     with pytest.raises(ValueError, match="must determine the 6 coefficients of degree 2"):
         ae.flight.Design(2, ((0.0, 1), (1.0, 4)))  # five launches for six numbers
     with pytest.raises(ValueError, match="must determine"):
-        ae.flight.Design(2, ((1.0, 12),))  # on a circle u^2 + v^2 = 1 is no news
+        ae.flight.Design(2, ((1.0, 12),))  # on a circle u^2 + v^2 = 1 adds nothing
     ae.flight.Design(2, ((0.0, 1), (1.0, 5)))
 
 

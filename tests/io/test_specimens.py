@@ -140,7 +140,7 @@ def test_data_that_are_wrong(save):
         ae.read_tip(save(text.replace("Atoms", "Things")), NAMES)
     with pytest.raises(FileError, match="takes units, style, got 'frame'"):
         ae.read_tip(save(text), NAMES, frame=0)
-    with pytest.raises(ValueError, match="style"):
+    with pytest.raises(ValueError, match=r"style must be one of atomic, .*did you mean 'full'"):
         ae.read_tip(save(text), NAMES, style="ful")
     with pytest.raises(ValueError, match="types"):
         ae.read_tip(save(text), "Al")

@@ -78,7 +78,7 @@ def test_a_table_of_a_prototype():
 
 
 def test_trends():
-    """Loi et al. 2013: field factor and compression grow with the angle of the shank and fall with the radius."""
+    """Field factor and compression grow with the angle of the shank and fall with the radius."""
     settings = [LocalElectrode(40e3, 20e3, angle) for angle in (2.0, 12.0)]
     solved = [[each.lens(radius) for radius in (15.0, 120.0)] for each in settings]
     factors = np.array([[each.field_factor for each in row] for row in solved])

@@ -249,5 +249,5 @@ def test_measured_ions_have_no_true_sites(rng):
     result = ae.reconstruct(hits, atomic_volume=0.011, distance=100.0, radius=4.0)
     with pytest.raises(ValueError, match="truth is needed for hits that were not simulated"):
         result.errors()
-    with pytest.raises(ValueError, match="errors"):
+    with pytest.raises(ValueError, match="errors need at least 3 ions, got 2"):
         ae.reconstruct(hits[:2], atomic_volume=0.011, distance=100.0, radius=4.0).errors(np.zeros((2, 3)))

@@ -107,7 +107,7 @@ def test_what_is_no_precipitate(alloy):
         ae.reconstruction.precipitate_errors(reconstruction_of(sites), few, sites)
     with pytest.raises(ValueError, match="inside"):
         ae.reconstruction.precipitate_errors(reconstruction_of(sites), inside[:-1], sites)
-    with pytest.raises(ValueError, match="must"):
+    with pytest.raises(ValueError, match="must have an extent in all directions"):
         ae.reconstruction.precipitate_errors(reconstruction_of(sites * [1, 1, 0]), inside, sites)
 
 
