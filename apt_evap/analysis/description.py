@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from apt_evap._common.codec import to_plain
 from apt_evap.detection.binning import find_quantisations
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
@@ -146,6 +147,7 @@ def _of_run(run):
         "law": run.settings["law"],
         "clock": _clock(run),
         "real_units": _real_units(run),
+        "microscope": _microscope(run),
         "seed": run.seed,
         "tip": _tip(run.settings["tip"]),
         "detector": {"distance": run.detector.distance, "width": run.detector.width},
@@ -196,7 +198,7 @@ def _real_units(run):
             charges[ion] = charges.get(ion, 0) + int(((run.species == species) & (run.real.charges == charge)).sum())
     units = run.units
     return {
-        "voltages": _extent(run.voltages * units.voltage_ratio),
+        "voltages": _extent(run.instrument_voltages),
         "operating_field": _plain(units.operating_field),
         "field_reference": units.field_reference,
         "field_at_atom_over_cap": units.field_ratio and _plain(units.field_ratio),
@@ -206,15 +208,34 @@ def _real_units(run):
     }
 
 
+def _microscope(run):
+    """Lens of a run, and what it does to it."""
+    if run.lens is None:
+        return None
+    lens, radii = run.lens.lens, run.lens.radii(run.emissions.ions)
+    return to_plain(lens, short=True) | {
+        "radius": _extent(radii),
+        "field_factor": _extent(lens.field_factor(radii)),
+        "compression": _extent(lens.compression(radii)),
+    }
+
+
 def real_units_line(run: Run) -> str:
     """One line on a run in real units, str."""
     real = _real_units(run)
     low, high = real["voltages"] or (np.nan, np.nan)
     charges = ", ".join(f"{count:,} {name}" for name, count in real["flight_charges"].items())
-    return (
+    line = (
         f"real units: {low:,.4g} to {high:,.4g} V for {real['operating_field']:.3g} V/nm at the "
         f"{real['field_reference']}; {charges}; 1 eV at {run.voltage:g} V is {real['energy_scale']:.3g} eV"
     )
+    if run.lens is None or not len(run):
+        return line
+    found = _microscope(run)
+    ends = {
+        name: " to ".join(f"{value:.3g}" for value in found[name]) for name in found if isinstance(found[name], list)
+    }
+    return f"{line}; lens: R {ends['radius']} nm, k_f {ends['field_factor']}, xi {ends['compression']}"
 
 
 def _tip(settings):

@@ -14,11 +14,13 @@ from apt_evap._common.files import FileError, check_path, open_for_reading, repl
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import did_you_mean
 from apt_evap._version import __version__
+from apt_evap.config.lens_text import read_lens
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.io.distortion_grid import read_grid
 from apt_evap.io.formats import read as read_file
 from apt_evap.io.formats import read_ranges
+from apt_evap.microscope.local_electrode import LocalElectrode
 from apt_evap.simulation.run import Run, load
 
 _MARK = f"apt_evap {__version__}"
@@ -64,10 +66,16 @@ def _read(options):
 
 
 def in_real_units(run: Run, options: argparse.Namespace) -> Run:
-    """The run, in real units if the options ask for them; a run that already is keeps its own."""
-    if options.real_units is None or (run.units is not None and run.units.field_reference == options.real_units):
+    """The run, in real units if the options ask for them, as a lens does; a run that already is keeps its own."""
+    lens, reference = lens_of(options), options.real_units
+    if lens is None and (reference is None or (run.units is not None and run.units.field_reference == reference)):
         return run
-    return run.at_evaporation_field(field_reference=options.real_units)
+    return run.at_evaporation_field(lens, **({} if reference is None else {"field_reference": reference}))
+
+
+def lens_of(options: argparse.Namespace) -> LocalElectrode | None:
+    """The lens of the options."""
+    return None if options.lens is None else read_lens(options.lens)
 
 
 _SELECTING = ("ions", "mass", "voltage", "circle", "box", "ranges", "species")

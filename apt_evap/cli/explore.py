@@ -9,8 +9,9 @@ import webbrowser
 from collections.abc import Iterator
 from html import escape
 
+from apt_evap._common.codec import to_python
 from apt_evap._common.optional_imports import optional_import
-from apt_evap.cli._files import in_real_units, ions_of_map, read
+from apt_evap.cli._files import in_real_units, ions_of_map, lens_of, read
 from apt_evap.cli._output import put, say
 from apt_evap.cli.compare import read_registration
 from apt_evap.config.perturbation_text import read_perturbation
@@ -71,15 +72,23 @@ def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer, View]:
     if measured is not None and registration is None:
         say("note", "registering the maps, which takes up to some minutes; --registration sets a known registration")
     run_code = f"ae.load({options.run!r})"
-    if options.real_units is not None:
-        run_code += f".at_evaporation_field(field_reference={options.real_units!r})"
+    run_arguments = [options.run]
+    if options.lens is not None or options.real_units is not None:
+        arguments = []
+        if options.lens is not None:
+            arguments.append(to_python(lens_of(options)))
+            run_arguments.append(f"--lens={options.lens}")
+        if options.real_units is not None:
+            arguments.append(f"field_reference={options.real_units!r}")
+            run_arguments.append(f"--real-units={options.real_units}")
+        run_code += f".at_evaporation_field({', '.join(arguments)})"
     explorer = Explorer(
         run,
         measured,
         registration,
         run_code=run_code,
         measured_code="None" if options.file is None else _measured_code(options),
-        run_arguments=[options.run] + ([f"--real-units={options.real_units}"] if options.real_units else []),
+        run_arguments=run_arguments,
         measured_arguments=[] if options.file is None else _measured_arguments(options),
     )
     start = explorer.start

@@ -42,7 +42,7 @@ def _ions(content, options):
         return run.hits(perturbation)
     if not isinstance(content, Hits):
         raise ValueError(f"export needs a run or ions, {options.file!r} contains a map")
-    for name in ("real_units", "perturbation", "temperature", "jitter"):
+    for name in ("real_units", "lens", "perturbation", "temperature", "jitter"):
         if getattr(options, name) is not None:
             raise ValueError(f"--{name.replace('_', '-')} needs a run (.h5), {options.file!r} contains measured ions")
     return content

@@ -43,9 +43,9 @@ def execute(options: argparse.Namespace) -> int:
         content = in_real_units(content, options)
         drawn, titles = run_maps(content, _map_settings(content, options), lambda hits: select(hits, options))
         maps = drawn, [f"{title}{_species(options)}" for title in titles]
-    elif options.perturbation or options.real_units:
+    elif options.perturbation or options.real_units or options.lens:
         what = "a map" if isinstance(content, DetectorMap) else "measured ions"
-        name = "--perturbation" if options.perturbation else "--real-units"
+        name = "--perturbation" if options.perturbation else "--real-units" if options.real_units else "--lens"
         raise ValueError(f"{name} needs a run (.h5), {options.file!r} contains {what}")
     elif isinstance(content, DetectorMap):
         if options.bins is not None:
@@ -67,7 +67,7 @@ def _field_ion_map(content, options):
     """Field-ion image of the surface at the end of a run, and its title."""
     if not isinstance(content, Run):
         raise ValueError(f"--field-ion needs a run (.h5), got {options.file!r}")
-    for name in ("perturbation", "real_units"):
+    for name in ("perturbation", "real_units", "lens"):
         if getattr(options, name) is not None:
             raise ValueError(f"--field-ion and --{name.replace('_', '-')} exclude each other")
     if selects(options):

@@ -514,6 +514,12 @@ def _add_real_units(command: argparse.ArgumentParser) -> None:
         help="true V, eV and ns: the evaporation field is reached by the mean of the cap (cap, the default) or by the "
         "evaporating atom (site)",
     )
+    command.add_argument(
+        "--lens",
+        metavar="L",
+        help="microscope around the specimen: local-electrode or plane-electrode, with changed fields of "
+        "LocalElectrode such as local-electrode:shank_angle=7,distance=60e3 [degrees, nm]; for a run in real units",
+    )
 
 
 def _add_speech(command: argparse.ArgumentParser) -> None:

@@ -3,9 +3,10 @@
 import argparse
 from pathlib import Path
 
+from apt_evap._common.codec import for_json
 from apt_evap._common.files import FileError, check_path
 from apt_evap._common.validation import check_number
-from apt_evap.cli._files import in_real_units, read, select
+from apt_evap.cli._files import in_real_units, lens_of, read, select
 from apt_evap.cli._output import tell, tell_json
 from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.detection.hits import Hits
@@ -40,7 +41,7 @@ def execute(options: argparse.Namespace) -> int:
     reconstruction.write(output, frame=options.frame)
     tell(options, f"{reconstruction!r}")
     result = {"wrote": str(output), "file": options.file, "ions": len(reconstruction)}
-    result["settings"] = dict(reconstruction.settings)
+    result["settings"] = for_json(dict(reconstruction.settings))
     if hits.outcome is not None and len(reconstruction) > 2:  # simulated: the true sites are known
         errors = reconstruction.errors()
         result["errors"] = errors.to_dict()
@@ -91,6 +92,8 @@ def _constants(options):
     settings["radius"] = _radius(options.radius)
     if options.origins is not None:
         settings["origins"] = OriginTable.load(options.origins)
+    if options.lens is not None:
+        settings["lens"] = lens_of(options)
     if options.element is not None:
         element = _element(options.element)
         settings.setdefault("atomic_volume", 1 / atom_density(element.structure, element.a, element.c))

@@ -15,6 +15,7 @@ from typing import Any
 from apt_evap._common.codec import from_plain, to_plain
 from apt_evap._common.files import FileError, check_path, read_small_file, sha256_of
 from apt_evap._common.validation import check_count, check_kind, check_number, check_seed, check_switch, short_text
+from apt_evap.config.lens_text import read_lens
 from apt_evap.config.map_panels import MapSettings
 from apt_evap.config.tables import check_keys, check_table
 from apt_evap.detection.detector import Detector
@@ -27,6 +28,7 @@ from apt_evap.evaporation.voltage import VoltageControl, check_voltage
 from apt_evap.flight.crew import FlightSettings
 from apt_evap.flight.response import ResponseSettings
 from apt_evap.io.specimens import read_tip
+from apt_evap.microscope.local_electrode import LocalElectrode
 from apt_evap.simulation.monitor import Monitor
 from apt_evap.simulation.real_units import OperatingPoint, check_flight_charges
 from apt_evap.simulation.run import Run
@@ -87,6 +89,8 @@ class Config:
         Argument of `Run.at_evaporation_field`; None: the run is saved at the simulated voltage.
     rule : charging rule
         Distribution of the charge over the surface.
+    microscope : LocalElectrode or None
+        Lens in front of the specimen, for `Run.at_evaporation_field`.
     key : str
         Result of `key_of` for the content of the file.
 
@@ -113,6 +117,7 @@ class Config:
     control: VoltageControl | None
     real_units: OperatingPoint | None
     rule: Rule | CompiledRule
+    microscope: LocalElectrode | None
     key: str = ""
 
     def __post_init__(self):
@@ -207,7 +212,7 @@ class Config:
         return replace(run, provenance=run.provenance | origin)
 
     def as_saved(self, run: Run) -> Run:
-        """The run as it is saved: with its origin, and in real units if the file has a table ``[real_units]``.
+        """The run as it is saved: with its origin, and in real units if the file asks for them.
 
         Raises
         ------
@@ -215,10 +220,10 @@ class Config:
             If it cannot be converted; the message names the file.
         """
         run = self.with_origin(run)
-        if self.real_units is None:
+        if self.real_units is None and self.microscope is None:
             return run
-        with _located(self.path, "real_units"):
-            return run.at_evaporation_field(self.real_units)
+        with _located(self.path, "real_units" if self.microscope is None else "microscope"):
+            return run.at_evaporation_field(self.microscope, self.real_units)
 
 
 def read_config(path: str | Path) -> Config:
@@ -230,7 +235,8 @@ def read_config(path: str | Path) -> Config:
     ``[simulation]`` (ions, voltage, seed, responses), ``[detector]``, ``[charges]``, ``[flights]``, ``[responses]``,
     ``[monitor]`` (fields of `Detector`, `ChargeSettings`, `FlightSettings`, `ResponseSettings`, `Monitor`),
     ``[[phases]]`` (fields of `Phase`; instead of a material in ``[tip]``), ``[law]`` and ``[rule]`` (a name and the
-    fields of that class), ``[control]`` (`VoltageControl`), ``[real_units]`` (arguments of `Run.at_evaporation_field`)
+    fields of that class), ``[control]`` (`VoltageControl`), ``[real_units]`` (fields of `OperatingPoint`),
+    ``[microscope]`` (fields of `LocalElectrode`, or a ``preset``)
     and ``[maps]`` (fields of `MapSettings`). Only ``[tip]`` with a material and an apex_radius, or with a file,
     and the ions in ``[simulation]``, are required.
 
@@ -297,6 +303,7 @@ def config_of(document: dict[str, Any], path: Path) -> Config:
             "rule",
             "control",
             "real_units",
+            "microscope",
             "maps",
         )
         check_keys(document, ("output", "phases", *tables), ("tip", "simulation"))
@@ -343,6 +350,8 @@ def config_of(document: dict[str, Any], path: Path) -> Config:
         real_units = None
         if "real_units" in document:
             real_units = from_plain(document["real_units"], OperatingPoint, what="real_units")
+    with _located(path, "microscope"):
+        microscope = read_lens(document["microscope"]) if "microscope" in document else None
     with _located(path, "maps"):
         maps = from_plain(document.get("maps", {}), MapSettings, what="maps")
         maps.check_detector(detector)
@@ -364,6 +373,7 @@ def config_of(document: dict[str, Any], path: Path) -> Config:
         control=control if document.get("control") else None,
         real_units=real_units,
         rule=rule,
+        microscope=microscope,
         key=key,
     )
 

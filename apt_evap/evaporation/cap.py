@@ -26,14 +26,17 @@ class Cap(NamedTuple):
         Mean ratio of this field to the evaporation field of the atom, with the same weights.
     radius : float
         Radius of the sphere fitted to these atoms [nm].
+    apex : float
+        z of the top of this sphere [nm].
     """
 
     field: float
     ratio: float
     radius: float
+    apex: float
 
 
-NO_CAP = Cap(math.nan, math.nan, math.nan)
+NO_CAP = Cap(math.nan, math.nan, math.nan, math.nan)
 """Result of `measure_cap` for a surface with too few atoms around the axis."""
 
 
@@ -71,4 +74,5 @@ def measure_cap(positions: Floats, normals: Floats, fields: Floats, evaporation_
         chosen = from_centre[:, 2] >= cosine * lengths(from_centre)
     fields = fields[chosen]
     weights = fields / fields.sum()  # fields are proportional to charges
-    return Cap(float((weights * fields).sum()), float((weights * fields / evaporation_fields[chosen]).sum()), radius)
+    ratio = float((weights * fields / evaporation_fields[chosen]).sum())
+    return Cap(float((weights * fields).sum()), ratio, radius, float(centre[2]) + radius)

@@ -3,3 +3,4 @@ from .lens import Lens as Lens
 from .local_electrode import PRESETS as PRESETS
 from .local_electrode import LensProjection as LensProjection
 from .local_electrode import LocalElectrode as LocalElectrode
+from .run_lens import RunLens as RunLens

@@ -17,6 +17,7 @@ _RIM = 0.02  # length of the first panel of the electrode in radii of the apertu
 # potentials below 1e-6 of the voltage; with 20, 7e-4 pass outside. k_f differs by 1e-4)
 _ELECTRODE_SIZE = 1000
 _LEAST_SLOPE = 1e-3  # rad, above a profile that starts as a cylinder
+_FOOT_POINTS = 40  # of the rounded foot of a simulated specimen
 
 
 class Flank(NamedTuple):
@@ -122,3 +123,31 @@ def graded(path: Floats, first: float, growth: float) -> Floats:
     steps = np.concatenate([[0.0], np.cumsum((1 + growth) ** np.arange(count))])
     steps *= along[-1] / steps[-1]
     return np.column_stack([np.interp(steps, along, path[:, 0]), np.interp(steps, along, path[:, 1])])
+
+
+def simulated_flank(radius: float, angle: float, centre: float, foot: float, rounded: bool) -> Flank:
+    """Flank of a simulated specimen, which ends after a short shank.
+
+    Parameters
+    ----------
+    radius : float
+        Radius of the cap [nm].
+    angle : float
+        Half the opening angle of the shank [rad].
+    centre : float
+        Distance of the centre of the foot from that of the cap [nm]; the flat base is cut there.
+    foot : float
+        Radius of the foot, a sphere that touches the shank [nm].
+    rounded : bool
+        Whether the foot is rounded; otherwise its base is flat.
+    """
+    sin, cos = math.sin(angle), math.cos(angle)
+    start = [radius * cos, radius * (sin - 1)]
+    depth = -radius - centre
+    if rounded:
+        around = np.linspace(angle, -math.pi / 2, _FOOT_POINTS)
+        end = foot * np.column_stack([np.cos(around), np.sin(around)]) + (0, depth)
+        end[-1, 0] = 0.0
+    else:
+        end = np.array([[foot / cos, depth], [0.0, depth]])
+    return Flank(angle, np.vstack([start, end]), 0.0)

@@ -1,7 +1,7 @@
 """The lens of a specimen in front of an electrode, for all radii of its apex."""
 
 import math
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -444,7 +444,13 @@ class LocalElectrode:
 
     @cached_property
     def _table(self):
-        return _Table(self)
+        return _table_of(self)
+
+
+@lru_cache(maxsize=16)
+def _table_of(setting):
+    """Equal lenses share their solutions, for example those that are read from the settings of runs."""
+    return _Table(setting)
 
 
 class _Table:

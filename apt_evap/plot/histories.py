@@ -157,7 +157,7 @@ def _panels_of_run(run, points, element):
         raise ValueError(
             f"the voltage of {run!r} is constant: use the run in real units, run.at_evaporation_field(), or `history`"
         )
-    total = run.voltages * (1.0 if run.units is None else run.units.voltage_ratio)
+    total = run.instrument_voltages
     control = run.settings.get("control") if run.units is None else vars(run.units.control)
     pulsed = bool(control and control["pulse_fraction"] > 0)
     panels = [(_draw_voltage, total, points, "voltage with\npulse [V]" if pulsed else "voltage [V]")]

@@ -30,7 +30,8 @@ def run_constants(run: Run, evaporation_field: float | None = None) -> dict[str,
         * ``field_factor``: the median of V / (F R) over all ions, with the spheres of `fit_caps` for R; with too few
           ions for a sphere, with the radius of the tip;
         * ``compression`` and ``projection``: those of `image_compression`, without them if the ions do not suffice for
-          a fit.
+          a fit;
+        * ``lens`` in place of the last three, if the run has one.
 
     Raises
     ------
@@ -44,7 +45,7 @@ def run_constants(run: Run, evaporation_field: float | None = None) -> dict[str,
         field = units.operating_field
     else:
         field = check_number(evaporation_field, "evaporation_field", above=0, unit="V/nm")
-    voltages = run.voltages * units.voltage_ratio
+    voltages = run.instrument_voltages
     constants: dict[str, Any] = {
         "distance": run.detector.distance,
         "detector_radius": run.detector.width / 2,
@@ -60,6 +61,10 @@ def run_constants(run: Run, evaporation_field: float | None = None) -> dict[str,
         constants["projection"] = "compressed"
     except ValueError:  # too few ions
         pass
+    if run.lens is not None:
+        for name in ("field_factor", "compression", "projection"):
+            constants.pop(name, None)
+        constants["lens"] = run.lens.lens
     return constants
 
 

@@ -85,6 +85,7 @@ OPTIONAL = (
     _of_events("clock/waits"),
     Column("clock/voltages", np.float64, (), "V"),
     Column("real/voltages", np.float64, (), "V", derived=True),
+    Column("real/instrument_voltages", np.float64, (), "V", derived=True),
     Column("real/charges", np.int32, (), "e", derived=True),
     Column("real/masses", np.float64, (), "Da", derived=True),
     Column("real/pulse_ids", np.int64, derived=True),

@@ -60,12 +60,15 @@ class CapHistory(NamedTuple):
         Mean ratio of their fields to their evaporation fields.
     radii : ndarray, shape (k,)
         Radius of the sphere through these atoms [nm].
+    apexes : ndarray, shape (k,)
+        z of the top of this sphere [nm].
     """
 
     ions: np.ndarray
     fields: np.ndarray
     ratios: np.ndarray
     radii: np.ndarray
+    apexes: np.ndarray
 
     def __repr__(self) -> str:
         return short_repr(self)

@@ -82,8 +82,8 @@ class OperatingPoint:
     )
     field_factor: float | None = number(
         "k_f of the instrument, V = k_f F R, with the initial apex radius R. The reported voltages are then those of "
-        "the instrument, the ratio of both factors is constant. By default the voltages are those of the model, whose "
-        "field factor is smaller because it has no counter electrode.",
+        "the instrument, the ratio of both factors is constant. By default they follow from the lens; without a lens "
+        "they are those of the model, whose field factor is smaller because it has no counter electrode.",
         default=None,
         at_least=0.1,
         at_most=100,
@@ -109,11 +109,6 @@ class RealUnits:
     smoothing: int = count("Number of ions over which the voltage is averaged.", default=1, at_least=1)
     control: VoltageControl = part("Rate and pulses.", VoltageControl, default=VoltageControl())
     timing: Timing | None = part("Errors of the times of flight.", Timing, default=None)
-    voltage_ratio: float = number(
-        "Voltage of the instrument divided by that of the model, see `field_factor` in `Run.at_evaporation_field`.",
-        default=1.0,
-        above=0,
-    )
     seed: int = checked("Seed of isotopes, charges, pulses and times.", "int", check_seed, default=0)
 
 
@@ -122,6 +117,8 @@ class RealColumns(NamedTuple):
 
     voltages: np.ndarray
     """Voltage that accelerates each ion, V_dc + V_p [V], in the model."""
+    instrument_voltages: np.ndarray
+    """The same in the instrument [V], by the lens or the field factor; without both, that of the model."""
     charges: np.ndarray
     """Charge in flight [e], int32."""
     masses: np.ndarray
@@ -350,32 +347,38 @@ def in_real_units(run: Any, point: OperatingPoint) -> tuple[RealUnits, RealColum
     local = run.fields * voltages / evaporation_fields
     local = local / (local.mean() or 1.0) * goal if len(run) else local
     fields = local * evaporation_fields
+    operating_field = goal * host_field
     real = RealColumns(
         voltages=voltages,
+        instrument_voltages=_instrument_voltages(run, point.field_factor, voltages, operating_field),
         charges=flight_charges_of(given_charges, run.elements, run.species, emissions.charge_states, fields, u[:, 1]),
         masses=isotopes_of(run.elements, run.species, emissions.masses, u[:, 0]),
         pulse_ids=_pulse_ids(run, control, local / goal, u[:, 2]),
     )
     units = RealUnits(
         field_reference=point.field_reference,
-        operating_field=goal * host_field,
+        operating_field=operating_field,
         field_ratio=field_ratio,
         smoothing=point.smoothing,
         control=control,
         timing=point.timing,
-        voltage_ratio=_voltage_ratio(point.field_factor, tip.get("apex_radius"), voltages, goal * host_field),
         seed=seed,
     )
     return units, real
 
 
-def _voltage_ratio(field_factor, radius, voltages, operating_field):
-    """Voltage of an instrument with this field factor over that of the model."""
+def _instrument_voltages(run, field_factor, voltages, operating_field):
+    """Voltages of an instrument with a lens or a field factor, from those of the model."""
+    if run.lens is not None:
+        if field_factor is not None:
+            raise ValueError(f"field_factor follows from the lens, got field_factor={field_factor:g} and a lens")
+        return run.lens.voltages(voltages, run.emissions.ions, operating_field)
     if field_factor is None:
-        return 1.0
-    if radius is None or not len(voltages):
+        return voltages
+    radius = run.settings["tip"].get("apex_radius")
+    if radius is None:
         raise ValueError("field_factor needs the apex radius, which a tip made from positions does not have")
-    return field_factor * operating_field * radius / float(voltages[0])
+    return voltages * (field_factor * operating_field * radius / float(voltages[0]) if len(voltages) else 1.0)
 
 
 def _pulse_ids(run, control, excess, u):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apt_evap._common.codec import changed, to_plain
+from apt_evap._common.codec import changed, from_plain, to_plain
 from apt_evap._common.files import FileError, check_path
 from apt_evap._common.types import AnyPath, Booleans, Floats, Integers
 from apt_evap._common.validation import (
@@ -28,6 +28,8 @@ from apt_evap.emission.ion_random import IonRandom
 from apt_evap.emission.perturbations import Perturbation, Unperturbed, described
 from apt_evap.evaporation.state import EmitterState
 from apt_evap.flight.response import ResponseModel, Responses, ResponseSettings
+from apt_evap.microscope.local_electrode import LocalElectrode
+from apt_evap.microscope.run_lens import Course, RunLens
 from apt_evap.simulation.columns import (
     ALWAYS,
     OPTIONAL,
@@ -200,6 +202,17 @@ class Run:
         return np.full(len(self), self.voltage) if self.clock is None else self.clock.voltages
 
     @property
+    def instrument_voltages(self) -> Floats:
+        """Voltage between specimen and electrode at each event [V], shape (n,), at the top of the pulse."""
+        return self.voltages if self.real is None else self.real.instrument_voltages
+
+    @cached_property
+    def lens(self) -> RunLens | None:
+        """The lens in front of the specimen; None for a specimen in free space."""
+        plain = self.settings.get("microscope")
+        return None if plain is None else from_plain(plain, RunLens, what="microscope")
+
+    @property
     def flight_charges(self) -> Integers:
         """Charge of each ion in flight [e], shape (n,); without real units that at the barrier."""
         return self.emissions.charge_states if self.real is None else self.real.charges
@@ -301,7 +314,7 @@ class Run:
         ValueError
             As for `hits`.
         """
-        x, y, _, outcome = self.detector.impacts(*self._landed(perturbation, False))
+        x, y, _, outcome = self.detector.impacts(*self._seen(*self._landed(perturbation, False)))
         return x, y, outcome
 
     @cached_property
@@ -333,12 +346,23 @@ class Run:
             launches = launches._replace(first=launches.first * factors, second=launches.second * factors)
         return self.response_model.evaluate(self.responses, launches, emissions.masses, scale)
 
+    def _seen(self, directions, times):
+        """Directions and times in the instrument, of those of the simulated flights."""
+        if self.lens is not None:
+            masses = self.emissions.masses if self.real is None else self.real.masses
+            voltages = np.full(len(self), self.voltage) if self.real is None else self.real.instrument_voltages
+            return self.lens.seen(
+                directions, self.emissions.ions, masses, self.flight_charges, voltages, self.detector.distance
+            )
+        if self.real is not None:
+            # t is proportional to sqrt(m / (n V)) on the same path; the last V is that of the instrument
+            voltages = self.real.voltages / self.real.instrument_voltages
+            times = times * np.sqrt(self.energy_scales * voltages * (self.real.masses / self.emissions.masses))
+        return directions, times
+
     def _hits(self, directions, times, perturbation):
         emissions, columns, units = self.emissions, {}, {"charge": "e", "field": "V/nm"}
-        if self.units is not None and self.real is not None:
-            # t is proportional to sqrt(m / (n V)) on the same path; the last V is that of the instrument
-            masses = self.real.masses / emissions.masses / self.units.voltage_ratio
-            times = times * np.sqrt(self.energy_scales * masses)
+        directions, times = self._seen(directions, times)
         x, y, times, outcome = self.detector.impacts(directions, times)
         if self.real is None:
             # of the flights, also if a control had another one for the events
@@ -370,7 +394,7 @@ class Run:
     def _measured(self, times, outcome):
         """Columns that an instrument would record: voltages, pulses, times with their errors, m/n from these."""
         units, real = self.units, self.real
-        total = real.voltages * units.voltage_ratio
+        total = real.instrument_voltages
         fraction = units.control.pulse_fraction
         columns = {"voltage": total / (1.0 + fraction), "pulse_id": real.pulse_ids}
         if fraction > 0:
@@ -393,7 +417,9 @@ class Run:
             multiplicity[hit] = counts[np.searchsorted(first, pulse)]
         return columns | {"pulses": pulses, "multiplicity": multiplicity}
 
-    def at_evaporation_field(self, point: OperatingPoint | None = None, **arguments: Any) -> "Run":
+    def at_evaporation_field(
+        self, lens: LocalElectrode | None = None, point: OperatingPoint | None = None, **arguments: Any
+    ) -> "Run":
         r"""The same run in real units: at the voltages that bring it to its evaporation field.
 
         Energies of perturbations are then true eV, `voltages` true V and times of flight true ns. Nothing is simulated
@@ -401,6 +427,9 @@ class Run:
 
         Parameters
         ----------
+        lens : LocalElectrode, optional
+            Lens of specimen, shank and electrode. Voltages, positions of hits and times of flight are then those of the
+            instrument, as its voltage and its image compression follow the radius of the cap; see `on_detector`.
         point : OperatingPoint, optional
             Operating field, charges in flight, pulses and errors of the times; by default `OperatingPoint()`.
         **arguments
@@ -414,7 +443,8 @@ class Run:
         Raises
         ------
         ValueError
-            If an argument is outside its range, or the run does not contain the fields of its cap.
+            If an argument is outside its range, the run does not contain the fields of its cap, or a lens is given for
+            a specimen that is not a cap on a shank.
 
         Notes
         -----
@@ -429,14 +459,24 @@ class Run:
         """
         if point is not None:
             check_kind(point, "point", OperatingPoint, "an OperatingPoint")
-        units, real = in_real_units(self, changed(point or OperatingPoint(), arguments))
-        return replace(self, units=units, real=real)
+        run = self._behind(lens)
+        units, real = in_real_units(run, changed(point or OperatingPoint(), arguments))
+        return replace(run, units=units, real=real)
+
+    def _behind(self, lens):
+        """The same run with a lens; without one, itself."""
+        if lens is None:
+            return self
+        check_kind(lens, "lens", LocalElectrode, "a LocalElectrode")
+        course = Course(self.cap.ions, self.cap.radii, self.cap.apexes)
+        imaged = RunLens.of(lens, self.settings["tip"], course)
+        return replace(self, settings=self.settings | {"microscope": to_plain(imaged)})
 
     def simulated(self) -> "Run":
         """The same run without real units, at the simulated voltage."""
         return self if self.units is None else replace(self, units=None, real=None)
 
-    def on_detector(self, detector: Detector) -> "Run":
+    def on_detector(self, detector: Detector, lens: LocalElectrode | None = None) -> "Run":
         """The same ions on another detector.
 
         Parameters
@@ -444,12 +484,34 @@ class Run:
         detector : Detector
             Detector with another distance, width or projection. Outside the field, the time of flight is proportional
             to the distance.
+        lens : LocalElectrode, optional
+            Lens in front of the specimen; by default that of the run, if it has one. The angle of the simulated flight
+            is traced back to the cap by the free specimen, and from there to the detector by the lens. Ions that the
+            electrode stops miss the detector.
 
         Returns
         -------
         Run
+
+        Raises
+        ------
+        ValueError
+            If the specimen is not a cap on a shank, or the lens has a potential of the detector and the run is not in
+            real units, so that its voltages are not known.
         """
         check_kind(detector, "detector", Detector, "a Detector")
+        if lens is not None:
+            behind = self._behind(lens)
+            if self.real is not None and (self.lens is None or self.lens.lens != lens):
+                raise ValueError(
+                    f"lens changes the voltages of a run in real units: use run.at_evaporation_field(lens), got {lens}"
+                )
+            if self.real is None and lens.detector_potential:
+                raise ValueError(
+                    f"lens has the detector_potential {lens.detector_potential:g} V, whose influence depends on the "
+                    "voltages: use run.at_evaporation_field(lens)"
+                )
+            return behind.on_detector(detector)
         ratio = detector.distance / self.detector.distance
         flown, responses = self.flown, self.responses
         if ratio != 1.0:

@@ -39,7 +39,8 @@ _RUN, _STATE = "run", "state"  # kinds of files
 
 _SIMULATION = f"{ENTRY}/simulation"
 _OWN = "NXcollection"
-_UNITS = {"field": "V/nm", "fields": "V/nm", "radii": "nm", "charges": "e"}  # of tables and of the state
+# of tables and of the state
+_UNITS = {"field": "V/nm", "fields": "V/nm", "radii": "nm", "apexes": "nm", "charges": "e"}
 _STATE_ARRAYS = {
     "sites": (np.int64, (None,)),
     "charges": (np.float64, (None,)),

@@ -1,6 +1,7 @@
 """Real units, temperature and export in the shell."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -61,6 +62,36 @@ def test_a_run_at_a_temperature_is_saved_in_real_units(made, capsys):
     assert main(["info", str(made / "hot.h5")]) == 0
     text = capsys.readouterr().out
     assert "Arrhenius(temperature=80" in text and "operating field [V/nm]" in text
+
+
+def test_a_settings_file_with_a_microscope(made, tmp_path, monkeypatch, capsys):
+    """The run is saved behind the lens, as --lens shows a run that is not."""
+    monkeypatch.chdir(tmp_path)
+    text = HOT.partition("[law]")[0] + '[microscope]\npreset = "local electrode"\nshank_angle = 7.0\n'
+    Path("lens.toml").write_text(text)
+    assert main(["run", "lens.toml", "-o", "lens.h5"]) == 0
+    assert "lens: R 1" in capsys.readouterr().out
+    lens = ae.microscope.LocalElectrode.preset("local electrode", shank_angle=7.0)
+    run, plain = ae.load("lens.h5"), ae.load(made / "cold.h5")
+    assert run.lens.lens == lens and run.fingerprint() == plain.fingerprint()
+    told = summary("lens.h5", capsys)["microscope"]
+    assert told["shank_angle"] == 7.0 and told["field_factor"][0] == pytest.approx(lens.field_factor(told["radius"][0]), rel=1e-5)
+    assert summary(made / "cold.h5", capsys)["microscope"] is None
+    for command in ("export", "reconstruct", "map"):
+        outputs = [f"{command}{name}.png" if command == "map" else f"{command}{name}.epos" for name in "12"]
+        assert main([command, "lens.h5", "-o", outputs[0], "--quiet"]) == 0
+        option = "--lens=local-electrode:shank_angle=7"
+        assert main([command, str(made / "cold.h5"), option, "-o", outputs[1], "--quiet"]) == 0
+        one, two = (Path(name).read_bytes() for name in outputs)
+        assert command == "map" or one == two
+
+
+@pytest.mark.parametrize(
+    "text", ["remote-electrode", "local-electrode:angle=3", "local-electrode:5", "local-electrode:shank_angle=99"]
+)
+def test_a_wrong_lens_is_named(made, tmp_path, text, capsys):
+    assert main(["map", str(made / "cold.h5"), "--lens", text, "-o", str(tmp_path / "map.png")]) == 2
+    assert text in capsys.readouterr().err and not (tmp_path / "map.png").exists()
 
 
 def test_info_of_a_run_at_the_simulated_voltage(made, capsys):

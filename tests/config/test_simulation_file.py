@@ -21,6 +21,7 @@ from apt_evap.emission.perturbations import Combined, LateralVelocity, RollUp, U
 from apt_evap.evaporation.settings import ChargeSettings
 from apt_evap.flight.crew import FlightSettings
 from apt_evap.io.tapsim_nodes import write_nodes
+from apt_evap.microscope.local_electrode import LocalElectrode
 from apt_evap.simulation.simulation import Simulation
 from apt_evap.specimen.materials import material
 from apt_evap.specimen.tip import Tip
@@ -435,3 +436,16 @@ def test_a_specimen_from_a_file(tmp_path):
         (tmp_path / "a.toml").write_text(text.replace(old, new))
         with pytest.raises(FileError, match=message):
             read_config(tmp_path / "a.toml").simulation(n_threads=1)
+
+
+def test_a_microscope_by_its_preset_or_its_fields(tmp_path):
+    base = '[tip]\nmaterial = "Ni"\napex_radius = "6 a"\n[simulation]\nions = 10\n[microscope]\n'
+    path = tmp_path / "lens.toml"
+    path.write_text(base + "distance = 40e3\naperture = 20e3\nshank_angle = 5.0\n")
+    lens = read_config(path).microscope
+    path.write_text(base + 'preset = "local electrode"\n')
+    assert read_config(path).microscope == lens == LocalElectrode(40e3, 20e3, 5.0)
+    for wrong, name in (('preset = "remote"', "preset"), ("distance = 40e3", "aperture"), ("preset = 3", "preset")):
+        path.write_text(base + wrong)
+        with pytest.raises(FileError, match=name):
+            read_config(path)

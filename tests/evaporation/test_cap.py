@@ -30,7 +30,8 @@ def slow_cap(positions, normals, fields, evaporation_fields):
     radius = np.sqrt(rest + np.dot(centre, centre))
     ratios = (fields / evaporation_fields)[chosen]
     weights = fields[chosen]
-    return np.average(weights, weights=weights), np.average(ratios, weights=weights), radius
+    field, ratio = np.average(weights, weights=weights), np.average(ratios, weights=weights)
+    return field, ratio, radius, centre[2] + radius
 
 
 # ---- points --------------------------------------------------------------------------------------------------------
@@ -43,6 +44,7 @@ def test_a_perfect_sphere(centre, rng):
     cap = measure_cap(centre + radius * directions, directions, fields, evaporation_fields)
     # a linear problem of four numbers, whose condition number of about 100 multiplies roundings
     assert cap.radius == pytest.approx(radius, rel=1e-12)
+    assert cap.apex == pytest.approx(centre[2] + radius, rel=1e-12)
     # averaged is over exactly the atoms within 45 degrees, seen from the centre: the centre is right
     inside = directions[:, 2] >= COSINE
     assert cap.field == pytest.approx(np.average(fields[inside], weights=fields[inside]), rel=1e-12)
@@ -70,8 +72,9 @@ def test_turning_and_moving_a_surface_leaves_its_cap(surface12):
     shift = np.array([3.0, 4.0, -20.0])
     turned = measure_cap(positions @ turn + shift, normals @ turn, charges, evaporation_fields)
     scaled = measure_cap(2.0 * positions, normals, 3.0 * charges, evaporation_fields)
-    assert turned == pytest.approx(cap, rel=1e-11)  # roundings of positions of 20 nm, in squares
-    assert scaled == pytest.approx((3 * cap.field, 3 * cap.ratio, 2 * cap.radius), rel=1e-12)
+    moved = cap._replace(apex=cap.apex - 20.0)
+    assert turned == pytest.approx(moved, rel=1e-11)  # roundings of positions of 20 nm, in squares
+    assert scaled == pytest.approx((3 * cap.field, 3 * cap.ratio, 2 * cap.radius, 2 * cap.apex), rel=1e-12)
 
 
 def test_atoms_far_from_the_axis_do_not_matter(rng):
@@ -104,7 +107,7 @@ def test_too_few_atoms_have_no_cap(n, known):
     assert len(around) == n
     cap = measure_cap(points, points, np.ones(len(points)), np.ones(len(points)))
     if known:
-        assert cap == pytest.approx((1.0, 1.0, 1.0), rel=1e-12)
+        assert cap == pytest.approx((1.0, 1.0, 1.0, 1.0), rel=1e-12)
     else:
         assert np.isnan(cap).all() and np.isnan(NO_CAP).all()
 
@@ -137,7 +140,7 @@ def test_atoms_that_never_evaporate_are_not_of_the_cap(nickel, small_tip):
 def test_fields_of_the_cap_are_in_proportion_to_the_voltage(small_tip):
     one, two = (ae.evaporation.Emitter(small_tip, voltage, n_threads=1).cap for voltage in (500.0, 1500.0))
     # charges converge to rounding in the same steps
-    assert two == pytest.approx((3 * one.field, 3 * one.ratio, one.radius), rel=1e-9)
+    assert two == pytest.approx((3 * one.field, 3 * one.ratio, one.radius, one.apex), rel=1e-9)
 
 
 def test_the_ratio_of_an_alloy_is_that_of_each_species():
@@ -194,7 +197,7 @@ def test_the_history_of_a_run_has_the_cap_after_each_relaxation(small_tip, tmp_p
         if n % 40 == 0 and len(batch):
             caps.append(batch.cap)
         n += len(batch)
-    assert np.array_equal(np.array(caps).T, [run.cap.fields, run.cap.ratios, run.cap.radii])
+    assert np.array_equal(np.array(caps).T, [run.cap.fields, run.cap.ratios, run.cap.radii, run.cap.apexes])
     first = ae.evaporation.Emitter(small_tip, n_threads=1).cap
     assert tuple(values[0] for values in run.cap[1:]) == first
     run.save(tmp_path / "run.h5")

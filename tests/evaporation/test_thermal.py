@@ -564,7 +564,7 @@ def test_a_run_that_is_resumed_between_two_relaxations_has_the_same_bits(tmp_pat
         assert len(part) == n_ions
     assert part.fingerprint() == whole.fingerprint()
     assert same(part.clock, whole.clock) == [True, True]
-    assert same(part.cap, whole.cap) == [True] * 4
+    assert same(part.cap, whole.cap) == [True] * 5
     assert part.clock.waits.shape == part.clock.voltages.shape == (130,)
     assert ae.load(tmp_path / "run.h5").fingerprint() == whole.fingerprint()
 

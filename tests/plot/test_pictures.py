@@ -307,7 +307,7 @@ def test_voltages_of_an_instrument(run):
     real = run.at_evaporation_field(field_factor=3.3)  # a single charge, 2: no panel of a ratio
     axes = plot.voltage_curve(real, points=5)
     assert labels_of(axes) == ["voltage with pulse [V]", "field at the cap [V/nm]", "ions per pulse"]
-    total = real.voltages * real.units.voltage_ratio
+    total = real.instrument_voltages
     np.testing.assert_allclose(axes[0].lines[0].get_ydata(), course(total, 5).median)
 
 

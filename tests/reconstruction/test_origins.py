@@ -1,6 +1,7 @@
 """The table of origins: a known field of shifts is found, and the errors of a twin run become smaller."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -128,9 +129,8 @@ def test_the_errors_of_a_twin_run(twins, nickel):
     # a table of a crystal that is turned has the right pole, but wrong zone lines
     assert reconstructed(second, nickel, table.rotated(60.0)).errors(second).lateral_rms > 1.5 * corrected.lateral_rms
     with pytest.raises(ValueError, match="runs must have the same crystal and orientation"):
-        other = ae.Run(
-            **{**vars(first), "settings": {**first.settings, "tip": {**first.settings["tip"], "axis": [0, 0, 1]}}}
-        )
+        tip = {**first.settings["tip"], "axis": [0, 0, 1]}
+        other = replace(first, settings={**first.settings, "tip": tip})
         ae.reconstruction.origin_table([first, other])
 
 

@@ -1,0 +1,57 @@
+"""Lenses from a table or from text such as local-electrode:shank_angle=7."""
+
+import tomllib
+from collections.abc import Mapping
+from typing import Any
+
+from apt_evap._common.codec import from_plain
+from apt_evap._common.validation import short_text
+from apt_evap.microscope.local_electrode import PRESETS, LocalElectrode
+
+
+def read_lens(settings: str | Mapping[str, Any]) -> LocalElectrode:
+    """Make a lens from a table, or from the text of an option.
+
+    Parameters
+    ----------
+    settings : str or mapping
+        Fields of `LocalElectrode`, perhaps with a ``preset`` whose other fields they replace. As text: the name of a
+        preset and the fields that are changed, ``"local-electrode:shank_angle=7,distance=60e3"``.
+
+    Returns
+    -------
+    LocalElectrode
+
+    Raises
+    ------
+    ValueError
+        If the preset is unknown, or a field is unknown, missing or outside its range.
+
+    Examples
+    --------
+    >>> ae.config.read_lens("local-electrode:shank_angle=7").shank_angle  # degrees
+    7.0
+    """
+    if isinstance(settings, str):
+        try:
+            return read_lens(_table(settings))
+        except ValueError as error:
+            raise ValueError(f"lens {settings!r}: {error}; an example is local-electrode:shank_angle=5") from error
+    table = dict(settings)
+    if "preset" in table:
+        name = table.pop("preset")
+        known = {each.replace(" ", "-"): each for each in PRESETS}
+        if not isinstance(name, str) or name.replace(" ", "-") not in known:
+            raise ValueError(f"preset must be {' or '.join(map(repr, PRESETS))}, got {short_text(name)}")
+        table = {**PRESETS[known[name.replace(" ", "-")]], **table}
+    return from_plain(table, LocalElectrode, what="lens")
+
+
+def _table(text):
+    """Table of a lens from text."""
+    name, _, fields = text.partition(":")
+    try:
+        changes = tomllib.loads(fields.replace(",", "\n"))
+    except tomllib.TOMLDecodeError:
+        raise ValueError(f"expected fields such as shank_angle=7 after the colon, got {fields!r}") from None
+    return {"preset": name, **changes}

@@ -1,0 +1,211 @@
+"""The lens in front of the specimen of a run: what the free specimen of the simulation becomes in an instrument."""
+
+import math
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy
+from numpy.typing import ArrayLike
+
+from apt_evap._common.codec import checked, part, settings
+from apt_evap._common.types import Floats, Integers
+from apt_evap._common.validation import check_array
+from apt_evap.microscope.conductors import simulated_flank
+from apt_evap.microscope.lens import Lens
+from apt_evap.microscope.local_electrode import LensProjection, LocalElectrode
+
+_FAR = 1e9  # distance and aperture of an electrode that a specimen does not feel: 1 m [nm]
+_FAR_ANGLE = math.radians(75)
+_BESIDE = 90.0  # degrees: an ion that flies away from the detector
+_STEP = 0.05  # relative change of the radius, or of the length in radii, from stage to stage
+_MOST_STAGES = 16
+_SHORTEST = 0.05  # of the radius: a shank that is used up
+_AWAY = 2.0  # length of a stereographic direction that misses every detector
+_DIGITS = 10  # of what is stored: the last digits of a solution depend on the library of linear algebra
+
+
+class Course(NamedTuple):
+    """The cap of a specimen during a run, each of shape (k,)."""
+
+    ions: Integers
+    """Number of evaporated ions."""
+    radii: Floats
+    """Radius [nm]."""
+    apexes: Floats
+    """z of the apex [nm]."""
+
+
+def _stages(given, name):
+    rows = check_array(given, name, ("n", 7))
+    return tuple(tuple(row) for row in rows.tolist())
+
+
+@settings
+class RunLens:
+    """Lens in front of the specimen of a run.
+
+    A simulated specimen stands in free space and has a short shank. Its ions leave at the angle theta on the cap and
+    fly at the angle theta_free. In the instrument they leave at the same theta and fly at theta'. Both functions follow
+    from boundary elements, so that theta'(theta_free) needs no new flights. Azimuths do not change. The place of an ion
+    on the crystal, the energy that it needs there, and its field are those of the run.
+
+    Notes
+    -----
+    The radius of the cap and the length of the shank change during a run. The free specimen is solved at several
+    stages; between them the results are interpolated.
+
+    Examples
+    --------
+    >>> run = ae.Simulation(ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1)), seed=1).run(100)
+    >>> real = run.at_evaporation_field(ae.microscope.LocalElectrode.preset("local electrode"))
+    >>> real.lens.radii([0, 99]).round(1)  # nm
+    array([1.7, 1.7])
+    """
+
+    lens: LocalElectrode = part("The lens of the instrument.", LocalElectrode)
+    stages: tuple[tuple[float, ...], ...] = checked(
+        "Of each stage the number of ions, the radius of the cap [nm], the largest angle on it that passes the "
+        "electrode [degrees], and of the free specimen the field factor and the coefficients of `LensProjection`.",
+        "sequence of rows",
+        _stages,
+    )
+
+    @classmethod
+    def of(cls, lens: LocalElectrode, tip: Mapping[str, Any], course: Course) -> "RunLens":
+        """Put a lens in front of the specimen of a run.
+
+        Parameters
+        ----------
+        lens : LocalElectrode
+            The lens.
+        tip : mapping
+            Settings of the tip of the run.
+        course : Course
+            The cap during the run.
+
+        Raises
+        ------
+        ValueError
+            If the specimen is not a cap on a shank, or its cap is not known.
+        """
+        if tip.get("apex_radius") is None:
+            raise ValueError("lens needs the shape of the free specimen, which a tip made from positions does not have")
+        known = np.isfinite(course.radii)
+        if not known.any():
+            raise ValueError("lens needs the radius of the cap, which this run does not contain: too few surface atoms")
+        ions, radii, apexes = (np.asarray(each, float)[known] for each in course)
+        change = max(float(np.log(radii.max() / radii.min())), float(np.ptp(apexes) / radii.min()))
+        count = max(1, min(1 + math.ceil(change / _STEP), _MOST_STAGES, len(ions) // 2))
+        at = np.linspace(ions[0], ions[-1], count)
+        rows = [
+            (ion, radius, lens.widest_angle(radius), *_free(tip, radius, apex))
+            for ion, radius, apex in zip(at, _smooth(at, ions, radii), _smooth(at, ions, apexes), strict=True)
+        ]
+        return cls(lens, tuple(tuple(float(f"{value:.{_DIGITS}g}") for value in row) for row in rows))
+
+    def radii(self, ions: ArrayLike) -> Floats:
+        """Radius of the cap when these ions leave [nm], shape (n,)."""
+        return self._at(ions, slice(1, 2))[:, 0]
+
+    def voltages(self, model: Floats, ions: ArrayLike, field: float) -> Floats:
+        """Voltages of the instrument.
+
+        Parameters
+        ----------
+        model : ndarray
+            Voltages of the simulated specimen [V], shape (n,).
+        ions : array_like
+            Numbers of the ions, shape (n,).
+        field : float
+            Operating field [V/nm].
+
+        Returns
+        -------
+        ndarray
+            V = k_f(R) F R [V], shape (n,), in the mean over the ions. Their fluctuations are those of the model, after
+            division by the field factor of the free specimen, which is solved for each stage.
+        """
+        radii, factors = self._at(ions, slice(1, 2))[:, 0], self._at(ions, slice(3, 4))[:, 0]
+        own = model / factors
+        return field * self.lens.field_factor(radii) * own / np.mean(own / radii) if len(own) else own
+
+    def seen(
+        self,
+        directions: Floats,
+        ions: ArrayLike,
+        masses: Floats,
+        charges: ArrayLike,
+        voltages: Floats,
+        flight_length: float,
+    ) -> tuple[Floats, Floats]:
+        """Directions and times of flights in the instrument.
+
+        Parameters
+        ----------
+        directions : ndarray
+            Stereographic directions of the flights of the free specimen, shape (n, 2); NaN for ions that never left.
+        ions : array_like
+            Numbers of the ions, shape (n,).
+        masses, charges, voltages : array_like
+            Of each ion in flight [Da], [e], and between specimen and electrode [V], shape (n,).
+        flight_length : float
+            Distance of the plane of the detector [mm].
+
+        Returns
+        -------
+        directions : ndarray
+            Stereographic directions of the hits on the plane, seen from the apex, shape (n, 2). Ions that the
+            electrode stops, or the detector turns back, point away from it.
+        times : ndarray
+            Times of flight to the plane [ns], shape (n,); NaN for these ions.
+        """
+        lengths = np.hypot(*directions.T)
+        free = np.degrees(2 * np.arctan(lengths))
+        stage = self._at(ions, slice(1, 7))
+        ahead = free < _BESIDE
+        angles = LensProjection(stage[:, 3:]).cap_angles(np.where(ahead, free, 0.0))
+        angles = np.where(ahead & (angles <= stage[:, 1]), angles, np.nan)
+        passes = np.isfinite(angles)
+        angles, radii = np.where(passes, angles, 0.0), stage[:, 0]
+        distances = self.lens.distance_from_axis(angles, radii, voltages, flight_length)
+        passes &= np.isfinite(distances)
+        times = self.lens.flight_time(masses, charges, voltages, flight_length, radii, angles)
+        seen = np.where(passes, np.tan(np.arctan(distances / flight_length) / 2), _AWAY)
+        stretch = np.divide(seen, lengths, out=np.zeros_like(seen), where=lengths > 0)
+        stretch[np.isnan(lengths)] = np.nan
+        return directions * stretch[:, None], np.where(passes, times, np.nan)
+
+    @cached_property
+    def _table(self):
+        return np.array(self.stages)
+
+    def _at(self, ions, columns):
+        """Columns of the stages, interpolated for each ion, shape (n, columns)."""
+        at, rows = self._table[:, 0], self._table[:, columns]
+        if len(rows) == 1:
+            return np.broadcast_to(rows, (len(np.asarray(ions)), rows.shape[1]))
+        place = np.interp(ions, at, np.arange(len(at)))
+        first = np.minimum(place.astype(np.int64), len(at) - 2)
+        share = (place - first)[:, None]
+        return rows[first] * (1 - share) + rows[first + 1] * share
+
+
+def _smooth(at, ions, values):
+    """Values of the piecewise linear function, with its knots at `at`, that fits values at these ions best."""
+    if len(at) == 1:
+        return [float(values.mean())]
+    knots = np.concatenate([at[:1], at, at[-1:]])
+    return scipy.interpolate.make_lsq_spline(ions, values, knots, k=1)(at)
+
+
+def _free(tip, radius, apex):
+    """Field factor and coefficients of the projection of the simulated specimen at one stage."""
+    angle = math.radians(tip["shank_angle"])
+    foot = tip["apex_radius"] + tip["shank_length"] * math.sin(angle)
+    # the centre of the initial cap is the origin
+    centre = max(apex - radius + tip["shank_length"], _SHORTEST * radius)
+    flank = simulated_flank(radius, angle, centre, foot, tip["base"] == "rounded")
+    free = Lens(radius, flank, _FAR, _FAR, _FAR_ANGLE)
+    return free.field_factor, *free.coefficients[:3]
