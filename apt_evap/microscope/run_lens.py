@@ -109,6 +109,11 @@ class RunLens:
         """Radius of the cap when these ions leave [nm], shape (n,)."""
         return self._at(ions, slice(1, 2))[:, 0]
 
+    def rim(self, voltage: float, flight_length: float) -> float:
+        """Radius of the image that the electrode leaves [mm], on a plane at this flight length [mm]; the least one."""
+        angles, radii = self._table[:, 2], self._table[:, 1]
+        return float(np.nanmin(self.lens.distance_from_axis(angles, radii, voltage, flight_length)))
+
     def voltages(self, model: Floats, ions: ArrayLike, field: float) -> Floats:
         """Voltages of the instrument.
 

@@ -24,7 +24,7 @@ def run_constants(run: Run, evaporation_field: float | None = None) -> dict[str,
     -------
     dict
         * ``distance``: that of the detector [mm];
-        * ``detector_radius``: of the circle inside the square detector [mm];
+        * ``detector_radius``: of the circle inside the square detector, or of the image of the lens [mm];
         * ``atomic_volume`` [nm^3] and ``evaporation_field``: of the first species. Without the former for a specimen
           from positions, whose volume is not known;
         * ``field_factor``: the median of V / (F R) over all ions, with the spheres of `fit_caps` for R; with too few
@@ -65,6 +65,8 @@ def run_constants(run: Run, evaporation_field: float | None = None) -> dict[str,
         for name in ("field_factor", "compression", "projection"):
             constants.pop(name, None)
         constants["lens"] = run.lens.lens
+        rim = run.lens.rim(float(np.min(run.instrument_voltages)), run.detector.distance)
+        constants["detector_radius"] = min(constants["detector_radius"], rim)
     return constants
 
 
