@@ -15,6 +15,7 @@ from apt_evap._common.validation import check_array
 from apt_evap.microscope.conductors import simulated_flank
 from apt_evap.microscope.lens import Lens
 from apt_evap.microscope.local_electrode import LensProjection, LocalElectrode
+from apt_evap.units import FLIGHT_TIME, NM_PER_MM
 
 _FAR = 1e9  # distance and aperture of an electrode that a specimen does not feel: 1 m [nm]
 _FAR_ANGLE = math.radians(75)
@@ -23,6 +24,7 @@ _STEP = 0.05  # relative change of the radius, or of the length in radii, from s
 _MOST_STAGES = 16
 _SHORTEST = 0.05  # of the radius: a shank that is used up
 _AWAY = 2.0  # length of a stereographic direction that misses every detector
+_COLUMNS = 10  # of a stage
 _DIGITS = 10  # of what is stored: the last digits of a solution depend on the library of linear algebra
 
 
@@ -38,7 +40,7 @@ class Course(NamedTuple):
 
 
 def _stages(given, name):
-    rows = check_array(given, name, ("n", 7))
+    rows = check_array(given, name, ("n", _COLUMNS))
     return tuple(tuple(row) for row in rows.tolist())
 
 
@@ -67,7 +69,7 @@ class RunLens:
     lens: LocalElectrode = part("The lens of the instrument.", LocalElectrode)
     stages: tuple[tuple[float, ...], ...] = checked(
         "Of each stage the number of ions, the radius of the cap [nm], the largest angle on it that passes the "
-        "electrode [degrees], and of the free specimen the field factor and the coefficients of `LensProjection`.",
+        "electrode [degrees], and of the free specimen the field factor and the coefficients of `Lens`.",
         "sequence of rows",
         _stages,
     )
@@ -139,22 +141,28 @@ class RunLens:
     def seen(
         self,
         directions: Floats,
+        times: Floats,
         ions: ArrayLike,
         masses: Floats,
         charges: ArrayLike,
+        model: Floats,
         voltages: Floats,
         flight_length: float,
     ) -> tuple[Floats, Floats]:
-        """Directions and times of flights in the instrument.
+        r"""Directions and times of flights in the instrument.
 
         Parameters
         ----------
         directions : ndarray
             Stereographic directions of the flights of the free specimen, shape (n, 2); NaN for ions that never left.
+        times : ndarray
+            Times of these flights to a plane at the flight length, at the voltages `model` [ns], shape (n,).
         ions : array_like
             Numbers of the ions, shape (n,).
-        masses, charges, voltages : array_like
-            Of each ion in flight [Da], [e], and between specimen and electrode [V], shape (n,).
+        masses, charges : array_like
+            Of each ion in flight [Da], [e], shape (n,).
+        model, voltages : ndarray
+            Voltage of the free specimen, and voltage between specimen and electrode in the instrument [V], shape (n,).
         flight_length : float
             Distance of the plane of the detector [mm].
 
@@ -165,18 +173,34 @@ class RunLens:
             electrode stops, or the detector turns back, point away from it.
         times : ndarray
             Times of flight to the plane [ns], shape (n,); NaN for these ions.
+
+        Notes
+        -----
+        An ion starts at its atom, some volts below the potential of the smooth cap, perhaps with an energy of its own.
+        Both change its time by a share that is the larger, the smaller the voltage is. With the times of smooth
+        conductors :math:`t_\mathrm{free}` and :math:`t_\mathrm{lens}`,
+
+        .. math::
+
+           t = t_\mathrm{lens} \left( 1 + \frac{V_\mathrm{model}}{V}
+               \Big( \frac{t_\mathrm{simulated}}{t_\mathrm{free}} - 1 \Big) \right) .
         """
         lengths = np.hypot(*directions.T)
         free = np.degrees(2 * np.arctan(lengths))
-        stage = self._at(ions, slice(1, 7))
+        stage = self._at(ions, slice(1, _COLUMNS))
         ahead = free < _BESIDE
-        angles = LensProjection(stage[:, 3:]).cap_angles(np.where(ahead, free, 0.0))
+        angles = LensProjection(stage[:, 3:6]).cap_angles(np.where(ahead, free, 0.0))
         angles = np.where(ahead & (angles <= stage[:, 1]), angles, np.nan)
         passes = np.isfinite(angles)
         angles, radii = np.where(passes, angles, 0.0), stage[:, 0]
         distances = self.lens.distance_from_axis(angles, radii, voltages, flight_length)
         passes &= np.isfinite(distances)
-        times = self.lens.flight_time(masses, charges, voltages, flight_length, radii, angles)
+        square = np.radians(angles) ** 2
+        delays = stage[:, 6] + square * (stage[:, 7] + square * stage[:, 8])
+        path = flight_length * NM_PER_MM / np.cos(np.radians(np.where(passes, free, 0.0))) + delays
+        smooth = FLIGHT_TIME * np.sqrt(masses / (charges * model)) * path / math.sqrt(2)
+        excess = np.where(passes, times / smooth - 1, 0.0) * model / voltages
+        times = self.lens.flight_time(masses, charges, voltages, flight_length, radii, angles) * (1 + excess)
         seen = np.where(passes, np.tan(np.arctan(distances / flight_length) / 2), _AWAY)
         stretch = np.divide(seen, lengths, out=np.zeros_like(seen), where=lengths > 0)
         stretch[np.isnan(lengths)] = np.nan
@@ -213,4 +237,4 @@ def _free(tip, radius, apex):
     centre = max(apex - radius + tip["shank_length"], _SHORTEST * radius)
     flank = simulated_flank(radius, angle, centre, foot, tip["base"] == "rounded")
     free = Lens(radius, flank, _FAR, _FAR, _FAR_ANGLE)
-    return free.field_factor, *free.coefficients[:3]
+    return free.field_factor, *free.coefficients

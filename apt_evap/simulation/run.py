@@ -348,17 +348,18 @@ class Run:
 
     def _seen(self, directions, times):
         """Directions and times in the instrument, of those of the simulated flights."""
-        if self.lens is not None:
-            masses = self.emissions.masses if self.real is None else self.real.masses
-            voltages = np.full(len(self), self.voltage) if self.real is None else self.real.instrument_voltages
-            return self.lens.seen(
-                directions, self.emissions.ions, masses, self.flight_charges, voltages, self.detector.distance
-            )
-        if self.real is not None:
-            # t is proportional to sqrt(m / (n V)) on the same path; the last V is that of the instrument
-            voltages = self.real.voltages / self.real.instrument_voltages
-            times = times * np.sqrt(self.energy_scales * voltages * (self.real.masses / self.emissions.masses))
-        return directions, times
+        ions, masses, model, voltages = self.emissions.ions, self.emissions.masses, self.voltages, self.voltages
+        if self.real is None:
+            # of the flights, also if a control had another one for the events
+            model = voltages = np.full(len(self), self.voltage)
+        else:
+            # t is proportional to sqrt(m / (n V)) on the same path
+            masses, voltages = self.real.masses, self.real.instrument_voltages
+            times = times * np.sqrt(self.energy_scales * (masses / self.emissions.masses))
+        if self.lens is None:
+            return directions, times * np.sqrt(model / voltages)
+        charges, distance = self.flight_charges, self.detector.distance
+        return self.lens.seen(directions, times, ions, masses, charges, model, voltages, distance)
 
     def _hits(self, directions, times, perturbation):
         emissions, columns, units = self.emissions, {}, {"charge": "e", "field": "V/nm"}
