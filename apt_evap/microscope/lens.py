@@ -127,7 +127,9 @@ class Lens:
             field[near] = -(at + share * (2 * square + share * 3 * cube)) / length
         return potential, field
 
-    def fly(self, angles: Floats, lateral: Floats | float = 0.0, *, to_electrode: bool = False) -> Flights:
+    def fly(
+        self, angles: Floats, lateral: Floats | float = 0.0, *, height: float = 0.0, to_electrode: bool = False
+    ) -> Flights:
         """Flights of ions from the cap.
 
         Parameters
@@ -136,6 +138,8 @@ class Lens:
             Angles of the launch on the cap from the axis [rad], shape (n,).
         lateral : ndarray or float
             Kinetic energy along the surface at launch, in units of n e V, away from the axis.
+        height : float
+            Height above the cap at which the ions start [nm].
         to_electrode : bool
             Whether the flights end before the electrode.
 
@@ -146,21 +150,23 @@ class Lens:
         Notes
         -----
         The equation of motion in the logarithm of the time, by `scipy.integrate.solve_ivp` (DOP853). The first 4 % of
-        the radius are a series in the distance s from the surface: an ion at rest is displaced along the surface by
-        s^2 F' / (6 R F), and its path has the inclination s F' / (3 R F), with F' = dF / dtheta.
+        the radius are a series in the distance s from the surface. The field along it is s F' / R, with F' = dF /
+        dtheta. An ion that starts at rest at the height h is displaced along it by (h (s - h) + (s - h)^2 / 6) F' / (R
+        F), and its path has the inclination (s + 2 h) F' / (3 R F).
         """
-        radius, start, count = self.radius, self._start, len(angles)
+        radius, start, count = self.radius, max(self._start, 2 * height), len(angles)
         field = self._cap_field(angles**2)
         bend = 2 * angles * self._cap_field.deriv()(angles**2) / field / radius
-        time = np.sqrt(2 * start / field) * (1 + start / (6 * radius))
+        way = start - height
+        time = np.sqrt(2 * way / field) * (1 + way / (6 * radius))
         speed = np.sqrt(2 * lateral) * np.ones(count)
         far = radius + start
-        place = angles + bend * start**2 / 6 / far + speed * time / radius * (1 - start / (1.5 * radius))
+        place = angles + bend * (height * way + way**2 / 6) / far + speed * time / radius * (1 - start / (1.5 * radius))
         rho, z = far * np.sin(place), far * np.cos(place) - radius
         turning = speed * radius / far  # the angular momentum of the launch is conserved
-        energy = 1 - self._charged.fields(np.abs(rho), z)[0] + lateral
+        energy = 1 - height * field * (1 - height / radius) - self._charged.fields(np.abs(rho), z)[0] + lateral
         outwards = np.sqrt(2 * energy - turning**2)
-        turning = turning + outwards * bend * start / 3
+        turning = turning + outwards * bend * (start + 2 * height) / 3
         outwards = np.sqrt(2 * energy - turning**2)
         velocity = outwards * np.array([np.sin(place), np.cos(place)]) + turning * np.array(
             [np.cos(place), -np.sin(place)]

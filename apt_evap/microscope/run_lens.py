@@ -24,7 +24,9 @@ _STEP = 0.05  # relative change of the radius, or of the length in radii, from s
 _MOST_STAGES = 16
 _SHORTEST = 0.05  # of the radius: a shank that is used up
 _AWAY = 2.0  # length of a stereographic direction that misses every detector
-_COLUMNS = 10  # of a stage
+_HEIGHT = 0.6  # nearest neighbour distances at which an ion starts, see `RunLens`
+_PROBE = np.radians([20.0])  # the share by which the height changes an angle depends on it by 2 % of itself
+_COLUMNS = 11  # of a stage
 _DIGITS = 10  # of what is stored: the last digits of a solution depend on the library of linear algebra
 
 
@@ -58,6 +60,11 @@ class RunLens:
     The radius of the cap and the length of the shank change during a run. The free specimen is solved at several
     stages; between them the results are interpolated.
 
+    An ion starts at its atom, at a potential some volts below that of the smooth cap, as if at rest above it. This
+    matters for the small radii of simulations: a height h changes theta_free by the share 0.12 h/R and theta' by 0.40
+    h/R (shank of 5 degrees). h is 0.6 nearest neighbour distances, 0.15 nm for nickel, from flights through atoms and
+    boundary elements (``articles/microscope``).
+
     Examples
     --------
     >>> run = ae.Simulation(ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1)), seed=1).run(100)
@@ -69,13 +76,14 @@ class RunLens:
     lens: LocalElectrode = part("The lens of the instrument.", LocalElectrode)
     stages: tuple[tuple[float, ...], ...] = checked(
         "Of each stage the number of ions, the radius of the cap [nm], the largest angle on it that passes the "
-        "electrode [degrees], and of the free specimen the field factor and the coefficients of `Lens`.",
+        "electrode [degrees], the factor of the angles for the height of the start, and of the free specimen the "
+        "field factor and the coefficients of `Lens`.",
         "sequence of rows",
         _stages,
     )
 
     @classmethod
-    def of(cls, lens: LocalElectrode, tip: Mapping[str, Any], course: Course) -> "RunLens":
+    def of(cls, lens: LocalElectrode, tip: Mapping[str, Any], course: Course, distance: float = 0.0) -> "RunLens":
         """Put a lens in front of the specimen of a run.
 
         Parameters
@@ -86,6 +94,8 @@ class RunLens:
             Settings of the tip of the run.
         course : Course
             The cap during the run.
+        distance : float
+            Nearest neighbour distance of the crystal [nm]; 0 for ions that start on the smooth cap.
 
         Raises
         ------
@@ -102,7 +112,7 @@ class RunLens:
         count = max(1, min(1 + math.ceil(change / _STEP), _MOST_STAGES, len(ions) // 2))
         at = np.linspace(ions[0], ions[-1], count)
         rows = [
-            (ion, radius, lens.widest_angle(radius), *_free(tip, radius, apex))
+            (ion, radius, *_behind(lens, radius, _HEIGHT * distance), *_free(tip, radius, apex, _HEIGHT * distance))
             for ion, radius, apex in zip(at, _smooth(at, ions, radii), _smooth(at, ions, apexes), strict=True)
         ]
         return cls(lens, tuple(tuple(float(f"{value:.{_DIGITS}g}") for value in row) for row in rows))
@@ -134,7 +144,7 @@ class RunLens:
             V = k_f(R) F R [V], shape (n,), in the mean over the ions. Their fluctuations are those of the model, after
             division by the field factor of the free specimen, which is solved for each stage.
         """
-        radii, factors = self._at(ions, slice(1, 2))[:, 0], self._at(ions, slice(3, 4))[:, 0]
+        radii, factors = self._at(ions, slice(1, 2))[:, 0], self._at(ions, slice(4, 5))[:, 0]
         own = model / factors
         return field * self.lens.field_factor(radii) * own / np.mean(own / radii) if len(own) else own
 
@@ -189,14 +199,14 @@ class RunLens:
         free = np.degrees(2 * np.arctan(lengths))
         stage = self._at(ions, slice(1, _COLUMNS))
         ahead = free < _BESIDE
-        angles = LensProjection(stage[:, 3:6]).cap_angles(np.where(ahead, free, 0.0))
+        angles = LensProjection(stage[:, 4:7]).cap_angles(np.where(ahead, free, 0.0))
         angles = np.where(ahead & (angles <= stage[:, 1]), angles, np.nan)
         passes = np.isfinite(angles)
         angles, radii = np.where(passes, angles, 0.0), stage[:, 0]
-        distances = self.lens.distance_from_axis(angles, radii, voltages, flight_length)
+        distances = stage[:, 2] * self.lens.distance_from_axis(angles, radii, voltages, flight_length)
         passes &= np.isfinite(distances)
         square = np.radians(angles) ** 2
-        delays = stage[:, 6] + square * (stage[:, 7] + square * stage[:, 8])
+        delays = stage[:, 7] + square * (stage[:, 8] + square * stage[:, 9])
         path = flight_length * NM_PER_MM / np.cos(np.radians(np.where(passes, free, 0.0))) + delays
         smooth = FLIGHT_TIME * np.sqrt(masses / (charges * model)) * path / math.sqrt(2)
         excess = np.where(passes, times / smooth - 1, 0.0) * model / voltages
@@ -229,7 +239,19 @@ def _smooth(at, ions, values):
     return scipy.interpolate.make_lsq_spline(ions, values, knots, k=1)(at)
 
 
-def _free(tip, radius, apex):
+def _behind(lens, radius, height):
+    """Largest angle that passes the electrode, and factor of the angles for this height of the start."""
+    return lens.widest_angle(radius), _raised(lens.lens(radius), height)
+
+
+def _raised(lens, height):
+    """Angle of a flight from this height over that of a flight from the cap."""
+    if height == 0:
+        return 1.0
+    return float((lens.fly(_PROBE, height=height).angles / lens.fly(_PROBE).angles)[0])
+
+
+def _free(tip, radius, apex, height):
     """Field factor and coefficients of the projection of the simulated specimen at one stage."""
     angle = math.radians(tip["shank_angle"])
     foot = tip["apex_radius"] + tip["shank_length"] * math.sin(angle)
@@ -237,4 +259,5 @@ def _free(tip, radius, apex):
     centre = max(apex - radius + tip["shank_length"], _SHORTEST * radius)
     flank = simulated_flank(radius, angle, centre, foot, tip["base"] == "rounded")
     free = Lens(radius, flank, _FAR, _FAR, _FAR_ANGLE)
-    return free.field_factor, *free.coefficients
+    projection, delays = np.split(free.coefficients, 2)
+    return free.field_factor, *(projection * _raised(free, height)), *delays

@@ -4,6 +4,7 @@ from ._figure import new_figure as new_figure
 from .charges import charge_states as charge_states
 from .histories import history as history
 from .histories import voltage_curve as voltage_curve
+from .losses import conditions as conditions
 from .maps import color_limits as color_limits
 from .maps import common_limits as common_limits
 from .maps import describe as describe

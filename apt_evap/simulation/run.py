@@ -470,7 +470,7 @@ class Run:
             return self
         check_kind(lens, "lens", LocalElectrode, "a LocalElectrode")
         course = Course(self.cap.ions, self.cap.radii, self.cap.apexes)
-        imaged = RunLens.of(lens, self.settings["tip"], course)
+        imaged = RunLens.of(lens, self.settings["tip"], course, self.emissions.nearest_neighbour_distance)
         return replace(self, settings=self.settings | {"microscope": to_plain(imaged)})
 
     def simulated(self) -> "Run":

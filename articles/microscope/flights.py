@@ -179,8 +179,8 @@ def main():
     own = np.searchsorted(kept, leaving)
     scale = np.median(atoms.charges[own] / free_atoms.charges[leaving])  # of charges per volt
     spread = np.std(atoms.charges[own] / free_atoms.charges[leaving] / scale)
-    behind = RunLens.of(lens, emitter.tip.settings, course_of(cap))
-    expected = free_factor * lens.field_factor(cap.radius) / behind.stages[0][3]
+    behind = RunLens.of(lens, emitter.tip.settings, course_of(cap), emitter.tip.nearest_neighbour_distance)
+    expected = free_factor * lens.field_factor(cap.radius) / behind.stages[0][4]
     print(f"charges per volt within {spread:.2%}: k_f {free_factor / scale:.3f}, by the lens {expected:.3f}")
 
     def both(at):
