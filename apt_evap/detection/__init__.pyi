@@ -6,5 +6,6 @@ from .instrument import Detection as Detection
 from .instrument import Recording as Recording
 from .mass_ranges import Ranges as Ranges
 from .projection import Projection as Projection
+from .timing import Cooling as Cooling
 from .timing import Timing as Timing
 from .timing import mass_to_charge as mass_to_charge

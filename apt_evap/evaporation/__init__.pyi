@@ -4,8 +4,8 @@ from .bonds import BondField as BondField
 from .bonds import CoordinationTable as CoordinationTable
 from .bonds import PairEnergies as PairEnergies
 from .cap import Cap as Cap
-from .conditions import Conditions as Conditions
-from .conditions import conditions as conditions
+from .losses import Conditions as Conditions
+from .losses import conditions as conditions
 from .emitter import Batch as Batch
 from .emitter import Emitter as Emitter
 from .law import Law as Law

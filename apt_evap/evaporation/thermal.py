@@ -11,6 +11,7 @@ from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_number, short_text
 from apt_evap._core.elementary import logarithm
 from apt_evap._core.law import BARRIERS, LawKernel, ThermalRate, WeightedField
+from apt_evap.detection.timing import Cooling
 from apt_evap.evaporation.bonds import BondField, bond_table, bonds_field
 from apt_evap.evaporation.voltage import VoltageControl
 from apt_evap.specimen.tip import Tip
@@ -197,6 +198,31 @@ class Arrhenius:
             seconds = (length or 1.0) / control.rate
             barrier = max(float(logarithm(self.attempt_frequency * seconds * CANDIDATES)), 1.0)
         return barrier, length
+
+    def cooling(self, tip: Tip, control: VoltageControl | None = None) -> Cooling:
+        """Cooling after the laser pulses, for the tails of mass peaks: ``Timing(cooling=law.cooling(tip))``.
+
+        Parameters
+        ----------
+        tip : Tip
+            The specimen, whose first species gives the barrier.
+        control : VoltageControl, optional
+            Rate; by default that of the law.
+
+        Returns
+        -------
+        Cooling
+            That of the hottest side.
+
+        Raises
+        ------
+        ValueError
+            If the law has no laser.
+        """
+        if self.laser is None:
+            raise ValueError(f"law must have a laser for its cooling, got {self}")
+        barrier, _ = self.working_point(float(self.sensitivities(tip)[0]), control or self.default_control())
+        return Cooling(self.temperature, self.laser.temperature_rise, self.laser.decay, barrier)
 
     def kernel(self, tip: Tip, control: VoltageControl | None = None) -> LawKernel:
         """Return the compiled law for a specimen."""

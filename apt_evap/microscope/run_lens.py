@@ -154,7 +154,7 @@ class RunLens:
         times: Floats,
         ions: ArrayLike,
         masses: Floats,
-        charges: ArrayLike,
+        charges: Integers,
         model: Floats,
         voltages: Floats,
         flight_length: float,

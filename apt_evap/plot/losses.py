@@ -8,7 +8,7 @@ from matplotlib.colors import LogNorm, TwoSlopeNorm
 from numpy.typing import NDArray
 
 from apt_evap._common.validation import check_choice, check_kind
-from apt_evap.evaporation.conditions import Conditions
+from apt_evap.evaporation.losses import Conditions
 from apt_evap.plot._figure import new_figure
 
 _LEVELS = (1e-4, 1e-3, 1e-2, 1e-1)  # of the lost share

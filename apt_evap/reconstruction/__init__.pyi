@@ -2,6 +2,8 @@
 from .calibration import DistributionMap as DistributionMap
 from .calibration import compression_from_poles as compression_from_poles
 from .calibration import distribution_map as distribution_map
+from .consistency import Check as Check
+from .consistency import checks as checks
 from .constants import run_constants as run_constants
 from .density import CapDensity as CapDensity
 from .errors import ErrorBins as ErrorBins
@@ -18,3 +20,5 @@ from .origins import origin_table as origin_table
 from .precipitate import PrecipitateErrors as PrecipitateErrors
 from .precipitate import SemiAxes as SemiAxes
 from .precipitate import precipitate_errors as precipitate_errors
+from .shank import ShankFit as ShankFit
+from .shank import fit_shank as fit_shank

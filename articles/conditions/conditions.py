@@ -16,7 +16,7 @@ import math
 import numpy as np
 
 import apt_evap as ae
-from apt_evap.evaporation.conditions import between_pulses, conditions
+from apt_evap.evaporation.losses import between_pulses, conditions
 from apt_evap.units import BOLTZMANN
 
 ELEMENTS, SOLUTE = ("Al", "Cu"), 0.1

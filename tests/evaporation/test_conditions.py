@@ -8,7 +8,7 @@ from scipy.integrate import quad
 
 import apt_evap as ae
 from apt_evap.evaporation import conditions
-from apt_evap.evaporation.conditions import between_pulses
+from apt_evap.evaporation.losses import between_pulses
 from apt_evap.units import BOLTZMANN
 
 BARRIERS = {

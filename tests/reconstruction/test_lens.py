@@ -1,6 +1,7 @@
 """Reconstruction with a lens: field factor and image compression that follow the radius of each ion."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -117,3 +118,65 @@ def test_the_place_on_the_detector_and_the_angle_are_inverse(lens):
     distance = lens.distance_from_axis(angles, 40.0, voltages, LENGTH)
     assert lens.cap_angle(distance, 40.0, voltages, LENGTH) == pytest.approx(np.broadcast_to(angles, (2, 4)), abs=1e-9)
     assert np.isnan(lens.cap_angle(1e4, 40.0, 5000.0, LENGTH))
+
+
+# ---- the shank -------------------------------------------------------------------------------------------------------
+
+
+def test_the_shank_angle_follows_from_the_voltages(lens, receding):
+    hits, _, share = receding
+    known = {"atomic_volume": VOLUME * share, "efficiency": EFFICIENCY, "distance": LENGTH, "detector_radius": RIM}
+    start = replace(lens, shank_angle=9.0)
+    fit = ae.reconstruction.fit_shank(hits, start, **known, evaporation_field=FIELD)
+    # 40 sections of a curve without noise; the second order of the radius in the depth is left
+    assert fit.angle == pytest.approx(SHANK, abs=0.05) and fit.error < 0.05
+    assert fit.radii[0] == pytest.approx(20.0, rel=0.03) and fit.radii[-1] == pytest.approx(40.0, rel=0.03)
+    # a wrong field: the voltage alone does not tell
+    other = ae.reconstruction.fit_shank(hits, start, **known, evaporation_field=1.02 * FIELD)
+    assert other.angle - fit.angle == pytest.approx(2 * fit.per_cent["evaporation field"], rel=0.2)
+    assert abs(fit.per_cent["evaporation field"]) > 0.02
+
+
+def test_voltages_without_a_shank_are_refused(lens, receding):
+    hits, _, share = receding
+    known = {"atomic_volume": VOLUME * share, "efficiency": EFFICIENCY, "distance": LENGTH, "detector_radius": RIM}
+    falling = replace(hits, voltage=hits.voltage[::-1].copy())
+    with pytest.raises(ValueError, match="hits"):
+        ae.reconstruction.fit_shank(falling, lens, **known, evaporation_field=FIELD)
+    with pytest.raises(ValueError, match="profile"):
+        profiled = replace(lens, profile=((0.0, 20.0), (100.0, 40.0)))
+        ae.reconstruction.fit_shank(hits, profiled, **known, evaporation_field=FIELD)
+
+
+# ---- checks ----------------------------------------------------------------------------------------------------------
+
+
+def test_checks_find_wrong_constants(nickel):
+    """Lattice planes across the axis and a uniform density, seen through right and wrong constants."""
+    rng, spacing, radius = np.random.default_rng(2), 0.203, 25.0
+    sites = np.column_stack([rng.uniform(-6, 6, (20_000, 2)), spacing * rng.integers(0, 40, 20_000)])
+    below = radius - np.sqrt(radius**2 - (sites[:, :2] ** 2).sum(axis=1))
+    sites = sites[np.argsort(sites[:, 2] - below, kind="stable")]
+    rim = 6.0
+    sites = sites[np.hypot(*sites[:, :2].T) < rim]
+    angles = np.arcsin(np.hypot(*sites[:, :2].T) / radius)
+    azimuth = np.arctan2(sites[:, 1], sites[:, 0])
+    across = LENGTH * np.tan(angles / 1.5)
+    hits = ae.Hits(x=across * np.cos(azimuth), y=across * np.sin(azimuth))
+    volume = math.pi * rim**2 * (np.ptp(sites[:, 2]) + spacing) / len(sites)
+    constants = {
+        "distance": LENGTH,
+        "projection": "compressed",
+        "detector_radius": LENGTH * math.tan(math.asin(rim / radius) / 1.5),
+    }
+    poles = {"111": ((0.0, 0.0), spacing)}
+    right = ae.reconstruct(hits, **constants, atomic_volume=volume, radius=radius)
+    planes, density = ae.reconstruction.checks(right, poles)
+    assert planes.good and planes.found == pytest.approx(spacing, rel=0.03)
+    assert density.good and density.expected == pytest.approx(1 / volume)
+    wrong = ae.reconstruct(hits, **constants, atomic_volume=1.3 * volume, radius=radius)
+    planes, _ = ae.reconstruction.checks(wrong, poles)
+    assert planes.found == pytest.approx(1.3 * spacing, rel=0.03) and not planes.good
+    assert "efficiency" in repr(planes)
+    with pytest.raises(ValueError, match="spacing of 111"):
+        ae.reconstruction.checks(right, {"111": ((0.0, 0.0), 0.0)})

@@ -1,0 +1,141 @@
+"""The angle of the shank from the course of the voltage."""
+
+import math
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy
+
+from apt_evap._common.types import Floats
+from apt_evap._common.validation import check_kind
+from apt_evap.detection.hits import Hits
+from apt_evap.microscope.local_electrode import LocalElectrode
+from apt_evap.reconstruction.reconstruct import Reconstruction, reconstruct
+
+_ANGLES = (0.5, 20.0)  # degrees: limits of the search; blunter ones leave a detector of 40 degrees no image
+_IONS = 20_000  # that are reconstructed: the radius is a mean over many ions
+_SECTIONS = 40  # of the sequence, for the slope and its error
+_PRECISION = 1e-3  # degrees
+_STEP = 0.01  # relative, for the sensitivities
+
+
+class ShankFit(NamedTuple):
+    """Angle of the shank that agrees with the voltages of a measurement; made by `fit_shank`."""
+
+    angle: float
+    """Half the opening angle [degrees]."""
+    error: float
+    """Standard error from the scatter of the radii about a straight shank [degrees]."""
+    depths: Floats
+    """Depth of the apex in each section of the sequence [nm], shape (k,)."""
+    radii: Floats
+    """Radius of the apex in each section [nm], shape (k,)."""
+    per_cent: dict[str, float]
+    """Change of the angle [degrees] if a constant is 1 % larger, by its name: the voltages fix one combination only."""
+
+    def __repr__(self) -> str:
+        changes = ", ".join(f"{change:+.2g} for 1 % more {name}" for name, change in self.per_cent.items())
+        radii = f"R {self.radii[0]:.3g} to {self.radii[-1]:.3g} nm in {np.ptp(self.depths):.3g} nm"
+        return f"<ShankFit: {self.angle:.2f} +- {self.error:.2f} degrees, {radii}; {changes}>"
+
+
+def fit_shank(hits: Hits, lens: LocalElectrode, **constants: Any) -> ShankFit:
+    r"""Fit the angle of the shank to the course of the voltage.
+
+    Parameters
+    ----------
+    hits : Hits
+        Ions with voltages, in the sequence of evaporation.
+    lens : LocalElectrode
+        Lens with the geometry of the microscope; the angle of its shank is replaced. Not with a profile.
+    **constants
+        Arguments of `reconstruct`: atomic_volume, distance, evaporation_field, efficiency, detector_radius, ...
+
+    Returns
+    -------
+    ShankFit
+        Use it as ``dataclasses.replace(lens, shank_angle=fit.angle)``.
+
+    Raises
+    ------
+    ValueError
+        If no angle from 0.5 to 20 degrees agrees with the voltages, for example because they do not rise, or the lens
+        has a profile.
+
+    Notes
+    -----
+    With the angle :math:`\alpha`, the lens gives the radius of each ion from its voltage, and the volume of the ions
+    the depth of the apex. On a shank with this angle
+
+    .. math:: \frac{dR}{dz} = \frac{\sin\alpha}{1 - \sin\alpha} ,
+
+    and the angle is the one for which this holds. A voltage curve alone determines one number. Another evaporation
+    field, efficiency or field of view would change the angle by `ShankFit.per_cent`.
+
+    Examples
+    --------
+    >>> lens = ae.microscope.LocalElectrode(40e3, 20e3, shank_angle=6.0)
+    >>> radii = np.linspace(30.0, 40.0, 2000)  # nm, of a cap that recedes on this shank
+    >>> rng = np.random.default_rng(1)
+    >>> places = rng.uniform(-20, 20, (2, 2000))
+    >>> ions = ae.Hits(x=places[0], y=places[1], voltage=lens.field_factor(radii) * 35.0 * radii)
+    >>> known = {"atomic_volume": 19.3, "distance": 90.0, "detector_radius": 20.0, "evaporation_field": 35.0}
+    >>> round(ae.reconstruction.fit_shank(ions, lens, **known).angle, 1)
+    6.0
+    """
+    check_kind(hits, "hits", Hits, "Hits, such as read(path)")
+    check_kind(lens, "lens", LocalElectrode, "a LocalElectrode")
+    if lens.profile is not None:
+        raise ValueError("lens has a profile, which gives the angle of the shank at every radius")
+    hits = hits[hits.detected]
+    every = max(1, -(-len(hits) // _IONS))
+    thinned = constants | {"efficiency": constants.get("efficiency", 1.0) / every}
+
+    def sections(angle, changed):
+        found = reconstruct(hits[::every], lens=replace(lens, shank_angle=angle), **changed)
+        return _sections(found)
+
+    def excess(angle, changed=thinned):
+        depths, radii = sections(angle, changed)
+        return _slope(depths, radii)[0] - _widening(angle)
+
+    low, high = excess(_ANGLES[0]), excess(_ANGLES[1])
+    if not low > 0 > high:
+        raise ValueError(
+            f"hits must have voltages that agree with a shank of {_ANGLES[0]:g} to {_ANGLES[1]:g} degrees, got radii "
+            f"that change by {low + _widening(_ANGLES[0]):.3g} nm per nm of depth"
+        )
+    angle = float(scipy.optimize.brentq(excess, *_ANGLES, xtol=_PRECISION))
+    depths, radii = sections(angle, thinned)
+    slope = (excess(angle + 0.1) - excess(angle)) / 0.1
+    per_cent = {}
+    names = {"evaporation_field": "evaporation field", "atomic_volume": "volume per detected ion"}
+    for name, text in names.items():
+        changed = thinned | {name: thinned[name] * (1 + _STEP)}
+        per_cent[text] = float(-excess(angle, changed) / slope)
+    farther = replace(lens, distance=lens.distance * (1 + _STEP), shank_angle=angle)
+    found = _slope(*_sections(reconstruct(hits[::every], lens=farther, **thinned)))[0] - _widening(angle)
+    per_cent["distance of the electrode"] = float(-found / slope)
+    return ShankFit(angle, abs(_slope(depths, radii)[1] / slope), depths, radii, per_cent)
+
+
+def _widening(angle):
+    """dR/dz on a shank with this angle [degrees]."""
+    sine = math.sin(math.radians(angle))
+    return sine / (1 - sine)
+
+
+def _sections(reconstruction: Reconstruction) -> tuple[Floats, Floats]:
+    """Mean depth of the apex and mean radius of successive ions, each of shape (k,)."""
+    parts = np.array_split(np.arange(len(reconstruction)), min(_SECTIONS, len(reconstruction)))
+    depths, radii = reconstruction.depths, reconstruction.radii
+    return np.array([depths[part].mean() for part in parts]), np.array([radii[part].mean() for part in parts])
+
+
+def _slope(depths, radii):
+    """Slope of the radii over the depths, and its standard error from the scatter of the sections."""
+    if len(depths) < 3 or np.ptp(depths) == 0:
+        raise ValueError(f"hits must have at least 3 ions at different depths, got {len(depths)}")
+    fit = scipy.stats.linregress(depths, radii)
+    return float(fit.slope), float(fit.stderr)
