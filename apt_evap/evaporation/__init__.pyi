@@ -4,11 +4,11 @@ from .bonds import BondField as BondField
 from .bonds import CoordinationTable as CoordinationTable
 from .bonds import PairEnergies as PairEnergies
 from .cap import Cap as Cap
-from .losses import Conditions as Conditions
-from .losses import conditions as conditions
 from .emitter import Batch as Batch
 from .emitter import Emitter as Emitter
 from .law import Law as Law
+from .losses import Conditions as Conditions
+from .losses import conditions as conditions
 from .rule import CompiledRule as CompiledRule
 from .rule import Rule as Rule
 from .settings import ChargeSettings as ChargeSettings
