@@ -145,7 +145,7 @@ def false_order(
     >>> run = ae.Simulation(tip, seed=1).run(400, [ae.Unperturbed()], responses=False)
     >>> order = ae.visibility.false_order(run, "Al")
     >>> order.ions, order.solutes
-    (248, 47)
+    (208, 63)
     """
     runs = [runs] if isinstance(runs, Run) else list(check_sequence(runs, "runs", "Run"))
     if not runs:
