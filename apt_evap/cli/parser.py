@@ -477,8 +477,8 @@ def _add_visible(commands: Any) -> None:
         "visible",
         help="would a feature of a specimen be found, and how wrong would it come out?",
         description="Simulate a feature of a specimen, such as a precipitate, emulate many twins of it, and apply an\n"
-        "analysis to them: the probability that it finds the feature, the number of ions that this needs, and bias and\n"
-        "scatter of size and composition. The Python file of the analysis is run.",
+        "analysis to them: the probability that it finds the feature, the number of ions that this needs,\n"
+        "bias and scatter of size and composition. The Python file of the analysis is run.",
         epilog="example: apt-evap visible particle.toml --json",
         **_SHAPE,
     )

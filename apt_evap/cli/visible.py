@@ -20,6 +20,8 @@ def execute(options: argparse.Namespace) -> int:
             tell(options, f"{name}: not between {low:,} and {high:,} recorded ions of the feature")
     for name, error in answer.errors.items():
         unit = "" if name.endswith("composition") else " nm"
-        tell(options, f"{name}: bias {error.bias:+.3f} ± {error.bias_error:.3f}{unit}, scatter {error.scatter:.3f}{unit}")
+        tell(
+            options, f"{name}: bias {error.bias:+.3f} ± {error.bias_error:.3f}{unit}, scatter {error.scatter:.3f}{unit}"
+        )
     tell_json(options, answer.to_dict())
     return 0

@@ -97,7 +97,8 @@ class OriginOperators:
         if efficiency is None:
             efficiency = self.settings["instrument"].get("efficiency", 1.0)
         check_number(efficiency, "efficiency", above=0, at_most=1)
-        feature, arguments = varied(*self._case(), **values)
+        feature, specimen = self._case()
+        feature, arguments = varied(feature, specimen, **values)
         means, covariances, recorded = self._at(feature, arguments, values)
         tip = made(feature, arguments, seed, self.depth)
         radius = arguments["apex_radius"]
@@ -148,11 +149,13 @@ class OriginOperators:
             try:
                 settings = json.loads(file.text("settings"))
                 axes = {name: file.read(f"axes/{name}", np.float64, (None,)) for name in settings.pop("axes")}
-                arrays = [file.read(name, np.float64, None) for name in ("means", "covariances", "recorded")]
+                means, covariances, recorded = (
+                    file.read(name, np.float64, None) for name in ("means", "covariances", "recorded")
+                )
                 elements, depth = tuple(settings.pop("elements")), settings.pop("depth")
             except (KeyError, ValueError) as error:
                 raise FileError(f"{str(path)!r} does not contain origin operators: {error}") from error
-        return cls(axes, elements, *arrays, depth, settings)
+        return cls(axes, elements, means, covariances, recorded, depth, settings)
 
     def _case(self):
         specimen = dict(self.settings["specimen"])
@@ -233,16 +236,15 @@ def origin_operators(
     parts: list[tuple[Floats, ...]] = []
     for number, values in enumerate(nodes):
         variant, chosen = varied(feature, arguments, **values)
-        run = simulated(
-            variant, chosen, perturbation, seed=seed + number, depth=depth, n_threads=n_threads, **settings
-        )
+        run = simulated(variant, chosen, perturbation, seed=seed + number, depth=depth, n_threads=n_threads, **settings)
         ions = recorded_ions(run, replace(instrument, efficiency=1.0), perturbation)
         elements = tuple(names_of(run.elements)[0])
         arrived = _arrived(made(variant, chosen, seed + number, depth), ions, chosen["apex_radius"], depth)
         parts.append((*_moments(variant, ions, len(elements), chosen["apex_radius"]), arrived))
     shape = tuple(len(values) for values in grid.values())
-    tables = [np.reshape(each, shape + each[0].shape) for each in zip(*parts, strict=True)]
-    return OriginOperators(grid, elements, *tables, depth, described(feature, arguments, instrument))
+    means, covariances, recorded = (np.reshape(each, shape + each[0].shape) for each in zip(*parts, strict=True))
+    plain = described(feature, arguments, instrument)
+    return OriginOperators(grid, elements, means, covariances, recorded, depth, plain)
 
 
 def displaced(
@@ -351,4 +353,3 @@ def _arrived(tip, ions, radius, depth):
     fractions = fractions[tuple(nearest)]
     fractions[-1] = fractions[:, -1] = 0.0
     return fractions
-

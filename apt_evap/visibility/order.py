@@ -170,7 +170,7 @@ def false_order(
         for row in shuffled:
             row += _counts(pairs, random.permutation(chosen))
     fraction = solutes / ions
-    by_chance = [_parameter(*row, fraction) for row in shuffled]
+    by_chance = [_parameter(neighbours, like, fraction) for neighbours, like in shuffled]
     reconstructed, true = (_bootstrap(np.concatenate(parts), fraction, random) for parts in found)
     return FalseOrder(
         reconstructed, Estimated(float(np.mean(by_chance)), float(np.std(by_chance, ddof=1))), true, ions, solutes

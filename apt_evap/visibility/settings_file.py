@@ -118,7 +118,7 @@ def estimate_of_file(path: str | Path, *, n_threads: int | None = None) -> Visib
     name = chosen.feature or list(phases)[-1]
     feature = phases.pop(check_choice(name, "feature", tuple(phases)))
     specimen = Tip(**{**config.tip, "phases": tuple(phases.values()), "seed": config.tip.get("seed", 0)})
-    simulation = {
+    simulation: dict[str, Any] = {
         "voltage": config.voltage,
         "law": config.law,
         "rule": config.rule,
