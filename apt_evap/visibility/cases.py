@@ -26,6 +26,7 @@ VARIABLES = {
 }
 """What can be varied in a specimen with a feature."""
 
+_MOST = 0.9  # fraction of the atoms of a very small tip that can evaporate
 _BELOW = 1.2  # nm that evaporate below the feature, so that its last atoms do
 
 
@@ -125,6 +126,7 @@ def simulated(
     tip = made(feature, arguments, seed, depth)
     host = arguments["phases"][0].material
     ions = round(depth * np.pi * radius**2 * atom_density(host.structure, host.a, host.c))
+    ions = min(ions, int(_MOST * np.count_nonzero(tip.evaporable)))
     simulation = Simulation(tip, seed=seed, n_threads=n_threads, **settings)
     # energies are those at the evaporation field: flights with perturbations need the responses of the run
     rest = perturbation is None or perturbation == Unperturbed()

@@ -13,8 +13,8 @@ from apt_evap.config.simulation_file import config_of, read_document
 from apt_evap.detection.instrument import Instrument
 from apt_evap.specimen.phases import Phase
 from apt_evap.specimen.tip import Tip
-from apt_evap.visibility.estimate import Visibility, estimate
 from apt_evap.visibility.operators import OriginOperators, origin_operators
+from apt_evap.visibility.probability import Visibility, estimate
 
 
 def _analysis(value, name):
