@@ -26,7 +26,7 @@ from apt_evap.visibility.recorded import Ions, recorded_ions
 
 _RESAMPLES = 200  # of the bootstrap: 5 % of an error
 _FEWEST = 10  # ions of a feature for its second moments
-_NEAREST = 0.3  # fraction of the twins from which a true size is inferred
+_NEAREST, _LEAST_NEAR = 0.2, 20  # fraction and least number of the twins from which a true size is inferred
 _WEAK = 1e-3  # weight of a slope of 1: keeps it finite if a threshold separates all twins
 _SIZES = ("size", "lateral", "depth", "thickness")
 
@@ -141,8 +141,8 @@ class Visibility:
         Notes
         -----
         All sizes that were drawn are equally probable before the measurement, per relative change. The true sizes of
-        the 30 % of the twins with the nearest measured sizes, moved along a line that is fitted to them, are the
-        distribution (regression adjustment: Beaumont et al., Genetics 162, 2025 (2002)).
+        the fifth of the twins (at least 20) with the nearest measured sizes, moved along a line that is fitted to them,
+        are the distribution: a regression adjustment.
         """
         if self.sized is None:
             raise ValueError("name must be that of a measured size: this answer has no twins with different sizes")
@@ -155,9 +155,15 @@ class Visibility:
         x, y = np.log(seen[usable]), np.log(self.sized.sizes[usable])
         if len(x) < _FEWEST:
             raise ValueError(f"name must be measured in at least {_FEWEST} twins, got {name} in {len(x)}")
-        near = np.argsort(np.abs(x - value))[: max(_FEWEST, round(_NEAREST * len(x)))]
-        slope, _ = np.polyfit(x[near], y[near], 1)
-        low, median, high = np.exp(np.quantile(y[near] + slope * (value - x[near]), [0.16, 0.5, 0.84]))
+        near = np.argsort(np.abs(x - value))[: max(_LEAST_NEAR, round(_NEAREST * len(x)))]
+        # the value is the origin, so that the first constant of the line belongs to it
+        line = np.column_stack([np.ones(len(near)), x[near] - value])
+        inverse = np.linalg.pinv(line)
+        fitted = inverse @ y[near]
+        # deviation of each twin from the line of the others, and quantiles of a further one: both widen the interval
+        apart = (y[near] - line @ fitted) / (1 - np.einsum("ij,ji->i", line, inverse))
+        half = min(0.34 * (len(near) + 1) / (len(near) - 1), 0.5)
+        low, median, high = np.exp(fitted[0] + np.quantile(apart, [0.5 - half, 0.5, 0.5 + half]))
         return TrueSize(float(median), float(low), float(high))
 
     def to_dict(self) -> dict[str, Any]:

@@ -145,7 +145,7 @@ def test_the_emulator_agrees_with_full_simulations(ratio):
     region = ae.specimen.Sphere((0, 0, radius - 1.4), 1.1)
     feature = ae.specimen.Phase("sphere", "Al", region, solutes={"Cu": 0.5}, evaporation_field=ratio * field)
     tip = ae.Tip("Al", apex_radius=radius, axis=(0, 1, 2), shank_length=2 * radius)
-    axes = {"size": [0.9, 1.3], "field_ratio": [ratio - 0.1, ratio + 0.1]}
+    axes = {"size": [0.9, 1.3], "field_ratio": [ratio - 0.05, ratio + 0.05]}
     operators = ae.visibility.origin_operators(feature, tip, EVERYTHING, axes=axes, n_threads=1)
     differences = []
     for number, size in enumerate((1.0, 1.1, 1.2)):
