@@ -124,16 +124,17 @@ def test_intervals_contain_the_true_size_of_hidden_twins(tip, operators):
     instrument = ae.Instrument(field_of_view=160.0, efficiency=0.5)
     answer = ae.visibility.estimate(
         particle(0.7), tip, instrument, lambda positions, labels: 0.0,
-        operators=operators, twins=300, permutations=1, seed=100_000,
+        operators=operators, twins=900, permutations=1, seed=100_000,
     )  # fmt: skip
     random = np.random.default_rng(3)
-    n, hits = 300, 0
+    n, hits = 600, 0
     for k, size in enumerate(np.exp(random.uniform(np.log(0.5), np.log(0.9), n))):
         feature, _ = varied(particle(0.7), specimen_of(tip), size=size)
         seen, _ = apparent_shape(feature, operators.emulate(k, 0.5, size=size), 0)
         low, high = answer.true_size(seen["lateral"])[1:]
         hits += low <= size <= high
-    # 62 to 74 % as demanded of 60; 300 twins give 68 +- 2.7 %
+    # 600 hidden twins give 68 +- 1.9 %, and the 900 that make the intervals +- 2 % more
+    print(hits / n)
     assert 0.62 <= hits / n <= 0.74
 
 
