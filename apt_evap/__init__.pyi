@@ -19,6 +19,7 @@ from . import simulation as simulation
 from . import specimen as specimen
 from . import sweep as sweep
 from . import units as units
+from . import visibility as visibility
 from . import warnings as warnings
 from ._common.files import FileError as FileError
 from .crystallography.orientation import Orientation as Orientation

@@ -36,6 +36,7 @@ _GUIDES = {
     "specimen": "specimens howto/own_structure",
     "sweep": "howto/sweep",
     "units": "conventions",
+    "visibility": "howto/visibility",
 }
 
 

@@ -38,6 +38,7 @@ from a simulation to its map, and to the emission energies of a measured map:
   apt-evap examples --to FOLDER                      settings files and scripts to start from
   apt-evap sweep plan study.toml                     many simulations, on one machine or a cluster
   apt-evap explore ni111.h5 R5083.epos               both maps in the browser, with sliders for the emission
+  apt-evap visible particle.toml                     would this precipitate be found?
   apt-evap COMMAND --help                            all arguments of a command, with examples
 """
 
@@ -72,6 +73,7 @@ def make_parser() -> argparse.ArgumentParser:
         _add_completion,
         _add_sweep,
         _add_explore,
+        _add_visible,
     ):
         add(commands)
     return parser
@@ -468,6 +470,21 @@ def _add_explore(commands: Any) -> None:
 # ---- arguments of several commands -----------------------------------------------------------------------------------
 
 _FILE_HELP = "a run (.h5), measured ions (.epos, ...) or a map (.npz)"
+
+
+def _add_visible(commands: Any) -> None:
+    command = commands.add_parser(
+        "visible",
+        help="would a feature of a specimen be found, and how wrong would it come out?",
+        description="Simulate a feature of a specimen, such as a precipitate, emulate many twins of it, and apply an\n"
+        "analysis to them: the probability that it finds the feature, the number of ions that this needs,\n"
+        "bias and scatter of size and composition. The Python file of the analysis is run.",
+        epilog="example: apt-evap visible particle.toml --json",
+        **_SHAPE,
+    )
+    command.add_argument("config", metavar="FILE.toml", help="settings of a simulation, with a table [visibility]")
+    command.add_argument("--threads", type=_integer(1), metavar="N", help="default: all processors")
+    _add_speech(command)
 
 
 def _add_reading(parser: argparse.ArgumentParser) -> Any:

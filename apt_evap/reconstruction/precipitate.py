@@ -162,8 +162,8 @@ def precipitate_errors(
     kinds = groups_of(reconstruction.hits, truth, species, "species")
     kinds = belongs.astype(np.int64) if kinds is None else kinds
     positions = reconstruction.fitted_positions(truth, fit) if fit else reconstruction.positions
-    apparent, shape = _ellipsoid(positions, belongs)
-    original, true_shape = _ellipsoid(sites, belongs)
+    apparent, shape = ellipsoid_of(positions, belongs)
+    original, true_shape = ellipsoid_of(sites, belongs)
     numbers = np.unique(kinds[belongs | apparent])
     fractions = [np.array([np.mean(kinds[chosen] == number) for number in numbers]) for chosen in (belongs, apparent)]
     return PrecipitateErrors(
@@ -181,7 +181,7 @@ def precipitate_errors(
     )
 
 
-def _ellipsoid(positions: Floats, belongs: Booleans) -> tuple[Booleans, SemiAxes]:
+def ellipsoid_of(positions: Floats, belongs: Booleans) -> tuple[Booleans, SemiAxes]:
     """Ions within the ellipsoid of the second moments of some ions, and its semi-axes."""
     cloud = positions[belongs]
     mean = cloud.mean(axis=0)

@@ -1,0 +1,27 @@
+"""`apt-evap visible`: would a feature of a specimen be found, and how wrong would it come out?"""
+
+import argparse
+import math
+
+from apt_evap.cli._output import tell, tell_json
+from apt_evap.visibility.settings_file import estimate_of_file
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Run the command."""
+    answer = estimate_of_file(options.config, n_threads=options.threads)
+    found = answer.probability
+    tell(options, f"probability to be found: {found.value:.2f} ± {found.error:.2f}")
+    for name, number in (("N50", answer.n50), ("N95", answer.n95)):
+        if math.isfinite(number.value):
+            tell(options, f"{name}: {number.value:.0f} ± {number.error:.0f} recorded ions of the feature")
+        elif answer.sized is not None and len(answer.sized.ions):
+            low, high = answer.sized.ions.min(), answer.sized.ions.max()
+            tell(options, f"{name}: not between {low:,} and {high:,} recorded ions of the feature")
+    for name, error in answer.errors.items():
+        unit = "" if name.endswith("composition") else " nm"
+        tell(
+            options, f"{name}: bias {error.bias:+.3f} ± {error.bias_error:.3f}{unit}, scatter {error.scatter:.3f}{unit}"
+        )
+    tell_json(options, answer.to_dict())
+    return 0
