@@ -270,7 +270,8 @@ class Run:
         -------
         Hits
             One row per ion, in the sequence of evaporation; `outcome` is the outcome of each flight. ``extra`` contains
-            the element of each ion, and its charge and field before evaporation.
+            the element of each ion, its charge and field before evaporation, and the name of its phase if there are
+            several.
 
         Raises
         ------
@@ -352,6 +353,8 @@ class Run:
             extra = {"charge": self.charges * scale, "field": self.fields * scale, "charge_state": self.real.charges}
             units["charge_state"] = "e"
         extra["element"] = np.array(self.elements)[self.species]
+        if len(self.phase_names) > 1:
+            extra["phase_name"] = np.array(self.phase_names)[self.phase]
         return Hits(
             x=x,
             y=y,
