@@ -104,9 +104,9 @@ def describe_atoms(positions: Floats, numbers: NDArray[np.integer], names: Seque
     Returns
     -------
     dict
-        As `describe`. ``atoms_above`` has, for each of the names but the first, the number of all atoms within 45
-        degrees of the axis that are less deep below the sphere of the apex than the first, a tenth and nine tenths of
-        the atoms of this name: about the ions before a particle is reached, entered and passed.
+        As `describe`. ``atoms_above`` has, for each of the names but the first, the number of all atoms that are less
+        deep below the sphere of the apex, along z, than the first, a tenth and nine tenths of the atoms of this name:
+        about the ions before a particle is reached, entered and passed. Not all of them hit the detector.
     """
     low, high = positions.min(axis=0), positions.max(axis=0)
     contents = {

@@ -114,8 +114,7 @@ def apex_sphere(positions: Floats) -> tuple[Floats, float] | None:
 
 
 def depths(positions: Floats, centre: Floats, radius: float) -> Floats:
-    """Depth of atoms below the apex sphere along z [nm], shape (n,); NaN beyond 45 degrees of the axis."""
-    lateral = np.linalg.norm(positions[:, :2] - centre[:2], axis=1)
+    """Depth of atoms below the apex sphere along z [nm], shape (n,); NaN for atoms beside the sphere."""
     with np.errstate(invalid="ignore"):
-        depth = centre[2] + np.sqrt(radius**2 - lateral**2) - positions[:, 2]
-    return np.where(lateral < radius * np.sin(_CAP), depth, np.nan)
+        above = np.sqrt(radius**2 - np.sum((positions[:, :2] - centre[:2]) ** 2, axis=1))
+    return centre[2] + above - positions[:, 2]

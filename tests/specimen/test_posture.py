@@ -56,7 +56,7 @@ def test_the_sphere_of_the_apex_and_depths_below_it(needle):
     centre, radius = apex_sphere(needle + np.array([3.0, -2.0, 7.0]))
     assert radius == pytest.approx(2.5, abs=0.12)  # half a nearest neighbour distance: the surface is of atoms
     assert centre == pytest.approx([3.0, -2.0, 7.0], abs=0.15)
-    places = np.array([[0.0, 0.0, 2.0], [1.0, 0.0, np.sqrt(2.5**2 - 1) - 0.7], [2.4, 0.0, 0.0]])
+    places = np.array([[0.0, 0.0, 2.0], [1.0, 0.0, np.sqrt(2.5**2 - 1) - 0.7], [2.6, 0.0, 0.0]])
     assert depths(places, np.zeros(3), 2.5) == pytest.approx([0.5, 0.7, np.nan], nan_ok=True)
 
 
@@ -81,8 +81,8 @@ def test_info_of_a_specimen(needle, tmp_path, monkeypatch, capsys):
     }
     assert told["height"] == pytest.approx(np.ptp(needle[:, 2]), abs=1e-4) and told["points_along"] == [0, 0, 1]
     assert told["apex_radius"] == pytest.approx(2.5, abs=0.12)
-    # shells below 45 degrees of a sphere of 2.5 nm, at 91.4 atoms / nm^3, before the top and the bottom of the particle
-    area = np.pi * (2.5 * np.sin(np.pi / 4)) ** 2
+    # caps of a sphere of 2.5 nm that moves down, at 91.4 atoms / nm^3, before the top and the bottom of the particle
+    area = np.pi * 2.5**2
     above = told["atoms_above"]["Al"]
     assert above["its_first_atom"] == pytest.approx(91.4 * area * 0.8, rel=0.2)
     assert above["its_first_atom"] < above["a_tenth_of_them"] < above["nine_tenths_of_them"] < 91.4 * area * 2.2
