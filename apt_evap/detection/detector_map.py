@@ -11,6 +11,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
+from apt_evap._common.notebook import as_picture
 from apt_evap._common.optional_imports import optional_import
 from apt_evap._common.types import Booleans, Floats, Integers
 from apt_evap._common.validation import check_array, check_kind, check_number, check_seed, check_switch
@@ -369,6 +370,8 @@ class DetectorMap:
     def _smooth(self, sigma):
         width, height = self.bin_size
         return masked_gaussian(self.values, self.mask, (sigma / height, sigma / width))
+
+    _repr_png_ = as_picture
 
     def __repr__(self) -> str:
         ny, nx = self.values.shape

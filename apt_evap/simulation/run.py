@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from apt_evap._common.codec import changed, to_plain
 from apt_evap._common.files import FileError, check_path
+from apt_evap._common.notebook import as_table
 from apt_evap._common.types import AnyPath, Booleans, Floats, Integers
 from apt_evap._common.validation import (
     check_kind,
@@ -164,6 +165,8 @@ class Run:
             columns += response_columns(self.response_settings)
         there = columns_of(self, columns)
         return [column for column in columns if column.path in there]
+
+    _repr_html_ = as_table
 
     def __repr__(self) -> str:
         flown = ", ".join(_describe(perturbation) for perturbation in self.perturbations)
