@@ -1,15 +1,18 @@
 """Summary of a run, a file of ions or a map, in plain types."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apt_evap._common.codec import to_plain
+from apt_evap._common.types import Floats
 from apt_evap.detection.binning import find_quantisations
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.simulation.run import Run
-from apt_evap.specimen.posture import apex_sphere, depths
+from apt_evap.specimen.posture import apex_sphere, depths, pointing, upright
 from apt_evap.specimen.tip import Tip
 
 UNITS = {
@@ -80,35 +83,60 @@ def describe(data: Run | Hits | DetectorMap | Tip) -> dict[str, Any]:
 
 
 def _of_tip(tip):
-    low, high = tip.positions.min(axis=0), tip.positions.max(axis=0)
     names = [element.name for element in tip.elements]
+    contents = describe_atoms(tip.positions, tip.species, names)
+    if len(tip.phase_names) > 1:
+        contents["atoms_above"] = describe_atoms(tip.positions, tip.phase, tip.phase_names)["atoms_above"]
+    return contents | {"evaporable": int(tip.evaporable.sum())}
+
+
+def describe_atoms(positions: Floats, numbers: NDArray[np.integer], names: Sequence[str]) -> dict[str, Any]:
+    """Summarise the atoms of a specimen.
+
+    Parameters
+    ----------
+    positions : ndarray, shape (n, 3)
+        Places of the atoms [nm].
+    numbers : ndarray of int, shape (n,)
+        Species or phase of each atom.
+    names : sequence of str
+        Names of these; the first one is the matrix.
+
+    Returns
+    -------
+    dict
+        As `describe`. ``atoms_above`` has, for each of the names but the first, the number of all atoms that are less
+        deep below the sphere of the apex, along z, than the first, a tenth and nine tenths of the atoms of this name:
+        about the ions before a particle is reached, entered and passed. Not all of them hit the detector.
+    """
+    low, high = positions.min(axis=0), positions.max(axis=0)
     contents = {
         "kind": "specimen",
-        "atoms": len(tip),
-        "species": _counts(names, tip.species),
-        "evaporable": int(tip.evaporable.sum()),
+        "atoms": len(positions),
+        "species": _counts(names, numbers),
         "extent_x": [_plain(low[0]), _plain(high[0])],
         "extent_y": [_plain(low[1]), _plain(high[1])],
         "extent_z": [_plain(low[2]), _plain(high[2])],
+        "points_along": None,
         "height": _plain(high[2] - low[2]),
         "apex_radius": None,
+        "atoms_above": {},
     }
-    sphere = apex_sphere(tip.positions)
-    if sphere is not None:
-        contents["apex_radius"] = _plain(sphere[1])
-        contents["atoms_above"] = _atoms_above(tip, depths(tip.positions, *sphere), names)
+    if len(positions) < 4 or (sphere := apex_sphere(turned := upright(positions))) is None:
+        return contents
+    contents["points_along"] = [round(float(part), 2) + 0.0 for part in pointing(positions)]
+    contents["height"] = _plain(np.ptp(turned[:, 2]))
+    contents["apex_radius"] = _plain(sphere[1])
+    depth = depths(turned, *sphere)
+    sorted_depths = np.sort(depth[np.isfinite(depth)])
+    for number, name in enumerate(names):
+        own = depth[(numbers == number) & np.isfinite(depth)]
+        if number and len(own):
+            reached = np.searchsorted(sorted_depths, np.quantile(own, [0.0, 0.1, 0.9], method="lower"))
+            contents["atoms_above"][name] = dict(
+                zip(("its_first_atom", "a_tenth_of_them", "nine_tenths_of_them"), reached.tolist(), strict=True)
+            )
     return contents
-
-
-def _atoms_above(tip, depth, names):
-    """Atoms that are less deep than the first one of a minority, by phase or by species, within 45 degrees."""
-    labels, groups = (tip.phase, tip.phase_names) if len(tip.phase_names) > 1 else (tip.species, names)
-    above = {}
-    for number, name in enumerate(groups):
-        own = depth[labels == number]
-        if number and np.isfinite(own).any():
-            above[name] = int(np.count_nonzero(depth < np.nanmin(own)))
-    return above
 
 
 def _of_map(map):

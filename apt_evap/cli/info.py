@@ -2,29 +2,26 @@
 
 import argparse
 import json
+import warnings
+from collections import Counter
 from pathlib import Path
 
-from apt_evap.analysis.description import UNITS, describe
+import numpy as np
+
+from apt_evap._common.files import FileError
+from apt_evap.analysis.description import UNITS, describe, describe_atoms
 from apt_evap.cli._files import read, select, selects
 from apt_evap.cli._output import put
 from apt_evap.detection.detector_map import DetectorMap
-from apt_evap.io.specimens import read_tip, specimen_format
+from apt_evap.io.specimens import read_atoms, specimen_format, tip_of
 from apt_evap.simulation.run import Run
 from apt_evap.simulation.stop_reason import StopReason
-from apt_evap.specimen.tip import Tip
+from apt_evap.warnings import SpecimenWarning
 
 
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
-    content = _specimen(options) or read(options)
-    summary = {"file": options.file}
-    if selects(options) and not isinstance(content, DetectorMap | Tip):
-        ions = content.hits(content.first_perturbation) if isinstance(content, Run) else content
-        summary["selected_of"], content = len(ions), select(ions, options)
-    summary |= describe(content)
-    if isinstance(content, Run) and content.ended == StopReason.UNFINISHED:
-        summary["kind"] = f"unfinished run of {len(content):,} ions"
-        summary["ended"] = "not yet: continue with the same command and --resume"
+    summary = {"file": options.file} | (_specimen(options) or _content(options))
     if options.json:
         put(json.dumps(summary, indent=2, allow_nan=False))
     else:
@@ -32,14 +29,43 @@ def execute(options: argparse.Namespace) -> int:
     return 0
 
 
+def _content(options):
+    """Summary of a run, of ions or of a map."""
+    content, summary = read(options), {}
+    if selects(options) and not isinstance(content, DetectorMap):
+        ions = content.hits(content.first_perturbation) if isinstance(content, Run) else content
+        summary["selected_of"], content = len(ions), select(ions, options)
+    summary |= describe(content)
+    if isinstance(content, Run) and content.ended == StopReason.UNFINISHED:
+        summary["kind"] = f"unfinished run of {len(content):,} ions"
+        summary["ended"] = "not yet: continue with the same command and --resume"
+    return summary
+
+
 def _specimen(options):
-    """The specimen of a file, or None for a file of ions."""
+    """Summary of a file of a specimen, or None for a file of ions."""
     path = Path(options.file)
     if options.format is not None or not path.is_file():
         return None
-    if specimen_format(path) == "ase" and path.suffix.lower() not in _SPECIMENS:
+    kind = specimen_format(path)
+    if kind == "ase" and path.suffix.lower() not in _SPECIMENS:
         return None
-    return read_tip(options.file, dict(options.types or ()))
+    try:
+        atoms, given = read_atoms(path), dict(options.types or ())
+    except ImportError as error:
+        raise FileError(str(error)) from error
+    kinds = [each for each, _ in Counter(atoms.types).most_common()]
+    number = {each: k for k, each in enumerate(kinds)}
+    numbers = np.array([number[each] for each in atoms.types])
+    contents = {"format": kind} | describe_atoms(atoms.positions, numbers, [given.get(each, each) for each in kinds])
+    with warnings.catch_warnings(record=True) as doubts:
+        warnings.simplefilter("always", SpecimenWarning)
+        try:
+            contents["evaporable"] = int(tip_of(path, atoms, given).evaporable.sum())
+            obstacles = []
+        except FileError as error:
+            obstacles = [str(error)]
+    return contents | {"obstacles_to_a_simulation": obstacles + [str(doubt.message) for doubt in doubts]}
 
 
 def _lines(summary, indent=0, of_columns=False):

@@ -202,7 +202,8 @@ def _add_info(commands: Any) -> None:
         help="summarise a file",
         description="Summarise a run (for an unfinished run, give the folder), a file of ions, a map, or a specimen\n"
         "(LAMMPS, TAPSim, ASE).",
-        epilog="example: apt-evap info ni111.h5\n         apt-evap info R5083.epos --json | jq .columns.voltage",
+        epilog="example: apt-evap info ni111.h5\n         apt-evap info R5083.epos --json | jq .columns.voltage\n"
+        "         apt-evap info precipitate.lmp --types 1=Al,2=Cu",
         **_SHAPE,
     )
     command.add_argument("file", metavar="FILE", help=_FILE_HELP)

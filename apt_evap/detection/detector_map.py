@@ -5,16 +5,21 @@ from __future__ import annotations  # help() then shows ArrayLike instead of its
 import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from apt_evap._common.notebook import as_picture
+from apt_evap._common.optional_imports import optional_import
 from apt_evap._common.types import Booleans, Floats, Integers
 from apt_evap._common.validation import check_array, check_kind, check_number, check_seed, check_switch
 from apt_evap.detection.binning import bin_edges, count, field_of_view, find_quantisations
 from apt_evap.warnings import MapWarning
+
+if TYPE_CHECKING:
+    import xarray
 
 _MAX_IONS = 2**53  # integers up to here are exact as float64, the type of sums and densities
 
@@ -281,6 +286,35 @@ class DetectorMap:
         """Centres of the bins in x and in y [mm], shapes (nx,) and (ny,)."""
         return tuple((edges[:-1] + edges[1:]) / 2 for edges in (self.x_edges, self.y_edges))
 
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        """Values of the bins, shape (ny, nx), for functions of NumPy: ``np.asarray(hit_map)``."""
+        return np.array(self.values, dtype) if copy else np.asarray(self.values, dtype)
+
+    def to_xarray(self) -> xarray.DataArray:
+        """Convert to a labelled array of xarray, an optional package.
+
+        Returns
+        -------
+        xarray.DataArray
+            Hits or densities with the dimensions y and x, NaN outside the detector; the coordinates are the centres of
+            the bins [mm].
+
+        Raises
+        ------
+        ImportError
+            If xarray is not installed.
+        """
+        x, y = self.centres
+        kind = "hits" if self.is_counts else "density"
+        known = {"source": self.source, "ions": self.ions, "smoothing": self.smoothing}
+        return optional_import("xarray", "to_xarray").DataArray(
+            np.where(self.mask, self.values, np.nan),
+            {"y": ("y", y, {"units": "mm"}), "x": ("x", x, {"units": "mm"})},
+            ("y", "x"),
+            kind,
+            {name: value for name, value in known.items() if value not in (None, "")},
+        )
+
     def smoothed(self, sigma: float) -> DetectorMap:
         """Smooth the density with a Gaussian inside the detector.
 
@@ -336,6 +370,8 @@ class DetectorMap:
     def _smooth(self, sigma):
         width, height = self.bin_size
         return masked_gaussian(self.values, self.mask, (sigma / height, sigma / width))
+
+    _repr_png_ = as_picture
 
     def __repr__(self) -> str:
         ny, nx = self.values.shape

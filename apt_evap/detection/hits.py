@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from apt_evap._common.notebook import as_table
 from apt_evap._common.types import Booleans, Column
 from apt_evap._common.validation import check_array, check_kind, check_number, check_seed, did_you_mean, short_text
 from apt_evap.detection.binning import find_quantisations
@@ -364,6 +365,8 @@ class Hits:
         columns = {name: getattr(self, name)[selection] for name in self.columns}
         extra = {name: values[selection] for name, values in self.extra.items()}
         return Hits(**columns, extra=extra, units=self.units, source=self.source)
+
+    _repr_html_ = as_table
 
     def __repr__(self) -> str:
         detected = np.count_nonzero(self.detected)

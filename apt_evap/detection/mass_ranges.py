@@ -12,6 +12,8 @@ from apt_evap._common.validation import check_array, check_kind, check_sequence,
 from apt_evap.detection.hits import Hits
 from apt_evap.warnings import DataWarning
 
+_MANY = 1 / 3  # of the ions outside every range; measured: 7 % of an oxide on silicon with its own ranges
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Ranges:
@@ -177,6 +179,11 @@ class Ranges:
         ------
         ValueError
             If a species is unknown.
+
+        Warns
+        -----
+        DataWarning
+            If more than a third of the ions are outside every range.
         """
         known = self.species_names
         for name in names or (None,):
@@ -185,7 +192,16 @@ class Ranges:
                 raise ValueError(
                     f"{self.source or 'these ranges'} have no species {short_text(name)}{hint}, only {', '.join(known)}"
                 )
-        return hits[np.isin(self.species(hits), [known.index(name) for name in names])]
+        species = self.species(hits)
+        outside = int(np.count_nonzero(species < 0))
+        if outside > _MANY * len(hits):
+            warnings.warn(
+                f"{outside:,} of {len(hits):,} ions ({outside / len(hits):.0%}) are outside every range of "
+                f"{self.source or 'these ranges'}: do the ranges belong to these ions?",
+                DataWarning,
+                stacklevel=2,
+            )
+        return hits[np.isin(species, [known.index(name) for name in names])]
 
     def _warn_of_overlap(self):
         order = np.argsort(self.low, kind="stable")

@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -31,8 +32,8 @@ def points_and_data(path: AnyPath, hits: Hits) -> tuple[Booleans | slice, Floats
     positions : ndarray, shape (n, 3)
         Positions [nm].
     data : dict of ndarray
-        Other columns by name, with the numeric columns of `extra`. Detector coordinates are called detector_x and
-        detector_y.
+        Other columns by name, with the columns of `extra` that are numbers or texts. Detector coordinates are called
+        detector_x and detector_y.
 
     Raises
     ------
@@ -52,19 +53,25 @@ def points_and_data(path: AnyPath, hits: Hits) -> tuple[Booleans | slice, Floats
     chosen = finite if n_omitted else slice(None)
     data = {_NAMES.get(name, name): getattr(hits, name) for name in hits.columns if name != "positions"}
     for name, values in hits.extra.items():
-        if values.dtype.kind in "iuf":
-            data[_distinct(name, data)] = values
+        if values.dtype.kind in "iuf" or (values.dtype.kind == "U" and values.ndim == 1):
+            data[distinct(name, data)] = values
     return chosen, positions[chosen], {name: values[chosen] for name, values in data.items()}
 
 
-def _distinct(name, others):
+def numbered(texts: NDArray[Any]) -> tuple[list[str], NDArray[np.int32]]:
+    """Distinct texts in alphabetical order, and the number of that of each ion, int32 (n,)."""
+    names, numbers = np.unique(texts, return_inverse=True)
+    return names.tolist(), numbers.astype(np.int32)
+
+
+def distinct(name: str, others: Iterable[str]) -> str:
     """Return a word of letters, digits and underscores that differs from the others."""
     word = re.sub(r"[^0-9A-Za-z]+", "_", name).strip("_") or "column"
     word = "_" + word if word[0].isdigit() else word
     taken = {*others, "species", "pos"}
     number = 2
-    distinct = word
-    while distinct in taken:
-        distinct = f"{word}_{number}"
+    found = word
+    while found in taken:
+        found = f"{word}_{number}"
         number += 1
-    return distinct
+    return found

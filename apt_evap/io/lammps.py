@@ -12,7 +12,7 @@ from numbers import Integral
 import numpy as np
 
 from apt_evap._common.files import FileError
-from apt_evap._common.types import AnyPath, Floats
+from apt_evap._common.types import AnyPath, Booleans, Floats
 from apt_evap._common.validation import check_choice, short_text
 from apt_evap.io._texts import read_text
 
@@ -30,6 +30,7 @@ class Atoms:
 
     positions: Floats
     types: Sequence[str]
+    evaporable: Booleans | None = None
 
 
 def is_dump(head: str) -> bool:
@@ -70,50 +71,43 @@ def read_dump(path: AnyPath, *, units: str = "metal", frame: int = -1) -> Atoms:
     if not isinstance(frame, Integral) or isinstance(frame, bool):
         raise ValueError(f"frame must be an integer, got {short_text(frame)}")
     lines = read_text(path, "the text of a LAMMPS dump", _MAX_BYTES).splitlines()
-    starts = [at for at, line in enumerate(lines) if line.startswith("ITEM: TIMESTEP")]
+    heads = [at for at, line in enumerate(lines) if line[:6] == "ITEM: "]
+    starts = [at for at in heads if lines[at].startswith("ITEM: TIMESTEP")]
     if not starts:
         raise FileError(f"{where} has no line ITEM: TIMESTEP, as in a LAMMPS dump")
     if not -len(starts) <= frame < len(starts):
         raise FileError(f"{where} has {len(starts)} frames, there is no frame {frame}")
-    for at, line in enumerate(lines[:-1]):
-        if line.startswith("ITEM: UNITS"):
+    for at in heads:
+        if lines[at].startswith("ITEM: UNITS") and at + 1 < len(lines):
             units = lines[at + 1].strip()
     unit = _unit(units, where)
     at = starts[frame]
     stop = next((start for start in starts if start > at), len(lines))
-    items = {}
-    for k in range(at, stop):
-        if lines[k].startswith("ITEM: "):
-            items[" ".join(lines[k].split()[1:3])] = k
+    items = {" ".join(lines[k].split()[1:3]): k for k in heads if at <= k < stop}
     for name in ("NUMBER OF", "BOX BOUNDS"):
         if name not in items:
             raise FileError(f"{where} has no line ITEM: {name} in a frame, as in a LAMMPS dump")
-    first = next((k for k in range(at, stop) if lines[k].startswith("ITEM: ATOMS")), None)
+    first = next((k for k in heads if at <= k < stop and lines[k].startswith("ITEM: ATOMS")), None)
     if first is None:
         raise FileError(f"{where} has no line ITEM: ATOMS in a frame, as in a LAMMPS dump")
     n = _integer(lines, items["NUMBER OF"] + 1, "the number of atoms", where)
     columns = lines[first].split()[2:]
-    rows = [line.split() for line in lines[first + 1 : min(first + 1 + n, stop)]]
+    rows = lines[first + 1 : min(first + 1 + n, stop)]
     if len(rows) != n or n == 0:
         raise FileError(f"{where} states {n} atoms but contains {len(rows)} in a frame")
-    _check_widths(rows, len(columns), where)
-    positions = _dump_positions(columns, rows, lines, items["BOX BOUNDS"], where)
     name = "element" if "element" in columns else "type"
     if name not in columns:
         raise FileError(f"{where} has neither a column type nor a column element, only {' '.join(columns):.100}")
-    index = columns.index(name)
-    return Atoms(positions * unit, [row[index] for row in rows])
-
-
-def _dump_positions(columns, rows, lines, box, where):
     for suffix in ("", "u", "s", "su"):
         names = [f"{axis}{suffix}" for axis in "xyz"]
         if set(names) <= set(columns):
             break
     else:
         raise FileError(f"{where} has no columns x y z (or xs, xu, xsu, ...), only {' '.join(columns):.100}")
-    values = np.stack([_floats([row[columns.index(name)] for row in rows], where) for name in names], axis=1)
-    return values if "s" not in suffix else _unscaled(values, lines, box, where)
+    types, values = _table(rows, columns.index(name), [columns.index(each) for each in names], where)
+    if "s" in suffix:
+        values = _unscaled(values, lines, items["BOX BOUNDS"], where)
+    return Atoms(values * unit, types)
 
 
 def _unscaled(values, lines, box, where):
@@ -173,6 +167,8 @@ def read_data(path: AnyPath, *, units: str = "metal", style: str | None = None) 
     )
     sections = {}
     for at, line in enumerate(lines[1:], 1):
+        if not line.lstrip()[:1].isupper():
+            continue
         title, _, comment = line.partition("#")
         if _SECTION.fullmatch(title.strip()):
             sections.setdefault(title.strip(), (at, comment))
@@ -185,7 +181,7 @@ def read_data(path: AnyPath, *, units: str = "metal", style: str | None = None) 
         raise FileError(f"{where} states {n} atoms but contains {len(rows)} in its section Atoms")
     if style is not None:
         check_choice(style, "style", _STYLES)
-    width = len(rows[0])
+    width = len(rows[0].split())
     given = comment.split()[:1]
     if style is None and given:
         style = given[0] if given[0] in _STYLES else ""
@@ -199,24 +195,36 @@ def read_data(path: AnyPath, *, units: str = "metal", style: str | None = None) 
     of_type, first = _STYLES[style]
     if width not in (first + 3, first + 6):
         raise FileError(f"{where}: the style {style} has {first + 3} columns or {first + 6}, got {width}")
-    _check_widths(rows, width, where)
     labels = {}
     if "Atom Type Labels" in sections:
-        labels = {row[0]: row[1] for row in _section_rows(lines, sections["Atom Type Labels"][0], n) if len(row) > 1}
-    positions = np.stack([_floats([row[first + k] for row in rows], where) for k in range(3)], axis=1)
-    return Atoms(positions * unit, [labels.get(row[of_type], row[of_type]) for row in rows])
+        pairs = (row.split() for row in _section_rows(lines, sections["Atom Type Labels"][0], n))
+        labels = {pair[0]: pair[1] for pair in pairs if len(pair) > 1}
+    types, positions = _table(rows, of_type, range(first, first + 3), where)
+    return Atoms(positions * unit, [labels.get(each, each) for each in types])
+
+
+def _table(rows, of_type, of_places, where):
+    """Types of the atoms as texts, and their coordinates, from the columns with these numbers."""
+    try:
+        types = np.loadtxt(rows, str, comments=None, usecols=of_type, ndmin=1).tolist()
+        places = np.loadtxt(rows, float, comments=None, usecols=of_places, ndmin=2)
+    except ValueError as error:
+        raise FileError(f"{where}: expected numbers for the coordinates of each atom, got {error!s:.100}") from error
+    if len(types) != len(rows):
+        raise FileError(f"{where} states {len(rows)} atoms but contains {len(types)}")
+    return types, _finite(places, where)
 
 
 def _section_rows(lines, at, n):
-    """At most n rows of a section whose title is in line `at`."""
+    """At most n rows of a section whose title is in line `at`, without comments."""
     rows = []
     for line in lines[at + 1 :]:
-        text = line.partition("#")[0]
-        if not text.strip():
+        text = line.partition("#")[0].strip()
+        if not text:
             continue
-        if len(rows) == n or _SECTION.fullmatch(text.strip()):
+        if len(rows) == n or (text[0].isupper() and _SECTION.fullmatch(text)):
             break
-        rows.append(text.split())
+        rows.append(text)
     return rows
 
 
@@ -237,13 +245,11 @@ def _floats(cells, where):
     try:
         values = np.array(cells, float)
     except ValueError as error:
-        raise FileError(f"{where}: expected numbers for the coordinates, got {error!s:.80}") from error
+        raise FileError(f"{where}: expected numbers for the bounds of the box, got {error!s:.80}") from error
+    return _finite(values, where)
+
+
+def _finite(values, where):
     if not np.isfinite(values).all():
         raise FileError(f"{where}: expected finite coordinates, got {values[~np.isfinite(values)][0]}")
     return values
-
-
-def _check_widths(rows, width, where):
-    for row in rows:
-        if len(row) < width:
-            raise FileError(f"{where}: expected {width} values for each atom, got {' '.join(row)!r:.60}")

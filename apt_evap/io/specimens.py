@@ -77,26 +77,34 @@ def read_tip(
     >>> ae.read_tip("tip.dump", {1: "Ni"})
     <Tip: 8,179 atoms of Ni from positions>
     """
-    name = str(check_path(path))
     names = {str(key): value for key, value in check_kind(types or {}, "types", Mapping, "a mapping").items()}
-    own = specimen_format(path)
+    given = {key: value for key, value in (("units", units), ("frame", frame), ("style", style)) if value is not None}
+    return tip_of(path, read_atoms(path, format, **given), names, **options)
+
+
+def read_atoms(path: AnyPath, format: str | None = None, **given: Any) -> Atoms:
+    """Read the atoms of a file as they are, with the options of `read_tip` for its format."""
+    name, own = str(check_path(path)), specimen_format(path)
     kind = own if format is None else check_choice(format, "format", SPECIMEN_FORMATS)
     if kind == "ase" != own:  # ASE makes hydrogen of types without a name
         raise FileError(f"{name!r} is a file of the format {own}, which ASE reads without the names of its types")
-    given = {key: value for key, value in (("units", units), ("frame", frame), ("style", style)) if value is not None}
     for key in given:
         if key not in _OPTIONS[kind]:
             takes = ", ".join(_OPTIONS[kind]) or "no such options"
             raise FileError(f"{name!r}: reading a specimen of format {kind} takes {takes}, got {key!r}")
     if kind == "ase":
-        atoms = _read_ase(path)
-        if "evaporable" in atoms.arrays:
-            options = {"evaporable": atoms.arrays["evaporable"]} | options
-        found = Atoms(atoms.get_positions() / 10, atoms.get_chemical_symbols())  # Angstrom
-    else:
-        reader: Any = {"lammps-dump": read_dump, "lammps-data": read_data, "tapsim": read_nodes}[kind]
-        found = reader(path, **given)
-    kinds = [each for each, _ in Counter(found.types).most_common()]
+        atoms = _read_ase(path)  # in Angstrom
+        return Atoms(atoms.get_positions() / 10, atoms.get_chemical_symbols(), atoms.arrays.get("evaporable"))
+    reader: Any = {"lammps-dump": read_dump, "lammps-data": read_data, "tapsim": read_nodes}[kind]
+    return reader(path, **given)
+
+
+def tip_of(path: AnyPath, atoms: Atoms, names: Mapping[str, Material | str], **options: Any) -> Tip:
+    """Make a tip of the atoms of a file, with the materials of its types by name."""
+    name = str(path)
+    if atoms.evaporable is not None:
+        options = {"evaporable": atoms.evaporable} | options
+    kinds = [each for each, _ in Counter(atoms.types).most_common()]
     for key in names:
         if key not in kinds:
             raise FileError(f"{name!r} has no atoms of type {key!r}, only of {', '.join(kinds)!s:.100}")
@@ -109,8 +117,8 @@ def read_tip(
     number = {each: k for k, each in enumerate(kinds)}
     try:
         arguments: dict[str, Any] = {
-            "positions": found.positions,
-            "species": np.array([number[each] for each in found.types], np.int32),
+            "positions": atoms.positions,
+            "species": np.array([number[each] for each in atoms.types], np.int32),
             "elements": [as_material(names.get(each, each), "types") for each in kinds],
         }
         return Tip.from_positions(**(arguments | options))

@@ -5,7 +5,7 @@ import numpy as np
 from apt_evap._common.files import replace_file
 from apt_evap._common.types import AnyPath
 from apt_evap.detection.hits import Hits
-from apt_evap.io._points import points_and_data
+from apt_evap.io._points import distinct, numbered, points_and_data
 
 _CHUNK = 1 << 20
 _TYPES = {"f": "Float", "i": "Int", "u": "UInt"}
@@ -14,8 +14,10 @@ _TYPES = {"f": "Float", "i": "Int", "u": "UInt"}
 def write_vtp(path: AnyPath, hits: Hits) -> None:
     """Write ions as VTK points with one vertex each, and all other columns as point data.
 
-    Positions are in nm, all other columns in the units of `Hits`. Ions whose positions are not finite are left out.
-    Ions that missed the detector are written, with NaN for missing values.
+    Positions are in nm, all other columns in the units of `Hits`. A column of texts, such as the elements of simulated
+    ions, is an array of strings, with an array of its numbers in alphabetical order (element_number), because ParaView
+    colours by numbers only. Ions whose positions are not finite are left out. Ions that missed the detector are
+    written, with NaN for missing values.
 
     Parameters
     ----------
@@ -32,6 +34,8 @@ def write_vtp(path: AnyPath, hits: Hits) -> None:
         If the file cannot be written.
     """
     _, positions, data = points_and_data(path, hits)
+    for name, texts in [(name, values) for name, values in data.items() if values.dtype.kind == "U"]:
+        data[distinct(f"{name}_number", data)] = numbered(texts)[1]
     n = len(positions)
     index = np.arange(n + 1, dtype=np.int32 if n < 2**31 - 1 else np.int64)
     blocks = []
@@ -39,6 +43,14 @@ def write_vtp(path: AnyPath, hits: Hits) -> None:
 
     def array(name, values):
         nonlocal written
+        if values.dtype.kind == "U":
+            names, numbers = numbered(values)
+            texts = np.array([name.encode() + b"\0" for name in names], object)[numbers]
+            blocks.append(np.frombuffer(b"".join(texts), np.uint8))
+            offset, written = written, written + 8 + blocks[-1].nbytes
+            return (
+                f'<DataArray type="String" Name="{name}" NumberOfTuples="{n}" format="appended" offset="{offset}"/>\n'
+            )
         if values.dtype.kind == "f" and values.dtype.itemsize not in (4, 8):
             values = values.astype(np.float64)
         blocks.append(values)

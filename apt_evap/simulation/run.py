@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from apt_evap._common.codec import changed, from_plain, to_plain
 from apt_evap._common.files import FileError, check_path
+from apt_evap._common.notebook import as_table
 from apt_evap._common.types import AnyPath, Booleans, Floats, Integers
 from apt_evap._common.validation import (
     check_kind,
@@ -167,6 +168,8 @@ class Run:
         there = columns_of(self, columns)
         return [column for column in columns if column.path in there]
 
+    _repr_html_ = as_table
+
     def __repr__(self) -> str:
         flown = ", ".join(_describe(perturbation) for perturbation in self.perturbations)
         responses = "" if self.responses is None else f"responses, {self.flagged.sum():,} of them flagged"
@@ -283,7 +286,8 @@ class Run:
         -------
         Hits
             One row per ion, in the sequence of evaporation; `outcome` is the outcome of each flight. ``extra`` contains
-            the element of each ion, and its charge and field before evaporation.
+            the element of each ion, its charge and field before evaporation, and the name of its phase if there are
+            several.
 
         Raises
         ------
@@ -377,6 +381,8 @@ class Run:
             extra = {"charge": self.charges * scale, "field": self.fields * scale, "charge_state": self.real.charges}
             units["charge_state"] = "e"
         extra["element"] = np.array(self.elements)[self.species]
+        if len(self.phase_names) > 1:
+            extra["phase_name"] = np.array(self.phase_names)[self.phase]
         return Hits(
             x=x,
             y=y,

@@ -1,4 +1,4 @@
-"""How a specimen from positions stands: upright, upside down or on its side; the sphere of its apex."""
+"""How a specimen from positions stands: upright, upside down, on its side or leaning; the sphere of its apex."""
 
 import warnings
 
@@ -12,12 +12,26 @@ from apt_evap.warnings import SpecimenWarning
 _LEAST = 200  # atoms: fewer have no shape
 _END = 0.1  # fraction of the height at either end whose widths are compared
 _WIDER = 1.25  # ratio of these widths: that of a straight wire with ends cut along a lattice plane is below 1.1
-_LONGER = 1.25  # ratio of the length of a lying needle to its height and to its width
+_LONGER = 1.44  # ratio of the standard deviations along both longest axes: a cylinder 1.25 times as long as wide
+_LEANING = 10.0  # angle to z [degrees]: the axis of an upright needle is within 2 degrees
 _CAP = np.radians(45.0)  # atoms within this angle of the axis define the sphere of the apex
 
 
+def pointing(positions: Floats) -> Floats:
+    """Direction from the wide to the narrow end of a specimen, a unit vector of shape (3,).
+
+    It is along the longest principal axis of the atoms [nm], shape (n, 3), or along z if none is clearly the longest.
+    If both ends are about equally wide, it is the direction with the larger z.
+    """
+    values, vectors = np.linalg.eigh(np.cov(positions.T))
+    axis = vectors[:, 2] if values[2] > _LONGER**2 * values[1] else np.array([0.0, 0.0, 1.0])
+    axis = axis if axis[2] > 0 or (axis[2] == 0 and axis.sum() > 0) else -axis
+    first, last = _widths(positions, axis)
+    return -axis if last > _WIDER * first else axis
+
+
 def warn_if_odd(positions: Floats) -> None:
-    """Warn if a specimen stands upside down or lies on its side; its axis should be +z, with the apex on top.
+    """Warn if a specimen stands upside down, lies on its side or leans; its axis should be +z, with the apex on top.
 
     Parameters
     ----------
@@ -31,34 +45,41 @@ def warn_if_odd(positions: Floats) -> None:
     """
     if len(positions) < _LEAST:
         return
-    x, y, z = np.ptp(positions, axis=0)
-    length, width = max(x, y), min(x, y)
-    if length > _LONGER * max(z, width):
-        axis = "x" if x > y else "y"
-        warnings.warn(
-            f"the specimen lies on its side: it is {length:.3g} nm long in {axis}, and {z:.3g} nm high in z; its axis "
-            "must be +z, with the apex on top",
-            SpecimenWarning,
-            stacklevel=3,
-        )
+    axis = pointing(positions)
+    angle = float(np.degrees(np.arccos(np.clip(axis[2], -1.0, 1.0))))
+    if angle < _LEANING:
         return
-    top, bottom = _widths(positions)
-    if top > _WIDER * bottom:
-        warnings.warn(
-            f"the specimen stands upside down: its top is {2 * top:.3g} nm wide, and its bottom {2 * bottom:.3g} nm; "
-            "its apex must be on top, at the largest z",
-            SpecimenWarning,
-            stacklevel=3,
-        )
+    if angle < 45.0:
+        seen = "leans"
+    elif angle <= 135.0:
+        seen = f"lies on its side, along {'xyz'[np.argmax(np.abs(axis))]}"
+    else:
+        seen = "stands upside down"
+    warnings.warn(
+        f"the specimen {seen}: its narrow end points along ({axis[0]:.2f}, {axis[1]:.2f}, {axis[2]:.2f}), "
+        f"{angle:.0f} degrees from z; its axis must be +z, with the apex on top, at the largest z",
+        SpecimenWarning,
+        stacklevel=3,
+    )
 
 
-def _widths(positions):
-    """Radius of the atoms in the uppermost and in the lowest part [nm]."""
-    heights = positions[:, 2]
+def _widths(positions, axis):
+    """Radius of the atoms in the first and in the last tenth of the length along an axis [nm]."""
+    heights = positions @ axis
     low, high = heights.min(), heights.max()
-    ends = heights >= high - _END * (high - low), heights <= low + _END * (high - low)
-    centre = np.median(positions[:, :2], axis=0)
-    return tuple(float(np.percentile(np.linalg.norm(positions[end, :2] - centre, axis=1), 95)) for end in ends)
+    lateral = positions - heights[:, None] * axis
+    centre = np.median(lateral, axis=0)
+    ends = heights <= low + _END * (high - low), heights >= high - _END * (high - low)
+    return tuple(float(np.percentile(np.linalg.norm(lateral[end] - centre, axis=1), 95)) for end in ends)
+
+
+def upright(positions: Floats) -> Floats:
+    """Positions turned about their mean such that their narrow end points along +z, shape (n, 3) [nm]."""
+    x, y, z = pointing(positions)
+    if z > np.cos(np.radians(_LEANING)):
+        return positions
+    turn = scipy.spatial.transform.Rotation.align_vectors([[0.0, 0.0, 1.0]], [[x, y, z]])[0]
+    return turn.apply(positions - positions.mean(axis=0))
 
 
 def apex_sphere(positions: Floats) -> tuple[Floats, float] | None:
@@ -93,8 +114,7 @@ def apex_sphere(positions: Floats) -> tuple[Floats, float] | None:
 
 
 def depths(positions: Floats, centre: Floats, radius: float) -> Floats:
-    """Depth of atoms below the apex sphere along z [nm], shape (n,); NaN beyond 45 degrees of the axis."""
-    lateral = np.linalg.norm(positions[:, :2] - centre[:2], axis=1)
+    """Depth of atoms below the apex sphere along z [nm], shape (n,); NaN for atoms beside the sphere."""
     with np.errstate(invalid="ignore"):
-        depth = centre[2] + np.sqrt(radius**2 - lateral**2) - positions[:, 2]
-    return np.where(lateral < radius * np.sin(_CAP), depth, np.nan)
+        above = np.sqrt(radius**2 - np.sum((positions[:, :2] - centre[:2]) ** 2, axis=1))
+    return centre[2] + above - positions[:, 2]

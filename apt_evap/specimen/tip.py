@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from apt_evap._common.codec import from_plain, to_plain
 from apt_evap._common.memory import check_memory
+from apt_evap._common.notebook import as_table
 from apt_evap._common.small_matrices import lengths
 from apt_evap._common.types import Booleans, Floats
 from apt_evap._common.validation import (
@@ -481,6 +482,8 @@ class Tip:
 
     def __len__(self) -> int:
         return len(self.positions)
+
+    _repr_html_ = as_table
 
     def __repr__(self) -> str:
         names = "-".join(dict.fromkeys(element.name for element in self.elements))

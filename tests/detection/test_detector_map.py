@@ -304,3 +304,16 @@ def test_measured_map_shows_no_stripes():
     # some 100 totals: the scatter of a standard deviation is 7 %, plus what structure is left
     assert stripes(hits.map()) < 1.3 and stripes(hits.map(dither_seed=1)) < 1.3
     assert stripes(hits.map(position_step=None)) > 5
+
+
+def test_a_map_is_an_array_for_numpy_and_xarray():
+    values = np.arange(6.0).reshape(2, 3)
+    map = DetectorMap.from_array(values, [0, 2, 4, 6], [0, 1, 2], mask=values > 0, is_counts=True, source="a file")
+    assert np.asarray(map).tolist() == values.tolist() and np.asarray(map, "f4").dtype == np.float32
+    assert np.shares_memory(np.asarray(map), map.values) and not np.shares_memory(np.array(map), map.values)
+    xarray = pytest.importorskip("xarray")
+    labelled = map.to_xarray()
+    assert isinstance(labelled, xarray.DataArray) and labelled.dims == ("y", "x") and labelled.name == "hits"
+    assert labelled.x.values.tolist() == [1, 3, 5] and labelled.y.values.tolist() == [0.5, 1.5]
+    assert labelled.x.attrs["units"] == "mm" and labelled.attrs["ions"] == 15 and labelled.attrs["source"] == "a file"
+    np.testing.assert_array_equal(labelled.values, np.where(values > 0, values, np.nan))

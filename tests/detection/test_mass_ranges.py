@@ -11,6 +11,7 @@ from apt_evap._common.files import FileError
 from apt_evap.detection.hits import Hits, Outcome
 from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.io.formats import read, read_ranges
+from apt_evap.warnings import DataWarning
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 
@@ -133,6 +134,7 @@ def test_what_is_no_rrng(save, tmp_path):
         assert len(read_ranges(save(TIDY[: TIDY.index("Range3")]))) == 2
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")  # most of these ions are outside
 def test_ions_are_within_low_and_below_high():
     ranges = Ranges(["Si", "O", "Si"], [14.0, 16.0, 28.0], [15.0, 17.0, 29.0])
     hits = of([13.99, 14.0, 14.5, 15.0, 16.5, 28.5, 29.0, np.nan, np.inf, -1.0])
@@ -266,3 +268,13 @@ def test_columns_that_cannot_be_windowed():
 def test_extra_columns_are_checked(extra):
     with pytest.raises(ValueError):
         Hits(x=np.zeros(5), extra=extra)
+
+
+def test_ranges_of_another_file_are_named():
+    ranges = Ranges(["Si", "O"], [14.0, 16.0], [15.0, 17.0])
+    hits = Hits(mass_to_charge=[14.5, 14.5, 16.5, 20.0])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(ranges.select(hits, "Si")) == 2
+    with pytest.warns(DataWarning, match="2 of 4"):
+        assert len(ranges.select(hits[[0, 1, 3, 3]], "Si")) == 2

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+import apt_evap as ae
 from apt_evap._common.files import FileError
 from apt_evap.detection.hits import Hits, Outcome
 from apt_evap.detection.mass_ranges import Ranges
@@ -81,6 +82,12 @@ def parse_vtp(path):
         for array in piece.find(folder):
             at = start + int(array.get("offset"))
             size = int.from_bytes(data[at : at + 8], "little")
+            if array.get("type") == "String":
+                texts = data[at + 8 : at + 8 + size].decode().split("\0")
+                assert int(array.get("NumberOfTuples")) == n == len(texts) - 1 and texts.pop() == ""
+                parts[folder, array.get("Name")] = np.array(texts)
+                read_to = max(read_to, at + 8 + size)
+                continue
             kind = re.fullmatch(r"(Float|Int|UInt)(\d+)", array.get("type"))
             dtype = f"<{kind[1][0].lower()}{int(kind[2]) // 8}"
             values = np.frombuffer(data[at + 8 : at + 8 + size], dtype)
@@ -94,6 +101,7 @@ def parse_vtp(path):
 
 def test_xyz_holds_every_column(tmp_path):
     hits = full()
+    hits.extra["text"] = np.array(["a", "b c", ""])
     write(tmp_path / "a.xyz", hits, species=["Si", "O", "Cr"])
     columns = parse_xyz(tmp_path / "a.xyz")
     assert columns.pop("species").tolist() == ["Si", "O", "Cr"]
@@ -105,6 +113,7 @@ def test_xyz_holds_every_column(tmp_path):
         assert (values.dtype.kind == "i") == (of in ("pulse_id", "outcome"))
     np.testing.assert_array_equal(columns.pop("pair"), hits.extra["pair"])
     assert columns.pop("a_b").tolist() == [1, 2, 3] and columns.pop("a_b_2").tolist() == [4, 5, 6]
+    assert columns.pop("text").tolist() == ["a", "b_c", "_"]
     assert columns == {}
 
 
@@ -120,6 +129,8 @@ def test_vtp_holds_every_column(tmp_path):
         np.testing.assert_array_equal(values, getattr(hits, of))
         assert values.dtype == getattr(hits, of).dtype
     np.testing.assert_array_equal(parts.pop(("PointData", "pair")), hits.extra["pair"])
+    assert parts.pop(("PointData", "text")).tolist() == ["a", "b", "c"]
+    assert parts.pop(("PointData", "text_number")).tolist() == [0, 1, 2]
     assert {name for _, name in parts} == {"a_b", "a_b_2"}
 
 
@@ -231,9 +242,63 @@ def test_what_cannot_be_written(tmp_path):
     assert len(parse_xyz(tmp_path / "a.XYZ")["pos"]) == 3
 
 
-def test_ions_of_a_run(tmp_path, small_tip):
-    import apt_evap as ae
+@pytest.fixture(scope="module")
+def two_phases():
+    """Hits of a specimen of nickel with a particle below its apex, and their elements and phases."""
+    sphere = ae.specimen.Sphere((0, 0, 2.0), 0.9)
+    particle = ae.specimen.Phase("rich in copper", "Ni", region=sphere, solutes={"Cu": 0.5})
+    tip = ae.Tip(phases=[ae.specimen.Phase("matrix", "Ni"), particle], apex_radius=2.0, seed=1)
+    run = ae.Simulation(tip, seed=1).run(150, responses=False, progress=False)
+    elements = [run.elements[k] for k in run.species]
+    names = [run.phase_names[k] for k in run.phase]
+    assert {"Ni", "Cu"} == set(elements) and len(set(names)) == 2
+    return run.hits(ae.Unperturbed()), elements, names
 
+
+def test_elements_and_phases_of_a_run(tmp_path, two_phases):
+    hits, elements, names = two_phases
+    for suffix in ("xyz", "vtp", "csv"):
+        write(tmp_path / f"a.{suffix}", hits)
+    columns = parse_xyz(tmp_path / "a.xyz")
+    assert columns["species"].tolist() == elements and "element" not in columns
+    assert columns["phase_name"].tolist() == [name.replace(" ", "_") for name in names]
+    parts = parse_vtp(tmp_path / "a.vtp")
+    for name, texts in (("element", elements), ("phase_name", names)):
+        assert parts["PointData", name].tolist() == texts
+        kinds = sorted(set(texts))
+        assert [kinds[k] for k in parts["PointData", f"{name}_number"]] == texts
+    with open(tmp_path / "a.csv", newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["element"] for row in rows] == elements and [row["phase_name"] for row in rows] == names
+
+
+def test_ase_reads_the_ions_of_a_run(tmp_path, two_phases):
+    ase_io = pytest.importorskip("ase.io")
+    hits, elements, names = two_phases
+    write(tmp_path / "a.xyz", hits)
+    atoms = ase_io.read(tmp_path / "a.xyz")
+    assert atoms.get_chemical_symbols() == elements
+    assert atoms.arrays["phase_name"].tolist() == [name.replace(" ", "_") for name in names]
+    np.testing.assert_allclose(atoms.positions, 10 * hits.positions, rtol=0, atol=0.51e-5)  # five decimals
+    np.testing.assert_array_equal(atoms.arrays["ion"], hits.ion)
+    np.testing.assert_array_equal(atoms.arrays["detector_x"], hits.x)
+
+
+def test_vtk_reads_the_ions_of_a_run(tmp_path, two_phases):
+    vtk = pytest.importorskip("vtk")
+    hits, elements, names = two_phases
+    write(tmp_path / "a.vtp", hits)
+    reader = vtk.vtkXMLPolyDataReader()
+    reader.SetFileName(str(tmp_path / "a.vtp"))
+    reader.Update()
+    data = reader.GetOutput().GetPointData()
+    for name, texts in (("element", elements), ("phase_name", names)):
+        array = data.GetAbstractArray(name)
+        assert [array.GetValue(k) for k in range(array.GetNumberOfValues())] == texts
+    assert data.GetArray("ion").GetTuple1(7) == hits.ion[7]
+
+
+def test_ions_of_a_run(tmp_path, small_tip):
     run = ae.Simulation(small_tip, seed=1).run(40, responses=False, progress=False)
     hits = run.hits(run.perturbations[0])
     write(tmp_path / "a.xyz", hits, species="Ni")

@@ -1,14 +1,16 @@
 """How a specimen from positions stands, and where its apex is."""
 
 import json
+import sys
 import warnings
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import apt_evap as ae
 from apt_evap.cli.main import main
-from apt_evap.specimen.posture import apex_sphere, depths
+from apt_evap.specimen.posture import apex_sphere, depths, pointing, upright
 
 
 @pytest.fixture(scope="module")
@@ -39,37 +41,70 @@ def test_a_specimen_upside_down_or_on_its_side_is_named(needle):
             tip_of(needle[:, axes])
 
 
+def test_a_specimen_that_leans_is_named(needle):
+    for axis in ([0.2, 0.1, 1.0], [1.0, 0.5, -0.2], [-0.6, 0.2, -1.0]):
+        axis = np.array(axis) / np.linalg.norm(axis)
+        turned = Rotation.align_vectors([axis], [[0.0, 0.0, 1.0]])[0].apply(needle)
+        # the flat base is cut along a plane of the lattice: half an atom in 8.5 nm
+        assert pointing(turned) == pytest.approx(axis, abs=0.02)
+        with pytest.warns(ae.warnings.SpecimenWarning):
+            tip_of(turned)
+        assert np.ptp(upright(turned)[:, 2]) == pytest.approx(np.ptp(needle[:, 2]), abs=0.15)  # one plane of atoms
+
+
 def test_the_sphere_of_the_apex_and_depths_below_it(needle):
     centre, radius = apex_sphere(needle + np.array([3.0, -2.0, 7.0]))
     assert radius == pytest.approx(2.5, abs=0.12)  # half a nearest neighbour distance: the surface is of atoms
     assert centre == pytest.approx([3.0, -2.0, 7.0], abs=0.15)
-    places = np.array([[0.0, 0.0, 2.0], [1.0, 0.0, np.sqrt(2.5**2 - 1) - 0.7], [2.4, 0.0, 0.0]])
+    places = np.array([[0.0, 0.0, 2.0], [1.0, 0.0, np.sqrt(2.5**2 - 1) - 0.7], [2.6, 0.0, 0.0]])
     assert depths(places, np.zeros(3), 2.5) == pytest.approx([0.5, 0.7, np.nan], nan_ok=True)
 
 
 def test_info_of_a_specimen(needle, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     types = np.where(np.linalg.norm(needle - [0, 0, 1.0], axis=1) < 0.7, 2, 1)  # a particle, 0.8 nm below the apex
-    rows = "".join(
-        f"{k + 1} {t} {x} {y} {z}\n" for k, (t, (x, y, z)) in enumerate(zip(types, 10 * needle, strict=True))
-    )
-    (tmp_path / "tip.dump").write_text(
-        f"ITEM: TIMESTEP\n0\nITEM: NUMBER OF ATOMS\n{len(needle)}\nITEM: BOX BOUNDS ff ff ff\n"
-        f"-100 100\n-100 100\n-100 100\nITEM: ATOMS id type x y z\n{rows}"
-    )
-    assert main(["info", "tip.dump"]) == 2 and "types" in capsys.readouterr().err
+
+    def dump(places):  # Angstrom
+        rows = "".join(f"{k + 1} {t} {x} {y} {z}\n" for k, (t, (x, y, z)) in enumerate(zip(types, places, strict=True)))
+        (tmp_path / "tip.dump").write_text(
+            f"ITEM: TIMESTEP\n0\nITEM: NUMBER OF ATOMS\n{len(needle)}\nITEM: BOX BOUNDS ff ff ff\n"
+            f"-100 100\n-100 100\n-100 100\nITEM: ATOMS id type x y z\n{rows}"
+        )
+
+    dump(10 * needle)
     assert main(["info", "tip.dump", "--types", "1=Ni,2=Al", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
+    assert told["format"] == "lammps-dump" and told["obstacles_to_a_simulation"] == []
     assert told["atoms"] == len(needle) and told["species"] == {
         "Ni": int((types == 1).sum()),
         "Al": int((types == 2).sum()),
     }
-    assert told["height"] == pytest.approx(np.ptp(needle[:, 2]), abs=1e-4)
+    assert told["height"] == pytest.approx(np.ptp(needle[:, 2]), abs=1e-4) and told["points_along"] == [0, 0, 1]
     assert told["apex_radius"] == pytest.approx(2.5, abs=0.12)
-    # a shell of 0.8 nm below 45 degrees of a sphere of 2.5 nm, at 91.4 atoms / nm^3
-    volume = np.pi * (2.5 * np.sin(np.pi / 4)) ** 2 * 0.8
-    assert told["atoms_above"]["Al"] == pytest.approx(91.4 * volume, rel=0.2)
+    # caps of a sphere of 2.5 nm that moves down, at 91.4 atoms / nm^3, before the top and the bottom of the particle
+    area = np.pi * 2.5**2
+    above = told["atoms_above"]["Al"]
+    assert above["its_first_atom"] == pytest.approx(91.4 * area * 0.8, rel=0.2)
+    assert above["its_first_atom"] < above["a_tenth_of_them"] < above["nine_tenths_of_them"] < 91.4 * area * 2.2
     assert main(["info", "tip.dump", "--types", "1=Ni,2=Al"]) == 0
     text = capsys.readouterr().out
     assert "apex radius [nm]" in text and "height [nm]" in text
     assert main(["info", "tip.dump", "--types", "1"]) == 2 and "--types" in capsys.readouterr().err
+    # what does not have names yet, or names that are not known, or lies on its side, is described all the same
+    for of_types in ([], ["--types", "1=Ni,2=Kryptonite"]):
+        assert main(["info", "tip.dump", "--json", *of_types]) == 0
+        unnamed = json.loads(capsys.readouterr().out)
+        assert unnamed["apex_radius"] == told["apex_radius"] and len(unnamed["obstacles_to_a_simulation"]) == 1
+        assert list(unnamed["atoms_above"].values()) == [above]
+    dump(10 * needle[:, [2, 1, 0]])
+    assert main(["info", "tip.dump", "--types", "1=Ni,2=Al", "--json"]) == 0
+    lying = json.loads(capsys.readouterr().out)
+    assert lying["points_along"] == pytest.approx([1, 0, 0], abs=0.02)
+    assert lying["apex_radius"] == pytest.approx(told["apex_radius"], abs=0.05)  # turned by up to 0.02
+    assert "side" in " ".join(lying["obstacles_to_a_simulation"])
+
+
+def test_info_of_a_specimen_without_ase(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "ase.io", None)
+    (tmp_path / "tip.xyz").write_text("2\n\nNi 0 0 0\nNi 0 0 2\n")
+    assert main(["info", str(tmp_path / "tip.xyz")]) == 2 and "ase" in capsys.readouterr().err
