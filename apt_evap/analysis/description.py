@@ -1,6 +1,6 @@
 """Summary of a run, a file of ions or a map, in plain types."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -175,7 +175,7 @@ def _of_run(run):
         "law": run.settings["law"],
         "clock": _clock(run),
         "real_units": _real_units(run),
-        "microscope": _microscope(run),
+        "microscope": microscope_of(run),
         "seed": run.seed,
         "tip": _tip(run.settings["tip"]),
         "detector": {"distance": run.detector.distance, "width": run.detector.width},
@@ -236,8 +236,8 @@ def _real_units(run):
     }
 
 
-def _microscope(run):
-    """Lens of a run, and what it does to it."""
+def microscope_of(run: Run) -> dict[str, Any] | None:
+    """Lens of a run, and its radii, field factors and compressions, dict; None without a lens."""
     if run.lens is None:
         return None
     lens, radii = run.lens.lens, run.lens.radii(run.emissions.ions)
@@ -257,13 +257,17 @@ def real_units_line(run: Run) -> str:
         f"real units: {low:,.4g} to {high:,.4g} V for {real['operating_field']:.3g} V/nm at the "
         f"{real['field_reference']}; {charges}; 1 eV at {run.voltage:g} V is {real['energy_scale']:.3g} eV"
     )
-    if run.lens is None or not len(run):
-        return line
-    found = _microscope(run)
+    found = microscope_of(run) if len(run) else None
+    return line if found is None else f"{line}; {lens_text(found)}"
+
+
+def lens_text(found: Mapping[str, Any]) -> str:
+    """One line on the result of `microscope_of`, str."""
     ends = {
-        name: " to ".join(f"{value:.3g}" for value in found[name]) for name in found if isinstance(found[name], list)
+        name: " to ".join(f"{value:.3g}" for value in found[name]) for name in ("radius", "field_factor", "compression")
     }
-    return f"{line}; lens: R {ends['radius']} nm, k_f {ends['field_factor']}, xi {ends['compression']}"
+    shank = f"shank of {found['shank_angle']:g} degrees"
+    return f"lens: {shank}, R {ends['radius']} nm, k_f {ends['field_factor']}, xi {ends['compression']}"
 
 
 def _tip(settings):

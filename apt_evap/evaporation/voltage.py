@@ -4,12 +4,15 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
+import numpy as np
+
 from apt_evap._common.codec import count, number, settings
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_number
+from apt_evap._common.validation import check_kind, check_number
 from apt_evap._core.control import SteadyRate
 from apt_evap._core.elementary import exponential, logarithm
 from apt_evap._core.law import LawKernel
+from apt_evap.detection.hits import Hits
 from apt_evap.units import BOLTZMANN
 
 if TYPE_CHECKING:
@@ -72,6 +75,47 @@ class VoltageControl:
     memory: int = count(
         "Number of ions over which the control averages the rate.", default=250, at_least=1, at_most=1_000_000
     )
+
+    @classmethod
+    def of_hits(cls, hits: Hits, seen: float = 1.0, **changes: Any) -> "VoltageControl":
+        """Control of a measurement: its rate, and its pulse fraction.
+
+        Parameters
+        ----------
+        hits : Hits
+            Measured ions with the pulses between them, and with both voltages.
+        seen : float
+            Fraction of the ions that leave which the instrument detects: its efficiency times the share of the ions in
+            its field of view. An instrument controls the rate of the detected ions; `rate` is that of all.
+        **changes
+            Fields of `VoltageControl` that are not in the file, such as the width of the pulses.
+
+        Returns
+        -------
+        VoltageControl
+
+        Raises
+        ------
+        ValueError
+            If a column is missing, there are no pulses, or `seen` is not a fraction.
+
+        Examples
+        --------
+        >>> ions = ae.Hits(voltage=np.full(50, 5000.0), pulse_voltage=np.full(50, 1000.0), pulses=np.full(50, 200))
+        >>> control = ae.VoltageControl.of_hits(ions, seen=0.5)
+        >>> control.rate, control.pulse_fraction
+        (0.01, 0.2)
+        """
+        check_kind(hits, "hits", Hits, "Hits, such as read(path)")
+        seen = check_number(seen, "seen", above=0, at_most=1)
+        pulses, standing, pulse = hits.require("pulses", "voltage", "pulse_voltage")
+        if not (len(hits) and pulses.sum() > 0 and (standing > 0).all()):
+            raise ValueError(
+                f"hits must have pulses and voltages, got {int(pulses.sum())} pulses and {len(hits)} ions, "
+                f"{int(np.count_nonzero(standing <= 0))} of them without a voltage"
+            )
+        rate = len(hits) / float(pulses.sum()) / seen
+        return cls(**{"rate": rate, "pulse_fraction": float(np.median(pulse / standing)), **changes})
 
     def effective_width(self, softness: float) -> float:
         r"""Time at the top of a pulse with the same number of events [s].

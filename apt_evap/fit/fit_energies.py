@@ -10,6 +10,7 @@ import numpy as np
 from apt_evap._common.codec import for_json
 from apt_evap._common.threads import thread_count
 from apt_evap._common.validation import check_count, check_kind
+from apt_evap.analysis.description import microscope_of
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.energies import Thermal
@@ -181,6 +182,7 @@ def fit_energies(
         "share_above_energy_limit": grid.share_above(energy_limit),
         "run": {"ions": len(run), "provenance": run.provenance, **run.settings},
         "real_units": real_units_of(run),
+        "microscope": microscope_of(run),
         "structure": missing,
     }
     return Study(

@@ -13,7 +13,7 @@ from apt_evap.detection.hits import Hits
 from apt_evap.microscope.local_electrode import LocalElectrode
 from apt_evap.reconstruction.reconstruct import Reconstruction, reconstruct
 
-_ANGLES = (0.5, 20.0)  # degrees: limits of the search; blunter ones leave a detector of 40 degrees no image
+_ANGLES = (0.5, 1.0, 2.0, 3.0, 5.0, 7.0, 10.0, 14.0, 20.0)  # degrees, between which the angle is searched
 _IONS = 20_000  # that are reconstructed: the radius is a mean over many ions
 _SECTIONS = 40  # of the sequence, for the slope and its error
 _PRECISION = 1e-3  # degrees
@@ -100,13 +100,18 @@ def fit_shank(hits: Hits, lens: LocalElectrode, **constants: Any) -> ShankFit:
         depths, radii = sections(angle, changed)
         return _slope(depths, radii)[0] - _widening(angle)
 
-    low, high = excess(_ANGLES[0]), excess(_ANGLES[1])
-    if not low > 0 > high:
+    # upwards, because the lens of a blunt shank shows less than the detector sees
+    values = []
+    for each in _ANGLES:
+        values.append(excess(each))
+        if not values[-1] > 0:
+            break
+    if len(values) == 1 or values[-1] > 0:
         raise ValueError(
-            f"hits must have voltages that agree with a shank of {_ANGLES[0]:g} to {_ANGLES[1]:g} degrees, got radii "
-            f"that change by {low + _widening(_ANGLES[0]):.3g} nm per nm of depth"
+            f"hits must have voltages that agree with a shank of {_ANGLES[0]:g} to {_ANGLES[-1]:g} degrees, got radii "
+            f"that change by {values[0] + _widening(_ANGLES[0]):.3g} nm per nm of depth"
         )
-    angle = float(scipy.optimize.brentq(excess, *_ANGLES, xtol=_PRECISION))
+    angle = float(scipy.optimize.brentq(excess, *_ANGLES[len(values) - 2 : len(values)], xtol=_PRECISION))
     depths, radii = sections(angle, thinned)
     slope = (excess(angle + 0.1) - excess(angle)) / 0.1
     per_cent = {}

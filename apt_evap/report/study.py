@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from apt_evap import plot
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_kind
+from apt_evap.analysis.description import lens_text
 from apt_evap.fit.study import Score, Study
 from apt_evap.report.origin import add_origin, origin
 from apt_evap.report.page import Page, escape, flat, folded, heading, paragraph, table, text_of
@@ -161,6 +162,8 @@ def _energies(study):
     rows.append(("SSIM", best.score, refined.score))
     between = "between its points" + " (interval of 95 %)" * bool(refined.intervals)
     note = "Fitted energies scale with the assumed tip radius and voltage."
+    if study.provenance.get("microscope"):
+        note += f" The run is behind a {lens_text(study.provenance['microscope'])}."
     return table(rows, (f"{mechanism}, {place}", "best on the grid", between)) + paragraph(note, "note")
 
 

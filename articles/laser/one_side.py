@@ -99,7 +99,7 @@ def draw(run, axes, title, last=60_000):
     axes[1].set_title("ions")
     states = ae.analysis.charge_state_ratio_map(hits, "Ni", bins=20).to_map()
     shown = axes[2].pcolormesh(
-        states.x_edges, states.y_edges, np.where(states.mask, states.values, np.nan), norm=LogNorm()
+        states.x_edges, states.y_edges, np.where(states.mask, states.values, np.nan), norm=LogNorm(1e-3, 1.0)
     )
     axes[2].figure.colorbar(shown, ax=axes[2], label="Ni$^{2+}$ / Ni$^+$")
     axes[2].set(aspect="equal", title="charge states", xlabel="x [mm]", ylabel="y [mm]")

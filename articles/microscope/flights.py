@@ -150,14 +150,19 @@ def main():
     )
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
+    report(*compare(**vars(options)))
+
+
+def compare(radius, ions, events, cut=0.5, seed=1):
+    """Directions and times by the rule and by the flights, and which ions had a lateral energy."""
     lens = ae.microscope.LocalElectrode(distance=40e3, aperture=20e3, shank_angle=5.0)
     begin = time.process_time()
-    emitter = surface(options.radius, lens.shank_angle, options.events, options.seed)
+    emitter = surface(radius, lens.shank_angle, events, seed)
     cap = emitter.cap
     from_centre = emitter.positions - (0, 0, cap.apex - cap.radius)
     within = np.degrees(np.arccos(from_centre[:, 2] / np.linalg.norm(from_centre, axis=1))) < 32.0
-    leaving = np.flatnonzero(within)[np.argsort(-emitter.fields[within])][: options.ions]
-    rng = np.random.default_rng(options.seed)
+    leaving = np.flatnonzero(within)[np.argsort(-emitter.fields[within])][:ions]
+    rng = np.random.default_rng(seed)
     places, normals = emitter.positions[leaving], emitter.normals[leaving]
     across = np.cross(normals, rng.normal(size=places.shape))
     across /= np.linalg.norm(across, axis=1)[:, None]
@@ -175,7 +180,7 @@ def main():
     free_places, free_times = on_plane(ends, cap.apex)
     print(f"free flights: {ends[-1]} evaluations; {time.process_time() - begin:.0f} s", flush=True)
 
-    atoms, rings, kept = in_instrument(emitter, lens, cap, options.cut)
+    atoms, rings, kept = in_instrument(emitter, lens, cap, cut)
     own = np.searchsorted(kept, leaving)
     scale = np.median(atoms.charges[own] / free_atoms.charges[leaving])  # of charges per volt
     spread = np.std(atoms.charges[own] / free_atoms.charges[leaving] / scale)
@@ -196,9 +201,9 @@ def main():
     unit = FLIGHT_TIME * np.sqrt(MASS / (CHARGE * volts))
     lengths = np.linalg.norm(free_places, axis=1)
     stereographic = free_places * (np.tan(np.arctan(lengths) / 2) / lengths)[:, None]
-    ions, masses, charges = np.zeros(len(places)), MASS * volts / volts, CHARGE * volts / volts
-    seen, times = behind.seen(stereographic, free_times * unit, ions, masses, charges, volts, volts / scale, LENGTH)
-    report(seen, times, true_places, true_times * unit * math.sqrt(scale), kinetic > 0)
+    numbers, masses, charges = np.zeros(len(places)), MASS * volts / volts, CHARGE * volts / volts
+    seen, times = behind.seen(stereographic, free_times * unit, numbers, masses, charges, volts, volts / scale, LENGTH)
+    return seen, times, true_places, true_times * unit * math.sqrt(scale), kinetic > 0
 
 
 def course_of(cap):

@@ -70,7 +70,7 @@ def test_a_settings_file_with_a_microscope(made, tmp_path, monkeypatch, capsys):
     text = HOT.partition("[law]")[0] + '[microscope]\npreset = "local electrode"\nshank_angle = 7.0\n'
     Path("lens.toml").write_text(text)
     assert main(["run", "lens.toml", "-o", "lens.h5"]) == 0
-    assert "lens: R 1" in capsys.readouterr().out
+    assert "lens: shank of 7 degrees, R 1" in capsys.readouterr().out
     lens = ae.microscope.LocalElectrode.preset("local electrode", shank_angle=7.0)
     run, plain = ae.load("lens.h5"), ae.load(made / "cold.h5")
     assert run.lens.lens == lens and run.fingerprint() == plain.fingerprint()

@@ -1,5 +1,7 @@
 """The applied voltage and its control: settings, and the width of a pulse."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -86,3 +88,32 @@ def test_bad_voltages_are_refused(voltage):
     with pytest.raises(ValueError, match="voltage"):
         check_voltage(voltage)
     assert check_voltage(np.int64(2000)) == 2000.0
+
+
+# ---- of a measurement ------------------------------------------------------------------------------------------------
+
+
+def test_the_control_of_a_measurement(small_tip):
+    """Rate and pulses of a run in real units come back from its hits, for all ions that leave."""
+    control = ae.VoltageControl(rate=0.02, pulse_fraction=0.15)
+    run = ae.Simulation(small_tip, seed=1, n_threads=1, control=control).run(
+        400, [ae.Unperturbed()], responses=False, progress=False
+    )
+    hits = run.at_evaporation_field().hits(ae.Unperturbed())
+    found = ae.VoltageControl.of_hits(hits, pulse_width=0.7)
+    # the pulses before the first ion are not counted
+    assert found.rate == pytest.approx(0.02, rel=0.15)
+    assert found.pulse_fraction == pytest.approx(0.15, rel=1e-12) and found.pulse_width == 0.7
+    seen = run.at_evaporation_field().record(ae.Instrument(efficiency=0.5, field_of_view=120.0))
+    share = len(seen) / len(run)
+    assert ae.VoltageControl.of_hits(seen, share).rate == pytest.approx(0.02, rel=0.15)
+
+
+def test_a_measurement_without_pulses_has_no_control():
+    ions = ae.Hits(voltage=np.full(5, 5e3), pulse_voltage=np.zeros(5), pulses=np.zeros(5, int))
+    with pytest.raises(ValueError, match="hits"):
+        ae.VoltageControl.of_hits(ions)
+    with pytest.raises(ValueError, match="seen"):
+        ae.VoltageControl.of_hits(replace(ions, pulses=np.ones(5, int)), 1.5)
+    with pytest.raises(ValueError, match="pulses"):
+        ae.VoltageControl.of_hits(ae.Hits(voltage=np.ones(5), pulse_voltage=np.ones(5)))

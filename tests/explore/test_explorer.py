@@ -52,10 +52,13 @@ def equal(first, second):
     return True
 
 
-@pytest.mark.parametrize("units", ["simulated", "cap"])
+@pytest.mark.parametrize("units", ["simulated", "cap", "lens"])
 @pytest.mark.parametrize("perturbation", PERTURBATIONS, ids=repr)
 def test_maps_have_the_bits_of_the_library(run, measured, perturbation, units):
-    run = run if units == "simulated" else run.at_evaporation_field(field_reference=units)
+    if units == "lens":
+        run = run.at_evaporation_field(ae.microscope.LocalElectrode.preset("local electrode"))
+    elif units != "simulated":
+        run = run.at_evaporation_field(field_reference=units)
     explorer = Explorer(run, measured, TURNED)
     view = View(perturbation, 24, 2.0, flattening=8.0)
     for _ in range(2):  # also when everything is kept from the first time

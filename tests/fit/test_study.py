@@ -619,6 +619,18 @@ def test_a_study_of_a_run_in_real_units_finds_real_energies(run):
     assert above[1] == pytest.approx(above[0], rel=1e-9) and above[0].max() > 0
 
 
+def test_a_run_behind_a_lens_gives_the_same_energies(run):
+    """The measured map is made through the lens, too; energies at the crystal do not change."""
+    real = run.at_evaporation_field(ae.microscope.LocalElectrode.preset("local electrode"))
+    mean = float(np.median(0.2 / real.energy_scales))
+    measured = real.hits(ae.RollUp(ae.TruncatedNormal(mean, mean / 2))).map(64)
+    options = {"relative_spreads": (0.5,), "registration": HERE, "replicas": 1, "resamples": 0, "progress": False}
+    study = fit_energies(real, measured, means=(0.5 * mean, mean, 2 * mean), **options)
+    assert study.optimum.mean == pytest.approx(mean, rel=1e-12)
+    assert study.provenance["microscope"]["shank_angle"] == 5.0
+    assert study.provenance["microscope"]["compression"][0] > 1.3
+
+
 def test_study_settings_are_checked():
     assert FitSettings(smoothing=1, flattening=0).flattening == 0.0
     for wrong, words in (
