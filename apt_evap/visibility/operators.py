@@ -53,12 +53,12 @@ class OriginOperators:
         Values of each variable [units of `VARIABLES`], in increasing order.
     elements : tuple of str
         Names of the elements, in alphabetical order.
-    means : ndarray, shape (*axes, groups, n, m, 3)
+    means : ndarray, shape (axes ..., groups, n, m, 3)
         Mean shift [nm] away from the axis of the feature, across, and along the axis of the specimen. The groups are
         the elements outside the feature, then inside. The n and m cells are those of the two coordinates of a site.
-    covariances : ndarray, shape (*axes, groups, n, m, 3, 3)
+    covariances : ndarray, shape (axes ..., groups, n, m, 3, 3)
         Covariance about the mean [nm^2].
-    recorded : ndarray, shape (*axes, k, l)
+    recorded : ndarray, shape (axes ..., k, l)
         Fraction of the sites whose ions arrive, by the depth below the apex and the distance from the axis.
     depth : float
         Depth that evaporates [nm].
