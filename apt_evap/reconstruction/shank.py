@@ -16,7 +16,7 @@ from apt_evap.reconstruction.reconstruct import Reconstruction, reconstruct
 _ANGLES = (0.5, 1.0, 2.0, 3.0, 5.0, 7.0, 10.0, 14.0, 20.0)  # degrees, between which the angle is searched
 _IONS = 20_000  # that are reconstructed: the radius is a mean over many ions
 _SECTIONS = 40  # of the sequence, for the slope and its error
-_PRECISION = 1e-3  # degrees
+_PRECISION = 1e-2  # degrees
 _STEP = 0.01  # relative, for the sensitivities
 
 

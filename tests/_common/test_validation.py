@@ -512,6 +512,34 @@ CASES = [
         {"initial_radius": POSITIVE, "shank_angle": [*NUMBER, -1.0, 45], "evaporation_field": [30.0]},
     ),
     (
+        ae.reconstruction.fit_shank,
+        {
+            "hits": hits,
+            "lens": ae.microscope.LocalElectrode(40e3, 20e3, 5.0),
+            "atomic_volume": 0.011,
+            "distance": 100.0,
+        },
+        {"hits": [*OBJECT, None], "lens": [*OBJECT, None]},
+    ),
+    (
+        ae.reconstruction.checks,
+        {"reconstruction": ae.reconstruct(hits, atomic_volume=0.011, distance=100.0, radius=30.0)},
+        {"reconstruction": [*OBJECT, None], "radius": POSITIVE},
+    ),
+    (
+        ae.evaporation.conditions,
+        {"composition": {"Al": 1.0}},
+        {
+            "composition": [*TABLE, None, {}, {"Al": 0.5}, {"Al": NAN}],
+            "temperatures": [None, "x", [0.0], [NAN], 1e9],
+            "pulse_fractions": [None, "x", [0.0], [NAN], 1.5],
+            "law": OBJECT,
+            "control": OBJECT,
+        },
+    ),
+    (ae.detection.Cooling, {"temperature": 50.0, "temperature_rise": 100.0, "time_constant": 2.0}, {}),
+    (ae.visibility.VisibilitySettings, {"analysis": "clusters.py:pairs"}, {}),
+    (
         ae.Reconstruction.errors,
         {"self": ae.reconstruct(hits, atomic_volume=0.011, distance=100.0, radius=30.0), "truth": np.eye(3)},
         {
@@ -842,6 +870,7 @@ def test_every_public_name_with_arguments_is_in_the_table():
     taken = {*MADE, *ARRAYS, "Unperturbed", "Union"}  # no arguments; positional arguments only, in test_regions
     taken |= {"chunks", "precipitate_errors", "likeness"}  # in test_chunks, test_precipitate, test_verdict
     taken |= {"write_nodes", "write_types", "describe"}  # in test_tapsim_nodes, test_main
+    taken |= set(ae.visibility.__all__)  # in tests/visibility
     missing = {
         name
         for place in (ae, *SPACES)

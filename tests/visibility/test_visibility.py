@@ -231,6 +231,7 @@ def test_a_layer_along_the_axis_keeps_its_middle(tip):
     assert places[0] == pytest.approx([1.0, 1.0 / RADIUS]) and directions[0, 0] == pytest.approx([1, 0, 0])
 
 
+@pytest.mark.slow
 def test_a_thicker_layer_is_seen_thicker(tip):
     layer = ae.specimen.Phase("layer", "Ni", ae.specimen.Layer(1.7, 2.1), solutes={"Al": 0.5}, evaporation_field=FIELD)
     operators = ae.visibility.origin_operators(layer, tip, EVERYTHING, axes={"size": [0.4, 0.8]}, n_threads=1)
