@@ -1,45 +1,21 @@
-"""What a notebook shows of a map, a run, ions or a specimen: a picture or a table instead of one line of text."""
+"""Views of data in a notebook: a module above those of the data makes them when a notebook asks."""
 
-import io
-from html import escape
 from importlib import import_module
 from typing import Any
 
-# pictures and summaries are in folders above those of the data: they are imported by name, when a notebook asks
-_DPI = 90
+_makers: list[str] = []
 
 
-def as_picture(map: Any) -> bytes:
-    """Picture of a detector map as PNG, bytes; assigned to ``_repr_png_``."""
-    from matplotlib.figure import Figure  # takes a while
-
-    figure = Figure((5.0, 4.2))  # not of pyplot, which would draw it a second time
-    import_module("apt_evap.plot").detector_map(map, figure.subplots())
-    with io.BytesIO() as file:
-        figure.savefig(file, format="png", dpi=_DPI, bbox_inches="tight")
-        return file.getvalue()
+def shown_by(module: str) -> None:
+    """Set the module whose functions `picture` and `folded_table` make the views."""
+    _makers[:] = [module]
 
 
-def as_table(data: Any) -> str:
-    """One line on the data, and a folded table of what `apt-evap info` prints, as HTML; assigned to ``_repr_html_``."""
-    described = import_module("apt_evap.analysis.description")
-    rows = _table(described.describe(data), described.UNITS)
-    return f"<details><summary><code>{escape(repr(data))}</code></summary>{rows}</details>"
+def as_picture(map: Any) -> bytes | None:
+    """Picture as PNG, bytes; assigned to ``_repr_png_``."""
+    return import_module(_makers[0]).picture(map) if _makers else None
 
 
-def _table(contents, units):
-    rows = []
-    for key, value in contents.items():
-        label = key.replace("_", " ") + (f" [{units[key]}]" if key in units else "")
-        rows.append(f'<tr><th style="text-align:left">{escape(label)}</th><td>{_cell(value, units)}</td></tr>')
-    return f"<table>{''.join(rows)}</table>"
-
-
-def _cell(value, units):
-    if isinstance(value, dict) and value:
-        return _table(value, units)
-    if isinstance(value, list | dict):
-        return ", ".join(_cell(each, units) for each in value) or "none"
-    if isinstance(value, int) and not isinstance(value, bool):
-        return f"{value:,}"
-    return "none" if value is None else escape(f"{value:g}" if isinstance(value, float) else str(value))
+def as_table(data: Any) -> str | None:
+    """Table as HTML; assigned to ``_repr_html_``."""
+    return import_module(_makers[0]).folded_table(data) if _makers else None

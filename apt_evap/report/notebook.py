@@ -1,0 +1,46 @@
+"""What a notebook shows of a map, a run, ions or a specimen: a picture or a table instead of one line of text."""
+
+import io
+from html import escape
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from apt_evap.analysis.description import UNITS, describe
+from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.plot.maps import detector_map
+
+_DPI = 90
+
+
+def picture(map: DetectorMap) -> bytes:
+    """Picture of a detector map as PNG, bytes."""
+    figure = Figure((5.0, 4.2))  # not of pyplot, which would draw it a second time
+    detector_map(map, figure.subplots())
+    with io.BytesIO() as file:
+        figure.savefig(file, format="png", dpi=_DPI, bbox_inches="tight")
+        return file.getvalue()
+
+
+def folded_table(data: Any) -> str:
+    """One line on the data, and a folded table of what `apt-evap info` prints, as HTML."""
+    rows = _table(describe(data), UNITS)
+    return f"<details><summary><code>{escape(repr(data))}</code></summary>{rows}</details>"
+
+
+def _table(contents, units):
+    rows = []
+    for key, value in contents.items():
+        label = key.replace("_", " ") + (f" [{units[key]}]" if key in units else "")
+        rows.append(f'<tr><th style="text-align:left">{escape(label)}</th><td>{_cell(value, units)}</td></tr>')
+    return f"<table>{''.join(rows)}</table>"
+
+
+def _cell(value, units):
+    if isinstance(value, dict) and value:
+        return _table(value, units)
+    if isinstance(value, list | dict):
+        return ", ".join(_cell(each, units) for each in value) or "none"
+    if isinstance(value, int) and not isinstance(value, bool):
+        return f"{value:,}"
+    return "none" if value is None else escape(f"{value:g}" if isinstance(value, float) else str(value))
