@@ -269,7 +269,10 @@ def test_any_arrangement(n, leaf, seed, grid):
     # a point may be as near to an atom as it likes: per point, and relative to the sum of sizes
     size = np.array([(charges / ((point - positions) ** 2).sum(axis=1)).sum() for point in points])
     assert (np.linalg.norm(tree.fields(points, 0.0) - expected, axis=1) < 1e-12 * size).all()
-    assert (np.linalg.norm(tree.fields(points, 0.5) - expected, axis=1) < 0.02 * size).all()
+    # what quadrupoles leave out, sum of (l + 1) x^l for l >= 3, of charges on the rim of a ball that appears under the
+    # opening angle, x = 0.25: 0.09. Measured with 60,000 arrangements of 2 to 9 atoms: at most 0.047, 0.8 % above 0.02
+    rest = sum((order + 1) * 0.25**order for order in range(3, 30))
+    assert (np.linalg.norm(tree.fields(points, 0.5) - expected, axis=1) < rest * size).all()
 
 
 def test_refuses_an_empty_tree():
