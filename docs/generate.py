@@ -21,6 +21,7 @@ _GUIDES = {
     "analysis": "charge_states real_units field_ion_image",
     "config": "settings",
     "crystallography": "howto/find_orientation",
+    "dataset": "howto/data_set",
     "detection": "instruments howto/correct_distortion",
     "emission": "emission charge_states extending",
     "evaporation": "charging_rules laws temperature extending_physics",

@@ -71,16 +71,16 @@ class Example:
 
 
 class DataSet:
-    """A data set in a folder; made by `load`. Its examples are read when they are used.
+    """A data set in a folder: a sequence of its examples, which are read when they are used.
 
-    Examples
-    --------
-    >>> data = ae.dataset.load("aluminium")
-    >>> len(data), len(data.split("train"))
-    (4, 4)
-    >>> example = data[0]
-    >>> example.ions["site"].shape[1], example.about["material"]
-    (3, 'Al')
+    Parameters
+    ----------
+    folder : Path
+        The folder.
+    content : dict
+        Content of ``dataset.json``.
+    shards : tuple of dict
+        The files whose examples it contains, of ``content["shards"]``.
     """
 
     def __init__(self, folder: Path, content: dict[str, Any], shards: tuple[dict[str, Any], ...]) -> None:
@@ -110,9 +110,10 @@ class DataSet:
         number = int(np.searchsorted(self._firsts, index, side="right")) - 1
         shard, row = self.shards[number]["name"], index - int(self._firsts[number])
         about = {name: values[row] for name, values in self._read(shard, "examples").items()}
+        about = {name: value.item() if isinstance(value, np.generic) else value for name, value in about.items()}
         about |= {name: json.loads(about[name]) for name in _JSON}
-        first = int(about.pop("first_ion"))
-        rows = slice(first, first + int(about["ions"]))
+        first = about.pop("first_ion")
+        rows = slice(first, first + about["ions"])
         if self.content["dataset"]["format"] == "hdf5":
             ions = read_table(self.folder, shard, "ions", self.schema, "hdf5", rows)
         else:

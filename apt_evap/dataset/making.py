@@ -173,7 +173,7 @@ def make(
     without_failed: bool = False,
     note: Callable[[str], object] = lambda text: None,
 ) -> dict[str, Any]:
-    """Make a data set, or finish one that was interrupted.
+    r"""Make a data set, or finish one that was interrupted.
 
     Runs that are missing are made by the sweep. Files of examples that are complete are not written again. Equal
     studies give equal bytes, also after an interruption.
@@ -200,6 +200,21 @@ def make(
     ------
     FileError
         If a run has failed, a file is damaged, or cannot be written.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> tip, ions = 'material = "Al"\napex_radius = "5 a"\nshank_length = "5 a"', "ions = 60"
+    >>> _ = Path("base.toml").write_text(f"[tip]\n{tip}\n[simulation]\n{ions}\n")
+    >>> study = 'base = "base.toml"\nsample = 1\n[sweep]\n"tip.axis" = "random"\n'
+    >>> _ = Path("study.toml").write_text(f'{study}[dataset]\nemissions = ["Unperturbed", "RollUp:0.02"]\n')
+    >>> planned = ae.dataset.plan_set("study.toml")
+    >>> planned
+    <PlannedSet: 1 runs, 2 examples>
+    >>> content = ae.dataset.make(planned, "set")
+    >>> example = ae.dataset.load("set")[1]
+    >>> print(example.about["material"], example.about["emission"]["name"], example.ions["site"].shape[1])
+    Al RollUp 3
     """
     folder, sweep = check_path(folder), planned.sweep
     try:
