@@ -57,4 +57,4 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _size(n_bytes):
-    return f"{n_bytes / 1e9:.2g} GB" if n_bytes >= 1e9 else f"{n_bytes / 1e6:.2g} MB"
+    return f"{n_bytes / 1e9:.3g} GB" if n_bytes >= 1e9 else f"{n_bytes / 1e6:.3g} MB"
