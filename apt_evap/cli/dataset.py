@@ -16,7 +16,7 @@ def execute(options: argparse.Namespace) -> int:
         tell(options, f"{path}: all files are as in its checksums")
     else:
         planned = plan_set(path)
-        hours = "" if planned.hours is None else f"; about {hours_text(planned.hours)} of one worker"
+        hours = "" if planned.hours is None else f"; about {hours_text(planned.hours)} of one worker left"
         tell(options, f"{len(planned.sweep.points):,} runs, {planned.examples:,} examples{hours}")
         tell(
             options,

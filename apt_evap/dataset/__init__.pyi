@@ -8,4 +8,5 @@ from .making import PlannedSet as PlannedSet
 from .making import make as make
 from .making import plan_set as plan_set
 from .making import verify as verify
+from .settings import SPLITS as SPLITS
 from .settings import DatasetSettings as DatasetSettings

@@ -23,6 +23,7 @@ from apt_evap.dataset.fields import chosen_tables
 from apt_evap.dataset.settings import SPLITS, DatasetSettings, read_instrument
 from apt_evap.dataset.shards import Schema, file_names, key_in, key_of_shard, read_table, write_shard
 from apt_evap.simulation.run import load
+from apt_evap.sweep.overview import status
 from apt_evap.sweep.planning import RUN, Sweep, plan
 from apt_evap.sweep.pool import work_locally
 from apt_evap.sweep.sampling import drawn
@@ -34,9 +35,10 @@ ABOUT, SHEET, SUMS = "dataset.json", "README.md", "SHA256SUMS"
 """Files of a data set beside those of its examples."""
 _MAX_BYTES = 1 << 30
 _SHARD = re.compile(rf"({'|'.join(SPLITS)})-\d{{4,}}(\.h5|\.\w+\.parquet)")
-# Measured: a run of 2,000 ions and more takes 1.15 to 1.3 kB per ion on the disk with its responses
-_RUN_BYTES_PER_ION = 1300
-_RECORDING = 1e-5  # seconds per ion and example
+# Measured for 30 runs of 2,000 ions with responses: 507 bytes per ion, 95 kB for the picture and the other files
+_RUN_BYTES_PER_ION, _RUN_BYTES = 510, 1e5
+# Measured there: 2 s for 30 examples, with the import of the package; doubled as the times of the runs
+_RECORDING = 6e-5  # seconds per ion and example
 
 
 @dataclass(frozen=True)
@@ -85,11 +87,10 @@ class PlannedSet:
 
     @property
     def hours(self) -> float | None:
-        """Time of one worker, within a factor of 3 [h]; None if it is not known."""
-        hours = [needs.hours for needs in self.sweep.foresights]
+        """Time of one worker that is left, within a factor of 3 [h]; None if it is not known."""
+        left = status(self.sweep)["hours_left"]
         ions = sum(needs.ions for needs in self.sweep.foresights)
-        recording = _RECORDING * ions * self.settings.per_run / 3600
-        return None if None in hours else recording + sum(each for each in hours if each is not None)
+        return None if left is None else left + _RECORDING * ions * self.settings.per_run / 3600
 
     @property
     def bytes(self) -> int:
@@ -103,7 +104,8 @@ class PlannedSet:
     @property
     def run_bytes(self) -> int:
         """Size of the runs in the folder of the sweep, which the finished data set does not need [bytes]."""
-        return _RUN_BYTES_PER_ION * sum(needs.ions for needs in self.sweep.foresights)
+        foresights = self.sweep.foresights
+        return int(_RUN_BYTES * len(foresights) + _RUN_BYTES_PER_ION * sum(needs.ions for needs in foresights))
 
 
 def plan_set(path: AnyPath) -> PlannedSet:

@@ -300,7 +300,8 @@ def with_values(document: dict[str, Any], values: Mapping[str, Any]) -> dict[str
     document : dict
         Settings, tables in tables.
     values : mapping
-        Values by path; a missing table is made, a value that is a table replaces the whole one.
+        Values by path; a missing table is made, a value that is a table replaces the whole one. An entry of a list is
+        named by its number from 0: ``phases.1.region.radius``.
 
     Returns
     -------
@@ -316,8 +317,16 @@ def with_values(document: dict[str, Any], values: Mapping[str, Any]) -> dict[str
     for path, value in values.items():
         table, *names = document, *path.split(".")
         for depth, name in enumerate(names[:-1], start=1):
-            table = table.setdefault(name, {})
-            if not isinstance(table, dict):
+            table = table[_number(name, table)] if isinstance(table, list) else table.setdefault(name, {})
+            if not isinstance(table, dict | list):
                 raise ValueError(f"{path} leads through {'.'.join(names[:depth])}, which is {short_text(table)}")
-        table[names[-1]] = copy.deepcopy(value)
+        last: Any = _number(names[-1], table) if isinstance(table, list) else names[-1]
+        table[last] = copy.deepcopy(value)
     return document
+
+
+def _number(name, entries):
+    """Number of an entry of a list."""
+    if not (name.isdecimal() and int(name) < len(entries)):
+        raise ValueError(f"{short_text(name)} in a path must be the number of an entry, from 0 to {len(entries) - 1}")
+    return int(name)
