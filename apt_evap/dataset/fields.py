@@ -25,12 +25,17 @@ class Field(NamedTuple):
     """Shape of a row."""
 
     @property
+    def kind(self) -> str:
+        """Name of its type: "text", "float32", ..."""
+        return TEXT if self.dtype == TEXT else np.dtype(self.dtype).name
+
+    @property
     def bytes(self) -> int:
         """Size of a row of numbers [bytes]."""
         return 0 if self.dtype == TEXT else np.dtype(self.dtype).itemsize * int(np.prod(self.row))
 
 
-EXAMPLE = Field("example", np.uint32, "Index of the example, from 0.")
+EXAMPLE = Field("example", np.uint32, "Index of the example, from 0 in each file.")
 TABLES: dict[str, tuple[Field, ...]] = {
     "examples": (
         Field("name", TEXT, "Name: key of the run, and number of the emission."),

@@ -56,7 +56,7 @@ class Example:
     @property
     def instrument(self) -> Instrument:
         """The instrument."""
-        return read_instrument({key: value for key, value in self.about["instrument"].items() if key != "name"})
+        return read_instrument(self.about["instrument"])
 
     @property
     def hits(self) -> Hits:

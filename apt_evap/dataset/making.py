@@ -248,6 +248,8 @@ def make(
         raise FileError(
             f"{len(states):,} of {len(sweep.points):,} runs are not done, such as {key}: {state.name}{message}{remedy}"
         )
+    if missing:
+        (folder / SUMS).unlink(missing_ok=True)  # those of files that are replaced now
     for number, shard in enumerate(missing, start=1):
         note(f"file {number:,} of {len(missing):,}: {shard.name}")
         examples = []
@@ -310,7 +312,7 @@ def _finish(planned, folder, made):
             name: [
                 {
                     "name": field.name,
-                    "type": field.dtype if isinstance(field.dtype, str) else np.dtype(field.dtype).name,
+                    "type": field.kind,
                     "shape": list(field.row),
                     "unit": field.unit,
                     "description": field.text,

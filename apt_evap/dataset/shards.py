@@ -12,7 +12,7 @@ from apt_evap._common.files import FileError, open_for_reading, replace_file
 from apt_evap._common.optional_imports import optional_import
 from apt_evap.dataset.examples import Rows, typed
 from apt_evap.dataset.fields import TEXT, Field
-from apt_evap.storage.digested_hdf5 import open_hdf5, tail_of, write_hdf5
+from apt_evap.storage.digested_hdf5 import tail_of, write_hdf5
 
 Schema = dict[str, tuple[Field, ...]]
 _KIND = "dataset"
@@ -109,9 +109,7 @@ def key_in(folder: Path, name: str, schema: Schema, suffix: str) -> str | None:
     return keys.pop() if len(keys) == 1 else None
 
 
-def read_table(
-    folder: Path, name: str, table: str, schema: Schema, suffix: str, rows: slice = slice(None), *, check: bool = False
-) -> Rows:
+def read_table(folder: Path, name: str, table: str, schema: Schema, suffix: str, rows: slice = slice(None)) -> Rows:
     """Read rows of a table of a shard.
 
     Parameters
@@ -122,8 +120,6 @@ def read_table(
         Name of the table.
     rows : slice
         Rows to read.
-    check : bool
-        Whether to compare the digest of an HDF5 file before.
 
     Returns
     -------
@@ -138,9 +134,6 @@ def read_table(
     path = folder / file_names(name, schema, suffix)[table]
     try:
         if suffix == "hdf5":
-            if check:
-                with open_hdf5(path):
-                    pass
             with h5py.File(path, "r", locking=False) as file:
                 return {field.name: _taken(file[f"{table}/{field.name}"], field, rows) for field in schema[table]}
         parquet = optional_import("pyarrow.parquet", "a data set in Parquet")

@@ -51,8 +51,8 @@ class RandomAxis:
     def of(self, material: Material) -> list[float]:
         """Crystal direction [u v w] for a material.
 
-        Uniform on the sphere, in the triangle [001], [011], [111] of a cubic crystal, or in that between [0001],
-        [2-1-10] and [10-10] of a hexagonal one. Its third corner is on the equator.
+        Uniform on the sphere, in the triangle [001], [011], [111] of a cubic crystal, or in the triangle [0001],
+        [2-1-10], [10-10] of a hexagonal one.
         """
         across = np.sqrt(1.0 - self.first * self.first)
         sector = np.pi / 6 if material.structure == "hcp" else 2 * np.pi

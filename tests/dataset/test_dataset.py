@@ -21,6 +21,7 @@ from apt_evap.cli.main import main
 from apt_evap.dataset.making import make, plan_set, split_of, verify
 from apt_evap.dataset.settings import DatasetSettings
 from apt_evap.simulation.run import load
+from apt_evap.sweep.claims import Claims
 
 BASE = """
 [tip]
@@ -138,6 +139,24 @@ def test_more_samples_do_not_move_the_first_ones(made, tmp_path):
     assert full and full.items() <= {shard.name: shard.key for shard in plan.shards}.items()
 
 
+def test_more_samples_after_an_interruption(made, tmp_path, monkeypatch):
+    """Killed when the last file is replaced, but the checksums are those of the smaller set."""
+    few = planned(tmp_path)
+    make(few, tmp_path / "set")
+    more = planned(tmp_path, STUDY.replace("sample = 4", "sample = 8"))
+    assert any(shard.name == old.name and shard.key != old.key for shard in more.shards for old in few.shards)
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr("apt_evap.dataset.making._finish", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        make(more, tmp_path / "set")
+    with pytest.raises(FileError, match="SHA256SUMS"):
+        verify(tmp_path / "set")
+    make(more, tmp_path / "set")
+    make(more, tmp_path / "other")
+    check_same(tmp_path / "set", tmp_path / "other")
+    make(planned(tmp_path), tmp_path / "set")  # and fewer: files that are not of the set are removed
+    check_same(made[1], tmp_path / "set")
+
+
 def test_runs_of_a_specimen_are_in_one_part(tmp_path):
     study = STUDY.replace(
         "[dataset]", '"law" = [{ name = "Extremal" }, { name = "Arrhenius", temperature = 50.0 }]\n[dataset]'
@@ -215,8 +234,6 @@ def test_damage_is_found(made, tmp_path):
 def test_runs_that_fail_are_named_or_left_out(tmp_path):
     plan = planned(tmp_path)
     key = plan.sweep.keys[0]
-    from apt_evap.sweep.claims import Claims  # the journal of a run that ended with an error
-
     folder = plan.sweep.folder_of(key)
     (folder / "run.h5").unlink()
     claims = Claims(folder)
