@@ -37,6 +37,7 @@ _MAX_BYTES = 1 << 30
 _SHARD = re.compile(rf"({'|'.join(SPLITS)})-\d{{4,}}(\.h5|\.\w+\.parquet)")
 # Measured for 30 runs of 2,000 ions with responses: 507 bytes per ion, 95 kB for the picture and the other files
 _RUN_BYTES_PER_ION, _RUN_BYTES = 510, 1e5
+_TEXT_BYTES, _FILE_BYTES = 4000, 40_000  # measured: 2.5 kB of texts in an example, 20 kB of HDF5 in an empty file
 # Measured there: 2 s for 30 examples, with the import of the package; doubled as the times of the runs
 _RECORDING = 6e-5  # seconds per ion and example
 
@@ -96,10 +97,14 @@ class PlannedSet:
     def bytes(self) -> int:
         """Largest size of the data set: all ions within the field of view, before any compression [bytes]."""
         ions = sum(needs.ions for needs in self.sweep.foresights)
+        rows = {"examples": 1, "poles": 24 * self.settings.families, "zone_lines": 13}  # as many as there can be
+        rows["cap"] = 1 + ions // len(self.sweep.points) // 100
+        sizes = {name: sum(field.bytes for field in fields) for name, fields in self.schema.items()}
+        per_example = _TEXT_BYTES + sum(rows[name] * sizes[name] for name in rows if name in sizes)
         instrument = drawn(self.settings.instrument, np.random.default_rng(0), "instrument")
         efficiency = read_instrument(instrument).efficiency
-        per_ion = sum(field.bytes for field in self.schema["ions"])
-        return int(efficiency * per_ion * ions * self.settings.per_run)
+        of_ions = int(efficiency * sizes["ions"] * ions * self.settings.per_run)
+        return of_ions + per_example * self.examples + _FILE_BYTES * len(self.shards)
 
     @property
     def run_bytes(self) -> int:

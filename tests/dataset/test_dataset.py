@@ -363,7 +363,7 @@ def test_the_command_foretells_makes_and_verifies(made, tmp_path, capsys):
     size = sum(shard["bytes"] for shard in ae.dataset.load(made[1]).shards)
     ions = sum(shard["ions"] for shard in ae.dataset.load(made[1]).shards)
     per_ion = sum(field.bytes for field in plan.schema["ions"])
-    assert ions * per_ion < foretold["bytes"] and size > ions * per_ion
+    assert ions * per_ion < size < foretold["bytes"] < 5 * size  # a fifth of the ions is recorded at least
     capsys.readouterr()
     assert main(["dataset", str(tmp_path / "study_set"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["counts"]["train"]["examples"] > 0
