@@ -2,6 +2,7 @@
 from . import analysis as analysis
 from . import config as config
 from . import crystallography as crystallography
+from . import dataset as dataset
 from . import detection as detection
 from . import emission as emission
 from . import evaporation as evaporation

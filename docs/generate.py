@@ -12,6 +12,7 @@ from numpydoc.docscrape import FunctionDoc
 import apt_evap
 from apt_evap._common.codec import declared
 from apt_evap.cli.parser import EXIT_CODES, make_parser
+from apt_evap.dataset.fields import TABLES
 
 HERE = Path(__file__).parent
 
@@ -21,6 +22,7 @@ _GUIDES = {
     "analysis": "charge_states real_units field_ion_image",
     "config": "settings",
     "crystallography": "howto/find_orientation",
+    "dataset": "howto/data_set",
     "detection": "instruments howto/correct_distortion",
     "emission": "emission charge_states extending",
     "evaporation": "charging_rules laws temperature extending_physics",
@@ -86,6 +88,17 @@ def settings(path):
         rows = [("Key", "Value", "Default", "Meaning"), *_keys(described)]
         text = f"{table['text'].strip()} In Python: `{table['object']}`."
         lines += [table["title"], "-" * len(table["title"]), "", text, "", *_table("15 20 15 50", rows, 1)]
+    _write(path, lines)
+
+
+def dataset_fields(path):
+    """Write a table of the fields for each table of a data set."""
+    lines = []
+    for name, fields in TABLES.items():
+        rows = [("Field", "Type", "Shape of a row", "Unit", "Meaning")]
+        for field in fields:
+            rows.append((f"``{field.name}``", field.kind, str(field.row) if field.row else "", field.unit, field.text))
+        lines += [f".. rubric:: {name}", "", *_table("15 10 12 8 55", rows, 1)]
     _write(path, lines)
 
 

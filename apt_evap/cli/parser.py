@@ -39,6 +39,7 @@ from a simulation to its map, and to the emission energies of a measured map:
   apt-evap sweep plan study.toml                     many simulations, on one machine or a cluster
   apt-evap explore ni111.h5 R5083.epos               both maps in the browser, with sliders for the emission
   apt-evap visible particle.toml                     would this precipitate be found?
+  apt-evap dataset study.toml -o set                 a data set with the truth of every ion
   apt-evap COMMAND --help                            all arguments of a command, with examples
 """
 
@@ -74,6 +75,7 @@ def make_parser() -> argparse.ArgumentParser:
         _add_sweep,
         _add_explore,
         _add_visible,
+        _add_dataset,
     ):
         add(commands)
     return parser
@@ -485,6 +487,29 @@ def _add_visible(commands: Any) -> None:
     )
     command.add_argument("config", metavar="FILE.toml", help="settings of a simulation, with a table [visibility]")
     command.add_argument("--threads", type=_integer(1), metavar="N", help="default: all processors")
+    _add_speech(command)
+
+
+def _add_dataset(commands: Any) -> None:
+    command = commands.add_parser(
+        "dataset",
+        help="make a data set with the truth of every ion, or verify one",
+        description="Run the simulations of a study file, record their ions as an instrument would, and write them\n"
+        "with the truth: for machine learning and statistics. Time and size are foretold. The command can be killed\n"
+        "and started again at any time; equal studies give equal bytes. For the folder of a data set, verify it.",
+        epilog="example:\n"
+        "  apt-evap dataset study.toml --plan              runs, examples, hours, size; runs nothing\n"
+        "  apt-evap dataset study.toml -o set --workers 2  make the set, or finish it\n"
+        "  apt-evap dataset set                            verify its checksums",
+        **_SHAPE,
+    )
+    command.add_argument("study", metavar="STUDY.toml", help="study file with a table [dataset], or a data set")
+    command.add_argument("-o", "--output", metavar="FOLDER", help="default: name of the study with _set")
+    command.add_argument("--plan", action="store_true", help="only foretell time and size")
+    command.add_argument("--workers", type=_integer(1), default=1, metavar="N", help="processes; default: 1")
+    command.add_argument(
+        "--without-failed", action="store_true", help="leave out runs that have failed, instead of an error"
+    )
     _add_speech(command)
 
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from apt_evap._common.codec import checked, number, part, settings, vector
+from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_choice, check_kind, check_number, check_seed
 from apt_evap._core.elementary import arctangent, normal_quantile
 from apt_evap.detection.detector import PROJECTIONS
@@ -233,7 +234,7 @@ class Instrument:
         distance = check_number(distance, "distance", at_least=1, at_most=1e6, unit="mm")
         u = IonRandom((check_seed(seed) + _SEED_STEP) % (1 << 64), ion).uniform(_COLUMNS)
         points = np.column_stack([x, y]).astype(np.float64) * (self.distance / distance)
-        places = self._places(points)
+        places = self.places(points)
         times = self._times(points, times.astype(np.float64) * (self.distance / distance))
         late = np.ones(len(times))
         if self.timing is not None:
@@ -270,8 +271,19 @@ class Instrument:
         """Whether ions fly straight to a plane, so that their paths have different lengths."""
         return self.projection == "plane" and self.flight_path is None
 
-    def _places(self, points):
-        """Positions on the detector of straight flights to the plane at `distance`; NaN for ions that do not arrive."""
+    def places(self, points: Floats) -> Floats:
+        """Positions on the detector of straight flights.
+
+        Parameters
+        ----------
+        points : ndarray
+            Where straight flights cross the plane at `distance` [mm], shape (n, 2); NaN for those that do not.
+
+        Returns
+        -------
+        ndarray
+            True positions [mm], shape (n, 2), also outside the field of view; NaN for ions that do not arrive.
+        """
         if self.projection == "plane":
             return points
         places = np.full_like(points, np.nan)

@@ -14,11 +14,12 @@ from typing import Any
 from apt_evap._common.codec import count, from_plain, number, settings
 from apt_evap._common.files import FileError, check_path, sha256_of
 from apt_evap._common.types import AnyPath
-from apt_evap._common.validation import short_text
+from apt_evap._common.validation import check_count, check_seed, short_text
 from apt_evap.config.simulation_file import Config, config_of, key_of, read_document
 from apt_evap.config.tables import check_keys, check_table
 from apt_evap.sweep.compare_settings import CompareSettings
 from apt_evap.sweep.foresight import Foresight, foresee
+from apt_evap.sweep.sampling import AXIS, RandomAxis, option_of, samples
 
 MAX_POINTS = 100_000  # a larger product is a typing error
 POINTS = "points"
@@ -97,6 +98,8 @@ class SweepStudy:
         Comparison with a measured map.
     sha256 : str
         Of the bytes of both files, and of the files of specimens.
+    dataset : dict
+        The table ``[dataset]``, for `apt_evap.dataset`.
     """
 
     path: Path
@@ -107,6 +110,7 @@ class SweepStudy:
     each: JobSettings
     compare: CompareSettings | None
     sha256: str
+    dataset: dict
 
 
 def folder_of_study(path: AnyPath) -> Path:
@@ -132,7 +136,12 @@ def read_study(path: AnyPath) -> SweepStudy:
     ``base`` is the file of settings that all points share (of `apt-evap run`, relative to the study file). ``[sweep]``
     contains lists of values by path; all combinations are points. Each ``[[points]]`` is one more point. Paths are
     quoted: ``"tip.axis" = [[0, 0, 1], [1, 1, 1]]``. ``[each]`` contains the fields of `JobSettings`, ``[compare]`` a
-    measured file and the parameters of `fit_tips`.
+    measured file and the parameters of `fit_tips`, ``[dataset]`` the fields of `DatasetSettings`.
+
+    With ``sample = 300``, values of ``[sweep]`` can also be ranges: ``{ uniform = [20, 60] }``, ``{ log_uniform =
+    [1e-3, 0.1] }``, ``{ integer = [1, 6] }``, ``{ choice = ["Ni", "Al"] }``, and "random" for the axis. Samples are
+    Sobol' points, scrambled by ``seed``, and have seeds of their own. Each sample is combined with all combinations of
+    the lists.
 
     Parameters
     ----------
@@ -151,18 +160,19 @@ def read_study(path: AnyPath) -> SweepStudy:
     path = Path(path)
     table = read_document(path)
     try:
-        check_keys(table, ("base", "each", "compare", "sweep", "points"), ("base",))
+        known = ("base", "sample", "seed", "each", "compare", "dataset", "sweep", "points")
+        check_keys(table, known, ("base",))
         base = table["base"]
         if not isinstance(base, str) or not base:
             raise ValueError(f"base must be a file name such as 'ni111.toml', got {short_text(base)}")
-        for name in ("each", "compare", "sweep"):
+        for name in ("each", "compare", "dataset", "sweep"):
             check_table(table.get(name, {}), name)
         each = from_plain(table.get("each", {}), JobSettings, what="[each]")
         compare = CompareSettings.of(table["compare"], path.parent) if "compare" in table else None
         if compare is not None and not Path(compare.measured).is_file():
             raise ValueError(f"[compare] measured must be an existing file, got {short_text(compare.measured)}")
-        choices = [*_product(table.get("sweep", {})), *_single(table.get("points", []))]
-        if not table.get("sweep") and not table.get("points"):
+        choices = [*_product(table), *_single(table.get("points", []))]
+        if not choices:
             raise ValueError("a sweep needs a table [sweep] or points [[points]], got neither")
     except ValueError as error:
         raise FileError(f"{str(path)!r}: {error}") from error
@@ -175,6 +185,7 @@ def read_study(path: AnyPath) -> SweepStudy:
     place, digests = folder_of_study(path) / POINTS / "point", {}
     for values in choices:
         try:
+            values = _own(values, settings, base_path)
             document = with_values(settings, values)
             config = config_of(document, base_path)
             if "path" in config.tip:
@@ -189,7 +200,32 @@ def read_study(path: AnyPath) -> SweepStudy:
             raise FileError(f"{str(path)!r}, {Point('', values, {})}: {error}") from error
     content = path.read_bytes() + base_path.read_bytes() + "".join(digests.values()).encode()
     sha256 = hashlib.sha256(content).hexdigest()
-    return SweepStudy(path, base_path, tuple(points.values()), tuple(configs), tuple(foresights), each, compare, sha256)
+    return SweepStudy(
+        path,
+        base_path,
+        tuple(points.values()),
+        tuple(configs),
+        tuple(foresights),
+        each,
+        compare,
+        sha256,
+        table.get("dataset", {}),
+    )
+
+
+def _own(values, settings, path):
+    """Values of a point: with the axis for its crystal, and the seeds that its specimen takes."""
+    table = settings["tip"]
+    if "file" in table:
+        values = {key: value for key, value in values.items() if key not in ("tip.seed", "tip.offset_seed")}
+    elif "origin" in table or "tip.origin" in values:
+        values = {key: value for key, value in values.items() if key != "tip.offset_seed"}
+    if isinstance(values.get(AXIS), RandomAxis):
+        tip = config_of(with_values(settings, values | {AXIS: [0, 0, 1]}), path).tip
+        if "path" in tip:
+            raise ValueError(f"{AXIS} must be that of a material, but the specimen is a file")
+        values = values | {AXIS: values[AXIS].of(tip["phases"][0].material if "phases" in tip else tip["material"])}
+    return values
 
 
 def _specimen_table(table, path, place, digests):
@@ -201,19 +237,33 @@ def _specimen_table(table, path, place, digests):
 
 
 def _product(table):
-    """Values by path, for all combinations of the lists of a table."""
-    number = 1
-    for path, values in table.items():
+    """Values by path, for all combinations of the lists of a study, with each of its samples."""
+    sweep, lists, options = table.get("sweep", {}), {}, {}
+    is_sampled = "sample" in table
+    number = check_count(table["sample"], "sample", at_least=1) if is_sampled else 1
+    seed = check_seed(table.get("seed", 0), "seed")
+    if "seed" in table and not is_sampled:
+        raise ValueError(f"seed is that of samples, and needs sample = 300, got {seed} alone")
+    for path, values in sweep.items():
         check_setting_path(path)
-        if not isinstance(values, list) or not values:
-            quoted = f': write the path in quotes, "{path}.{next(iter(values))}"' if isinstance(values, dict) else ""
+        if isinstance(values, list) and values:
+            lists[path] = values
+            number *= len(values)
+        elif is_sampled and not isinstance(values, list):
+            options[path] = option_of(values, path)
+        else:
+            quoted = ""
+            if isinstance(values, dict) and values:
+                name = next(iter(values))
+                quoted = f': a range needs sample = 300; otherwise write the path in quotes, "{path}.{name}"'
             raise ValueError(f"[sweep] {path} must be a list of values, got {short_text(values)}{quoted}")
-        number *= len(values)
-        if number > MAX_POINTS:
-            raise ValueError(f"[sweep] must have at most {MAX_POINTS:,} combinations, got {number:,} or more")
-    if table:
-        for values in itertools.product(*table.values()):
-            yield dict(zip(table, values, strict=True))
+    if number > MAX_POINTS:
+        raise ValueError(f"a sweep must have at most {MAX_POINTS:,} points, got {number:,}")
+    if not (sweep or is_sampled):
+        return
+    for sample in samples(options, table["sample"], seed) if is_sampled else [{}]:
+        for values in itertools.product(*lists.values()):
+            yield sample | dict(zip(lists, values, strict=True))
 
 
 def _single(points):
@@ -250,7 +300,8 @@ def with_values(document: dict[str, Any], values: Mapping[str, Any]) -> dict[str
     document : dict
         Settings, tables in tables.
     values : mapping
-        Values by path; a missing table is made, a value that is a table replaces the whole one.
+        Values by path; a missing table is made, a value that is a table replaces the whole one. An entry of a list is
+        named by its number from 0: ``phases.1.region.radius``.
 
     Returns
     -------
@@ -266,8 +317,16 @@ def with_values(document: dict[str, Any], values: Mapping[str, Any]) -> dict[str
     for path, value in values.items():
         table, *names = document, *path.split(".")
         for depth, name in enumerate(names[:-1], start=1):
-            table = table.setdefault(name, {})
-            if not isinstance(table, dict):
+            table = table[_number(name, table)] if isinstance(table, list) else table.setdefault(name, {})
+            if not isinstance(table, dict | list):
                 raise ValueError(f"{path} leads through {'.'.join(names[:depth])}, which is {short_text(table)}")
-        table[names[-1]] = copy.deepcopy(value)
+        last: Any = _number(names[-1], table) if isinstance(table, list) else names[-1]
+        table[last] = copy.deepcopy(value)
     return document
+
+
+def _number(name, entries):
+    """Number of an entry of a list."""
+    if not (name.isdecimal() and int(name) < len(entries)):
+        raise ValueError(f"{short_text(name)} in a path must be the number of an entry, from 0 to {len(entries) - 1}")
+    return int(name)

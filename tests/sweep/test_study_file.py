@@ -65,6 +65,16 @@ def test_with_values_leaves_the_settings_alone():
     assert document == {"tip": {"axis": [0, 0, 1]}}
 
 
+def test_entries_of_lists_have_numbers():
+    document = {"phases": [{"name": "matrix"}, {"region": {"radius": 1.0, "centre": [0, 0, 5]}}]}
+    changed = with_values(document, {"phases.1.region.radius": 2.0, "phases.1.region.centre.2": 6})
+    assert changed["phases"][1] == {"region": {"radius": 2.0, "centre": [0, 0, 6]}}
+    wrong = {"phases.2.name": "2", "phases.name": "name", "phases.-1.name": "-1", "phases.1.region.centre.3": "3"}
+    for path, name in wrong.items():
+        with pytest.raises(ValueError, match=f"'{name}'"):
+            with_values(document, {path: 1})
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -1,0 +1,60 @@
+"""`apt-evap dataset`: make a data set from a study file, or verify one."""
+
+import argparse
+from pathlib import Path
+
+from apt_evap.cli._output import say, tell, tell_json
+from apt_evap.dataset.making import ABOUT, make, plan_set, verify
+from apt_evap.sweep.foresight import hours_text
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Run the command."""
+    path = Path(options.study)
+    if path.is_dir() and (path / ABOUT).exists():
+        content = verify(path)
+        tell(options, f"{path}: all files are as in its checksums")
+    else:
+        planned = plan_set(path)
+        hours = "" if planned.hours is None else f"; about {hours_text(planned.hours)} of one worker left"
+        tell(options, f"{len(planned.sweep.points):,} runs, {planned.examples:,} examples{hours}")
+        tell(
+            options,
+            f"at most {_size(planned.bytes)} in the data set, about {_size(planned.run_bytes)} of runs in "
+            f"{planned.sweep.folder}, which it does not need when it is finished",
+        )
+        if options.plan:
+            tell_json(
+                options,
+                {
+                    "runs": len(planned.sweep.points),
+                    "examples": planned.examples,
+                    "hours": planned.hours,
+                    "bytes": planned.bytes,
+                    "run_bytes": planned.run_bytes,
+                },
+            )
+            return 0
+        path = Path(options.output) if options.output else path.with_name(f"{path.stem}_set")
+        content = make(
+            planned,
+            path,
+            workers=options.workers,
+            without_failed=options.without_failed,
+            note=lambda text: tell(options, text),
+        )
+        for key, values in content["left_out"].items():
+            say("note", f"run {key} has failed and is left out: {values}")
+    for split, counts in content["counts"].items():
+        tell(options, f"{split}: {counts['examples']:,} examples of {counts['runs']:,} runs, {counts['ions']:,} ions")
+    size = sum(shard["bytes"] for shard in content["shards"])
+    tell(options, f"{path}: {_size(size)}")
+    tell_json(
+        options,
+        {"folder": str(path), "bytes": size, "counts": content["counts"], "left_out": list(content["left_out"])},
+    )
+    return 0
+
+
+def _size(n_bytes):
+    return f"{n_bytes / 1e9:.3g} GB" if n_bytes >= 1e9 else f"{n_bytes / 1e6:.3g} MB"

@@ -1,0 +1,217 @@
+"""Sampled settings of a study: ranges, choices and random axes, drawn from Sobol' points."""
+
+import hashlib
+import inspect
+import re
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.stats import qmc
+
+from apt_evap._common.types import Floats
+from apt_evap._common.validation import did_you_mean, short_text
+from apt_evap._core.elementary import exponential, logarithm, sine_and_cosine
+from apt_evap.specimen.lattice import direction_vectors
+from apt_evap.specimen.materials import Material
+
+AXIS, RANDOM = "tip.axis", "random"
+"""The setting that can be random, and the word for it."""
+SEEDS = ("simulation.seed", "tip.seed", "tip.offset_seed")
+"""Seeds that every sample has of its own."""
+_DIGITS = 6  # of a drawn number: the same text, and the same key of a point, on every machine
+_DECIMALS = 5  # of a random axis: 0.001 degrees
+_BITS = 30  # of Sobol' points: 1e9 samples
+_LENGTH = re.compile(r"\s*([-+.\deE]+)\s*(a|nm)\s*")
+_SCRAMBLED_BY = "rng" if "rng" in inspect.signature(qmc.Sobol).parameters else "seed"  # since SciPy 1.15
+
+
+@dataclass(frozen=True)
+class Option:
+    """A setting that is sampled."""
+
+    width: int
+    """Number of coordinates in the unit interval that a value takes."""
+    value: Callable[[Sequence[float]], Any]
+    """Value for these coordinates."""
+
+
+@dataclass(frozen=True)
+class RandomAxis:
+    """A direction in the standard triangle of a crystal that is not known yet."""
+
+    first: float
+    second: float
+
+    def __str__(self):
+        return RANDOM
+
+    def of(self, material: Material) -> list[float]:
+        """Crystal direction [u v w] for a material.
+
+        Uniform on the sphere, in the triangle [001], [011], [111] of a cubic crystal, or in the triangle [0001],
+        [2-1-10], [10-10] of a hexagonal one.
+        """
+        across = np.sqrt(1.0 - self.first * self.first)
+        sector = np.pi / 6 if material.structure == "hcp" else 2 * np.pi
+        sine, cosine = (float(part[0]) for part in sine_and_cosine(np.array([sector * self.second])))
+        vector = np.array([across * cosine, across * sine, self.first])
+        if material.structure == "hcp":
+            vector = np.linalg.solve(direction_vectors("hcp", material.a, material.c).T, vector)
+        else:
+            vector = np.sort(np.abs(vector))
+        return [float(each) for each in np.round(vector, _DECIMALS)]
+
+
+def is_option(value: Any) -> bool:
+    """Whether a value is a table of one range or choice, such as ``{ uniform = [20, 60] }``."""
+    return isinstance(value, Mapping) and len(value) == 1 and next(iter(value)) in _KINDS
+
+
+def option_of(value: Any, path: str) -> Option:
+    """Option of a value of a study: a range, a choice, or "random" for an axis.
+
+    Raises
+    ------
+    ValueError
+        If it is none of them, or its bounds are wrong.
+    """
+    if value == RANDOM and path == AXIS:
+        return Option(2, lambda u: RandomAxis(*u))
+    if not is_option(value):
+        known, key = ", ".join(_KINDS), next(iter(value), "") if isinstance(value, Mapping) else value
+        raise ValueError(f"{path} must be one of {known}, got {short_text(value)}{did_you_mean(key, _KINDS)}")
+    ((kind, content),) = value.items()
+    if kind == "choice":
+        if not isinstance(content, list) or not content:
+            raise ValueError(f"{path}: choice must be a list of values, got {short_text(content)}")
+        return Option(1, lambda u: content[int(u[0] * len(content))])
+    low, high, unit = _bounds(content, f"{path}: {kind}")
+    if kind == "integer":
+        if unit or not (low.is_integer() and high.is_integer()):
+            raise ValueError(f"{path}: integer must be two integers, got {short_text(content)}")
+        return Option(1, lambda u: int(low) + int(u[0] * (high - low + 1)))
+    if kind == "uniform":
+        return Option(1, lambda u: _rounded(low + u[0] * (high - low), unit))
+    if low <= 0:
+        raise ValueError(f"{path}: log_uniform must be two positive numbers, got {short_text(content)}")
+    first, last = logarithm(np.array([low, high]))
+    return Option(1, lambda u: _rounded(float(exponential(np.array([first + u[0] * (last - first)]))[0]), unit))
+
+
+_KINDS = ("uniform", "log_uniform", "integer", "choice")
+
+
+def _bounds(content, name):
+    """Two numbers in increasing order and their unit, "" if they have none."""
+    if isinstance(content, list) and len(content) == 2:
+        if all(isinstance(each, int | float) and not isinstance(each, bool) for each in content):
+            numbers, units = [float(each) for each in content], {""}
+        else:
+            found = [_LENGTH.fullmatch(each) if isinstance(each, str) else None for each in content]
+            try:
+                numbers, units = [float(each[1]) for each in found], {each[2] for each in found}  # type: ignore[index]
+            except (TypeError, ValueError):
+                numbers, units = [], set()
+        if len(units) == 1 and np.isfinite(numbers).all() and numbers[0] < numbers[1]:
+            return (*numbers, units.pop())
+    raise ValueError(
+        f'{name} must be two numbers in increasing order, or two lengths such as ["20 a", "60 a"], '
+        f"got {short_text(content)}"
+    )
+
+
+def _rounded(number, unit):
+    text = f"{number:.{_DIGITS}g}"
+    return f"{text} {unit}" if unit else float(text)
+
+
+def sobol(n: int, width: int, seed: int) -> Floats:
+    """First points of a scrambled Sobol' sequence; more points do not change the first ones.
+
+    Parameters
+    ----------
+    n, width : int
+        Number of points and of coordinates.
+    seed : int
+        Seed of the scrambling.
+
+    Returns
+    -------
+    ndarray
+        Coordinates from 0 to 1, shape (n, width).
+    """
+    if not width:
+        return np.empty((n, 0))
+    sequence = qmc.Sobol(width, scramble=True, bits=_BITS, **{_SCRAMBLED_BY: np.random.default_rng(seed)})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # the balance of a power of 2 is lost on purpose
+        return sequence.random(n)
+
+
+def seed_of(*words: Any) -> int:
+    """Seed that is derived from words and numbers, from 0 to 2^31 - 1."""
+    digest = hashlib.sha256("/".join(map(str, words)).encode()).digest()
+    return int.from_bytes(digest[:4], "big") >> 1
+
+
+def samples(options: Mapping[str, Option], n: int, seed: int) -> list[dict[str, Any]]:
+    """Values by path of each sample, and its seeds.
+
+    Parameters
+    ----------
+    options : mapping of str to Option
+        What is sampled, by path. Their order gives the coordinates of the Sobol' points.
+    n : int
+        Number of samples.
+    seed : int
+        Seed of the study.
+
+    Returns
+    -------
+    list of dict
+    """
+    points = sobol(n, sum(option.width for option in options.values()), seed)
+    found = []
+    for number, coordinates in enumerate(points.tolist()):
+        values, first = {}, 0
+        for path, option in options.items():
+            values[path] = option.value(coordinates[first : first + option.width])
+            first += option.width
+        found.append(values | {path: seed_of(seed, number, path) for path in SEEDS})
+    return found
+
+
+def drawn(thing: Any, random: np.random.Generator, name: str) -> Any:
+    """A table or list with a drawn value in the place of each range or choice in it.
+
+    Parameters
+    ----------
+    thing : object
+        Plain types.
+    random : numpy.random.Generator
+        Random numbers.
+    name : str
+        What it is, for messages.
+
+    Returns
+    -------
+    object
+    """
+    if is_option(thing):
+        option = option_of(thing, name)
+        return option.value(random.random(option.width).tolist())
+    if isinstance(thing, Mapping):
+        return {key: drawn(each, random, f"{name}.{key}") for key, each in thing.items()}
+    return [drawn(each, random, name) for each in thing] if isinstance(thing, list) else thing
+
+
+def has_options(thing: Any) -> bool:
+    """Whether a table or list contains a range or choice."""
+    if is_option(thing):
+        return True
+    return any(
+        map(has_options, thing.values() if isinstance(thing, Mapping) else thing if isinstance(thing, list) else ())
+    )
