@@ -870,7 +870,7 @@ def test_every_public_name_with_arguments_is_in_the_table():
     taken = {*MADE, *ARRAYS, "Unperturbed", "Union"}  # no arguments; positional arguments only, in test_regions
     taken |= {"chunks", "precipitate_errors", "likeness"}  # in test_chunks, test_precipitate, test_verdict
     taken |= {"write_nodes", "write_types", "describe"}  # in test_tapsim_nodes, test_main
-    taken |= set(ae.visibility.__all__)  # in tests/visibility
+    taken |= {*ae.visibility.__all__, *ae.dataset.__all__}  # in tests/visibility, tests/dataset
     missing = {
         name
         for place in (ae, *SPACES)
