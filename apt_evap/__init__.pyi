@@ -9,6 +9,7 @@ from . import evaporation as evaporation
 from . import explore as explore
 from . import fit as fit
 from . import flight as flight
+from . import indexing as indexing
 from . import io as io
 from . import maps as maps
 from . import microscope as microscope
@@ -41,6 +42,7 @@ from .evaporation.voltage import VoltageControl as VoltageControl
 from .fit.fit_energies import fit_energies as fit_energies
 from .flight.crew import FlightSettings as FlightSettings
 from .flight.response import ResponseSettings as ResponseSettings
+from .indexing.index import index as index
 from .io.formats import read as read
 from .io.formats import write as write
 from .io.npz import read_map as read_map

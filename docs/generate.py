@@ -39,6 +39,7 @@ _GUIDES = {
     "sweep": "howto/sweep",
     "units": "conventions",
     "visibility": "howto/visibility",
+    "indexing": "howto/find_orientation",
 }
 
 
