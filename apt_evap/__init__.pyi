@@ -20,6 +20,7 @@ from . import report as report
 from . import simulation as simulation
 from . import specimen as specimen
 from . import sweep as sweep
+from . import twin as twin
 from . import units as units
 from . import visibility as visibility
 from . import warnings as warnings

@@ -18,7 +18,7 @@ def execute(options: argparse.Namespace) -> int:
     """Run the command."""
     picture = picture_path(options.output or f"{Path(options.file).stem}_indexed.png")
     check_output(picture, is_picture, options.force)
-    found = indexed(options)
+    found, _ = indexed(options)
     tell(options, f"{found}")
     save_figure(picture, plot.indexing(found)[0].figure)
     tell(options, f"wrote {picture}")
@@ -41,10 +41,10 @@ def map_of(options: argparse.Namespace) -> tuple[DetectorMap, Hits | None]:
     return ions.map(bins=128), ions
 
 
-def indexed(options: argparse.Namespace) -> Indexing:
-    """Index the map of a command."""
-    detector_map, _ = map_of(options)
-    return index(
+def indexed(options: argparse.Namespace) -> tuple[Indexing, Hits | None]:
+    """Index the map of a command; the answer, and the ions that the map is made of."""
+    detector_map, ions = map_of(options)
+    found = index(
         detector_map,
         options.element,
         scales=options.scales,
@@ -52,3 +52,4 @@ def indexed(options: argparse.Namespace) -> Indexing:
         poles=options.pole or (),
         lines=options.line or (),
     )
+    return found, ions

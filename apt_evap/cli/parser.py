@@ -32,6 +32,7 @@ from a simulation to its map, and to the emission energies of a measured map:
   apt-evap info R5083.epos --json | jq .ions         also for measured files; --json for programs
   apt-evap map R5083.epos --bins 128                 map of measured ions
   apt-evap index R5083.epos --element Ni             which crystal direction is where on the map
+  apt-evap twin R5083.epos --element Ni              all of this: index, simulate, register, fit, report
   apt-evap compare ni111.h5 R5083.epos -o study      fit the emission energies to the measured map
   apt-evap export ni111.h5 --real-units -o ni111.epos
                                                      ions as an instrument would write them
@@ -70,6 +71,8 @@ def make_parser() -> argparse.ArgumentParser:
         _add_map,
         _add_info,
         _add_index,
+        _add_start,
+        _add_twin,
         _add_compare,
         _add_export,
         _add_reconstruct,
@@ -243,6 +246,57 @@ def _add_index(commands: Any) -> None:
     )
     command.add_argument("--force", action="store_true", help="overwrite a file not made by apt-evap")
     _add_speech(command)
+
+
+def _add_start(commands: Any) -> None:
+    command = commands.add_parser(
+        "start",
+        help="settings file for a simulation of a measured specimen",
+        description="Index a measured map, and write a settings file for a simulation of its specimen: axis,\n"
+        "rotation, radius, detector and emission, with the origin of every number as a comment.",
+        epilog="example:\n"
+        "  apt-evap start R5083.epos --element Ni --distance 90 -o specimen.toml\n"
+        "  apt-evap run specimen.toml",
+        **_SHAPE,
+    )
+    command.add_argument("file", metavar="FILE", help="measured ions (.epos, ...) or a map (.npz)")
+    command.add_argument("-o", "--output", metavar="FILE.toml", help="default: the name of FILE with .toml")
+    _add_reading(command)
+    _add_indexing(command)
+    _add_specimen(command)
+    command.add_argument("--force", action="store_true", help="overwrite a file not made by this command")
+    _add_speech(command)
+
+
+def _add_twin(commands: Any) -> None:
+    command = commands.add_parser(
+        "twin",
+        help="from a measured file to a simulation of its specimen, a fit and a report",
+        description="Index a measured map, simulate its specimen, register the simulated map on the measured one, fit\n"
+        "the emission, and write a report. The same command continues after an interruption.",
+        epilog="writes to FOLDER:\n"
+        "  specimen.toml, start.json   settings of the simulation, and the indexing\n"
+        "  run.h5, run.png             the simulation\n"
+        "  registration.json, study/   as of apt-evap compare; study/report.html has it all\n"
+        "  answer.txt                  constants of the measurement\n\n"
+        "example: apt-evap twin R5083.epos --element Ni --distance 90 --minutes 10",
+        **_SHAPE,
+    )
+    command.add_argument("file", metavar="FILE", help="measured ions (.epos, ...) or a map (.npz)")
+    command.add_argument("-o", "--output", metavar="FOLDER", help="default: FILE_twin in this folder")
+    _add_reading(command)
+    _add_indexing(command)
+    _add_specimen(command)
+
+
+def _add_specimen(command: Any) -> None:
+    group = command.add_argument_group("specimen")
+    group.add_argument(
+        "--minutes", type=float, default=10.0, metavar="N", help="time that the simulation may take; default: 10"
+    )
+    group.add_argument("--field-factor", type=float, metavar="KF", help="for the radius from the voltage; default: 3.3")
+    group.add_argument("--lens", metavar="L", help="microscope that gives the field factor, as for apt-evap export")
+    group.add_argument("--threads", type=_integer(1), metavar="N", help="default: all processors")
 
 
 def _add_indexing(command: Any) -> None:

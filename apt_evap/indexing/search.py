@@ -21,13 +21,13 @@ from apt_evap.detection.projection import Projection
 from apt_evap.indexing.marks import Mark, rotations_misfit
 from apt_evap.indexing.master_pattern import MasterPattern, nearest
 
-RINGS, AZIMUTHS = 24, 120
+RINGS, AZIMUTHS = 20, 96
 """Points of a polar picture."""
-AXIS_STEP = 2.5
+AXIS_STEP = 3.0
 """Distance of neighbouring axes in the search [degrees]."""
-SCALE_STEP = 0.06
+SCALE_STEP = 0.08
 """Step of the search in the logarithm of the scale."""
-SMOOTHED = 1.2
+SMOOTHED = 1.5
 """Standard deviation of the Gaussian that smooths the patterns [degrees], about the distance to the nearest axis."""
 DEGREE = 4
 """Degree of the polynomials that are removed from maps and patterns."""
