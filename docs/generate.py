@@ -1,18 +1,25 @@
 """Pages that are made from the package: the API, the commands with their options, and the keys of a settings file."""
 
 import argparse
+import base64
 import importlib
 import inspect
+import io
+import json
 import re
 import tomllib
 from pathlib import Path
 
+import matplotlib
+import numpy as np
 from numpydoc.docscrape import FunctionDoc
+from PIL import Image
 
 import apt_evap
 from apt_evap._common.codec import declared
 from apt_evap.cli.parser import EXIT_CODES, make_parser
 from apt_evap.dataset.fields import TABLES
+from apt_evap.indexing import master_pattern
 
 HERE = Path(__file__).parent
 
@@ -102,6 +109,56 @@ def dataset_fields(path):
             rows.append((f"``{field.name}``", field.kind, str(field.row) if field.row else "", field.unit, field.text))
         lines += [f".. rubric:: {name}", "", *_table("15 10 12 8 55", rows, 1)]
     _write(path, lines)
+
+
+def atlas(path):
+    """Write the page of the atlas: the master patterns as pictures, poles and zone axes of each crystal."""
+    crystals = {}
+    for element in ("Ni", "W", "Si", "Ti"):
+        material = apt_evap.material(element)
+        hexagonal = material.structure == "hcp"
+        poles, zones = apt_evap.crystallography.poles(material, 7), apt_evap.crystallography.zones(material)
+        views = {"[0001]": (0, 0, 0, 1), "[10-10]": (1, 0, -1, 0), "[11-20]": (1, 1, -2, 0)} if hexagonal else {
+            "[001]": (0, 0, 1), "[011]": (0, 1, 1), "[111]": (1, 1, 1), "[112]": (1, 1, 2)}  # fmt: skip
+        normals = apt_evap.crystallography.direction_normals(material, list(views.values()))
+        crystals[material.structure] = {
+            "name": f"{material.structure} ({element})",
+            "radii": {
+                f"{pattern.apex_radius:g}": [_png(each) for each in pattern.smoothed(0.3)]
+                for pattern in apt_evap.indexing.master_patterns(material.structure)
+            },
+            "poles": [
+                [*normal.round(5).tolist(), "".join(f"{abs(i)}\u0305" if i < 0 else str(i) for i in plane.tolist()),
+                 round(float(spacing / poles.spacings.max()), 3)]
+                for normal, plane, spacing in zip(poles.normals, poles.planes, poles.spacings, strict=True)
+            ],
+            "zones": [
+                [*axis.round(5).tolist(), int(family)]
+                for axis, family in zip(zones.directions, zones.families, strict=True)
+            ],
+            "axes": [[label, axis.round(5).tolist()] for label, axis in zip(views, normals, strict=True)],
+        }  # fmt: skip
+    colours = (matplotlib.colormaps["inferno"](range(256))[:, :3] * 255).round().astype("uint8")
+    text = (HERE / "atlas.html").read_text()
+    for name, value in {
+        "DATA": json.dumps(crystals, ensure_ascii=False),
+        "HALF": master_pattern.HALF,
+        "PIXEL": repr(master_pattern.PIXEL),
+        "BRIGHTEST": repr(master_pattern.BRIGHTEST),
+        "COLOURS": base64.b64encode(colours.tobytes()).decode(),
+    }.items():
+        text = text.replace(f"@{name}@", str(value))
+    _write(path, text.splitlines())
+
+
+def _png(densities):
+    """Square roots of densities in 64 levels of grey, as a PNG in base64."""
+    levels = (np.sqrt(np.clip(densities, 0, master_pattern.BRIGHTEST) / master_pattern.BRIGHTEST) * 63).round() * (
+        255 / 63
+    )
+    file = io.BytesIO()
+    Image.fromarray(levels.round().astype("uint8")).save(file, "PNG", optimize=True)
+    return base64.b64encode(file.getvalue()).decode()
 
 
 def _keys(described):

@@ -29,27 +29,30 @@ from apt_evap.emission.perturbations import Perturbation
 from apt_evap.simulation.run import Run
 from apt_evap.specimen.lattice import check_structure
 
-_HALF = 160  # pixels from the pole to the rim of a pattern
+HALF = 160
+"""Pixels from the pole to the rim of a pattern."""
 _RIM = 1.45  # of the equal-area disc: its equator is at sqrt(2)
-_PIXEL = _RIM / _HALF  # [rad] at the pole, 0.52 degrees
+PIXEL = _RIM / HALF
+"""Size of a pixel at the pole [rad], 0.52 degrees."""
+BRIGHTEST = 8.0
+"""Largest density of a stored pattern [mean densities]; brighter pixels are set to this."""
 _WIDEST = 50.0  # degrees from the axis of the tip: farther out are ions from the shank
 _ROUNDS = 6  # of density and decrease in turn: the last changes are below 0.1 %
 _DEGREE = 3  # of the decrease, in the squared sine of the polar angle
-_BRIGHTEST = 8.0  # mean densities; brighter pixels are set to this
-_LEVELS = 255 / math.sqrt(_BRIGHTEST)  # stored values are square roots: noise of a count is equal at all densities
+_LEVELS = 255 / math.sqrt(BRIGHTEST)  # stored values are square roots: noise of a count is equal at all densities
 
 
 def _disc(directions: Floats) -> Floats:
     """Pixels, shape (2, n), of directions on the equal-area disc of a hemisphere; opposite directions are equal."""
     x, y, z = np.where(directions[:, 2:] < 0, -directions, directions).T
-    stretch = np.sqrt(2 / (1 + z)) / _PIXEL
-    return np.stack([y * stretch, x * stretch]) + _HALF
+    stretch = np.sqrt(2 / (1 + z)) / PIXEL
+    return np.stack([y * stretch, x * stretch]) + HALF
 
 
 @cache
 def _grid() -> Floats:
-    """Directions of all pixels, shape ((2 _HALF + 1)^2, 3); beyond the equator they are on the other hemisphere."""
-    steps = np.arange(-_HALF, _HALF + 1) * _PIXEL
+    """Directions of all pixels, shape ((2 HALF + 1)^2, 3); beyond the equator they are on the other hemisphere."""
+    steps = np.arange(-HALF, HALF + 1) * PIXEL
     x, y = (each.ravel() for each in np.meshgrid(steps, steps))
     z = 1 - (x * x + y * y) / 2
     stretch = np.sqrt(np.maximum((1 + z) / 2, 0))
@@ -86,7 +89,7 @@ class MasterPattern:
     ions: int
 
     def __post_init__(self):
-        side = 2 * _HALF + 1
+        side = 2 * HALF + 1
         check_structure(self.structure)
         check_number(self.apex_radius, "apex_radius", above=0, unit="lattice constants")
         check_array(self.densities, "densities", (2, side, side))
@@ -118,7 +121,7 @@ class MasterPattern:
         sigma = check_number(sigma, "sigma", at_least=0, unit="degrees")
         if sigma == 0:
             return self.densities
-        return scipy.ndimage.gaussian_filter(self.densities, (0, *2 * [math.radians(sigma) / _PIXEL]), mode="nearest")
+        return scipy.ndimage.gaussian_filter(self.densities, (0, *2 * [math.radians(sigma) / PIXEL]), mode="nearest")
 
     def map(
         self,
@@ -223,7 +226,7 @@ class MasterPattern:
 
     def save(self, path: AnyPath) -> None:
         """Write the pattern to a file (.npz): square roots of the densities in 255 levels, up to 8 mean densities."""
-        levels = np.rint(np.sqrt(np.clip(self.densities, 0, _BRIGHTEST)) * _LEVELS).astype(np.uint8)
+        levels = np.rint(np.sqrt(np.clip(self.densities, 0, BRIGHTEST)) * _LEVELS).astype(np.uint8)
         with open(path, "wb") as file:
             np.savez_compressed(
                 file, structure=self.structure, apex_radius=self.apex_radius, levels=levels, ions=self.ions
@@ -252,9 +255,9 @@ def nearest(densities: Floats, directions: Floats) -> Floats:
 def _folded(structure: str, views: Sequence[tuple[Floats, Floats]]) -> Floats:
     """Density over the sphere, folded, of directions (n, 3) of tips with the rotation matrices (3, 3)."""
     group, grid = point_group(structure), _grid()
-    side = 2 * _HALF + 1
-    edges = (np.arange(side + 1) - _HALF - 0.5) * _PIXEL
-    hemisphere = np.hypot(*(np.indices((side, side)) - _HALF)) * _PIXEL < math.sqrt(2)
+    side = 2 * HALF + 1
+    edges = (np.arange(side + 1) - HALF - 0.5) * PIXEL
+    hemisphere = np.hypot(*(np.indices((side, side)) - HALF)) * PIXEL < math.sqrt(2)
     lowest = math.cos(math.radians(_WIDEST))
     counts = np.zeros((side, side))
     cosines, kept = [], []
