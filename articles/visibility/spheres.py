@@ -6,7 +6,7 @@ Spheres of Al with 25 % Cu in Al[012] with 5 % Cu, R = 8 nm, with 0.8, 1 and 1.2
 matrix; and a monolayer with 50 % Cu, 0.2 nm thick, across the axis and along it. The instrument has an efficiency of 50
 %. The analysis counts the pairs of Cu ions within 3 nm of the feature that are closer than 0.6 nm. For each feature,
 full simulations make the operators and the emulator draws the twins. The script prints a table with the processor time
-of each answer and writes table.json. It takes a quarter of an hour on a processor core.
+of each answer and writes table.json. It takes eleven minutes of a processor core.
 """
 
 import argparse
