@@ -25,6 +25,7 @@ from apt_evap._common.validation import (
     short_text,
 )
 from apt_evap.detection.detector import Detector
+from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits, Outcome
 from apt_evap.detection.instrument import Instrument
 from apt_evap.emission.emissions import Emissions, TangentialLaunches
@@ -393,6 +394,28 @@ class Run:
         rim = np.tile([stereographic_rim(self.field_of_view), 0.0], (len(some), 1))
         return float(np.sqrt(squared_lengths(some._seen(rim, np.ones(len(some)))[0])).min())
 
+    def grid(self, bins: int) -> DetectorMap:
+        """Empty map of the complete detector, for the `like` of maps of this run.
+
+        Parameters
+        ----------
+        bins : int
+            Number of bins along each side.
+
+        Returns
+        -------
+        DetectorMap
+            Without hits. Bins outside the field of view of the flights are outside its mask.
+        """
+        grid = self.detector.grid(bins)
+        if self._rim >= stereographic_rim(self.detector.half_angle):
+            return grid
+        x, y = ((edges[1:] + edges[:-1]) / 2 for edges in (grid.x_edges, grid.y_edges))
+        places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        angles = self.detector.seen_from_apex.angles(places).reshape(grid.values.shape)
+        mask = np.tan(angles / 2) <= self._rim
+        return DetectorMap.from_array(grid.values, grid.x_edges, grid.y_edges, mask, is_counts=True)
+
     def _rim_on(self, instrument):
         """Least distance from the centre of an instrument at which ions at the rim arrive [mm]."""
         azimuths = 2 * np.pi * np.arange(_RIM_SAMPLES) / _RIM_SAMPLES
@@ -577,7 +600,15 @@ class Run:
                     f"lens has the detector_potential {lens.detector_potential:g} V, whose influence depends on the "
                     "voltages: use run.at_evaporation_field(lens)"
                 )
-            return behind.on_detector(detector)
+            run = behind._shown_on(detector)
+        else:
+            run = self._shown_on(detector)
+        edge = stereographic_rim(detector.polar_angle(detector.width / 2))
+        run._warn_if_beyond(run._rim < edge * (1 - 1e-6), "detector")
+        return run
+
+    def _shown_on(self, detector):
+        """The same run on another detector."""
         ratio = detector.distance / self.detector.distance
         flown, responses = self.flown, self.responses
         if ratio != 1.0:
@@ -587,10 +618,7 @@ class Run:
                 site, rolled = responses.site * factors, responses.rolled * factors
                 responses = replace(responses, site=site, rolled=rolled, residuals=responses.residuals * ratio)
         settings = self.settings | {"detector": to_plain(detector)}
-        run = replace(self, detector=detector, settings=settings, flown=flown, responses=responses)
-        edge = stereographic_rim(detector.polar_angle(detector.width / 2))
-        run._warn_if_beyond(run._rim < edge * (1 - 1e-6), "detector")
-        return run
+        return replace(self, detector=detector, settings=settings, flown=flown, responses=responses)
 
     def record(
         self, instrument: Instrument, perturbation: Perturbation | None = None, *, seed: int | None = None

@@ -239,6 +239,10 @@ def test_a_detector_that_sees_more_is_warned_about(wide_part):
     with pytest.warns(RunWarning, match="field of view"):
         seen = wide_part.on_detector(ae.Detector(distance=50.0, width=80.0))
     assert seen.hits(ae.Unperturbed()).extent is None  # an outline follows from the ions, as of measured ones
+    grid = wide_part.grid(40)
+    x = (grid.x_edges[1:] + grid.x_edges[:-1]) / 2
+    np.testing.assert_array_equal(grid.mask, np.hypot(*np.meshgrid(x, x)) <= 100.0 * np.tan(np.radians(20.0)))
+    assert wide_part.hits(ae.RollUp(1.5)).map(like=grid).ions > 30
     real = wide_part.at_evaporation_field()
     with pytest.warns(RunWarning, match="field of view"):
         real.record(ae.Instrument(distance=100.0, field_of_view=80.0))
