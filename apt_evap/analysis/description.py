@@ -30,6 +30,7 @@ UNITS = {
     "bin_size": "mm",
     "distance": "mm",
     "width": "mm",
+    "field_of_view": "degrees",
     "field_before_leaving": "V/nm",
     "energy_limit": "eV",
     "median_residual": "mm",
@@ -59,6 +60,7 @@ UNITS = {
 """Units in the result of `describe`, by key."""
 
 
+_OUTCOMES = ("perturbation", "hit", "missed", "never_left", "outside", "not_flown")
 _MEASURED = ("x", "y", "time_of_flight", "voltage", "pulse_voltage", "mass_to_charge", "positions", "pulse_id")
 
 
@@ -179,11 +181,12 @@ def _of_run(run):
         "seed": run.seed,
         "tip": _tip(run.settings["tip"]),
         "detector": {"distance": run.detector.distance, "width": run.detector.width},
+        "field_of_view": run.field_of_view,
         "ions": len(run),
         "species": _counts(run.elements, run.species),
         "phases": _counts(run.phase_names, run.phase),
         "field_before_leaving": _extent(run.fields),
-        "outcomes": {key: summary[key] for key in ("perturbation", "hit", "missed", "never_left")},
+        "outcomes": {key: summary[key] for key in _OUTCOMES if key in summary},
         "without_neighbour_to_roll_onto": summary["without_neighbour"],
         "detached": summary["detached"],
         "perturbations_flown": [str(each["repr"] if isinstance(each, dict) else each) for each in run.perturbations],

@@ -113,7 +113,7 @@ def run_maps(
     run: Run, settings: MapSettings, choose: Callable[[Hits], Hits] = lambda hits: hits
 ) -> tuple[list[DetectorMap], list[str]]:
     """Maps of the complete detector, for all ions or a selection, and their titles."""
-    grid = run.detector.grid(settings.bins or bins_for(len(run)))
+    grid = run.grid(settings.bins or bins_for(len(run)))
     maps = [choose(run.hits(panel.perturbation)).map(like=grid, position_step=None) for panel in settings.panels]
     return [_smooth(each, settings.smoothing) for each in maps], [panel.title for panel in settings.panels]
 

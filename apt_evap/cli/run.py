@@ -102,13 +102,16 @@ def _tell_outcomes(options, config, run, output, n_ions):
     """Print the numbers of hits, and notes about problems."""
     frequent_misses = []
     for panel in config.maps.panels:
-        hit, missed, never_left = run.hits(panel.perturbation).counts.values()
+        hit, missed, never_left, outside = run.hits(panel.perturbation).counts.values()
         frequent_misses += [missed] if 2 * missed > len(run) else []
+        view = "" if run.field_of_view is None else f", {outside:,} are outside the field of view"
         tell(
-            options, f"{panel.title}: {hit:,} hit the detector, {missed:,} missed it, {never_left:,} never left the tip"
+            options,
+            f"{panel.title}: {hit:,} hit the detector, {missed:,} missed it, {never_left:,} never left the tip{view}",
         )
     if run.responses is not None:
-        tell(options, f"responses: {run.flagged.sum():,} ions flagged as inexact")
+        view = "" if run.field_of_view is None else f", {run.not_flown.sum():,} ions not flown"
+        tell(options, f"responses: {run.flagged.sum():,} ions flagged as inexact{view}")
     if frequent_misses:
         say(
             "note",

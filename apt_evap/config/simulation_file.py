@@ -25,10 +25,11 @@ from apt_evap.evaporation.rule import CompiledRule, ConstantPotential, Robin, Ru
 from apt_evap.evaporation.settings import ChargeSettings
 from apt_evap.evaporation.thermal import Arrhenius
 from apt_evap.evaporation.voltage import VoltageControl, check_voltage
-from apt_evap.flight.crew import FlightSettings
+from apt_evap.flight.crew import WHOLE_DETECTOR, FlightSettings
 from apt_evap.flight.response import ResponseSettings
 from apt_evap.io.specimens import read_tip
 from apt_evap.microscope.local_electrode import LocalElectrode
+from apt_evap.microscope.run_lens import field_of_view
 from apt_evap.simulation.monitor import Monitor
 from apt_evap.simulation.real_units import OperatingPoint, check_flight_charges
 from apt_evap.simulation.run import Run
@@ -191,13 +192,17 @@ class Config:
                 names = tuple(element.name for element in tip.elements)
                 check_flight_charges(self.real_units.flight_charges, names)
         with _located(self.path):  # flights and tip or detector: no single table
+            flight_settings = self.flight_settings
+            if self.microscope is not None and flight_settings.field_of_view == WHOLE_DETECTOR:
+                angle = field_of_view(self.microscope, tip, self.detector)
+                flight_settings = replace(flight_settings, field_of_view=angle)
             return Simulation(
                 tip,
                 voltage=self.voltage,
                 seed=self.seed,
                 detector=self.detector,
                 charge_settings=self.charge_settings,
-                flight_settings=self.flight_settings,
+                flight_settings=flight_settings,
                 response_settings=self.response_settings,
                 monitor=self.monitor,
                 n_threads=n_threads,

@@ -1,11 +1,14 @@
 """The detector, and the hits of straight flights onto it."""
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from apt_evap._common.codec import choice, number, settings
 from apt_evap._common.small_matrices import squared_lengths
 from apt_evap._common.types import Floats
+from apt_evap._core.elementary import arctangent
 from apt_evap.detection.binning import bin_edges
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Outcome
@@ -46,6 +49,19 @@ class Detector:
         """Area of the detector: x_min, x_max, y_min, y_max [mm]."""
         half = self.width / 2
         return -half, half, -half, half
+
+    def polar_angle(self, radius: float) -> float:
+        """Polar angle [degrees], at most 90, of the ions that arrive at this distance from the centre [mm]."""
+        angle = radius / self.distance
+        if self.projection == "plane":
+            angle = float(arctangent(angle))
+        return min(90.0, angle * (180.0 / math.pi))
+
+    @property
+    def half_angle(self) -> float:
+        """Polar angle of the corners [degrees], at most 90."""
+        # a little more, so that rounding leaves no corner outside
+        return min(90.0, self.polar_angle(math.sqrt(0.5) * self.width) * (1.0 + 1e-9))
 
     def grid(self, bins: int) -> DetectorMap:
         """Empty map of the complete detector, for the `like` of other maps.

@@ -34,6 +34,8 @@ class Outcome(IntEnum):
     """The ion missed the detector."""
     NEVER_LEFT = 2
     """The ion never left the specimen."""
+    OUTSIDE = 3
+    """The ion does not arrive in the field of view of the flights, see `FlightSettings`; it may not have been flown."""
 
 
 _FLOAT = ("x", "y", "time_of_flight", "voltage", "pulse_voltage", "mass_to_charge", "positions")

@@ -368,7 +368,7 @@ class Explorer:
 
     def _bins_of_run(self, bins):
         """Map on the complete detector, as `apt-evap map` makes it."""
-        return self.run.hits(Unperturbed()).map(like=self.run.detector.grid(bins), position_step=None)
+        return self.run.hits(Unperturbed()).map(like=self.run.grid(bins), position_step=None)
 
     def _region(self, bins, registration):
         measured = measured_map(self.measured, bins)
@@ -601,7 +601,7 @@ class Explorer:
 
     def _python_maps(self, view):
         if self.measured is None:
-            lines = [f"simulated = hits.map(like=run.detector.grid({view.bins}), position_step=None)"]
+            lines = [f"simulated = hits.map(like=run.grid({view.bins}), position_step=None)"]
             names = ["simulated"]
         else:
             lines = [

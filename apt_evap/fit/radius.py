@@ -201,7 +201,7 @@ def _direction(run, plane):
 
 def _map_of(run, perturbation, draws):
     """Counts on the complete detector, over several draws."""
-    grid = run.detector.grid(_BINS)
+    grid = run.grid(_BINS)
     by_response = draws > 1  # a flight does not depend on the seed
     hits = [replace(run, seed=run.seed + draw).hits(perturbation, by_response=by_response) for draw in range(draws)]
     maps = [each.map(like=grid, position_step=None) for each in hits]

@@ -10,18 +10,27 @@ from typing import Any
 
 import numpy as np
 
-from apt_evap._common.codec import count, number, settings
-from apt_evap._common.types import Floats
-from apt_evap._core.flights import LEFT, Flights
+from apt_evap._common.codec import checked, count, number, settings
+from apt_evap._common.types import Booleans, Floats
+from apt_evap._common.validation import check_number
+from apt_evap._core.flights import LEFT, NEVER_LEFT, NOT_FLOWN, Flights
 from apt_evap._core.journal import Journal
 from apt_evap._core.octree import Octree
 from apt_evap.detection.detector import Detector
 from apt_evap.evaporation.emitter import Batch, Emitter
+from apt_evap.flight.field_of_view import LEAST_MARGIN, MARGIN, Scouts, stereographic_rim
 from apt_evap.flight.landing import Ends
 from apt_evap.specimen.tip import Tip
 from apt_evap.units import COULOMB, NM_PER_MM
 
 _MAX_STEPS = 1_000_000  # flights take a few tens
+WHOLE_DETECTOR = "detector"
+
+
+def _field_of_view(given, name):
+    if given == WHOLE_DETECTOR:
+        return given
+    return check_number(given, name, above=0, at_most=90, unit="degrees", why=f'or "{WHOLE_DETECTOR}"')
 
 
 @settings
@@ -63,6 +72,16 @@ class FlightSettings:
         at_least=1,
         at_most=_MAX_STEPS,
     )
+    field_of_view: float | str | None = checked(
+        "Largest polar angle of the flights that count, seen from the apex: half the opening angle of the field of "
+        'view. "detector" for that of the corners of the detector. All atoms evaporate, but the responses are computed '
+        "only for ions that can arrive in the field of view, with any energy up to that of the responses. By default, "
+        "all ions fly.",
+        'float, at most 90, or "detector"',
+        _field_of_view,
+        default=None,
+        unit="degrees",
+    )
 
 
 def check_reach(settings: FlightSettings, tip: Tip, detector: Detector) -> None:
@@ -103,15 +122,21 @@ class FlightCrew:
         Accuracy and end of the flights.
     n_threads : int
         Number of threads.
+    detector : Detector
+        The detector, for the directions of scouts.
     """
 
-    def __init__(self, tip: Tip, settings: FlightSettings, n_threads: int) -> None:
+    def __init__(self, tip: Tip, settings: FlightSettings, n_threads: int, detector: Detector) -> None:
         self._n_helpers = n_threads - 1
         self._pool = self._record = None
         self._own = threading.local()  # per thread: its flights, the record and the number of journals they followed
         self._halt, self._go = np.zeros(1, np.int64), threading.Event()
         self._go.set()
         self._options = _options(tip, settings)
+        self._view: dict[str, float] = {}
+        if settings.field_of_view is not None:
+            rim = stereographic_rim(min(90.0, settings.field_of_view + LEAST_MARGIN))  # type: ignore[operator]
+            self._view = {"rim": rim, "margin": MARGIN, "plane": tip.apex + detector.distance * NM_PER_MM}
 
     @contextmanager
     def at_work(self) -> Iterator[Any]:
@@ -133,7 +158,9 @@ class FlightCrew:
             self._halt[0] = 0
             self._go.set()
 
-    def start(self, batch: Batch, groups: Sequence[tuple[Floats, Floats]]) -> Callable[[], list[Ends]]:
+    def start(
+        self, batch: Batch, groups: Sequence[tuple[Floats, Floats]], scouts: Scouts | None = None, n_always: int = 0
+    ) -> Callable[[], tuple[list[Ends], Booleans]]:
         """Start the flights of a batch.
 
         Parameters
@@ -143,16 +170,25 @@ class FlightCrew:
         groups : sequence of (ndarray, ndarray)
             Positions [nm] and velocities [sqrt(V)] of launches, each of shape (n, m, 3): m launches per ion, with
             common time steps. NaN for launches that are not flown.
+        scouts : Scouts, optional
+            Launches that decide for each ion whether it is flown, if the settings have a field of view.
+        n_always : int
+            Number of groups that are flown whatever the scouts say, before them.
 
         Returns
         -------
         callable
-            Completes the flights of the batch and returns the `Ends` of each group.
+            Completes the flights of the batch and returns the `Ends` of each group, and whether each ion was flown in
+            all groups, bool (n,).
         """
         if batch.tree is not None:
             self._record = _Record(batch.tree)
         record, number = self._record, len(self._record.journals)
         record.journals.append(batch.journal)
+        view: dict[str, Any] = {}
+        if scouts is not None and self._view:
+            groups = [*groups[:n_always], (scouts.positions, scouts.velocities), *groups[n_always:]]
+            view = self._view | {"families": scouts.families, "scouts": n_always}
         n, sizes = len(batch), [group[0].shape[1] for group in groups]
         positions = np.concatenate([group[0] for group in groups], axis=1).reshape(-1, 3)
         velocities = np.concatenate([group[1] for group in groups], axis=1).reshape(-1, 3)
@@ -167,16 +203,16 @@ class FlightCrew:
         ).ravel()
         end = np.empty((int(counts.sum()), 7))
         outcome = np.empty(len(end), np.int8)
-        event = np.repeat(np.arange(n), len(groups))
+        event = np.arange(n)
         start = np.concatenate([[0], np.cumsum(counts)])
         launches = np.ascontiguousarray(positions[finite]), np.ascontiguousarray(velocities[finite])
         counter = np.zeros(1, np.int64)
 
         def fly():
-            while counter[0] < len(event):
+            while counter[0] < n:
                 self._go.wait()
                 flights = self._flights_at(record, number)
-                flights.fly(batch.journal, event, start, *launches, end, outcome, counter, self._halt)
+                flights.fly(batch.journal, event, start, *launches, end, outcome, counter, self._halt, **view)
 
         helpers = [self._pool.submit(fly) for _ in range(self._n_helpers)]
 
@@ -186,13 +222,16 @@ class FlightCrew:
                 helper.result()
             ends = np.full((len(finite), 7), np.nan)
             ends[finite] = end
-            left = np.zeros(len(finite), bool)
-            left[finite] = outcome == LEFT
-            ends, left = ends.reshape(n, sum(sizes), 7), left.reshape(n, sum(sizes))
-            edges = np.cumsum([0, *sizes])
-            return [
+            outcomes = np.full(len(finite), NEVER_LEFT, np.int8)
+            outcomes[finite] = outcome
+            ends, outcomes = ends.reshape(n, sum(sizes), 7), outcomes.reshape(n, sum(sizes))
+            left, edges = outcomes == LEFT, np.cumsum([0, *sizes])
+            every = [
                 Ends(ends[:, a:b, :3], ends[:, a:b, 3:6], ends[:, a:b, 6], left[:, a:b]) for a, b in pairwise(edges)
             ]
+            if view:
+                del every[n_always]
+            return every, ~(outcomes == NOT_FLOWN).any(axis=1)
 
         return wait
 

@@ -1,6 +1,6 @@
 """Straight flight to the detector: direction and time of flight."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,10 @@ class Ends(NamedTuple):
     """Reduced times [nm/sqrt(V)], shape (n, m)."""
     left: Booleans
     """Whether the ion left the field, shape (n, m)."""
+
+    def rows(self, rows: Any) -> "Ends":
+        """Ends of the launches of some of the ions."""
+        return Ends(self.positions[rows], self.velocities[rows], self.times[rows], self.left[rows])
 
 
 def land(ends: Ends, slowness: Floats, detector: Detector, apex: float) -> tuple[Floats, Floats]:

@@ -206,11 +206,15 @@ class Responses:
         The same for launches from the position after each roll-up.
     residuals : ndarray of float32, shape (n, 1 + rolls)
         Residual of each fit [mm].
+    not_flown : ndarray of bool, shape (n,), optional
+        Ions that cannot arrive in the field of view of the flights: all their numbers are NaN. None if all ions were
+        flown.
     """
 
     site: np.ndarray
     rolled: np.ndarray
     residuals: np.ndarray
+    not_flown: np.ndarray | None = None
 
     def __post_init__(self):
         # in memory, the ions of each roll-up are together, as `evaluate` reads them: it takes a quarter less time
@@ -272,7 +276,7 @@ class ResponseModel:
             groups.append((starts, velocities))
         return groups
 
-    def fit(self, ends: Sequence[Ends], slowness: Floats, apex: float) -> Responses:
+    def fit(self, ends: Sequence[Ends], slowness: Floats, apex: float, flown: Booleans | None = None) -> Responses:
         """Fit the polynomials to the ends of the launches.
 
         Parameters
@@ -283,22 +287,26 @@ class ResponseModel:
             See `Emissions.slowness`.
         apex : float
             z of the apex [nm].
+        flown : ndarray of bool, shape (n,), optional
+            Ions that were flown, for a field of view.
 
         Returns
         -------
         Responses
         """
+        rows = slice(None) if flown is None else flown
         coefficients, residuals = [], []
         for design, each in zip(self.settings.designs, ends, strict=True):
-            directions, times = land(each, slowness, self.detector, apex)
+            directions, times = land(each.rows(rows), slowness[rows], self.detector, apex)
             n, m = times.shape
             values = fit_quantities(directions.reshape(-1, 2), times.ravel()).reshape(n, m, 3)
             polynomials, residual = design.fit(values)
-            coefficients.append(polynomials)
+            coefficients.append(_in_rows(polynomials, flown))
             # a small change of the stereographic direction is half as large on a plane at unit distance
-            residuals.append(2.0 * self.detector.distance * residual)
+            residuals.append(_in_rows(2.0 * self.detector.distance * residual, flown))
         site, *rolled = coefficients
-        return Responses(site, np.stack(rolled, axis=1), np.stack(residuals, axis=1).astype(np.float32))
+        all_residuals = np.stack(residuals, axis=1).astype(np.float32)
+        return Responses(site, np.stack(rolled, axis=1), all_residuals, None if flown is None else ~flown)
 
     def evaluate(
         self,
@@ -366,8 +374,19 @@ class ResponseModel:
     def flagged(self, responses: Responses, emissions: Emissions) -> Booleans:
         """Whether the response of an ion has a residual above the bound, or could not be fitted, bool (n,)."""
         inexact = ~(responses.residuals <= self.settings.bound)
+        if responses.not_flown is not None:
+            inexact &= ~responses.not_flown[:, None]
         flagged = inexact[:, 0] | (inexact[:, 1] & emissions.can_roll)
         return flagged if self.settings.rolls == 1 else flagged | (inexact[:, 2] & emissions.can_roll_twice)
+
+
+def _in_rows(values, rows):
+    """Values in these rows, NaN in the others; without rows, the values."""
+    if rows is None:
+        return values
+    result = np.full((len(rows), *values.shape[1:]), np.nan, values.dtype)
+    result[rows] = values
+    return result
 
 
 def fit_quantities(directions: Floats, times: Floats) -> Floats:

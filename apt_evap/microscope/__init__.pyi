@@ -4,3 +4,4 @@ from .local_electrode import PRESETS as PRESETS
 from .local_electrode import LensProjection as LensProjection
 from .local_electrode import LocalElectrode as LocalElectrode
 from .run_lens import RunLens as RunLens
+from .run_lens import field_of_view as field_of_view

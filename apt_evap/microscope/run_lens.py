@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -11,11 +11,15 @@ from numpy.typing import ArrayLike
 
 from apt_evap._common.codec import checked, part, settings
 from apt_evap._common.types import Floats, Integers
-from apt_evap._common.validation import check_array
+from apt_evap._common.validation import check_array, check_kind
+from apt_evap.detection.detector import Detector
 from apt_evap.microscope.conductors import simulated_flank
 from apt_evap.microscope.lens import Lens
 from apt_evap.microscope.local_electrode import LensProjection, LocalElectrode
 from apt_evap.units import FLIGHT_TIME, NM_PER_MM
+
+if TYPE_CHECKING:
+    from apt_evap.specimen.tip import Tip
 
 _FAR = 1e9  # distance and aperture of an electrode that a specimen does not feel: 1 m [nm]
 _FAR_ANGLE = math.radians(75)
@@ -39,6 +43,12 @@ class Course(NamedTuple):
     """Radius [nm]."""
     apexes: Floats
     """z of the apex [nm]."""
+
+
+# Stage of a specimen for the widest field of view: a flat cap, and a shank that is used up. The angle of free flights
+# that arrive at 15 to 30 degrees increases with both, by 1.0 to 2.3 degrees from 0.85 to 1.2 R and from a new shank.
+_FLATTENED = 1.25
+_MARGIN = 1.0  # degrees
 
 
 def _stages(given, name):
@@ -229,6 +239,57 @@ class RunLens:
         first = np.minimum(place.astype(np.int64), len(at) - 2)
         share = (place - first)[:, None]
         return rows[first] * (1 - share) + rows[first + 1] * share
+
+
+def field_of_view(lens: LocalElectrode, tip: "Tip", detector: Detector) -> float:
+    """Polar angle of the simulated flights that covers a detector behind a lens, for `FlightSettings`.
+
+    Parameters
+    ----------
+    lens : LocalElectrode
+        The lens. It has no potential of the detector, whose influence depends on the voltages.
+    tip : Tip
+        The specimen: a cap on a shank.
+    detector : Detector
+        The detector.
+
+    Returns
+    -------
+    float
+        Half the opening angle [degrees], at most 90, with a margin of 1 degree for changes of the cap during the run.
+
+    Raises
+    ------
+    ValueError
+        If the specimen is not a cap on a shank, or the lens has a potential of the detector.
+
+    Examples
+    --------
+    >>> lens = ae.microscope.LocalElectrode.preset("local electrode")
+    >>> tip = ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1))
+    >>> detector = ae.Detector(distance=90.0, width=45.0)
+    >>> angle = ae.microscope.field_of_view(lens, tip, detector)
+    >>> print(f"{angle:.0f} degrees for {detector.half_angle:.0f} degrees behind the lens")
+    32 degrees for 19 degrees behind the lens
+    """
+    check_kind(lens, "lens", LocalElectrode, "a LocalElectrode")
+    check_kind(tip, "tip", "phase_at", "a Tip")
+    check_kind(detector, "detector", Detector, "a Detector")
+    if lens.detector_potential:
+        raise ValueError(
+            f"lens has the detector_potential {lens.detector_potential:g} V, whose influence depends on the voltages: "
+            "give the field of view as a number [degrees]"
+        )
+    radius = tip.settings.get("apex_radius")
+    course = Course(np.arange(2), np.full(2, _FLATTENED * (radius or np.nan)), np.zeros(2))
+    stages = RunLens.of(lens, tip.settings, course, tip.nearest_neighbour_distance)
+    angles = np.linspace(0.0, _BESIDE, 901)[:-1]
+    lengths, ones = np.tan(np.radians(angles) / 2), np.ones(len(angles))
+    directions, _ = stages.seen(
+        np.column_stack([lengths, 0 * lengths]), ones, 0 * ones, ones, ones.astype(int), ones, ones, detector.distance
+    )
+    arrives = np.degrees(2 * np.arctan(np.hypot(*directions.T))) <= detector.half_angle
+    return min(_BESIDE, float(angles[arrives].max()) + _MARGIN)
 
 
 def _smooth(at, ions, values):

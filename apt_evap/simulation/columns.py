@@ -84,6 +84,7 @@ OPTIONAL = (
     Column("emissions/rollup_distances", np.float64, (), "nm"),  # phases that differ in it
     _of_events("clock/waits"),
     Column("clock/voltages", np.float64, (), "V"),
+    Column("responses/not_flown", np.bool_, derived=True),  # with a field of view
     Column("real/voltages", np.float64, (), "V", derived=True),
     Column("real/instrument_voltages", np.float64, (), "V", derived=True),
     Column("real/charges", np.int32, (), "e", derived=True),

@@ -19,8 +19,8 @@ class History(NamedTuple):
     residual_rms, residual_max : ndarray, shape (k,)
         RMS and largest residual of the sampled charges, relative to the mean charge; see `charge_residuals`.
     missed, never_left, flagged : ndarray, shape (k,)
-        Fractions of the ions since the previous check that missed the detector, that never left (both for the first
-        perturbation of the run), and that are flagged for inexact responses.
+        Fractions of the flown ions since the previous check that missed the detector, that never left (both for the
+        first perturbation of the run), and that are flagged for inexact responses.
     field : ndarray, shape (k,)
         Mean field at the evaporation of these ions [V/nm].
     """

@@ -86,7 +86,7 @@ class Watch:
         self._settings, self._interval = settings, interval
         self._rows = []  # complete checks that have not been taken yet
         self._open = None  # ions, RMS and largest residual of a check whose ions are not all counted
-        self._since = []  # outcomes, flags and fields of the ions since the last check, batch by batch
+        self._since = []  # outcomes, flags and fields of ions since the last check, batch by batch
         self._counted, self._warned = first, set()
         self._last = max((int(part.history.ions[-1]) for part in previous if len(part.history.ions)), default=first)
         self._latest = {}
@@ -118,7 +118,7 @@ class Watch:
         if len(part):
             new = part.emissions.ions >= self._last if self._open is None else slice(None)
             hits = part.hits(part.first_perturbation)
-            self._since.append((hits.outcome[new], part.flagged[new], part.fields[new]))
+            self._since.append((hits.outcome[new], part.flagged[new], part.not_flown[new], part.fields[new]))
             self._counted = int(part.emissions.ions[-1]) + 1
         self._close()
 
@@ -126,9 +126,12 @@ class Watch:
         if self._open is None or self._counted < self._open[0]:
             return
         if self._since:
-            outcome, flagged, fields = (np.concatenate(columns) for columns in zip(*self._since, strict=True))
-            fractions = [float(np.mean(outcome == kind)) for kind in (Outcome.MISSED, Outcome.NEVER_LEFT)]
-            fractions.append(float(np.mean(flagged)))
+            outcome, flagged, not_flown, fields = (
+                np.concatenate(columns) for columns in zip(*self._since, strict=True)
+            )
+            events = (outcome == Outcome.MISSED, outcome == Outcome.NEVER_LEFT, flagged)
+            n_flown = max(1, np.count_nonzero(~not_flown))
+            fractions = [float(np.count_nonzero(each) / n_flown) for each in events]
             self._rows.append((*self._open, *fractions, float(np.mean(fields))))
             self._judge(*fractions)
         self._open, self._since = None, []

@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -14,6 +16,7 @@ from numpy.typing import NDArray
 from apt_evap._common.codec import changed, from_plain, to_plain
 from apt_evap._common.files import FileError, check_path
 from apt_evap._common.notebook import as_table
+from apt_evap._common.small_matrices import squared_lengths
 from apt_evap._common.types import AnyPath, Booleans, Floats, Integers
 from apt_evap._common.validation import (
     check_kind,
@@ -22,12 +25,14 @@ from apt_evap._common.validation import (
     short_text,
 )
 from apt_evap.detection.detector import Detector
+from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits, Outcome
 from apt_evap.detection.instrument import Instrument
 from apt_evap.emission.emissions import Emissions, TangentialLaunches
 from apt_evap.emission.ion_random import IonRandom
 from apt_evap.emission.perturbations import Perturbation, Unperturbed, described
 from apt_evap.evaporation.state import EmitterState
+from apt_evap.flight.field_of_view import stereographic_rim
 from apt_evap.flight.response import ResponseModel, Responses, ResponseSettings
 from apt_evap.microscope.local_electrode import LocalElectrode
 from apt_evap.microscope.run_lens import Course, RunLens
@@ -49,6 +54,9 @@ from apt_evap.simulation.provenance import joined, provenance_now
 from apt_evap.simulation.real_units import OperatingPoint, RealColumns, RealUnits, in_real_units, random_of
 from apt_evap.simulation.run_hdf5 import read_run, write_run
 from apt_evap.simulation.stop_reason import StopReason
+from apt_evap.warnings import RunWarning
+
+_RIM_SAMPLES = 16  # ions, and azimuths, for which the rim of the field of view is followed to a detector
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -173,6 +181,8 @@ class Run:
     def __repr__(self) -> str:
         flown = ", ".join(_describe(perturbation) for perturbation in self.perturbations)
         responses = "" if self.responses is None else f"responses, {self.flagged.sum():,} of them flagged"
+        if self.field_of_view is not None and self.responses is not None:
+            responses += f"; {self.not_flown.sum():,} ions not flown"
         details = "; ".join(part for part in (responses, flown and f"flown: {flown}", self.ended) if part)
         where = f"{self.voltage:g} V"
         if self.units is not None and len(self):
@@ -229,6 +239,18 @@ class Run:
         if self.real is None:
             return np.ones(len(self))
         return self.emissions.charge_states * self.voltage / (self.real.charges * self.real.voltages)
+
+    @property
+    def field_of_view(self) -> float | None:
+        """Largest polar angle of the flights that count [degrees]; None if all do, see `FlightSettings`."""
+        return self.settings.get("flights", {}).get("field_of_view")
+
+    @property
+    def not_flown(self) -> Booleans:
+        """Ions without responses, because they cannot arrive in the field of view of the flights, bool (n,)."""
+        if self.responses is None or self.responses.not_flown is None:
+            return np.zeros(len(self), bool)
+        return self.responses.not_flown
 
     @property
     def response_model(self) -> ResponseModel:
@@ -295,8 +317,8 @@ class Run:
             If the perturbation was not flown and cannot be evaluated from the responses.
         """
         check_switch(by_response, "by_response")
-        directions, times = self._landed(perturbation, by_response)
-        return self._hits(directions, times, perturbation)
+        directions, times, not_flown = self._landed(perturbation, by_response)
+        return self._hits(directions, times, not_flown, perturbation)
 
     def places(self, perturbation: Perturbation) -> tuple[Floats, Floats, NDArray[np.int8]]:
         """Positions of the hits alone, the same as those of `hits`.
@@ -318,7 +340,7 @@ class Run:
         ValueError
             As for `hits`.
         """
-        x, y, _, outcome = self.detector.impacts(*self._seen(*self._landed(perturbation, False)))
+        x, y, _, outcome = self._impacts(*self._landed(perturbation, False))
         return x, y, outcome
 
     @cached_property
@@ -327,12 +349,12 @@ class Run:
         return IonRandom(self.seed, self.emissions.ions)
 
     def _landed(self, perturbation, by_response):
-        """Stereographic directions (n, 2) and times of flight (n,) for a perturbation."""
+        """Stereographic directions (n, 2), times of flight (n,) and ions that were not flown, for a perturbation."""
         for flown_as, flown in zip(self.perturbations, self.flown, strict=True):
             known = flown_as == perturbation or flown_as == described(perturbation)  # by name and repr in a file
             # the energies of flights were those at the simulated voltage
             if known and not by_response and (self.real is None or perturbation == Unperturbed()):
-                return flown.directions, flown.times
+                return flown.directions, flown.times, None
         if not callable(getattr(perturbation, "tangential", None)):
             check_kind(perturbation, "perturbation", "launch", "a perturbation such as Unperturbed() or RollUp(0.2)")
             raise ValueError(
@@ -348,7 +370,68 @@ class Run:
             scales = self.energy_scales
             scale, factors = float(np.median(scales)), np.sqrt(scales)
             launches = launches._replace(first=launches.first * factors, second=launches.second * factors)
-        return self.response_model.evaluate(self.responses, launches, emissions.masses, scale)
+        directions, times = self.response_model.evaluate(self.responses, launches, emissions.masses, scale)
+        return directions, times, self.responses.not_flown
+
+    def _impacts(self, directions, times, not_flown):
+        """Positions, times and outcomes on the detector, of flights that end within the field of view."""
+        if self.field_of_view is None:
+            return self.detector.impacts(*self._seen(directions, times))
+        outside = squared_lengths(directions) > stereographic_rim(self.field_of_view) ** 2
+        if not_flown is not None:
+            outside |= not_flown
+        directions, times = np.where(outside[:, None], np.nan, directions), np.where(outside, np.nan, times)
+        *columns, outcome = self.detector.impacts(*self._seen(directions, times))
+        outcome[outside] = Outcome.OUTSIDE
+        return *columns, outcome
+
+    @cached_property
+    def _rim(self):
+        """Least length of the stereographic directions in which ions at the rim of the field of view arrive."""
+        if self.field_of_view is None or not len(self):
+            return math.inf
+        some = self[np.unique(np.linspace(0, len(self) - 1, _RIM_SAMPLES).astype(int))]
+        rim = np.tile([stereographic_rim(self.field_of_view), 0.0], (len(some), 1))
+        return float(np.sqrt(squared_lengths(some._seen(rim, np.ones(len(some)))[0])).min())
+
+    def grid(self, bins: int) -> DetectorMap:
+        """Empty map of the complete detector, for the `like` of maps of this run.
+
+        Parameters
+        ----------
+        bins : int
+            Number of bins along each side.
+
+        Returns
+        -------
+        DetectorMap
+            Without hits. Bins outside the field of view of the flights are outside its mask.
+        """
+        grid = self.detector.grid(bins)
+        if self._rim >= stereographic_rim(self.detector.half_angle):
+            return grid
+        x, y = ((edges[1:] + edges[:-1]) / 2 for edges in (grid.x_edges, grid.y_edges))
+        places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        angles = self.detector.seen_from_apex.angles(places).reshape(grid.values.shape)
+        mask = np.tan(angles / 2) <= self._rim
+        return DetectorMap.from_array(grid.values, grid.x_edges, grid.y_edges, mask, is_counts=True)
+
+    def _rim_on(self, instrument):
+        """Least distance from the centre of an instrument at which ions at the rim arrive [mm]."""
+        azimuths = 2 * np.pi * np.arange(_RIM_SAMPLES) / _RIM_SAMPLES
+        radius = 2 * self._rim / (1 - self._rim**2) * instrument.distance
+        places = instrument.places(radius * np.column_stack([np.cos(azimuths), np.sin(azimuths)]))
+        return np.nanmin(np.hypot(*places.T), initial=math.inf) * (1 + 1e-6)
+
+    def _warn_if_beyond(self, seen, what):
+        """Warn if there are directions within those of a device that are outside the field of view of the flights."""
+        if seen:
+            warnings.warn(
+                f"the {what} sees ions outside the field of view of the flights ({self.field_of_view:.4g} degrees), "
+                "which are missing: run with a larger field_of_view (FlightSettings, or [flights] in a settings file)",
+                RunWarning,
+                stacklevel=3,
+            )
 
     def _seen(self, directions, times):
         """Directions and times in the instrument, of those of the simulated flights."""
@@ -365,10 +448,9 @@ class Run:
         charges, distance = self.flight_charges, self.detector.distance
         return self.lens.seen(directions, times, ions, masses, charges, model, voltages, distance)
 
-    def _hits(self, directions, times, perturbation):
+    def _hits(self, directions, times, not_flown, perturbation):
         emissions, columns, units = self.emissions, {}, {"charge": "e", "field": "V/nm"}
-        directions, times = self._seen(directions, times)
-        x, y, times, outcome = self.detector.impacts(directions, times)
+        x, y, times, outcome = self._impacts(directions, times, not_flown)
         if self.real is None:
             # of the flights, also if a control had another one for the events
             columns = {"voltage": np.full(len(self), self.voltage)}
@@ -395,7 +477,7 @@ class Run:
             extra=extra,
             units=units,
             source=f"simulation, {_describe(perturbation)}",
-            extent=self.detector.extent,
+            extent=self.detector.extent if self._rim >= stereographic_rim(self.detector.half_angle) else None,
         )
 
     def _measured(self, times, outcome):
@@ -518,7 +600,15 @@ class Run:
                     f"lens has the detector_potential {lens.detector_potential:g} V, whose influence depends on the "
                     "voltages: use run.at_evaporation_field(lens)"
                 )
-            return behind.on_detector(detector)
+            run = behind._shown_on(detector)
+        else:
+            run = self._shown_on(detector)
+        edge = stereographic_rim(detector.polar_angle(detector.width / 2))
+        run._warn_if_beyond(run._rim < edge * (1 - 1e-6), "detector")
+        return run
+
+    def _shown_on(self, detector):
+        """The same run on another detector."""
         ratio = detector.distance / self.detector.distance
         flown, responses = self.flown, self.responses
         if ratio != 1.0:
@@ -526,7 +616,7 @@ class Run:
             if responses is not None:
                 factors = np.array([1.0, 1.0, ratio], np.float32)[:, None]  # directions and time
                 site, rolled = responses.site * factors, responses.rolled * factors
-                responses = Responses(site, rolled, responses.residuals * ratio)
+                responses = replace(responses, site=site, rolled=rolled, residuals=responses.residuals * ratio)
         settings = self.settings | {"detector": to_plain(detector)}
         return replace(self, detector=detector, settings=settings, flown=flown, responses=responses)
 
@@ -565,6 +655,7 @@ class Run:
         units = self.units if instrument.timing is None else replace(self.units, timing=None)
         plane = replace(self, units=units, detector=replace(self.detector, projection="plane"))
         hits = plane.hits(self.first_perturbation if perturbation is None else perturbation)
+        self._warn_if_beyond(self._rim < 1.0 and self._rim_on(instrument) < instrument.field_of_view / 2, "instrument")
         truth = {"species": self.species}
         if len(self.phase_names) > 1:
             truth["phase"] = self.phase
@@ -572,9 +663,16 @@ class Run:
         return instrument.hits(hits, self.detector.distance, seed=self.seed if seed is None else check_seed(seed))
 
     def summary(self) -> dict[str, Any]:
-        """Counts, dict: ions, outcomes of the first perturbation, ions that cannot roll up, flagged ions."""
+        """Counts, dict: ions, outcomes of the first perturbation, ions that cannot roll up, flagged ions.
+
+        With a field of view, also the ions outside it, and those of them that were not flown.
+        """
         first = self.first_perturbation
         counts = {outcome.name.lower(): count for outcome, count in self.hits(first).counts.items()}
+        if self.field_of_view is None:
+            del counts["outside"]
+        else:
+            counts |= {"not_flown": int(self.not_flown.sum())}
         return {
             "ions": len(self),
             "perturbation": _describe(first),

@@ -8,6 +8,7 @@ threads and any size of a batch.
 import threading
 import warnings
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 
 import numpy as np
 
@@ -27,7 +28,8 @@ from apt_evap.evaporation.law import Extremal, Law
 from apt_evap.evaporation.rule import CompiledRule, Rule
 from apt_evap.evaporation.settings import ChargeSettings
 from apt_evap.evaporation.voltage import VoltageControl, check_voltage
-from apt_evap.flight.crew import FlightCrew, FlightSettings, check_reach
+from apt_evap.flight.crew import WHOLE_DETECTOR, FlightCrew, FlightSettings, check_reach
+from apt_evap.flight.field_of_view import scouts_of
 from apt_evap.flight.landing import land
 from apt_evap.flight.response import ResponseModel, ResponseSettings
 from apt_evap.simulation.checkpoint import Checkpoint, Keeper
@@ -112,6 +114,9 @@ class Simulation:
         self.law = Extremal() if law is None else law
         self.flight_settings = FlightSettings() if flight_settings is None else flight_settings
         check_kind(self.flight_settings, "flight_settings", FlightSettings, "FlightSettings")
+        if self.flight_settings.field_of_view == WHOLE_DETECTOR:
+            # as a number, because a run can be shown on other detectors
+            self.flight_settings = replace(self.flight_settings, field_of_view=self.detector.half_angle)
         self.response_settings = ResponseSettings() if response_settings is None else response_settings
         check_kind(self.response_settings, "response_settings", ResponseSettings, "ResponseSettings")
         if charge_settings is not None:
@@ -136,7 +141,7 @@ class Simulation:
         self.settings = self._settings_of(tip)
         self.n_evaporated = 0
         self._running = threading.Lock()
-        self._crew = FlightCrew(tip, self.flight_settings, self.n_threads)
+        self._crew = FlightCrew(tip, self.flight_settings, self.n_threads, self.detector)
 
     @property
     def tip(self) -> Tip:
@@ -297,12 +302,15 @@ class Simulation:
         groups = [(launch.positions[:, None], (launch.velocities * slowness[:, None])[:, None]) for launch in launches]
         groups += [(no_launches, no_launches)] * (len(emissions) - len(launches))
         model = ResponseModel(self.response_settings, self.detector)
+        limited, scouts = self.flight_settings.field_of_view is not None, None
         if responses:
             groups += model.launches(emission_batch)
-        flight = self._crew.start(batch, groups)
+            scouts = scouts_of(emission_batch, self.response_settings) if limited else None
+        flight = self._crew.start(batch, groups, scouts, len(emissions))
 
         def finish():
-            ends, apex = flight(), self.tip.apex
+            (ends, every), apex = flight(), self.tip.apex
+            flown_ions = every if limited else None
             flown = []
             for each in ends[: len(emissions)]:
                 directions, times = land(each, slowness, self.detector, apex)
@@ -315,7 +323,7 @@ class Simulation:
                 fields=batch.fields,
                 perturbations=emissions,
                 flown=tuple(flown),
-                responses=model.fit(ends[len(emissions) :], slowness, apex) if responses else None,
+                responses=model.fit(ends[len(emissions) :], slowness, apex, flown_ions) if responses else None,
                 seed=self.seed,
                 voltage=self.voltage,
                 detector=self.detector,

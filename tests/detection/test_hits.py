@@ -30,7 +30,7 @@ def test_detected_needs_a_hit_and_finite_coordinates():
 
 
 def test_counts_name_every_outcome():
-    assert simulated().counts == {Outcome.HIT: 2, Outcome.MISSED: 1, Outcome.NEVER_LEFT: 1}
+    assert simulated().counts == {Outcome.HIT: 2, Outcome.MISSED: 1, Outcome.NEVER_LEFT: 1, Outcome.OUTSIDE: 0}
     assert Hits(x=[1.0, 2.0]).counts[Outcome.HIT] == 2
 
 
@@ -83,7 +83,7 @@ def test_missing_column_names_column_and_source():
         ({"positions": np.zeros((3, 2))}, r"positions must have shape \(n, 3\)"),
         ({"pulses": [-1]}, "pulses must contain integers"),
         ({"site": [0.5]}, "site must contain integers"),
-        ({"outcome": [3]}, "outcome must be"),
+        ({"outcome": [4]}, "outcome must be"),
         ({"x": ["far"]}, "x must be an array of numbers"),
     ],
 )
