@@ -28,6 +28,8 @@ DIFFERENT = 6.0
 """Angle between two orientations above which they are different answers [degrees]."""
 DECIDED = 12.0
 """Margin to the next different orientation above which a map decides, see the notes of `index`."""
+RIVAL = 0.8
+"""Largest score of another orientation, relative to that of the first one, with which a map decides."""
 LEAST_COMPRESSION, LARGEST_COMPRESSION = 1.2, 2.2
 """Image compressions between which the scale is searched, if only the flight length is known."""
 _STARTS, _FINAL = 12, 6  # orientations that are refined, and that are refined to the end
@@ -199,7 +201,8 @@ def index(
     the likelihood of the counts, with free amplitudes of both patterns and a slow change of the efficiency. The margin
     of two orientations is twice the logarithm of the ratio of their likelihoods, divided by the variance of the sums of
     neighbouring residuals of the better one in units of Poisson's. So a model that leaves structure unexplained decides
-    less. Above a margin of 12 to the next orientation that differs by more than 6 degrees the map is `decided`.
+    less. The map is `decided` if the margin to the next orientation that differs by more than 6 degrees is above 12, and
+    no such orientation explains more than 0.8 of what the first one explains.
 
     The axis is that at the centre of the field of view. An orientation and its mirror image look the same in crystals
     with mirror planes: a map does not decide its handedness.
@@ -300,13 +303,19 @@ def _judged(measured, disc, material, patterns, found, proper, n):
                 pattern=patterns[number],
             )
         )
-    margin = float(evidence[0] - evidence[1]) if len(evidence) > 1 else math.inf
-    decided = margin > DECIDED
+    margin, best = math.inf, float(np.clip(found[0][1].explained, 0, 1))
+    if len(found) > 1:
+        margin = float(evidence[0] - evidence[1])
+    next_best = max((float(np.clip(each.explained, 0, 1)) for _, each in found[1:]), default=0.0)
+    decided = margin > DECIDED and next_best < RIVAL * best
+    numbers = f"{best:.2f} of the structure instead of {next_best:.2f} (margin {margin:.0f}; {DECIDED:g} is needed)"
     if decided:
-        reason = f"no other orientation explains the map nearly as well (margin {margin:.0f}, {DECIDED:g} is needed)"
+        reason = f"it explains more than any other orientation, {numbers}"
+    elif margin > DECIDED:
+        reason = f"another orientation explains nearly as much: the first {numbers}"
     else:
         alike = int(np.count_nonzero(evidence > evidence[0] - DECIDED))
-        reason = f"{alike} orientations explain the map about equally well (margin {margin:.1f} of {DECIDED:g})"
+        reason = f"{alike} orientations explain the map about equally well, {numbers}"
     return Indexing(measured, tuple(candidates), decided, reason)
 
 

@@ -106,11 +106,14 @@ def _slow(radii, azimuths):
     return np.linalg.qr(terms * np.sqrt(weights)[:, None])[0], weights
 
 
-def flattened(disc: Disc) -> Floats:
-    """Polar picture of a map without its slow changes, times the root of the areas, shape (RINGS, AZIMUTHS)."""
+def flattened(disc: Disc, sigma: float) -> Floats:
+    """Polar picture of a map, smoothed by `sigma` [mm], without its slow changes, times the root of the areas.
+
+    Shape (RINGS, AZIMUTHS).
+    """
     radii, azimuths = _polar(RINGS, AZIMUTHS)
     slow, weights = _slow(radii, azimuths)
-    smoothed = disc.map.smoothed(_NARROW * disc.radius)
+    smoothed = disc.map.smoothed(max(sigma, _NARROW * disc.radius))
     values = np.where(smoothed.mask, smoothed.values, np.nan)
     r, phi = np.meshgrid(radii * disc.radius, azimuths, indexing="ij")
     x, y = smoothed.centres
@@ -175,9 +178,6 @@ def search(
     radii, azimuths = _polar(RINGS, AZIMUTHS)
     slow, weights = _slow(radii, azimuths)
     root = np.sqrt(weights)
-    picture = flattened(disc)
-    spectrum = np.fft.rfft(picture, axis=1)
-    norm = np.linalg.norm(picture)
     group = point_group(patterns[0].structure)
     proper = group[np.linalg.det(group) > 0]
     # of an axis and its mirror image the pattern is the same, with the azimuth reversed
@@ -187,6 +187,9 @@ def search(
     smooth = [pattern.smoothed(SMOOTHED) for pattern in patterns]
     found = []
     for scale in np.geomspace(*scales, steps + 1):
+        # smoothed by the same angle as the patterns
+        picture = flattened(disc, np.radians(SMOOTHED) * scale)
+        spectrum, norm = np.fft.rfft(picture, axis=1), np.linalg.norm(picture)
         theta = ring * (disc.radius / scale)
         local = np.column_stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
         marked = [Projection(scale, disc.centre).directions(mark.places) for mark in marks]

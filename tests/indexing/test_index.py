@@ -166,7 +166,7 @@ def test_the_search_is_the_direct_correlation():
     directions = np.column_stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
     densities = np.minimum(pattern.at(directions @ start.matrix, sigma=module.SMOOTHED), 2.5) * np.sqrt(weights)
     densities -= (densities @ slow) @ slow.T
-    picture = flattened(disc).ravel()
+    picture = flattened(disc, np.radians(module.SMOOTHED) * 58.0).ravel()
     fit = np.linalg.lstsq(densities.T, picture, rcond=None)[0]
     direct = np.linalg.norm(densities.T @ fit) / np.linalg.norm(picture)
     # the search takes the nearest pixel of the pattern, here it is interpolated
