@@ -202,7 +202,7 @@ def index(
     of two orientations is twice the logarithm of the ratio of their likelihoods, divided by the variance of the sums of
     neighbouring residuals of the better one in units of Poisson's. So a model that leaves structure unexplained decides
     less. The map is `decided` if the margin to the next orientation that differs by more than 6 degrees is above 12, and
-    no such orientation explains more than 0.8 of what the first one explains.
+    without marks of a user no such orientation explains more than 0.8 of what the first one explains.
 
     The axis is that at the centre of the field of view. An orientation and its mirror image look the same in crystals
     with mirror planes: a map does not decide its handedness.
@@ -259,7 +259,7 @@ def index(
         if all(misorientation(each.matrix, other.matrix, proper) > DIFFERENT for _, other in different):
             different.append((number, each))
     n = check_count(candidates, "candidates", at_least=1)
-    return _judged(measured, disc, material, patterns, different, proper, n)
+    return _judged(measured, disc, material, patterns, different, proper, n, bool(marks))
 
 
 def _evidence(found):
@@ -285,7 +285,7 @@ def _scales(disc, scales, distance):
     return disc.radius / math.radians(WIDEST), disc.radius / math.radians(NARROWEST)
 
 
-def _judged(measured, disc, material, patterns, found, proper, n):
+def _judged(measured, disc, material, patterns, found, proper, n, marked):
     evidence = _evidence(found)
     weights = np.exp(0.5 * (evidence - evidence[0]))
     candidates = []
@@ -307,7 +307,7 @@ def _judged(measured, disc, material, patterns, found, proper, n):
     if len(found) > 1:
         margin = float(evidence[0] - evidence[1])
     next_best = max((float(np.clip(each.explained, 0, 1)) for _, each in found[1:]), default=0.0)
-    decided = margin > DECIDED and next_best < RIVAL * best
+    decided = margin > DECIDED and (marked or next_best < RIVAL * best)
     numbers = f"{best:.2f} of the structure instead of {next_best:.2f} (margin {margin:.0f}; {DECIDED:g} is needed)"
     if decided:
         reason = f"it explains more than any other orientation, {numbers}"

@@ -35,6 +35,7 @@ MARK_COST = 0.02
 """Correlation that a squared standard error of a mark costs in the search."""
 _NARROW = 1 / 40  # radii of the field of view: smoothing of the measured map
 _RIM = 0.04  # radii of the field of view: its rim, where the density rises
+_HITS = 40  # in the area of a Gaussian, 4 pi sigma^2, for a noise of 16 %
 _DARK = 0.3  # of the median density: a rim and corners that are darker are not used
 _BRIGHTEST = 2.5  # mean densities: brighter points of map and pattern are set to this
 
@@ -71,7 +72,9 @@ def disc_of(map: DetectorMap) -> Disc:
     mask = map.mask & field_of_view(np.where(map.mask, values, 0))
     width, height = map.bin_size
     size = np.sqrt(np.count_nonzero(mask) * width * height / np.pi)
-    smoothed = map.smoothed(_RIM * size).values
+    # as many hits in a smoothed point as in `field_of_view`
+    hits = max(float(values[mask].sum()), 1.0)
+    smoothed = map.smoothed(max(_RIM, np.sqrt(_HITS / (4 * hits))) * size).values
     # dark poles are inside
     mask &= scipy.ndimage.binary_fill_holes(smoothed > _DARK * np.median(smoothed[mask]))
     mask = _distance(mask, map.bin_size) > _RIM * size

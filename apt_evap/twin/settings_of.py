@@ -219,6 +219,9 @@ def _text(indexing, radii, size, lens, factor):
         "[responses]",
         "wide = true    # for ions that roll onto a mean of their neighbours",
         "",
+        "[flights]",
+        'field_of_view = "detector"    # only ions that can arrive are flown; all atoms evaporate',
+        "",
         "[detector]    # so large and so far away that the simulated map has the size of the measured one",
         'projection = "equidistant"    # closer to measured maps than a plane',
         f"distance = {projection.scale * _SIMULATED_COMPRESSION:.2f}    # mm: the scale of the map, "
