@@ -139,6 +139,7 @@ def test_the_page_is_driven(page, served):
 
     # a line drawn by the mouse gives profiles
     page.get_by_text("line", exact=True).click()
+    page.wait_for_function("maps[0].toolbar.active_drag.type == 'FreehandDrawTool'")
     drag(page, place(page, 0, 0.3, 0.3), place(page, 0, 0.7, 0.6))
     page.wait_for_function("[...Bokeh.documents[0].all_models].some(m => m.type == 'ColumnDataSource' &&"
                            " m.data.x?.length > 3 && m.data.y?.length > 3 && !m.data.image)")  # fmt: skip
@@ -147,6 +148,7 @@ def test_the_page_is_driven(page, served):
 
     # a rectangle gives a command, a button copies it
     page.get_by_text("box", exact=True).click()
+    page.wait_for_function("maps[0].toolbar.active_drag.type == 'BoxSelectTool'")
     drag(page, place(page, 0, 0.3, 0.3), place(page, 0, 0.6, 0.6))
     page.wait_for_function("[...Bokeh.documents[0].all_models].some(m => /--box=/.test(m.text ?? ''))")
     page.get_by_text("code", exact=True).click()
@@ -158,6 +160,7 @@ def test_the_page_is_driven(page, served):
 
     # two clicks index the map
     page.get_by_text("pole", exact=True).click()
+    page.wait_for_function("maps[1].toolbar.active_drag.type == 'PointDrawTool'")
     page.get_by_text("index", exact=True).click()
     for each in ((0.4, 0.5), (0.6, 0.5)):
         page.mouse.click(*place(page, 1, *each))
