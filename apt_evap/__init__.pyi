@@ -9,6 +9,7 @@ from . import evaporation as evaporation
 from . import explore as explore
 from . import fit as fit
 from . import flight as flight
+from . import indexing as indexing
 from . import io as io
 from . import maps as maps
 from . import microscope as microscope
@@ -19,6 +20,7 @@ from . import report as report
 from . import simulation as simulation
 from . import specimen as specimen
 from . import sweep as sweep
+from . import twin as twin
 from . import units as units
 from . import visibility as visibility
 from . import warnings as warnings
@@ -41,6 +43,7 @@ from .evaporation.voltage import VoltageControl as VoltageControl
 from .fit.fit_energies import fit_energies as fit_energies
 from .flight.crew import FlightSettings as FlightSettings
 from .flight.response import ResponseSettings as ResponseSettings
+from .indexing.index import index as index
 from .io.formats import read as read
 from .io.formats import write as write
 from .io.npz import read_map as read_map

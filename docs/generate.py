@@ -37,8 +37,10 @@ _GUIDES = {
     "simulation": "howto/resume real_units",
     "specimen": "specimens howto/own_structure",
     "sweep": "howto/sweep",
+    "twin": "howto/simulate_my_specimen",
     "units": "conventions",
     "visibility": "howto/visibility",
+    "indexing": "howto/find_orientation",
 }
 
 

@@ -159,7 +159,10 @@ def picture_path(path: AnyPath) -> Path:
 
 
 def save_picture(path: Path, maps: Sequence[DetectorMap], titles: Sequence[str]) -> None:
-    figure = plot.detector_maps(maps, titles, limits=plot.common_limits(maps))[0].figure
+    save_figure(path, plot.detector_maps(maps, titles, limits=plot.common_limits(maps))[0].figure)
+
+
+def save_figure(path: Path, figure: Any) -> None:
     suffix = path.suffix.lower()
     with replace_file(path) as file:
         figure.savefig(file, format=suffix[1:], dpi=200, metadata={_MARK_KEYS[suffix]: _MARK})

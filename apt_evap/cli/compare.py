@@ -17,9 +17,11 @@ from apt_evap.cli._files import check_output, ions_of_map, read, select
 from apt_evap.cli._output import put
 from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.detection.hits import Hits
 from apt_evap.fit.fit_energies import fit_energies
 from apt_evap.fit.grid import EnergyGrid
 from apt_evap.fit.settings import FitSettings
+from apt_evap.fit.study import Study
 from apt_evap.registration.register import Registration
 from apt_evap.report.origin import recorded_warnings
 from apt_evap.report.study import write_study
@@ -35,16 +37,22 @@ OVERLAY, REPORT = "registration.png", "report.html"
 
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
+    compare(options)
+    return 0
+
+
+def compare(options: argparse.Namespace, measured: Hits | DetectorMap | None = None) -> Study:
+    """Compare as the command does; with the measurement of another command instead of the file of the options."""
     # these are a line of the result
     with recorded_warnings(() if options.quiet else (RegistrationWarning, StructureWarning)) as messages:
-        return _compare(options, messages)
+        return _compare(options, measured, messages)
 
 
-def _compare(options, messages):
+def _compare(options, measured, messages):
     folder = check_path(options.output or f"{Path(options.file).stem}_study")
     _check_folder(folder, options.force)
     registration = None if options.registration is None else read_registration(options.registration)
-    measured = _measured(options)
+    measured = _measured(options) if measured is None else measured
     run = load(options.run)
     if run.responses is None:
         raise ValueError(f"{options.run!r} has no responses: repeat the run with responses = true in [simulation]")
@@ -62,7 +70,7 @@ def _compare(options, messages):
         put("\n".join(study.lines()))
         check = f"; check {OVERLAY}, --registration sets a known registration" if study.registration.doubtful else ""
         put(f"wrote {', '.join(FILES)} to {folder}{check}")
-    return 0
+    return study
 
 
 def _given(options, kind):

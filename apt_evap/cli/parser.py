@@ -1,6 +1,7 @@
 """Arguments of the commands; no numerical module is imported, so that help is fast."""
 
 import argparse
+import re
 from collections.abc import Callable, Iterable
 from math import inf, isfinite
 from typing import Any, NoReturn
@@ -30,6 +31,8 @@ from a simulation to its map, and to the emission energies of a measured map:
                                                      map of the same ions, with roll-up at 0.3 eV; takes about 1 s
   apt-evap info R5083.epos --json | jq .ions         also for measured files; --json for programs
   apt-evap map R5083.epos --bins 128                 map of measured ions
+  apt-evap index R5083.epos --element Ni             which crystal direction is where on the map
+  apt-evap twin R5083.epos --element Ni              all of this: index, simulate, register, fit, report
   apt-evap compare ni111.h5 R5083.epos -o study      fit the emission energies to the measured map
   apt-evap export ni111.h5 --real-units -o ni111.epos
                                                      ions as an instrument would write them
@@ -67,6 +70,9 @@ def make_parser() -> argparse.ArgumentParser:
         _add_run,
         _add_map,
         _add_info,
+        _add_index,
+        _add_start,
+        _add_twin,
         _add_compare,
         _add_export,
         _add_reconstruct,
@@ -82,6 +88,10 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 class _Parser(argparse.ArgumentParser):
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._negative_number_matcher = re.compile(r"-\.?\d")  # a value such as -9.6,4 is not an option
+
     def error(self, message: str) -> NoReturn:
         raise ValueError(f"{message} (see {self.prog} --help)")
 
@@ -214,6 +224,98 @@ def _add_info(commands: Any) -> None:
         "--types", type=_types, metavar="1=Al,2=Cu", help="elements of the types of a specimen that have no names"
     )
     command.add_argument("--json", action="store_true", help="as JSON, for programs; units as in the text output")
+
+
+def _add_index(commands: Any) -> None:
+    command = commands.add_parser(
+        "index",
+        help="which crystal direction is where on a measured map",
+        description="Find the orientation of the crystal from a measured map, by a search over all orientations, and\n"
+        "draw poles and zone lines over the map. The answer may be that the map does not decide.",
+        epilog="example:\n"
+        "  apt-evap index R5083.epos --element Ni\n"
+        "  apt-evap index R5083.epos --element Al --ranges R5083.rrng --species Al --distance 90\n"
+        "  apt-evap index R5083.epos --element W --pole 3.5,-8,0,1,1 --line -20,5,18,9 --line 10,-20,4,22",
+        **_SHAPE,
+    )
+    command.add_argument("file", metavar="FILE", help="measured ions (.epos, ...) or a map (.npz)")
+    _add_reading(command)
+    _add_indexing(command)
+    command.add_argument(
+        "-o", "--output", metavar="MAP.png", help=".png, .pdf or .svg; default: FILE_indexed.png in this folder"
+    )
+    command.add_argument("--force", action="store_true", help="overwrite a file not made by apt-evap")
+    _add_speech(command)
+
+
+def _add_start(commands: Any) -> None:
+    command = commands.add_parser(
+        "start",
+        help="settings file for a simulation of a measured specimen",
+        description="Index a measured map, and write a settings file for a simulation of its specimen: axis,\n"
+        "rotation, radius, detector and emission, with the origin of every number as a comment.",
+        epilog="example:\n"
+        "  apt-evap start R5083.epos --element Ni --distance 90 -o specimen.toml\n"
+        "  apt-evap run specimen.toml",
+        **_SHAPE,
+    )
+    command.add_argument("file", metavar="FILE", help="measured ions (.epos, ...) or a map (.npz)")
+    command.add_argument("-o", "--output", metavar="FILE.toml", help="default: the name of FILE with .toml")
+    _add_reading(command)
+    _add_indexing(command)
+    _add_specimen(command)
+    command.add_argument("--force", action="store_true", help="overwrite a file not made by this command")
+    _add_speech(command)
+
+
+def _add_twin(commands: Any) -> None:
+    command = commands.add_parser(
+        "twin",
+        help="from a measured file to a simulation of its specimen, a fit and a report",
+        description="Index a measured map, simulate its specimen, register the simulated map on the measured one, fit\n"
+        "the emission, and write a report. The same command continues after an interruption.",
+        epilog="writes to FOLDER:\n"
+        "  specimen.toml, start.json   settings of the simulation, and the indexing\n"
+        "  run.h5, run.png             the simulation\n"
+        "  registration.json, study/   as of apt-evap compare; study/report.html has it all\n"
+        "  answer.txt                  constants of the measurement\n\n"
+        "example: apt-evap twin R5083.epos --element Ni --distance 90 --minutes 10",
+        **_SHAPE,
+    )
+    command.add_argument("file", metavar="FILE", help="measured ions (.epos, ...) or a map (.npz)")
+    command.add_argument("-o", "--output", metavar="FOLDER", help="default: FILE_twin in this folder")
+    _add_reading(command)
+    _add_indexing(command)
+    _add_specimen(command)
+
+
+def _add_specimen(command: Any) -> None:
+    group = command.add_argument_group("specimen")
+    group.add_argument(
+        "--minutes", type=float, default=10.0, metavar="N", help="time that the simulation may take; default: 10"
+    )
+    group.add_argument("--field-factor", type=float, metavar="KF", help="for the radius from the voltage; default: 3.3")
+    group.add_argument("--lens", metavar="L", help="microscope that gives the field factor, as for apt-evap export")
+    group.add_argument("--threads", type=_integer(1), metavar="N", help="default: all processors")
+
+
+def _add_indexing(command: Any) -> None:
+    group = command.add_argument_group("crystal")
+    group.add_argument("--element", metavar="NAME", required=True, help="the crystal, such as Ni")
+    group.add_argument("--distance", type=_number("mm"), metavar="MM", help="flight length of the instrument")
+    group.add_argument(
+        "--scales", type=_numbers, metavar="LOW,HIGH", help="bounds of the scale of the map [mm/rad], if it is known"
+    )
+    group.add_argument(
+        "--pole", type=_mark(2), action="append", metavar="X,Y[,H,K,L]", help="a pole that you see [mm]; repeat it"
+    )
+    group.add_argument(
+        "--line",
+        type=_mark(4),
+        action="append",
+        metavar="X,Y,X,Y[,U,V,W]",
+        help="two points of a zone line that you see [mm], and its zone axis if you know it; repeat it",
+    )
 
 
 def _add_compare(commands: Any) -> None:
@@ -614,6 +716,19 @@ def _numbers(text: str) -> tuple[float, ...]:
         return tuple(float(part) for part in text.split(","))
     except ValueError:
         raise argparse.ArgumentTypeError(f"must be numbers separated by commas, got {text!r}") from None
+
+
+def _mark(n: int) -> Callable[[str], tuple[Any, ...]]:
+    """`n` coordinates, and perhaps three or four indices after them."""
+
+    def mark(text):
+        numbers = _numbers(text)
+        indices = numbers[n:]
+        if len(numbers) < n or len(indices) not in (0, 3, 4) or any(each != round(each) for each in indices):
+            raise argparse.ArgumentTypeError(f"must be {n} coordinates [mm], perhaps with indices, got {text!r}")
+        return (*numbers[:n], tuple(int(each) for each in indices)) if indices else numbers
+
+    return mark
 
 
 def _option(text: str) -> tuple[str, tuple[float, ...]]:

@@ -1,6 +1,7 @@
 # The pictures: read by type checkers, and by the lazy loader in __init__.py.
 from ._figure import add_colorbar as add_colorbar
 from ._figure import new_figure as new_figure
+from .candidates import indexing as indexing
 from .charges import charge_states as charge_states
 from .histories import history as history
 from .histories import voltage_curve as voltage_curve

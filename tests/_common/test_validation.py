@@ -871,6 +871,7 @@ def test_every_public_name_with_arguments_is_in_the_table():
     taken |= {"chunks", "precipitate_errors", "likeness"}  # in test_chunks, test_precipitate, test_verdict
     taken |= {"write_nodes", "write_types", "describe"}  # in test_tapsim_nodes, test_main
     taken |= {*ae.visibility.__all__, *ae.dataset.__all__}  # in tests/visibility, tests/dataset
+    taken |= {*ae.indexing.__all__, *ae.twin.__all__, "index", "indexing"}  # in tests/indexing, tests/twin
     missing = {
         name
         for place in (ae, *SPACES)

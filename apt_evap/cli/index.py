@@ -1,0 +1,55 @@
+"""`apt-evap index`: which crystal direction is where on a measured map."""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+from apt_evap import plot
+from apt_evap.cli._files import check_output, ions_of_map, is_picture, picture_path, read, save_figure
+from apt_evap.cli._output import tell, tell_json
+from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.detection.hits import Hits
+from apt_evap.detection.timing import mass_to_charge
+from apt_evap.indexing.index import Indexing, index
+from apt_evap.simulation.run import Run
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Run the command."""
+    picture = picture_path(options.output or f"{Path(options.file).stem}_indexed.png")
+    check_output(picture, is_picture, options.force)
+    found, _ = indexed(options)
+    tell(options, f"{found}")
+    save_figure(picture, plot.indexing(found)[0].figure)
+    tell(options, f"wrote {picture}")
+    tell_json(options, {"wrote": str(picture), "file": options.file, **found.to_dict()})
+    return 0
+
+
+def map_of(options: argparse.Namespace) -> tuple[DetectorMap, Hits | None]:
+    """The map of a command, and the selected ions if it is made of ions."""
+    content = read(options)
+    if isinstance(content, Run):
+        raise ValueError(f"a measured file is needed, {options.file!r} contains a run, whose orientation is known")
+    if isinstance(content, DetectorMap):
+        return content, None
+    columns = (content.time_of_flight, content.voltage, content.x, content.y)
+    if content.mass_to_charge is None and options.distance is not None and all(each is not None for each in columns):
+        time, voltage, x, y = columns
+        content = replace(content, mass_to_charge=mass_to_charge(voltage, time, x, y, options.distance))
+    ions = ions_of_map(content, options)
+    return ions.map(bins=128), ions
+
+
+def indexed(options: argparse.Namespace) -> tuple[Indexing, Hits | None]:
+    """Index the map of a command; the answer, and the ions that the map is made of."""
+    detector_map, ions = map_of(options)
+    found = index(
+        detector_map,
+        options.element,
+        scales=options.scales,
+        distance=None if options.scales else options.distance,
+        poles=options.pole or (),
+        lines=options.line or (),
+    )
+    return found, ions

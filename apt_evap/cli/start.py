@@ -1,0 +1,48 @@
+"""`apt-evap start`: a settings file for a simulation of a measured specimen."""
+
+import argparse
+from pathlib import Path
+
+from apt_evap._common.files import check_path
+from apt_evap._common.threads import thread_count
+from apt_evap.cli._files import check_output, lens_of
+from apt_evap.cli._output import tell, tell_json
+from apt_evap.cli.index import indexed
+from apt_evap.twin.settings_of import MARK, Start, settings_of
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Run the command."""
+    path = check_path(options.output or f"{Path(options.file).stem}.toml")
+    check_output(path, is_start, options.force)
+    start = start_of(options)
+    tell(options, f"{start.indexing}")
+    start.save(path)
+    tell(options, f"wrote {path}: {start.foresight}; simulate with apt-evap run {path}")
+    tell_json(options, {"wrote": str(path), "file": options.file, **summary(start)})
+    return 0
+
+
+def start_of(options: argparse.Namespace) -> Start:
+    """Settings by the options of a command."""
+    found, ions = indexed(options)
+    return settings_of(
+        found,
+        ions,
+        lens=lens_of(options),
+        field_factor=options.field_factor,
+        minutes=options.minutes,
+        threads=thread_count(options.threads),
+    )
+
+
+def summary(start: Start) -> dict[str, object]:
+    """A start in plain types."""
+    radii = [None if radius != radius else radius for radius in start.radii]
+    return {"radii": radii, "simulated_radius": start.simulated_radius, **start.indexing.to_dict()}
+
+
+def is_start(path: Path) -> bool:
+    """Whether a file was made by this command."""
+    with open(path, "rb") as file:
+        return file.read(len(MARK)) == MARK.encode()

@@ -1,0 +1,328 @@
+"""Which crystal direction is where on a map: the search, its refinement, and what the map decides."""
+
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from apt_evap._common.short_repr import short_repr
+from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence
+from apt_evap.crystallography.orientation import Orientation
+from apt_evap.crystallography.symmetry import point_group
+from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.detection.hits import Hits
+from apt_evap.detection.projection import Projection
+from apt_evap.indexing.marks import marks_of
+from apt_evap.indexing.master_pattern import MasterPattern, master_patterns
+from apt_evap.indexing.refine import BINS, Refined, bins_of, refine
+from apt_evap.indexing.search import disc_of, misorientation, search
+from apt_evap.specimen.materials import as_material
+
+WIDEST, NARROWEST = 45.0, 12.0
+"""Half angles of the field of view between which the scale is searched, if it is not known [degrees]."""
+DIFFERENT = 6.0
+"""Angle between two orientations above which they are different answers [degrees]."""
+DECIDED = 12.0
+"""Margin to the next different orientation above which a map decides, see the notes of `index`."""
+LEAST_COMPRESSION, LARGEST_COMPRESSION = 1.2, 2.2
+"""Image compressions between which the scale is searched, if only the flight length is known."""
+_STARTS, _FINAL = 12, 6  # orientations that are refined, and that are refined to the end
+_BEYOND = 1.1  # refined scales may leave their bounds by this factor: the stretch changes the scale
+_MAP_BINS = 128
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """An orientation that a map may show.
+
+    Parameters
+    ----------
+    orientation : Orientation
+        Orientation of the crystal, with the axis of the specimen at the centre of the map: for `Tip`.
+    projection : Projection
+        Where directions are on the map.
+    score : float
+        Fraction of the structure of the map that the orientation explains, 0 to 1: of its deviance from slow changes,
+        beyond the noise.
+    confidence : float
+        Confidence that this candidate, or an orientation within 6 degrees, is right, if one of the candidates is.
+    rolled : float
+        Part of the pattern of ions that roll up, 0 to 1.
+    contrast : float
+        Sum of the amplitudes of the patterns; 1 for a map like the simulated ones, less for fainter lines.
+    angle_error : float
+        Standard error of the orientation by noise alone [degrees].
+    pattern : MasterPattern
+        The pattern that fits best.
+    """
+
+    orientation: Orientation
+    projection: Projection
+    score: float
+    confidence: float
+    rolled: float
+    contrast: float
+    angle_error: float
+    pattern: MasterPattern
+
+    def __repr__(self) -> str:
+        return short_repr(self)
+
+    def _plain(self):
+        projection = self.projection
+        return {
+            "axis": [round(each, 4) for each in self.orientation.axis],
+            "rotation": round(self.orientation.rotation, 2),
+            "scale": projection.scale,
+            "centre": list(projection.centre),
+            "compression": projection.compression,
+            "score": self.score,
+            "confidence": self.confidence,
+            "rolled": self.rolled,
+            "contrast": self.contrast,
+            "angle_error": self.angle_error,
+            "pattern_radius": self.pattern.apex_radius,
+        }
+
+    def __str__(self):
+        axis = " ".join(f"{each:.2f}" for each in self.orientation.axis)
+        return f"[{axis}], rotation {self.orientation.rotation:.1f}°, {self.projection.scale:.1f} mm/rad"
+
+
+@dataclass(frozen=True, eq=False)
+class Indexing:
+    """Orientations that a map may show, and whether it decides; the answer of `index`.
+
+    Parameters
+    ----------
+    map : DetectorMap
+        The map.
+    candidates : tuple of Candidate
+        Different orientations, the best one first.
+    decided : bool
+        Whether the map decides for the first candidate.
+    reason : str
+        One sentence: why it is decided or not.
+    """
+
+    map: DetectorMap
+    candidates: tuple[Candidate, ...]
+    decided: bool
+    reason: str
+
+    @property
+    def best(self) -> Candidate:
+        """The first candidate."""
+        return self.candidates[0]
+
+    @property
+    def verdict(self) -> str:
+        """The word "indexed" or "undecided"."""
+        return "indexed" if self.decided else "undecided"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the answer in plain types, without the map.
+
+        Returns
+        -------
+        dict
+            verdict, reason, and of each candidate its axis, rotation, scale, centre, compression, score, confidence,
+            rolled, contrast, angle_error and the radius of the pattern.
+        """
+        return {
+            "verdict": self.verdict,
+            "reason": self.reason,
+            "candidates": [each._plain() for each in self.candidates],
+        }
+
+    def __repr__(self) -> str:
+        return short_repr(self)
+
+    def __str__(self):
+        rows = [f"{self.verdict}: {self.reason}"]
+        rows += [f"{each.confidence:5.0%}  score {each.score:.2f}  {each}" for each in self.candidates]
+        return "\n".join(rows)
+
+
+def index(
+    measured: DetectorMap | Hits,
+    material: Any,
+    *,
+    scales: Sequence[float] | None = None,
+    poles: Sequence[Any] = (),
+    lines: Sequence[Any] = (),
+    patterns: Sequence[MasterPattern] | None = None,
+    distance: float | None = None,
+    candidates: int = 4,
+) -> Indexing:
+    """Find out which crystal direction is where on a map.
+
+    Parameters
+    ----------
+    measured : DetectorMap or Hits
+        A map of one element or phase.
+    material : Material or str
+        The crystal.
+    scales : sequence of two float, optional
+        Bounds of the scale [mm/rad]: the flight length divided by the image compression. A lens gives them within 10 %:
+        ``L / lens.compression(radius)``. By default those of `distance`, or a half angle of the field of view between
+        12 and 45 degrees.
+    poles : sequence, optional
+        Poles that you see: (x, y) [mm], or (x, y, indices) if you know which one it is.
+    lines : sequence, optional
+        Zone lines that you see: (x, y, x, y) of two points far from each other [mm], or with the indices of the zone
+        axis as a fifth value. They need not meet in a pole.
+    patterns : sequence of MasterPattern, optional
+        Patterns of the crystal; by default those of the package, for several radii.
+    distance : float, optional
+        Flight length [mm], for a scale between 1/2.2 and 1/1.2 of it.
+    candidates : int
+        Largest number of candidates in the answer.
+
+    Returns
+    -------
+    Indexing
+
+    Raises
+    ------
+    ValueError
+        If there is no pattern of the structure, or an argument is outside its range.
+
+    Notes
+    -----
+    A search over all axes, rotations and scales compares the map with a master pattern: the density of hits in every
+    direction of the crystal, simulated, for ions that roll up and for ions that do not. The best results are refined by
+    the likelihood of the counts, with free amplitudes of both patterns and a slow change of the efficiency. The margin
+    of two orientations is twice the logarithm of the ratio of their likelihoods, divided by the variance of the sums of
+    neighbouring residuals of the better one in units of Poisson's. So a model that leaves structure unexplained decides
+    less. Above a margin of 12 to the next orientation that differs by more than 6 degrees the map is `decided`.
+
+    The axis is that at the centre of the field of view. An orientation and its mirror image look the same in crystals
+    with mirror planes: a map does not decide its handedness.
+
+    :doc:`/howto/find_orientation` has what was measured with simulated and measured maps.
+
+    Examples
+    --------
+    >>> pattern = ae.indexing.master_patterns("fcc")[0]
+    >>> orientation = ae.Orientation("Ni", axis=(0.30, 0.54, 0.79), rotation=20.0)
+    >>> simulated = pattern.map(orientation, ae.detection.Projection(60.0), width=70.0, ions=30_000, rolled=0.5, seed=1)
+    >>> found = ae.index(simulated, "Ni")
+    >>> found.verdict, f"{found.best.projection.scale:.0f} mm/rad"
+    ('indexed', '60 mm/rad')
+    """
+    material = as_material(material)
+    if isinstance(measured, Hits):
+        measured = measured.map(bins=_MAP_BINS)
+    check_kind(measured, "measured", DetectorMap, "a DetectorMap or Hits")
+    patterns = (
+        master_patterns(material.structure)
+        if patterns is None
+        else check_sequence(patterns, "patterns", "MasterPattern")
+    )
+    for pattern in patterns:
+        check_kind(pattern, "patterns", MasterPattern, "MasterPattern")
+        if pattern.structure != material.structure:
+            raise ValueError(f"patterns must be of {material.structure}, got {pattern!r}")
+    disc = disc_of(measured)
+    marks = marks_of(material, poles, lines)
+    low, high = _scales(disc, scales, distance)
+    bins = bins_of(disc)
+    sigma = max(0.35 * math.degrees(2 * disc.radius / BINS / math.sqrt(low * high)), 0.5)
+    densities = [pattern.smoothed(sigma) for pattern in patterns]
+
+    def refined(start, steps):
+        number = start[0]
+        return number, refine(bins, disc, densities[number], *start[1:], marks, steps)
+
+    starts = search(disc, patterns, (low, high), _STARTS, marks)
+    group = point_group(material.structure)
+    proper = group[np.linalg.det(group) > 0]
+    found = [refined((each.pattern, each.matrix, each.scale, each.rolled), 7) for each in starts]
+    found = _ranked(found)
+    again = []
+    for number, each in found[:_FINAL]:
+        rolled = each.amplitudes[1] / max(each.amplitudes.sum(), 1e-9)
+        again.append(refined((number, each.matrix, each.scale, rolled), 20))
+    found = _ranked(again + found[_FINAL:])
+    within = [each for each in found if low / _BEYOND < each[1].scale < high * _BEYOND]
+    found = within or found
+    different: list[tuple[int, Refined]] = []
+    for number, each in found:
+        if all(misorientation(each.matrix, other.matrix, proper) > DIFFERENT for _, other in different):
+            different.append((number, each))
+    n = check_count(candidates, "candidates", at_least=1)
+    return _judged(measured, disc, material, patterns, different, proper, n)
+
+
+def _evidence(found):
+    """Twice the logarithm of the likelihood, in units of the noise about the model of the largest gain, shape (n,)."""
+    dispersion = max(found, key=lambda each: each[1].gain)[1].dispersion
+    return np.array([each.gain / dispersion - each.misfit for _, each in found])
+
+
+def _ranked(found):
+    return [found[k] for k in np.argsort(-_evidence(found), kind="stable")]
+
+
+def _scales(disc, scales, distance):
+    """Bounds of the scale [mm/rad]."""
+    if scales is not None and distance is not None:
+        raise ValueError("give scales or distance, not both")
+    if scales is not None:
+        low, high = check_array(scales, "scales", (2,)).tolist()
+        return check_number(low, "scales", above=0), check_number(high, "scales", at_least=low, unit="mm/rad")
+    if distance is not None:
+        length = check_number(distance, "distance", above=0, unit="mm")
+        return length / LARGEST_COMPRESSION, length / LEAST_COMPRESSION
+    return disc.radius / math.radians(WIDEST), disc.radius / math.radians(NARROWEST)
+
+
+def _judged(measured, disc, material, patterns, found, proper, n):
+    evidence = _evidence(found)
+    weights = np.exp(0.5 * (evidence - evidence[0]))
+    candidates = []
+    for (number, each), weight in zip(found[:n], weights / weights.sum(), strict=False):
+        contrast = float(each.amplitudes.sum())
+        candidates.append(
+            Candidate(
+                orientation=_orientation(material, each.matrix, proper),
+                projection=_projection(disc, each),
+                score=float(np.clip(each.explained, 0, 1)),
+                confidence=float(weight),
+                rolled=float(each.amplitudes[1] / max(contrast, 1e-9)),
+                contrast=contrast,
+                angle_error=float(np.degrees(np.sqrt(np.trace(each.covariance[:3, :3]) * each.dispersion))),
+                pattern=patterns[number],
+            )
+        )
+    margin = float(evidence[0] - evidence[1]) if len(evidence) > 1 else math.inf
+    decided = margin > DECIDED
+    if decided:
+        reason = f"no other orientation explains the map nearly as well (margin {margin:.0f}, {DECIDED:g} is needed)"
+    else:
+        alike = int(np.count_nonzero(evidence > evidence[0] - DECIDED))
+        reason = f"{alike} orientations explain the map about equally well (margin {margin:.1f} of {DECIDED:g})"
+    return Indexing(measured, tuple(candidates), decided, reason)
+
+
+def _orientation(material, matrix, proper):
+    """The equal orientation whose axis is in the standard triangle, or in its mirror image."""
+    axes = np.einsum("nij,j->ni", proper, matrix[2])
+    general = np.array([0.36, 0.52, 0.775]) if material.structure != "hcp" else np.array([0.5, 0.13, 0.85])
+    mirrored = general * (-1, 1, 1) if material.structure != "hcp" else general * (1, -1, 1)
+    member = proper[np.maximum(axes @ general, axes @ mirrored - 1e-3).argmax()]
+    return Orientation.from_matrix(material, matrix @ member.T)
+
+
+def _projection(disc, refined):
+    """The projection whose radius has the same first two terms: equidistant, or compressed for a negative stretch."""
+    stretch = refined.stretch
+    if stretch > -0.01:
+        return Projection(refined.scale, disc.centre)
+    scale = refined.scale / (1 - stretch)
+    return Projection(scale, disc.centre, compression=math.sqrt(-(1 - stretch) / (3 * stretch)) * disc.radius / scale)
