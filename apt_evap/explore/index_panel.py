@@ -1,5 +1,7 @@
 """Index mode of the page: poles and zone lines that are clicked on the measured map, and the orientations that fit."""
 
+import multiprocessing
+import threading
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -11,11 +13,15 @@ from bokeh.models import Button, CheckboxGroup, ColumnDataSource, Div, LabelSet,
 from apt_evap._common.codec import to_python
 from apt_evap.crystallography.orientation import Orientation
 from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.detection.hits import Hits
 from apt_evap.detection.projection import Projection
 from apt_evap.explore.latest import Latest
 from apt_evap.explore.marks import Marks, overlay
 from apt_evap.explore.widgets import LEFT
+from apt_evap.fit.fit_energies import measured_map
+from apt_evap.indexing.index import index
 from apt_evap.specimen.materials import MATERIALS
+from apt_evap.twin.settings_of import settings_of
 
 HINT = "mode “pole”: click a pole whose family you choose here; drag a mark to move it"
 
@@ -27,8 +33,8 @@ class IndexPanel:
     ----------
     fig : bokeh.plotting.figure
         The measured map.
-    like : callable
-        Returns the measured map.
+    measured : callable
+        Returns the measured ions or map.
     material : str
         The crystal at the start.
     later : callable
@@ -40,12 +46,12 @@ class IndexPanel:
     def __init__(
         self,
         fig: Any,
-        like: Callable[[], DetectorMap],
+        measured: Callable[[], Hits | DetectorMap],
         material: str,
         later: Callable[[Callable[[], None], int], Any],
         put_code: Callable[[str], None],
     ) -> None:
-        self._like, self._later, self._put_code = like, later, put_code
+        self._measured, self._later, self._put_code = measured, later, put_code
         self.latest = Latest(lambda wish: wish())
         self.candidates: list[tuple[Orientation, Projection, str]] = []
         self._make_widgets(material)
@@ -64,6 +70,10 @@ class IndexPanel:
         self.undo, self.new_line, self.clear = (
             Button(label=label, width=90) for label in ("undo", "next line", "clear")
         )
+        self.search = Button(label="search", width=90)
+        self.search.on_click(self._search)
+        self.settings = Button(label="settings file", width=110, visible=False)
+        self.settings.on_click(lambda: self._put_code(self._settings))
         self.choice = Select(title="candidates", options=[], width=LEFT - 10, visible=False)
         self.text = Div(text=HINT, width=LEFT - 10, styles={"color": "var(--faint)"})
         self.material.on_change("value", lambda attr, old, new: self._material_changed())
@@ -77,6 +87,7 @@ class IndexPanel:
         self.column = column(
             row(self.material, self.family),
             row(self.undo, self.new_line, self.clear),
+            row(self.search, self.settings),
             self.text,
             self.choice,
             row(self.scale, self.options),
@@ -173,6 +184,34 @@ class IndexPanel:
         }
         self.latest.ask(partial(self._fit, marks, options))
 
+    def _search(self):
+        """Search over all orientations by `index`, in another process; marks narrow it."""
+        marks = self.read()
+        options: dict[str, Any] = {
+            "poles": [place for _, place in marks.poles],
+            "lines": [(*points[0], *points[-1]) for _, points in marks.lines if len(points) > 1],
+        }
+        if self.scale.value:
+            options["scales"] = (0.95 * self.scale.value, 1.05 * self.scale.value)
+        arguments = self._measured(), self.material.value, options
+        self.search.update(label="searching", disabled=True)
+
+        def work():
+            try:
+                with multiprocessing.get_context("spawn").Pool(1) as pool:
+                    found = pool.apply(_indexed, arguments)
+            except ValueError as error:
+                found = [], str(error), ""
+            self._later(partial(self._put_searched, *found), 0)
+
+        threading.Thread(target=work, daemon=True).start()
+
+    def _put_searched(self, candidates, text, settings):
+        self.search.update(label="search", disabled=False)
+        self._settings = settings
+        self.settings.visible = bool(settings)
+        self._put(candidates, text)
+
     def _missing(self, marks):
         if marks.poles and marks.lines:
             return "type a scale, or mark a second pole"
@@ -209,7 +248,7 @@ class IndexPanel:
             self.text.text = self._hint
             return
         orientation, projection, quality = self.candidates[int(self.choice.value or 0)]
-        drawn = overlay(orientation, projection, self._like())
+        drawn = overlay(orientation, projection, measured_map(self._measured()))
         gap = [[np.nan, np.nan]]
         points = np.concatenate([each for line in drawn.lines for each in (line, gap)] or [gap])
         self.lines.data = {"x": points[:, 0], "y": points[:, 1]}
@@ -222,3 +261,17 @@ class IndexPanel:
         self._put_code(
             f"import apt_evap as ae\n\norientation = {to_python(orientation)}\nprojection = ae.detection.{projection!r}"
         )
+
+
+def _indexed(measured, material, options):
+    """Candidates of `index`, its verdict, and the settings file of the first one as `apt-evap start` makes it."""
+    found = index(measured, material, **options)
+    rows = [
+        (each.orientation, each.projection, f"{each.confidence:.0%}, score {each.score:.2f}")
+        for each in found.candidates
+    ]
+    try:
+        settings = settings_of(found, measured if isinstance(measured, Hits) else None).text
+    except ValueError:  # no tip is small enough
+        settings = ""
+    return rows, f"{found.verdict}: {found.reason}", settings

@@ -302,7 +302,7 @@ class Page:
         self.line.on_change("data", lambda attr, old, new: self._line_drawn())
         if explorer.measured is not None:
             self.index = IndexPanel(
-                self.maps[-1], lambda: self.shown.whole, self._material(), self._later, self._put_python
+                self.maps[-1], lambda: explorer.measured, self._material(), self._later, self._put_python
             )
             for name in ("pole", "zone line"):
                 self._drags[-1][name] = self.index.tool

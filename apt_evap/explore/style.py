@@ -16,6 +16,7 @@ WIDGETS = """
 .bk-input, .bk-btn, .bk-btn-default { background-color: var(--panel); color: var(--ink); border-color: var(--edge); }
 .bk-input option, .bk-menu { background-color: var(--panel); color: var(--ink); }
 .bk-input::placeholder { color: var(--faint); }
+.bk-btn-default:hover, .bk-btn-default:disabled { background-color: var(--edge); color: var(--ink); }
 .bk-btn-default.bk-active, .bk-btn.bk-active { background-color: #2f6fb3; color: #ffffff; }
 .bk-btn { padding: 4px 8px; }
 .noUi-target { background-color: var(--edge); }

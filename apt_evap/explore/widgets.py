@@ -24,9 +24,8 @@ for (const [range, stretch] of [[fig.x_range, Math.max(1, 1 / ratio)], [fig.y_ra
 """
 _COPY = """
 navigator.clipboard.writeText(text.text)
-const label = cb_obj.label
-cb_obj.label = "copied"
-setTimeout(() => { cb_obj.label = label }, 1500)
+button.label = "copied"
+setTimeout(() => { button.label = label }, 1500)
 """
 _SAVE = """
 figures.forEach((fig, k) => Bokeh.index.find_one(fig)?.export("png", true).to_blob().then(blob => {
@@ -134,7 +133,7 @@ def grid(children: Sequence[Any]) -> Any:
 def copy_button(label: str, text: Any) -> Button:
     """Button that copies a text and says so."""
     button = Button(label=label, width=150)
-    button.js_on_click(CustomJS(args={"text": text}, code=_COPY))
+    button.js_on_click(CustomJS(args={"text": text, "button": button, "label": label}, code=_COPY))
     return button
 
 

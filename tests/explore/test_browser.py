@@ -149,6 +149,7 @@ def test_the_page_is_driven(page, served):
     # a rectangle gives a command, a button copies it
     page.get_by_text("box", exact=True).click()
     page.wait_for_function("maps[0].toolbar.active_drag.type == 'BoxSelectTool'")
+    page.wait_for_timeout(500)
     drag(page, place(page, 0, 0.3, 0.3), place(page, 0, 0.6, 0.6))
     page.wait_for_function("[...Bokeh.documents[0].all_models].some(m => /--box=/.test(m.text ?? ''))")
     page.get_by_text("code", exact=True).click()

@@ -417,6 +417,28 @@ def test_poles_are_clicked(measured):
     page.close()
 
 
+def test_the_orientation_is_searched():
+    """The search is that of the library, in another process; its settings can be copied."""
+    pattern = ae.indexing.master_patterns("fcc")[0]
+    orientation = ae.Orientation("Ni", axis=(0.30, 0.54, 0.79), rotation=20.0)
+    projection = ae.detection.Projection(60.0)
+    measured = pattern.map(orientation, projection, width=70.0, ions=30_000, rolled=0.5, seed=1)
+    opened = Opened(Explorer(None, measured))
+    index = opened.page.index
+    index.material.value, index.scale.value = "Ni", 60.0
+    index._search()
+    assert index.search.disabled
+    opened.settle(lambda: not index.search.disabled)
+    found = ae.index(measured, "Ni", scales=(57.0, 63.0))
+    assert found.reason in index.text.text and found.verdict in index.text.text
+    assert len(index.candidates) == len(found.candidates)
+    assert np.array_equal(index.candidates[0][0].matrix, found.best.orientation.matrix)
+    assert not opened.page.shell.text.startswith("[")
+    index._put_code(index._settings)
+    assert opened.page.python.text == ae.twin.settings_of(found).text
+    opened.page.close()
+
+
 def test_a_file_is_opened(measured):
     """A page without files opens one; what cannot be read leaves the page."""
     made = []
