@@ -165,6 +165,7 @@ def test_the_page_is_driven(page, served):
     page.get_by_text("index", exact=True).click()
     for each in ((0.4, 0.5), (0.6, 0.5)):
         page.mouse.click(*place(page, 1, *each))
+        page.wait_for_timeout(600)  # not a double click
     page.wait_for_function("written().includes('mm/rad')")
     picture(page, "8_index")
 
