@@ -13,9 +13,8 @@ from typing import Any
 
 from apt_evap._common.codec import to_python
 from apt_evap._common.optional_imports import optional_import
-from apt_evap.cli._files import in_real_units, ions_of_map, lens_of, read
+from apt_evap.cli._files import in_real_units, ions_of_map, lens_of, read, read_registration
 from apt_evap.cli._output import put, say
-from apt_evap.cli.compare import read_registration
 from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.explore.controls import values_of

@@ -126,7 +126,6 @@ class IndexPanel:
                 text_color="lime",
                 text_font_size="13px",
                 text_font_style="bold",
-                text_outline_color="black",
             )
         )
         self.tool = PointDrawTool(renderers=[drawn], add=False)

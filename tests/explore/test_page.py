@@ -20,7 +20,7 @@ from bokeh.util.token import generate_jwt_token, generate_session_id
 from tornado.httpclient import HTTPClientError, HTTPRequest
 from tornado.websocket import websocket_connect
 
-from apt_evap.cli.compare import read_registration
+from apt_evap.cli._files import read_registration
 from apt_evap.explore.page import MODES, Page
 from apt_evap.explore.server import serve
 
