@@ -1,6 +1,7 @@
 """Files of the commands: reading by the options; writing that never replaces files of other programs."""
 
 import argparse
+import json
 import os
 import tempfile
 from collections.abc import Callable, Sequence
@@ -10,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from apt_evap import plot
-from apt_evap._common.files import FileError, check_path, open_for_reading, replace_file
+from apt_evap._common.codec import from_plain
+from apt_evap._common.files import FileError, check_path, open_for_reading, read_small_file, replace_file
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import did_you_mean
 from apt_evap._version import __version__
@@ -21,6 +23,7 @@ from apt_evap.io.distortion_grid import read_grid
 from apt_evap.io.formats import read as read_file
 from apt_evap.io.formats import read_ranges
 from apt_evap.microscope.local_electrode import LocalElectrode
+from apt_evap.registration.register import Registration
 from apt_evap.simulation.run import Run, load
 
 _MARK = f"apt_evap {__version__}"
@@ -149,6 +152,33 @@ def ions_of_map(hits: Hits, options: argparse.Namespace) -> Hits:
     selection = select(hits, options)
     check_places(selection, options)
     return selection
+
+
+MAX_STUDY = 1 << 28  # bytes: a study contains three numbers for each point of its grid
+
+
+def read_registration(text: str) -> Registration:
+    """Registration from a file (of a registration or a study), or from numbers."""
+    parts = text.split(",")
+    try:
+        mirror = parts[4:] == ["mirror"]
+        rotation, scale, *shift = (float(part) for part in (parts[:4] if mirror else parts))
+    except ValueError:
+        numbers = None
+    else:
+        numbers = (rotation, scale, tuple(shift), mirror) if len(shift) == 2 else None
+    if numbers is not None:
+        return Registration(*numbers)
+    if Path(text).suffix.lower() != ".json":
+        raise ValueError(f"--registration must be a .json file or ROTATION,SCALE,DX,DY[,mirror], got {text!r}")
+    written = read_small_file(text, MAX_STUDY, "a registration or a study")
+    try:
+        content = json.loads(written)
+        registration = dict(content.get("registration", content))
+        registration.pop("doubtful", None)  # follows from the others
+        return from_plain(registration, Registration, what="registration")
+    except (ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:
+        raise FileError(f"{text!r} does not contain a registration: {error}") from error
 
 
 def picture_path(path: AnyPath) -> Path:

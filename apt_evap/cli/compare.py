@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from apt_evap import plot
-from apt_evap._common.codec import declared, from_plain
+from apt_evap._common.codec import declared
 from apt_evap._common.files import FileError, check_path, read_small_file, replace_file
-from apt_evap.cli._files import check_output, ions_of_map, read, select
+from apt_evap.cli._files import MAX_STUDY, check_output, ions_of_map, read, read_registration, select
 from apt_evap.cli._output import put
 from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.detection.detector_map import DetectorMap
@@ -22,7 +22,6 @@ from apt_evap.fit.fit_energies import fit_energies
 from apt_evap.fit.grid import EnergyGrid
 from apt_evap.fit.settings import FitSettings
 from apt_evap.fit.study import Study
-from apt_evap.registration.register import Registration
 from apt_evap.report.origin import recorded_warnings
 from apt_evap.report.study import write_study
 from apt_evap.simulation.run import Run, load
@@ -30,7 +29,6 @@ from apt_evap.simulation.run_hdf5 import is_run
 from apt_evap.warnings import RegistrationWarning, StructureWarning
 
 _STUDY = "study.json"
-_MAX_BYTES = 1 << 28  # bytes: a study contains three numbers for each point of its grid
 _TABLE = "ssim.csv"
 OVERLAY, REPORT = "registration.png", "report.html"
 
@@ -81,30 +79,6 @@ def _given(options, kind):
 # ---- input ---------------------------------------------------------------------------------------------------------
 
 
-def read_registration(text: str) -> Registration:
-    """Registration from a file (of a registration or a study), or from numbers."""
-    parts = text.split(",")
-    try:
-        mirror = parts[4:] == ["mirror"]
-        rotation, scale, *shift = (float(part) for part in (parts[:4] if mirror else parts))
-    except ValueError:
-        numbers = None
-    else:
-        numbers = (rotation, scale, tuple(shift), mirror) if len(shift) == 2 else None
-    if numbers is not None:
-        return Registration(*numbers)
-    if Path(text).suffix.lower() != ".json":
-        raise ValueError(f"--registration must be a .json file or ROTATION,SCALE,DX,DY[,mirror], got {text!r}")
-    written = read_small_file(text, _MAX_BYTES, "a registration or a study")
-    try:
-        content = json.loads(written)
-        registration = dict(content.get("registration", content))
-        registration.pop("doubtful", None)  # follows from the others
-        return from_plain(registration, Registration, what="registration")
-    except (ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:
-        raise FileError(f"{text!r} does not contain a registration: {error}") from error
-
-
 def _measured(options):
     content = read(options)
     if isinstance(content, Run):
@@ -135,7 +109,7 @@ def _check_folder(folder, force):
 
 def _is_study(path):
     try:
-        return str(json.loads(read_small_file(path, _MAX_BYTES, "a study")).get("made_by", "")).startswith("apt_evap")
+        return str(json.loads(read_small_file(path, MAX_STUDY, "a study")).get("made_by", "")).startswith("apt_evap")
     except (ValueError, AttributeError, RecursionError):
         return False
 

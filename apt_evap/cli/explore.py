@@ -1,4 +1,4 @@
-"""`apt-evap explore`: maps of a run in the browser, for any emission, beside a measured map."""
+"""`apt-evap explore`: maps in the browser, of a run for any emission, of a measurement, or of both."""
 
 import argparse
 import contextlib
@@ -7,17 +7,19 @@ import sys
 import tempfile
 import webbrowser
 from collections.abc import Iterator
+from functools import partial
 from html import escape
+from typing import Any
 
 from apt_evap._common.codec import to_python
 from apt_evap._common.optional_imports import optional_import
-from apt_evap.cli._files import in_real_units, ions_of_map, lens_of, read
+from apt_evap.cli._files import in_real_units, ions_of_map, lens_of, read, read_registration
 from apt_evap.cli._output import put, say
-from apt_evap.cli.compare import read_registration
 from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.explore.controls import values_of
 from apt_evap.explore.explorer import Explorer, View
+from apt_evap.io.formats import read as read_file
 from apt_evap.simulation.run import Run, load
 
 
@@ -27,10 +29,12 @@ def execute(options: argparse.Namespace) -> int:
         optional_import("bokeh.server.server", "explore")
     except ImportError as error:
         raise ValueError("explore needs bokeh, which is not installed: pip install 'apt_evap[explore]'") from error
-    from apt_evap.explore.page import serve  # the only module that needs Bokeh
+    from apt_evap.explore.server import serve  # needs Bokeh
 
     explorer, view = explorer_and_view(options)
-    server, url = serve(explorer, view, port=options.port, registration_of=read_registration)
+    server, url = serve(
+        explorer, view, port=options.port, registration_of=read_registration, with_file=partial(_with_file, options)
+    )
     put(url)
     say("note", "open this address in a browser on this machine; Ctrl-C ends the explorer")
     with _opened(url) if options.browser else contextlib.nullcontext(), contextlib.suppress(KeyboardInterrupt):
@@ -38,8 +42,29 @@ def execute(options: argparse.Namespace) -> int:
     return 0
 
 
-def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer, View]:
-    """Explorer of the files of the command, and the view of its options.
+def _with_file(options, path):
+    """Explorer and view with one more file: a run replaces the run, anything else the measurement."""
+    changes: dict[str, Any] = {"registration": None, "simulated": None}
+    if _run_in(path) is not None:
+        changes["run"] = path
+    else:
+        changes |= dict.fromkeys((*_READING, *_SELECTION, *_OTHERS)) | {"file": path}
+    fresh = argparse.Namespace(**(vars(options) | changes))
+    found = explorer_and_view(fresh)
+    vars(options).update(vars(fresh))  # only if both files are good
+    return found
+
+
+def _run_in(path):
+    """The run of a file, None if it contains something else."""
+    if os.path.isdir(path):
+        return load(path)  # unfinished
+    content = read_file(path) if path.lower().endswith(".h5") else None
+    return content if isinstance(content, Run) else None
+
+
+def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer | None, View | None]:
+    """Explorer of the files of the command, and the view of its options; None without a file.
 
     Parameters
     ----------
@@ -56,39 +81,33 @@ def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer, View]:
     ValueError
         If an option or a file is invalid.
     """
-    run = load(options.run)
-    if run.responses is None:
-        raise ValueError(f"{options.run!r} has no responses: repeat the run with responses = true in [simulation]")
-    run = in_real_units(run, options)
+    run = None if options.run is None else _run_in(options.run)
+    if options.run is not None and run is None:
+        if options.file is not None:
+            raise ValueError(f"RUN must be a run, {options.run!r} contains something else")
+        options.run, options.file = None, options.run
+    if run is not None:
+        if run.responses is None:
+            raise ValueError(f"{options.run!r} has no responses: repeat the run with responses = true in [simulation]")
+        run = in_real_units(run, options)
     measured = None if options.file is None else _measured(options)
     registration = None
     if options.registration is not None:
-        if measured is None:
-            raise ValueError("--registration needs MEASURED")
+        if measured is None or run is None:
+            raise ValueError("--registration needs RUN and MEASURED")
         registration = read_registration(options.registration)
     perturbation = None if options.perturbation is None else read_perturbation(options.perturbation)
     if perturbation is not None:
-        values_of(perturbation)  # checked before a long registration
-    if measured is not None and registration is None:
-        say("note", "registering the maps, which takes up to some minutes; --registration sets a known registration")
-    run_code = f"ae.load({options.run!r})"
-    run_arguments = [options.run]
-    if options.lens is not None or options.real_units is not None:
-        arguments = []
-        if options.lens is not None:
-            arguments.append(to_python(lens_of(options)))
-            run_arguments.append(f"--lens={options.lens}")
-        if options.real_units is not None:
-            arguments.append(f"field_reference={options.real_units!r}")
-            run_arguments.append(f"--real-units={options.real_units}")
-        run_code += f".at_evaporation_field({', '.join(arguments)})"
+        values_of(perturbation)
+    if run is None and measured is None:
+        return None, None
     explorer = Explorer(
         run,
         measured,
         registration,
-        run_code=run_code,
+        run_code="None" if run is None else _run_code(options),
         measured_code="None" if options.file is None else _measured_code(options),
-        run_arguments=run_arguments,
+        run_arguments=[] if run is None else _run_arguments(options),
         measured_arguments=[] if options.file is None else _measured_arguments(options),
     )
     start = explorer.start
@@ -105,7 +124,7 @@ def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer, View]:
 
 def _ions(options, explorer):
     """First and last ion of `--simulated` within those of the run, None for all."""
-    if options.simulated is None:
+    if options.simulated is None or explorer.run is None:
         return None
     every = explorer.first_and_last
     first, last = (end if bound is None else int(bound) for bound, end in zip(options.simulated, every, strict=True))
@@ -126,7 +145,27 @@ def _measured(options):
 
 # ---- the same in text ----------------------------------------------------------------------------------------------
 
+
+def _run_arguments(options):
+    """Arguments that name RUN and its units."""
+    arguments = [options.run]
+    if options.lens is not None:
+        arguments.append(f"--lens={options.lens}")
+    if options.real_units is not None:
+        arguments.append(f"--real-units={options.real_units}")
+    return arguments
+
+
+def _run_code(options):
+    """Python expression that reads RUN."""
+    arguments = [] if options.lens is None else [to_python(lens_of(options))]
+    if options.real_units is not None:
+        arguments.append(f"field_reference={options.real_units!r}")
+    return f"ae.load({options.run!r})" + (f".at_evaporation_field({', '.join(arguments)})" if arguments else "")
+
+
 _READING = ("format", "byte_order", "arrays", "unit")
+_OTHERS = ("ranges", "species", "partial", "circle", "box", "undistort")
 _SELECTION = {"ions": "ion", "mass": "mass_to_charge", "voltage": "voltage"}
 
 

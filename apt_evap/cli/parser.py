@@ -544,22 +544,24 @@ def _add_sweep(commands: Any) -> None:
 def _add_explore(commands: Any) -> None:
     command = commands.add_parser(
         "explore",
-        help="maps of a run in the browser, with sliders for the emission",
-        description="Show the map of a run in the browser, with sliders for the emission, beside a measured map.\n"
-        "Needs the extra of the package: pip install 'apt_evap[explore]'. The page is served to this machine only,\n"
-        "under an address that is printed. Ctrl-C ends the explorer. On the page, a button copies a command or Python\n"
-        "lines that give the same maps.",
+        help="maps in the browser: of a run, with sliders for the emission, of a measurement, or of both",
+        description="Show the map of a run in the browser, with sliders for the emission, a measured map, or both.\n"
+        "Files can also be opened on the page. Needs the extra of the package: pip install 'apt_evap[explore]'. The\n"
+        "page is served to this machine only, under an address that is printed. Ctrl-C ends the explorer. On it,\n"
+        "buttons copy a command or Python lines that give the same maps.",
         epilog="example:\n"
+        "  apt-evap explore\n"
+        "  apt-evap explore W_tap.raw\n"
         "  apt-evap explore ni111.h5\n"
         "  apt-evap explore ni111.h5 R5083.epos --mass 27,29 --registration R5083_study/study.json",
         **_SHAPE,
     )
-    command.add_argument("run", metavar="RUN.h5", help="a run with responses")
+    command.add_argument("run", metavar="RUN.h5", nargs="?", help="a run with responses")
     command.add_argument("file", metavar="MEASURED", nargs="?", help="measured ions (.epos, ...) or a map (.npz)")
     command.add_argument(
         "--registration",
         metavar="R",
-        help="a JSON file (such as study.json) or ROTATION,SCALE,DX,DY[,mirror] in degrees and mm; default: automatic",
+        help="a JSON file (such as study.json) or ROTATION,SCALE,DX,DY[,mirror] in degrees and mm; default: search",
     )
     command.add_argument("--perturbation", metavar="P", help="at the start, as for map; default: RollUp:0.155,0.155")
     command.add_argument("--bins", type=_integer(11, MAX_BINS), metavar="N", help="bins along the longer side")

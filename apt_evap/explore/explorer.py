@@ -4,7 +4,7 @@ import math
 import shlex
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -30,6 +30,7 @@ from apt_evap.maps.profiles import Profile, Rectangle, zone_line_profile
 from apt_evap.maps.rings import Ring, ring_statistics
 from apt_evap.maps.similarity import WINDOW, Similarity, similarity, similarity_ceiling, window_fits
 from apt_evap.registration.register import Registration, register
+from apt_evap.registration.verdict import Likeness, likeness
 from apt_evap.simulation.run import Run
 from apt_evap.warnings import AptWarning
 
@@ -88,12 +89,14 @@ class Shown:
     ----------
     view : View
         The view.
-    simulated : DetectorMap
-        Counts of the simulated ions, in the measured frame if there is a measured map.
+    simulated : DetectorMap or None
+        Counts of the simulated ions, in the measured frame if there is a measured map; None without a run.
     measured : DetectorMap or None
-        The measured map within the region that both maps cover.
+        The measured map, with a run within the region that both maps cover.
     pictures : tuple of DetectorMap
-        The same maps flattened and smoothed.
+        The same maps flattened and smoothed; without those that are None.
+    whole : DetectorMap or None
+        The complete measured map, flattened and smoothed.
     similarity : Similarity or None
         `similarity` of both maps; None without a measured map or with too few bins.
     ceiling : Similarity or None
@@ -109,9 +112,10 @@ class Shown:
     """
 
     view: View
-    simulated: DetectorMap
+    simulated: DetectorMap | None
     measured: DetectorMap | None
     pictures: tuple[DetectorMap, ...]
+    whole: DetectorMap | None
     similarity: Similarity | None
     ceiling: Similarity | None
     ions: int
@@ -141,19 +145,19 @@ class Commands(NamedTuple):
 
 
 class Explorer:
-    """Maps of a run for any emission, fast enough to follow a slider.
+    """Maps of a run for any emission, fast enough to follow a slider, a measured map, or both.
 
     All maps have the same bits as those of `Run.hits` and `Hits.map`.
 
     Parameters
     ----------
-    run : Run
+    run : Run, optional
         A run with responses, at the simulated voltage or in real units.
     measured : Hits or DetectorMap, optional
         Measured ions, or a map.
     registration : Registration, optional
-        Transform into the measured frame; by default that with the highest correlation for some emissions, found by
-        `register` in up to some minutes.
+        Transform into the measured frame. By default only scaled to the same size, until `register` is called, which
+        takes up to some minutes.
     preview : int
         Number of ions of a preview; runs of up to this many have no previews.
     run_code, measured_code : str
@@ -164,12 +168,12 @@ class Explorer:
     Raises
     ------
     ValueError
-        If the run has no responses, or as in `register`.
+        If the run has no responses, or an argument is missing.
     """
 
     def __init__(
         self,
-        run: Run,
+        run: Run | None = None,
         measured: Hits | DetectorMap | None = None,
         registration: Registration | None = None,
         *,
@@ -179,26 +183,36 @@ class Explorer:
         run_arguments: Sequence[str] = ("RUN.h5",),
         measured_arguments: Sequence[str] = ("MEASURED",),
     ) -> None:
-        if check_kind(run, "run", Run, "a Run").responses is None:
+        if run is None and measured is None:
+            raise ValueError("the explorer needs a run, measured ions or a measured map, got none")
+        if run is not None and check_kind(run, "run", Run, "a Run").responses is None:
             raise ValueError(f"the explorer needs a run with responses, got {run!r}")
         if registration is not None:
             check_kind(registration, "registration", Registration, "a Registration")
-            if measured is None:
-                raise ValueError("registration needs measured ions or a measured map, got none")
+            if measured is None or run is None:
+                raise ValueError("registration needs a run, and measured ions or a measured map, got only one of them")
         preview = check_count(preview, "preview", at_least=1)
-        self.run = run
+        self.run: Any = run
         self.measured = measured
         self.run_code, self.measured_code = run_code, measured_code
-        self._run_arguments = list(run_arguments)
+        self._run_arguments = [] if run is None else list(run_arguments)
         self._measured_arguments = [] if measured is None else list(measured_arguments)
-        step = math.ceil(len(run) / preview)
-        self._preview_run = self.run[::step] if step > 1 else self.run
+        step = 1 if run is None else math.ceil(len(run) / preview)
+        self._preview_run: Any = run if run is None or step == 1 else run[::step]
         self._kept_places: list[tuple[Any, Hits]] = []
         self._kept_maps: dict[Any, Any] = {}
         self._kept_picture: tuple[Any, Any] = (None, None)
+        self.registered = registration is not None
+        """Whether the registration was found or given, not only set to show both maps in the same size."""
         self.registration = registration
-        if measured is not None and registration is None:
-            self.register([perturbation_of(name, _starting_values(name)) for name in MECHANISMS])
+        if run is not None and measured is not None and registration is None:
+            self.registration = self._same_size()
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """Files of the run and of the measurement, empty without one."""
+        first, second = (each[0] if each else "" for each in (self._run_arguments, self._measured_arguments))
+        return first, second
 
     # ---- maps ------------------------------------------------------------------------------------------------------
 
@@ -211,6 +225,16 @@ class Explorer:
         else:
             bins = bins_for(len(self.run)) if self.measured is None else BINS
         return View(perturbation, bins, self.smoothing_for(bins))
+
+    def _same_size(self):
+        """Registration by the size of both fields of view alone."""
+        hits, target = self._preview_run.hits(Unperturbed()), measured_map(self.measured)
+        x, y = np.meshgrid(*target.centres)
+        fields = [(hits.x[hits.detected], hits.y[hits.detected]), (x[target.mask], y[target.mask])]
+        boxes = [np.percentile(each, [1, 99], axis=1) for each in fields]
+        own, other = (float(np.ptp(each, axis=0).max()) for each in boxes)
+        shift = boxes[1].mean(axis=0) - other / own * boxes[0].mean(axis=0)
+        return Registration(0.0, other / own, tuple(shift.tolist()))
 
     def smoothing_for(self, bins: int) -> float:
         """Smoothing by one bin, to two digits [mm]."""
@@ -231,13 +255,25 @@ class Explorer:
         ions = self.run.emissions.ions
         return int(ions[0]), int(ions[-1]) + 1
 
-    def register(self, perturbations: Sequence[Perturbation]) -> Registration:
-        """Register the run on the measurement: the best of several emissions. Sets and returns `registration`.
+    def register(
+        self,
+        perturbations: Sequence[Perturbation] | None = None,
+        progress: Callable[[int, int], None] | None = None,
+        apply: Callable[..., Registration] | None = None,
+    ) -> Registration:
+        """Register the run on the measurement: the best of several emissions. Returns `registration`.
+
+        It is set at each emission that is better than those before.
 
         Parameters
         ----------
-        perturbations : sequence of perturbation
-            Emissions to try.
+        perturbations : sequence of perturbation, optional
+            Emissions to try; by default one of each mechanism.
+        progress : callable, optional
+            Called at the start and after each emission, with the number of those that are done, and of all. An error
+            that it raises ends the search.
+        apply : callable, optional
+            Calls a function with a tuple of arguments, such as ``multiprocessing.Pool.apply``.
 
         Returns
         -------
@@ -246,27 +282,37 @@ class Explorer:
         Raises
         ------
         ValueError
-            If there is no measurement, or as in `register`.
+            If there is no run or no measurement, or as in `register`.
 
         Warns
         -----
         RegistrationWarning
             If the best registration is doubtful.
         """
-        if self.measured is None:
-            raise ValueError("a registration needs measured ions or a measured map, got none")
+        if self.run is None or self.measured is None:
+            raise ValueError("a registration needs a run, and measured ions or a measured map, got only one of them")
         target = measured_map(self.measured)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", AptWarning)  # given once, for the best one
-            found = [register(self.run.hits(each), target) for each in perturbations]
-        best = max(found, key=lambda each: each.score)
+        if perturbations is None:
+            perturbations = [perturbation_of(name, _starting_values(name)) for name in MECHANISMS]
+        best: Registration | None = None
+        progress = progress or (lambda done, number: None)
+        progress(0, len(perturbations))
+        for done, each in enumerate(perturbations, 1):
+            arguments = self.run.hits(each), target
+            found = _registration(*arguments) if apply is None else apply(_registration, arguments)
+            progress(done, len(perturbations))
+            if best is None or found.score > best.score:
+                best = found
+                self.set_registration(best)
+        if best is None:
+            raise ValueError("perturbations must contain at least one perturbation, got none")
         best.warn_if_doubtful()
-        self.set_registration(best)
         return best
 
     def set_registration(self, registration: Registration) -> None:
         """Set the transform into the measured frame."""
         self.registration = check_kind(registration, "registration", Registration, "a Registration")
+        self.registered = True
         self._kept_places, self._kept_maps = [], {}
 
     def show(self, view: View, preview: bool = False) -> Shown:
@@ -291,16 +337,18 @@ class Explorer:
         start = time.perf_counter()
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", AptWarning)
-            hits = self.hits(view, preview)
             like = self.bins_like(view.bins)
-            simulated = hits.map(like=like, position_step=None)
-            flat = simulated.flattened(view.flattening)
-            pictures: tuple[DetectorMap, ...] = (flat.smoothed(view.smoothing),)
-            alike = ceiling = None
+            simulated = whole = alike = ceiling = None
+            pictures: tuple[DetectorMap, ...] = ()
+            if self.run is not None:
+                hits = self.hits(view, preview)
+                simulated = hits.map(like=like, position_step=None)
+                flat = simulated.flattened(view.flattening)
+                pictures = (flat.smoothed(view.smoothing),)
             if self.measured is not None:
-                measured, picture = self._measured_picture(view)
+                measured, picture, whole = self._measured_pictures(view)
                 pictures += (picture,)
-                if _has_window(like):
+                if self.registered and _has_window(like):
                     alike = similarity(flat, measured, smoothing=view.smoothing)
                     ceiling = self._ceiling(view)
         return Shown(
@@ -308,9 +356,10 @@ class Explorer:
             simulated=simulated,
             measured=None if self.measured is None else like,
             pictures=pictures,
+            whole=whole,
             similarity=alike,
             ceiling=ceiling,
-            ions=len(hits),
+            ions=0 if self.run is None else len(hits),
             preview=preview and self._preview_run is not self.run,
             seconds=time.perf_counter() - start,
             notes=tuple(str(each.message) for each in caught if issubclass(each.category, AptWarning)),
@@ -331,7 +380,7 @@ class Explorer:
         Hits
             With x, y, ion and outcome.
         """
-        run = self._preview_run if preview else self.run
+        run: Any = self._preview_run if preview else self.run
         registration = self.registration  # may be set by another thread
         key = view.perturbation, run is self.run, registration
         places = next((hits for kept_key, hits in self._kept_places if kept_key == key), None)
@@ -354,7 +403,8 @@ class Explorer:
         Returns
         -------
         DetectorMap
-            The measured map within the region that the simulated maps cover, or the unperturbed map of the run.
+            The measured map, with a run within the region that the simulated maps cover; without a measurement the
+            unperturbed map of the run.
 
         Raises
         ------
@@ -363,7 +413,17 @@ class Explorer:
         """
         key = bins, self.registration
         if key not in self._kept_maps:
-            self._kept_maps[key] = self._bins_of_run(bins) if self.measured is None else self._region(*key)
+            if self.measured is None:
+                self._kept_maps[key] = self._bins_of_run(bins)
+            else:
+                self._kept_maps[key] = self._complete(bins) if self.run is None else self._region(*key)
+        return self._kept_maps[key]
+
+    def _complete(self, bins):
+        """The complete measured map."""
+        key = "complete", bins
+        if key not in self._kept_maps:
+            self._kept_maps[key] = measured_map(self.measured, bins)
         return self._kept_maps[key]
 
     def _bins_of_run(self, bins):
@@ -371,7 +431,7 @@ class Explorer:
         return self.run.hits(Unperturbed()).map(like=self.run.grid(bins), position_step=None)
 
     def _region(self, bins, registration):
-        measured = measured_map(self.measured, bins)
+        measured = self._complete(bins)
         mask = measured.mask & field_of_view(np.where(measured.mask, measured.values, 0))
         for perturbation in (Unperturbed(), REGION):
             hits = registration.hits(self._preview_run.hits(perturbation))
@@ -381,12 +441,15 @@ class Explorer:
         ions = int(measured.values[mask].sum()) if measured.is_counts else None
         return replace(measured, mask=mask, ions=ions, detected=None)
 
-    def _measured_picture(self, view):
-        """The measured map flattened, and also smoothed; the same objects as long as a view changes neither."""
+    def _measured_pictures(self, view):
+        """The measured map flattened, also smoothed, and this of the complete one; kept until a view changes them."""
         key = view.bins, view.flattening, view.smoothing, self.registration
         if self._kept_picture[0] != key:
             flat = self.bins_like(view.bins).flattened(view.flattening)
-            self._kept_picture = key, (flat, flat.smoothed(view.smoothing))
+            picture = whole = flat.smoothed(view.smoothing)
+            if self.run is not None:
+                whole = self._complete(view.bins).flattened(view.flattening).smoothed(view.smoothing)
+            self._kept_picture = key, (flat, picture, whole)
         return self._kept_picture[1]
 
     def _ceiling(self, view):
@@ -459,8 +522,12 @@ class Explorer:
         pole = self.pole
         scale = 1.0 if self.registration is None else self.registration.scale
         projection = Projection(self._projection.scale * scale, pole.place, compression=self._projection.compression)
-        maps = [shown.simulated] if shown.measured is None else [shown.simulated, shown.measured]
-        return tuple(ring_statistics(each, projection, fold=pole.fold) for each in maps)
+        return tuple(ring_statistics(each, projection, fold=pole.fold) for each in _maps(shown))
+
+    def likeness(self, shown: Shown) -> Likeness:
+        """Whether both maps show the same crystal along the same axis, see `likeness`."""
+        assert shown.simulated is not None and shown.measured is not None and self.registration is not None
+        return likeness(shown.simulated, shown.measured, self.registration)
 
     def profiles(self, shown: Shown, ends: Any, width: float) -> tuple[Rectangle, tuple[Profile, ...]]:
         """Profiles across a line on the maps.
@@ -479,7 +546,7 @@ class Explorer:
         rectangle : Rectangle
             Region along the line.
         profiles : tuple of Profile
-            `zone_line_profile` of the simulated and of the measured map.
+            `zone_line_profile` of the simulated and of the measured map, as far as there are both.
 
         Raises
         ------
@@ -489,8 +556,8 @@ class Explorer:
         (x0, y0), (x1, y1) = check_array(ends, "ends", (2, 2)).tolist()
         length = math.hypot(x1 - x0, y1 - y0)
         rectangle = Rectangle(((x0 + x1) / 2, (y0 + y1) / 2), math.degrees(math.atan2(y1 - y0, x1 - x0)), length, width)
-        maps = [shown.simulated] if shown.measured is None else [shown.simulated, shown.measured]
-        bins = max(2, int(width / max(shown.simulated.bin_size)))
+        maps = _maps(shown)
+        bins = max(2, int(width / max(maps[0].bin_size)))
         return rectangle, tuple(zone_line_profile(each, rectangle, bins=bins) for each in maps)
 
     def atoms_at(self, view: View, x: float, y: float, radius: float) -> Hits:
@@ -542,13 +609,14 @@ class Explorer:
         Commands
         """
         # a picture of `map` is neither registered nor flattened
-        command = "map" if self.measured is None and not view.flattening else "explore"
-        name, *options = self._run_arguments
-        shell = ["apt-evap", command, name, *self._measured_arguments, *options]
+        one = self.measured is None or self.run is None
+        command = "map" if one and not view.flattening else "explore"
+        # options of the run follow both files
+        shell = ["apt-evap", command, *self._run_arguments[:1], *self._measured_arguments, *self._run_arguments[1:]]
         shell += self._shell_options(view, command)
         if view.flattening:
             shell += ["--flatten", repr(view.flattening)]
-        if self.registration is not None:
+        if self.registered and self.registration is not None:
             shell += [f"--registration={self.registration.to_text()}"]
         return Commands(shlex.join(shell), "\n".join([*self._python_hits(view), *self._python_maps(view)]))
 
@@ -572,7 +640,8 @@ class Explorer:
         box = f"--box={','.join(map(repr, bounds))}"
         window = f".window(x=({bounds[0]!r}, {bounds[1]!r}), y=({bounds[2]!r}, {bounds[3]!r}))"
         python = [*self._python_hits(view)]
-        python[-1] += window
+        if self.run is not None:
+            python[-1] += window
         shell = ""
         if self.measured is None:
             shell = shlex.join(["apt-evap", "map", *self._run_arguments, *self._shell_options(view, "map"), box])
@@ -582,7 +651,7 @@ class Explorer:
         return Commands(shell, "\n".join(python))
 
     def _shell_options(self, view, command):
-        options = ["--perturbation", write_perturbation(view.perturbation)]
+        options = [] if self.run is None else ["--perturbation", write_perturbation(view.perturbation)]
         options += ["--bins", str(view.bins), "--smooth", repr(view.smoothing)]
         if view.ions is not None:
             # --ions of `explore` selects measured ions
@@ -590,6 +659,8 @@ class Explorer:
         return options
 
     def _python_hits(self, view):
+        if self.run is None:
+            return ["import apt_evap as ae", ""]
         lines = ["import apt_evap as ae", "", f"run = {self.run_code}"]
         hits = f"run.hits({to_python(view.perturbation)})"
         if self.registration is not None:
@@ -604,17 +675,32 @@ class Explorer:
             lines = [f"simulated = hits.map(like=run.grid({view.bins}), position_step=None)"]
             names = ["simulated"]
         else:
+            arguments = (
+                f"None, {self.measured_code}" if self.run is None else f"run, {self.measured_code}, registration"
+            )
             lines = [
                 "from apt_evap.explore.explorer import Explorer",
-                f"measured = Explorer(run, {self.measured_code}, registration).bins_like({view.bins})",
-                "simulated = hits.map(like=measured, position_step=None)",
+                f"measured = Explorer({arguments}).bins_like({view.bins})",
             ]
-            names = ["simulated", "measured"]
+            names = ["measured"]
+            if self.run is not None:
+                lines.append("simulated = hits.map(like=measured, position_step=None)")
+                names = ["simulated", "measured"]
         flat = f".flattened({view.flattening!r})" if view.flattening else ""
-        if self.measured is not None:
+        if len(names) > 1:
             lines.append(f"print(ae.similarity(simulated{flat}, measured{flat}, smoothing={view.smoothing!r}))")
         pictures = ", ".join(f"{name}{flat}.smoothed({view.smoothing!r})" for name in names)
         return [*lines, f"ae.plot.detector_maps([{pictures}])[0].figure.savefig('maps.png')"]
+
+
+def _registration(simulated, measured):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", AptWarning)  # given once, for the best one
+        return register(simulated, measured)
+
+
+def _maps(shown):
+    return [each for each in (shown.simulated, shown.measured) if each is not None]
 
 
 def _has_window(like):

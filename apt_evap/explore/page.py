@@ -1,21 +1,21 @@
-"""The page of the explorer, and the server that shows it to this user on this machine. Only this module needs Bokeh."""
+"""The page of the explorer. Only the modules page, index_panel, widgets, style and server of this room need Bokeh."""
 
-import logging
 import math
-import secrets
-import socket
+import multiprocessing
+import threading
+import time
 from collections.abc import Callable
 from functools import partial
 from html import escape
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bokeh.application import Application
-from bokeh.application.handlers import FunctionHandler
 from bokeh.document import Document
-from bokeh.events import SelectionGeometry, Tap
+from bokeh.events import DocumentReady, SelectionGeometry, Tap
 from bokeh.layouts import column, row
 from bokeh.models import (
+    AutocompleteInput,
     BoxSelectTool,
     Button,
     ColorBar,
@@ -23,44 +23,74 @@ from bokeh.models import (
     CustomJS,
     Div,
     FreehandDrawTool,
+    GlobalInlineStyleSheet,
     HoverTool,
     LinearColorMapper,
+    PanTool,
     PreText,
     RadioButtonGroup,
-    Range1d,
     RangeSlider,
     Select,
     Slider,
     TextInput,
+    Toggle,
+    WheelZoomTool,
+    Widget,
 )
 from bokeh.palettes import Inferno256, Viridis256, interp_palette
 from bokeh.plotting import figure
-from bokeh.server.server import Server
-from bokeh.util.token import generate_session_id
 
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.explore.controls import CONTROLS, MECHANISMS, perturbation_of, values_of
 from apt_evap.explore.explorer import Commands, Explorer, Shown, View
+from apt_evap.explore.index_panel import IndexPanel
 from apt_evap.explore.latest import Latest
+from apt_evap.explore.marks import plain
+from apt_evap.explore.style import STYLES, VEIL, WIDGETS, page_styles, theme
 from apt_evap.explore.surface_image import COLORED_BY, SIDES, specimen_image
+from apt_evap.explore.widgets import (
+    LEFT,
+    color_bar,
+    copy_button,
+    grid,
+    group,
+    number,
+    save_button,
+    show_extent,
+    square,
+)
 from apt_evap.maps.zone_line import fit_zone_line
-from apt_evap.plot.maps import common_limits
+from apt_evap.plot.limits import color_limits, common_limits
 from apt_evap.registration.register import Registration
+from apt_evap.specimen.materials import MATERIALS
 from apt_evap.warnings import AptWarning
 
 MODES = ("side by side", "difference", "blink")
 """What the page shows beside the simulated map, if there is a measured one."""
+TOOLS = ("move", "atoms", "line", "box", "pole", "zone line")
+"""What the mouse does on a map."""
 BLINK = 600
 """Time that each map is visible in the mode "blink" [ms]."""
 READOUT_DELAY = 60
 """Delay of the numbers of a preview [ms]: a text changes the layout, which takes as long as to paint a map (50 ms)."""
-_ADDRESS = "127.0.0.1"
-_SIDE = 380  # pixels of a map
-_TOOLS = "pan,wheel_zoom,box_zoom,reset,save"
 _MOST_BINS = 512
 _MOST_ATOMS = 500  # atoms highlighted in the view of the specimen
+_MOST_FILES = 300  # that are proposed
+_SUFFIXES = (".h5", ".epos", ".pos", ".apt", ".raw", ".nxs", ".npz")
 _DIFFERENCES = interp_palette(("#053061", "#4393c3", "#f7f7f7", "#d6604d", "#67001f"), 255)
-_OUTSIDE = "#e0e0e0"
+_OUTSIDE = "#00000000"
+_CHIPS = {"alike": "#2e7d4f", "doubtful": "#a8741a", "not alike": "#a93a3a"}
+_KEY_B = """
+document.addEventListener("keydown", event => {
+  const inside = event.composedPath()[0]
+  if (event.key == "b" && !["INPUT", "TEXTAREA", "SELECT"].includes(inside.tagName))
+    mode.active = mode.active == 2 ? 0 : 2
+})
+"""
+
+
+class _Overtaken(Exception):
+    """A registration that is not wanted any more."""
 
 
 class Page:
@@ -68,49 +98,112 @@ class Page:
 
     Parameters
     ----------
-    explorer : Explorer
-        Computes all numbers.
+    explorer : Explorer or None
+        Computes all numbers; None for a page on which files are opened.
     document : bokeh.document.Document
         Gets the page.
     view : View, optional
         What is shown first; by default `Explorer.start`.
     registration_of : callable, optional
         Makes a `Registration` from the text of a user; without it, the registration cannot be typed.
+    opened : callable, optional
+        Reads a file, from its path and the document; the function that it returns makes the page again.
     later : callable, optional
         Calls a function in the thread of the document, after a delay [ms]; by default the document itself does.
     """
 
     def __init__(
         self,
-        explorer: Explorer,
+        explorer: Explorer | None,
         document: Document,
         view: View | None = None,
         registration_of: Callable[[str], Registration] | None = None,
+        opened: Callable[[str, Document], Callable[[], None]] | None = None,
         later: Callable[[Callable[[], None], int], Any] | None = None,
     ) -> None:
-        self.explorer, self.document = explorer, document
+        self.explorer: Any = explorer
+        self.document = document
         self._later = self._call_later if later is None else later
-        self._registration_of = registration_of
+        self._registration_of, self._opened = registration_of, opened
         self._blinking: Any = None
         self._readout_waits = False
-        self.shown = explorer.show(explorer.start if view is None else view)
+        self._search: Any = None  # a process
+        self._searches = 0
+        self._progress: tuple[int, int] | None = None
+        self._progress_text = ""
+        self._verdict: Any = None
+        self.index: IndexPanel | None = None
         self.latest = Latest(lambda wish: wish())
-        self._make_controls(self.shown.view)
-        self._make_maps()
-        self._make_profile()
-        self._make_specimen()
-        self._make_text()
-        self.put(self.shown)
-        self._put_specimen()
         document.title = "apt-evap explore"
-        document.add_root(self._layout())
-        self.latest.ask(partial(self._rings_of, self.shown))
+        document.theme = theme(STYLES[0])
+        self._make_head()
+        if explorer is None:
+            root = column(self.head, self.notes, sizing_mode="stretch_width")
+        else:
+            self.shown = explorer.show(explorer.start if view is None else view)
+            self._make_controls(self.shown.view)
+            self._make_maps()
+            self._make_profile()
+            self._make_specimen()
+            self._make_text()
+            self.put(self.shown)
+            self._put_specimen()
+            root = self._layout()
+        for each in root.select({"type": Widget}):
+            each.stylesheets = [*each.stylesheets, WIDGETS]
+        root.styles = page_styles(STYLES[0])
+        root.stylesheets = [GlobalInlineStyleSheet(css="body { margin: 0; }")]
+        self.root = root
+        document.add_root(root)
+        if explorer is not None:
+            self.latest.ask(partial(self._judge, self.shown))
+            if self.both and not explorer.registered and later is None:
+                self._register(None)
+
+    def close(self) -> None:
+        """End what runs in the background."""
+        self._stop_search()
+        self.latest.close()
+        if self.index is not None:
+            self.index.latest.close()
+
+    @property
+    def both(self) -> bool:
+        """Whether there are a run and a measurement."""
+        return self.explorer.run is not None and self.explorer.measured is not None
 
     # ---- widgets ---------------------------------------------------------------------------------------------------
 
+    def _make_head(self):
+        """Line above everything: files and their facts, the verdict, the similarity; a field that opens files."""
+        self.facts = Div(text="<b>apt-evap explore</b>", sizing_mode="stretch_width")
+        self.chip, self.readout = Div(), Div(width=330)
+        self.notes = Div(sizing_mode="stretch_width", styles={"color": "#d9822b"})
+        self.file = AutocompleteInput(
+            placeholder="open a file: a run or a measurement",
+            completions=_files() if self._opened else [],
+            restrict=False,
+            case_sensitive=False,
+            search_strategy="includes",
+            min_characters=1,
+            width=LEFT - 10,
+            visible=self._opened is not None,
+        )
+        self.file.on_change("value", lambda attr, old, new: self._file_named())
+        self.style = Button(label="light", width=56)
+        self.style.on_click(self._next_style)
+        self.head = row(
+            self.file, self.facts, self.chip, self.readout, self.style,
+            sizing_mode="stretch_width", styles={"align-items": "center", "gap": "8px"},
+        )  # fmt: skip
+
     def _make_controls(self, view):
+        explorer = self.explorer
         mechanism, values = values_of(view.perturbation)
-        self.mechanism = RadioButtonGroup(labels=list(MECHANISMS), active=list(MECHANISMS).index(mechanism))
+        self._start = view
+        self.mechanism = RadioButtonGroup(
+            labels=list(MECHANISMS), active=list(MECHANISMS).index(mechanism), width=LEFT - 10
+        )
         self.mechanism.on_change("active", lambda attr, old, new: self._mechanism_changed())
         self.sliders = {
             each.name: Slider(
@@ -123,11 +216,11 @@ class Page:
             )
             for each in self._controls()
         }
-        like = self.explorer.bins_like(view.bins)
+        like = explorer.bins_like(view.bins)
         longer = max(like.extent[1] - like.extent[0], like.extent[3] - like.extent[2])
         size = max(like.bin_size)
-        most = max(like.values.shape) if isinstance(self.explorer.measured, DetectorMap) else _MOST_BINS
-        first, last = self.explorer.first_and_last
+        most = max(like.values.shape) if isinstance(explorer.measured, DetectorMap) else _MOST_BINS
+        first, last = (0, 1) if explorer.run is None else explorer.first_and_last
         millimetres = {"start": 0.0, "step": float(f"{size / 10:.1g}"), "format": "0[.]00"}
         self.smoothing = Slider(
             title="smoothing [mm]", value=view.smoothing, end=max(10 * size, view.smoothing), **millimetres
@@ -143,69 +236,105 @@ class Page:
             step=max(1, (last - first) // 200),
             value=view.ions or (first, last),
             format="0,0",
+            width=LEFT - 20,
         )
         for each in (*self.sliders.values(), self.smoothing, self.flattening, self.bins, self.ions):
             each.on_change("value", lambda attr, old, new: self.ask(preview=True))
             each.on_change("value_throttled", lambda attr, old, new: self.ask(preview=False))
-        self.mode = RadioButtonGroup(labels=list(MODES), active=0, visible=self.explorer.measured is not None)
+        self.mode = RadioButtonGroup(labels=list(MODES), active=0, visible=self.both, width=LEFT - 10)
         self.mode.on_change("active", lambda attr, old, new: self._mode_changed())
-        self.width = Slider(
-            title="width of a profile [mm]", width=_SIDE // 2, start=0.0, end=longer / 2, step=size, value=longer / 6
-        )
-        self.width.on_change("value_throttled", lambda attr, old, new: self._put_profiles())
-        self.radius = Slider(
-            title="radius of a click [mm]", width=_SIDE // 2, start=0.0, end=longer / 10, step=size / 4, value=2 * size
-        )
-        self.color = Select(title="atoms coloured by", value="order", options=[*COLORED_BY.items()])
-        self.side = Select(title="seen from", value="above", options=[*SIDES])
+        self.same_scale = Toggle(label="same scale", visible=self.both, width=100)
+        self.same_scale.on_change("active", lambda attr, old, new: self._put_scales())
+        self.width = Slider(title="width of a profile [mm]", start=0.0, end=longer / 2, step=size, value=longer / 6)
+        self.width.on_change("value", lambda attr, old, new: self._put_profiles())
+        self.radius = Slider(title="radius of a click [mm]", start=0.0, end=longer / 10, step=size / 4, value=2 * size)
+        self.color = Select(title="atoms coloured by", value="order", options=[*COLORED_BY.items()], width=190)
+        self.side = Select(title="seen from", value="above", options=[*SIDES], width=100)
         for each in (self.color, self.side):
             each.on_change("value", lambda attr, old, new: self._put_specimen())
-        has_map = self.explorer.measured is not None
-        self.register = Button(label="register with this emission", visible=has_map)
-        self.register.on_click(self._register)
+        self.register = Button(label="with this emission", width=(LEFT - 20) // 2)
+        self.register.on_click(lambda: self._register([self.view().perturbation]))
+        self.register_all = Button(label="search again", width=(LEFT - 20) // 2)
+        self.register_all.on_click(lambda: self._register(None))
         self.registration = TextInput(
-            title="registration: degrees, scale, x, y [mm], mirror",
-            visible=has_map and self._registration_of is not None,
+            title="degrees, scale, x, y [mm], mirror",
+            placeholder="30,0.5,1,-2",
+            visible=self._registration_of is not None,
+            width=LEFT - 10,
         )
         self.registration.on_change("value", lambda attr, old, new: self._registration_typed())
         self._show_sliders()
 
     def _make_maps(self):
-        self.sources = [ColumnDataSource(_image(each)) for each in self.shown.pictures]
-        self.colors = LinearColorMapper(palette=Inferno256, nan_color=_OUTSIDE)
+        explorer, shown = self.explorer, self.shown
+        self.names = [name for name, each in (("simulated", explorer.run), ("measured", explorer.measured)) if each]
+        drawn = enumerate(self._drawn(shown))
+        self.sources = [ColumnDataSource(_image(each, self._values(shown, k))) for k, each in drawn]
+        self.colors = [LinearColorMapper(palette=Inferno256, nan_color=_OUTSIDE) for _ in self.sources]
         self.bars: list[ColorBar] = []
-        self.maps = [self._map("simulated", self.sources[0], **_ranges(self.shown.simulated.extent))]
-        if len(self.sources) > 1:
-            self.maps.append(
-                self._map("measured", self.sources[1], x_range=self.maps[0].x_range, y_range=self.maps[0].y_range)
-            )
-            self.difference_colors = LinearColorMapper(palette=_DIFFERENCES, nan_color=_OUTSIDE, low=-1, high=1)
-            self.difference_bar = ColorBar(
-                color_mapper=self.difference_colors, width=10, title="simulated less / more", visible=False
-            )
-            self.maps[1].add_layout(self.difference_bar, "right")
-            self.difference = ColumnDataSource(_image(self.shown.pictures[0]))
-            self.difference_image = self._draw(self.maps[1], self.difference, self.difference_colors, visible=False)
-            self.blink_image = self._draw(self.maps[0], self.sources[1], self.colors, visible=False)
+        self.maps: list[Any] = []
+        self._drags: list[dict[str, Any]] = []
         self.line = ColumnDataSource({"xs": [], "ys": []})
         self.rectangle = ColumnDataSource({"x": [], "y": []})
         self.click = ColumnDataSource({"x": [], "y": [], "radius": []})
-        for each in self.maps:
+        for name, source, colors in zip(self.names, self.sources, self.colors, strict=True):
+            linked = {"x_range": self.maps[0].x_range, "y_range": self.maps[0].y_range} if self.maps else {}
+            self.maps.append(self._map(name, source, colors, **linked))
+        if self.both:
+            last = self.maps[1]
+            self.veil = ColumnDataSource({"image": [], "x": [], "y": [], "dw": [], "dh": []})
+            last.image_rgba("image", "x", "y", "dw", "dh", source=self.veil, level="image")
+            self.difference_colors = LinearColorMapper(palette=_DIFFERENCES, nan_color=_OUTSIDE, low=-1, high=1)
+            self.difference_bar = color_bar(self.difference_colors, "simulated less / more", visible=False)
+            last.add_layout(self.difference_bar, "below")
+            self.difference = ColumnDataSource(_image(shown.pictures[0]))
+            self.difference_image = self._draw(last, self.difference, self.difference_colors, visible=False)
+            self.blink_image = self._draw(self.maps[0], self.sources[1], self.colors[1], visible=False)
+        for each, drags in zip(self.maps, self._drags, strict=True):
             drawn = each.multi_line("xs", "ys", source=self.line, line_color="cyan", line_width=2)
             each.patch("x", "y", source=self.rectangle, fill_alpha=0.0, line_color="cyan", line_dash="dashed")
             each.circle("x", "y", radius="radius", source=self.click, fill_alpha=0.0, line_color="lime", line_width=2)
-            tool = FreehandDrawTool(renderers=[drawn], num_objects=1, description="line for a profile")
-            each.add_tools(tool, BoxSelectTool(description="rectangle of ions"))
-            each.on_event(Tap, self._clicked)
+            drags["line"] = FreehandDrawTool(renderers=[drawn], num_objects=1)
+            drags["box"] = BoxSelectTool()
+            each.add_tools(drags["line"], drags["box"])
+            each.on_event(Tap, partial(self._clicked, each))
             each.on_event(SelectionGeometry, self._selected)
         self.line.on_change("data", lambda attr, old, new: self._line_drawn())
+        if explorer.measured is not None:
+            self.index = IndexPanel(
+                self.maps[-1], lambda: explorer.measured, self._material(), self._later, self._put_python
+            )
+            for name in ("pole", "zone line"):
+                self._drags[-1][name] = self.index.tool
+        tools = [each for each in TOOLS if self._is_served(each)]
+        self.tool = RadioButtonGroup(labels=tools, active=tools.index("atoms") if "atoms" in tools else 0)
+        self.tool.on_change("active", lambda attr, old, new: self._tool_changed())
+        self._tool_changed()
 
-    def _map(self, title, source, **ranges):
-        fig = _square(title, x_axis_label="x [mm]", y_axis_label="y [mm]", **ranges)
-        image = self._draw(fig, source, self.colors)
+    def _is_served(self, tool):
+        if tool == "atoms":
+            return self.explorer.run is not None
+        return tool not in ("pole", "zone line") or self.index is not None
+
+    def _material(self):
+        """Name of the crystal of the run, if it is one of the table."""
+        if self.explorer.run is not None:
+            material = self.explorer.run.settings["tip"].get("material", {})
+            if material.get("name") in MATERIALS:
+                return material["name"]
+        return "W"
+
+    def _map(self, title, source, colors, **ranges):
+        pan, wheel = PanTool(), WheelZoomTool()
+        fig = square(
+            title, self.shown.pictures[0].extent, [pan, wheel], active_scroll=wheel,
+            x_axis_label="x [mm]", y_axis_label="y [mm]", **ranges,
+        )  # fmt: skip
+        image = self._draw(fig, source, colors)
         fig.add_tools(HoverTool(renderers=[image], tooltips=[("x, y [mm]", "$x{0.0}, $y{0.0}"), ("density", "@image")]))
-        self.bars.append(ColorBar(color_mapper=self.colors, width=10, title="hits per area / mean"))
-        fig.add_layout(self.bars[-1], "right")
+        self.bars.append(color_bar(colors, "hits per area / mean"))
+        fig.add_layout(self.bars[-1], "below")
+        self._drags.append({"move": pan})
         return fig
 
     @staticmethod
@@ -216,49 +345,79 @@ class Page:
 
     def _make_profile(self):
         self.profile = figure(
-            title="profile: draw a line on a map",
-            frame_width=_SIDE,
-            frame_height=_SIDE // 2,
-            tools=_TOOLS,
+            title="profile: draw a line on a map (mode “line”)",
+            sizing_mode="stretch_width",
+            height=230,
+            tools="pan,wheel_zoom",
+            toolbar_location=None,
             x_axis_label="distance from the line [mm]",
             y_axis_label="density",
         )
         self.curves = [ColumnDataSource({"x": [], "y": []}) for _ in self.sources]
-        for source, name, dash in zip(self.curves, ("simulated", "measured"), ("solid", "dashed"), strict=False):
-            self.profile.line("x", "y", source=source, legend_label=name, line_dash=dash, line_color="black")
+        for source, name in zip(self.curves, self.names, strict=True):
+            color = "#4aa3ff" if name == "simulated" else "#ffb04a"
+            self.profile.line("x", "y", source=source, legend_label=name, line_width=2, line_color=color)
 
     def _make_specimen(self):
-        self.specimen = _square("specimen: click on a map", **_ranges((0.0, 1.0, 0.0, 1.0)))
-        self.specimen_colors = LinearColorMapper(palette=Viridis256, nan_color="white")
+        tools = [PanTool(), WheelZoomTool()]
+        self.specimen = square("specimen: click on a map (mode “atoms”)", (0.0, 1.0, 0.0, 1.0), tools)
+        self.specimen.toolbar.active_scroll = tools[1]
+        self.specimen_colors = LinearColorMapper(palette=Viridis256, nan_color=_OUTSIDE)
         self.specimen_source = ColumnDataSource({"image": [], "x": [], "y": [], "dw": [], "dh": []})
         self._draw(self.specimen, self.specimen_source, self.specimen_colors)
-        self.specimen.add_layout(ColorBar(color_mapper=self.specimen_colors, width=10), "right")
+        self.specimen_bar = color_bar(self.specimen_colors, COLORED_BY["order"])
+        self.specimen.add_layout(self.specimen_bar, "below")
         self.atoms = ColumnDataSource({"x": [], "y": []})
         self.specimen.scatter("x", "y", source=self.atoms, size=9, fill_alpha=0.0, line_color="red", line_width=2)
 
     def _make_text(self):
-        self.readout, self.rings, self.notes = Div(width=300), Div(width=300), Div(width=300)
-        self.shell, self.python = (PreText(width=1000, styles={"overflow-x": "auto"}) for _ in range(2))
-        self.copy = [Button(label=f"copy as {name}", width=150) for name in ("command", "Python")]
-        for button, text in zip(self.copy, (self.shell, self.python), strict=True):
-            button.js_on_click(CustomJS(args={"text": text}, code="navigator.clipboard.writeText(text.text)"))
+        self.rings = Div(width=LEFT - 10, text="rings about the pole: computed from all ions")
+        self.shell, self.python = (PreText(sizing_mode="stretch_width") for _ in range(2))
+        self.copy = [
+            copy_button(f"copy as {name}", text) for name, text in (("command", self.shell), ("Python", self.python))
+        ]
 
     def _layout(self):
-        emission = [self.mechanism, *self.sliders.values()]
-        maps = [self.smoothing, self.flattening, self.bins, self.ions, self.mode]
-        left = column(
-            *emission, *maps, self.readout, self.rings, self.notes, self.register, self.registration, width=320
-        )
-        below = row(
-            column(self.profile, row(self.width, self.radius)), column(self.specimen, row(self.color, self.side))
-        )
-        text = column(row(*self.copy), self.shell, self.python)
-        return row(left, column(row(*self.maps), below, text))
+        explorer = self.explorer
+        emission = [self.mechanism, *map(number, self.sliders.values())]
+        display = [self.mode, row(self.same_scale, save_button(self.maps))]
+        display += map(number, (self.smoothing, self.flattening, self.bins, self.width))
+        groups = []
+        if explorer.run is not None:
+            groups.append(group("emission", emission, self._reset_emission))
+        groups.append(group("display", display, self._reset_display))
+        if explorer.run is not None:
+            groups.append(group("ions", [self.ions, number(self.radius)], self._reset_ions))
+        if self.index is not None:
+            groups.append(group("index", [self.index.column], active=explorer.run is None))
+        if self.both:
+            groups.append(
+                group("registration", [row(self.register_all, self.register), self.registration], active=False)
+            )
+        if explorer.run is not None:
+            groups.append(group("rings", [self.rings], active=False))
+        left = column(*groups, width=LEFT)
+        whole = Button(label="whole map", width=90)
+        whole.on_click(self._whole_map)
+        bar = row(self.tool, whole, sizing_mode="stretch_width")
+        parts: list[Any] = [column(each, sizing_mode="stretch_width") for each in self.maps]
+        if explorer.run is None:
+            parts.append(self.profile)
+        else:
+            parts.append(column(self.specimen, row(self.color, self.side), self.profile, sizing_mode="stretch_width"))
+        code = group("code", [row(*self.copy), self.shell, self.python], active=False)
+        right = column(bar, grid(parts), code, sizing_mode="stretch_width")
+        if self.both:
+            self.document.js_on_event(DocumentReady, CustomJS(args={"mode": self.mode}, code=_KEY_B))
+        body = row(left, right, sizing_mode="stretch_width")
+        return column(self.head, self.notes, body, sizing_mode="stretch_width")
 
     # ---- from the widgets ------------------------------------------------------------------------------------------
 
     def _controls(self):
         """Controls of all mechanisms, each once, in their order."""
+        if self.explorer.run is None:
+            return []
         of_name = {each.name: each for name in MECHANISMS for each in self.explorer.controls(name)}
         return [of_name[each.name] for each in CONTROLS if each.name in of_name]
 
@@ -266,7 +425,7 @@ class Page:
         """View of the current positions of the widgets."""
         mechanism = list(MECHANISMS)[self.mechanism.active]
         first, last = (int(end) for end in self.ions.value)
-        every = self.explorer.first_and_last
+        every = (first, last) if self.explorer.run is None else self.explorer.first_and_last
         defaults = {each.name: each.value for each in CONTROLS}
         return View(
             perturbation=perturbation_of(
@@ -297,15 +456,20 @@ class Page:
             return
         self._later(partial(self.put, shown), 0)
         if not preview:
-            self._rings_of(shown)
+            self._judge(shown)
 
-    def _rings_of(self, shown):
-        if self.latest.overtaken:
+    def _judge(self, shown):
+        """Verdict and rings of maps of all ions."""
+        if self.latest.overtaken or self.explorer.run is None:
             return
+        if self.explorer.registered:
+            self._later(partial(self._put_verdict, shown, self.explorer.likeness(shown)), 0)
+        elif self.both:
+            return  # rings need the place of the pole on the measured map
         try:
             rings = self.explorer.rings(shown)
         except ValueError as error:
-            text = f"rings: {escape(str(error))}"
+            text = escape(f"not here: {str(error).split(' on <')[0]}")
         else:
             text = self._rings_text(rings)
         self._later(partial(self._put_rings, shown, text), 0)
@@ -315,6 +479,8 @@ class Page:
         self.ask(preview=False)
 
     def _show_sliders(self):
+        if self.explorer.run is None:
+            return
         names = {each.name for each in self.explorer.controls(list(MECHANISMS)[self.mechanism.active])}
         for name, slider in self.sliders.items():
             slider.visible = name in names
@@ -340,17 +506,111 @@ class Page:
         self.blink_image.visible = measured
         self.maps[0].title.text = "measured" if measured else "simulated"
 
-    def _register(self):
-        self._put_notes(["registering: up to some minutes"])
-        self.latest.ask(partial(self._find_registration, self.view()))
+    def _tool_changed(self):
+        """Give the mouse to the chosen tool; a map without it is moved."""
+        name = self.tool.labels[self.tool.active]
+        for each, drags in zip(self.maps, self._drags, strict=True):
+            each.toolbar.active_drag = drags.get(name, drags["move"])
 
-    def _find_registration(self, view):
-        try:
-            self.explorer.register([view.perturbation])
-        except ValueError as error:
-            self._later(partial(self._put_notes, [str(error)]), 0)
+    def _whole_map(self):
+        for name in ("x_range", "y_range"):
+            each = getattr(self.maps[0], name)
+            each.update(start=each.reset_start, end=each.reset_end)
+
+    def _reset_emission(self):
+        mechanism, values = values_of(self._start.perturbation)
+        for each in self._controls():
+            self.sliders[each.name].value = values.get(each.name, each.value)
+        self.mechanism.active = list(MECHANISMS).index(mechanism)
+        self.ask(preview=False)
+
+    def _reset_display(self):
+        for name in ("smoothing", "flattening", "bins"):
+            getattr(self, name).value = getattr(self._start, name)
+        self.mode.active, self.same_scale.active = 0, False
+        self.ask(preview=False)
+
+    def _reset_ions(self):
+        self.ions.value = self.explorer.first_and_last
+        self.ask(preview=False)
+
+    def _next_style(self):
+        style, self.style.label = self.style.label, "dark" if self.style.label == "light" else "light"
+        self.root.styles = page_styles(style)
+        self.document.theme = theme(style)
+        if self.explorer is not None:
+            self._put_veil()
+
+    # ---- files and the registration, in the background -------------------------------------------------------------
+
+    def _file_named(self):
+        path = self.file.value.strip()
+        if self._opened is None or not path:
             return
-        self._compute(view, False)
+        self._put_notes([f"reading {path}"])
+
+        def work():
+            try:
+                again = self._opened(path, self.document)
+            except (ValueError, OSError) as error:
+                self._later(partial(self._put_notes, [str(error)]), 0)
+                return
+
+            def show():
+                self.close()
+                again()
+
+            self._later(show, 0)
+
+        threading.Thread(target=work, daemon=True).start()
+
+    def _stop_search(self):
+        self._searches += 1
+        if self._search is not None:
+            self._search.terminate()
+            self._search = None
+        self._progress = None
+
+    def _register(self, perturbations):
+        """Find the registration in another process, which leaves this one to the page."""
+        self._stop_search()
+        search = self._searches
+        started = time.monotonic()
+
+        def progress(done, number):
+            if search != self._searches:
+                raise _Overtaken
+            self._later(partial(self._put_progress, search, started, done, number), 0)
+
+        def work():
+            try:
+                with multiprocessing.get_context("spawn").Pool(1) as self._search:
+                    self.explorer.register(perturbations, progress, self._search.apply)
+            except _Overtaken:
+                return
+            except ValueError as error:
+                self._later(partial(self._put_notes, [str(error)]), 0)
+            self._later(partial(self._search_ended, search), 0)
+
+        threading.Thread(target=work, daemon=True).start()
+
+    def _put_progress(self, search, started, done, number):
+        if search != self._searches:
+            return
+        self._progress = done, number
+        self._put_chip(None)
+        if done:
+            seconds = time.monotonic() - started
+            self._progress_text = f"about {seconds / done * (number - done):.0f} s left"
+            self.ask(preview=False)  # the best until now
+        else:
+            self._progress_text = "half a minute each"
+        self._put_chip(None)
+
+    def _search_ended(self, search):
+        if search == self._searches:
+            self._progress = None
+            self.ask(preview=False)
 
     def _registration_typed(self):
         if self._registration_of is None or self.registration.value == self._registration_text():
@@ -360,17 +620,24 @@ class Page:
         except (ValueError, OSError) as error:
             self._put_notes([str(error)])
             return
+        self._stop_search()
         self.explorer.set_registration(registration)
         self.ask(preview=False)
 
     def _registration_text(self):
         registration = self.explorer.registration
-        return "" if registration is None else registration.to_text()
+        return registration.to_text() if self.explorer.registered else ""
 
-    def _clicked(self, event):
-        """Highlight the atoms whose ions land near a click."""
-        radius = self.radius.value
-        if radius <= 0 or event.x is None or event.y is None:
+    def _clicked(self, fig, event):
+        """Mark a pole or a line on the measured map, or highlight the atoms whose ions land near a click."""
+        radius, tool = self.radius.value, self.tool.labels[self.tool.active]
+        if event.x is None or event.y is None:
+            return
+        if tool in ("pole", "zone line"):
+            if fig is self.maps[-1]:
+                self.index.add(event.x, event.y, of_line=tool == "zone line")
+            return
+        if tool != "atoms" or radius <= 0:
             return
         self.click.data = {"x": [event.x], "y": [event.y], "radius": [radius]}
         self._put_atoms()
@@ -406,11 +673,12 @@ class Page:
         self.document.hold("combine")
         try:
             if not shown.preview:
-                low, high = common_limits(shown.pictures)
-                self.colors.update(low=low, high=high)
-            for source, old, new in zip(self.sources, before.pictures, shown.pictures, strict=True):
-                if new is not old:
-                    source.data = _image(new)
+                self._put_scales()
+                self._put_veil()
+            drawn = zip(self.sources, self._drawn(before), self._drawn(shown), strict=True)
+            for number, (source, old, new) in enumerate(drawn):
+                if new is not old or before.whole is not shown.whole:
+                    source.data = _image(new, self._values(shown, number))
             if MODES[self.mode.active] == "difference":
                 self._put_difference()
             if shown.preview and not self._readout_waits:
@@ -421,6 +689,7 @@ class Page:
                 self._put_notes(shown.notes)
                 self._put_profiles()
                 self._put_commands(self.explorer.commands(shown.view), "maps")
+                show_extent(self.maps[0], self._drawn(shown)[-1].extent)
                 if self.registration.value != self._registration_text():
                     self.registration.value = self._registration_text()
                 if not same_ions:
@@ -428,6 +697,43 @@ class Page:
                 self._put_atoms()
         finally:
             self.document.unhold()
+
+    def _drawn(self, shown):
+        """Maps that are drawn: the measured one is the whole."""
+        return (
+            shown.pictures if shown.whole is None else (*shown.pictures[: self.explorer.run is not None], shown.whole)
+        )
+
+    def _values(self, shown, number):
+        """Densities of a map, relative to their mean where both are compared."""
+        drawn = self._drawn(shown)[number]
+        if shown.whole is None or drawn is not shown.whole or not self.both:
+            return drawn.density
+        mean = float(drawn.density[shown.measured.mask].mean())
+        return drawn.density / mean if mean > 0 else drawn.density
+
+    def _put_scales(self):
+        pictures = self.shown.pictures
+        limits = [common_limits(pictures)] * 2 if self.same_scale.active else [color_limits(each) for each in pictures]
+        for colors, (low, high) in zip(self.colors, limits, strict=False):
+            colors.update(low=low, high=high)
+
+    def _put_veil(self):
+        """Dim the part of the measured map that is not compared."""
+        if not self.both:
+            return
+        shown = self.shown
+        left, right, lower, upper = shown.whole.extent
+        outside = (
+            shown.whole.mask & ~shown.measured.mask if self.explorer.registered else np.zeros_like(shown.whole.mask)
+        )
+        style = next(each for each in STYLES if each != self.style.label)
+        image = np.zeros((*outside.shape, 4), np.uint8)
+        image[outside] = VEIL[style]
+        self.veil.data = {
+            "image": [image.view(np.uint32)[..., 0]], "x": [left], "y": [lower],
+            "dw": [right - left], "dh": [upper - lower],
+        }  # fmt: skip
 
     def _put_difference(self):
         first, second = self.shown.pictures
@@ -444,20 +750,52 @@ class Page:
 
     def _put_readout(self):
         shown = self.shown
-        lines = []
+        number = ""
         if shown.similarity is not None:
-            lines.append(f"similarity <b>{shown.similarity.value:.3f}</b>")
-            if shown.ceiling is not None:
-                lines.append(f"of two halves of the measurement {shown.ceiling.value:.3f}")
-        ions = shown.simulated.shown_ions
-        lines.append(f"{ions}{', preview' if shown.preview else ''}, {1e3 * shown.seconds:.0f} ms")
-        self.readout.text = f'<div style="color: {_gray(shown.preview)}">{"<br>".join(lines)}</div>'
+            halves = "" if shown.ceiling is None else f"; of two halves of the measurement {shown.ceiling.value:.3f}"
+            number = f'<span style="font-size: 26px">{shown.similarity.value:.3f}</span> similarity{halves}<br>'
+        ions = "" if shown.simulated is None else f"{shown.simulated.shown_ions} on the map"
         if shown.preview:
-            self.rings.styles = {"color": _gray(True)}
+            ions += ", preview"
+        tone = "var(--faint)" if shown.preview else "var(--ink)"
+        self.readout.text = f'<div style="color: {tone}">{number}<small>{ions}</small></div>'
+        self.facts.text = " &nbsp; ".join(_facts(self.explorer))
+        if not shown.preview:
+            self._put_chip(None)
+
+    def _put_verdict(self, shown, likeness):
+        if shown is self.shown:
+            self._put_chip(likeness)
+
+    def _put_chip(self, likeness):
+        """State of the registration, or the verdict on both maps."""
+        if likeness is not None:
+            self._verdict = likeness
+        if not self.both:
+            return
+        parts = []
+        if self._progress is not None:
+            done, number = self._progress
+            parts.append(
+                f'<progress value="{done}" max="{number}" style="width: 120px"></progress><br>'
+                f"<small>registering, {self._progress_text}</small>"
+            )
+        if self.explorer.registered and self._verdict is not None:
+            text, color = self._verdict.verdict, _CHIPS[self._verdict.verdict]
+            score = "" if math.isnan(self._verdict.symmetry) else f" ({self._verdict.symmetry:.2f})"
+            reason = self._verdict.reason
+            if self.explorer.registration.doubtful:
+                reason += f"; the correlation of the registered maps is only {self.explorer.registration.score:.2f}"
+            parts.append(
+                f'<span title="{escape(reason)}" style="background: {color}; color: white; border-radius: 10px;'
+                f' padding: 3px 10px; white-space: nowrap">{text}{score}</span>'
+            )
+        elif self._progress is None and not self.explorer.registered:
+            parts.append("<small>not registered</small>")
+        self.chip.text = "<br>".join(parts)
 
     def _put_rings(self, shown, text):
         if shown is self.shown:
-            self.rings.styles = {"color": _gray(False)}
             self.rings.text = text
 
     def _rings_text(self, rings):
@@ -470,7 +808,7 @@ class Page:
                 error = "" if math.isnan(ring.error) else f" ± {ring.error:.2f}"
                 cells.append(f"<td>{ring.contrast:.2f}{error}<br>{ring.minimum:.2f} to {ring.maximum:.2f}</td>")
             lines.append(f"<tr><td>{name}</td>{''.join(cells)}</tr>")
-        about = _plain(pole.label)
+        about = plain(pole.label)
         return (
             f"rings about {about}: contrast, lowest and highest density"
             f'<table cellpadding="3"><tr><td></td>{head}</tr>{"".join(lines)}</table>'
@@ -500,6 +838,8 @@ class Page:
         self.profile.title.text = "; ".join(lines)
 
     def _put_specimen(self):
+        if self.explorer.run is None:
+            return
         image = specimen_image(self.explorer.run, self.color.value, self.side.value, self.shown.view.ions)
         left, right, lower, upper = image.extent
         values = image.values[np.isfinite(image.values)]
@@ -508,8 +848,8 @@ class Page:
         self.specimen_source.data = {
             "image": [image.values], "x": [left], "y": [lower], "dw": [right - left], "dh": [upper - lower],
         }  # fmt: skip
-        for name, new in _ranges(image.extent).items():
-            getattr(self.specimen, name).update(start=new.start, end=new.end, reset_start=new.start, reset_end=new.end)
+        show_extent(self.specimen, image.extent)
+        self.specimen_bar.title = COLORED_BY[self.color.value]
         self.specimen.xaxis.axis_label = "x [nm]"
         self.specimen.yaxis.axis_label = "y [nm]" if self.side.value == "above" else "z [nm]"
         self._put_atoms()
@@ -529,21 +869,8 @@ class Page:
         self.shell.text = commands.shell or f"(no command for this {what}: the measured map has no ions)"
         self.python.text = commands.python
 
-
-def _square(title, **options):
-    """Figure for an image, with equal scales along both axes."""
-    fig = figure(
-        title=title, frame_width=_SIDE, frame_height=_SIDE, tools=_TOOLS, active_scroll="wheel_zoom", **options
-    )
-    fig.grid.visible = False
-    return fig
-
-
-def _ranges(extent):
-    """Ranges of equal length about an area."""
-    half = 0.5 * max(extent[1] - extent[0], extent[3] - extent[2])
-    middles = {"x_range": 0.5 * (extent[0] + extent[1]), "y_range": 0.5 * (extent[2] + extent[3])}
-    return {name: Range1d(middle - half, middle + half) for name, middle in middles.items()}
+    def _put_python(self, python):
+        self.shell.text, self.python.text = "", python
 
 
 def _image(picture, values=None):
@@ -554,78 +881,39 @@ def _image(picture, values=None):
     return {"image": [values.astype(np.float32)], "x": [left], "y": [lower], **size}
 
 
-def _gray(preview):
-    return "#a0a0a0" if preview else "#000000"
+def _files():
+    """Files of the current folder and the folders in it that can be opened."""
+    paths = [path for pattern in ("*", "*/*") for path in sorted(Path().glob(pattern))]
+    return [str(path) for path in paths if path.suffix.lower() in _SUFFIXES][:_MOST_FILES]
 
 
-def _plain(label):
-    """Label of a pole without the math syntax of matplotlib."""
-    for math_text, text in (("$", ""), (r"\bar{", "-"), ("}", ""), (r"\,", " ")):
-        label = label.replace(math_text, text)
-    return label
+def _facts(explorer):
+    """What is on the page: files, numbers of ions, axis, radius and voltage."""
+    first, second = (escape(Path(name).name) for name in explorer.names)
+    facts = []
+    if explorer.run is not None:
+        run = explorer.run
+        tip = run.settings["tip"]
+        parts = [f"{len(run):,} ions of {', '.join(run.elements)}"]
+        if "axis" in tip:
+            parts.append(f"[{' '.join(f'{each:g}' for each in tip['axis'])}]")
+        if tip.get("apex_radius"):
+            parts.append(f"R = {tip['apex_radius']:.3g} nm")
+        parts.append(_voltages(run.voltages))
+        facts.append(f"<b>{first}</b> {escape(', '.join(parts))}")
+    if explorer.measured is not None:
+        measured = explorer.measured
+        if isinstance(measured, DetectorMap):
+            text = f"{measured.values.shape[1]} × {measured.values.shape[0]} bins"
+        else:
+            text = f"{len(measured):,} ions"
+            if measured.voltage is not None and np.ptp(measured.voltage) > 0:
+                text += f", {_voltages(measured.voltage)}"
+        facts.append(f"<b>{second}</b> {text}")
+    return facts
 
 
-class _WithoutStrangers(logging.Filter):
-    """Leaves out the tracebacks of connections that end before they belong to a session, as of other web pages."""
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        return not record.getMessage().startswith("Uncaught exception GET /ws ")
-
-
-_WITHOUT_STRANGERS = _WithoutStrangers()  # one object: a logger takes it once
-
-
-def serve(
-    explorer: Explorer,
-    view: View | None = None,
-    *,
-    port: int = 0,
-    registration_of: Callable[[str], Registration] | None = None,
-) -> tuple[Server, str]:
-    """Make the server of a page that only the holder of its address can open, from this machine.
-
-    Parameters
-    ----------
-    explorer : Explorer
-        Computes all numbers.
-    view : View, optional
-        What is shown first.
-    port : int
-        Port on 127.0.0.1; 0 for a free one.
-    registration_of : callable, optional
-        As for `Page`.
-
-    Returns
-    -------
-    server : bokeh.server.server.Server
-        Its ``io_loop.start()`` serves the page.
-    url : str
-        Address with a signed session.
-
-    Raises
-    ------
-    OSError
-        If the port is in use.
-    """
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        probe.bind((_ADDRESS, port))
-        port = probe.getsockname()[1]
-
-    def make(document: Document) -> None:
-        page = Page(explorer, document, view, registration_of)
-        document.on_session_destroyed(lambda _: page.latest.close())
-
-    logging.getLogger("tornado.application").addFilter(_WITHOUT_STRANGERS)
-    key = secrets.token_bytes(32)  # other users of this machine reach 127.0.0.1, too
-    server = Server(
-        {"/": Application(FunctionHandler(make))},
-        port=port,
-        address=_ADDRESS,
-        secret_key=key,
-        sign_sessions=True,
-        generate_session_ids=False,
-        allow_websocket_origin=[f"{_ADDRESS}:{port}", f"localhost:{port}"],
-    )
-    server.start()
-    return server, f"http://{_ADDRESS}:{port}/?bokeh-session-id={generate_session_id(key, signed=True)}"
+def _voltages(values):
+    low, high = float(np.min(values)), float(np.max(values))
+    texts = [f"{each:,.0f}" for each in (low, high)]
+    return f"{' to '.join(dict.fromkeys(texts))} V"

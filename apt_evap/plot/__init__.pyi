@@ -5,9 +5,9 @@ from .candidates import indexing as indexing
 from .charges import charge_states as charge_states
 from .histories import history as history
 from .histories import voltage_curve as voltage_curve
+from .limits import color_limits as color_limits
+from .limits import common_limits as common_limits
 from .losses import conditions as conditions
-from .maps import color_limits as color_limits
-from .maps import common_limits as common_limits
 from .maps import describe as describe
 from .maps import detector_map as detector_map
 from .maps import detector_maps as detector_maps

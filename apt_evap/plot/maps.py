@@ -13,6 +13,7 @@ from apt_evap.detection.binning import bins_for
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.plot._figure import OUTSIDE, DrawnAxes, add_colorbar, new_figure, set_caption, set_title
+from apt_evap.plot.limits import color_limits
 
 
 def detector_map(
@@ -132,44 +133,6 @@ def _map_of(map: DetectorMap | Hits, name: str) -> DetectorMap:
         counts = map.map(bins_for(int(np.count_nonzero(map.detected))))
         return counts.smoothed(max(counts.bin_size))
     return check_kind(map, name, DetectorMap, "a DetectorMap or Hits, such as run.hits(perturbation)")
-
-
-def color_limits(map: DetectorMap) -> tuple[float, float]:
-    """Robust limits of a colour scale: the 0.5 and 99.5 percentiles of the density inside the detector.
-
-    Parameters
-    ----------
-    map : DetectorMap
-        The map.
-
-    Returns
-    -------
-    tuple of float
-        Lowest and highest density; 0 and 2 if all are equal.
-    """
-    low, high = np.percentile(map.density[map.mask], [0.5, 99.5])
-    return (float(low), float(high)) if high > low else (0.0, 2.0)
-
-
-def common_limits(maps: Sequence[DetectorMap]) -> tuple[float, float]:
-    """Common limits of a colour scale for several maps: the 0.5 and 99.5 percentiles of all densities.
-
-    The lower limit becomes 0 if it is less than 1/20 of the upper one.
-
-    Parameters
-    ----------
-    maps : sequence of DetectorMap
-        The maps.
-
-    Returns
-    -------
-    tuple of float
-        Lowest and highest density; 0 and 2 if all are equal.
-    """
-    low, high = np.percentile(np.concatenate([map.density[map.mask] for map in maps]), [0.5, 99.5])
-    if not high > low:
-        return 0.0, 2.0
-    return (float(low) if low > high / 20 else 0.0), float(high)
 
 
 def describe(map: DetectorMap) -> str:

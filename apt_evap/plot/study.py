@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from apt_evap._common.validation import check_array, check_number
 from apt_evap.fit.study import Study
 from apt_evap.plot._figure import OUTSIDE, add_colorbar, new_figure
-from apt_evap.plot.maps import common_limits, detector_map
+from apt_evap.plot.limits import common_limits
+from apt_evap.plot.maps import detector_map
 
 _MARK = "#00d0ff"  # visible on all colours of both maps
 

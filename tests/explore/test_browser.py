@@ -22,7 +22,7 @@ pytest.importorskip("bokeh")
 playwright = pytest.importorskip("playwright.sync_api")
 pytestmark = pytest.mark.browser
 
-CHROMIUM = shutil.which("chromium-headless-shell")  # None: that of playwright
+CHROMIUM = shutil.which("chromium-headless-shell") or shutil.which("chromium")  # None: that of playwright
 PATIENCE = 60_000  # ms: the machine may be busy
 
 # the first image of the page, and what is written beside it
@@ -105,7 +105,7 @@ def drag(page, start, end):
 
 def test_the_page_is_driven(page, served):
     # keys move a slider, the map and what is written
-    page.wait_for_function("written().includes('rings')")
+    page.wait_for_function("written().includes('similarity')")
     picture(page, "1_start")
     before, text = page.evaluate("mean()"), page.evaluate("written()")
     pixels = page.screenshot()
@@ -128,8 +128,8 @@ def test_the_page_is_driven(page, served):
     page.wait_for_function("maps[0].title.text == 'measured'")
     picture(page, "4_blink")
     page.wait_for_function("maps[0].title.text == 'simulated'")
-    page.get_by_text("side by side", exact=True).click()
-    page.wait_for_function("maps[1].title.text == 'measured'")
+    page.keyboard.press("b")
+    page.wait_for_function("maps[1].title.text == 'measured' && maps[0].title.text == 'simulated'")
 
     # a click shows atoms of the specimen
     page.mouse.click(*place(page, 0, 0.5, 0.4))
@@ -138,7 +138,8 @@ def test_the_page_is_driven(page, served):
     picture(page, "5_click")
 
     # a line drawn by the mouse gives profiles
-    page.get_by_title("line for a profile").first.click()
+    page.get_by_text("line", exact=True).click()
+    page.wait_for_function("maps[0].toolbar.active_drag.type == 'FreehandDrawTool'")
     drag(page, place(page, 0, 0.3, 0.3), place(page, 0, 0.7, 0.6))
     page.wait_for_function("[...Bokeh.documents[0].all_models].some(m => m.type == 'ColumnDataSource' &&"
                            " m.data.x?.length > 3 && m.data.y?.length > 3 && !m.data.image)")  # fmt: skip
@@ -146,13 +147,27 @@ def test_the_page_is_driven(page, served):
     picture(page, "6_profile")
 
     # a rectangle gives a command, a button copies it
-    page.get_by_title("rectangle of ions").first.click()
+    page.get_by_text("box", exact=True).click()
+    page.wait_for_function("maps[0].toolbar.active_drag.type == 'BoxSelectTool'")
+    page.wait_for_timeout(500)
     drag(page, place(page, 0, 0.3, 0.3), place(page, 0, 0.6, 0.6))
     page.wait_for_function("[...Bokeh.documents[0].all_models].some(m => /--box=/.test(m.text ?? ''))")
+    page.get_by_text("code", exact=True).click()
     page.get_by_text("copy as command").click()
+    page.wait_for_function("model('copied')")
     copied = page.evaluate("navigator.clipboard.readText()")
     assert copied.startswith("apt-evap map ions.epos --box=")
     picture(page, "7_rectangle")
+
+    # two clicks index the map
+    page.get_by_text("pole", exact=True).click()
+    page.wait_for_function("maps[1].toolbar.active_drag.type == 'PointDrawTool'")
+    page.get_by_text("index", exact=True).click()
+    for each in ((0.4, 0.5), (0.6, 0.5)):
+        page.mouse.click(*place(page, 1, *each))
+        page.wait_for_timeout(600)  # not a double click
+    page.wait_for_function("written().includes('mm/rad')")
+    picture(page, "8_index")
 
     # no request off the machine, and no error
     assert page.errors == []

@@ -10,7 +10,7 @@ import pytest
 from rough import ROUGH
 
 import apt_evap as ae
-from apt_evap.cli.explore import explorer_and_view
+from apt_evap.cli.explore import _with_file, explorer_and_view
 from apt_evap.cli.main import main
 from apt_evap.cli.parser import make_parser
 from apt_evap.explore.controls import MECHANISMS, controls_of, perturbation_of, values_of
@@ -271,17 +271,128 @@ def test_the_symmetry_of_a_pole(run, axis, label, fold):
 def test_a_registration_is_found(run, measured):
     """The best of those for several emissions; half a minute each."""
     explorer = Explorer(run, measured)
+    explorer.register()
     target = measured.map(128)
     scores = [ae.register(run.hits(each), target).score for each in (ae.Unperturbed(), explorer.start.perturbation)]
     assert explorer.registration.score >= max(scores)
     assert explorer.registration.method == "search"
 
 
+def test_the_best_registration_is_kept(run, measured):
+    """Each better one is set at once; an error of the progress ends the search."""
+    scores = iter([0.6, 0.9, 0.7])
+    explorer, steps = Explorer(run, measured), []
+
+    def found(function, arguments):
+        assert len(arguments[0]) == len(run) and arguments[1].values.shape == measured.map(128).values.shape
+        return ae.Registration(0.0, 0.5, (0.0, 0.0), score=next(scores))
+
+    def progress(done, number):
+        steps.append((done, number, explorer.registration.score))
+
+    emissions = [ae.Unperturbed(), ae.RollUp(0.2), ae.RollUp(0.3)]
+    assert explorer.register(emissions, progress, found).score == 0.9 == explorer.registration.score
+    assert [each[:2] for each in steps] == [(k, 3) for k in range(4)] and steps[2][2] == 0.6
+    scores = iter([0.95])
+
+    def stopped(done, number):
+        if done:
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        explorer.register(emissions, stopped, found)
+    assert explorer.registration.score == 0.9
+    for arguments in ((run,), (None, measured)):
+        with pytest.raises(ValueError, match="registration"):
+            Explorer(*arguments).register()
+
+
+def test_before_the_registration_both_maps_have_one_size(run, measured):
+    explorer = Explorer(run, measured)
+    assert not explorer.registered and explorer.registration.rotation == 0.0
+    shown = explorer.show(explorer.start)
+    assert shown.similarity is None and shown.ceiling is None
+    assert "--registration" not in explorer.commands(shown.view).shell
+    hits = explorer.hits(replace(shown.view, perturbation=ae.Unperturbed()))
+    hits = hits[hits.detected]
+    for own, other in ((hits.x, measured.x), (hits.y, measured.y)):
+        assert np.nanmedian(own) == pytest.approx(np.median(other), abs=6)  # mm, of a field of view of 70 mm
+    assert np.ptp(np.nanpercentile(hits.x, [1, 99])) == pytest.approx(
+        np.ptp(np.percentile(measured.x, [1, 99])), rel=0.2
+    )
+    explorer.set_registration(TURNED)
+    assert explorer.registered and explorer.show(explorer.start).similarity is not None
+
+
+def test_the_verdict_is_that_of_the_library(run, measured, explorer):
+    shown = explorer.show(View(ae.RollUp(ENERGY), 24, 2.0))
+    found = explorer.likeness(shown)
+    expected = ae.registration.likeness(shown.simulated, shown.measured, TURNED)
+    assert found.verdict == expected.verdict and found.reason == expected.reason
+
+
+@pytest.mark.parametrize("as_map", [False, True])
+def test_a_measurement_alone(measured, as_map, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    ae.write("ions.epos", measured)
+    ions = ae.read("ions.epos")
+    given = ions.map(64) if as_map else ions
+    explorer = Explorer(None, given, measured_arguments=["ions.epos"], measured_code="ae.read('ions.epos')")
+    view = replace(explorer.start, bins=32)
+    shown = explorer.show(view)
+    assert shown.simulated is None and shown.similarity is None and shown.ions == 0
+    assert shown.measured.values.sum() >= 0.99 * len(ions) and shown.pictures == (shown.whole,)
+    assert np.array_equal(shown.whole.density, shown.measured.smoothed(view.smoothing).density, equal_nan=True)
+    assert max(shown.measured.values.shape) == 32
+    _, (profile,) = explorer.profiles(shown, [[-10.0, -10.0], [10.0, 10.0]], 12.0)
+    assert len(profile.density) > 3
+    if not as_map:
+        names = executed(explorer.commands(view).python)
+        assert equal(names["measured"], shown.measured)
+        assert executed(explorer.selection(view, (0.0, 9.0), (0.0, 9.0)).python)["measured"].x.min() >= 0
+        drawn = []
+        monkeypatch.setattr("apt_evap.cli.map.save_picture", lambda path, maps, titles: drawn.append(maps[0]))
+        words = shlex.split(explorer.commands(view).shell)
+        assert main([*words[1:], "--quiet"]) == 0
+        assert np.array_equal(drawn[0].density, shown.whole.density, equal_nan=True)
+
+
+@pytest.mark.parametrize("files", [[], ["run.h5"], ["ions.epos"], ["run.h5", "ions.epos"]])
+def test_the_command_opens_what_there_is(run, measured, tmp_path, monkeypatch, files):
+    monkeypatch.chdir(tmp_path)
+    run.save("run.h5")
+    ae.write("ions.epos", measured)
+    explorer, view = explorer_and_view(make_parser().parse_args(["explore", *files]))
+    if not files:
+        assert explorer is view is None
+        return
+    assert (explorer.run is not None, explorer.measured is not None) == tuple(
+        name in files for name in ("run.h5", "ions.epos")
+    )
+    assert explorer.names == tuple(name if name in files else "" for name in ("run.h5", "ions.epos"))
+    assert explorer.show(view).pictures
+
+
+def test_a_file_is_opened_beside_the_others(run, measured, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run.save("run.h5")
+    ae.write("ions.epos", measured)
+    options = make_parser().parse_args(["explore", "--circle", "20"])
+    explorer, _ = _with_file(options, "ions.epos")
+    assert explorer.run is None and len(explorer.measured) == len(measured)  # the circle was of another file
+    with pytest.raises(ValueError, match="none"):
+        _with_file(options, "none.epos")
+    explorer, view = _with_file(options, "run.h5")  # the file that failed is forgotten
+    assert explorer.names == ("run.h5", "ions.epos") and len(explorer.show(view).pictures) == 2
+
+
 def test_what_is_refused(run, measured):
     bare = replace(run, responses=None)
     for arguments, sentence in [
         ((bare,), "needs a run with responses"),
-        ((run, None, TURNED), "registration needs measured ions"),
+        ((run, None, TURNED), "registration needs"),
+        ((None, measured, TURNED), "registration needs"),
+        ((), "run, measured"),
         (("run",), "run must be a Run"),
         ((run, measured, 3.0), "registration must be a Registration"),
     ]:
@@ -395,8 +506,9 @@ def test_without_bokeh_one_sentence(run, tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("line", "sentence"),
     [
+        (["ions.npz", "run.h5"], "RUN must be"),
         (["run.h5", "run.h5"], "MEASURED must be measured ions or a map, 'run.h5' is a run"),
-        (["run.h5", "--registration=1,1,0,0"], "--registration needs MEASURED"),
+        (["run.h5", "--registration=1,1,0,0"], "--registration"),
         (["run.h5", "--perturbation", "RollUp:1,2,3"], "RollUp takes"),
         (["run.h5", "--simulated", "5000,"], "--simulated selects none of the ions 0 to 2000"),
         (["none.h5"], "cannot read 'none.h5'"),

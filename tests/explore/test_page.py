@@ -1,5 +1,6 @@
 """The page of the explorer in a document without a browser."""
 
+import threading
 import time
 from dataclasses import replace
 from types import SimpleNamespace
@@ -14,13 +15,14 @@ from apt_evap.explore.explorer import Explorer, View
 pytest.importorskip("bokeh")
 
 from bokeh.document import Document
-from bokeh.models import Slider
+from bokeh.models import Slider, Spinner
 from bokeh.util.token import generate_jwt_token, generate_session_id
 from tornado.httpclient import HTTPClientError, HTTPRequest
 from tornado.websocket import websocket_connect
 
-from apt_evap.cli.compare import read_registration
-from apt_evap.explore.page import MODES, Page, serve
+from apt_evap.cli._files import read_registration
+from apt_evap.explore.page import MODES, Page
+from apt_evap.explore.server import serve
 
 SECONDS = 60  # until a test gives up: the machine may be busy
 
@@ -61,7 +63,11 @@ class Opened:
 def opened(run, measured):
     opened = Opened(Explorer(run, measured, ae.Registration(0.0, 1.0, (0.0, 0.0)), preview=500))
     yield opened
-    opened.page.latest.close()
+    opened.page.close()
+
+
+def _limits(page):
+    return [(each.low, each.high) for each in page.colors]
 
 
 def image(source):
@@ -82,8 +88,11 @@ def test_a_slider_moves_the_map_as_the_core_computes_it(opened):
     shown = page.explorer.show(page.view())
     assert page.view().perturbation == ae.RollUp(ae.TruncatedNormal(0.33, 0.33))
     assert not np.array_equal(image(page.sources[0]), before, equal_nan=True)
-    for source, picture in zip(page.sources, shown.pictures, strict=True):
-        assert np.array_equal(image(source), picture.density.astype(np.float32), equal_nan=True)
+    assert np.array_equal(image(page.sources[0]), shown.pictures[0].density.astype(np.float32), equal_nan=True)
+    # the whole measured map, relative to the mean where both are compared
+    inside, whole = shown.measured.mask, shown.whole.density
+    expected = (whole / whole[inside].mean()).astype(np.float32)
+    assert np.array_equal(image(page.sources[1]), expected, equal_nan=True)
     assert f"{shown.similarity.value:.3f}" in page.readout.text
     assert page.python.text == page.explorer.commands(page.view()).python
     assert "RollUp:0.33,0.33" in page.shell.text
@@ -121,31 +130,30 @@ def test_every_widget_moves_something(opened):
 
 def test_a_preview_is_grey(opened):
     page = opened.page
-    opened.settle(lambda: "rings about 111" in page.rings.text or "rings:" in page.rings.text)
+    opened.settle(lambda: "rings about 111" in page.rings.text or "not here" in page.rings.text)
     page.sliders["mean"].value = 0.4  # still moving
     opened.settle(lambda: opened.shows(preview=True))
     assert page.shown.ions == 500 and "preview" in page.readout.text
-    gray = "#a0a0a0"
-    assert gray in page.readout.text and page.rings.styles["color"] == gray
+    gray = "var(--faint)"
+    assert gray in page.readout.text
     page.sliders["mean"].trigger("value_throttled", None, 0.4)
     opened.settle(opened.shows)
-    opened.settle(lambda: page.rings.styles["color"] != gray)
     assert (gray not in page.readout.text and "2,000 ions" in page.readout.text) or "of" in page.readout.text
 
 
 def test_a_preview_sends_only_what_changes(opened):
     page = opened.page
     opened.settle(opened.shows)
-    limits, data = (page.colors.low, page.colors.high), [dict(each.data) for each in (*page.sources, page.difference)]
+    limits, data = _limits(page), [dict(each.data) for each in (*page.sources, page.difference)]
     page.sliders["mean"].value = 0.4
     opened.settle(lambda: opened.shows(preview=True))
     simulated, measured, difference = (*page.sources, page.difference)
     assert simulated.data["image"][0] is not data[0]["image"][0]
     assert measured.data["image"][0] is data[1]["image"][0] and difference.data["image"][0] is data[2]["image"][0]
-    assert (page.colors.low, page.colors.high) == limits
+    assert _limits(page) == limits
     page.sliders["mean"].trigger("value_throttled", None, 0.4)
     opened.settle(opened.shows)
-    assert (page.colors.low, page.colors.high) != limits
+    assert _limits(page) != limits
     page.smoothing.value = 2.0  # changes both maps
     opened.settle(lambda: opened.shows(preview=True))
     assert not np.array_equal(measured.data["image"][0], data[1]["image"][0], equal_nan=True)
@@ -181,7 +189,7 @@ def test_difference_and_blink(opened):
     assert np.array_equal(image(page.difference), expected, equal_nan=True)
     assert page.difference_colors.low == -page.difference_colors.high < 0
     # the bar beside the difference is its own
-    (bar,) = [each for each in page.maps[1].right if getattr(each, "color_mapper", None) and each.visible]
+    (bar,) = [each for each in page.maps[1].below if getattr(each, "color_mapper", None) and each.visible]
     assert bar.color_mapper is page.difference_image.glyph.color_mapper and bar.title
     assert page.bars[0].visible
     page.mode.active = MODES.index("blink")
@@ -224,7 +232,7 @@ def test_a_line_gives_profiles(opened):
 
 def test_a_click_shows_atoms(opened):
     page = opened.page
-    page._clicked(SimpleNamespace(x=5.0, y=-3.0))
+    page._clicked(page.maps[0], SimpleNamespace(x=5.0, y=-3.0))
     atoms = page.explorer.atoms_at(page.shown.view, 5.0, -3.0, page.radius.value)
     assert len(atoms) > 0 and f"{len(atoms)} atoms land within" in page.specimen.title.text
     assert np.array_equal(page.atoms.data["x"], atoms.positions[:, 0])
@@ -260,7 +268,7 @@ def test_a_registration_is_typed(run, measured):
     assert page.explorer.registration == ae.Registration(30.0, 0.9, (1.0, 2.0), True)
     opened.settle(lambda: not np.array_equal(image(page.sources[0]), before, equal_nan=True))
     assert "--registration=30.0,0.9,1.0,2.0,mirror" in page.shell.text
-    page.latest.close()
+    page.close()
 
 
 def test_errors_and_warnings_are_shown(opened):
@@ -278,13 +286,174 @@ def test_errors_and_warnings_are_shown(opened):
 def test_one_map_without_a_measurement(run):
     opened = Opened(Explorer(run), view=View(ae.LateralVelocity(0.2), 32, 4.0))
     page = opened.page
-    assert len(page.maps) == 1 and not page.mode.visible and not page.registration.visible
+    assert len(page.maps) == 1 and not page.mode.visible and page.tool.labels == ["move", "atoms", "line", "box"]
     assert page.mechanism.active == 1 and page.sliders["relative_spread"].value == 0.0
     throttled(page.sliders["mean"], 0.3)
     opened.settle(opened.shows)
     assert "similarity" not in page.readout.text and page.shell.text.startswith("apt-evap map RUN.h5")
     page.document.validate()
-    page.latest.close()
+    page.close()
+
+
+def test_a_measurement_alone(measured):
+    opened = Opened(Explorer(None, measured, measured_arguments=["map.npz"]))
+    page = opened.page
+    assert len(page.maps) == 1 and not page.sliders and "atoms" not in page.tool.labels
+    assert np.array_equal(image(page.sources[0]), page.shown.whole.density.astype(np.float32), equal_nan=True)
+    throttled(page.smoothing, 5.0)
+    opened.settle(lambda: page.shown.view.smoothing == 5.0)
+    page.line.data = {"xs": [[-20.0, 20.0]], "ys": [[0.0, 1.0]]}
+    assert len(page.curves) == 1 and len(page.curves[0].data["y"]) > 3
+    assert "map.npz" in page.facts.text and page.chip.text == ""
+    page.document.validate()
+    page.close()
+
+
+def test_each_map_has_its_own_scale(opened):
+    page = opened.page
+    own = _limits(page)
+    assert own == [ae.plot.color_limits(each) for each in page.shown.pictures]
+    page.same_scale.active = True
+    assert _limits(page) == [ae.plot.common_limits(page.shown.pictures)] * 2
+    page._reset_display()
+    assert _limits(page) == own
+
+
+def test_what_is_not_compared_is_dimmed(run, measured):
+    opened = Opened(Explorer(run, measured, ae.Registration(0.0, 0.5, (5.0, 0.0)), preview=500))
+    page = opened.page
+    veil, shown = image(page.veil), page.shown
+    assert np.array_equal(veil != 0, shown.whole.mask & ~shown.measured.mask) and 0 < (veil != 0).mean() < 1
+    assert np.isfinite(image(page.sources[1]))[shown.whole.mask].all()
+    before = veil[veil != 0][0]
+    page._next_style()
+    assert image(page.veil)[veil != 0][0] != before and page.style.label == "dark"
+    page.close()
+
+
+def test_groups_are_reset(opened):
+    page = opened.page
+    start = page.view()
+    for slider in (page.sliders["mean"], page.smoothing, page.bins):
+        throttled(slider, slider.start + 0.5 * (slider.end - slider.start) // 1)
+    page.mechanism.active, page.ions.value = 1, (300, 900)
+    assert page.view() != start
+    for reset in (page._reset_emission, page._reset_display, page._reset_ions):
+        reset()
+    assert page.view() == start
+    opened.settle(opened.shows)
+
+
+def test_a_number_is_typed(opened):
+    """The field beside a slider moves it, and the slider the field."""
+    (field,) = opened.page.document.select({"type": Spinner, "name": "mean energy [eV]"})
+    assert field.value == opened.page.sliders["mean"].value
+    (callback,) = field.js_property_callbacks["change:value_throttled"]
+    assert callback.args["slider"] is opened.page.sliders["mean"]
+
+
+def test_the_registration_arrives(run, measured, monkeypatch):
+    """A search in the background shows its progress, and its result; another registration ends it."""
+    opened = Opened(Explorer(run, measured, preview=500))
+    page, go, ended = opened.page, threading.Semaphore(0), []
+    found = [ae.Registration(0.0, 1.0, (0.0, 0.0), score=each, overlap=1.0, method="search") for each in (0.3, 0.9)]
+
+    def register(perturbations, progress, apply):
+        for done, each in enumerate(found):
+            try:
+                progress(done, 2)
+            except Exception:
+                ended.append(done)
+                raise
+            go.acquire(timeout=SECONDS)
+            page.explorer.set_registration(each)
+        progress(2, 2)
+
+    monkeypatch.setattr(page.explorer, "register", register)
+    assert "not registered" in page.chip.text and "similarity" not in page.readout.text
+    page._register(None)
+    opened.settle(lambda: "registering" in page.chip.text and "<progress" in page.chip.text)
+    throttled(page.sliders["mean"], 0.3)  # the page goes on
+    opened.settle(opened.shows)
+    go.release()
+    opened.settle(lambda: "similarity" in page.readout.text and 'value="1"' in page.chip.text)
+    go.release()
+    opened.settle(lambda: "progress" not in page.chip.text and page.explorer.registration.score == 0.9)
+    opened.settle(lambda: page._verdict is not None and page._verdict.verdict in page.chip.text)
+    page._register(None)
+    page._stop_search()
+    go.release()
+    opened.settle(lambda: ended)
+    assert page._progress is None and "<progress" not in page.chip.text
+    page.close()
+
+
+def test_poles_are_clicked(measured):
+    opened = Opened(Explorer(None, measured))
+    page, index = opened.page, opened.page.index
+    index.material.value = "Ni"
+    orientation, projection = ae.Orientation("Ni", axis=(1, 1, 1)), ae.detection.Projection(60.0)
+    page.tool.active = page.tool.labels.index("pole")
+    assert page.maps[0].toolbar.active_drag is index.tool
+    for plane, family in (((1, 1, 1), "111"), ((0, 0, 2), "200"), ((0, 2, 0), "200"), ((1, 1, 3), "311")):
+        index.family.value = family
+        direction = np.array(plane) / np.linalg.norm(plane)
+        ((x, y),) = projection.places(orientation.directions([direction]))
+        page._clicked(page.maps[0], SimpleNamespace(x=float(x), y=float(y)))
+    opened.settle(lambda: len(index.read().poles) == 4 and "scale 60.0" in index.text.text)
+    best, fitted, _ = index.candidates[0]
+    assert fitted.scale == pytest.approx(60.0, rel=1e-6) and "RMS 0.00" in index.text.text
+    assert len(index.poles.data["x"]) > 4 and np.isfinite(index.lines.data["x"]).sum() > 20
+    names = {}
+    exec(page.python.text, names)
+    assert np.allclose(names["orientation"].matrix, best.matrix) and names["projection"] == fitted
+    index._undo()
+    page.tool.active = page.tool.labels.index("zone line")
+    page._clicked(page.maps[0], SimpleNamespace(x=1.0, y=2.0))
+    marks = index.read()
+    assert len(marks.poles) == 3 and marks.lines == [(marks.families.index("311"), [(1.0, 2.0)])]
+    index._clear()
+    opened.settle(lambda: not index.candidates and len(index.poles.data["x"]) == 0)
+    page.close()
+
+
+def test_the_orientation_is_searched():
+    """The search is that of the library, in another process; its settings can be copied."""
+    pattern = ae.indexing.master_patterns("fcc")[0]
+    orientation = ae.Orientation("Ni", axis=(0.30, 0.54, 0.79), rotation=20.0)
+    projection = ae.detection.Projection(60.0)
+    measured = pattern.map(orientation, projection, width=70.0, ions=30_000, rolled=0.5, seed=1)
+    opened = Opened(Explorer(None, measured))
+    index = opened.page.index
+    index.material.value, index.scale.value = "Ni", 60.0
+    index._search()
+    assert index.search.disabled
+    opened.settle(lambda: not index.search.disabled)
+    found = ae.index(measured, "Ni", scales=(57.0, 63.0))
+    assert found.reason in index.text.text and found.verdict in index.text.text
+    assert len(index.candidates) == len(found.candidates)
+    assert np.array_equal(index.candidates[0][0].matrix, found.best.orientation.matrix)
+    assert not opened.page.shell.text.startswith("[")
+    index._put_code(index._settings)
+    assert opened.page.python.text == ae.twin.settings_of(found).text
+    opened.page.close()
+
+
+def test_a_file_is_opened(measured):
+    """A page without files opens one; what cannot be read leaves the page."""
+    made = []
+
+    def read(path, document):
+        if path == "bad":
+            raise ValueError("cannot read 'bad'")
+        return lambda: made.append(path)
+
+    opened = Opened(None, opened=read)
+    page = opened.page
+    page.file.value = "bad"
+    opened.settle(lambda: "cannot read" in page.notes.text)
+    page.file.value = "good"
+    opened.settle(lambda: made == ["good"])
 
 
 def test_a_slider_of_the_document_runs_the_callback(opened):

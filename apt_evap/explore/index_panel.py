@@ -1,0 +1,276 @@
+"""Index mode of the page: poles and zone lines that are clicked on the measured map, and the orientations that fit."""
+
+import multiprocessing
+import threading
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+from bokeh.layouts import column, row
+from bokeh.models import Button, CheckboxGroup, ColumnDataSource, Div, LabelSet, NumericInput, PointDrawTool, Select
+
+from apt_evap._common.codec import to_python
+from apt_evap.crystallography.orientation import Orientation
+from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.detection.hits import Hits
+from apt_evap.detection.projection import Projection
+from apt_evap.explore.latest import Latest
+from apt_evap.explore.marks import Marks, overlay
+from apt_evap.explore.widgets import LEFT
+from apt_evap.fit.fit_energies import measured_map
+from apt_evap.indexing.index import index
+from apt_evap.specimen.materials import MATERIALS
+from apt_evap.twin.settings_of import settings_of
+
+HINT = "mode “pole”: click a pole whose family you choose here; drag a mark to move it"
+
+
+class IndexPanel:
+    """Widgets and drawings of the index mode.
+
+    Parameters
+    ----------
+    fig : bokeh.plotting.figure
+        The measured map.
+    measured : callable
+        Returns the measured ions or map.
+    material : str
+        The crystal at the start.
+    later : callable
+        As for `Page`.
+    put_code : callable
+        Shows Python lines.
+    """
+
+    def __init__(
+        self,
+        fig: Any,
+        measured: Callable[[], Hits | DetectorMap],
+        material: str,
+        later: Callable[[Callable[[], None], int], Any],
+        put_code: Callable[[str], None],
+    ) -> None:
+        self._measured, self._later, self._put_code = measured, later, put_code
+        self.latest = Latest(lambda wish: wish())
+        self.candidates: list[tuple[Orientation, Projection, str]] = []
+        self._make_widgets(material)
+        self._make_drawings(fig)
+        self._material_changed()
+
+    def _make_widgets(self, material):
+        half = (LEFT - 20) // 2
+        self.material = Select(title="crystal", options=list(MATERIALS), value=material, width=half)
+        self.family = Select(title="family of the pole", width=half, options=[])
+        self.scale = NumericInput(title="scale [mm/rad]", placeholder="fitted", mode="float", low=1e-3, width=half)
+        self.centre = [
+            NumericInput(title=f"{name} of the axis [mm]", value=0.0, mode="float", width=half) for name in "xy"
+        ]
+        self.options = CheckboxGroup(labels=["mirrored"], width=half)
+        self.undo, self.new_line, self.clear = (
+            Button(label=label, width=90) for label in ("undo", "next line", "clear")
+        )
+        self.search = Button(label="search", width=90)
+        self.search.on_click(self._search)
+        self.settings = Button(label="settings file", width=110, visible=False)
+        self.settings.on_click(lambda: self._put_code(self._settings))
+        self.choice = Select(title="candidates", options=[], width=LEFT - 10, visible=False)
+        self.text = Div(text=HINT, width=LEFT - 10, styles={"color": "var(--faint)"})
+        self.material.on_change("value", lambda attr, old, new: self._material_changed())
+        for each in (self.scale, *self.centre):
+            each.on_change("value", lambda attr, old, new: self.fit())
+        self.options.on_change("active", lambda attr, old, new: self.fit())
+        self.choice.on_change("value", lambda attr, old, new: self._show_candidate())
+        self.undo.on_click(self._undo)
+        self.clear.on_click(self._clear)
+        self.new_line.on_click(self._next_line)
+        self.column = column(
+            row(self.material, self.family),
+            row(self.undo, self.new_line, self.clear),
+            row(self.search, self.settings),
+            self.text,
+            self.choice,
+            row(self.scale, self.options),
+            row(*self.centre),
+        )
+
+    def _make_drawings(self, fig):
+        self.lines = ColumnDataSource({"x": [], "y": []})
+        self.poles = ColumnDataSource({"x": [], "y": [], "label": []})
+        self.marks = ColumnDataSource({"x": [], "y": [], "family": [], "line": []})
+        fig.line("x", "y", source=self.lines, line_color="#35b6ff", line_width=1, line_alpha=0.8)
+        fig.scatter("x", "y", source=self.poles, size=7, fill_alpha=0, line_color="white")
+        shadow = {"background_fill_color": "black", "background_fill_alpha": 0.5}
+        fig.add_layout(
+            LabelSet(
+                x="x",
+                y="y",
+                text="label",
+                source=self.poles,
+                x_offset=4,
+                y_offset=3,
+                text_color="white",
+                text_font_size="10px",
+                **shadow,
+            )
+        )
+        drawn = fig.scatter("x", "y", source=self.marks, size=13, marker="cross", line_color="lime", line_width=3)
+        fig.add_layout(
+            LabelSet(
+                x="x",
+                y="y",
+                text="family",
+                source=self.marks,
+                x_offset=8,
+                y_offset=-14,
+                text_color="lime",
+                text_font_size="13px",
+                text_font_style="bold",
+            )
+        )
+        self.tool = PointDrawTool(renderers=[drawn], add=False)
+        fig.add_tools(self.tool)
+        self.marks.on_change("data", lambda attr, old, new: self.fit())
+        self._line = 1
+
+    # ---- marks -----------------------------------------------------------------------------------------------------
+
+    def add(self, x: float, y: float, of_line: bool) -> None:
+        """Add a mark of the chosen family: a pole, or a point on a zone line from the first pole to such a pole."""
+        new = {"x": x, "y": y, "family": self.family.value, "line": self._line if of_line else 0}
+        self.marks.data = {name: [*values, new[name]] for name, values in self.marks.data.items()}
+
+    def _undo(self):
+        self.marks.data = {name: list(values)[:-1] for name, values in self.marks.data.items()}
+
+    def _clear(self):
+        self._line = 1
+        self.marks.data = {name: [] for name in self.marks.data}
+
+    def _next_line(self):
+        self._line = max([0, *self.marks.data["line"]]) + 1
+
+    def _material_changed(self):
+        families = list(Marks(self.material.value).families)
+        self.family.update(options=families, value=families[0])
+        self._clear()
+
+    def read(self) -> Marks:
+        """The marks on the map."""
+        marks = Marks(self.material.value)
+        lines: dict[int, tuple[int, list[tuple[float, float]]]] = {}
+        for x, y, family, line in zip(*(self.marks.data[name] for name in ("x", "y", "family", "line")), strict=True):
+            number = marks.families.index(family)
+            if line:
+                lines.setdefault(line, (number, []))[1].append((x, y))
+            else:
+                marks.poles.append((number, (x, y)))
+        marks.lines = list(lines.values())
+        return marks
+
+    # ---- fits ------------------------------------------------------------------------------------------------------
+
+    def fit(self) -> None:
+        """Fit the marks; the candidates come later."""
+        marks = self.read()
+        if len(marks.poles) < 2 and not (marks.poles and marks.lines and self.scale.value):
+            self._put([], self._missing(marks))
+            return
+        options = {
+            "scale": self.scale.value,
+            "centre": tuple(each.value or 0.0 for each in self.centre),
+            "mirror": bool(self.options.active),
+        }
+        self.latest.ask(partial(self._fit, marks, options))
+
+    def _search(self):
+        """Search over all orientations by `index`, in another process; marks narrow it."""
+        marks = self.read()
+        options: dict[str, Any] = {
+            "poles": [place for _, place in marks.poles],
+            "lines": [(*points[0], *points[-1]) for _, points in marks.lines if len(points) > 1],
+        }
+        if self.scale.value:
+            options["scales"] = (0.95 * self.scale.value, 1.05 * self.scale.value)
+        arguments = self._measured(), self.material.value, options
+        self.search.update(label="searching", disabled=True)
+
+        def work():
+            try:
+                with multiprocessing.get_context("spawn").Pool(1) as pool:
+                    found = pool.apply(_indexed, arguments)
+            except ValueError as error:
+                found = [], str(error), ""
+            self._later(partial(self._put_searched, *found), 0)
+
+        threading.Thread(target=work, daemon=True).start()
+
+    def _put_searched(self, candidates, text, settings):
+        self.search.update(label="search", disabled=False)
+        self._settings = settings
+        self.settings.visible = bool(settings)
+        self._put(candidates, text)
+
+    def _missing(self, marks):
+        if marks.poles and marks.lines:
+            return "type a scale, or mark a second pole"
+        return "mark a second pole, or points of a zone line through the first one" if marks.poles else HINT
+
+    def _fit(self, marks, options):
+        try:
+            found = marks.fits(**options)
+        except ValueError as error:
+            self._later(partial(self._put, [], str(error)), 0)
+            return
+        rows = [(each.orientation, each.projection, f"RMS {each.rms:.2f} mm") for each in found]
+        exact = len(marks.poles) == 2 and not marks.lines and options["scale"] is None
+        hint = "two poles fit exactly: a third one decides" if exact else ""
+        self._later(partial(self._put, rows, hint), 0)
+
+    def _put(self, candidates, text):
+        self.candidates = candidates
+        self._hint = text
+        options = []
+        for number, (orientation, projection, quality) in enumerate(candidates):
+            axis = " ".join(f"{each:.2f}" for each in orientation.axis)
+            options.append((str(number), f"{number + 1}: [{axis}], {projection.scale:.1f} mm/rad, {quality}"))
+        self.choice.update(options=options, visible=bool(options))
+        if self.choice.value != "0" and options:
+            self.choice.value = "0"  # draws it
+        else:
+            self._show_candidate()
+
+    def _show_candidate(self):
+        if not self.candidates:
+            self.lines.data = {"x": [], "y": []}
+            self.poles.data = {"x": [], "y": [], "label": []}
+            self.text.text = self._hint
+            return
+        orientation, projection, quality = self.candidates[int(self.choice.value or 0)]
+        drawn = overlay(orientation, projection, measured_map(self._measured()))
+        gap = [[np.nan, np.nan]]
+        points = np.concatenate([each for line in drawn.lines for each in (line, gap)] or [gap])
+        self.lines.data = {"x": points[:, 0], "y": points[:, 1]}
+        self.poles.data = {"x": drawn.places[:, 0], "y": drawn.places[:, 1], "label": list(drawn.labels)}
+        axis = ", ".join(f"{each:.3f}" for each in orientation.axis)
+        self.text.text = (
+            f"<b>{quality}</b>, scale {projection.scale:.1f} mm/rad<br>axis [{axis}], rotation "
+            f"{orientation.rotation:.2f}°<br>{self._hint}"
+        )
+        self._put_code(
+            f"import apt_evap as ae\n\norientation = {to_python(orientation)}\nprojection = ae.detection.{projection!r}"
+        )
+
+
+def _indexed(measured, material, options):
+    """Candidates of `index`, its verdict, and the settings file of the first one as `apt-evap start` makes it."""
+    found = index(measured, material, **options)
+    rows = [
+        (each.orientation, each.projection, f"{each.confidence:.0%}, score {each.score:.2f}")
+        for each in found.candidates
+    ]
+    try:
+        settings = settings_of(found, measured if isinstance(measured, Hits) else None).text
+    except ValueError:  # no tip is small enough
+        settings = ""
+    return rows, f"{found.verdict}: {found.reason}", settings

@@ -1,0 +1,144 @@
+"""Parts of the page: folding groups, sliders with a field for the number, and square figures that fill their place."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from bokeh.layouts import column, row
+from bokeh.models import Button, ColorBar, CustomJS, Range1d, Slider, Spinner, Toggle
+from bokeh.plotting import figure
+
+LEFT = 300
+"""Width of the controls [px]."""
+NARROWEST = 320
+"""Least width of a map [px]: two of them stand side by side on a screen of 1000 px."""
+
+# the frame of a figure is seldom square: the longer direction shows more, so that both have the same scale
+_KEEP_SQUARE = """
+if (!(fig.inner_width > 0 && fig.inner_height > 0)) return
+const ratio = fig.inner_height / fig.inner_width
+for (const [range, stretch] of [[fig.x_range, Math.max(1, 1 / ratio)], [fig.y_range, Math.max(1, ratio)]]) {
+  const [low, high] = range.tags
+  const middle = (low + high) / 2, half = (high - low) / 2 * stretch
+  range.setv({start: middle - half, end: middle + half, reset_start: middle - half, reset_end: middle + half})
+}
+"""
+_COPY = """
+navigator.clipboard.writeText(text.text)
+button.label = "copied"
+setTimeout(() => { button.label = label }, 1500)
+"""
+_SAVE = """
+figures.forEach((fig, k) => Bokeh.index.find_one(fig)?.export("png", true).to_blob().then(blob => {
+  const link = document.createElement("a")
+  link.href = URL.createObjectURL(blob)
+  link.download = `map_${k + 1}.png`
+  link.click()
+}))
+"""
+
+
+def square(title: str, extent: Sequence[float], tools: Sequence[Any], **options: Any) -> Any:
+    """Figure without a toolbar for an image, with equal scales along both axes and the width of its place."""
+    fig = figure(
+        title=title,
+        sizing_mode="scale_width",
+        aspect_ratio=0.9,
+        min_width=NARROWEST - 30,
+        tools=list(tools),
+        toolbar_location=None,
+        **({"x_range": Range1d(), "y_range": Range1d()} | options),
+    )
+    fig.grid.visible = False
+    show_extent(fig, extent)
+    keep = CustomJS(args={"fig": fig}, code=_KEEP_SQUARE)
+    for name in ("inner_width", "inner_height"):
+        fig.js_on_change(name, keep)
+    fig.x_range.js_on_change("tags", keep)
+    return fig
+
+
+def show_extent(fig: Any, extent: Sequence[float]) -> None:
+    """Show a square about an area; the page stretches it to the frame of the figure."""
+    left, right, lower, upper = extent
+    half = 0.52 * max(right - left, upper - lower)
+    for each, middle in ((fig.y_range, 0.5 * (lower + upper)), (fig.x_range, 0.5 * (left + right))):
+        ends = [middle - half, middle + half]
+        if each.tags != ends:
+            each.update(start=ends[0], end=ends[1])
+            each.tags = ends
+
+
+def color_bar(mapper: Any, title: str, **options: Any) -> ColorBar:
+    """Colour bar with a label, below a figure."""
+    return ColorBar(color_mapper=mapper, height=8, title=title, orientation="horizontal", padding=4, **options)
+
+
+def number(slider: Slider) -> Any:
+    """Slider with a field in which its number can be typed."""
+    field = Spinner(
+        value=slider.value,
+        low=slider.start,
+        step=slider.step,
+        format="0[.]000",
+        width=80,
+        margin=(17, 5, 0, 0),
+        css_classes=["number"],
+        name=slider.title,
+    )
+    slider.js_link("value", field, "value")
+    field.js_on_change(
+        "value_throttled",
+        CustomJS(
+            args={"slider": slider},
+            code="const value = cb_obj.value_throttled\n"
+            "if (value == null) return\n"
+            "slider.setv({end: Math.max(slider.end, value), value})\n"
+            "slider.value_throttled = value",
+        ),
+    )
+    slider.width = LEFT - 100
+    both = row(slider, field)
+    slider.on_change("visible", lambda attr, old, new: both.update(visible=new))
+    both.visible = slider.visible
+    return both
+
+
+def group(title: str, children: Sequence[Any], reset: Callable[[], None] | None = None, active: bool = True) -> Any:
+    """Group of widgets under a title that folds it, with a button that resets them."""
+    inside = column(*children, sizing_mode="stretch_width", visible=active)
+    head = Toggle(label=title, active=active, sizing_mode="stretch_width", height=28, css_classes=["group"])
+    head.js_link("active", inside, "visible")
+    top: list[Any] = [head]
+    if reset is not None:
+        button = Button(label="reset", width=56, height=28)
+        button.on_click(reset)
+        top.append(button)
+    return column(row(*top, sizing_mode="stretch_width"), inside, sizing_mode="stretch_width")
+
+
+def grid(children: Sequence[Any]) -> Any:
+    """As many columns as the window has place for."""
+    return column(
+        *children,
+        sizing_mode="stretch_width",
+        styles={
+            "display": "grid",
+            "grid-template-columns": f"repeat(auto-fit, minmax({NARROWEST}px, 1fr))",
+            "gap": "6px",
+            "align-items": "start",
+        },
+    )
+
+
+def copy_button(label: str, text: Any) -> Button:
+    """Button that copies a text and says so."""
+    button = Button(label=label, width=150)
+    button.js_on_click(CustomJS(args={"text": text, "button": button, "label": label}, code=_COPY))
+    return button
+
+
+def save_button(figures: Sequence[Any]) -> Button:
+    """Button that saves the pictures of figures."""
+    button = Button(label="save pictures", width=110)
+    button.js_on_click(CustomJS(args={"figures": list(figures)}, code=_SAVE))
+    return button
