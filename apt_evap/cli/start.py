@@ -8,7 +8,7 @@ from apt_evap._common.threads import thread_count
 from apt_evap.cli._files import check_output, lens_of
 from apt_evap.cli._output import tell, tell_json
 from apt_evap.cli.index import indexed
-from apt_evap.twin.settings_of import MARK, Start, settings_of
+from apt_evap.twin.start import MARK, Start, settings_of
 
 
 def execute(options: argparse.Namespace) -> int:

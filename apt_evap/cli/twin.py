@@ -17,7 +17,7 @@ from apt_evap.cli.start import is_start, start_of, summary
 from apt_evap.emission.perturbations import LateralVelocity, RollUp
 from apt_evap.registration.register import Registration, register
 from apt_evap.simulation.run import load
-from apt_evap.twin.settings_of import ENERGY, FIELD_FACTOR, HEIGHT, ROLLS, SHARPNESS
+from apt_evap.twin.start import ENERGY, FIELD_FACTOR, HEIGHT, ROLLS, SHARPNESS
 
 SETTINGS, FACTS, RUN, REGISTRATION, STUDY, ANSWER = (
     "specimen.toml", "start.json", "run.h5", "registration.json", "study", "answer.txt",

@@ -21,7 +21,7 @@ from apt_evap.explore.widgets import LEFT
 from apt_evap.fit.fit_energies import measured_map
 from apt_evap.indexing.index import index
 from apt_evap.specimen.materials import MATERIALS
-from apt_evap.twin.settings_of import settings_of
+from apt_evap.twin.start import settings_of
 
 HINT = "mode “pole”: click a pole whose family you choose here; drag a mark to move it"
 

@@ -201,8 +201,8 @@ def index(
     the likelihood of the counts, with free amplitudes of both patterns and a slow change of the efficiency. The margin
     of two orientations is twice the logarithm of the ratio of their likelihoods, divided by the variance of the sums of
     neighbouring residuals of the better one in units of Poisson's. So a model that leaves structure unexplained decides
-    less. The map is `decided` if the margin to the next orientation that differs by more than 6 degrees is above 12, and
-    without marks of a user no such orientation explains more than 0.8 of what the first one explains.
+    less. The map is `decided` if the margin to the next orientation that differs by more than 6 degrees is above 12,
+    and without marks of a user no such orientation explains more than 0.8 of what the first one explains.
 
     The axis is that at the centre of the field of view. An orientation and its mirror image look the same in crystals
     with mirror planes: a map does not decide its handedness.

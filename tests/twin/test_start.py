@@ -8,7 +8,7 @@ import pytest
 import apt_evap as ae
 from apt_evap.cli.main import main
 from apt_evap.indexing.master_pattern import master_patterns
-from apt_evap.twin.settings_of import FIELD_FACTOR, MARK
+from apt_evap.twin.start import FIELD_FACTOR, MARK
 
 
 @pytest.fixture(scope="module")
