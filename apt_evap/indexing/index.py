@@ -4,7 +4,7 @@ from __future__ import annotations  # help() then shows ArrayLike instead of its
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -33,6 +33,7 @@ RIVAL = 0.8
 LEAST_COMPRESSION, LARGEST_COMPRESSION = 1.2, 2.2
 """Image compressions between which the scale is searched, if only the flight length is known."""
 _STARTS, _FINAL = 12, 6  # orientations that are refined, and that are refined to the end
+_QUICK, _RIVALS = 7, 4  # steps of a first refinement; orientations of each other structure that are tried
 _BEYOND = 1.1  # refined scales may leave their bounds by this factor: the stretch changes the scale
 _MAP_BINS = 128
 
@@ -202,7 +203,8 @@ def index(
     of two orientations is twice the logarithm of the ratio of their likelihoods, divided by the variance of the sums of
     neighbouring residuals of the better one in units of Poisson's. So a model that leaves structure unexplained decides
     less. The map is `decided` if the margin to the next orientation that differs by more than 6 degrees is above 12,
-    and without marks of a user no such orientation explains more than 0.8 of what the first one explains.
+    and without marks of a user no such orientation explains more than 0.8 of what the first one explains, and no other
+    crystal structure explains more.
 
     The axis is that at the centre of the field of view. An orientation and its mirror image look the same in crystals
     with mirror planes: a map does not decide its handedness.
@@ -245,7 +247,7 @@ def index(
     starts = search(disc, patterns, (low, high), _STARTS, marks)
     group = point_group(material.structure)
     proper = group[np.linalg.det(group) > 0]
-    found = [refined((each.pattern, each.matrix, each.scale, each.rolled), 7) for each in starts]
+    found = [refined((each.pattern, each.matrix, each.scale, each.rolled), _QUICK) for each in starts]
     found = _ranked(found)
     again = []
     for number, each in found[:_FINAL]:
@@ -259,7 +261,12 @@ def index(
         if all(misorientation(each.matrix, other.matrix, proper) > DIFFERENT for _, other in different):
             different.append((number, each))
     n = check_count(candidates, "candidates", at_least=1)
-    return _judged(measured, disc, material, patterns, different, proper, n, bool(marks))
+    answer = _judged(measured, disc, material, patterns, different, proper, n, bool(marks))
+    if answer.decided and not marks:
+        rival = _rival(disc, bins, sigma, (low, high), different[0][1], answer.best.pattern)
+        if rival:
+            answer = replace(answer, decided=False, reason=f"a {rival} crystal explains the map better")
+    return answer
 
 
 def _evidence(found):
@@ -270,6 +277,20 @@ def _evidence(found):
 
 def _ranked(found):
     return [found[k] for k in np.argsort(-_evidence(found), kind="stable")]
+
+
+def _rival(disc, bins, sigma, scales, best, pattern):
+    """Another structure that explains a map better than the best orientation, "" if there is none."""
+    for other in ("fcc", "bcc", "diamond", "hcp"):
+        if other == pattern.structure:
+            continue
+        rival = min(master_patterns(other), key=lambda each: abs(math.log(each.apex_radius / pattern.apex_radius)))
+        densities = rival.smoothed(sigma)
+        for start in search(disc, (rival,), scales, _RIVALS):
+            found = refine(bins, disc, densities, start.matrix, start.scale, start.rolled, steps=_QUICK)
+            if found.gain > best.gain:
+                return other
+    return ""
 
 
 def _scales(disc, scales, distance):

@@ -68,7 +68,10 @@ def write_study(
         page.add(paragraph(f"The maps are alike: {study.likeness.reason}."))
     page.add(*(paragraph(text, "doubt red") for text in of_registration))
     page.add(*(paragraph(text, "doubt") for text in (*others, *(f"Warning: {each}" for each in made["warnings"]))))
-    page.add(heading("Energies"), _energies(study), heading("Measured and simulated map"), _blinking(page, study))
+    similarity = f"similarity {study.optimum.score}, unperturbed {study.baselines['unperturbed']}"
+    result = f"{study.grid.name} describes the measured map best with {study.point(study.best_cell)}; {similarity}."
+    page.add(paragraph(result[:1].upper() + result[1:]))
+    page.add(heading("Measured and simulated map"), _blinking(page, study), heading("Energies"), _energies(study))
     page.add(heading("Similarity with the measured map"), _scores(study))
     page.add('<div class="matrices">', *_matrices(study), "</div>")
     page.add(paragraph("Rows: standard deviation / mean. Columns: mean energy [eV]. Frame: the best point.", "note"))
