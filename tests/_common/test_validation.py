@@ -522,6 +522,15 @@ CASES = [
         {"hits": [*OBJECT, None], "lens": [*OBJECT, None]},
     ),
     (
+        ae.microscope.field_of_view,
+        {
+            "lens": ae.microscope.LocalElectrode(40e3, 20e3, 5.0),
+            "tip": ae.Tip("Ni", apex_radius=2.0),
+            "detector": ae.Detector(distance=90.0, width=45.0),
+        },
+        {"lens": [*OBJECT, None], "tip": [*OBJECT, None], "detector": [*OBJECT, None]},
+    ),
+    (
         ae.reconstruction.checks,
         {"reconstruction": ae.reconstruct(hits, atomic_volume=0.011, distance=100.0, radius=30.0)},
         {"reconstruction": [*OBJECT, None], "radius": POSITIVE},
