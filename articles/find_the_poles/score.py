@@ -3,13 +3,12 @@
     apt-evap dataset study.toml -o set --workers 2
     python score.py set > score.txt
 
-A line for every map: structure, emission, ions, verdict, margin of the verdict, largest error of a direction at three
+A line for every map: structure, emission, ions, verdict, largest error of a direction at three
 places of the map [degrees], and the poles found: true poles on the map that have a pole of the same family within 2
 degrees. At the end the table of the README.
 """
 
 import argparse
-import re
 import time
 
 import numpy as np
@@ -79,7 +78,6 @@ def main():
         start = time.perf_counter()
         found = ae.index(map, element, scales=bounds)
         seconds = time.perf_counter() - start
-        margin = float(re.search(r"margin ([-\d.inf]+)", found.reason)[1])
         group = point_group(about["structure"])
         truth = projection.directions(PLACES) @ np.asarray(about["orientation"])
         off = error(found.best, truth, PLACES, group)
@@ -90,7 +88,7 @@ def main():
         if "probability" in about["emission"]:
             name += " of a part"
         rows.append((about["structure"], name, len(example.hits), found.decided, off, right, len(places), seconds))
-        print(*rows[-1][:3], found.verdict, f"margin {margin:.1f} off {off:.1f} poles {right}/{len(places)}",
+        print(*rows[-1][:3], found.verdict, f"off {off:.1f} poles {right}/{len(places)}",
               f"score {found.best.score:.2f} {seconds:.1f} s", flush=True)  # fmt: skip
     if not options.wrong:
         table(rows)

@@ -5,7 +5,7 @@ import pytest
 
 import apt_evap as ae
 from apt_evap.crystallography.symmetry import point_group
-from apt_evap.indexing.index import DECIDED
+from apt_evap.indexing.index import DECIDED, LEAST_IONS
 from apt_evap.indexing.marks import marks_of
 from apt_evap.indexing.master_pattern import master_patterns
 from apt_evap.indexing.refine import bins_of, deviance, refine
@@ -206,6 +206,14 @@ def test_marks_of_a_wrong_form_are_refused():
         ae.index(map, "Ni", scales=(50.0, 60.0), distance=90.0)
     with pytest.raises(ValueError, match="patterns"):
         ae.index(map, "Ni", patterns=master_patterns("bcc"))
+
+
+def test_few_ions_do_not_decide(monkeypatch):
+    _, map = made("fcc", (0.30, 0.54, 0.79), 20.0, ions=20_000)
+    assert quickly(map, "Ni").decided and map.ions > LEAST_IONS
+    monkeypatch.setattr("apt_evap.indexing.index.LEAST_IONS", 30_000)
+    found = quickly(map, "Ni")
+    assert not found.decided and f"{map.ions:,}" in found.reason
 
 
 def test_the_picture_of_an_answer_shows_its_candidates():
