@@ -327,8 +327,8 @@ cdef class Octree:
         for k in range(sources.n_cells):
             cell = &self.cells[sources.cell[k], 0]
             dx, dy, dz = cell[0] - centre[0], cell[1] - centre[1], cell[2] - centre[2]
-            if dx * dx + dy * dy + dz * dz <= SAME_PLACE:
-                continue   # a leaf of one atom, which was removed
+            if cell[3] == 0.0:
+                continue   # a leaf whose atoms were removed: a flight may start at its place
             part = near if dx * dx + dy * dy + dz * dz <= far_radius * far_radius else far
             at = part.n_cells
             part.cells[at], part.cells[part.capacity + at] = <float>dx, <float>dy

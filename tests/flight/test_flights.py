@@ -338,6 +338,30 @@ def test_flights_follow_the_events(tip12):
         assert np.array_equal(alone[0], end[event])
 
 
+def test_a_group_starts_at_the_place_of_a_leaf_whose_atom_is_gone():
+    """The empty cell there has no field: the flights of the group leave together, in the usual number of steps."""
+    random = np.random.default_rng(4)
+    for _ in range(40):
+        atoms = random.normal(size=(60, 3))
+        charges = np.ones(60)
+        charges[0] = 0.0
+        atoms[0] *= 2.5 / np.linalg.norm(atoms[0])
+        starts = atoms[0] * (1 + 0.04 * np.array([0.0, 1, 1, 1, 1, 1, 1]))[:, None]
+        launches = random.normal(scale=0.5, size=(7, 3))
+        tree = Octree(atoms, charges, leaf_size=1)
+        end, outcome, flights = fly(tree, starts, launches, groups=[0, 7], opening_angle=0.3)
+        alone, *_ = fly(tree, starts, launches)
+        assert (outcome == LEFT).all() and flights.n_steps < 25  # 13 to 16; 500 and more if one of them hits an atom
+        # directions: the opening angle of 0.3 against direct sums
+        directions = [each[:, 3:6] / np.linalg.norm(each[:, 3:6], axis=1)[:, None] for each in (end, alone)]
+        assert np.abs(directions[0] - directions[1]).max() < 2e-3
+
+
+def test_a_launch_that_starts_at_an_atom_is_given_up_soon():
+    end, outcome, flights = fly(POINT, np.zeros((1, 3)), np.zeros((1, 3)), opening_angle=0.3)
+    assert outcome[0] == NEVER_LEFT and flights.n_steps < 20 and np.isfinite(end[0, :3]).all()
+
+
 def test_flights_halt_and_go_on(tip12):
     """Halted, they take no ion; batch by batch the surface is followed to the state it has after all events."""
     emitter = ae.evaporation.Emitter(tip12)

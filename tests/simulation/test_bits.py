@@ -14,7 +14,7 @@ import pytest
 import apt_evap as ae
 from apt_evap.config.simulation_file import read_config
 
-FINGERPRINT = "c33de221a7025b190e703cc033055109c6df9aee6b97e8e2e1e935b8af04016e"
+FINGERPRINT = "c10f372b622eda9c71898bc1640525062d8822489ef648c2ba1366fdf1546235"
 PROGRAM = """
 import warnings
 
