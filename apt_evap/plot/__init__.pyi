@@ -12,6 +12,7 @@ from .maps import describe as describe
 from .maps import detector_map as detector_map
 from .maps import detector_maps as detector_maps
 from .overlays import overlay as overlay
+from .overlays import score_surface as score_surface
 from .pole_labels import poles as poles
 from .profiles import profile as profile
 from .profiles import profile_comparison as profile_comparison

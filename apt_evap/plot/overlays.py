@@ -1,15 +1,16 @@
-"""Overlay of a registered simulated map on a measured one."""
+"""Overlay of a registered simulated map on a measured one, and the scores that the registration chose from."""
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
+from apt_evap._common.validation import check_kind
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.plot._figure import OUTSIDE, DrawnAxes, add_colorbar, new_figure, set_caption, set_title
 from apt_evap.plot.maps import detector_map
 from apt_evap.registration.correlation_search import BROAD, View
-from apt_evap.registration.register import Registration
+from apt_evap.registration.register import Registration, ScoreSurface
 
 BRIGHT, DARK, RIM = "cyan", "lime", "white"
 _SMOOTHING = 0.015
@@ -110,3 +111,49 @@ def _caption(registration):
     else:
         quality = "as given"
     return f"{registration}\n{quality}"
+
+
+def score_surface(surface: ScoreSurface, ax: Axes | None = None) -> Axes:
+    """Draw the score of a registration against rotation and scale, with its maximum.
+
+    Parameters
+    ----------
+    surface : ScoreSurface
+        Result of `registration.score_surface`, for at least two rotations and two scales.
+    ax : matplotlib.axes.Axes, optional
+        A new figure by default.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+
+    Raises
+    ------
+    ValueError
+        If there are too few rotations or scales, or no score is known.
+
+    Examples
+    --------
+    >>> run = ae.Simulation(ae.Tip("Ni", apex_radius=2.5, axis=(1, 1, 1)), seed=1).run(400)
+    >>> simulated = run.hits(ae.RollUp(0.2)).map(bins=32)
+    >>> surface = ae.registration.score_surface(simulated, simulated, rotations=(-60, 60), scales=(0.9, 1.1))
+    >>> ax = ae.plot.score_surface(surface)             # ax.figure.savefig("score_surface.png")
+    """
+    check_kind(surface, "surface", ScoreSurface, "a ScoreSurface")
+    if min(surface.scores.shape) < 2 or not np.isfinite(surface.scores).any():
+        raise ValueError(
+            f"surface must have two rotations, two scales and a score, got {surface.scores.shape[1]} and "
+            f"{surface.scores.shape[0]}"
+        )
+    ax = new_figure((6.0, 4.0)).add_subplot() if ax is None else ax
+    image = ax.pcolormesh(surface.rotations, surface.scales, surface.scores, shading="nearest", cmap="viridis")
+    row, column = np.unravel_index(np.nanargmax(surface.scores), surface.scores.shape)
+    best = surface.rotations[column], surface.scales[row]
+    ax.plot(*best, "o", markersize=11, markerfacecolor="none", markeredgecolor="white", markeredgewidth=1.5)
+    ax.set_xlabel("Rotation [degrees]")
+    ax.set_ylabel("Scale [measured mm per simulated mm]")
+    ax.set_title(
+        f"score {surface.scores[row, column]:.2f} at {best[0]:.0f} degrees and {best[1]:.3g}", fontsize="medium"
+    )
+    ax.figure.colorbar(image, ax=ax, label="score", fraction=0.05, pad=0.02)
+    return ax

@@ -5,7 +5,7 @@ from __future__ import annotations  # help() then shows ArrayLike instead of its
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -35,6 +35,7 @@ from apt_evap.warnings import RegistrationWarning
 DOUBTFUL = 0.5
 """Limit of score times square root of the overlap. Wrong transforms reach 0.25 on noise, 0.5 on maps of other poles."""
 _MAX_FITS = 12  # transforms that are refined: twice the number of symmetric ones of a threefold axis with mirrors
+_AT_BOUND = 0.01  # part of the range of a search within which a result is at its bound
 _BINS = 384  # bins of a map of simulated hits
 
 
@@ -272,7 +273,8 @@ def register(
     Warns
     -----
     RegistrationWarning
-        If the search had no start, and the score is in the range of unrelated maps.
+        If the search had no start, and the score is in the range of unrelated maps, or if rotation, scale or shift are
+        at a bound of the search.
 
     Notes
     -----
@@ -343,7 +345,84 @@ def register(
     best, *ties = (_registration(fit, method) for fit in fits)
     best = replace(best, ties=tuple(ties))
     best.warn_if_doubtful()
+    at = _bounds_reached(fits[0].transform, *bounds)
+    if at:
+        warnings.warn(
+            f"the registration is at a bound of its search: {', '.join(at)}; widen it, or check the maps and the axis "
+            "of the simulated specimen",
+            RegistrationWarning,
+            stacklevel=2,
+        )
     return best
+
+
+class ScoreSurface(NamedTuple):
+    """Best correlation of two maps for every rotation and scale, over all shifts: the answer of `score_surface`."""
+
+    rotations: Floats
+    """[degrees], shape (n,)."""
+    scales: Floats
+    """[measured mm per simulated mm], shape (m,)."""
+    scores: Floats
+    """Correlation in the common area, times the square root of the overlap; NaN without overlap, shape (m, n)."""
+    mirror: bool
+    """Whether the simulated map is mirrored."""
+
+
+def score_surface(
+    simulated: DetectorMap | Hits,
+    measured: DetectorMap | Hits,
+    *,
+    scales: tuple[float, ...],
+    rotations: tuple[float, ...] = (0.0, 354.0),
+    mirror: bool = False,
+    overlap: float = 0.5,
+) -> ScoreSurface:
+    """Correlation of two maps as a function of rotation and scale: what `register` chooses from.
+
+    One sharp maximum is a registration that can be trusted. Several equal ones are the symmetry of the pole. A ridge
+    along the scale, as for lines that cross in a single pole, says that the maps do not determine it.
+
+    Parameters
+    ----------
+    simulated, measured, overlap
+        As in `register`.
+    scales : tuple of float
+        Lower and upper bound [measured mm per simulated mm], in steps of at most 5 %.
+    rotations : tuple of float
+        Lower and upper bound [degrees], in steps of at most 3 degrees.
+    mirror : bool
+        Whether the simulated map is mirrored.
+
+    Returns
+    -------
+    ScoreSurface
+
+    Raises
+    ------
+    ValueError
+        If an argument is outside its range.
+
+    Examples
+    --------
+    >>> run = ae.Simulation(ae.Tip("Ni", apex_radius=2.5, axis=(1, 1, 1)), seed=1).run(400)
+    >>> simulated = run.hits(ae.RollUp(0.2))
+    >>> measured = ae.Registration(rotation=20.0, scale=0.3, shift=(1.0, 2.0)).hits(simulated)
+    >>> maps = simulated.map(bins=32), measured.map(bins=32)
+    >>> surface = ae.registration.score_surface(*maps, rotations=(0, 60), scales=(0.25, 0.35))
+    >>> best = np.unravel_index(np.nanargmax(surface.scores), surface.scores.shape)
+    >>> print(f"{surface.rotations[best[1]]:.0f} degrees, {surface.scales[best[0]]:.2f}")
+    21 degrees, 0.30
+    """
+    simulated, measured = (_view(value, name) for value, name in ((simulated, "simulated"), (measured, "measured")))
+    turns = _steps(_range(rotations, "rotations", unit="degrees"), ROTATION_STEP / 2)
+    factors = np.exp(_steps(np.log(_range(scales, "scales", above=0)), SCALE_STEP / 2))
+    mirror, least = check_switch(mirror, "mirror"), check_number(overlap, "overlap", above=0, at_most=1)
+    scores = np.full((len(factors), len(turns)), np.nan)
+    for fit in search(simulated, measured, turns, factors, (mirror,), least):
+        row = np.argmin(np.abs(factors - fit.transform.scale))
+        scores[row, np.argmin(np.abs(turns - fit.transform.rotation))] = fit.rank
+    return ScoreSurface(turns, factors, scores, mirror)
 
 
 def register_distortion(
@@ -504,6 +583,23 @@ def _near(start, pole, tolerance, measured):
     if tolerance is None:
         tolerance = fraction * measured.diameter
     return Near(anchor, place, check_number(tolerance, "tolerance", at_least=0, unit="mm"))
+
+
+def _bounds_reached(transform, rotations, scales, near):
+    """What of a transform is within 1 % of a bound of the search, in words."""
+    found = []
+    for name, value, ends in (("rotation", transform.rotation, rotations), ("scale", transform.scale, scales)):
+        if ends is not None and ends[1] > ends[0]:
+            low, high = ends
+            if name == "rotation":
+                value = low + (value - low + 180.0) % 360.0 - 180.0 if value < low or value > high else value
+            if min(value - low, high - value) < _AT_BOUND * (high - low):
+                found.append(f"{name} {value:.4g} of {low:.4g} to {high:.4g}")
+    if near is not None and near.tolerance > 0:
+        away = transform.forth(near.anchor) - near.place
+        if max(abs(away.real), abs(away.imag)) > (1 - 2 * _AT_BOUND) * near.tolerance:
+            found.append(f"shift ({away.real:.2g}, {away.imag:.2g}) mm of at most {near.tolerance:.2g} mm (tolerance)")
+    return found
 
 
 def _view(value, name):

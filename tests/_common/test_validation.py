@@ -611,6 +611,15 @@ CASES = [
     (ae.maps.effective_ions, {}, {"map": [*OBJECT, None]}),
     (ae.io.read_grid, {}, {"path": [None, 3, NAN, [], "a\0b", "none.csv"]}),
     (ae.read_tip, {}, {"path": [None, 3, NAN, [], "a\0b", "none.lmp"]}),
+    (
+        ae.registration.score_surface,
+        {"simulated": grid, "measured": grid, "scales": (0.9, 1.1)},
+        {
+            "simulated": [*OBJECT, None],
+            "scales": [None, "x", (0.0, 1.0), (2.0, 1.0)],
+            "rotations": [None, "x", (2.0, 1.0)],
+        },
+    ),
     (ae.registration.register_distortion, {"simulated": grid, "measured": grid}, {"registration": [*OBJECT, None]}),
     (
         ae.registration.Distortion,

@@ -128,19 +128,36 @@ def test_what_is_known_is_kept(map_of, simulated):
     start = ae.Registration(8.0, 0.5, (11.0, 1.0), True)
     found = register(simulated, map, start=start)
     rotation, stretch, distance = off(found, true, 30)
-    assert found.method == "start" and found.mirror
+    assert found.method == "start" and found.mirror  # and no warning: nothing is at a bound
     assert rotation < 1 and stretch < 0.01 and distance < 0.01
     fixed = register(simulated, map, start=start, scales=0.44, rotations=15.0)
     assert (fixed.scale, fixed.rotation) == pytest.approx((0.44, 15.0), rel=1e-12)
     assert fixed.score < found.score
-    bound = register(simulated, map, start=start, scales=(0.46, 0.5), rotations=(18.0, 25.0))
+    with pytest.warns(RegistrationWarning, match="rotation 18 .* scale 0.46"):
+        bound = register(simulated, map, start=start, scales=(0.46, 0.5), rotations=(18.0, 25.0))
     assert 0.46 <= bound.scale <= 0.5 and 18 <= bound.rotation <= 25
     wrong = ((0.0, 0.0), (8.5, 3.0))
-    held = register(simulated, map, pole=wrong, tolerance=0.2, scales=(0.43, 0.47))
+    with pytest.warns(RegistrationWarning, match=r"shift .*\(tolerance\)"):
+        held = register(simulated, map, pole=wrong, tolerance=0.2, scales=(0.43, 0.47))
     assert held.method == "pole" and held.mirror
     assert np.abs(np.subtract(held.points(0.0, 0.0), wrong[1])).max() <= 0.2 + 1e-9
-    plain = register(simulated, map, start=start, mirrors=(False,), tolerance=30.0)
+    with pytest.warns(RegistrationWarning, match="bound"):
+        plain = register(simulated, map, start=start, mirrors=(False,), tolerance=30.0)
     assert not plain.mirror and plain.score < found.score - 0.1
+
+
+def test_the_score_surface_has_its_maximum_at_the_registration(map_of, simulated):
+    map = map_of(ae.Registration(17.0, 0.45, (8.0, 3.0)), 30, 2)
+    surface = ae.registration.score_surface(simulated, map, scales=(0.36, 0.55), rotations=(-30.0, 80.0))
+    assert surface.scores.shape == (len(surface.scales), len(surface.rotations)) and not surface.mirror
+    row, column = np.unravel_index(np.nanargmax(surface.scores), surface.scores.shape)
+    assert abs(surface.rotations[column] - 17.0) <= 3.0  # one step of the grid
+    assert abs(np.log(surface.scales[row] / 0.45)) <= 0.05
+    assert surface.scores[row, column] > np.nanmedian(surface.scores) + 0.3  # 0.8 and 0.2
+    ax = ae.plot.score_surface(surface)
+    assert f"{surface.scores[row, column]:.2f}" in ax.get_title()
+    with pytest.raises(ValueError, match="surface"):
+        ae.plot.score_surface(surface._replace(scores=surface.scores[:1]))
 
 
 @pytest.mark.slow
