@@ -205,6 +205,8 @@ class Explorer:
         self.registered = registration is not None
         """Whether the registration was found or given, not only set to show both maps in the same size."""
         self.registration = registration
+        self.near: dict[str, Any] = {}
+        """Options of `register` that say where the run is on the measurement."""
         if run is not None and measured is not None and registration is None:
             self.registration = self._same_size()
 
@@ -298,7 +300,7 @@ class Explorer:
         progress = progress or (lambda done, number: None)
         progress(0, len(perturbations))
         for done, each in enumerate(perturbations, 1):
-            arguments = self.run.hits(each), target
+            arguments = self.run.hits(each), target, self.near
             found = _registration(*arguments) if apply is None else apply(_registration, arguments)
             progress(done, len(perturbations))
             if best is None or found.score > best.score:
@@ -693,10 +695,10 @@ class Explorer:
         return [*lines, f"ae.plot.detector_maps([{pictures}])[0].figure.savefig('maps.png')"]
 
 
-def _registration(simulated, measured):
+def _registration(simulated, measured, near):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AptWarning)  # given once, for the best one
-        return register(simulated, measured)
+        return register(simulated, measured, **near)
 
 
 def _maps(shown):

@@ -3,6 +3,7 @@
 import multiprocessing
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -19,9 +20,9 @@ from apt_evap.explore.latest import Latest
 from apt_evap.explore.marks import Marks, overlay
 from apt_evap.explore.widgets import LEFT
 from apt_evap.fit.fit_energies import measured_map
-from apt_evap.indexing.index import index
+from apt_evap.indexing.index import Indexing, index
 from apt_evap.specimen.materials import MATERIALS
-from apt_evap.twin.start import settings_of
+from apt_evap.twin.start import Start, settings_of
 
 HINT = "mode “pole”: click a pole whose family you choose here; drag a mark to move it"
 
@@ -54,6 +55,7 @@ class IndexPanel:
         self._measured, self._later, self._put_code = measured, later, put_code
         self.latest = Latest(lambda wish: wish())
         self.candidates: list[tuple[Orientation, Projection, str]] = []
+        self._found: Indexing | None = None  # of the search that gave the candidates
         self._make_widgets(material)
         self._make_drawings(fig)
         self._material_changed()
@@ -68,12 +70,10 @@ class IndexPanel:
         ]
         self.options = CheckboxGroup(labels=["mirrored"], width=half)
         self.undo, self.new_line, self.clear = (
-            Button(label=label, width=90) for label in ("undo", "next line", "clear")
+            Button(label=label, width=62) for label in ("undo", "next line", "clear")
         )
-        self.search = Button(label="search", width=90)
+        self.search = Button(label="search", width=68)
         self.search.on_click(self._search)
-        self.settings = Button(label="settings file", width=110, visible=False)
-        self.settings.on_click(lambda: self._put_code(self._settings))
         self.choice = Select(title="candidates", options=[], width=LEFT - 10, visible=False)
         self.text = Div(text=HINT, width=LEFT - 10, styles={"color": "var(--faint)"})
         self.material.on_change("value", lambda attr, old, new: self._material_changed())
@@ -86,8 +86,7 @@ class IndexPanel:
         self.new_line.on_click(self._next_line)
         self.column = column(
             row(self.material, self.family),
-            row(self.undo, self.new_line, self.clear),
-            row(self.search, self.settings),
+            row(self.undo, self.new_line, self.clear, self.search),
             self.text,
             self.choice,
             row(self.scale, self.options),
@@ -192,24 +191,43 @@ class IndexPanel:
         }
         if self.scale.value:
             options["scales"] = (0.95 * self.scale.value, 1.05 * self.scale.value)
-        arguments = self._measured(), self.material.value, options
+        arguments = self._measured(), self.material.value
         self.search.update(label="searching", disabled=True)
 
         def work():
             try:
                 with multiprocessing.get_context("spawn").Pool(1) as pool:
-                    found = pool.apply(_indexed, arguments)
+                    found = pool.apply(index, arguments, options)
             except ValueError as error:
-                found = [], str(error), ""
-            self._later(partial(self._put_searched, *found), 0)
+                self._later(partial(self._put_searched, None, str(error)), 0)
+            else:
+                self._later(partial(self._put_searched, found, f"{found.verdict}: {found.reason}"), 0)
 
         threading.Thread(target=work, daemon=True).start()
 
-    def _put_searched(self, candidates, text, settings):
+    def _put_searched(self, found, text):
         self.search.update(label="search", disabled=False)
-        self._settings = settings
-        self.settings.visible = bool(settings)
-        self._put(candidates, text)
+        rows = [] if found is None else [
+            (each.orientation, each.projection, f"{each.confidence:.0%}, score {each.score:.2f}")
+            for each in found.candidates
+        ]  # fmt: skip
+        self._put(rows, text, found)
+
+    def settings(self, minutes: float, threads: int) -> Start:
+        """Settings of a simulation of the chosen candidate, as ``apt-evap start`` makes them; in any thread."""
+        if not self.candidates:
+            raise ValueError("index the map first: click poles, or search")
+        number, measured = int(self.choice.value or 0), self._measured()
+        found = self._found
+        if found is None:  # poles that were clicked
+            found = index(measured, self.candidates[number][0].material, start=self.candidates[number][:2])
+        elif number:
+            first = found.candidates[number]
+            others = tuple(each for each in found.candidates if each is not first)
+            reason = "chosen by hand; another orientation explains the map better"
+            found = replace(found, candidates=(first, *others), decided=False, reason=reason)
+        hits = measured if isinstance(measured, Hits) else None
+        return settings_of(found, hits, minutes=minutes, threads=threads)
 
     def _missing(self, marks):
         if marks.poles and marks.lines:
@@ -227,8 +245,8 @@ class IndexPanel:
         hint = "two poles fit exactly: a third one decides" if exact else ""
         self._later(partial(self._put, rows, hint), 0)
 
-    def _put(self, candidates, text):
-        self.candidates = candidates
+    def _put(self, candidates, text, found=None):
+        self.candidates, self._found = candidates, found
         self._hint = text
         options = []
         for number, (orientation, projection, quality) in enumerate(candidates):
@@ -260,17 +278,3 @@ class IndexPanel:
         self._put_code(
             f"import apt_evap as ae\n\norientation = {to_python(orientation)}\nprojection = ae.detection.{projection!r}"
         )
-
-
-def _indexed(measured, material, options):
-    """Candidates of `index`, its verdict, and the settings file of the first one as `apt-evap start` makes it."""
-    found = index(measured, material, **options)
-    rows = [
-        (each.orientation, each.projection, f"{each.confidence:.0%}, score {each.score:.2f}")
-        for each in found.candidates
-    ]
-    try:
-        settings = settings_of(found, measured if isinstance(measured, Hits) else None).text
-    except ValueError:  # no tip is small enough
-        settings = ""
-    return rows, f"{found.verdict}: {found.reason}", settings

@@ -46,6 +46,7 @@ from apt_evap.explore.explorer import Commands, Explorer, Shown, View
 from apt_evap.explore.index_panel import IndexPanel
 from apt_evap.explore.latest import Latest
 from apt_evap.explore.marks import plain
+from apt_evap.explore.run_panel import RunPanel, Workbench
 from apt_evap.explore.style import STYLES, VEIL, WIDGETS, page_styles, theme
 from apt_evap.explore.surface_image import COLORED_BY, SIDES, specimen_image
 from apt_evap.explore.widgets import (
@@ -110,6 +111,8 @@ class Page:
         Reads a file, from its path and the document; the function that it returns makes the page again.
     later : callable, optional
         Calls a function in the thread of the document, after a delay [ms]; by default the document itself does.
+    bench : Workbench, optional
+        What outlives the page.
     """
 
     def __init__(
@@ -120,7 +123,9 @@ class Page:
         registration_of: Callable[[str], Registration] | None = None,
         opened: Callable[[str, Document], Callable[[], None]] | None = None,
         later: Callable[[Callable[[], None], int], Any] | None = None,
+        bench: Workbench | None = None,
     ) -> None:
+        self._bench = Workbench() if bench is None else bench
         self.explorer: Any = explorer
         self.document = document
         self._later = self._call_later if later is None else later
@@ -166,6 +171,7 @@ class Page:
         self.latest.close()
         if self.index is not None:
             self.index.latest.close()
+            self.simulate.close()
 
     @property
     def both(self) -> bool:
@@ -304,6 +310,10 @@ class Page:
             self.index = IndexPanel(
                 self.maps[-1], lambda: explorer.measured, self._material(), self._later, self._put_python
             )
+            self.simulate = RunPanel(
+                self.index.settings, f"{Path(explorer.names[1]).stem}.toml", self._bench, self._later,
+                self._put_python, self._open if self._opened else None,
+            )  # fmt: skip
             for name in ("pole", "zone line"):
                 self._drags[-1][name] = self.index.tool
         tools = [each for each in TOOLS if self._is_served(each)]
@@ -390,6 +400,7 @@ class Page:
             groups.append(group("ions", [self.ions, number(self.radius)], self._reset_ions))
         if self.index is not None:
             groups.append(group("index", [self.index.column], active=explorer.run is None))
+            groups.append(group("simulate", [self.simulate.column], active=explorer.run is None))
         if self.both:
             groups.append(
                 group("registration", [row(self.register_all, self.register), self.registration], active=False)
@@ -544,9 +555,11 @@ class Page:
     # ---- files and the registration, in the background -------------------------------------------------------------
 
     def _file_named(self):
-        path = self.file.value.strip()
-        if self._opened is None or not path:
-            return
+        if self._opened is not None and (path := self.file.value.strip()):
+            self._open(path)
+
+    def _open(self, path):
+        """Read a file in a thread, and make the page again."""
         self._put_notes([f"reading {path}"])
 
         def work():

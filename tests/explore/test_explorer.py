@@ -282,8 +282,10 @@ def test_the_best_registration_is_kept(run, measured):
     """Each better one is set at once; an error of the progress ends the search."""
     scores = iter([0.6, 0.9, 0.7])
     explorer, steps = Explorer(run, measured), []
+    explorer.near = {"rotations": 0.0}
 
     def found(function, arguments):
+        assert arguments[2] == {"rotations": 0.0}
         assert len(arguments[0]) == len(run) and arguments[1].values.shape == measured.map(128).values.shape
         return ae.Registration(0.0, 0.5, (0.0, 0.0), score=next(scores))
 

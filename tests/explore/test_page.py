@@ -22,6 +22,7 @@ from tornado.websocket import websocket_connect
 
 from apt_evap.cli._files import read_registration
 from apt_evap.explore.page import MODES, Page
+from apt_evap.explore.run_panel import Workbench
 from apt_evap.explore.server import serve
 
 SECONDS = 60  # until a test gives up: the machine may be busy
@@ -433,10 +434,69 @@ def test_the_orientation_is_searched():
     assert found.reason in index.text.text and found.verdict in index.text.text
     assert len(index.candidates) == len(found.candidates)
     assert np.array_equal(index.candidates[0][0].matrix, found.best.orientation.matrix)
-    assert not opened.page.shell.text.startswith("[")
-    index._put_code(index._settings)
-    assert opened.page.python.text == ae.twin.settings_of(found).text
+    assert index.settings(10.0, 1).text == ae.twin.settings_of(found).text
+    if len(found.candidates) > 1:
+        index.choice.value = "1"
+        assert np.array_equal(index.settings(10.0, 1).indexing.best.orientation.matrix, index.candidates[1][0].matrix)
     opened.page.close()
+
+
+def test_settings_are_written_and_run(measured, tmp_path, monkeypatch):
+    """From poles that are clicked to a run that opens; no file is replaced without a second click."""
+    monkeypatch.chdir(tmp_path)
+    asked = []
+    opened = Opened(Explorer(None, measured), opened=lambda path, document: lambda: asked.append(path))
+    page, index, panel = opened.page, opened.page.index, opened.page.simulate
+    panel._write()
+    opened.settle(lambda: not panel.write.disabled)
+    assert "index the map first" in panel.text.text and not list(tmp_path.iterdir())
+    panel._start_or_stop()
+    assert "write the settings first" in panel.text.text
+    index.material.value = "Ni"
+    orientation, projection = ae.Orientation("Ni", axis=(1, 1, 1)), ae.detection.Projection(60.0)
+    for plane, family in (((1, 1, 1), "111"), ((0, 0, 2), "200"), ((0, 2, 0), "200")):
+        index.family.value = family
+        ((x, y),) = projection.places(orientation.directions([np.array(plane) / np.linalg.norm(plane)]))
+        index.add(float(x), float(y), of_line=False)
+    opened.settle(lambda: "scale 60.0" in index.text.text)
+    path = tmp_path / "tip.toml"
+    path.write_text("mine")
+    panel.file.value, panel.minutes.value = "tip.toml", 1.0
+    panel._write()
+    assert "exists" in panel.text.text and str(path) in panel.text.text and path.read_text() == "mine"
+    panel._write()
+    opened.settle(lambda: not panel.write.disabled)
+    config = ae.config.read_config(path)
+    assert config.tip["material"].name == "Ni" and "not searched" in path.read_text()
+    assert page.python.text == path.read_text() and str(path) in panel.text.text
+    # fewer ions, for the test
+    path.write_text(path.read_text().replace(f"ions = {config.n_ions:_}", "ions = 200"))
+    panel._start_or_stop()
+    assert panel.start.label == "stop the run"
+    opened.settle(lambda: "of 200 ions" in panel.text.text or asked)
+    opened.settle(lambda: asked)
+    assert asked == [str(tmp_path / "tip.h5")] and len(ae.load(tmp_path / "tip.h5")) == 200
+    assert page._bench.near[asked[0]]["start"].shift == index.settings(1.0, 1).registration.shift
+    assert panel.start.label == "start the run"
+
+
+def test_a_page_made_again_shows_the_run(measured, tmp_path):
+    """A run outlives its page, which shows it again and stops it."""
+    run = SimpleNamespace(
+        active=True, finished=False, message="", ions=50, n_ions=200, seconds_left=20.0, output=tmp_path / "a.h5"
+    )
+    run.stop = lambda: setattr(run, "message", "stopping")
+    bench = Workbench()
+    bench.run = run
+    opened = Opened(Explorer(None, measured), bench=bench)
+    panel = opened.page.simulate
+    assert "50 of 200 ions, 20 s left" in panel.text.text and panel.start.label == "stop the run"
+    panel._start_or_stop()
+    panel._look()
+    assert "stopping" in panel.text.text
+    run.active, run.message = False, "stopped with 60 of 200 ions"
+    opened.settle(lambda: "stopped with 60" in panel.text.text)
+    assert panel.start.label == "start the run"
 
 
 def test_a_file_is_opened(measured):
