@@ -37,7 +37,7 @@ from bokeh.models import (
     WheelZoomTool,
     Widget,
 )
-from bokeh.palettes import Inferno256, Viridis256, interp_palette
+from bokeh.palettes import Inferno256, interp_palette
 from bokeh.plotting import figure
 
 from apt_evap.detection.detector_map import DetectorMap
@@ -47,8 +47,9 @@ from apt_evap.explore.index_panel import IndexPanel
 from apt_evap.explore.latest import Latest
 from apt_evap.explore.marks import plain
 from apt_evap.explore.run_panel import RunPanel, Workbench
+from apt_evap.explore.specimen_view import SIDES, SpecimenView
 from apt_evap.explore.style import STYLES, VEIL, WIDGETS, page_styles, theme
-from apt_evap.explore.surface_image import COLORED_BY, SIDES, specimen_image
+from apt_evap.explore.surface_atoms import COLORED_BY, surface_atoms
 from apt_evap.explore.widgets import (
     LEFT,
     color_bar,
@@ -149,7 +150,7 @@ class Page:
             self._make_controls(self.shown.view)
             self._make_maps()
             self._make_profile()
-            self._make_specimen()
+            self.specimen = SpecimenView()
             self._make_text()
             self.put(self.shown)
             self._put_specimen()
@@ -254,10 +255,11 @@ class Page:
         self.width = Slider(title="width of a profile [mm]", start=0.0, end=longer / 2, step=size, value=longer / 6)
         self.width.on_change("value", lambda attr, old, new: self._put_profiles())
         self.radius = Slider(title="radius of a click [mm]", start=0.0, end=longer / 10, step=size / 4, value=2 * size)
-        self.color = Select(title="atoms coloured by", value="order", options=[*COLORED_BY.items()], width=190)
-        self.side = Select(title="seen from", value="above", options=[*SIDES], width=100)
-        for each in (self.color, self.side):
-            each.on_change("value", lambda attr, old, new: self._put_specimen())
+        colors = {name: title for name, title in COLORED_BY.items() if name != "phase" or self._has_phases()}
+        self.color = Select(title="atoms coloured by", value="order", options=[*colors.items()], width=190)
+        self.color.on_change("value", lambda attr, old, new: self._put_specimen())
+        self.side = RadioButtonGroup(labels=[*SIDES], active=None)
+        self.side.on_change("active", lambda attr, old, new: self._side_changed())
         self.register = Button(label="with this emission", width=(LEFT - 20) // 2)
         self.register.on_click(lambda: self._register([self.view().perturbation]))
         self.register_all = Button(label="search again", width=(LEFT - 20) // 2)
@@ -368,18 +370,6 @@ class Page:
             color = "#4aa3ff" if name == "simulated" else "#ffb04a"
             self.profile.line("x", "y", source=source, legend_label=name, line_width=2, line_color=color)
 
-    def _make_specimen(self):
-        tools = [PanTool(), WheelZoomTool()]
-        self.specimen = square("specimen: click on a map (mode “atoms”)", (0.0, 1.0, 0.0, 1.0), tools)
-        self.specimen.toolbar.active_scroll = tools[1]
-        self.specimen_colors = LinearColorMapper(palette=Viridis256, nan_color=_OUTSIDE)
-        self.specimen_source = ColumnDataSource({"image": [], "x": [], "y": [], "dw": [], "dh": []})
-        self._draw(self.specimen, self.specimen_source, self.specimen_colors)
-        self.specimen_bar = color_bar(self.specimen_colors, COLORED_BY["order"])
-        self.specimen.add_layout(self.specimen_bar, "below")
-        self.atoms = ColumnDataSource({"x": [], "y": []})
-        self.specimen.scatter("x", "y", source=self.atoms, size=9, fill_alpha=0.0, line_color="red", line_width=2)
-
     def _make_text(self):
         self.rings = Div(width=LEFT - 10, text="rings about the pole: computed from all ions")
         self.shell, self.python = (PreText(sizing_mode="stretch_width") for _ in range(2))
@@ -415,7 +405,9 @@ class Page:
         if explorer.run is None:
             parts.append(self.profile)
         else:
-            parts.append(column(self.specimen, row(self.color, self.side), self.profile, sizing_mode="stretch_width"))
+            parts.append(
+                column(self.specimen.figure, row(self.color, self.side), self.profile, sizing_mode="stretch_width")
+            )
         code = group("code", [row(*self.copy), self.shell, self.python], active=False)
         right = column(bar, grid(parts), code, sizing_mode="stretch_width")
         if self.both:
@@ -853,19 +845,17 @@ class Page:
     def _put_specimen(self):
         if self.explorer.run is None:
             return
-        image = specimen_image(self.explorer.run, self.color.value, self.side.value, self.shown.view.ions)
-        left, right, lower, upper = image.extent
-        values = image.values[np.isfinite(image.values)]
-        low, high = (float(end) for end in np.percentile(values, [1, 99]))
-        self.specimen_colors.update(low=low, high=high if high > low else low + 1)
-        self.specimen_source.data = {
-            "image": [image.values], "x": [left], "y": [lower], "dw": [right - left], "dh": [upper - lower],
-        }  # fmt: skip
-        show_extent(self.specimen, image.extent)
-        self.specimen_bar.title = COLORED_BY[self.color.value]
-        self.specimen.xaxis.axis_label = "x [nm]"
-        self.specimen.yaxis.axis_label = "y [nm]" if self.side.value == "above" else "z [nm]"
+        atoms = surface_atoms(self.explorer.run, self.color.value, self.shown.view.ions)
+        self.specimen.put(atoms, self.color.value)
         self._put_atoms()
+
+    def _side_changed(self):
+        if self.side.active is not None:
+            self.specimen.look_from(self.side.labels[self.side.active])
+            self.side.active = None  # the same side again after a turn
+
+    def _has_phases(self):
+        return self.explorer.run is not None and len(self.explorer.run.phase_names) > 1
 
     def _put_atoms(self):
         if not self.click.data["x"]:
@@ -873,10 +863,8 @@ class Page:
         x, y, radius = (self.click.data[name][0] for name in ("x", "y", "radius"))
         atoms = self.explorer.atoms_at(self.shown.view, x, y, radius)
         assert atoms.positions is not None
-        places = atoms.positions[:, SIDES[self.side.value][:2]]
-        few = slice(None, None, max(1, math.ceil(len(atoms) / _MOST_ATOMS)))
-        self.atoms.data = {"x": places[few, 0], "y": places[few, 1]}
-        self.specimen.title.text = f"{len(atoms):,} atoms land within {radius:.2g} mm of ({x:.1f}, {y:.1f}) mm"
+        self.specimen.mark(atoms.positions[:: max(1, math.ceil(len(atoms) / _MOST_ATOMS))])
+        self.specimen.figure.title.text = f"{len(atoms):,} atoms land within {radius:.2g} mm of ({x:.1f}, {y:.1f}) mm"
 
     def _put_commands(self, commands: Commands, what):
         self.shell.text = commands.shell or f"(no command for this {what}: the measured map has no ions)"

@@ -15,7 +15,7 @@ from apt_evap.cli.main import main
 from apt_evap.cli.parser import make_parser
 from apt_evap.explore.controls import MECHANISMS, controls_of, perturbation_of, values_of
 from apt_evap.explore.explorer import Explorer, View
-from apt_evap.explore.surface_image import SIDES, specimen_image
+from apt_evap.explore.surface_atoms import surface_atoms
 
 TURNED = ae.Registration(20.0, 0.5, (1.0, -2.0), True)
 ENERGY = ae.TruncatedNormal(0.2, 0.1)
@@ -456,38 +456,29 @@ def test_perturbations_without_controls():
             values_of(perturbation)
 
 
-@pytest.mark.parametrize("side", SIDES)
-def test_the_front_atom_is_seen(run, side):
-    """At the place of an atom, the image has the value of the frontmost atom within half its diameter."""
-    run = replace(run, fields=np.random.default_rng(1).random(len(run)))  # no two are equal
-    image = specimen_image(run, "field", side, ions=(400, 2000))
-    right, up, depth = SIDES[side]
-    positions = run.emissions.positions[400:]
-    nearness = positions[:, depth] if side == "above" else -positions[:, depth]
-    left, _, lower, _ = image.extent
-    ny, nx = image.values.shape
-    pixel = (image.extent[1] - left) / nx
-    diameter = run.emissions.nearest_neighbour_distance
-    checked = 0
-    for x, y in positions[::11, [right, up]]:
-        distance = np.hypot(positions[:, right] - x, positions[:, up] - y)
-        sure, near = distance < diameter / 2 - 1.5 * pixel, distance < diameter / 2 + 1.5 * pixel
-        front = np.flatnonzero(near)[nearness[near].argmax()]
-        if sure[front]:  # no disc ends here
-            value = image.values[int((y - lower) / pixel), int((x - left) / pixel)]
-            assert value == np.float32(run.fields[400 + front])
-            checked += 1
-    assert checked > 15
-    assert np.isnan(image.values[0, 0]) and max(ny, nx) <= 480
+def test_atoms_of_the_surface(run):
+    """Seen from above and from the sides, every front atom is among them."""
+    atoms = surface_atoms(run, "field", ions=(400, 2000))
+    positions, diameter = run.emissions.positions[400:], run.emissions.nearest_neighbour_distance
+    assert len(atoms.positions) < len(positions)
+    rows = [int(np.flatnonzero((positions == each).all(axis=1))[0]) for each in atoms.positions]
+    assert np.array_equal(atoms.values, run.fields[400:][rows])
+    radius, seen = 0.6 * diameter, []  # spheres of the page
+    for depth, sign in ((2, 1), (0, 1), (0, -1), (1, 1), (1, -1)):
+        across = np.delete(positions, depth, axis=1)
+        for k in range(0, len(positions), 23):
+            rest = radius**2 - ((across - across[k]) ** 2).sum(axis=1)
+            over = np.flatnonzero(rest > 0)
+            seen.append(over[(sign * positions[over, depth] + np.sqrt(rest[over])).argmax()] in rows)
+    assert np.mean(seen) > 0.98
 
 
 def test_colours_of_the_specimen(run):
     for color, values in (("order", run.emissions.ions), ("field", run.fields), ("charge", run.charges)):
-        image = specimen_image(run, color)
-        drawn = image.values[np.isfinite(image.values)]
-        assert np.isin(drawn, values.astype(np.float32)).all() and len(np.unique(drawn)) > 100
+        assert np.isin(surface_atoms(run, color).values, values).all()
+    assert not surface_atoms(run, "phase").values.any()
     with pytest.raises(ValueError, match="color"):
-        specimen_image(run, "mass")
+        surface_atoms(run, "mass")
 
 
 # ---- command line ---------------------------------------------------------------------------------------------------

@@ -235,15 +235,20 @@ def test_a_click_shows_atoms(opened):
     page = opened.page
     page._clicked(page.maps[0], SimpleNamespace(x=5.0, y=-3.0))
     atoms = page.explorer.atoms_at(page.shown.view, 5.0, -3.0, page.radius.value)
-    assert len(atoms) > 0 and f"{len(atoms)} atoms land within" in page.specimen.title.text
-    assert np.array_equal(page.atoms.data["x"], atoms.positions[:, 0])
+    assert len(atoms) > 0 and f"{len(atoms)} atoms land within" in page.specimen.figure.title.text
+    view = page.specimen
+    assert np.array_equal(view.marked.data["px"] + view.centre[0], atoms.positions[:, 0])
     assert page.click.data == {"x": [5.0], "y": [-3.0], "radius": [page.radius.value]}
-    image_above = image(page.specimen_source)
-    page.side.value = "side"
-    assert np.array_equal(page.atoms.data["y"], atoms.positions[:, 2])
-    assert image(page.specimen_source).shape != image_above.shape and page.specimen.yaxis.axis_label == "z [nm]"
+    drawn = ae.explore.surface_atoms(page.explorer.run)
+    assert np.allclose(view.points.data["z"] + view.centre[2], drawn.positions[:, 2], atol=1e-5)
+    before = view.points.data["color"]
     page.color.value = "field"
-    assert np.nanmax(image(page.specimen_source)) <= page.explorer.run.fields.max() + 1e-4
+    assert (view.points.data["color"] != before).any() and "phase" not in dict(page.color.options)
+    assert view.colors.high <= page.explorer.run.fields.max()
+    for _ in range(2):
+        page.side.active = 0
+        assert view.points.tags == [0.0, 90.0] and page.side.active is None
+        view.points.tags = [10.0, 20.0]  # as a mouse turns it
 
 
 def test_a_rectangle_gives_commands(opened):
