@@ -432,8 +432,8 @@ def test_the_orientation_is_searched():
     opened = Opened(Explorer(None, measured))
     index = opened.page.index
     index.material.value, index.scale.value = "Ni", 60.0
-    index._search()
-    assert index.search.disabled
+    index._search(index.search)
+    assert index.search.disabled and index.search.label == "searching"
     opened.settle(lambda: not index.search.disabled)
     found = ae.index(measured, "Ni", scales=(57.0, 63.0))
     assert found.reason in index.text.text and found.verdict in index.text.text
@@ -443,6 +443,22 @@ def test_the_orientation_is_searched():
     if len(found.candidates) > 1:
         index.choice.value = "1"
         assert np.array_equal(index.settings(10.0, 1).indexing.best.orientation.matrix, index.candidates[1][0].matrix)
+    # the handles move it, and the fit starts from there
+    (x, y), (orientation, projection, _) = (index.handles.tags[:2], index.candidates[0])
+    reach = index.handles.tags[2] - x
+    index.choice.value = "0"
+    end = complex(x + 1, y) + 1.05 * reach * np.exp(1j * np.radians(4.0))
+    index.handles.data = {"x": [x + 1, end.real], "y": [y, end.imag]}
+    moved, place, quality = index.candidates[0]
+    assert quality == "moved by hand" and len(index.candidates) == len(found.candidates) + 1
+    assert place.scale == pytest.approx(1.05 * projection.scale) and place.centre == pytest.approx((x + 1, y))
+    assert moved.rotation == pytest.approx(orientation.rotation + 4.0) and moved.axis == pytest.approx(orientation.axis)
+    index.handles.data = {"x": [x], "y": [y]}  # one is deleted
+    assert len(index.handles.data["x"]) == 2 and index.candidates[0][0] is moved
+    index._search(index.refine, index.candidates[0][:2])
+    opened.settle(lambda: not index.refine.disabled)
+    assert index.candidates[0][0].matrix == pytest.approx(orientation.matrix, abs=0.005)
+    assert index.candidates[0][1].scale == pytest.approx(projection.scale, rel=0.01) and len(index.candidates) == 1
     opened.page.close()
 
 
