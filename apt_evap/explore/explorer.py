@@ -25,6 +25,7 @@ from apt_evap.detection.limits import MAX_BINS
 from apt_evap.detection.projection import Projection
 from apt_evap.emission.perturbations import Perturbation, RollUp, TruncatedNormal, Unperturbed
 from apt_evap.explore.controls import MECHANISMS, Control, controls_of, perturbation_of
+from apt_evap.explore.placement import misplaced
 from apt_evap.fit.fit_energies import BINS, measured_map
 from apt_evap.maps.profiles import Profile, Rectangle, zone_line_profile
 from apt_evap.maps.rings import Ring, ring_statistics
@@ -527,9 +528,13 @@ class Explorer:
         return tuple(ring_statistics(each, projection, fold=pole.fold) for each in _maps(shown))
 
     def likeness(self, shown: Shown) -> Likeness:
-        """Whether both maps show the same crystal along the same axis, see `likeness`."""
+        """Whether both maps show the same crystal along the same axis, see `likeness`, and lie on each other."""
         assert shown.simulated is not None and shown.measured is not None and self.registration is not None
-        return likeness(shown.simulated, shown.measured, self.registration)
+        arguments = shown.simulated, shown.measured, self.registration
+        found = likeness(*arguments)
+        if found.verdict == "alike" and (why := misplaced(*arguments)):
+            return found._replace(verdict="doubtful", reason=f"{found.reason}, but {why}: check the registration")
+        return found
 
     def profiles(self, shown: Shown, ends: Any, width: float) -> tuple[Rectangle, tuple[Profile, ...]]:
         """Profiles across a line on the maps.

@@ -73,6 +73,8 @@ TOOLS = ("move", "atoms", "line", "box", "pole", "zone line")
 """What the mouse does on a map."""
 BLINK = 600
 """Time that each map is visible in the mode "blink" [ms]."""
+FIRST_MAP = 1000
+"""Time that the browser has for the first maps before the registration begins [ms]: it keeps a processor busy."""
 READOUT_DELAY = 60
 """Delay of the numbers of a preview [ms]: a text changes the layout, which takes as long as to paint a map (50 ms)."""
 _MOST_BINS = 512
@@ -164,7 +166,7 @@ class Page:
         if explorer is not None:
             self.latest.ask(partial(self._judge, self.shown))
             if self.both and not explorer.registered and later is None:
-                self._register(None)
+                self._call_later(partial(self._register, None), FIRST_MAP)
 
     def close(self) -> None:
         """End what runs in the background."""

@@ -15,6 +15,7 @@ from apt_evap.cli.main import main
 from apt_evap.cli.parser import make_parser
 from apt_evap.explore.controls import MECHANISMS, controls_of, perturbation_of, values_of
 from apt_evap.explore.explorer import Explorer, View
+from apt_evap.explore.placement import misplaced
 from apt_evap.explore.surface_atoms import surface_atoms
 
 TURNED = ae.Registration(20.0, 0.5, (1.0, -2.0), True)
@@ -331,6 +332,24 @@ def test_the_verdict_is_that_of_the_library(run, measured, explorer):
     found = explorer.likeness(shown)
     expected = ae.registration.likeness(shown.simulated, shown.measured, TURNED)
     assert found.verdict == expected.verdict and found.reason == expected.reason
+
+
+@pytest.mark.parametrize(("rotation", "scale"), [(0.0, 60.0), (20.0, 60.0), (120.0, 60.0), (0.0, 51.0)])
+def test_maps_that_do_not_lie_on_each_other(rotation, scale):
+    """The verdict depends on the registration: rotations by the symmetry of [111], 120 degrees, are as good."""
+    pattern, name = ae.indexing.master_patterns("fcc")[0], "Ni"
+    simulated, measured = (
+        pattern.map(ae.Orientation(name, axis=(1, 1, 1), rotation=turn), ae.detection.Projection(each), width=70.0,
+                    ions=40_000, rolled=0.8, seed=seed)
+        for turn, each, seed in ((0.0, 60.0, 1), (rotation, scale, 2))
+    )  # fmt: skip
+    measured = replace(measured, x_edges=simulated.x_edges, y_edges=simulated.y_edges)
+    why = misplaced(simulated, measured, ae.Registration(0.0, 1.0, (0.0, 0.0)))
+    if rotation == 20.0:
+        assert any(f"turned by {angle}° and scaled by 1 " in why for angle in range(-180, 181, 3)
+                   if abs((angle - 20.0 + 60) % 120 - 60) <= 1.5)  # fmt: skip
+    else:
+        assert ("scaled by 0.85" in why) == bool(why) == (scale != 60.0)
 
 
 @pytest.mark.parametrize("as_map", [False, True])
