@@ -298,17 +298,22 @@ class Explorer:
         if perturbations is None:
             perturbations = [perturbation_of(name, _starting_values(name)) for name in MECHANISMS]
         best: Registration | None = None
+        found: Registration | None
+        failed = ValueError("perturbations must contain at least one perturbation, got none")
         progress = progress or (lambda done, number: None)
         progress(0, len(perturbations))
         for done, each in enumerate(perturbations, 1):
             arguments = self.run.hits(each), target, self.near
-            found = _registration(*arguments) if apply is None else apply(_registration, arguments)
+            try:
+                found = _registration(*arguments) if apply is None else apply(_registration, arguments)
+            except ValueError as error:  # such as a map that is too empty with this emission
+                found, failed = None, error
             progress(done, len(perturbations))
-            if best is None or found.score > best.score:
+            if found is not None and (best is None or found.score > best.score):
                 best = found
                 self.set_registration(best)
         if best is None:
-            raise ValueError("perturbations must contain at least one perturbation, got none")
+            raise failed
         best.warn_if_doubtful()
         return best
 

@@ -1,4 +1,4 @@
-"""The page of the explorer. Only the modules page, index_panel, widgets, style and server of this room need Bokeh."""
+"""The page of the explorer. The numbers of this room need no Bokeh: see explorer."""
 
 import math
 import multiprocessing
@@ -842,7 +842,7 @@ class Page:
                 lines.append(str(fit_zone_line(profile)))
             except (ValueError, AptWarning):
                 lines.append("no line")
-        self.profile.title.text = "; ".join(lines)
+        self.profile.title.text = "\n".join(lines)
 
     def _put_specimen(self):
         if self.explorer.run is None:

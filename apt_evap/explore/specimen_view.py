@@ -65,7 +65,7 @@ class SpecimenView:
 
     def __init__(self) -> None:
         wheel = WheelZoomTool()
-        self.figure: Any = square("specimen: drag to turn it; click on a map (mode “atoms”)", (-1, 1, -1, 1), [wheel])
+        self.figure: Any = square("specimen: drag to turn it", (-1, 1, -1, 1), [wheel])
         self.figure.toolbar.active_scroll = wheel
         self.figure.axis.visible = False
         self.points = ColumnDataSource({name: [] for name in ("x", "y", "z", "color", "radius")})

@@ -296,6 +296,17 @@ def test_the_best_registration_is_kept(run, measured):
     emissions = [ae.Unperturbed(), ae.RollUp(0.2), ae.RollUp(0.3)]
     assert explorer.register(emissions, progress, found).score == 0.9 == explorer.registration.score
     assert [each[:2] for each in steps] == [(k, 3) for k in range(4)] and steps[2][2] == 0.6
+    scores = iter([ValueError("empty"), 0.8])
+
+    def fails(function, arguments):
+        if isinstance(score := next(scores), ValueError):
+            raise score
+        return ae.Registration(0.0, 0.5, (0.0, 0.0), score=score)
+
+    assert explorer.register(emissions[:2], apply=fails).score == 0.8
+    scores = iter([ValueError("empty")])
+    with pytest.raises(ValueError, match="empty"):
+        explorer.register(emissions[:1], apply=fails)
     scores = iter([0.95])
 
     def stopped(done, number):
@@ -304,7 +315,7 @@ def test_the_best_registration_is_kept(run, measured):
 
     with pytest.raises(KeyError):
         explorer.register(emissions, stopped, found)
-    assert explorer.registration.score == 0.9
+    assert explorer.registration.score == 0.8
     for arguments in ((run,), (None, measured)):
         with pytest.raises(ValueError, match="registration"):
             Explorer(*arguments).register()
