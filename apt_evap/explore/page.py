@@ -47,9 +47,9 @@ from apt_evap.explore.index_panel import IndexPanel
 from apt_evap.explore.latest import Latest
 from apt_evap.explore.marks import plain
 from apt_evap.explore.run_panel import RunPanel, Workbench
+from apt_evap.explore.specimen_surface import COLORED_BY, surface_atoms
 from apt_evap.explore.specimen_view import SIDES, SpecimenView
 from apt_evap.explore.style import STYLES, VEIL, WIDGETS, page_styles, theme
-from apt_evap.explore.surface_atoms import COLORED_BY, surface_atoms
 from apt_evap.explore.widgets import (
     LEFT,
     color_bar,

@@ -8,7 +8,7 @@ from bokeh.models import ColumnDataSource, CustomJS, LinearColorMapper, WheelZoo
 from bokeh.palettes import Viridis256
 
 from apt_evap._common.types import Floats
-from apt_evap.explore.surface_atoms import COLORED_BY, SurfaceAtoms
+from apt_evap.explore.specimen_surface import COLORED_BY, SurfaceAtoms
 from apt_evap.explore.widgets import color_bar, show_extent, square
 
 SIDES = {"above": (0.0, 90.0), "side": (0.0, 0.0), "oblique": (30.0, 40.0)}

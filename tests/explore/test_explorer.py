@@ -16,7 +16,7 @@ from apt_evap.cli.parser import make_parser
 from apt_evap.explore.controls import MECHANISMS, controls_of, perturbation_of, values_of
 from apt_evap.explore.explorer import Explorer, View
 from apt_evap.explore.placement import misplaced
-from apt_evap.explore.surface_atoms import surface_atoms
+from apt_evap.explore.specimen_surface import surface_atoms
 
 TURNED = ae.Registration(20.0, 0.5, (1.0, -2.0), True)
 ENERGY = ae.TruncatedNormal(0.2, 0.1)

@@ -23,7 +23,7 @@ _SHELL = 1.5  # nearest neighbour distances: within it are the two first shells 
 
 
 class SurfaceAtoms(NamedTuple):
-    """Atoms of a surface."""
+    """Atoms on the surface of a specimen."""
 
     positions: Floats
     """Positions [nm], shape (n, 3)."""
