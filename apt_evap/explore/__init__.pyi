@@ -8,5 +8,5 @@ from .explorer import Explorer as Explorer
 from .explorer import Pole as Pole
 from .explorer import Shown as Shown
 from .explorer import View as View
-from .surface_image import SpecimenImage as SpecimenImage
-from .surface_image import specimen_image as specimen_image
+from .specimen_surface import SurfaceAtoms as SurfaceAtoms
+from .specimen_surface import surface_atoms as surface_atoms

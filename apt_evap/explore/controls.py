@@ -46,7 +46,7 @@ CONTROLS = (
     Control("second_roll", "probability of a second roll-up", 0.0, 1.0, 0.05, 0.0),
     Control("sharpness", "sharpness of the target", 0.0, 3.0, 0.05, 0.0),
     Control("height", "launch height [nm]", 0.0, 0.2, 0.005, 0.0),
-    Control("others", "mean energy of ions that do not roll up [eV]", 0.0, 1.0, 0.005, 0.0),
+    Control("others", "mean energy without roll-up [eV]", 0.0, 1.0, 0.005, 0.0),
 )
 """Sliders for the emission. A mechanism has those that are fields of its perturbation; an energy has two."""
 

@@ -25,6 +25,7 @@ from apt_evap.detection.limits import MAX_BINS
 from apt_evap.detection.projection import Projection
 from apt_evap.emission.perturbations import Perturbation, RollUp, TruncatedNormal, Unperturbed
 from apt_evap.explore.controls import MECHANISMS, Control, controls_of, perturbation_of
+from apt_evap.explore.placement import misplaced
 from apt_evap.fit.fit_energies import BINS, measured_map
 from apt_evap.maps.profiles import Profile, Rectangle, zone_line_profile
 from apt_evap.maps.rings import Ring, ring_statistics
@@ -205,6 +206,8 @@ class Explorer:
         self.registered = registration is not None
         """Whether the registration was found or given, not only set to show both maps in the same size."""
         self.registration = registration
+        self.near: dict[str, Any] = {}
+        """Options of `register` that say where the run is on the measurement."""
         if run is not None and measured is not None and registration is None:
             self.registration = self._same_size()
 
@@ -295,17 +298,22 @@ class Explorer:
         if perturbations is None:
             perturbations = [perturbation_of(name, _starting_values(name)) for name in MECHANISMS]
         best: Registration | None = None
+        found: Registration | None
+        failed = ValueError("perturbations must contain at least one perturbation, got none")
         progress = progress or (lambda done, number: None)
         progress(0, len(perturbations))
         for done, each in enumerate(perturbations, 1):
-            arguments = self.run.hits(each), target
-            found = _registration(*arguments) if apply is None else apply(_registration, arguments)
+            arguments = self.run.hits(each), target, self.near
+            try:
+                found = _registration(*arguments) if apply is None else apply(_registration, arguments)
+            except ValueError as error:  # such as a map that is too empty with this emission
+                found, failed = None, error
             progress(done, len(perturbations))
-            if best is None or found.score > best.score:
+            if found is not None and (best is None or found.score > best.score):
                 best = found
                 self.set_registration(best)
         if best is None:
-            raise ValueError("perturbations must contain at least one perturbation, got none")
+            raise failed
         best.warn_if_doubtful()
         return best
 
@@ -525,9 +533,13 @@ class Explorer:
         return tuple(ring_statistics(each, projection, fold=pole.fold) for each in _maps(shown))
 
     def likeness(self, shown: Shown) -> Likeness:
-        """Whether both maps show the same crystal along the same axis, see `likeness`."""
+        """Whether both maps show the same crystal along the same axis, see `likeness`, and lie on each other."""
         assert shown.simulated is not None and shown.measured is not None and self.registration is not None
-        return likeness(shown.simulated, shown.measured, self.registration)
+        arguments = shown.simulated, shown.measured, self.registration
+        found = likeness(*arguments)
+        if found.verdict == "alike" and (why := misplaced(*arguments)):
+            return found._replace(verdict="doubtful", reason=f"{found.reason}, but {why}: check the registration")
+        return found
 
     def profiles(self, shown: Shown, ends: Any, width: float) -> tuple[Rectangle, tuple[Profile, ...]]:
         """Profiles across a line on the maps.
@@ -693,10 +705,10 @@ class Explorer:
         return [*lines, f"ae.plot.detector_maps([{pictures}])[0].figure.savefig('maps.png')"]
 
 
-def _registration(simulated, measured):
+def _registration(simulated, measured, near):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AptWarning)  # given once, for the best one
-        return register(simulated, measured)
+        return register(simulated, measured, **near)
 
 
 def _maps(shown):

@@ -1,14 +1,27 @@
 """Index mode of the page: poles and zone lines that are clicked on the measured map, and the orientations that fit."""
 
+import cmath
+import math
 import multiprocessing
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 from bokeh.layouts import column, row
-from bokeh.models import Button, CheckboxGroup, ColumnDataSource, Div, LabelSet, NumericInput, PointDrawTool, Select
+from bokeh.models import (
+    Button,
+    CheckboxGroup,
+    ColumnDataSource,
+    CustomJS,
+    Div,
+    LabelSet,
+    NumericInput,
+    PointDrawTool,
+    Select,
+)
 
 from apt_evap._common.codec import to_python
 from apt_evap.crystallography.orientation import Orientation
@@ -19,11 +32,30 @@ from apt_evap.explore.latest import Latest
 from apt_evap.explore.marks import Marks, overlay
 from apt_evap.explore.widgets import LEFT
 from apt_evap.fit.fit_energies import measured_map
-from apt_evap.indexing.index import index
+from apt_evap.indexing.index import Indexing, index
 from apt_evap.specimen.materials import MATERIALS
-from apt_evap.twin.start import settings_of
+from apt_evap.twin.start import Start, settings_of
 
 HINT = "mode “pole”: click a pole whose family you choose here; drag a mark to move it"
+MOVED = "moved by hand"
+_REACH = 0.3  # distance between both handles, as a fraction of the width of the map
+# Rotation, scale and centre of the handles move the overlay. Python computes it when the mouse is released.
+_FOLLOW = """
+const {x, y} = handles.data, [cx, cy, hx, hy] = handles.tags
+if (x.length != 2) return
+const [lastx, lasty] = x.last ?? [cx, cy]
+x[1] += x[0] - lastx
+y[1] += y[0] - lasty
+x.last = [x[0], y[0]]
+const square = (hx - cx) ** 2 + (hy - cy) ** 2, dx = x[1] - x[0], dy = y[1] - y[0]
+const c = (dx * (hx - cx) + dy * (hy - cy)) / square, s = (dy * (hx - cx) - dx * (hy - cy)) / square
+for (const each of [lines, poles]) {
+  const {x0, y0} = each.data
+  each.data.x = x0.map((_, k) => x[0] + c * (x0[k] - cx) - s * (y0[k] - cy))
+  each.data.y = x0.map((_, k) => y[0] + s * (x0[k] - cx) + c * (y0[k] - cy))
+  each.change.emit()
+}
+"""
 
 
 class IndexPanel:
@@ -54,6 +86,7 @@ class IndexPanel:
         self._measured, self._later, self._put_code = measured, later, put_code
         self.latest = Latest(lambda wish: wish())
         self.candidates: list[tuple[Orientation, Projection, str]] = []
+        self._found: Indexing | None = None  # of the search that gave the candidates
         self._make_widgets(material)
         self._make_drawings(fig)
         self._material_changed()
@@ -68,12 +101,12 @@ class IndexPanel:
         ]
         self.options = CheckboxGroup(labels=["mirrored"], width=half)
         self.undo, self.new_line, self.clear = (
-            Button(label=label, width=90) for label in ("undo", "next line", "clear")
+            Button(label=label, width=62) for label in ("undo", "next line", "clear")
         )
-        self.search = Button(label="search", width=90)
-        self.search.on_click(self._search)
-        self.settings = Button(label="settings file", width=110, visible=False)
-        self.settings.on_click(lambda: self._put_code(self._settings))
+        self.search = Button(label="search", width=68)
+        self.search.on_click(lambda: self._search(self.search))
+        self.refine = Button(label="fit from here", width=100, visible=False)
+        self.refine.on_click(lambda: self._search(self.refine, self.candidates[int(self.choice.value or 0)][:2]))
         self.choice = Select(title="candidates", options=[], width=LEFT - 10, visible=False)
         self.text = Div(text=HINT, width=LEFT - 10, styles={"color": "var(--faint)"})
         self.material.on_change("value", lambda attr, old, new: self._material_changed())
@@ -86,17 +119,18 @@ class IndexPanel:
         self.new_line.on_click(self._next_line)
         self.column = column(
             row(self.material, self.family),
-            row(self.undo, self.new_line, self.clear),
-            row(self.search, self.settings),
+            row(self.undo, self.new_line, self.clear, self.search),
             self.text,
             self.choice,
+            self.refine,
             row(self.scale, self.options),
             row(*self.centre),
         )
 
     def _make_drawings(self, fig):
-        self.lines = ColumnDataSource({"x": [], "y": []})
-        self.poles = ColumnDataSource({"x": [], "y": [], "label": []})
+        self.lines = ColumnDataSource({"x": [], "y": [], "x0": [], "y0": []})
+        self.poles = ColumnDataSource({"x": [], "y": [], "x0": [], "y0": [], "label": []})
+        self.handles = ColumnDataSource({"x": [], "y": []})
         self.marks = ColumnDataSource({"x": [], "y": [], "family": [], "line": []})
         fig.line("x", "y", source=self.lines, line_color="#35b6ff", line_width=1, line_alpha=0.8)
         fig.scatter("x", "y", source=self.poles, size=7, fill_alpha=0, line_color="white")
@@ -128,7 +162,12 @@ class IndexPanel:
                 text_font_style="bold",
             )
         )
-        self.tool = PointDrawTool(renderers=[drawn], add=False)
+        held = fig.scatter("x", "y", source=self.handles, size=14, line_color="black", fill_color="orange")
+        fig.line("x", "y", source=self.handles, line_color="orange", line_dash="dotted")
+        follow = {"handles": self.handles, "lines": self.lines, "poles": self.poles}
+        self.handles.js_on_change("change", CustomJS(args=follow, code=_FOLLOW))
+        self.handles.on_change("data", lambda attr, old, new: self._dragged())
+        self.tool = PointDrawTool(renderers=[drawn, held], add=False)
         fig.add_tools(self.tool)
         self.marks.on_change("data", lambda attr, old, new: self.fit())
         self._line = 1
@@ -183,33 +222,62 @@ class IndexPanel:
         }
         self.latest.ask(partial(self._fit, marks, options))
 
-    def _search(self):
-        """Search over all orientations by `index`, in another process; marks narrow it."""
+    def _search(self, button, start=None):
+        """Search over all orientations by `index`, or refine one, in another process; marks narrow it."""
         marks = self.read()
         options: dict[str, Any] = {
             "poles": [place for _, place in marks.poles],
             "lines": [(*points[0], *points[-1]) for _, points in marks.lines if len(points) > 1],
         }
-        if self.scale.value:
+        if start is not None:
+            options["start"] = start
+        elif self.scale.value:
             options["scales"] = (0.95 * self.scale.value, 1.05 * self.scale.value)
-        arguments = self._measured(), self.material.value, options
-        self.search.update(label="searching", disabled=True)
+        arguments = self._measured(), self.material.value
+        label = button.label
+        for each in (self.search, self.refine):
+            each.disabled = True
+        button.label = "searching" if start is None else "fitting"
+
+        def put(found, text):
+            for each in (self.search, self.refine):
+                each.disabled = False
+            button.label = label
+            self._put_searched(found, text)
 
         def work():
             try:
                 with multiprocessing.get_context("spawn").Pool(1) as pool:
-                    found = pool.apply(_indexed, arguments)
+                    found = pool.apply(index, arguments, options)
             except ValueError as error:
-                found = [], str(error), ""
-            self._later(partial(self._put_searched, *found), 0)
+                self._later(partial(put, None, str(error)), 0)
+            else:
+                self._later(partial(put, found, f"{found.verdict}: {found.reason}"), 0)
 
         threading.Thread(target=work, daemon=True).start()
 
-    def _put_searched(self, candidates, text, settings):
-        self.search.update(label="search", disabled=False)
-        self._settings = settings
-        self.settings.visible = bool(settings)
-        self._put(candidates, text)
+    def _put_searched(self, found, text):
+        rows = [] if found is None else [
+            (each.orientation, each.projection, f"{each.confidence:.0%}, score {each.score:.2f}")
+            for each in found.candidates
+        ]  # fmt: skip
+        self._put(rows, text, found)
+
+    def settings(self, minutes: float, threads: int) -> Start:
+        """Settings of a simulation of the chosen candidate, as ``apt-evap start`` makes them; in any thread."""
+        if not self.candidates:
+            raise ValueError("index the map first: click poles, or search")
+        number, measured = int(self.choice.value or 0), self._measured()
+        found = self._found
+        if found is None:  # poles that were clicked
+            found = index(measured, self.candidates[number][0].material, start=self.candidates[number][:2])
+        elif number:
+            first = found.candidates[number]
+            others = tuple(each for each in found.candidates if each is not first)
+            reason = "chosen by hand; another orientation explains the map better"
+            found = replace(found, candidates=(first, *others), decided=False, reason=reason)
+        hits = measured if isinstance(measured, Hits) else None
+        return settings_of(found, hits, minutes=minutes, threads=threads)
 
     def _missing(self, marks):
         if marks.poles and marks.lines:
@@ -227,14 +295,15 @@ class IndexPanel:
         hint = "two poles fit exactly: a third one decides" if exact else ""
         self._later(partial(self._put, rows, hint), 0)
 
-    def _put(self, candidates, text):
-        self.candidates = candidates
+    def _put(self, candidates, text, found=None):
+        self.candidates, self._found = candidates, found
         self._hint = text
         options = []
         for number, (orientation, projection, quality) in enumerate(candidates):
             axis = " ".join(f"{each:.2f}" for each in orientation.axis)
             options.append((str(number), f"{number + 1}: [{axis}], {projection.scale:.1f} mm/rad, {quality}"))
         self.choice.update(options=options, visible=bool(options))
+        self.refine.visible = bool(options)
         if self.choice.value != "0" and options:
             self.choice.value = "0"  # draws it
         else:
@@ -242,16 +311,17 @@ class IndexPanel:
 
     def _show_candidate(self):
         if not self.candidates:
-            self.lines.data = {"x": [], "y": []}
-            self.poles.data = {"x": [], "y": [], "label": []}
+            for each in (self.lines, self.poles, self.handles):
+                each.data = {name: [] for name in each.data}
             self.text.text = self._hint
             return
         orientation, projection, quality = self.candidates[int(self.choice.value or 0)]
         drawn = overlay(orientation, projection, measured_map(self._measured()))
         gap = [[np.nan, np.nan]]
         points = np.concatenate([each for line in drawn.lines for each in (line, gap)] or [gap])
-        self.lines.data = {"x": points[:, 0], "y": points[:, 1]}
-        self.poles.data = {"x": drawn.places[:, 0], "y": drawn.places[:, 1], "label": list(drawn.labels)}
+        self.lines.data = _twice(points)
+        self.poles.data = _twice(drawn.places) | {"label": list(drawn.labels)}
+        self._put_handles(projection)
         axis = ", ".join(f"{each:.3f}" for each in orientation.axis)
         self.text.text = (
             f"<b>{quality}</b>, scale {projection.scale:.1f} mm/rad<br>axis [{axis}], rotation "
@@ -261,16 +331,39 @@ class IndexPanel:
             f"import apt_evap as ae\n\norientation = {to_python(orientation)}\nprojection = ae.detection.{projection!r}"
         )
 
+    # ---- handles ---------------------------------------------------------------------------------------------------
 
-def _indexed(measured, material, options):
-    """Candidates of `index`, its verdict, and the settings file of the first one as `apt-evap start` makes it."""
-    found = index(measured, material, **options)
-    rows = [
-        (each.orientation, each.projection, f"{each.confidence:.0%}, score {each.score:.2f}")
-        for each in found.candidates
-    ]
-    try:
-        settings = settings_of(found, measured if isinstance(measured, Hits) else None).text
-    except ValueError:  # no tip is small enough
-        settings = ""
-    return rows, f"{found.verdict}: {found.reason}", settings
+    def _put_handles(self, projection):
+        """A handle at the centre, and one whose angle is the rotation and whose distance is the scale."""
+        x, y = projection.centre
+        left, right, _, _ = measured_map(self._measured()).extent
+        reach = _REACH * (right - left)
+        self.handles.tags = [x, y, x + reach, y]
+        self.handles.data = {"x": [x, x + reach], "y": [y, y]}
+
+    def _dragged(self):
+        """Make the candidate that the handles show."""
+        places = [complex(*each) for each in zip(self.handles.data["x"], self.handles.data["y"], strict=True)]
+        x, y, *end = self.handles.tags or (0.0, 0.0)
+        if not self.candidates or places == [complex(x, y), complex(*end)]:
+            return
+        number = int(self.choice.value or 0)
+        orientation, projection, quality = self.candidates[number]
+        if len(places) != 2 or places[0] == places[1]:  # one was deleted
+            self._put_handles(projection)
+            return
+        ratio = (places[1] - places[0]) / (complex(*end) - complex(x, y))
+        angle = cmath.phase(ratio) * (-1 if projection.mirror else 1)
+        turn = np.array([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1]])
+        moved = (
+            Orientation.from_matrix(orientation.material, turn @ orientation.matrix),
+            replace(projection, scale=projection.scale * abs(ratio), centre=(places[0].real, places[0].imag)),
+            MOVED,
+        )
+        others = [each for k, each in enumerate(self.candidates) if k != number or quality != MOVED]
+        self._put([moved, *others], "the fit starts from here")
+
+
+def _twice(points):
+    """Places, and the same for the handles, which move the first ones."""
+    return {"x": points[:, 0], "y": points[:, 1], "x0": points[:, 0], "y0": points[:, 1]}

@@ -1,4 +1,4 @@
-"""The page of the explorer. Only the modules page, index_panel, widgets, style and server of this room need Bokeh."""
+"""The page of the explorer. The numbers of this room need no Bokeh: see explorer."""
 
 import math
 import multiprocessing
@@ -37,7 +37,7 @@ from bokeh.models import (
     WheelZoomTool,
     Widget,
 )
-from bokeh.palettes import Inferno256, Viridis256, interp_palette
+from bokeh.palettes import Inferno256, interp_palette
 from bokeh.plotting import figure
 
 from apt_evap.detection.detector_map import DetectorMap
@@ -46,8 +46,10 @@ from apt_evap.explore.explorer import Commands, Explorer, Shown, View
 from apt_evap.explore.index_panel import IndexPanel
 from apt_evap.explore.latest import Latest
 from apt_evap.explore.marks import plain
+from apt_evap.explore.run_panel import RunPanel, Workbench
+from apt_evap.explore.specimen_surface import COLORED_BY, surface_atoms
+from apt_evap.explore.specimen_view import SIDES, SpecimenView
 from apt_evap.explore.style import STYLES, VEIL, WIDGETS, page_styles, theme
-from apt_evap.explore.surface_image import COLORED_BY, SIDES, specimen_image
 from apt_evap.explore.widgets import (
     LEFT,
     color_bar,
@@ -71,6 +73,8 @@ TOOLS = ("move", "atoms", "line", "box", "pole", "zone line")
 """What the mouse does on a map."""
 BLINK = 600
 """Time that each map is visible in the mode "blink" [ms]."""
+FIRST_MAP = 1000
+"""Time that the browser has for the first maps before the registration begins [ms]: it keeps a processor busy."""
 READOUT_DELAY = 60
 """Delay of the numbers of a preview [ms]: a text changes the layout, which takes as long as to paint a map (50 ms)."""
 _MOST_BINS = 512
@@ -110,6 +114,8 @@ class Page:
         Reads a file, from its path and the document; the function that it returns makes the page again.
     later : callable, optional
         Calls a function in the thread of the document, after a delay [ms]; by default the document itself does.
+    bench : Workbench, optional
+        What outlives the page.
     """
 
     def __init__(
@@ -120,7 +126,9 @@ class Page:
         registration_of: Callable[[str], Registration] | None = None,
         opened: Callable[[str, Document], Callable[[], None]] | None = None,
         later: Callable[[Callable[[], None], int], Any] | None = None,
+        bench: Workbench | None = None,
     ) -> None:
+        self._bench = Workbench() if bench is None else bench
         self.explorer: Any = explorer
         self.document = document
         self._later = self._call_later if later is None else later
@@ -144,7 +152,7 @@ class Page:
             self._make_controls(self.shown.view)
             self._make_maps()
             self._make_profile()
-            self._make_specimen()
+            self.specimen = SpecimenView()
             self._make_text()
             self.put(self.shown)
             self._put_specimen()
@@ -158,7 +166,7 @@ class Page:
         if explorer is not None:
             self.latest.ask(partial(self._judge, self.shown))
             if self.both and not explorer.registered and later is None:
-                self._register(None)
+                self._call_later(partial(self._register, None), FIRST_MAP)
 
     def close(self) -> None:
         """End what runs in the background."""
@@ -166,6 +174,7 @@ class Page:
         self.latest.close()
         if self.index is not None:
             self.index.latest.close()
+            self.simulate.close()
 
     @property
     def both(self) -> bool:
@@ -248,10 +257,11 @@ class Page:
         self.width = Slider(title="width of a profile [mm]", start=0.0, end=longer / 2, step=size, value=longer / 6)
         self.width.on_change("value", lambda attr, old, new: self._put_profiles())
         self.radius = Slider(title="radius of a click [mm]", start=0.0, end=longer / 10, step=size / 4, value=2 * size)
-        self.color = Select(title="atoms coloured by", value="order", options=[*COLORED_BY.items()], width=190)
-        self.side = Select(title="seen from", value="above", options=[*SIDES], width=100)
-        for each in (self.color, self.side):
-            each.on_change("value", lambda attr, old, new: self._put_specimen())
+        colors = {name: title for name, title in COLORED_BY.items() if name != "phase" or self._has_phases()}
+        self.color = Select(title="atoms coloured by", value="order", options=[*colors.items()], width=190)
+        self.color.on_change("value", lambda attr, old, new: self._put_specimen())
+        self.side = RadioButtonGroup(labels=[*SIDES], active=None)
+        self.side.on_change("active", lambda attr, old, new: self._side_changed())
         self.register = Button(label="with this emission", width=(LEFT - 20) // 2)
         self.register.on_click(lambda: self._register([self.view().perturbation]))
         self.register_all = Button(label="search again", width=(LEFT - 20) // 2)
@@ -304,6 +314,10 @@ class Page:
             self.index = IndexPanel(
                 self.maps[-1], lambda: explorer.measured, self._material(), self._later, self._put_python
             )
+            self.simulate = RunPanel(
+                self.index.settings, f"{Path(explorer.names[1]).stem}.toml", self._bench, self._later,
+                self._put_python, self._open if self._opened else None,
+            )  # fmt: skip
             for name in ("pole", "zone line"):
                 self._drags[-1][name] = self.index.tool
         tools = [each for each in TOOLS if self._is_served(each)]
@@ -358,18 +372,6 @@ class Page:
             color = "#4aa3ff" if name == "simulated" else "#ffb04a"
             self.profile.line("x", "y", source=source, legend_label=name, line_width=2, line_color=color)
 
-    def _make_specimen(self):
-        tools = [PanTool(), WheelZoomTool()]
-        self.specimen = square("specimen: click on a map (mode “atoms”)", (0.0, 1.0, 0.0, 1.0), tools)
-        self.specimen.toolbar.active_scroll = tools[1]
-        self.specimen_colors = LinearColorMapper(palette=Viridis256, nan_color=_OUTSIDE)
-        self.specimen_source = ColumnDataSource({"image": [], "x": [], "y": [], "dw": [], "dh": []})
-        self._draw(self.specimen, self.specimen_source, self.specimen_colors)
-        self.specimen_bar = color_bar(self.specimen_colors, COLORED_BY["order"])
-        self.specimen.add_layout(self.specimen_bar, "below")
-        self.atoms = ColumnDataSource({"x": [], "y": []})
-        self.specimen.scatter("x", "y", source=self.atoms, size=9, fill_alpha=0.0, line_color="red", line_width=2)
-
     def _make_text(self):
         self.rings = Div(width=LEFT - 10, text="rings about the pole: computed from all ions")
         self.shell, self.python = (PreText(sizing_mode="stretch_width") for _ in range(2))
@@ -390,6 +392,7 @@ class Page:
             groups.append(group("ions", [self.ions, number(self.radius)], self._reset_ions))
         if self.index is not None:
             groups.append(group("index", [self.index.column], active=explorer.run is None))
+            groups.append(group("simulate", [self.simulate.column], active=explorer.run is None))
         if self.both:
             groups.append(
                 group("registration", [row(self.register_all, self.register), self.registration], active=False)
@@ -404,7 +407,9 @@ class Page:
         if explorer.run is None:
             parts.append(self.profile)
         else:
-            parts.append(column(self.specimen, row(self.color, self.side), self.profile, sizing_mode="stretch_width"))
+            parts.append(
+                column(self.specimen.figure, row(self.color, self.side), self.profile, sizing_mode="stretch_width")
+            )
         code = group("code", [row(*self.copy), self.shell, self.python], active=False)
         right = column(bar, grid(parts), code, sizing_mode="stretch_width")
         if self.both:
@@ -544,9 +549,11 @@ class Page:
     # ---- files and the registration, in the background -------------------------------------------------------------
 
     def _file_named(self):
-        path = self.file.value.strip()
-        if self._opened is None or not path:
-            return
+        if self._opened is not None and (path := self.file.value.strip()):
+            self._open(path)
+
+    def _open(self, path):
+        """Read a file in a thread, and make the page again."""
         self._put_notes([f"reading {path}"])
 
         def work():
@@ -835,24 +842,22 @@ class Page:
                 lines.append(str(fit_zone_line(profile)))
             except (ValueError, AptWarning):
                 lines.append("no line")
-        self.profile.title.text = "; ".join(lines)
+        self.profile.title.text = "\n".join(lines)
 
     def _put_specimen(self):
         if self.explorer.run is None:
             return
-        image = specimen_image(self.explorer.run, self.color.value, self.side.value, self.shown.view.ions)
-        left, right, lower, upper = image.extent
-        values = image.values[np.isfinite(image.values)]
-        low, high = (float(end) for end in np.percentile(values, [1, 99]))
-        self.specimen_colors.update(low=low, high=high if high > low else low + 1)
-        self.specimen_source.data = {
-            "image": [image.values], "x": [left], "y": [lower], "dw": [right - left], "dh": [upper - lower],
-        }  # fmt: skip
-        show_extent(self.specimen, image.extent)
-        self.specimen_bar.title = COLORED_BY[self.color.value]
-        self.specimen.xaxis.axis_label = "x [nm]"
-        self.specimen.yaxis.axis_label = "y [nm]" if self.side.value == "above" else "z [nm]"
+        atoms = surface_atoms(self.explorer.run, self.color.value, self.shown.view.ions)
+        self.specimen.put(atoms, self.color.value)
         self._put_atoms()
+
+    def _side_changed(self):
+        if self.side.active is not None:
+            self.specimen.look_from(self.side.labels[self.side.active])
+            self.side.active = None  # the same side again after a turn
+
+    def _has_phases(self):
+        return self.explorer.run is not None and len(self.explorer.run.phase_names) > 1
 
     def _put_atoms(self):
         if not self.click.data["x"]:
@@ -860,10 +865,8 @@ class Page:
         x, y, radius = (self.click.data[name][0] for name in ("x", "y", "radius"))
         atoms = self.explorer.atoms_at(self.shown.view, x, y, radius)
         assert atoms.positions is not None
-        places = atoms.positions[:, SIDES[self.side.value][:2]]
-        few = slice(None, None, max(1, math.ceil(len(atoms) / _MOST_ATOMS)))
-        self.atoms.data = {"x": places[few, 0], "y": places[few, 1]}
-        self.specimen.title.text = f"{len(atoms):,} atoms land within {radius:.2g} mm of ({x:.1f}, {y:.1f}) mm"
+        self.specimen.mark(atoms.positions[:: max(1, math.ceil(len(atoms) / _MOST_ATOMS))])
+        self.specimen.figure.title.text = f"{len(atoms):,} atoms land within {radius:.2g} mm of ({x:.1f}, {y:.1f}) mm"
 
     def _put_commands(self, commands: Commands, what):
         self.shell.text = commands.shell or f"(no command for this {what}: the measured map has no ions)"

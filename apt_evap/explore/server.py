@@ -13,6 +13,7 @@ from bokeh.util.token import generate_session_id
 
 from apt_evap.explore.explorer import Explorer, View
 from apt_evap.explore.page import Page
+from apt_evap.explore.run_panel import Workbench
 from apt_evap.registration.register import Registration
 
 _ADDRESS = "127.0.0.1"
@@ -67,10 +68,11 @@ def serve(
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         probe.bind((_ADDRESS, port))
         port = probe.getsockname()[1]
+    bench = Workbench()
     shown = explorer, view  # also after the page is loaded again
 
     def make(document: Document) -> None:
-        page = Page(shown[0], document, shown[1], registration_of, None if with_file is None else opened)
+        page = Page(shown[0], document, shown[1], registration_of, None if with_file is None else opened, bench=bench)
         document.on_session_destroyed(lambda _: page.close())
 
     def opened(path: str, document: Document) -> Callable[[], None]:
@@ -78,6 +80,8 @@ def serve(
         nonlocal shown
         assert with_file is not None
         shown = with_file(path)
+        if shown[0] is not None:
+            shown[0].near = bench.near.get(path, {})
 
         def again():
             document.clear()

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 
 from apt_evap._common.short_repr import short_repr
 from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence
@@ -19,7 +20,7 @@ from apt_evap.detection.projection import Projection
 from apt_evap.indexing.marks import marks_of
 from apt_evap.indexing.master_pattern import MasterPattern, master_patterns
 from apt_evap.indexing.refine import BINS, Refined, bins_of, refine
-from apt_evap.indexing.search import disc_of, misorientation, search
+from apt_evap.indexing.search import Start, disc_of, misorientation, search
 from apt_evap.specimen.materials import as_material
 
 WIDEST, NARROWEST = 45.0, 12.0
@@ -164,6 +165,7 @@ def index(
     patterns: Sequence[MasterPattern] | None = None,
     distance: float | None = None,
     candidates: int = 4,
+    start: tuple[Orientation, Projection] | None = None,
 ) -> Indexing:
     """Find out which crystal direction is where on a map.
 
@@ -188,6 +190,8 @@ def index(
         Flight length [mm], for a scale between 1/2.2 and 1/1.2 of it.
     candidates : int
         Largest number of candidates in the answer.
+    start : tuple of Orientation and Projection, optional
+        Refine this orientation, such as one of `fit_orientation`, instead of a search. The answer is then undecided.
 
     Returns
     -------
@@ -238,6 +242,8 @@ def index(
             raise ValueError(f"patterns must be of {material.structure}, got {pattern!r}")
     disc = disc_of(measured)
     marks = marks_of(material, poles, lines)
+    if start is not None and scales is distance is None:
+        scales = start[1].scale / _BEYOND, start[1].scale * _BEYOND
     low, high = _scales(disc, scales, distance)
     bins = bins_of(disc)
     sigma = max(0.35 * math.degrees(2 * disc.radius / BINS / math.sqrt(low * high)), 0.5)
@@ -247,7 +253,11 @@ def index(
         number = start[0]
         return number, refine(bins, disc, densities[number], *start[1:], marks, steps)
 
-    starts = search(disc, patterns, (low, high), _STARTS, marks)
+    if start is None:
+        starts = search(disc, patterns, (low, high), _STARTS, marks)
+    else:
+        matrix = _matrix_at(disc.centre, *start)
+        starts = [Start(matrix, start[1].scale, 0.0, 0.5, number) for number in range(len(patterns))]
     group = point_group(material.structure)
     proper = group[np.linalg.det(group) > 0]
     found = [refined((each.pattern, each.matrix, each.scale, each.rolled), _QUICK) for each in starts]
@@ -265,6 +275,8 @@ def index(
             different.append((number, each))
     n = check_count(candidates, "candidates", at_least=1)
     answer = _judged(measured, disc, material, patterns, different, proper, n, bool(marks))
+    if start is not None:
+        return replace(answer, decided=False, reason="refined from a given orientation, others were not searched")
     if answer.decided and not marks:
         rival = _rival(disc, bins, sigma, (low, high), different[0][1], answer.best.pattern)
         if rival:
@@ -294,6 +306,17 @@ def _rival(disc, bins, sigma, scales, best, pattern):
             if found.gain > best.gain:
                 return other
     return ""
+
+
+def _matrix_at(centre, orientation, projection):
+    """Rotation from crystal to specimen with z along a place on the map, for a map that is not mirrored."""
+    matrix = orientation.matrix
+    if projection.mirror:  # crystals of the patterns have an inversion centre: x of all directions, or y and z
+        matrix, projection = np.diag([1.0, -1.0, -1.0]) @ matrix, replace(projection, mirror=False)
+    (z,) = projection.directions(np.array([centre]))
+    axis = np.cross(z, [0.0, 0.0, 1.0])
+    turn = axis * (np.arccos(np.clip(z[2], -1, 1)) / max(np.linalg.norm(axis), 1e-12))
+    return scipy.spatial.transform.Rotation.from_rotvec(turn).as_matrix() @ matrix
 
 
 def _scales(disc, scales, distance):

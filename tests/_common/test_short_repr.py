@@ -8,7 +8,7 @@ from apt_evap.analysis.voltage_history import Course
 from apt_evap.crystallography.directions import Poles, Zones, poles
 from apt_evap.crystallography.orientation import FittedOrientation
 from apt_evap.emission.emissions import TangentialLaunches
-from apt_evap.explore.surface_image import SpecimenImage
+from apt_evap.explore.specimen_surface import SurfaceAtoms
 from apt_evap.fit.structure import StructureScores
 from apt_evap.maps.profiles import Profile, ProfileComparison
 from apt_evap.reconstruction.errors import ErrorBins, GroupErrors
@@ -16,7 +16,7 @@ from apt_evap.simulation.history import CapHistory, History
 
 WITH_ARRAYS = (
     FittedCap, ImageCompression, Profile, ProfileComparison, Tracks, Course, FittedOrientation, Poles, Zones,
-    TangentialLaunches, StructureScores, SpecimenImage, ErrorBins, GroupErrors, CapHistory, History,
+    TangentialLaunches, StructureScores, SurfaceAtoms, ErrorBins, GroupErrors, CapHistory, History,
 )  # fmt: skip
 
 

@@ -15,7 +15,8 @@ from apt_evap.cli.main import main
 from apt_evap.cli.parser import make_parser
 from apt_evap.explore.controls import MECHANISMS, controls_of, perturbation_of, values_of
 from apt_evap.explore.explorer import Explorer, View
-from apt_evap.explore.surface_image import SIDES, specimen_image
+from apt_evap.explore.placement import misplaced
+from apt_evap.explore.specimen_surface import surface_atoms
 
 TURNED = ae.Registration(20.0, 0.5, (1.0, -2.0), True)
 ENERGY = ae.TruncatedNormal(0.2, 0.1)
@@ -282,8 +283,10 @@ def test_the_best_registration_is_kept(run, measured):
     """Each better one is set at once; an error of the progress ends the search."""
     scores = iter([0.6, 0.9, 0.7])
     explorer, steps = Explorer(run, measured), []
+    explorer.near = {"rotations": 0.0}
 
     def found(function, arguments):
+        assert arguments[2] == {"rotations": 0.0}
         assert len(arguments[0]) == len(run) and arguments[1].values.shape == measured.map(128).values.shape
         return ae.Registration(0.0, 0.5, (0.0, 0.0), score=next(scores))
 
@@ -293,6 +296,17 @@ def test_the_best_registration_is_kept(run, measured):
     emissions = [ae.Unperturbed(), ae.RollUp(0.2), ae.RollUp(0.3)]
     assert explorer.register(emissions, progress, found).score == 0.9 == explorer.registration.score
     assert [each[:2] for each in steps] == [(k, 3) for k in range(4)] and steps[2][2] == 0.6
+    scores = iter([ValueError("empty"), 0.8])
+
+    def fails(function, arguments):
+        if isinstance(score := next(scores), ValueError):
+            raise score
+        return ae.Registration(0.0, 0.5, (0.0, 0.0), score=score)
+
+    assert explorer.register(emissions[:2], apply=fails).score == 0.8
+    scores = iter([ValueError("empty")])
+    with pytest.raises(ValueError, match="empty"):
+        explorer.register(emissions[:1], apply=fails)
     scores = iter([0.95])
 
     def stopped(done, number):
@@ -301,7 +315,7 @@ def test_the_best_registration_is_kept(run, measured):
 
     with pytest.raises(KeyError):
         explorer.register(emissions, stopped, found)
-    assert explorer.registration.score == 0.9
+    assert explorer.registration.score == 0.8
     for arguments in ((run,), (None, measured)):
         with pytest.raises(ValueError, match="registration"):
             Explorer(*arguments).register()
@@ -329,6 +343,24 @@ def test_the_verdict_is_that_of_the_library(run, measured, explorer):
     found = explorer.likeness(shown)
     expected = ae.registration.likeness(shown.simulated, shown.measured, TURNED)
     assert found.verdict == expected.verdict and found.reason == expected.reason
+
+
+@pytest.mark.parametrize(("rotation", "scale"), [(0.0, 60.0), (20.0, 60.0), (120.0, 60.0), (0.0, 51.0)])
+def test_maps_that_do_not_lie_on_each_other(rotation, scale):
+    """The verdict depends on the registration: rotations by the symmetry of [111], 120 degrees, are as good."""
+    pattern, name = ae.indexing.master_patterns("fcc")[0], "Ni"
+    simulated, measured = (
+        pattern.map(ae.Orientation(name, axis=(1, 1, 1), rotation=turn), ae.detection.Projection(each), width=70.0,
+                    ions=40_000, rolled=0.8, seed=seed)
+        for turn, each, seed in ((0.0, 60.0, 1), (rotation, scale, 2))
+    )  # fmt: skip
+    measured = replace(measured, x_edges=simulated.x_edges, y_edges=simulated.y_edges)
+    why = misplaced(simulated, measured, ae.Registration(0.0, 1.0, (0.0, 0.0)))
+    if rotation == 20.0:
+        assert any(f"turned by {angle}° and scaled by 1 " in why for angle in range(-180, 181, 3)
+                   if abs((angle - 20.0 + 60) % 120 - 60) <= 1.5)  # fmt: skip
+    else:
+        assert ("scaled by 0.85" in why) == bool(why) == (scale != 60.0)
 
 
 @pytest.mark.parametrize("as_map", [False, True])
@@ -454,38 +486,29 @@ def test_perturbations_without_controls():
             values_of(perturbation)
 
 
-@pytest.mark.parametrize("side", SIDES)
-def test_the_front_atom_is_seen(run, side):
-    """At the place of an atom, the image has the value of the frontmost atom within half its diameter."""
-    run = replace(run, fields=np.random.default_rng(1).random(len(run)))  # no two are equal
-    image = specimen_image(run, "field", side, ions=(400, 2000))
-    right, up, depth = SIDES[side]
-    positions = run.emissions.positions[400:]
-    nearness = positions[:, depth] if side == "above" else -positions[:, depth]
-    left, _, lower, _ = image.extent
-    ny, nx = image.values.shape
-    pixel = (image.extent[1] - left) / nx
-    diameter = run.emissions.nearest_neighbour_distance
-    checked = 0
-    for x, y in positions[::11, [right, up]]:
-        distance = np.hypot(positions[:, right] - x, positions[:, up] - y)
-        sure, near = distance < diameter / 2 - 1.5 * pixel, distance < diameter / 2 + 1.5 * pixel
-        front = np.flatnonzero(near)[nearness[near].argmax()]
-        if sure[front]:  # no disc ends here
-            value = image.values[int((y - lower) / pixel), int((x - left) / pixel)]
-            assert value == np.float32(run.fields[400 + front])
-            checked += 1
-    assert checked > 15
-    assert np.isnan(image.values[0, 0]) and max(ny, nx) <= 480
+def test_atoms_of_the_surface(run):
+    """Seen from above and from the sides, every front atom is among them."""
+    atoms = surface_atoms(run, "field", ions=(400, 2000))
+    positions, diameter = run.emissions.positions[400:], run.emissions.nearest_neighbour_distance
+    assert len(atoms.positions) < len(positions)
+    rows = [int(np.flatnonzero((positions == each).all(axis=1))[0]) for each in atoms.positions]
+    assert np.array_equal(atoms.values, run.fields[400:][rows])
+    radius, seen = 0.6 * diameter, []  # spheres of the page
+    for depth, sign in ((2, 1), (0, 1), (0, -1), (1, 1), (1, -1)):
+        across = np.delete(positions, depth, axis=1)
+        for k in range(0, len(positions), 23):
+            rest = radius**2 - ((across - across[k]) ** 2).sum(axis=1)
+            over = np.flatnonzero(rest > 0)
+            seen.append(over[(sign * positions[over, depth] + np.sqrt(rest[over])).argmax()] in rows)
+    assert np.mean(seen) > 0.98
 
 
 def test_colours_of_the_specimen(run):
     for color, values in (("order", run.emissions.ions), ("field", run.fields), ("charge", run.charges)):
-        image = specimen_image(run, color)
-        drawn = image.values[np.isfinite(image.values)]
-        assert np.isin(drawn, values.astype(np.float32)).all() and len(np.unique(drawn)) > 100
+        assert np.isin(surface_atoms(run, color).values, values).all()
+    assert not surface_atoms(run, "phase").values.any()
     with pytest.raises(ValueError, match="color"):
-        specimen_image(run, "mass")
+        surface_atoms(run, "mass")
 
 
 # ---- command line ---------------------------------------------------------------------------------------------------

@@ -22,6 +22,7 @@ from tornado.websocket import websocket_connect
 
 from apt_evap.cli._files import read_registration
 from apt_evap.explore.page import MODES, Page
+from apt_evap.explore.run_panel import Workbench
 from apt_evap.explore.server import serve
 
 SECONDS = 60  # until a test gives up: the machine may be busy
@@ -234,15 +235,20 @@ def test_a_click_shows_atoms(opened):
     page = opened.page
     page._clicked(page.maps[0], SimpleNamespace(x=5.0, y=-3.0))
     atoms = page.explorer.atoms_at(page.shown.view, 5.0, -3.0, page.radius.value)
-    assert len(atoms) > 0 and f"{len(atoms)} atoms land within" in page.specimen.title.text
-    assert np.array_equal(page.atoms.data["x"], atoms.positions[:, 0])
+    assert len(atoms) > 0 and f"{len(atoms)} atoms land within" in page.specimen.figure.title.text
+    view = page.specimen
+    assert np.array_equal(view.marked.data["px"] + view.centre[0], atoms.positions[:, 0])
     assert page.click.data == {"x": [5.0], "y": [-3.0], "radius": [page.radius.value]}
-    image_above = image(page.specimen_source)
-    page.side.value = "side"
-    assert np.array_equal(page.atoms.data["y"], atoms.positions[:, 2])
-    assert image(page.specimen_source).shape != image_above.shape and page.specimen.yaxis.axis_label == "z [nm]"
+    drawn = ae.explore.surface_atoms(page.explorer.run)
+    assert np.allclose(view.points.data["z"] + view.centre[2], drawn.positions[:, 2], atol=1e-5)
+    before = view.points.data["color"]
     page.color.value = "field"
-    assert np.nanmax(image(page.specimen_source)) <= page.explorer.run.fields.max() + 1e-4
+    assert (view.points.data["color"] != before).any() and "phase" not in dict(page.color.options)
+    assert view.colors.high <= page.explorer.run.fields.max()
+    for _ in range(2):
+        page.side.active = 0
+        assert view.points.tags == [0.0, 90.0] and page.side.active is None
+        view.points.tags = [10.0, 20.0]  # as a mouse turns it
 
 
 def test_a_rectangle_gives_commands(opened):
@@ -426,17 +432,92 @@ def test_the_orientation_is_searched():
     opened = Opened(Explorer(None, measured))
     index = opened.page.index
     index.material.value, index.scale.value = "Ni", 60.0
-    index._search()
-    assert index.search.disabled
+    index._search(index.search)
+    assert index.search.disabled and index.search.label == "searching"
     opened.settle(lambda: not index.search.disabled)
     found = ae.index(measured, "Ni", scales=(57.0, 63.0))
     assert found.reason in index.text.text and found.verdict in index.text.text
     assert len(index.candidates) == len(found.candidates)
     assert np.array_equal(index.candidates[0][0].matrix, found.best.orientation.matrix)
-    assert not opened.page.shell.text.startswith("[")
-    index._put_code(index._settings)
-    assert opened.page.python.text == ae.twin.settings_of(found).text
+    assert index.settings(10.0, 1).text == ae.twin.settings_of(found).text
+    if len(found.candidates) > 1:
+        index.choice.value = "1"
+        assert np.array_equal(index.settings(10.0, 1).indexing.best.orientation.matrix, index.candidates[1][0].matrix)
+    # the handles move it, and the fit starts from there
+    (x, y), (orientation, projection, _) = (index.handles.tags[:2], index.candidates[0])
+    reach = index.handles.tags[2] - x
+    index.choice.value = "0"
+    end = complex(x + 1, y) + 1.05 * reach * np.exp(1j * np.radians(4.0))
+    index.handles.data = {"x": [x + 1, end.real], "y": [y, end.imag]}
+    moved, place, quality = index.candidates[0]
+    assert quality == "moved by hand" and len(index.candidates) == len(found.candidates) + 1
+    assert place.scale == pytest.approx(1.05 * projection.scale) and place.centre == pytest.approx((x + 1, y))
+    assert moved.rotation == pytest.approx(orientation.rotation + 4.0) and moved.axis == pytest.approx(orientation.axis)
+    index.handles.data = {"x": [x], "y": [y]}  # one is deleted
+    assert len(index.handles.data["x"]) == 2 and index.candidates[0][0] is moved
+    index._search(index.refine, index.candidates[0][:2])
+    opened.settle(lambda: not index.refine.disabled)
+    assert index.candidates[0][0].matrix == pytest.approx(orientation.matrix, abs=0.005)
+    assert index.candidates[0][1].scale == pytest.approx(projection.scale, rel=0.01) and len(index.candidates) == 1
     opened.page.close()
+
+
+def test_settings_are_written_and_run(measured, tmp_path, monkeypatch):
+    """From poles that are clicked to a run that opens; no file is replaced without a second click."""
+    monkeypatch.chdir(tmp_path)
+    asked = []
+    opened = Opened(Explorer(None, measured), opened=lambda path, document: lambda: asked.append(path))
+    page, index, panel = opened.page, opened.page.index, opened.page.simulate
+    panel._write()
+    opened.settle(lambda: not panel.write.disabled)
+    assert "index the map first" in panel.text.text and not list(tmp_path.iterdir())
+    panel._start_or_stop()
+    assert "write the settings first" in panel.text.text
+    index.material.value = "Ni"
+    orientation, projection = ae.Orientation("Ni", axis=(1, 1, 1)), ae.detection.Projection(60.0)
+    for plane, family in (((1, 1, 1), "111"), ((0, 0, 2), "200"), ((0, 2, 0), "200")):
+        index.family.value = family
+        ((x, y),) = projection.places(orientation.directions([np.array(plane) / np.linalg.norm(plane)]))
+        index.add(float(x), float(y), of_line=False)
+    opened.settle(lambda: "scale 60.0" in index.text.text)
+    path = tmp_path / "tip.toml"
+    path.write_text("mine")
+    panel.file.value, panel.minutes.value = "tip.toml", 1.0
+    panel._write()
+    assert "exists" in panel.text.text and str(path) in panel.text.text and path.read_text() == "mine"
+    panel._write()
+    opened.settle(lambda: not panel.write.disabled)
+    config = ae.config.read_config(path)
+    assert config.tip["material"].name == "Ni" and "not searched" in path.read_text()
+    assert page.python.text == path.read_text() and str(path) in panel.text.text
+    # fewer ions, for the test
+    path.write_text(path.read_text().replace(f"ions = {config.n_ions:_}", "ions = 200"))
+    panel._start_or_stop()
+    assert panel.start.label == "stop the run"
+    opened.settle(lambda: "of 200 ions" in panel.text.text or asked)
+    opened.settle(lambda: asked)
+    assert asked == [str(tmp_path / "tip.h5")] and len(ae.load(tmp_path / "tip.h5")) == 200
+    assert page._bench.near[asked[0]]["start"].shift == index.settings(1.0, 1).registration.shift
+    assert panel.start.label == "start the run"
+
+
+def test_a_page_made_again_shows_the_run(measured, tmp_path):
+    """A run outlives its page, which shows it again and stops it."""
+    run = SimpleNamespace(
+        active=True, finished=False, message="", ions=50, n_ions=200, seconds_left=20.0, output=tmp_path / "a.h5"
+    )
+    run.stop = lambda: setattr(run, "message", "stopping")
+    bench = Workbench()
+    bench.run = run
+    opened = Opened(Explorer(None, measured), bench=bench)
+    panel = opened.page.simulate
+    assert "50 of 200 ions, 20 s left" in panel.text.text and panel.start.label == "stop the run"
+    panel._start_or_stop()
+    panel._look()
+    assert "stopping" in panel.text.text
+    run.active, run.message = False, "stopped with 60 of 200 ions"
+    opened.settle(lambda: "stopped with 60" in panel.text.text)
+    assert panel.start.label == "start the run"
 
 
 def test_a_file_is_opened(measured):

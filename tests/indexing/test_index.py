@@ -187,6 +187,23 @@ def test_refinement_never_lowers_the_likelihood():
     assert deviance(bins.counts, bins.counts + 1e-12) == pytest.approx(0, abs=1e-6)
 
 
+@pytest.mark.parametrize("mirror", [False, True])
+def test_a_given_orientation_is_refined(mirror):
+    """A start that is some degrees off, about another centre, goes to the orientation of the map."""
+    truth, measured = made("fcc", (0.30, 0.54, 0.79), 20.0)
+    away = ae.detection.Projection(58.0, (2.0, -1.0), mirror=mirror)
+    # the orientation whose directions are at the same places of this projection
+    places = np.array([[0.0, 0.0], [15.0, 0.0], [0.0, 15.0]])
+    turn = away.directions(places).T @ np.linalg.inv(ae.detection.Projection(SCALE).directions(places).T)
+    matrix = turn @ truth.matrix
+    left, _, right = np.linalg.svd(-matrix if mirror else matrix)
+    start = ae.Orientation.from_matrix("Ni", left @ right)
+    found = ae.index(measured, "Ni", start=(start, away))
+    assert off(found.best, truth) < 1.0  # noise alone: 0.1
+    assert found.best.projection.scale == pytest.approx(SCALE, rel=0.02) and not found.decided
+    assert len(found.candidates) == 1
+
+
 def test_densities_are_indexed_as_counts_are():
     orientation, map = made("fcc", (0.30, 0.54, 0.79), 20.0, ions=60_000)
     density = ae.DetectorMap.from_array(np.where(map.mask, map.density, np.nan), map.x_edges, map.y_edges)

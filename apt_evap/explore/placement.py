@@ -1,0 +1,62 @@
+"""Whether two maps agree as they lie, or better if one of them is turned or scaled about the axis of the specimen."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.registration.correlation_search import BROAD, MEDIUM, NARROW, View, correlation
+from apt_evap.registration.register import Registration
+
+_ANGLES, _SCALES = np.arange(0.0, 360.0, 3.0), (0.85, 1.0, 1.18)
+_COMMON = 0.6  # of the area that must stay common
+
+
+def misplaced(simulated: DetectorMap, measured: DetectorMap, registration: Registration) -> str:
+    """Say how a registered map lies better, about the axis of the specimen; "" if it lies well.
+
+    Parameters
+    ----------
+    simulated, measured : DetectorMap
+        Maps in the measured frame, on the same bins.
+    registration : Registration
+        Transform into the measured frame.
+
+    Returns
+    -------
+    str
+
+    Notes
+    -----
+    Compared are the correlations of the flattened maps, as in `register`, for rotations by 3 degrees and three scales.
+    A difference counts from two standard errors, which are those of `register`.
+    """
+    common = simulated.mask & measured.mask
+    try:
+        views = [View(replace(each, mask=common)) for each in (simulated, measured)]
+    except ValueError:  # no bin remains without the rim
+        return ""
+    diameter = views[1].diameter
+    pixel = diameter / MEDIUM
+    moving, fixed = (view.flatten(NARROW * pixel, BROAD * diameter) for view in views)
+    centre = complex(*(float(each) for each in registration.points(0.0, 0.0)))
+    x, y = (each[common] for each in np.meshgrid(*measured.centres))
+    step = max(1, round(pixel / max(measured.bin_size)) ** 2)
+    points = (x + 1j * y)[::step]
+    values, inside = fixed.sample(points)
+    points, values = points[inside], values[inside]
+
+    def score(angle, scale):
+        turned = centre + (points - centre) * np.exp(-1j * np.radians(angle)) / scale
+        found, there = moving.sample(turned)
+        enough = there.mean() > _COMMON
+        return correlation(found[there], values[there]) * math.sqrt(there.mean()) if enough else -1.0
+
+    here = score(0.0, 1.0)
+    best, angle, scale = max((score(angle, scale), angle, scale) for angle in _ANGLES for scale in _SCALES)
+    patches = len(points) * step * math.prod(measured.bin_size) / (4 * math.pi * (NARROW * pixel) ** 2)
+    if best - here < 2 * math.sqrt(2 / patches) * (1 - best**2):
+        return ""
+    angle = (angle + 180) % 360 - 180
+    return f"turned by {angle:.0f}° and scaled by {scale:g} they correlate better: {best:.2f} instead of {here:.2f}"

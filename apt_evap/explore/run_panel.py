@@ -1,0 +1,166 @@
+"""Group of the page that writes the settings of a simulation of the measured specimen, and runs it."""
+
+import math
+import threading
+from collections.abc import Callable
+from functools import partial
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from bokeh.layouts import column, row
+from bokeh.models import Button, Div, NumericInput, TextInput
+
+from apt_evap._common.threads import thread_count
+from apt_evap.explore.background_run import BackgroundRun
+from apt_evap.explore.widgets import LEFT
+from apt_evap.twin.start import Start
+
+INTERVAL = 500
+"""Time between two looks at the run [ms]."""
+# bounds of the registration of the run: the indexing knows rotation, scale and place better than a search
+_ROTATIONS, _SCALES, _TILT = (-5.0, 5.0), (0.94, 1.06), math.radians(3.0)
+
+
+class Workbench:
+    """What outlives a page that is loaded again: the run in the background, and where maps of runs are to be found."""
+
+    def __init__(self) -> None:
+        self.run: BackgroundRun | None = None
+        self.near: dict[str, dict[str, Any]] = {}
+        """Options of `register` for the files of runs."""
+
+
+class RunPanel:
+    """Widgets that write the settings file, and start and stop its run.
+
+    Parameters
+    ----------
+    settings : callable
+        Returns the `Start` for minutes and threads; called in a thread.
+    name : str
+        Settings file that is proposed.
+    bench : Workbench
+        The run of all pages.
+    later : callable
+        As for `Page`.
+    put_code : callable
+        Shows the text of the settings file.
+    open_run : callable, optional
+        Opens a file on the page.
+    """
+
+    def __init__(
+        self,
+        settings: Callable[[float, int], Start],
+        name: str,
+        bench: Workbench,
+        later: Callable[[Callable[[], None], int], Any],
+        put_code: Callable[[str], None],
+        open_run: Callable[[str], None] | None = None,
+    ) -> None:
+        self._settings, self.bench, self._later = settings, bench, later
+        self._put_code, self._open_run = put_code, open_run
+        self._confirmed = ""  # the file whose replacement was asked for
+        half = (LEFT - 20) // 2
+        self.file = TextInput(title="settings file", value=name, width=half)
+        self.minutes = NumericInput(title="minutes of the run", value=10.0, mode="float", low=0.1, width=half)
+        self.write = Button(label="write settings", width=half)
+        self.start = Button(label="start the run", width=half)
+        self.text = Div(width=LEFT - 10, text="from the chosen candidate; index the map first")
+        self.file.on_change("value", lambda attr, old, new: self._ask_nothing())
+        self.write.on_click(self._write)
+        self.start.on_click(self._start_or_stop)
+        self.column = column(row(self.file, self.minutes), row(self.write, self.start), self.text)
+        self._closed = False
+        if bench.run is not None:
+            self._look()
+
+    def close(self) -> None:
+        """Look at the run no more; it goes on."""
+        self._closed = True
+
+    @property
+    def path(self) -> Path:
+        """Settings file."""
+        return Path(self.file.value.strip() or "specimen.toml").expanduser().absolute()
+
+    def _ask_nothing(self):
+        self._confirmed = ""
+        self.write.label = "write settings"
+
+    def _say(self, text):
+        self.text.text = escape(text)
+
+    def _write(self):
+        path = self.path
+        if path.suffix.lower() != ".toml":
+            self._say(f"a settings file ends in .toml, got {path.name}")
+            return
+        if path.exists() and self._confirmed != str(path):
+            self._confirmed, self.write.label = str(path), f"replace {path.name}"
+            self._say(f"{path} exists: click again to replace it, or give another name")
+            return
+        self._ask_nothing()
+        self.write.disabled = True
+        self._say("making the settings")
+        minutes = self.minutes.value or 10.0
+
+        def work():
+            try:
+                made = self._settings(minutes, thread_count())
+                made.save(path)
+            except (ValueError, OSError) as error:
+                self._later(partial(self._written, None, str(error)), 0)
+            else:
+                self._later(partial(self._written, made, f"wrote {path}: {made.foresight}"), 0)
+
+        threading.Thread(target=work, daemon=True).start()
+
+    def _written(self, made, text):
+        self.write.disabled = False
+        self._say(text)
+        if made is not None:
+            tolerance = _TILT * made.indexing.best.projection.scale
+            near = {"start": made.registration, "rotations": _ROTATIONS, "scales": _SCALES, "tolerance": tolerance}
+            self.bench.near[str(self.path.with_suffix(".h5"))] = near
+            self._put_code(made.text)
+
+    def _start_or_stop(self):
+        run = self.bench.run
+        if run is not None and run.active:
+            run.stop()
+            return
+        path = self.path
+        if not path.is_file():
+            self._say(f"{path} is not there yet: write the settings first")
+            return
+        self.bench.run = BackgroundRun(path, path.with_suffix(".h5"))
+        self._look()
+
+    def _look(self):
+        """Show the state of the run, again and again until it ends."""
+        run = self.bench.run
+        if self._closed or run is None:
+            return
+        active = run.active  # set by another thread
+        self.start.label = "stop the run" if active else "start the run"
+        if active:
+            left = "" if run.seconds_left is None else f", {_duration(run.seconds_left)} left"
+            state = run.message or f"{run.ions:,} of {run.n_ions:,} ions{left}"
+            self.text.text = (
+                f'<progress value="{run.ions}" max="{run.n_ions or 1}" style="width: 100%"></progress><br>'
+                f"{escape(state)}; {escape(str(run.output))}, opened here at its end"
+            )
+            self._later(self._look, INTERVAL)
+        elif not run.finished:
+            self._say(run.message)
+        else:
+            self.bench.run = None
+            self._say(f"{run.output} has all ions: apt-evap explore {run.output}")
+            if self._open_run is not None:
+                self._open_run(str(run.output))
+
+
+def _duration(seconds):
+    return f"{seconds / 60:.0f} min" if seconds > 100 else f"{seconds:.0f} s"
