@@ -1,5 +1,7 @@
 """Whether two maps show the same crystal: maps with lines of known symmetry, dark or bright, with noise."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -47,6 +49,15 @@ def test_the_same_crystal_is_alike_if_its_lines_are_dark_wide_noisy_or_turned():
 def test_another_crystal_is_not_alike(other):
     found = likeness(lines(THREE, ions=12_000), lines(other, ions=60_000, seed=1), HERE)
     assert found.verdict != "alike" and found.symmetry < ALIKE
+
+
+def test_a_doubtful_registration_makes_the_verdict_doubtful():
+    simulated, measured = lines(THREE, ions=12_000), lines(THREE, ions=60_000, seed=1)
+    searched = replace(HERE, method="search", score=0.3, overlap=1.0)
+    found = likeness(simulated, measured, searched)
+    assert found.verdict == "doubtful" and found.symmetry > ALIKE and "start" in found.reason
+    assert likeness(simulated, measured, replace(searched, score=0.8)).verdict == "alike"
+    assert likeness(simulated, measured, replace(searched, method="start")).verdict == "alike"
 
 
 def test_a_map_without_lines_or_of_noise_is_not_alike():
