@@ -173,7 +173,9 @@ def _add_map(commands: Any) -> None:
         "  apt-evap map R5083.epos --bins 128\n"
         "  apt-evap map R5083.epos --ranges R5083.rrng --species Si --voltage 4000, --circle 15 -o silicon.png\n"
         "  apt-evap map ni111.h5 --perturbation Unperturbed --perturbation RollUp:0.3,0.1 -o energies.png\n"
-        "  apt-evap map ni111.h5 --field-ion Ne -o image.png\n\n"
+        "  apt-evap map ni111.h5 --field-ion Ne -o image.png\n"
+        "  apt-evap map ni111.h5 --poles\n"
+        "  apt-evap map R5083.epos --poles W --axis 0,1,1 --distance 90\n\n"
         "a perturbation is NAME, NAME:NUMBERS or a TOML table:\n"
         "  Unperturbed              RollUp:0.2 (eV, all ions)    RollUp:0.155,0.155 (mean, standard deviation)\n"
         "  LateralVelocity:0.3,0.1  Combined:0.155,0.155,0.75 (the last number is the roll-up fraction)\n"
@@ -203,6 +205,20 @@ def _add_map(commands: Any) -> None:
         metavar="GAS",
         help="field-ion image of the surface at the end of a run, in He, Ne, Ar or H2; default: Ne",
     )
+    group = command.add_argument_group("crystal", "Poles and zone lines over the map.")
+    group.add_argument(
+        "--poles",
+        nargs="?",
+        const="",
+        metavar="NAME",
+        help="draw them, of a run or of a crystal such as W; where they are is searched as by apt-evap index",
+    )
+    group.add_argument(
+        "--axis", type=_numbers, metavar="H,K,L", help="pole near the centre of the map, or with --rotation the axis"
+    )
+    group.add_argument("--rotation", type=float, metavar="DEGREES", help="of the crystal about its axis; no search")
+    group.add_argument("--scale", type=_number("mm/rad"), metavar="S", help="scale of the map [mm/rad]")
+    group.add_argument("--distance", type=_number("mm"), metavar="MM", help="flight length of the instrument")
     _add_real_units(command)
     command.add_argument("--force", action="store_true", help="overwrite a file not made by apt-evap")
     _add_speech(command)

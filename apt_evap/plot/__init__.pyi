@@ -8,9 +8,11 @@ from .histories import voltage_curve as voltage_curve
 from .limits import color_limits as color_limits
 from .limits import common_limits as common_limits
 from .losses import conditions as conditions
+from .maps import binned as binned
 from .maps import describe as describe
 from .maps import detector_map as detector_map
 from .maps import detector_maps as detector_maps
+from .maps import specimen_title as specimen_title
 from .overlays import overlay as overlay
 from .pole_labels import poles as poles
 from .profiles import profile as profile

@@ -11,6 +11,7 @@ import pytest
 from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from matplotlib.text import Text
 
 import apt_evap as ae
@@ -133,6 +134,20 @@ def test_titles_are_names_of_files(run, emitter):
         ):
             assert ax.get_title() == written
             ax.title.get_window_extent()  # its letters are laid out
+
+
+def test_a_round_field_of_view_is_a_circle_and_a_run_has_a_title(run):
+    edges = np.linspace(-20, 20, 101)
+    x, y = np.meshgrid(*2 * [(edges[1:] + edges[:-1]) / 2])
+    for mask, circles in ((np.hypot(x - 2, y + 1) < 15, 1), (abs(x) + abs(y) < 15, 0), (np.isfinite(x), 0)):
+        ax = plot.detector_map(ae.DetectorMap.from_array(np.ones(x.shape), edges, edges, mask))
+        drawn = [each for each in ax.patches if isinstance(each, Circle)]
+        assert len(drawn) == circles
+        for circle in drawn:  # the mean of 4,400 bins of 0.4 mm
+            assert circle.center == pytest.approx((2, -1), abs=0.02) and circle.radius == pytest.approx(15, abs=0.02)
+    (ax,) = plot.detector_maps([run.hits(ae.Unperturbed())], ["own"], title=plot.specimen_title(run))
+    assert ax.get_title() == "own" and ax.figure.get_suptitle() == "Ni, axis [$111$], R = 2.1 nm"
+    assert_nothing_cut_off(ax.figure)
 
 
 @pytest.mark.parametrize("n, shape", [(1, (1, 1)), (3, (1, 3)), (4, (2, 2)), (5, (2, 3)), (7, (3, 3))])
@@ -586,8 +601,8 @@ def test_a_notebook_shows_its_pictures():
 def test_maps_of_ions_are_binned_by_themselves(run):
     hits = run.hits(ae.Unperturbed())
     ax = plot.detector_map(hits)
-    expected = hits.map(32)  # 250 ions
-    expected = expected.smoothed(max(expected.bin_size))
+    expected = hits.map(128)
+    expected = expected.smoothed(4 * max(expected.bin_size))  # as in 32 bins: 250 ions
     assert np.array_equal(ax.images[0].get_array()[expected.mask], expected.density[expected.mask])
     assert ax.images[0].get_extent() == list(expected.extent)
     both = plot.detector_maps([hits, expected])
