@@ -435,6 +435,7 @@ def _add_reconstruct(commands: Any) -> None:
         "them as .pos, .epos, .xyz or .vtp. A run has its own constants; its true sites give the errors.",
         epilog="example:\n"
         "  apt-evap reconstruct R5083.epos --element Si --distance 90 --efficiency 0.57 -o R5083.pos\n"
+        "  apt-evap reconstruct R5083.epos --element Si --distance 90 --ranges R5083.rrng --picture R5083.png\n"
         "  apt-evap reconstruct ni111.h5 --real-units\n"
         "  apt-evap reconstruct R5083.epos --atomic-volume 0.02 --distance 90 --radius shank --initial-radius 30 \\\n"
         "      --shank-angle 5",
@@ -444,6 +445,11 @@ def _add_reconstruct(commands: Any) -> None:
     command.add_argument("-o", "--output", metavar="OUT", help="default: FILE_reconstructed.pos in this folder")
     command.add_argument(
         "--frame", choices=FRAMES, default="depth", help="z is the depth, or goes out of the specimen; default: depth"
+    )
+    command.add_argument(
+        "--picture",
+        metavar="P.png",
+        help="draw side view, top view, depth profile and composition; --ranges gives the species of measured ions",
     )
     constants = command.add_argument_group("constants", "The defaults of a run are its own constants.")
     constants.add_argument("--protocol", choices=PROTOCOLS, default="cap", help="depth increment; default: cap")

@@ -18,6 +18,7 @@ from .pole_labels import poles as poles
 from .profiles import profile as profile
 from .profiles import profile_comparison as profile_comparison
 from .profiles import rectangles as rectangles
+from .reconstructions import reconstruction as reconstruction
 from .responses import ion_colors as ion_colors
 from .responses import response as response
 from .specimens import cut as cut

@@ -620,3 +620,31 @@ def test_a_specimen_is_a_surface_a_simulation_or_a_tip(small_tip, emitter):
     assert np.array_equal(drawn[0], drawn[1]) and np.array_equal(drawn[0], drawn[2])
     with pytest.raises(ValueError, match="emitter"):
         plot.specimen("Ni")
+
+
+# ---- reconstructions -------------------------------------------------------------------------------------------------
+
+
+def test_a_reconstruction_from_two_sides_with_its_profile(rng):
+    radius, azimuth = 20 * np.sqrt(rng.random(9000)), 2 * np.pi * rng.random(9000)
+    mass = np.where(np.arange(9000) < 3000, 27.0, np.where(rng.random(9000) < 0.25, 63.0, 90.0))
+    ions = ae.Hits(x=radius * np.cos(azimuth), y=radius * np.sin(azimuth), mass_to_charge=mass)
+    found = ae.reconstruct(ions, atomic_volume=0.011, distance=90.0, radius=30.0, efficiency=0.5)
+    side, top, density, radii = plot.reconstruction(found)
+    assert side.yaxis_inverted() and len(top.images) == 1
+    # a line for what is expected, 45.5 per nm^3, and the ions within 4 standard deviations of counts
+    expected = density.lines[-1].get_ydata()[0]
+    assert expected == pytest.approx(0.5 / 0.011)
+    counted = density.lines[0].get_ydata()
+    assert counted.mean() == pytest.approx(expected, rel=4 / np.sqrt(len(ions) / 4))
+    assert set(radii.lines[0].get_ydata()) == {30.0}
+    ranges = ae.detection.Ranges(names=("Al", "Cu"), low=[26, 62], high=[28, 64])
+    with pytest.warns(ae.warnings.DataWarning, match="outside every range"):
+        side, _, fractions, bars = plot.reconstruction(found, ranges, title="a$b")
+    names = [text.get_text() for text in bars.get_yticklabels()]
+    assert names == ["outside every range", "Al", "Cu"] and side.figure.get_suptitle() == "a$b"
+    widths = [bar.get_width() for bar in bars.patches]
+    assert widths == [np.mean(mass == each) for each in (90, 27, 63)]
+    steps = fractions.lines[names.index("Al")].get_ydata()  # in the first third only
+    assert steps[0] > 0.99 and steps[-1] < 0.01
+    assert_nothing_cut_off(side.figure)
