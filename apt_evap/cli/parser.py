@@ -294,18 +294,26 @@ def _add_twin(commands: Any) -> None:
         "  specimen.toml, start.json   settings of the simulation, and the indexing\n"
         "  run.h5, run.png             the simulation\n"
         "  registration.json, study/   as of apt-evap compare; study/report.html has it all\n"
-        "  answer.txt                  constants of the measurement\n\n"
-        "example: apt-evap twin R5083.epos --element Ni --distance 90 --minutes 10",
+        "  answer.txt                  constants of the measurement, what they depend on, and checks\n\n"
+        "example:\n"
+        "  apt-evap twin R5083.epos --element Ni --distance 90 --minutes 10\n"
+        "  apt-evap twin map.npz --element Ni --pole=-9.6,-0.4,1,1,1 --pole 2.4,6.2,1,1,3 --pole=-7.5,-13.5,1,3,1",
         **_SHAPE,
     )
     command.add_argument("file", metavar="FILE", help="measured ions (.epos, ...) or a map (.npz)")
     command.add_argument("-o", "--output", metavar="FOLDER", help="default: FILE_twin in this folder")
     _add_reading(command)
     _add_indexing(command)
-    _add_specimen(command)
+    _add_specimen(command).add_argument(
+        "--efficiency",
+        type=_number("1"),
+        default=0.5,
+        metavar="ETA",
+        help="part of the evaporated atoms that are among the selected ions, for the angle of the shank; default: 0.5",
+    )
 
 
-def _add_specimen(command: Any) -> None:
+def _add_specimen(command: Any) -> Any:
     group = command.add_argument_group("specimen")
     group.add_argument(
         "--minutes", type=float, default=10.0, metavar="N", help="time that the simulation may take; default: 10"
@@ -313,6 +321,7 @@ def _add_specimen(command: Any) -> None:
     group.add_argument("--field-factor", type=float, metavar="KF", help="for the radius from the voltage; default: 3.3")
     group.add_argument("--lens", metavar="L", help="microscope that gives the field factor, as for apt-evap export")
     group.add_argument("--threads", type=_integer(1), metavar="N", help="default: all processors")
+    return group
 
 
 def _add_indexing(command: Any) -> None:

@@ -16,6 +16,7 @@ from apt_evap.cli._files import (
     read,
     save_figure,
     select,
+    with_masses,
 )
 from apt_evap.cli._output import tell, tell_json
 from apt_evap.config.perturbation_text import read_perturbation
@@ -55,7 +56,7 @@ def execute(options: argparse.Namespace) -> int:
     ranges = read_ranges(options.ranges) if picture is not None and options.ranges is not None else None
     if ranges is not None and options.species is None:
         options.ranges = None
-    reconstruction = reconstruct(select(hits, options), **settings)
+    reconstruction = reconstruct(select(with_masses(hits, options), options), **settings)
     reconstruction.write(output, frame=options.frame)
     tell(options, f"{reconstruction!r}")
     result = {"wrote": str(output), "file": options.file, "ions": len(reconstruction)}
