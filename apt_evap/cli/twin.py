@@ -59,6 +59,7 @@ def execute(options: argparse.Namespace) -> int:
         )
         with replace_file(folder / REGISTRATION) as file:
             file.write((json.dumps(to_plain(registration), indent=1) + "\n").encode())
+    told: list[str] = []
     if not (folder / ANSWER).exists():
         measurement = _measurement(best, measured_map, ions, options)
         command = _reconstruct_command(measurement, options)
@@ -71,7 +72,9 @@ def execute(options: argparse.Namespace) -> int:
         section = measurement_section(measurement.constants, measurement.checks, command)
         study = compare(given, measured_map if ions is None else ions, [section])
         _write_answer(folder / ANSWER, facts, study, measurement, command)
-    put(read_small_file(folder / ANSWER, _LARGEST, "an answer").decode().rstrip())
+        told = study.lines()  # by `compare`
+    answer = read_small_file(folder / ANSWER, _LARGEST, "an answer").decode().splitlines()
+    put("\n".join(line for line in answer if line not in told))
     put(f"wrote {folder / STUDY / 'report.html'}")
     return 0
 
