@@ -6,6 +6,7 @@ import math
 import shlex
 from pathlib import Path
 
+from apt_evap import plot
 from apt_evap._common.codec import to_plain
 from apt_evap._common.files import FileError, check_path, read_small_file, replace_file
 from apt_evap.cli import run as run_command
@@ -18,11 +19,14 @@ from apt_evap.cli.start import is_start, start_of, summary
 from apt_evap.crystallography.orientation import Orientation
 from apt_evap.detection.projection import Projection
 from apt_evap.emission.perturbations import LateralVelocity, RollUp
+from apt_evap.emission.post_ionisation import FLIGHT_CHARGES
+from apt_evap.fit.defaults import MEANS
 from apt_evap.indexing.index import Candidate
 from apt_evap.indexing.master_pattern import master_patterns
 from apt_evap.io.formats import read_ranges
 from apt_evap.registration.register import Registration, register
 from apt_evap.report.measurement import measurement_section
+from apt_evap.report.page import Page
 from apt_evap.simulation.run import load
 from apt_evap.specimen.materials import material
 from apt_evap.twin.constants import constants_of
@@ -61,15 +65,20 @@ def execute(options: argparse.Namespace) -> int:
             file.write((json.dumps(to_plain(registration), indent=1) + "\n").encode())
     told: list[str] = []
     if not (folder / ANSWER).exists():
-        measurement = _measurement(best, measured_map, ions, options)
+        candidate = _candidate(best, options)
+        measurement = _measurement(candidate, measured_map, ions, options)
         command = _reconstruct_command(measurement, options)
         arguments = [folder / RUN, options.file, "-o", folder / STUDY, "--registration", folder / REGISTRATION]
+        # the deflection is that of energy / charge
+        charge = FLIGHT_CHARGES.get(options.element, 1)
+        means = ",".join(f"{charge * each:g}" for each in MEANS)
         emission_options = ["--mechanism", "lateral", "--option", f"height={HEIGHT}"]
         if rolls:
             emission_options = ["--mechanism", "roll-up", "--option", f"probability={_FRACTIONS}"]
             emission_options += ["--option", f"sharpness={SHARPNESS}", "--option", f"height={HEIGHT}"]
-        given = _parsed("compare", *arguments, *emission_options, options=options)
-        section = measurement_section(measurement.constants, measurement.checks, command)
+        given = _parsed("compare", *arguments, "--means", means, *emission_options, options=options)
+        picture = _picture(candidate, measured_map, facts)
+        section = measurement_section(measurement.constants, measurement.checks, command, picture)
         study = compare(given, measured_map if ions is None else ions, [section])
         _write_answer(folder / ANSWER, facts, study, measurement, command)
         told = study.lines()  # by `compare`
@@ -110,16 +119,29 @@ def _shift(candidate):
     return math.radians(_TILT) * candidate["scale"]
 
 
-def _measurement(best, measured_map, ions, options):
-    """Constants of the measurement, from the candidate in start.json."""
+def _candidate(best, options):
+    """The first candidate, as it is in start.json."""
     crystal = material(options.element)
     patterns = master_patterns(crystal.structure)
-    candidate = Candidate(
+    return Candidate(
         orientation=Orientation(crystal, tuple(best["axis"]), best["rotation"]),
         projection=Projection(best["scale"], tuple(best["centre"]), compression=best["compression"]),
         pattern=min(patterns, key=lambda each: abs(each.apex_radius - best["pattern_radius"])),
         **{name: best[name] for name in ("score", "confidence", "rolled", "contrast", "angle_error")},
     )
+
+
+def _picture(candidate, measured_map, facts):
+    """Measured map with the poles and zone lines of the candidate, as HTML."""
+    shown = measured_map.smoothed(max(measured_map.bin_size)) if measured_map.is_counts else measured_map
+    ax = plot.detector_map(shown, title=f"{candidate}")
+    plot.poles(ax, candidate.orientation, candidate.projection, region=shown, families=8)
+    return Page("").picture(ax.figure, f"Measured map with the poles and zone lines that it was simulated with "
+                                       f"({facts['verdict']}).")  # fmt: skip
+
+
+def _measurement(candidate, measured_map, ions, options):
+    """Constants of the measurement."""
     return constants_of(
         measured_map,
         candidate,

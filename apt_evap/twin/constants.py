@@ -51,7 +51,7 @@ class Constant(NamedTuple):
         """Value and error."""
         if math.isnan(self.value):
             return "not determined"
-        return f"{self.value:.4g}" if math.isnan(self.error) else f"{self.value:.4g} ± {self.error:.2g}"
+        return f"{self.value:.5g}" if math.isnan(self.error) else f"{self.value:.5g} ± {self.error:.2g}"
 
 
 class Observed(NamedTuple):
