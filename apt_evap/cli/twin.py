@@ -160,7 +160,7 @@ def _reconstruct_command(measurement, options):
     if "distance" not in known:
         return ""
     words = ["apt-evap", "reconstruct", options.file, "--element", options.element]
-    for name in ("distance", "efficiency", "compression", "field_factor", "projection"):
+    for name in ("distance", "detector_radius", "efficiency", "compression", "field_factor", "projection"):
         if name in known:
             value = known[name] if isinstance(known[name], str) else f"{known[name]:.4g}"
             words += [f"--{name.replace('_', '-')}", value]

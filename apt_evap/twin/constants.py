@@ -192,7 +192,8 @@ def constants_of(
     field = material.evaporation_field
     constants += _voltage_constants(voltages, field, lens, factor)
     volume = 1 / atom_density(material.structure, material.a, material.c)
-    constants.append(_shank(hits, candidate.projection, volume, efficiency, field, lens, factor, length))
+    disc = disc_of(measured)  # a few ions are far outside the field of view
+    constants.append(_shank(hits, disc, scale, volume, efficiency, field, lens, factor, length))
     if lens is not None and length is not None:
         radius = float(lens.radius(float(np.median(voltages)), field))
         checks.append(
@@ -209,6 +210,7 @@ def constants_of(
     if ranges is not None and hits.mass_to_charge is not None:
         checks += _charges(hits, material, ranges)
     arguments: dict[str, Any] = {"atomic_volume": volume, "evaporation_field": field, "efficiency": efficiency}
+    arguments["detector_radius"] = disc.radius - math.hypot(*disc.centre)
     if length is not None:
         arguments |= {"distance": length}
         if lens is None:
@@ -259,18 +261,18 @@ def _voltage_constants(voltages, field, lens, factor):
     return found
 
 
-def _shank(hits, projection, volume, efficiency, field, lens, factor, length):
+def _shank(hits, disc, scale, volume, efficiency, field, lens, factor, length):
     """Angle of the shank from the course of the voltage."""
     name = "angle of the shank [degrees]"
     if hits.x is None or hits.y is None:
         return Constant(name, math.nan, math.nan, "the ions have no places")
-    at = projection.centre
-    placed = replace(hits[hits.detected], extent=None)
-    placed = replace(placed, x=placed.x - at[0], y=placed.y - at[1])
+    placed = replace(hits.within_circle(disc.radius, disc.centre), extent=None)
+    placed = replace(placed, x=placed.x - disc.centre[0], y=placed.y - disc.centre[1])
     if lens is not None and length is not None:
         if lens.profile is not None:
             return Constant(name, math.nan, math.nan, "the lens has a profile")
         known = {"atomic_volume": volume, "distance": length, "evaporation_field": field, "efficiency": efficiency}
+        known["detector_radius"] = disc.radius
         try:
             fit = fit_shank(placed, lens, **known)
         except ValueError as error:
@@ -281,8 +283,9 @@ def _shank(hits, projection, volume, efficiency, field, lens, factor, length):
         every = max(1, -(-len(placed) // _IONS))
         # with the flight length and the compression of the map their ratio alone matters
         found = reconstruct(
-            placed[::every], atomic_volume=volume, distance=projection.scale, compression=1.0,
+            placed[::every], atomic_volume=volume, distance=scale, compression=1.0,
             projection="equidistant", field_factor=factor, evaporation_field=field, efficiency=efficiency / every,
+            detector_radius=disc.radius,
         )  # fmt: skip
         parts = np.array_split(np.arange(len(found)), min(_SECTIONS, len(found)))
         depths, radii = (np.array([each[part].mean() for part in parts]) for each in (found.depths, found.radii))
