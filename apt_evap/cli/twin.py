@@ -19,8 +19,6 @@ from apt_evap.cli.start import is_start, start_of, summary
 from apt_evap.crystallography.orientation import Orientation
 from apt_evap.detection.projection import Projection
 from apt_evap.emission.perturbations import LateralVelocity, RollUp
-from apt_evap.emission.post_ionisation import FLIGHT_CHARGES
-from apt_evap.fit.defaults import MEANS
 from apt_evap.indexing.index import Candidate
 from apt_evap.indexing.master_pattern import master_patterns
 from apt_evap.io.formats import read_ranges
@@ -69,14 +67,11 @@ def execute(options: argparse.Namespace) -> int:
         measurement = _measurement(candidate, measured_map, ions, options)
         command = _reconstruct_command(measurement, options)
         arguments = [folder / RUN, options.file, "-o", folder / STUDY, "--registration", folder / REGISTRATION]
-        # the deflection is that of energy / charge
-        charge = FLIGHT_CHARGES.get(options.element, 1)
-        means = ",".join(f"{charge * each:g}" for each in MEANS)
         emission_options = ["--mechanism", "lateral", "--option", f"height={HEIGHT}"]
         if rolls:
             emission_options = ["--mechanism", "roll-up", "--option", f"probability={_FRACTIONS}"]
             emission_options += ["--option", f"sharpness={SHARPNESS}", "--option", f"height={HEIGHT}"]
-        given = _parsed("compare", *arguments, "--means", means, *emission_options, options=options)
+        given = _parsed("compare", *arguments, *emission_options, options=options)
         picture = _picture(candidate, measured_map, facts)
         section = measurement_section(measurement.constants, measurement.checks, command, picture)
         study = compare(given, measured_map if ions is None else ions, [section])
