@@ -5,6 +5,7 @@ import json
 import os
 import tempfile
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,11 @@ from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import did_you_mean
 from apt_evap._version import __version__
 from apt_evap.config.lens_text import read_lens
+from apt_evap.crystallography.orientation import Orientation
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
+from apt_evap.detection.projection import Projection
+from apt_evap.detection.timing import mass_to_charge
 from apt_evap.io.distortion_grid import read_grid
 from apt_evap.io.formats import read as read_file
 from apt_evap.io.formats import read_ranges
@@ -129,6 +133,15 @@ def _of_species(hits, names, ranges):
     return hits[np.isin(elements, names)]
 
 
+def with_masses(hits: Hits, options: argparse.Namespace) -> Hits:
+    """The ions with mass-to-charge ratios from their times of flight, if they have none and the distance is given."""
+    columns = (hits.time_of_flight, hits.voltage, hits.x, hits.y)
+    if hits.mass_to_charge is not None or options.distance is None or any(each is None for each in columns):
+        return hits
+    time, voltage, x, y = columns
+    return replace(hits, mass_to_charge=mass_to_charge(voltage, time, x, y, options.distance))
+
+
 def check_columns(hits: Hits, options: argparse.Namespace) -> None:
     """Raise a ValueError for ions without detector coordinates."""
     if hits.x is None or hits.y is None:
@@ -188,8 +201,18 @@ def picture_path(path: AnyPath) -> Path:
     return path
 
 
-def save_picture(path: Path, maps: Sequence[DetectorMap], titles: Sequence[str]) -> None:
-    save_figure(path, plot.detector_maps(maps, titles, limits=plot.common_limits(maps))[0].figure)
+def save_picture(
+    path: Path,
+    maps: Sequence[DetectorMap],
+    titles: Sequence[str],
+    title: str | None = None,
+    crystal: tuple[Orientation, Projection] | None = None,
+) -> None:
+    axes = plot.detector_maps(maps, titles, limits=plot.common_limits(maps), title=title)
+    if crystal is not None:
+        for ax, each in zip(axes, maps, strict=True):
+            plot.poles(ax, *crystal, region=each, families=8)
+    save_figure(path, axes[0].figure)
 
 
 def save_figure(path: Path, figure: Any) -> None:

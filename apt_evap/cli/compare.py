@@ -6,6 +6,7 @@ import json
 import shlex
 import shutil
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -39,14 +40,16 @@ def execute(options: argparse.Namespace) -> int:
     return 0
 
 
-def compare(options: argparse.Namespace, measured: Hits | DetectorMap | None = None) -> Study:
-    """Compare as the command does; with the measurement of another command instead of the file of the options."""
+def compare(
+    options: argparse.Namespace, measured: Hits | DetectorMap | None = None, sections: Sequence[str] = ()
+) -> Study:
+    """Compare as the command does; another command may give the measurement, and more sections of the report."""
     # these are a line of the result
     with recorded_warnings(() if options.quiet else (RegistrationWarning, StructureWarning)) as messages:
-        return _compare(options, measured, messages)
+        return _compare(options, measured, messages, sections)
 
 
-def _compare(options, measured, messages):
+def _compare(options, measured, messages, sections):
     folder = check_path(options.output or f"{Path(options.file).stem}_study")
     _check_folder(folder, options.force)
     registration = None if options.registration is None else read_registration(options.registration)
@@ -63,7 +66,7 @@ def _compare(options, measured, messages):
         n_threads=options.threads,
         progress=False if options.quiet else None,
     )
-    _write(study, run, folder, options, messages)
+    _write(study, run, folder, options, messages, sections)
     if not options.quiet:
         put("\n".join(study.lines()))
         check = f"; check {OVERLAY}, --registration sets a known registration" if study.registration.doubtful else ""
@@ -114,7 +117,7 @@ def _is_study(path):
         return False
 
 
-def _write(study, run, folder, options, messages):
+def _write(study, run, folder, options, messages, sections):
     """Write all files to a temporary folder, and move them when they are complete."""
     figures = {name: draw(study, run) for name, draw in _FIGURES.items()}
     try:
@@ -133,6 +136,7 @@ def _write(study, run, folder, options, messages):
                 command=shlex.join(["apt-evap", *options.arguments]),
                 # the report tells a doubtful registration by itself
                 warnings=[str(each) for each in messages if not isinstance(each, RegistrationWarning)],
+                sections=sections,
             )
             folder.mkdir(exist_ok=True)
             for name in FILES:

@@ -1,15 +1,13 @@
 """`apt-evap index`: which crystal direction is where on a measured map."""
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 
 from apt_evap import plot
-from apt_evap.cli._files import check_output, ions_of_map, is_picture, picture_path, read, save_figure
+from apt_evap.cli._files import check_output, ions_of_map, is_picture, picture_path, read, save_figure, with_masses
 from apt_evap.cli._output import tell, tell_json
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
-from apt_evap.detection.timing import mass_to_charge
 from apt_evap.indexing.index import Indexing, index
 from apt_evap.simulation.run import Run
 
@@ -33,11 +31,7 @@ def map_of(options: argparse.Namespace) -> tuple[DetectorMap, Hits | None]:
         raise ValueError(f"a measured file is needed, {options.file!r} contains a run, whose orientation is known")
     if isinstance(content, DetectorMap):
         return content, None
-    columns = (content.time_of_flight, content.voltage, content.x, content.y)
-    if content.mass_to_charge is None and options.distance is not None and all(each is not None for each in columns):
-        time, voltage, x, y = columns
-        content = replace(content, mass_to_charge=mass_to_charge(voltage, time, x, y, options.distance))
-    ions = ions_of_map(content, options)
+    ions = ions_of_map(with_masses(content, options), options)
     return ions.map(bins=128), ions
 
 

@@ -1,4 +1,4 @@
-"""`apt-evap map`: draw detector maps of a run or of measured ions."""
+"""`apt-evap map`: draw detector maps of a run or of measured ions, with the poles of the crystal."""
 
 import argparse
 from collections.abc import Callable, Sequence
@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from apt_evap._common.codec import from_plain
+from apt_evap.analysis.apex import image_compression
 from apt_evap.analysis.ion_image import field_ion_image
 from apt_evap.cli._files import (
     check_output,
@@ -18,14 +19,20 @@ from apt_evap.cli._files import (
     save_picture,
     select,
     selects,
+    with_masses,
 )
-from apt_evap.cli._output import tell, tell_json
+from apt_evap.cli._output import say, tell, tell_json
 from apt_evap.config.map_panels import MapSettings, Panel
 from apt_evap.config.perturbation_text import read_perturbation
-from apt_evap.detection.binning import bins_for
+from apt_evap.crystallography.orientation import Orientation
+from apt_evap.detection.binning import shown_bins
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
+from apt_evap.detection.projection import Projection
 from apt_evap.emission.perturbations import Unperturbed
+from apt_evap.indexing.index import index
+from apt_evap.indexing.search import disc_of
+from apt_evap.plot.maps import binned, default_smoothing, specimen_title
 from apt_evap.simulation.run import Run
 from apt_evap.simulation.surface import surface_after
 
@@ -37,12 +44,13 @@ def execute(options: argparse.Namespace) -> int:
     picture = picture_path(options.output or f"{Path(options.file).stem}_map.png")
     check_output(picture, is_picture, options.force)
     content = read(options)
+    title = crystal = None
     if options.field_ion is not None:
-        maps = _field_ion_map(content, options)
+        maps, titles = _field_ion_map(content, options)
     elif isinstance(content, Run):
         content = in_real_units(content, options)
-        drawn, titles = run_maps(content, _map_settings(content, options), lambda hits: select(hits, options))
-        maps = drawn, [f"{title}{_species(options)}" for title in titles]
+        maps, titles = run_maps(content, _map_settings(content, options), lambda hits: select(hits, options))
+        titles = [f"{each}{_species(options)}" for each in titles]
     elif options.perturbation or options.real_units or options.lens:
         what = "a map" if isinstance(content, DetectorMap) else "measured ions"
         name = "--perturbation" if options.perturbation else "--real-units" if options.real_units else "--lens"
@@ -50,17 +58,62 @@ def execute(options: argparse.Namespace) -> int:
     elif isinstance(content, DetectorMap):
         if options.bins is not None:
             raise ValueError(f"--bins is only for ions, {options.file!r} is a map: its bins are {_bins_of(content)}")
-        sigma = 0.0 if options.smooth is None and not content.is_counts else options.smooth
-        maps = [_smooth(content, sigma)], [Path(options.file).name]
+        sigma = options.smooth if options.smooth is not None else default_smoothing(content) if content.is_counts else 0
+        maps, titles = [content.smoothed(sigma)], [Path(options.file).name]
     else:
-        selection = ions_of_map(content, options)
-        map = selection.map(options.bins or bins_for(int(selection.detected.sum())))
+        selection = ions_of_map(with_masses(content, options), options)
         part = f", {len(selection):,} of {len(content):,} ions" if selects(options) else ""
-        maps = [_smooth(map, options.smooth)], [f"{Path(options.file).name}{_species(options)}{part}"]
-    save_picture(picture, *maps)
+        maps = [binned(selection, options.bins, options.smooth)]
+        titles = [f"{Path(options.file).name}{_species(options)}{part}"]
+        content = selection
+    if isinstance(content, Run):
+        title = specimen_title(content)
+    if options.poles is not None:
+        title, crystal = _crystal(content, options, title)
+    elif options.axis or options.rotation is not None or options.scale is not None:
+        raise ValueError("--axis, --rotation and --scale are for --poles")
+    save_picture(picture, maps, titles, title, crystal)
     tell(options, f"wrote {picture}")
-    tell_json(options, {"wrote": str(picture), "file": options.file, "maps": summaries(*maps)})
+    tell_json(options, {"wrote": str(picture), "file": options.file, "maps": summaries(maps, titles)})
     return 0
+
+
+def _crystal(content, options, title):
+    """Title of the picture, and the orientation of the crystal and its projection: of a run, as given, or indexed."""
+    axis, rotation, scale = options.axis, options.rotation, options.scale
+    if isinstance(content, Run):
+        if options.poles or axis or rotation is not None:
+            raise ValueError(f"--poles of a run needs no element, axis or rotation: {options.file!r} has its own")
+        projection = image_compression(content).projection if scale is None else Projection(scale)
+        return title, (Orientation.from_settings(content.settings["tip"]), projection)
+    if not options.poles:
+        raise ValueError("--poles needs the crystal of a measured map, such as --poles W")
+    counts = content if isinstance(content, DetectorMap) else content.map(bins=128)
+    centre = disc_of(counts).centre
+    if rotation is not None:
+        if not axis or scale is None:
+            raise ValueError("--rotation needs --axis and --scale [mm/rad]; without it, it is searched")
+        orientation, projection = Orientation(options.poles, axis, rotation), Projection(scale, centre)
+        how = "as given"
+    else:
+        if any(each != round(each) for each in axis or ()):
+            raise ValueError(f"--axis without --rotation must be the indices of a pole, got {options.axis}")
+        found = index(
+            counts,
+            options.poles,
+            scales=None if scale is None else (scale, scale),
+            distance=options.distance if scale is None else None,
+            poles=[(*centre, tuple(int(each) for each in axis))] if axis else (),
+        )
+        tell(options, f"{found}")
+        if not found.decided:
+            say("warning", f"the map does not decide, the poles are those of the first candidate: {found.reason}")
+        orientation, projection, how = found.best.orientation, found.best.projection, found.verdict
+    along = " ".join(f"{each:.2f}" for each in orientation.axis)
+    return f"{orientation.material.name}, axis [{along}], {projection.scale:.1f} mm/rad, {how}", (
+        orientation,
+        projection,
+    )
 
 
 def _field_ion_map(content, options):
@@ -113,14 +166,13 @@ def run_maps(
     run: Run, settings: MapSettings, choose: Callable[[Hits], Hits] = lambda hits: hits
 ) -> tuple[list[DetectorMap], list[str]]:
     """Maps of the complete detector, for all ions or a selection, and their titles."""
-    grid = run.grid(settings.bins or bins_for(len(run)))
+    grid = run.grid(settings.bins or shown_bins(len(run)))
     maps = [choose(run.hits(panel.perturbation)).map(like=grid, position_step=None) for panel in settings.panels]
-    return [_smooth(each, settings.smoothing) for each in maps], [panel.title for panel in settings.panels]
+    sigma = settings.smoothing
+    if sigma is None:
+        sigma = default_smoothing(grid, None if settings.bins else len(run))
+    return [each.smoothed(sigma) for each in maps], [panel.title for panel in settings.panels]
 
 
 def _bins_of(detector_map):
     return " x ".join(map(str, detector_map.values.shape[::-1]))
-
-
-def _smooth(detector_map, sigma):
-    return detector_map.smoothed(max(detector_map.bin_size) if sigma is None else sigma)

@@ -173,7 +173,9 @@ def _add_map(commands: Any) -> None:
         "  apt-evap map R5083.epos --bins 128\n"
         "  apt-evap map R5083.epos --ranges R5083.rrng --species Si --voltage 4000, --circle 15 -o silicon.png\n"
         "  apt-evap map ni111.h5 --perturbation Unperturbed --perturbation RollUp:0.3,0.1 -o energies.png\n"
-        "  apt-evap map ni111.h5 --field-ion Ne -o image.png\n\n"
+        "  apt-evap map ni111.h5 --field-ion Ne -o image.png\n"
+        "  apt-evap map ni111.h5 --poles\n"
+        "  apt-evap map R5083.epos --poles W --axis 0,1,1 --distance 90\n\n"
         "a perturbation is NAME, NAME:NUMBERS or a TOML table:\n"
         "  Unperturbed              RollUp:0.2 (eV, all ions)    RollUp:0.155,0.155 (mean, standard deviation)\n"
         "  LateralVelocity:0.3,0.1  Combined:0.155,0.155,0.75 (the last number is the roll-up fraction)\n"
@@ -203,6 +205,20 @@ def _add_map(commands: Any) -> None:
         metavar="GAS",
         help="field-ion image of the surface at the end of a run, in He, Ne, Ar or H2; default: Ne",
     )
+    group = command.add_argument_group("crystal", "Poles and zone lines over the map.")
+    group.add_argument(
+        "--poles",
+        nargs="?",
+        const="",
+        metavar="NAME",
+        help="draw them, of a run or of a crystal such as W; where they are is searched as by apt-evap index",
+    )
+    group.add_argument(
+        "--axis", type=_numbers, metavar="H,K,L", help="pole near the centre of the map, or with --rotation the axis"
+    )
+    group.add_argument("--rotation", type=float, metavar="DEGREES", help="of the crystal about its axis; no search")
+    group.add_argument("--scale", type=_number("mm/rad"), metavar="S", help="scale of the map [mm/rad]")
+    group.add_argument("--distance", type=_number("mm"), metavar="MM", help="flight length of the instrument")
     _add_real_units(command)
     command.add_argument("--force", action="store_true", help="overwrite a file not made by apt-evap")
     _add_speech(command)
@@ -278,18 +294,26 @@ def _add_twin(commands: Any) -> None:
         "  specimen.toml, start.json   settings of the simulation, and the indexing\n"
         "  run.h5, run.png             the simulation\n"
         "  registration.json, study/   as of apt-evap compare; study/report.html has it all\n"
-        "  answer.txt                  constants of the measurement\n\n"
-        "example: apt-evap twin R5083.epos --element Ni --distance 90 --minutes 10",
+        "  answer.txt                  constants of the measurement, what they depend on, and checks\n\n"
+        "example:\n"
+        "  apt-evap twin R5083.epos --element Ni --distance 90 --minutes 10\n"
+        "  apt-evap twin map.npz --element Ni --pole=-9.6,-0.4,1,1,1 --pole 2.4,6.2,1,1,3 --pole=-7.5,-13.5,1,3,1",
         **_SHAPE,
     )
     command.add_argument("file", metavar="FILE", help="measured ions (.epos, ...) or a map (.npz)")
     command.add_argument("-o", "--output", metavar="FOLDER", help="default: FILE_twin in this folder")
     _add_reading(command)
     _add_indexing(command)
-    _add_specimen(command)
+    _add_specimen(command).add_argument(
+        "--efficiency",
+        type=_number("1"),
+        default=0.5,
+        metavar="ETA",
+        help="part of the evaporated atoms that are among the selected ions, for the angle of the shank; default: 0.5",
+    )
 
 
-def _add_specimen(command: Any) -> None:
+def _add_specimen(command: Any) -> Any:
     group = command.add_argument_group("specimen")
     group.add_argument(
         "--minutes", type=float, default=10.0, metavar="N", help="time that the simulation may take; default: 10"
@@ -297,6 +321,7 @@ def _add_specimen(command: Any) -> None:
     group.add_argument("--field-factor", type=float, metavar="KF", help="for the radius from the voltage; default: 3.3")
     group.add_argument("--lens", metavar="L", help="microscope that gives the field factor, as for apt-evap export")
     group.add_argument("--threads", type=_integer(1), metavar="N", help="default: all processors")
+    return group
 
 
 def _add_indexing(command: Any) -> None:
@@ -419,6 +444,7 @@ def _add_reconstruct(commands: Any) -> None:
         "them as .pos, .epos, .xyz or .vtp. A run has its own constants; its true sites give the errors.",
         epilog="example:\n"
         "  apt-evap reconstruct R5083.epos --element Si --distance 90 --efficiency 0.57 -o R5083.pos\n"
+        "  apt-evap reconstruct R5083.epos --element Si --distance 90 --ranges R5083.rrng --picture R5083.png\n"
         "  apt-evap reconstruct ni111.h5 --real-units\n"
         "  apt-evap reconstruct R5083.epos --atomic-volume 0.02 --distance 90 --radius shank --initial-radius 30 \\\n"
         "      --shank-angle 5",
@@ -428,6 +454,11 @@ def _add_reconstruct(commands: Any) -> None:
     command.add_argument("-o", "--output", metavar="OUT", help="default: FILE_reconstructed.pos in this folder")
     command.add_argument(
         "--frame", choices=FRAMES, default="depth", help="z is the depth, or goes out of the specimen; default: depth"
+    )
+    command.add_argument(
+        "--picture",
+        metavar="P.png",
+        help="draw side view, top view, depth profile and composition; --ranges gives the species of measured ions",
     )
     constants = command.add_argument_group("constants", "The defaults of a run are its own constants.")
     constants.add_argument("--protocol", choices=PROTOCOLS, default="cap", help="depth increment; default: cap")

@@ -3,13 +3,25 @@
 import argparse
 from pathlib import Path
 
+from apt_evap import plot
 from apt_evap._common.codec import for_json
 from apt_evap._common.files import FileError, check_path
 from apt_evap._common.validation import check_number
-from apt_evap.cli._files import in_real_units, lens_of, read, select
+from apt_evap.cli._files import (
+    check_output,
+    in_real_units,
+    is_picture,
+    lens_of,
+    picture_path,
+    read,
+    save_figure,
+    select,
+    with_masses,
+)
 from apt_evap.cli._output import tell, tell_json
 from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.detection.hits import Hits
+from apt_evap.io.formats import read_ranges
 from apt_evap.reconstruction.constants import run_constants
 from apt_evap.reconstruction.origins import OriginTable
 from apt_evap.reconstruction.reconstruct import reconstruct
@@ -23,6 +35,9 @@ def execute(options: argparse.Namespace) -> int:
     output = check_path(options.output or f"{Path(options.file).stem}_reconstructed.pos")
     if output.exists() and not options.force:
         raise FileError(f"{str(output)!r} exists: --force overwrites it")
+    picture = None if options.picture is None else picture_path(options.picture)
+    if picture is not None:
+        check_output(picture, is_picture, options.force)
     hits, known = _ions(options)
     settings = known | _constants(options)
     if settings["radius"] != "voltage":
@@ -37,16 +52,25 @@ def execute(options: argparse.Namespace) -> int:
         raise ValueError(
             f"{options.file!r} has no voltages: --radius shank, or a radius [nm], needs none, got --radius voltage"
         )
-    reconstruction = reconstruct(select(hits, options), **settings)
+    # ranges without species are only for the picture
+    ranges = read_ranges(options.ranges) if picture is not None and options.ranges is not None else None
+    if ranges is not None and options.species is None:
+        options.ranges = None
+    reconstruction = reconstruct(select(with_masses(hits, options), options), **settings)
     reconstruction.write(output, frame=options.frame)
     tell(options, f"{reconstruction!r}")
     result = {"wrote": str(output), "file": options.file, "ions": len(reconstruction)}
+    if picture is not None:
+        save_figure(picture, plot.reconstruction(reconstruction, ranges)[0].figure)
+        result["picture"] = str(picture)
     result["settings"] = for_json(dict(reconstruction.settings))
     if hits.outcome is not None and len(reconstruction) > 2:  # simulated: the true sites are known
         errors = reconstruction.errors()
         result["errors"] = errors.to_dict()
         tell(options, f"RMS errors: {errors.lateral_rms:.3f} nm lateral, {errors.depth_rms:.3f} nm in depth")
     tell(options, f"wrote {len(reconstruction):,} ions to {output}")
+    if picture is not None:
+        tell(options, f"wrote {picture}")
     tell_json(options, result)
     return 0
 

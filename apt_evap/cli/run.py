@@ -13,6 +13,7 @@ from apt_evap.cli._files import check_output, is_picture, picture_path, save_pic
 from apt_evap.cli._output import INTERRUPTED, say, tell, tell_json
 from apt_evap.cli.map import run_maps, summaries
 from apt_evap.config.simulation_file import config_of, read_document
+from apt_evap.plot.maps import specimen_title
 from apt_evap.simulation.checkpoint import Checkpoint
 from apt_evap.simulation.recorder import RunInterrupted
 from apt_evap.simulation.run_hdf5 import is_run
@@ -67,7 +68,7 @@ def execute(options: argparse.Namespace) -> int:
     tell(options, f"{'replaced' if replaced and not options.resume else 'wrote'} {output}")
     try:
         maps = run_maps(run, config.maps)
-        save_picture(picture, *maps)
+        save_picture(picture, *maps, title=specimen_title(run))
     except ValueError as error:
         raise ValueError(f"no maps are drawn, the run is in {str(output)!r}: {error}") from error
     tell(options, f"wrote {picture}")

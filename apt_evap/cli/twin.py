@@ -3,8 +3,10 @@
 import argparse
 import json
 import math
+import shlex
 from pathlib import Path
 
+from apt_evap import plot
 from apt_evap._common.codec import to_plain
 from apt_evap._common.files import FileError, check_path, read_small_file, replace_file
 from apt_evap.cli import run as run_command
@@ -14,10 +16,19 @@ from apt_evap.cli.compare import compare
 from apt_evap.cli.index import map_of
 from apt_evap.cli.parser import make_parser
 from apt_evap.cli.start import is_start, start_of, summary
+from apt_evap.crystallography.orientation import Orientation
+from apt_evap.detection.projection import Projection
 from apt_evap.emission.perturbations import LateralVelocity, RollUp
+from apt_evap.indexing.index import Candidate
+from apt_evap.indexing.master_pattern import master_patterns
+from apt_evap.io.formats import read_ranges
 from apt_evap.registration.register import Registration, register
+from apt_evap.report.measurement import measurement_section
+from apt_evap.report.page import Page
 from apt_evap.simulation.run import load
-from apt_evap.twin.start import ENERGY, FIELD_FACTOR, HEIGHT, ROLLS, SHARPNESS
+from apt_evap.specimen.materials import material
+from apt_evap.twin.constants import constants_of
+from apt_evap.twin.start import ENERGY, HEIGHT, ROLLS, SHARPNESS
 
 SETTINGS, FACTS, RUN, REGISTRATION, STUDY, ANSWER = (
     "specimen.toml", "start.json", "run.h5", "registration.json", "study", "answer.txt",
@@ -50,16 +61,24 @@ def execute(options: argparse.Namespace) -> int:
         )
         with replace_file(folder / REGISTRATION) as file:
             file.write((json.dumps(to_plain(registration), indent=1) + "\n").encode())
-    if not (folder / STUDY / "report.html").exists():
+    told: list[str] = []
+    if not (folder / ANSWER).exists():
+        candidate = _candidate(best, options)
+        measurement = _measurement(candidate, measured_map, ions, options)
+        command = _reconstruct_command(measurement, options)
         arguments = [folder / RUN, options.file, "-o", folder / STUDY, "--registration", folder / REGISTRATION]
         emission_options = ["--mechanism", "lateral", "--option", f"height={HEIGHT}"]
         if rolls:
             emission_options = ["--mechanism", "roll-up", "--option", f"probability={_FRACTIONS}"]
             emission_options += ["--option", f"sharpness={SHARPNESS}", "--option", f"height={HEIGHT}"]
         given = _parsed("compare", *arguments, *emission_options, options=options)
-        study = compare(given, measured_map if ions is None else ions)
-        _write_answer(folder / ANSWER, facts, study, options)
-    put(read_small_file(folder / ANSWER, _LARGEST, "an answer").decode().rstrip())
+        picture = _picture(candidate, measured_map, facts)
+        section = measurement_section(measurement.constants, measurement.checks, command, picture)
+        study = compare(given, measured_map if ions is None else ions, [section])
+        _write_answer(folder / ANSWER, facts, study, measurement, command)
+        told = study.lines()  # by `compare`
+    answer = read_small_file(folder / ANSWER, _LARGEST, "an answer").decode().splitlines()
+    put("\n".join(line for line in answer if line not in told))
     put(f"wrote {folder / STUDY / 'report.html'}")
     return 0
 
@@ -95,36 +114,75 @@ def _shift(candidate):
     return math.radians(_TILT) * candidate["scale"]
 
 
-def _write_answer(path, facts, study, options):
+def _candidate(best, options):
+    """The first candidate, as it is in start.json."""
+    crystal = material(options.element)
+    patterns = master_patterns(crystal.structure)
+    return Candidate(
+        orientation=Orientation(crystal, tuple(best["axis"]), best["rotation"]),
+        projection=Projection(best["scale"], tuple(best["centre"]), compression=best["compression"]),
+        pattern=min(patterns, key=lambda each: abs(each.apex_radius - best["pattern_radius"])),
+        **{name: best[name] for name in ("score", "confidence", "rolled", "contrast", "angle_error")},
+    )
+
+
+def _picture(candidate, measured_map, facts):
+    """Measured map with the poles and zone lines of the candidate, as HTML."""
+    shown = measured_map.smoothed(max(measured_map.bin_size)) if measured_map.is_counts else measured_map
+    ax = plot.detector_map(shown, title=f"{candidate}")
+    plot.poles(ax, candidate.orientation, candidate.projection, region=shown, families=8)
+    return Page("").picture(ax.figure, f"Measured map with the poles and zone lines that it was simulated with "
+                                       f"({facts['verdict']}).")  # fmt: skip
+
+
+def _measurement(candidate, measured_map, ions, options):
+    """Constants of the measurement."""
+    return constants_of(
+        measured_map,
+        candidate,
+        ions,
+        lens=lens_of(options),
+        field_factor=options.field_factor,
+        distance=options.distance,
+        efficiency=options.efficiency,
+        ranges=None if options.ranges is None else read_ranges(options.ranges),
+    )
+
+
+def _reconstruct_command(measurement, options):
+    """Command that reconstructs with the constants of the measurement, "" if it has no ions or no flight length."""
+    known = measurement.arguments
+    if "distance" not in known:
+        return ""
+    words = ["apt-evap", "reconstruct", options.file, "--element", options.element]
+    for name in ("distance", "detector_radius", "efficiency", "compression", "field_factor", "projection"):
+        if name in known:
+            value = known[name] if isinstance(known[name], str) else f"{known[name]:.4g}"
+            words += [f"--{name.replace('_', '-')}", value]
+    words += ["--lens", options.lens] if options.lens is not None else []
+    for name in ("ions", "mass", "voltage"):
+        if (bounds := getattr(options, name)) is not None:
+            words += [f"--{name}", ",".join("" if each is None else f"{each:.10g}" for each in bounds)]
+    for name in ("ranges", "species"):
+        words += [f"--{name}", getattr(options, name)] if getattr(options, name) is not None else []
+    return shlex.join(words)
+
+
+def _write_answer(path, facts, study, measurement, command):
     """Constants of the measurement, and what they depend on."""
     best = facts["candidates"][0]
     lines = [
         f"indexing: {facts['verdict']}, {facts['reason']}",
         f"axis [{' '.join(f'{each:.3f}' for each in best['axis'])}] at the centre of the map, rotation "
         f"{best['rotation']:.1f}, errors {best['angle_error']:.1f} degrees by noise",
-        f"scale {best['scale']:.1f} mm/rad",
+        *str(measurement).splitlines(),
     ]
-    reconstruct = ["apt-evap", "reconstruct", options.file, "--element", options.element]
-    if options.distance is not None:
-        compression = options.distance / best["scale"]
-        lines[-1] += (
-            f": image compression {compression:.2f}, only as sure as the flight length of {options.distance:g} mm"
-        )
-        reconstruct += ["--distance", f"{options.distance:g}", "--compression", f"{compression:.2f}"]
-    first, last = (math.nan if each is None else each for each in facts["radii"])
-    lens = lens_of(options)
-    if math.isnan(first):
+    if not measurement.arguments:
         lines.append("radius: not known, the file has no voltages")
-    else:
-        why = "the lens" if lens is not None else f"k_f = {options.field_factor or FIELD_FACTOR:g}"
-        lines.append(f"radius {first:.1f} to {last:.1f} nm by {why}: k_f, F and R are known only as the product V")
-        if lens is None:
-            reconstruct += ["--field-factor", f"{options.field_factor or FIELD_FACTOR:g}"]
     lines.append(f"simulated with R = {facts['simulated_radius']:.1f} nm")
-    if options.lens is not None:
-        reconstruct += ["--lens", options.lens]
     lines += study.lines()
     lines.append("the energies depend on the radius and the voltage, and on the rule of the roll-up")
-    lines.append(f"reconstruct with: {' '.join(reconstruct)}")
+    if command:
+        lines.append(f"reconstruct with: {command}")
     with replace_file(path) as file:
         file.write(("\n".join(lines) + "\n").encode())

@@ -12,6 +12,8 @@ from apt_evap.detection.limits import MAX_BINS
 
 _CHUNK = 1 << 16
 
+FEWEST_SHOWN = 128
+"""Least number of bins along a side of a picture."""
 MAX_BY_CHANCE = 32  # fewer different values may look quantised by chance: eight of a normal distribution did
 
 
@@ -159,6 +161,11 @@ def bin_edges(
 def bins_for(ions: int) -> int:
     """Bins along a side: the power of 2 from 32 to 256 that is closest to one ion per bin."""
     return int(2 ** np.clip(np.rint(np.log2(max(ions, 1)) / 2), 5, 8))
+
+
+def shown_bins(ions: int) -> int:
+    """Bins along a side of a picture: those of `bins_for`, but so many that few ions are not shown as squares."""
+    return max(bins_for(ions), FEWEST_SHOWN)
 
 
 def _cover(low, high, size):

@@ -217,8 +217,13 @@ class Hits:
         """
         return DetectorMap.from_hits(self, bins=bins, **options)
 
-    def to_dataframe(self) -> pandas.DataFrame:
+    def to_dataframe(self, ranges: Any = None) -> pandas.DataFrame:
         """Return the ions as a pandas DataFrame; needs pandas.
+
+        Parameters
+        ----------
+        ranges : Ranges, optional
+            Ranges of mass, for a column `species` with names, "" for an ion in no range.
 
         Returns
         -------
@@ -230,6 +235,8 @@ class Hits:
         columns = {name: getattr(self, name) for name in names}
         if self.positions is not None:
             columns |= dict(zip(("position_x", "position_y", "position_z"), self.positions.T, strict=True))
+        if ranges is not None:
+            columns["species"] = check_kind(ranges, "ranges", "labels", "Ranges").labels(self, "")
         return to_dataframe(columns | self.extra, source=self.source, units=self.units)
 
     def within_circle(self, radius: float, centre: ArrayLike = (0.0, 0.0)) -> Hits:

@@ -135,8 +135,17 @@ class Ranges:
         return np.array([number[name] for name in self.names] + [-1])[self.index(hits)]
 
     def labels(self, hits: Hits, outside: str = "X") -> NDArray[np.str_]:
-        """Name of the species of every ion, `outside` for an ion in no range, array of str of shape (n,)."""
-        return np.array([*self.species_names, check_kind(outside, "outside", str, "text")])[self.species(hits)]
+        """Name of the species of every ion, `outside` for an ion in no range, array of str of shape (n,).
+
+        Warns
+        -----
+        DataWarning
+            If more than a third of the ions are outside every range.
+        """
+        names = np.array([*self.species_names, check_kind(outside, "outside", str, "text")])
+        species = self.species(hits)
+        self._warn_of_others(species)
+        return names[species]
 
     def count_atoms(self, hits: Hits) -> dict[str, int]:
         """Number of atoms of each element; a molecular ion such as CrO2 counts with all its atoms.
@@ -193,15 +202,18 @@ class Ranges:
                     f"{self.source or 'these ranges'} have no species {short_text(name)}{hint}, only {', '.join(known)}"
                 )
         species = self.species(hits)
+        self._warn_of_others(species)
+        return hits[np.isin(species, [known.index(name) for name in names])]
+
+    def _warn_of_others(self, species):
         outside = int(np.count_nonzero(species < 0))
-        if outside > _MANY * len(hits):
+        if outside > _MANY * len(species):
             warnings.warn(
-                f"{outside:,} of {len(hits):,} ions ({outside / len(hits):.0%}) are outside every range of "
+                f"{outside:,} of {len(species):,} ions ({outside / len(species):.0%}) are outside every range of "
                 f"{self.source or 'these ranges'}: do the ranges belong to these ions?",
                 DataWarning,
-                stacklevel=2,
+                stacklevel=3,
             )
-        return hits[np.isin(species, [known.index(name) for name in names])]
 
     def _warn_of_overlap(self):
         order = np.argsort(self.low, kind="stable")

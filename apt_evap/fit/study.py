@@ -10,6 +10,7 @@ import numpy as np
 
 from apt_evap._common.codec import for_json, to_plain
 from apt_evap._common.files import replace_file
+from apt_evap._common.notebook import as_table
 from apt_evap._common.types import AnyPath, Floats
 from apt_evap._version import __version__
 from apt_evap.detection.detector_map import DetectorMap
@@ -228,6 +229,8 @@ class Study:
             f"best at {best.mean:g} eV, sigma/mean {best.relative_spread:g}{fraction}"
             f"{edge}, SSIM {best.score}; {others};\n between points {between}; {self._structure()}{self._energies()}>"
         )
+
+    _repr_html_ = as_table
 
     def lines(self) -> list[str]:
         """Result, similarity, and doubts if there are any: at most three lines, list of str."""

@@ -19,7 +19,7 @@ from apt_evap.detection.hits import Hits
 from apt_evap.detection.projection import Projection
 from apt_evap.indexing.marks import marks_of
 from apt_evap.indexing.master_pattern import MasterPattern, master_patterns
-from apt_evap.indexing.refine import BINS, Refined, bins_of, refine
+from apt_evap.indexing.refine import Refined, bins_of, refine, resolution
 from apt_evap.indexing.search import Start, disc_of, misorientation, search
 from apt_evap.specimen.materials import as_material
 
@@ -246,7 +246,7 @@ def index(
         scales = start[1].scale / _BEYOND, start[1].scale * _BEYOND
     low, high = _scales(disc, scales, distance)
     bins = bins_of(disc)
-    sigma = max(0.35 * math.degrees(2 * disc.radius / BINS / math.sqrt(low * high)), 0.5)
+    sigma = resolution(disc, math.sqrt(low * high))
     densities = [pattern.smoothed(sigma) for pattern in patterns]
 
     def refined(start, steps):

@@ -82,6 +82,11 @@ class Refined:
     """Of the rotation vector [rad] and the logarithm of the scale, shape (4, 4)."""
 
 
+def resolution(disc: Disc, scale: float) -> float:
+    """Smoothing of a pattern for the bins of a map [degrees]: a third of a bin, at least half a degree."""
+    return max(0.35 * float(np.degrees(2 * disc.radius / BINS / scale)), 0.5)
+
+
 def bins_of(disc: Disc) -> Bins:
     """Combine the bins of a map to about `BINS` across its disc."""
     map = disc.map

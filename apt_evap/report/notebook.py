@@ -1,4 +1,4 @@
-"""What a notebook shows of a map, a run, ions or a specimen: a picture or a table instead of one line of text."""
+"""What a notebook shows of maps, runs, ions, specimens, materials and studies: a picture or a table."""
 
 import io
 from html import escape
@@ -6,9 +6,12 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from apt_evap._common.codec import declared, to_plain
 from apt_evap.analysis.description import UNITS, describe
 from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.fit.study import Study
 from apt_evap.plot.maps import detector_map
+from apt_evap.specimen.materials import Material
 
 _DPI = 90
 
@@ -23,8 +26,16 @@ def picture(map: DetectorMap) -> bytes:
 
 
 def folded_table(data: Any) -> str:
-    """One line on the data, and a folded table of what `apt-evap info` prints, as HTML."""
-    rows = _table(describe(data), UNITS)
+    """One line on the data, and a folded table of its contents, such as what `apt-evap info` prints, as HTML."""
+    if isinstance(data, Material):
+        contents = to_plain(data)
+        contents["sources"] = [f"{name}: {source}" for name, source in contents["sources"].items()]
+        rows = _table(contents, {name: each.unit for name, each in declared(Material).items() if each.unit})
+    elif isinstance(data, Study):
+        scores = {name: str(score) for name, score in data.baselines.items()}
+        rows = _table({"result": data.lines(), "similarity": {"best": str(data.optimum.score)} | scores}, {})
+    else:
+        rows = _table(describe(data), UNITS)
     return f"<details><summary><code>{escape(repr(data))}</code></summary>{rows}</details>"
 
 

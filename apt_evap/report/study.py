@@ -31,6 +31,7 @@ def write_study(
     files: Sequence[AnyPath] = (),
     command: str = "",
     warnings: Sequence[str] = (),
+    sections: Sequence[str] = (),
 ) -> None:
     """Write a study as one HTML file.
 
@@ -54,6 +55,8 @@ def write_study(
         Command line to repeat the study.
     warnings : sequence of str
         Warnings of the study.
+    sections : sequence of str
+        More parts of the page, as HTML, after the energies.
 
     Raises
     ------
@@ -72,6 +75,7 @@ def write_study(
     result = f"{study.grid.name} describes the measured map best with {study.point(study.best_cell)}; {similarity}."
     page.add(paragraph(result[:1].upper() + result[1:]))
     page.add(heading("Measured and simulated map"), _blinking(page, study), heading("Energies"), _energies(study))
+    page.add(*sections)
     page.add(heading("Similarity with the measured map"), _scores(study))
     page.add('<div class="matrices">', *_matrices(study), "</div>")
     page.add(paragraph("Rows: standard deviation / mean. Columns: mean energy [eV]. Frame: the best point.", "note"))

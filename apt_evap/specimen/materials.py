@@ -5,6 +5,7 @@ from dataclasses import fields, replace
 from typing import Any
 
 from apt_evap._common.codec import checked, choice, count, from_plain, number, settings
+from apt_evap._common.notebook import as_table
 from apt_evap._common.validation import check_kind, check_number, did_you_mean, short_text
 from apt_evap.specimen.lattice import BASES, nearest_neighbour_distance
 from apt_evap.units import ELEMENTARY_CHARGE
@@ -68,6 +69,8 @@ class Material:
         compare=False,
         repr=False,
     )
+
+    _repr_html_ = as_table
 
     def _check(self):
         if (self.structure == "hcp") != (self.c is not None):

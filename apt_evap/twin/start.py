@@ -11,7 +11,7 @@ import numpy as np
 
 from apt_evap._common.files import replace_file
 from apt_evap._common.short_repr import short_repr
-from apt_evap._common.types import AnyPath
+from apt_evap._common.types import AnyPath, Floats
 from apt_evap._common.validation import check_count, check_kind, check_number
 from apt_evap._version import __version__
 from apt_evap.config.simulation_file import config_of
@@ -155,13 +155,19 @@ def settings_of(
     return Start(text, indexing, radii, size * material.a, registration, needs)
 
 
-def _radii(hits, field, lens, factor):
-    """Radii at both ends of a measurement [nm]."""
+def voltages_of(hits: Hits | None) -> Floats | None:
+    """Standing voltage plus pulse of the ions that have one [V], None if there is none."""
     if hits is None or hits.voltage is None:
-        return math.nan, math.nan
+        return None
     voltages = hits.voltage if hits.pulse_voltage is None else hits.voltage + hits.pulse_voltage
     voltages = voltages[np.isfinite(voltages) & (voltages > 0)]
-    if not len(voltages):
+    return voltages.astype(float) if len(voltages) else None
+
+
+def _radii(hits, field, lens, factor):
+    """Radii at both ends of a measurement [nm]."""
+    voltages = voltages_of(hits)
+    if voltages is None:
         return math.nan, math.nan
     ends = [float(np.median(part)) for part in (voltages[:_ENDS], voltages[-_ENDS:])]
     if lens is None:

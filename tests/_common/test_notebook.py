@@ -49,6 +49,7 @@ def test_runs_ions_and_specimens_are_shown_as_tables(small_tip):
         (run, "fingerprint", run.fingerprint()),
         (small_tip, "atoms", f"{len(small_tip):,}"),
         (hits, "ions", "2"),
+        (ae.material("Ni"), "a [nm]", "0.352"),
     ):
         shown = Cells(data._repr_html_())
         assert shown.cells[head] == text and shown.line == repr(data)

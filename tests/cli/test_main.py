@@ -425,7 +425,8 @@ def test_map_of_a_run_shows_the_whole_detector(folder, made, monkeypatch, capsys
     assert maps[0].ions == run.hits(Unperturbed()).counts[0]
     for each in maps:
         assert each.extent == (-150, 150, -150, 150) and each.mask.all()
-        assert each.values.shape == (32, 32) and each.smoothing == 300 / 32
+        # few ions: smaller bins, the same smoothing
+        assert each.values.shape == (128, 128) and each.smoothing == pytest.approx(300 / 32)
 
 
 @NO_PICTURES
@@ -457,8 +458,8 @@ def test_a_run_is_drawn_with_the_maps_of_its_config(folder, monkeypatch):
 def test_map_of_measured_ions_keeps_to_their_comb(measured, monkeypatch):
     (only,), titles = drawn_by(monkeypatch, "map", measured)
     assert titles == ["ions.epos"] and only.position_step == pytest.approx((0.5, 0.5))
-    # 4,000 ions: 64 bins over 81 teeth, so a tooth each
-    assert only.bin_size == pytest.approx((0.5, 0.5)) and only.smoothing == pytest.approx(0.5)
+    # 4,000 ions: a tooth of the comb each, smoothed as bins of a 64th of its 81 teeth
+    assert only.bin_size == pytest.approx((0.5, 0.5)) and only.smoothing == pytest.approx(81 * 0.5 / 64)
 
 
 @NO_PICTURES

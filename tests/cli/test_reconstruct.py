@@ -26,7 +26,7 @@ def measured(tmp_path, monkeypatch, rng):
     return ae.read("ni.epos")
 
 
-def test_measured_ions(measured, nickel, capsys):
+def test_measured_ions(measured, nickel, tmp_path, capsys):
     command = ["reconstruct", "ni.epos", "--element", "Ni", "--distance", "90", "--efficiency", "0.6"]
     assert main([*command, "--compression", "1.6"]) == 0
     told = capsys.readouterr().out
@@ -34,6 +34,10 @@ def test_measured_ions(measured, nickel, capsys):
     known = {"atomic_volume": nickel.a**3 / 4, "distance": 90.0, "efficiency": 0.6, "compression": 1.6}
     expected = ae.reconstruct(measured, **known, evaporation_field=35.0)
     assert ae.read("ni_reconstructed.pos").positions == pytest.approx(expected.positions, rel=1e-6, abs=1e-5)  # float32
+    ranges = "[Ions]\nNumber=1\nIon1=Ni\n[Ranges]\nNumber=1\nRange1=28 30 Vol:0.01 Ni:1 Color:FF0000\n"
+    (tmp_path / "ni.rrng").write_text(ranges)
+    assert main([*command, "-o", "b.pos", "--ranges", "ni.rrng", "--picture", "b.png"]) == 0
+    assert "wrote b.png" in capsys.readouterr().out and (tmp_path / "b.png").stat().st_size > 10_000
     assert main(command) == 2 and "'ni_reconstructed.pos' exists: --force" in capsys.readouterr().err
     # a table without shifts changes nothing but the direction of z
     places = np.random.default_rng(1).random((500, 2)) * 2 - 1

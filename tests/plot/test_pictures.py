@@ -11,6 +11,7 @@ import pytest
 from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from matplotlib.text import Text
 
 import apt_evap as ae
@@ -133,6 +134,20 @@ def test_titles_are_names_of_files(run, emitter):
         ):
             assert ax.get_title() == written
             ax.title.get_window_extent()  # its letters are laid out
+
+
+def test_a_round_field_of_view_is_a_circle_and_a_run_has_a_title(run):
+    edges = np.linspace(-20, 20, 101)
+    x, y = np.meshgrid(*2 * [(edges[1:] + edges[:-1]) / 2])
+    for mask, circles in ((np.hypot(x - 2, y + 1) < 15, 1), (abs(x) + abs(y) < 15, 0), (np.isfinite(x), 0)):
+        ax = plot.detector_map(ae.DetectorMap.from_array(np.ones(x.shape), edges, edges, mask))
+        drawn = [each for each in ax.patches if isinstance(each, Circle)]
+        assert len(drawn) == circles
+        for circle in drawn:  # the mean of 4,400 bins of 0.4 mm
+            assert circle.center == pytest.approx((2, -1), abs=0.02) and circle.radius == pytest.approx(15, abs=0.02)
+    (ax,) = plot.detector_maps([run.hits(ae.Unperturbed())], ["own"], title=plot.specimen_title(run))
+    assert ax.get_title() == "own" and ax.figure.get_suptitle() == "Ni, axis [$111$], R = 2.1 nm"
+    assert_nothing_cut_off(ax.figure)
 
 
 @pytest.mark.parametrize("n, shape", [(1, (1, 1)), (3, (1, 3)), (4, (2, 2)), (5, (2, 3)), (7, (3, 3))])
@@ -586,8 +601,8 @@ def test_a_notebook_shows_its_pictures():
 def test_maps_of_ions_are_binned_by_themselves(run):
     hits = run.hits(ae.Unperturbed())
     ax = plot.detector_map(hits)
-    expected = hits.map(32)  # 250 ions
-    expected = expected.smoothed(max(expected.bin_size))
+    expected = hits.map(128)
+    expected = expected.smoothed(4 * max(expected.bin_size))  # as in 32 bins: 250 ions
     assert np.array_equal(ax.images[0].get_array()[expected.mask], expected.density[expected.mask])
     assert ax.images[0].get_extent() == list(expected.extent)
     both = plot.detector_maps([hits, expected])
@@ -605,3 +620,31 @@ def test_a_specimen_is_a_surface_a_simulation_or_a_tip(small_tip, emitter):
     assert np.array_equal(drawn[0], drawn[1]) and np.array_equal(drawn[0], drawn[2])
     with pytest.raises(ValueError, match="emitter"):
         plot.specimen("Ni")
+
+
+# ---- reconstructions -------------------------------------------------------------------------------------------------
+
+
+def test_a_reconstruction_from_two_sides_with_its_profile(rng):
+    radius, azimuth = 20 * np.sqrt(rng.random(9000)), 2 * np.pi * rng.random(9000)
+    mass = np.where(np.arange(9000) < 3000, 27.0, np.where(rng.random(9000) < 0.25, 63.0, 90.0))
+    ions = ae.Hits(x=radius * np.cos(azimuth), y=radius * np.sin(azimuth), mass_to_charge=mass)
+    found = ae.reconstruct(ions, atomic_volume=0.011, distance=90.0, radius=30.0, efficiency=0.5)
+    side, top, density, radii = plot.reconstruction(found)
+    assert side.yaxis_inverted() and len(top.images) == 1
+    # a line for what is expected, 45.5 per nm^3, and the ions within 4 standard deviations of counts
+    expected = density.lines[-1].get_ydata()[0]
+    assert expected == pytest.approx(0.5 / 0.011)
+    counted = density.lines[0].get_ydata()
+    assert counted.mean() == pytest.approx(expected, rel=4 / np.sqrt(len(ions) / 4))
+    assert set(radii.lines[0].get_ydata()) == {30.0}
+    ranges = ae.detection.Ranges(names=("Al", "Cu"), low=[26, 62], high=[28, 64])
+    with pytest.warns(ae.warnings.DataWarning, match="outside every range"):
+        side, _, fractions, bars = plot.reconstruction(found, ranges, title="a$b")
+    names = [text.get_text() for text in bars.get_yticklabels()]
+    assert names == ["outside every range", "Al", "Cu"] and side.figure.get_suptitle() == "a$b"
+    widths = [bar.get_width() for bar in bars.patches]
+    assert widths == [np.mean(mass == each) for each in (90, 27, 63)]
+    steps = fractions.lines[names.index("Al")].get_ydata()  # in the first third only
+    assert steps[0] > 0.99 and steps[-1] < 0.01
+    assert_nothing_cut_off(side.figure)

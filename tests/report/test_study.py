@@ -254,3 +254,8 @@ def test_in_a_browser_without_network(page):
         browser.close()
     assert wrong == []
     assert [each for each in requests if not each.startswith("data:")] == [page.as_uri()]
+
+
+def test_a_study_is_a_folded_table_in_a_notebook(study):
+    shown = study._repr_html_()
+    assert shown.startswith("<details>") and str(study.optimum.score) in shown and study.lines()[0][:20] in shown

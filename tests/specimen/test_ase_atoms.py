@@ -139,6 +139,13 @@ class TestPandas:
         assert frame.attrs == {"source": hits.source, "units": {"charge": "e", "field": "V/nm"}}
         assert set(frame) == {*hits.columns, *hits.extra, "position_x", "position_y", "position_z"} - {"positions"}
 
+    def test_species_of_measured_ions(self):
+        ranges = ae.detection.Ranges(names=("Al", "Cu"), low=[26, 62], high=[28, 64])
+        frame = ae.Hits(mass_to_charge=[27.0, 63.0, 27.0, 40.0]).to_dataframe(ranges)
+        assert frame["species"].tolist() == ["Al", "Cu", "Al", ""]
+        with pytest.raises(ValueError, match="ranges"):
+            ae.Hits(x=[1.0]).to_dataframe("a.rrng")
+
     def test_further_columns_and_a_change_of_the_frame(self):
         hits = ae.Hits(x=[1.0, 2.0], extra={"pair": [[1, 2], [3, 4]], "name": ["a", "b"]})
         frame = hits.to_dataframe()

@@ -1,0 +1,174 @@
+"""A reconstruction: from the side, from the tip, its course along the depth and its composition."""
+
+from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
+
+from apt_evap._common.validation import check_kind
+from apt_evap.detection.hits import Hits
+from apt_evap.detection.mass_ranges import Ranges
+from apt_evap.plot._figure import add_colorbar, new_figure, set_title
+from apt_evap.plot.limits import color_limits
+from apt_evap.plot.maps import binned
+from apt_evap.reconstruction.reconstruct import Reconstruction
+
+_COLORS = ("C0", "C1", "C2", "C3", "C4", "C5", "C6", "0.6")
+_MOST = 7  # species with a colour of their own
+_DOTS = 20_000  # ions from the side: more hide each other
+_SECTIONS = 60  # along the depth, of at least _FEWEST ions
+_FEWEST = 50
+_CORE = 0.5  # of the field of view, in which profiles are counted
+OUTSIDE = "outside every range"
+
+
+def reconstruction(
+    found: Reconstruction, ranges: Ranges | None = None, *, title: str | None = None
+) -> NDArray[np.object_]:
+    """Draw a reconstruction: a slice from the side, the ions per area along the axis, a depth profile, the composition.
+
+    The slice is as thick as a tenth of the width, in the colours of the bars of the composition. The depth profile is
+    that of the ions within half the field of view: of several species their fractions, else the number of ions per
+    volume beside its expectation, the efficiency divided by the atomic volume. Of a single species the radius of the
+    cap is drawn in place of the composition.
+
+    Parameters
+    ----------
+    found : Reconstruction
+        Result of `reconstruct`.
+    ranges : Ranges, optional
+        Ranges of mass that give the species of measured ions; simulated ions have theirs.
+    title : str, optional
+        Title of the figure; by default the number of ions and the constants.
+
+    Returns
+    -------
+    ndarray of matplotlib.axes.Axes
+        Shape (4,).
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> radius, azimuth = 20 * np.sqrt(rng.random(20_000)), 2 * np.pi * rng.random(20_000)  # mm, uniform
+    >>> ions = ae.Hits(x=radius * np.cos(azimuth), y=radius * np.sin(azimuth))
+    >>> found = ae.reconstruct(ions, atomic_volume=0.011, distance=90.0, radius=30.0)
+    >>> ae.plot.reconstruction(found)[0].figure.savefig("reconstruction.png")
+    """
+    check_kind(found, "found", Reconstruction, "a Reconstruction, the result of reconstruct")
+    names, species = _species(found, ranges)
+    figure = new_figure((11.0, 8.4))
+    axes = figure.subplots(2, 2).ravel()
+    _side(axes[0], found, names, species)
+    _top(axes[1], found)
+    if len(names) > 1:
+        _fractions(axes[2], found, names, species)
+        _composition(axes[3], names, species)
+    else:
+        _density(axes[2], found)
+        axes[3].plot(found.depths, found.radii, color="C0")
+        axes[3].set(xlabel="depth of the apex [nm]", ylabel="radius of the cap [nm]")
+    if title is None:
+        x, y, z = np.ptp(found.positions, axis=0)
+        title = f"{len(found):,} ions, {x:.1f} × {y:.1f} × {z:.1f} nm"
+    figure.suptitle(title, parse_math=False)
+    return axes
+
+
+def _species(found, ranges):
+    """Names of the groups of ions, the most frequent first, and the group of each ion."""
+    if ranges is not None:
+        labels = check_kind(ranges, "ranges", Ranges, "Ranges, such as read_ranges(path)").labels(found.hits, OUTSIDE)
+    elif "element" in found.hits.extra:
+        labels = found.hits.extra["element"]
+    else:
+        return ["ions"], np.zeros(len(found), dtype=int)
+    names, group, number = np.unique(labels.astype(str), return_inverse=True, return_counts=True)
+    order = np.argsort(-number, kind="stable")
+    rank = np.empty(len(order), dtype=int)
+    rank[order] = np.arange(len(order))
+    sorted_names = names[order].tolist()
+    if len(names) <= _MOST + 1:
+        return sorted_names, rank[group]
+    return [*sorted_names[:_MOST], "other"], np.minimum(rank[group], _MOST)
+
+
+def _side(ax: Axes, found, names, species):
+    x, y, z = found.positions.T
+    near = np.flatnonzero(np.abs(y - np.median(y)) < 0.05 * np.ptp(y))
+    near = near[:: max(1, -(-len(near) // _DOTS))]
+    size = float(np.clip(_DOTS / max(len(near), 1), 1.5, 12.0))
+    for number, name in enumerate(names):
+        ions = near[species[near] == number]
+        ax.scatter(x[ions], z[ions], s=size, linewidths=0, color=_COLORS[number], label=name, rasterized=True)
+    ax.invert_yaxis()  # the apex of the first ion above
+    ax.set(aspect="equal", xlabel="x [nm]", ylabel="depth z [nm]")
+    set_title(ax, f"from the side, {0.1 * np.ptp(y):.1f} nm thick")
+
+
+def _top(ax: Axes, found):
+    shown = binned(Hits(x=found.positions[:, 0], y=found.positions[:, 1]))  # nm in place of mm
+    low, high = color_limits(shown)
+    image = ax.imshow(
+        shown.density, origin="lower", extent=shown.extent, cmap="inferno", vmin=low, vmax=high, interpolation="nearest"
+    )
+    ax.set(aspect="equal", xlabel="x [nm]", ylabel="y [nm]")
+    set_title(ax, "along the axis")
+    add_colorbar([image], ax, label="ions per area / mean")
+
+
+def _core(found):
+    """Ions within half the field of view, and its radius [nm]."""
+    across = np.hypot(*found.positions[:, :2].T)
+    rim = _CORE * float(np.quantile(across, 0.99))
+    return across < rim, rim
+
+
+def _sections(values):
+    """Edges of sections of equal width."""
+    n = int(np.clip(len(values) // _FEWEST, 1, _SECTIONS))
+    return np.linspace(values.min(), values.max() * (1 + 1e-12) + 1e-12, n + 1)
+
+
+def _density(ax: Axes, found):
+    near, rim = _core(found)
+    depths = found.depths  # from cap to cap, so that the curvature does not matter
+    edges = _sections(depths[near])
+    ions = np.histogram(depths[near], edges)[0]
+    volume = np.pi * rim**2 * np.diff(edges)
+    ax.errorbar(
+        (edges[1:] + edges[:-1]) / 2, ions / volume, np.sqrt(ions) / volume, fmt=".-", color="C0", label="near the axis"
+    )
+    expected = found.settings["efficiency"] / found.settings["atomic_volume"]
+    ax.axhline(expected, color="0.4", linestyle="dashed", label="efficiency / atomic volume")
+    ax.set(xlabel="depth of the apex [nm]", ylabel="ions per nm$^3$", ylim=(0, None))
+    ax.legend(fontsize="small")
+
+
+def _fractions(ax: Axes, found, names, species):
+    near, _ = _core(found)
+    depths = found.positions[near, 2]
+    edges = _sections(depths)
+    number = np.stack([np.histogram(depths[species[near] == each], edges)[0] for each in range(len(names))])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        fraction = number / number.sum(axis=0)
+        error = np.sqrt(fraction * (1 - fraction) / number.sum(axis=0))
+    for each, _name in enumerate(names):
+        ax.errorbar((edges[1:] + edges[:-1]) / 2, fraction[each], error[each], fmt=".-", color=_COLORS[each])
+    ax.set(xlabel="depth z [nm]", ylabel="fraction of the ions near the axis", ylim=(0, None))
+
+
+def _composition(ax: Axes, names, species):
+    number = np.bincount(species, minlength=len(names))
+    fraction = number / number.sum()
+    error = np.sqrt(fraction * (1 - fraction) / number.sum())
+    places = np.arange(len(names))
+    ax.barh(places, fraction, xerr=error, color=_COLORS[: len(names)])
+    for place, value, wide in zip(places, fraction, error, strict=True):
+        ax.annotate(
+            f"{value:.2%} ± {wide:.2%}", (value, place), xytext=(6, 0), textcoords="offset points", va="center",
+            fontsize="small",
+        )  # fmt: skip
+    ax.set_yticks(places, [name.replace("$", r"\$") for name in names])
+    ax.invert_yaxis()
+    ax.set(xlabel="fraction of all ions", xlim=(0, 1.6 * fraction.max()))
