@@ -193,7 +193,7 @@ def binned(hits: Hits, bins: int | None = None, smoothing: float | None = None) 
     --------
     >>> places = np.random.default_rng(1).uniform(-20, 20, (2, 3000))  # mm
     >>> ae.plot.binned(ae.Hits(x=places[0], y=places[1]))
-    <DetectorMap: 128 x 128 bins of 0.312 x 0.312 mm, 3,000 ions, smoothed by 0.62479 mm>
+    <DetectorMap: 3,000 ions, 128 x 128 bins of 0.3124 x 0.3124 mm, smoothed by 0.624811 mm>
     """
     ions = int(np.count_nonzero(check_kind(hits, "hits", Hits, "Hits").detected))
     counts = hits.map(shown_bins(ions) if bins is None else bins)

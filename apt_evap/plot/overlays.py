@@ -137,7 +137,8 @@ def score_surface(surface: ScoreSurface, ax: Axes | None = None) -> Axes:
     >>> run = ae.Simulation(ae.Tip("Ni", apex_radius=2.5, axis=(1, 1, 1)), seed=1).run(400)
     >>> simulated = run.hits(ae.RollUp(0.2)).map(bins=32)
     >>> surface = ae.registration.score_surface(simulated, simulated, rotations=(-60, 60), scales=(0.9, 1.1))
-    >>> ax = ae.plot.score_surface(surface)             # ax.figure.savefig("score_surface.png")
+    >>> ae.plot.score_surface(surface).get_title()
+    'score 0.99 at 0 degrees and 1.02'
     """
     check_kind(surface, "surface", ScoreSurface, "a ScoreSurface")
     if min(surface.scores.shape) < 2 or not np.isfinite(surface.scores).any():

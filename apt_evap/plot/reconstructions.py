@@ -53,7 +53,9 @@ def reconstruction(
     >>> radius, azimuth = 20 * np.sqrt(rng.random(20_000)), 2 * np.pi * rng.random(20_000)  # mm, uniform
     >>> ions = ae.Hits(x=radius * np.cos(azimuth), y=radius * np.sin(azimuth))
     >>> found = ae.reconstruct(ions, atomic_volume=0.011, distance=90.0, radius=30.0)
-    >>> ae.plot.reconstruction(found)[0].figure.savefig("reconstruction.png")
+    >>> axes = ae.plot.reconstruction(found)            # axes[0].figure.savefig("reconstruction.png")
+    >>> len(axes)
+    4
     """
     check_kind(found, "found", Reconstruction, "a Reconstruction, the result of reconstruct")
     names, species = _species(found, ranges)

@@ -110,8 +110,8 @@ def doubts(content: Mapping[str, Any]) -> tuple[list[str], list[str]]:
     """
     registration, settings, edges = content["registration"], content["settings"], content["optimum"]["at_edge"]
     of_registration, others = [], []
-    if content["likeness"]["verdict"] != "alike":
-        doubtful = content["likeness"]["verdict"] == "doubtful"
+    doubtful = content["likeness"]["verdict"] == "doubtful"
+    if content["likeness"]["verdict"] != "alike" and not (doubtful and registration["doubtful"]):
         verdict = "It is doubtful that the maps are alike" if doubtful else "The maps are not alike"
         of_registration.append(f"{verdict}: {content['likeness']['reason']}.")
     if registration["doubtful"]:
