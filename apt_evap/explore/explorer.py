@@ -13,7 +13,7 @@ import numpy as np
 
 from apt_evap._common.codec import to_python
 from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence
-from apt_evap.analysis.apex import image_compression
+from apt_evap.analysis.apex import image_compression, symmetric_places
 from apt_evap.config.perturbation_text import write_perturbation
 from apt_evap.crystallography.directions import poles
 from apt_evap.crystallography.orientation import Orientation
@@ -477,6 +477,10 @@ class Explorer:
         return image_compression(self.run).projection
 
     @cached_property
+    def _symmetric_places(self):
+        return symmetric_places(self.run)
+
+    @cached_property
     def _pole(self):
         """Label, direction in the specimen and symmetry of the pole nearest to the axis."""
         tip = self.run.settings["tip"]
@@ -536,7 +540,7 @@ class Explorer:
         """Whether both maps show the same crystal along the same axis, see `likeness`, and lie on each other."""
         assert shown.simulated is not None and shown.measured is not None and self.registration is not None
         arguments = shown.simulated, shown.measured, self.registration
-        found = likeness(*arguments)
+        found = likeness(*arguments, about=self._symmetric_places)
         if found.verdict == "alike" and (why := misplaced(*arguments)):
             return found._replace(verdict="doubtful", reason=f"{found.reason}, but {why}: check the registration")
         return found

@@ -10,6 +10,7 @@ import numpy as np
 from apt_evap._common.codec import for_json
 from apt_evap._common.threads import thread_count
 from apt_evap._common.validation import check_count, check_kind
+from apt_evap.analysis.apex import symmetric_places
 from apt_evap.analysis.description import microscope_of
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
@@ -184,6 +185,7 @@ def fit_energies(
         "real_units": real_units_of(run),
         "microscope": microscope_of(run),
         "structure": missing,
+        "symmetric_places": symmetric_places(run),
     }
     return Study(
         grid=grid,

@@ -161,7 +161,8 @@ class Study:
     @cached_property
     def likeness(self) -> Likeness:
         """Whether the best simulated map and the measured one show the same crystal along the same axis."""
-        return likeness(self.maps["optimum"], self.measured, self.registration)
+        about = self.provenance.get("symmetric_places", [(0.0, 0.0)])
+        return likeness(self.maps["optimum"], self.measured, self.registration, about=about)
 
     def compared(self, map: DetectorMap) -> DetectorMap:
         """Prepare a map of the measured frame as for the comparison: common region, flattened and smoothed."""

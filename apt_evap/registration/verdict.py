@@ -1,11 +1,11 @@
 """Whether a registered simulated map and a measured one show the same crystal: their symmetry about one point.
 
 The correlation of two registered maps, and their structural similarity, do not answer this: a search over all
-rotations, scales and shifts finds some agreement of any two maps with dark and bright places. The symmetry about the
-axis of the simulated specimen does. Each map is compared with itself, rotated about this point. The correlation as a
-function of the angle is a curve with maxima at the rotations of the crystal. It does not change if lines are dark
-instead of bright, or fainter, and it needs no agreement of the maps in place. Curves of both maps that agree have the
-same fold, and lines at the same angles from each other.
+rotations, scales and shifts finds some agreement of any two maps with dark and bright places. The symmetry about a pole
+does, the axis of the simulated specimen or a pole near it. Each map is compared with itself, rotated about this point.
+The correlation as a function of the angle is a curve with maxima at the rotations of the crystal. It does not change if
+lines are dark instead of bright, or fainter, and it needs no agreement of the maps in place. Curves of both maps that
+agree have the same fold, and lines at the same angles from each other.
 
 Measured, with tips of R = 6 to 7 nm, 12,000 to 15,000 ions, and ions that roll up (all, or half of them with lateral
 velocities), on measured maps of nickel, aluminium and tungsten: fcc [111] on nickel 0.76 to 0.80 and on aluminium 0.81
@@ -18,13 +18,15 @@ With maps drawn from master patterns and a search without start, agreement alone
 a doubtful registration makes the verdict doubtful (articles/measured_maps).
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_kind, check_seed
+from apt_evap._common.validation import check_array, check_kind, check_seed, check_sequence
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.registration.correlation_search import BROAD, FINE, NARROW, View, correlation
 from apt_evap.registration.register import Registration
@@ -45,14 +47,21 @@ class Likeness(NamedTuple):
     verdict: str
     """"alike", "doubtful" or "not alike"."""
     symmetry: float
-    """Agreement of the symmetries of both maps about the axis of the simulated specimen, -1 to 1; NaN if not known."""
+    """Agreement of the symmetries of both maps about a pole, -1 to 1; NaN if not known."""
     halves: float
     """The same for two random halves of the measured counts; NaN for densities."""
     reason: str
     """One sentence."""
 
 
-def likeness(simulated: DetectorMap, measured: DetectorMap, registration: Registration, *, seed: int = 0) -> Likeness:
+def likeness(
+    simulated: DetectorMap,
+    measured: DetectorMap,
+    registration: Registration,
+    *,
+    about: Sequence[ArrayLike] = ((0.0, 0.0),),
+    seed: int = 0,
+) -> Likeness:
     """Judge whether two maps show the same crystal along the same axis.
 
     Parameters
@@ -60,7 +69,10 @@ def likeness(simulated: DetectorMap, measured: DetectorMap, registration: Regist
     simulated, measured : DetectorMap
         Maps in the measured frame, on the same bins, such as those of a study.
     registration : Registration
-        Transform into the measured frame, which gives the place of the axis of the simulated specimen.
+        Transform into the measured frame.
+    about : sequence of array_like
+        Places of poles in the simulated frame [mm], shape (2,) each: the symmetries are compared about the first one
+        around which both maps are known. By default the axis of the specimen, which has no symmetry if it is no pole.
     seed : int
         Seed of the random halves of the measured counts.
 
@@ -77,12 +89,19 @@ def likeness(simulated: DetectorMap, measured: DetectorMap, registration: Regist
         check_kind(each, name, DetectorMap, "a DetectorMap")
     if simulated.values.shape != measured.values.shape:
         raise ValueError(f"simulated must have the bins of the measured map, got {simulated!r} and {measured!r}")
-    x, y = check_kind(registration, "registration", Registration, "a Registration").points(0.0, 0.0)
-    centre = complex(float(x), float(y))
+    check_kind(registration, "registration", Registration, "a Registration")
+    places = [check_array(each, "about", (2,)) for each in check_sequence(about, "about", "places [mm]")]
+    if not places:
+        raise ValueError("about must contain at least one place, got none")
     common = simulated.mask & measured.mask
     maps = [replace(each, mask=common) for each in (simulated, measured)]
-    own, other = (_symmetry(each, centre) for each in maps)
-    agreement = _agreement(own, other)
+    for place in places:
+        x, y = registration.points(*place)
+        centre = complex(float(x), float(y))
+        own, other = (_symmetry(each, centre) for each in maps)
+        agreement = _agreement(own, other)
+        if np.isfinite(agreement):
+            break
     halves = float("nan")
     if measured.is_counts:
         half = np.random.default_rng(check_seed(seed)).binomial(measured.counts, 0.5)
@@ -92,9 +111,9 @@ def likeness(simulated: DetectorMap, measured: DetectorMap, registration: Regist
 
 
 def _judged(agreement, halves, doubtful):
-    numbers = f"their symmetries about the axis of the specimen agree to {agreement:.2f}"
+    numbers = f"their symmetries about a pole agree to {agreement:.2f}"
     if np.isnan(agreement):
-        reason = "the axis of the simulated specimen is too close to the rim of the measured map for a verdict"
+        reason = "no pole near the axis of the specimen is far enough from the rim of the maps for a verdict"
         return Likeness("doubtful", agreement, halves, reason)
     if halves < ALIKE:
         reason = f"the measurement is too noisy for a verdict: those of two halves of its ions agree to {halves:.2f}"

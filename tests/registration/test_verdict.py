@@ -85,3 +85,14 @@ def _ions_of(map):
 def test_maps_on_other_bins_are_refused():
     with pytest.raises(ValueError, match="simulated"):
         likeness(ae.DetectorMap.from_array(np.ones((9, 9)), EDGES[:10], EDGES[:10]), lines(SIX), HERE)
+
+
+def test_the_first_place_with_enough_around_it_counts():
+    simulated, measured = lines(THREE, centre=(8.0, 5.0), ions=12_000), lines(THREE, centre=(8.0, 5.0), ions=60_000)
+    assert likeness(simulated, measured, HERE).verdict != "alike"  # the axis has no symmetry
+    about = [(38.0, 0.0), (8.0, 5.0), (0.0, 0.0)]  # the first one is at the rim
+    assert likeness(simulated, measured, HERE, about=about).verdict == "alike"
+    assert likeness(simulated, measured, HERE, about=about[:1]).verdict == "doubtful"
+    for wrong in ([], [(1.0,)], "pole"):
+        with pytest.raises(ValueError, match="about"):
+            likeness(simulated, measured, HERE, about=wrong)
