@@ -1,0 +1,91 @@
+"""Runs of tungsten, nickel and aluminium along their measured axes, for three charging rules.
+
+    python runs.py RUNS W 160 --rule others --seed 1
+
+One file for each metal, radius, rule and seed, `W_160_others_1.h5`; a file that is there is not made again. All atoms
+evaporate, only ions that can arrive in the measured field of view fly. Every emission is flown for the same ions, in
+the exact field. Energies are 0.35 eV in real units, sigma/mean 1, launches 0.1 nm above the site unless the name says
+otherwise.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+import apt_evap as ae
+
+ENERGY, HEIGHT = 0.35, 0.1  # eV, nm
+# Direction at the middle of the measured map, and half the opening angle of the flights [degrees]: the image
+# compression of these free specimens is about 1 there. Aluminium has two orientations, its map is undecided.
+AXES = {
+    "W": ((0.03, 0.69, 0.72), 18.0),
+    "Ni": ((0.302, 0.540, 0.786), 25.3),
+    "Al": ((0.31, 0.61, 0.73), 26.7),
+    "Al-2": ((0.39, 0.50, 0.77), 24.0),
+}
+RULES = {
+    "others": ae.ConstantPotential(law_field="others"),
+    "charge": ae.ConstantPotential(),
+    "Robin": ae.Robin(),
+}
+EMISSIONS = (
+    "unperturbed", "lateral", "lateral, height 0.2", "strongest", "sharpness 0.15", "sharpness 0.4", "sharpness 2",
+    "sharpness 0.4, height 0.2",
+)  # fmt: skip
+
+
+def emissions(scale):
+    """Perturbations in the order of `EMISSIONS`; `scale` is the simulated energy per real energy."""
+    energy = ae.TruncatedNormal(ENERGY * scale, ENERGY * scale)
+    return [
+        ae.Unperturbed(),
+        ae.LateralVelocity(energy, HEIGHT),
+        ae.LateralVelocity(energy, 2 * HEIGHT),
+        ae.RollUp(energy),
+        ae.RollUp(energy, 1.0, 0.15, HEIGHT),
+        ae.RollUp(energy, 1.0, 0.4, HEIGHT),
+        ae.RollUp(energy, 1.0, 2.0, HEIGHT),
+        ae.RollUp(energy, 1.0, 0.4, 2 * HEIGHT),
+    ]
+
+
+def simulated(metal, radius, rule, seed, skip, ions, threads):
+    """Run of one specimen; the second one has other atoms at the apex."""
+    axis, half_angle = AXES[metal]
+    material = ae.material(metal.partition("-")[0])
+    size = radius * material.a
+    shank = size if radius >= 160 else 2 * size
+    tip = ae.Tip(material, size, axis=axis, shank_length=shank, depth=8 * material.a, offset_seed=seed)
+    common = {"seed": seed, "rule": RULES[rule], "n_threads": threads}
+    common["response_settings"] = ae.ResponseSettings.wide()  # records the neighbours for the sharpness
+    pilot = ae.Simulation(tip, **common).run(256, responses=False, progress=False)
+    scale = float(np.median(pilot.at_evaporation_field().energy_scales))
+    seen = ae.FlightSettings(field_of_view=half_angle)
+    simulation = ae.Simulation(tip, flight_settings=seen, **common)
+    for _ in simulation.emitter.advance(skip):
+        pass
+    return simulation.run(ions, emissions(scale), responses=False, progress=False)
+
+
+def main():
+    """Simulate one run."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", type=Path, help="folder of the runs")
+    parser.add_argument("metal", choices=AXES)
+    parser.add_argument("radius", type=int, help="in lattice constants")
+    parser.add_argument("--rule", choices=RULES, default="others")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--skip", type=int, default=110_000, help="events before the first ion that flies")
+    parser.add_argument("--ions", type=int, default=300_000)
+    parser.add_argument("--threads", type=int)
+    options = parser.parse_args()
+    path = options.runs / f"{options.metal}_{options.radius}_{options.rule}_{options.seed}.h5"
+    options.runs.mkdir(parents=True, exist_ok=True)
+    if not path.exists():
+        arguments = options.metal, options.radius, options.rule, options.seed, options.skip, options.ions
+        simulated(*arguments, options.threads).save(path)
+
+
+if __name__ == "__main__":
+    main()
