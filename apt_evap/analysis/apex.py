@@ -13,16 +13,12 @@ import scipy
 from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_count, check_kind, check_sequence
-from apt_evap.crystallography.directions import poles
-from apt_evap.crystallography.orientation import Orientation
-from apt_evap.crystallography.symmetry import rotational_symmetry
 from apt_evap.detection.projection import Projection, polar_angles
 from apt_evap.emission.perturbations import Unperturbed
 from apt_evap.simulation.run import Run
 
 _CAP = math.radians(45)  # sites within this angle of the axis define the sphere: far from the shank
 _NEAR = math.radians(20)  # angle around the apex for its field
-_MOST_TILTED = math.radians(25)  # pole about which the symmetry of a map is compared
 _BIN = 2.0  # degrees
 _LEAST_IONS = 30  # fewest ions for the median of a bin
 _INNER = 15.0  # [degrees]: inside this angle a pole on the axis deflects its ions outwards
@@ -163,37 +159,6 @@ def image_compression(run: Run, caps: Sequence[FittedCap] | None = None) -> Imag
     scatter = float(np.diff(np.percentile(ratio, [16, 84]))[0] / 2)
     projection = onto_detector.compressed(compression)
     return ImageCompression(compression, scatter, low, high, angles, medians, projection)
-
-
-def symmetric_places(run: Run) -> list[tuple[float, float]]:
-    """Places of poles with a rotational symmetry within 25 degrees of the axis, the highest symmetry first.
-
-    Parameters
-    ----------
-    run : Run
-        A run with unperturbed flights or with responses.
-
-    Returns
-    -------
-    list of (float, float)
-        On the detector of the run [mm]; the axis alone if the specimen is no crystal, has no such pole, or the run has
-        too few ions for an image compression.
-    """
-    tip = check_kind(run, "run", "hits", "a Run").settings["tip"]
-    if "axis" not in tip:
-        return [(0.0, 0.0)]
-    orientation = Orientation.from_settings(tip)
-    normals = poles(orientation.material).normals
-    normals = normals[orientation.directions(normals)[:, 2] > math.cos(_MOST_TILTED)]
-    directions = orientation.directions(normals)
-    folds = np.array([rotational_symmetry(orientation.material, each) for each in normals], int)
-    order = np.lexsort((-directions[:, 2], -folds))
-    order = order[folds[order] > 1]
-    try:
-        projection = image_compression(run).projection
-    except ValueError:
-        return [(0.0, 0.0)]
-    return [(float(x), float(y)) for x, y in projection.places(directions[order])] or [(0.0, 0.0)]
 
 
 def field_factor(run: Run, caps: Sequence[FittedCap] | None = None) -> Floats:

@@ -7,6 +7,7 @@ from .directions import poles as poles
 from .directions import zones as zones
 from .orientation import FittedOrientation as FittedOrientation
 from .orientation import fit_orientation as fit_orientation
+from .symmetry import PoleSymmetry as PoleSymmetry
 from .symmetry import point_group as point_group
-from .symmetry import rotational_symmetry as rotational_symmetry
+from .symmetry import pole_symmetry as pole_symmetry
 from .symmetry import symmetry_about_axis as symmetry_about_axis

@@ -212,6 +212,12 @@ def label(indices: Iterable[int]) -> str:
     return "$" + space.join(rf"\bar{{{-index}}}" if index < 0 else str(index) for index in map(int, indices)) + "$"
 
 
+def plain_label(indices: Iterable[int]) -> str:
+    """Label of a pole or an axis in plain text: "011", or "1 -1 0" with a negative index (str)."""
+    texts = [str(int(index)) for index in indices]
+    return ("" if all(len(text) == 1 for text in texts) else " ").join(texts)
+
+
 def _three(material, indices, name, from_four):
     """Convert rows of three or, for hcp, four indices to three."""
     four = material.structure == "hcp" and np.ndim(indices) == 2 and np.shape(indices)[1] == 4

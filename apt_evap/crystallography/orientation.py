@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -16,12 +16,24 @@ from apt_evap._common.codec import checked, number, settings
 from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_sequence, check_switch, short_text
-from apt_evap.crystallography.directions import plane_normals
+from apt_evap.crystallography.directions import plane_normals, poles
+from apt_evap.crystallography.symmetry import point_group, pole_symmetry
 from apt_evap.detection.projection import Projection
 from apt_evap.specimen import lattice
 from apt_evap.specimen.materials import as_material
 
 _SAME = math.radians(0.1)  # directions closer than this count as one
+
+
+class OrientedPole(NamedTuple):
+    """A pole of an oriented crystal, in the frame of the specimen."""
+
+    direction: np.ndarray
+    """Unit vector, shape (3,)."""
+    symmetry: str
+    """Symmetry of the lattice about it, such as "2mm"."""
+    toward: np.ndarray
+    """Unit vector perpendicular to it, in a mirror plane if there is one, shape (3,)."""
 
 
 @settings
@@ -108,6 +120,46 @@ class Orientation:
     def directions(self, crystal_directions: ArrayLike) -> Floats:
         """Rotate vectors from the frame of the crystal to the frame of the specimen, both of shape (n, 3)."""
         return check_array(crystal_directions, "crystal_directions", ("n", 3)) @ self.matrix.T
+
+    def nearest_pole(self, plane: Sequence[int]) -> OrientedPole:
+        """Pole of a family of planes that is nearest to the axis of the specimen.
+
+        Parameters
+        ----------
+        plane : sequence of int
+            Miller indices of one plane of the family, four for hcp.
+
+        Returns
+        -------
+        OrientedPole
+            In the frame of the specimen: the arguments of `maps.folded`.
+        """
+        normal = plane_normals(self.material, np.atleast_2d(np.asarray(plane)))[0]
+        members = point_group(self.material.structure) @ normal
+        nearest = members[np.argmax(np.round(self.directions(members)[:, 2], 9))]
+        symmetry = pole_symmetry(self.material, nearest)
+        direction, toward = self.directions([nearest, symmetry.toward])
+        return OrientedPole(direction, symmetry.name, toward)
+
+    def symmetric_poles(self, within: float = 25.0) -> Floats:
+        """Directions of the poles with a rotational symmetry near the axis, the highest symmetry first.
+
+        Parameters
+        ----------
+        within : float
+            Largest angle from the axis [degrees].
+
+        Returns
+        -------
+        ndarray
+            Unit vectors in the frame of the specimen, shape (n, 3); n may be 0.
+        """
+        normals = poles(self.material).normals
+        normals = normals[self.directions(normals)[:, 2] > math.cos(math.radians(within))]
+        directions = self.directions(normals)
+        orders = np.array([pole_symmetry(self.material, each).order for each in normals], int)
+        order = np.lexsort((-directions[:, 2], -orders))
+        return directions[order[orders[order] > 1]]
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -12,6 +12,7 @@ from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array
 from apt_evap.specimen.lattice import check_structure
 
+_ANY = np.array([1.0, 0.3, 0.1])  # in no mirror plane; azimuths begin towards [100] where they can
 _TOLERANCE = 1e-6  # of the axis: orientations by integers are exact to rounding
 
 
@@ -34,8 +35,19 @@ def point_group(structure: str) -> Floats:
     return np.concatenate([members, -members])  # both groups contain the inversion
 
 
-def rotational_symmetry(material: Any, direction: ArrayLike) -> int:
-    """Order of the rotations about a direction that map the lattice of a crystal onto itself.
+class PoleSymmetry(NamedTuple):
+    """Symmetry of a lattice about a direction; result of `pole_symmetry`."""
+
+    name: str
+    """"6mm", "4mm", "3m", "2mm", "m" or "1"."""
+    order: int
+    """Order of the rotations about the direction: 1, 2, 3, 4 or 6."""
+    toward: np.ndarray
+    """Unit vector perpendicular to the direction, in a mirror plane if there is one, in the frame of the crystal."""
+
+
+def pole_symmetry(material: Any, direction: ArrayLike) -> PoleSymmetry:
+    """Symmetry of the lattice of a crystal about a direction.
 
     Parameters
     ----------
@@ -46,13 +58,45 @@ def rotational_symmetry(material: Any, direction: ArrayLike) -> int:
 
     Returns
     -------
-    int
-        1, 2, 3, 4 or 6.
+    PoleSymmetry
+        `toward` has symmetric directions for symmetric poles, so that maps about them can be compared.
+
+    Raises
+    ------
+    ValueError
+        If the direction is zero.
+
+    Examples
+    --------
+    >>> for direction in ((0, 0, 1), (1, 1, 1), (0, 1, 1), (1, 1, 3), (1, 2, 3)):
+    ...     print(ae.crystallography.pole_symmetry(ae.material("Ni"), direction).name)
+    4mm
+    3m
+    2mm
+    m
+    1
     """
     along = check_array(direction, "direction", (3,))
+    length = np.linalg.norm(along)
+    if not length > 0:
+        raise ValueError("direction must not be zero, got (0, 0, 0)")
     group = point_group(material.structure)
-    turned = group[np.linalg.det(group) > 0] @ along
-    return int(np.count_nonzero(np.linalg.norm(turned - along, axis=1) < _TOLERANCE * np.linalg.norm(along)))
+    # one of the symmetric directions stands for all: a rule for it gives them symmetric results
+    to_first = group[np.argmax(group @ (along / length) @ _ANY[::-1])]
+    pole = to_first @ along / length
+    keeps = group[np.linalg.norm(group @ pole - pole, axis=1) < _TOLERANCE]
+    rotations = np.linalg.det(keeps) > 0
+    order = int(np.count_nonzero(rotations))
+    mirrored = bool((~rotations).any())
+    if mirrored:
+        # the normal of a mirror plane is its eigenvector of -1
+        normals = [np.linalg.eigh(each)[1][:, 0] for each in keeps[~rotations]]
+        inside = [sign * np.cross(normal, pole) for normal in normals for sign in (1, -1)]
+    else:
+        inside = [np.cross(pole, np.eye(3)[np.abs(pole).argmin()])]
+    toward = max(inside, key=lambda each: float(each @ _ANY))
+    name = (f"{order}mm" if order % 2 == 0 else f"{order}m" if order > 1 else "m") if mirrored else str(order)
+    return PoleSymmetry(name, order, to_first.T @ toward / np.linalg.norm(toward))
 
 
 def symmetry_about_axis(material: Any, orientation: ArrayLike) -> Floats:

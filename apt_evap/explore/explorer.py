@@ -13,11 +13,11 @@ import numpy as np
 
 from apt_evap._common.codec import to_python
 from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence
-from apt_evap.analysis.apex import image_compression, symmetric_places
+from apt_evap.analysis.apex import image_compression
 from apt_evap.config.perturbation_text import write_perturbation
 from apt_evap.crystallography.directions import poles
 from apt_evap.crystallography.orientation import Orientation
-from apt_evap.crystallography.symmetry import rotational_symmetry
+from apt_evap.crystallography.symmetry import pole_symmetry
 from apt_evap.detection.binning import bins_for, field_of_view
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
@@ -31,7 +31,7 @@ from apt_evap.maps.profiles import Profile, Rectangle, zone_line_profile
 from apt_evap.maps.rings import Ring, ring_statistics
 from apt_evap.maps.similarity import WINDOW, Similarity, similarity, similarity_ceiling, window_fits
 from apt_evap.registration.register import Registration, register
-from apt_evap.registration.verdict import Likeness, likeness
+from apt_evap.registration.verdict import Likeness, likeness, symmetric_places
 from apt_evap.simulation.run import Run
 from apt_evap.warnings import AptWarning
 
@@ -477,10 +477,6 @@ class Explorer:
         return image_compression(self.run).projection
 
     @cached_property
-    def _symmetric_places(self):
-        return symmetric_places(self.run)
-
-    @cached_property
     def _pole(self):
         """Label, direction in the specimen and symmetry of the pole nearest to the axis."""
         tip = self.run.settings["tip"]
@@ -490,7 +486,7 @@ class Explorer:
             directions = orientation.directions(family.normals)
             nearest = int(directions[:, 2].argmax())
             if directions[nearest, 2] > math.cos(math.radians(_NEAR)):
-                fold = rotational_symmetry(orientation.material, family.normals[nearest])
+                fold = pole_symmetry(orientation.material, family.normals[nearest]).order
                 return family.labels[nearest], directions[nearest], fold
         return "axis", np.array([0.0, 0.0, 1.0]), 1
 
@@ -540,7 +536,13 @@ class Explorer:
         """Whether both maps show the same crystal along the same axis, see `likeness`, and lie on each other."""
         assert shown.simulated is not None and shown.measured is not None and self.registration is not None
         arguments = shown.simulated, shown.measured, self.registration
-        found = likeness(*arguments, about=self._symmetric_places)
+        tip = self.run.settings["tip"]
+        try:
+            projection = self._projection
+        except ValueError:  # too few ions
+            projection = None
+        orientation = Orientation.from_settings(tip) if "axis" in tip else None
+        found = likeness(*arguments, about=symmetric_places(orientation, projection))
         if found.verdict == "alike" and (why := misplaced(*arguments)):
             return found._replace(verdict="doubtful", reason=f"{found.reason}, but {why}: check the registration")
         return found

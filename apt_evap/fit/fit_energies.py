@@ -10,7 +10,7 @@ import numpy as np
 from apt_evap._common.codec import for_json
 from apt_evap._common.threads import thread_count
 from apt_evap._common.validation import check_count, check_kind
-from apt_evap.analysis.apex import symmetric_places
+from apt_evap.analysis.apex import image_compression
 from apt_evap.analysis.description import microscope_of
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
@@ -185,7 +185,7 @@ def fit_energies(
         "real_units": real_units_of(run),
         "microscope": microscope_of(run),
         "structure": missing,
-        "symmetric_places": symmetric_places(run),
+        "projection": _projection_of(run),
     }
     return Study(
         grid=grid,
@@ -209,6 +209,15 @@ def fit_energies(
     )
 
 
+def _projection_of(run):
+    """Scale and compression of the detector of a run; None if it has too few ions."""
+    try:
+        projection = image_compression(run).projection
+    except ValueError:
+        return None
+    return {"scale": projection.scale, "compression": projection.compression}
+
+
 def _pole_measure(search, registration, pole):
     """Measure of the structure about a pole, or None and the reason."""
     try:
@@ -224,6 +233,7 @@ def _structure_scores(measure, search, structures, maps, cell):
         return None
     measured = measure.structure(search.region)
     misfits = np.array([structure.misfit(measured) for structure in structures])
+    correlations = np.array([structure.correlation(measured) for structure in structures])
     misfit, errors = (column.reshape(search.grid.shape) for column in misfits.T)
     at = tuple(int(index) for index in cell)
     return StructureScores(
@@ -231,6 +241,7 @@ def _structure_scores(measure, search, structures, maps, cell):
         measured=measured,
         unperturbed=measure.structure(maps["unperturbed"]),
         optimum=structures[int(np.ravel_multi_index(at, search.grid.shape))],
+        correlations=correlations.reshape(search.grid.shape),
         misfit=misfit,
         errors=errors,
         best=tuple(int(index) for index in np.unravel_index(misfit.argmin(), misfit.shape)),

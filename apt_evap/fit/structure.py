@@ -17,15 +17,16 @@ from numpy.typing import ArrayLike
 from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import Floats
 from apt_evap.analysis.apex import image_compression
-from apt_evap.crystallography.directions import plane_normals, poles
+from apt_evap.crystallography.directions import plain_label, plane_normals, poles
 from apt_evap.crystallography.orientation import Orientation
-from apt_evap.crystallography.symmetry import rotational_symmetry
+from apt_evap.crystallography.symmetry import pole_symmetry
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.projection import Projection
+from apt_evap.maps.folded import FoldedMap, folded
 from apt_evap.maps.pole_frame import pole_frame
 from apt_evap.maps.pole_profiles import pole_profile
 from apt_evap.maps.profiles import Profile
-from apt_evap.maps.rings import RINGS, Ring, ring_statistics
+from apt_evap.maps.rings import RINGS, LineAmplitude, Ring, line_amplitude, ring_statistics
 from apt_evap.registration.register import Registration
 from apt_evap.simulation.run import Run
 
@@ -70,6 +71,8 @@ class Structure(NamedTuple):
     """Statistics of the rings."""
     radial: Profile
     """Density against the angle from the pole."""
+    folded: FoldedMap | None = None
+    """The map, folded about the pole; None if it has no hits there."""
 
     @property
     def values(self) -> Floats:
@@ -95,6 +98,15 @@ class Structure(NamedTuple):
         if misfit == 0.0:
             return 0.0, float(np.sqrt(np.mean(error**2)))
         return misfit, float(np.sqrt(np.sum((difference * error) ** 2)) / (len(difference) * misfit))
+
+    def correlation(self, measured: Structure) -> float:
+        """Correlation of the folded maps, NaN if one of them is not known."""
+        if self.folded is None or measured.folded is None:
+            return float("nan")
+        try:
+            return self.folded.correlation(measured.folded)
+        except ValueError:  # too small a common part
+            return float("nan")
 
     def lost(self, measured: Structure) -> bool:
         """Whether all rings with a significant measured contrast have lost it."""
@@ -148,7 +160,9 @@ class PoleMeasure:
             )
         self.plane = tuple(int(index) for index in planes[best])
         self.pole = directions[best]
-        self.fold = rotational_symmetry(orientation.material, normals[best])
+        symmetry = pole_symmetry(orientation.material, normals[best])
+        self.fold, self.symmetry = symmetry.order, symmetry.name
+        self.toward = orientation.directions([symmetry.toward])[0]
         sectors = [self._sectors(region, ring) for ring in RINGS]
         self.rings = [(ring, number) for ring, number in zip(RINGS, sectors, strict=True) if number]
         if not self.rings:
@@ -157,7 +171,13 @@ class PoleMeasure:
     def structure(self, map: DetectorMap, ions: float | None = None) -> Structure:
         """Structure of a map in the measured frame; `ions` as for `ring_statistics`."""
         rings = tuple(self._ring(map, ring, sectors, ions) for ring, sectors in self.rings)
-        return Structure(rings, pole_profile(map, self.projection, self.pole, ions=ions))
+        return Structure(rings, pole_profile(map, self.projection, self.pole, ions=ions), self._folded(map))
+
+    def _folded(self, map):
+        try:
+            return folded(map, self.projection, self.pole, self.symmetry, self.toward, reach=self.rings[-1][0][1])
+        except ValueError:  # no hits near the pole
+            return None
 
     def _ring(self, map, ring, sectors, ions):
         """A ring; one without hits has no contrast: its values are NaN."""
@@ -202,6 +222,8 @@ class StructureScores(NamedTuple):
     """Structure of the unperturbed map."""
     optimum: Structure
     """Structure of the map that is best by similarity."""
+    correlations: np.ndarray
+    """Correlation of the folded maps with the measured one on the grid, NaN if not known, shape of the grid."""
     misfit: np.ndarray
     """Root mean square difference from the measured values on the grid, shape of the grid."""
     errors: np.ndarray
@@ -213,6 +235,31 @@ class StructureScores(NamedTuple):
 
     def __repr__(self) -> str:
         return short_repr(self)
+
+    @property
+    def amplitudes(self) -> dict[tuple[float, float], LineAmplitude]:
+        """Amplitudes of the measured lines in the map that is best by similarity, for rings with a measured contrast.
+
+        The keys are the inner and outer radii [degrees].
+        """
+        pairs = zip(self.optimum.rings, self.measured.rings, strict=True)
+        return {(other.inner, other.outer): line_amplitude(own, other) for own, other in pairs if other.contrast > 0}
+
+    @property
+    def evidence(self) -> str:
+        """What the map that is best by similarity has of the measured structure about the pole, without a full stop."""
+        found = []
+        correlation = float(self.correlations[self.at_optimum])
+        if np.isfinite(correlation):
+            ceiling = self.measured.folded.ceiling if self.measured.folded is not None else float("nan")
+            most = f" (at most {ceiling:.2f} with the noise of the measurement)" if np.isfinite(ceiling) else ""
+            found.append(f"the folded maps correlate to {correlation:.2f}{most}")
+        known = {ring: each.value for ring, each in self.amplitudes.items() if np.isfinite(each.value)}
+        if known:
+            degrees = ", ".join(f"{inner:g} to {outer:g}" for inner, outer in known)
+            values = ", ".join(f"{each:.1f}" for each in known.values())
+            found.append(f"the lines have {values} of the measured amplitude at {degrees} degrees")
+        return f"about the pole ({plain_label(self.plane)}) {', and '.join(found)}" if found else ""
 
     @property
     def disagrees(self) -> bool:

@@ -13,13 +13,16 @@ from apt_evap._common.files import replace_file
 from apt_evap._common.notebook import as_table
 from apt_evap._common.types import AnyPath, Floats
 from apt_evap._version import __version__
+from apt_evap.crystallography.directions import plain_label
+from apt_evap.crystallography.orientation import Orientation
 from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.detection.projection import Projection
 from apt_evap.emission.perturbations import described
 from apt_evap.fit.grid import EnergyGrid
 from apt_evap.fit.settings import FitSettings
-from apt_evap.fit.structure import StructureScores
+from apt_evap.fit.structure import RegisteredProjection, StructureScores
 from apt_evap.registration.register import Registration
-from apt_evap.registration.verdict import Likeness, likeness
+from apt_evap.registration.verdict import Likeness, likeness, symmetric_places
 
 
 class Score(NamedTuple):
@@ -161,8 +164,25 @@ class Study:
     @cached_property
     def likeness(self) -> Likeness:
         """Whether the best simulated map and the measured one show the same crystal along the same axis."""
-        about = self.provenance.get("symmetric_places", [(0.0, 0.0)])
-        return likeness(self.maps["optimum"], self.measured, self.registration, about=about)
+        places = symmetric_places(self.orientation, self._projection)
+        return likeness(self.maps["optimum"], self.measured, self.registration, about=places)
+
+    @property
+    def _projection(self):
+        stored = self.provenance.get("projection")
+        return None if stored is None else Projection(stored["scale"], compression=stored["compression"])
+
+    @property
+    def orientation(self) -> Orientation | None:
+        """Orientation of the simulated crystal; None for a specimen that is none."""
+        tip = self.provenance["run"]["tip"]
+        return Orientation.from_settings(tip) if "axis" in tip else None
+
+    @property
+    def projection(self) -> RegisteredProjection | None:
+        """From directions in the simulated specimen onto the measured map; None if the run has too few ions for it."""
+        projection = self._projection
+        return None if projection is None else RegisteredProjection(projection, self.registration)
 
     def compared(self, map: DetectorMap) -> DetectorMap:
         """Prepare a map of the measured frame as for the comparison: common region, flattened and smoothed."""
@@ -269,11 +289,10 @@ class Study:
         scores = self.structure
         if scores is None:
             return ""
-        plane = "".join(map(str, scores.plane)) if min(scores.plane) >= 0 else " ".join(map(str, scores.plane))
         contrasts, measured = (
             " ".join(f"{ring.contrast:.2f}" for ring in each.rings) for each in (scores.optimum, scores.measured)
         )
-        text = f"rings about ({plane}): contrasts {contrasts}, measured {measured}, misfit "
+        text = f"rings about ({plain_label(scores.plane)}): contrasts {contrasts}, measured {measured}, misfit "
         text += f"{scores.misfit[scores.at_optimum]:.2f} ± {scores.errors[scores.at_optimum]:.2f}"
         if scores.disagrees:
             text += f"; rings and SSIM disagree: rings are best at {self.point(scores.best)}, misfit "

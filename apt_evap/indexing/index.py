@@ -21,6 +21,7 @@ from apt_evap.indexing.marks import marks_of
 from apt_evap.indexing.master_pattern import MasterPattern, master_patterns
 from apt_evap.indexing.refine import Refined, bins_of, refine, resolution
 from apt_evap.indexing.search import Start, disc_of, misorientation, search
+from apt_evap.maps.folded import FoldedMap, folded
 from apt_evap.specimen.materials import as_material
 
 WIDEST, NARROWEST = 45.0, 12.0
@@ -130,6 +131,25 @@ class Indexing:
     def verdict(self) -> str:
         """The word "indexed" or "undecided"."""
         return "indexed" if self.decided else "undecided"
+
+    def folded(self, plane: Sequence[int], candidate: Candidate | None = None, **options: Any) -> FoldedMap:
+        """The map, folded about a pole by the symmetry of the crystal.
+
+        Parameters
+        ----------
+        plane : sequence of int
+            Miller indices of a family of planes; of its poles the one nearest to the axis.
+        candidate : Candidate, optional
+            Orientation and projection; by default those of the first candidate.
+        **options
+            ``reach``, ``smoothing``, ``ions`` and ``seed`` of `maps.folded`.
+
+        Returns
+        -------
+        FoldedMap
+        """
+        chosen = self.best if candidate is None else candidate
+        return folded(self.map, chosen.projection, *chosen.orientation.nearest_pole(plane), **options)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the answer in plain types, without the map.

@@ -27,7 +27,9 @@ from numpy.typing import ArrayLike
 
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_kind, check_seed, check_sequence
+from apt_evap.crystallography.orientation import Orientation
 from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.detection.projection import Projection
 from apt_evap.registration.correlation_search import BROAD, FINE, NARROW, View, correlation
 from apt_evap.registration.register import Registration
 
@@ -108,6 +110,26 @@ def likeness(
         parts = (replace(maps[1], values=part) for part in (half, measured.counts - half))
         halves = _agreement(*(_symmetry(part, centre) for part in parts))
     return _judged(agreement, halves, registration.doubtful)
+
+
+def symmetric_places(orientation: Orientation | None, projection: Projection | None) -> list[tuple[float, float]]:
+    """Places of the poles with a rotational symmetry near the axis of a specimen, for `likeness`.
+
+    Parameters
+    ----------
+    orientation : Orientation or None
+        Orientation of the crystal.
+    projection : Projection or None
+        From directions in the specimen onto the simulated map.
+
+    Returns
+    -------
+    list of (float, float)
+        The highest symmetry first [mm]; the axis alone if one of the arguments is None, or there is no such pole.
+    """
+    if orientation is None or projection is None:
+        return [(0.0, 0.0)]
+    return [(float(x), float(y)) for x, y in projection.places(orientation.symmetric_poles())] or [(0.0, 0.0)]
 
 
 def _judged(agreement, halves, doubtful):

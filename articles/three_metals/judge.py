@@ -9,6 +9,7 @@ bright line in ranges of the angle, amplitudes and contrasts of three rings, den
 """
 
 import argparse
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -19,9 +20,6 @@ from scipy.ndimage import gaussian_filter
 
 import apt_evap as ae
 
-STEP = 0.25  # degrees
-SMOOTHING, BROAD = 0.6, 6.0  # degrees
-_COVERED = 0.9  # part of the weights of the smoothing that is inside the map
 FRACTIONS = (0.0, 0.05, 0.2, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 
 
@@ -29,8 +27,6 @@ class Metal(NamedTuple):
     """How a measured map is compared."""
 
     pole: tuple[int, int, int]
-    first: tuple[int, int, int]
-    """Direction of azimuth 0."""
     reach: float
     """Largest angle from the pole [degrees]."""
     rings: tuple[tuple[float, float], ...]
@@ -39,101 +35,44 @@ class Metal(NamedTuple):
 
 
 METALS = {
-    "W": Metal((0, 1, 1), (1, 0, 0), 15.5, ((4, 7), (7, 11), (11, 15.5)),
+    "W": Metal((0, 1, 1), 15.5, ((4, 7), (7, 11), (11, 15.5)),
                ((5.1, 7.0), (7.0, 9.5), (9.5, 12.7), (12.7, 15.5))),
-    "Ni": Metal((1, 1, 1), (-1, -1, 2), 18.0, ((5, 9), (9, 14), (14, 18)), ()),
+    "Ni": Metal((1, 1, 1), 18.0, ((5, 9), (9, 14), (14, 18)), ()),
 }  # fmt: skip
 
 
 def measured_of(metal, path):
-    """Measured map, its orientation and projection, and maps of two random halves of its ions, if there are ions."""
+    """Measured map, its orientation and projection."""
     if metal == "Ni":
         # three named poles; without them the map is undecided
         orientation = ae.Orientation("Ni", axis=(0.2926, 0.5418, 0.7879), rotation=155.31)
-        return ae.read_map(path), orientation, ae.detection.Projection(26.1013, centre=(0.4029, -0.3919)), None
+        return ae.read_map(path), orientation, ae.detection.Projection(26.1013, centre=(0.4029, -0.3919))
     ions = ae.read(path)
     map = ions.map(bins=256)
     found = ae.index(map, metal, distance=305.0)
     print(found)
-    half = np.random.default_rng(1).random(len(ions)) < 0.5
-    halves = [ions[each].map(like=map) for each in (half, ~half)]
-    return map, found.best.orientation, found.best.projection, halves
+    return map, found.best.orientation, found.best.projection
 
 
-def grid(metal):
-    """Directions in the crystal about the pole, shape (n, n, 3), angles and azimuths [degrees]."""
-    n = int(np.ceil(metal.reach / STEP))
-    u, v = np.meshgrid(np.arange(-n, n + 1) * STEP, np.arange(-n, n + 1) * STEP)
-    return directions_at(metal, u, v), np.hypot(u, v), np.degrees(np.arctan2(v, u))
+def folded(map, orientation, projection, metal):
+    """The map, folded about its pole."""
+    return ae.maps.folded(map, projection, *orientation.nearest_pole(metal.pole), reach=metal.reach)
 
 
-def directions_at(metal, u, v):
-    """Directions at angles along azimuth 0 and 90 degrees [degrees]."""
-    pole, first = (np.array(each) / np.linalg.norm(each) for each in (metal.pole, metal.first))
-    second = np.cross(pole, first)
-    angle, azimuth = np.radians(np.hypot(u, v))[..., None], np.arctan2(v, u)[..., None]
-    return np.cos(angle) * pole + np.sin(angle) * (np.cos(azimuth) * first + np.sin(azimuth) * second)
-
-
-def densities(map, orientation, projection, metal):
-    """Density per solid angle about the pole that is nearest to the axis, folded by its symmetry; NaN outside."""
-    directions, angle, _ = grid(metal)
-    group = ae.crystallography.point_group("fcc")  # that of bcc, too
-    pole = np.array(metal.pole) / np.linalg.norm(metal.pole)
-    own = [operation for operation in group if np.allclose(operation @ pole, pole)]
-    to_pole = group[np.argmax(orientation.directions(group @ pole)[:, 2])]
-    width, height = map.bin_size
-    x, y = np.meshgrid(*map.centres)
-    seen = projection.directions(np.column_stack([x.ravel(), y.ravel()])).reshape(*x.shape, 3)
-    solid = np.linalg.norm(np.cross(np.gradient(seen, axis=1), np.gradient(seen, axis=0)), axis=-1)
-    inside = map.mask & np.isfinite(map.values)
-    sigma = np.radians(SMOOTHING) * projection.scale / np.array([height, width])
-    counts, areas, covered = (
-        gaussian_filter(np.where(inside, each, 0.0), sigma) for each in (map.values, solid, np.ones(x.shape))
-    )
-    with np.errstate(invalid="ignore", divide="ignore"):
-        density = np.where(covered > _COVERED, counts / areas, np.nan)
-    total, number = np.zeros(angle.shape), np.zeros(angle.shape)
-    for operation in own:
-        places = projection.places(orientation.directions(directions.reshape(-1, 3) @ operation.T @ to_pole.T))
-        column = np.floor((places[:, 0] - map.x_edges[0]) / width).astype(int)
-        row = np.floor((places[:, 1] - map.y_edges[0]) / height).astype(int)
-        there = (column >= 0) & (column < x.shape[1]) & (row >= 0) & (row < x.shape[0])
-        found = np.full(len(places), np.nan)
-        found[there] = density[row[there], column[there]]
-        found = found.reshape(angle.shape)
-        known = np.isfinite(found)
-        total[known] += found[known]
-        number[known] += 1
-    folded = np.full(angle.shape, np.nan)
-    known = (number > 0) & (angle <= metal.reach)
-    folded[known] = total[known] / number[known]
-    return folded / np.nanmean(folded)
-
-
-def flattened(folded):
-    """Density divided by its broad mean."""
-    known = np.isfinite(folded)
-    sigma = BROAD / STEP
-    broad = gaussian_filter(np.where(known, folded, 0.0), sigma) / gaussian_filter(known.astype(float), sigma)
-    return folded / broad
-
-
-def correlation(first, second):
-    """Correlation of flattened maps."""
-    a, b = flattened(first), flattened(second)
-    known = np.isfinite(a) & np.isfinite(b)
-    return float(np.corrcoef(a[known], b[known])[0, 1])
+def polar(folded):
+    """Angles from the pole and azimuths of the cells [degrees]."""
+    u, v = np.meshgrid(folded.angles, folded.angles)
+    return np.hypot(u, v), np.degrees(np.arctan2(v, u))
 
 
 def rings(folded, metal):
     """Angular profile of each ring, relative to its mean, by 5 degrees of azimuth."""
-    _, angle, azimuth = grid(metal)
+    angle, azimuth = polar(folded)
     edges = np.arange(-180, 181, 5)
     profiles = []
     for inner, outer in metal.rings:
-        known = np.isfinite(folded) & (angle >= inner) & (angle < outer)
-        sums, _ = np.histogram(azimuth[known], edges, weights=folded[known])
+        known = np.isfinite(folded.density) & (angle >= inner) & (angle < outer)
+        sums, _ = np.histogram(azimuth[known], edges, weights=folded.density[known])
         numbers, _ = np.histogram(azimuth[known], edges)
         profile = sums / np.maximum(numbers, 1)
         profiles.append(profile / profile[numbers > 0].mean())
@@ -147,12 +86,12 @@ def amplitude(profile, measured):
 
 def line_azimuths(folded, metal):
     """Azimuth of the bright line in each range of the angle [degrees], between 0 and 90 degrees."""
-    _, angle, azimuth = grid(metal)
+    angle, azimuth = polar(folded)
     found = []
     for inner, outer in metal.line:
-        known = np.isfinite(folded) & (angle >= inner) & (angle < outer) & (azimuth > 5) & (azimuth < 85)
+        known = np.isfinite(folded.density) & (angle >= inner) & (angle < outer) & (azimuth > 5) & (azimuth < 85)
         edges = np.arange(5, 86, 2.5)
-        sums, _ = np.histogram(azimuth[known], edges, weights=folded[known])
+        sums, _ = np.histogram(azimuth[known], edges, weights=folded.density[known])
         numbers, _ = np.histogram(azimuth[known], edges)
         profile = gaussian_filter(sums / np.maximum(numbers, 1), 1.0)
         k = int(np.clip(np.argmax(profile), 1, len(profile) - 2))
@@ -163,9 +102,9 @@ def line_azimuths(folded, metal):
 
 def radial(folded, metal):
     """Densities from the pole outwards, in bins of a quarter of the reach, in units of the mean."""
-    _, angle, _ = grid(metal)
+    angle, _ = polar(folded)
     edges = np.linspace(0, metal.reach, 5)
-    return np.array([np.nanmean(folded[(angle >= a) & (angle < b)]) for a, b in pairwise(edges)])
+    return np.array([np.nanmean(folded.density[(angle >= a) & (angle < b)]) for a, b in pairwise(edges)])
 
 
 def row(name, folded, target, metal):
@@ -176,7 +115,7 @@ def row(name, folded, target, metal):
     amplitudes = " ".join(f"{amplitude(a, b):5.2f}" for a, b in zip(profiles, wanted, strict=True))
     azimuths = " ".join(f"{each:4.1f}" for each in line_azimuths(folded, metal))
     densities_ = " ".join(f"{each:.2f}" for each in radial(folded, metal))
-    print(f"{name:30} {correlation(folded, target):5.2f} | {azimuths} | {amplitudes} | {contrasts} | {densities_}")
+    print(f"{name:30} {folded.correlation(target):5.2f} | {azimuths} | {amplitudes} | {contrasts} | {densities_}")
 
 
 def projection_of(run):
@@ -194,7 +133,7 @@ def projection_of(run):
     return seen.compressed(compression)
 
 
-def simulated_densities(run, metal):
+def simulated_maps(run, metal):
     """Folded densities of every emission of a run."""
     projection = projection_of(run)
     orientation = ae.Orientation.from_settings(run.settings["tip"])
@@ -208,7 +147,7 @@ def simulated_densities(run, metal):
         there = hits.detected & (np.hypot(hits.x, hits.y) < 60)
         counts, _, _ = np.histogram2d(hits.y[there], hits.x[there], (edges, edges))
         map = ae.DetectorMap.from_array(counts, edges, edges, is_counts=True, mask=seen)
-        found[name] = densities(map, orientation, projection, metal)
+        found[name] = folded(map, orientation, projection, metal)
     return found
 
 
@@ -220,21 +159,21 @@ def main():
     parser.add_argument("runs", nargs="+", type=Path)
     options = parser.parse_args()
     metal = METALS[options.metal]
-    map, orientation, projection, halves = measured_of(options.metal, options.measured)
-    target = densities(map, orientation, projection, metal)
+    map, orientation, projection = measured_of(options.metal, options.measured)
+    target = folded(map, orientation, projection, metal)
     row("measured", target, target, metal)
-    if halves:
-        print(f"two halves {correlation(*(densities(each, orientation, projection, metal) for each in halves)):.2f}")
+    print(target)
     for path in options.runs:
         run = ae.load(path)
         print(f"{path.name}: {len(run):,} ions")
-        folded = simulated_densities(run, metal)
-        for name, density in folded.items():
-            row(name, density, target, metal)
+        simulated = simulated_maps(run, metal)
+        for name, each in simulated.items():
+            row(name, each, target, metal)
         for name in ("sharpness 0.15", "sharpness 0.4", "sharpness 2", "sharpness 0.4, height 0.2"):
-            others = folded["lateral, height 0.2" if name.endswith("height 0.2") else "lateral"]
+            others = simulated["lateral, height 0.2" if name.endswith("height 0.2") else "lateral"]
             for part in FRACTIONS:
-                row(f"{name}, fraction {part:g}", (1 - part) * others + part * folded[name], target, metal)
+                density = (1 - part) * others.density + part * simulated[name].density
+                row(f"{name}, fraction {part:g}", replace(others, density=density), target, metal)
 
 
 if __name__ == "__main__":

@@ -257,6 +257,26 @@ CASES = [
         },
     ),
     (
+        ae.maps.folded,
+        {
+            "map": grid,
+            "projection": ae.detection.Projection(30.0, centre=(10.0, 10.0)),
+            "pole": (0.0, 0.0, 1.0),
+            "symmetry": "2mm",
+            "toward": (1.0, 0.0, 0.0),
+        },
+        {
+            "map": [*OBJECT, None],
+            "projection": [*OBJECT, None],
+            "pole": [*VECTOR, (0, 0, 0)],
+            "symmetry": WORD,
+            "toward": [*VECTOR, (0, 0, 0), (0.0, 0.0, 2.0)],
+            "reach": [*POSITIVE, 91.0, 1e-9],
+            "smoothing": [*POSITIVE, 0.1, 1e9],
+            "seed": [value for value in SEED if value is not None],
+        },
+    ),
+    (
         ae.maps.line_amplitude,
         {"ring": azimuths, "measured": azimuths},
         {"ring": [*OBJECT, None], "measured": [*OBJECT, None], "shift": COUNT, "mirror": SWITCH},
@@ -661,7 +681,7 @@ CASES = [
     (ae.crystallography.poles, {"material": nickel}, {"material": OBJECT, "families": COUNT}),
     (ae.crystallography.zones, {"material": nickel}, {"material": OBJECT}),
     (ae.crystallography.point_group, {"structure": "fcc"}, {"structure": WORD}),
-    (ae.crystallography.rotational_symmetry, {"material": nickel, "direction": (1, 1, 1)}, {"direction": VECTOR}),
+    (ae.crystallography.pole_symmetry, {"material": nickel, "direction": (1, 1, 1)}, {"direction": VECTOR}),
     (
         ae.crystallography.symmetry_about_axis,
         {"material": nickel, "orientation": np.eye(3)},

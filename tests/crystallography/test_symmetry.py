@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 import apt_evap as ae
 from apt_evap.crystallography.directions import plane_normals, poles
-from apt_evap.crystallography.symmetry import point_group, rotational_symmetry, symmetry_about_axis
+from apt_evap.crystallography.symmetry import point_group, pole_symmetry, symmetry_about_axis
 from apt_evap.specimen.lattice import rotation_to_axis
 
 
@@ -50,23 +50,47 @@ def test_the_symmetry_about_an_axis_is_that_of_the_lattice(name, axis, order):
 
 
 @pytest.mark.parametrize(
-    ("name", "plane", "order"),
+    ("name", "plane", "symmetry", "order"),
     [
-        ("Ni", (1, 1, 1), 3),
-        ("Ni", (0, 0, 2), 4),
-        ("W", (0, 1, 1), 2),
-        ("Si", (1, 1, 3), 1),
-        ("Ti", (0, 0, 0, 2), 6),
-        ("Ti", (1, 0, -1, 0), 2),
-        ("Ti", (1, 0, -1, 1), 1),
+        ("Ni", (1, 1, 1), "3m", 3),
+        ("Ni", (0, 0, 2), "4mm", 4),
+        ("W", (0, 1, 1), "2mm", 2),
+        ("Si", (1, 1, 3), "m", 1),
+        ("Fe", (1, 2, 3), "1", 1),
+        ("Ti", (0, 0, 0, 2), "6mm", 6),
+        ("Ti", (1, 0, -1, 0), "2mm", 2),
+        ("Ti", (1, 0, -1, 1), "m", 1),
     ],
 )
-def test_the_symmetry_about_a_direction_is_that_of_the_poles(name, plane, order):
+def test_the_symmetry_about_a_direction_is_that_of_the_poles(name, plane, symmetry, order):
     material = ae.material(name)
     direction = plane_normals(material, np.array([plane]))[0]
-    assert rotational_symmetry(material, direction) == rotational_symmetry(material, -7.0 * direction) == order
+    found = pole_symmetry(material, direction)
+    assert (found.name, found.order) == (symmetry, order) == pole_symmetry(material, -7.0 * direction)[:2]
+    assert found.toward @ direction == pytest.approx(0, abs=1e-12) and np.linalg.norm(found.toward) == pytest.approx(1)
     normals = poles(material).normals
+    if "m" in symmetry:
+        mirror = np.cross(direction / np.linalg.norm(direction), found.toward)
+        mirrored = normals - 2 * np.outer(normals @ mirror, mirror)
+        assert (mirrored @ normals.T).max(axis=1).min() > 1 - 1e-9
     for fold in range(1, 13):
         turned = Rotation.from_rotvec(2 * np.pi / fold * direction / np.linalg.norm(direction)).apply(normals)
         onto_itself = (turned @ normals.T).max(axis=1).min() > 1 - 1e-9
         assert onto_itself == (order % fold == 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "plane"), [("Ni", (1, 1, 1)), ("W", (0, 1, 1)), ("W", (1, 1, 2)), ("Ti", (1, 0, -1, 1))]
+)
+def test_symmetric_poles_have_symmetric_azimuths(name, plane):
+    """Maps can be folded about different poles of a family: the same lines are at the same places."""
+    material = ae.material(name)
+    direction = plane_normals(material, np.array([plane]))[0]
+    group = point_group(material.structure)
+    first = pole_symmetry(material, direction)
+    for member in group @ direction:
+        found = pole_symmetry(material, member)
+        moved = np.linalg.norm(group @ direction - member, axis=1) + np.linalg.norm(
+            group @ first.toward - found.toward, axis=1
+        )
+        assert moved.min() < 1e-9
