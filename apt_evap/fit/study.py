@@ -276,6 +276,26 @@ class Study:
             doubts.append(f"the rings about the pole are best at {self.point(self.structure.best)}")
         return [first, second, *([f"doubt: {'; '.join(doubts)}"] if doubts else [])]
 
+    @property
+    def result(self) -> str:
+        """The result as one sentence: who leaves how, and with what mean energy in real units, if these are known."""
+        refined, real = self.refined, self.provenance.get("real_units")
+        factor, unit = (1.0, "eV at the simulated voltage") if real is None else (real["real_per_study"], "eV")
+        material = self.provenance["run"]["tip"].get("material")
+        name = material.get("name") if isinstance(material, dict) else material
+        ions = f"{name} ions" if isinstance(name, str) else "ions"
+        energy = f"a mean of {refined.scaled('true_mean', factor)} {unit}"
+        mechanism = self.grid.mechanism
+        if mechanism == "roll-up":
+            text = f"{ions} roll up with {energy}"
+        elif mechanism == "lateral":
+            text = f"{ions} leave with lateral energies with {energy}"
+        elif mechanism == "combined":
+            text = f"{ions} roll up in part, a fraction of {refined.bounded('rollup_fraction')}, with {energy}"
+        else:
+            text = f"{ions} leave by {self.grid.name} with {energy}"
+        return text + "".join(f", {name} {refined.bounded(name)}" for name in refined.options)
+
     def point(self, index: tuple[int, ...]) -> str:
         """Text of the energies and options at an index of the grid, str."""
         values = dict(zip(self.grid.axes, self.grid.values_at(np.asarray(index)).tolist(), strict=True))

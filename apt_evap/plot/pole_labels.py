@@ -115,4 +115,4 @@ def _oriented(orientation, projection):
         projection = projection or image_compression(orientation).projection
         return Orientation.from_settings(orientation.settings["tip"]), projection
     check_kind(orientation, "orientation", Orientation, "an Orientation, the result of fit_orientation, or a Run")
-    return orientation, check_kind(projection, "projection", Projection, "a Projection")
+    return orientation, check_kind(projection, "projection", "places", "a Projection")

@@ -13,7 +13,7 @@ import matplotlib
 from apt_evap._common.files import check_path, open_for_reading
 from apt_evap._common.types import AnyPath
 from apt_evap._version import __version__
-from apt_evap.report.page import Page, escape, folded, heading, table, text_of
+from apt_evap.report.page import Page, collapsed, escape, heading, table, text_of
 from apt_evap.simulation.provenance import system
 
 
@@ -105,5 +105,5 @@ def add_origin(page: Page, content: Mapping[str, Any]) -> None:
         ]
         page.add(table(rows, ("File", "Bytes", "SHA-256")))
     versions = {"written by": content["made_by"], "written at": content["created"], **content["system"]}
-    page.add(folded("Versions", table((name, text_of(value)) for name, value in versions.items())))
+    page.add(collapsed("Versions", table((name, text_of(value)) for name, value in versions.items())))
     page.data("origin", content)

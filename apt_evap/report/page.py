@@ -51,11 +51,12 @@ h1 { font-size: 1.6em; line-height: 1.25; overflow-wrap: anywhere; }
 h2 { font-size: 1.2em; margin: 1.8em 0 0.5em; border-bottom: 1px solid #ccc; }
 .doubt { border-left: 5px solid #e0a000; background: #fff7e0; padding: 0.4em 0.8em; margin: 0.4em 0; }
 .doubt.red { border-color: #c00; background: #fdeaea; }
+.result { font-size: 1.15em; }
 .note { color: #555; font-size: 0.9em; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; margin: 0.6em 0; }
 th, td { padding: 0.25em 0.7em; text-align: left; vertical-align: top; border-bottom: 1px solid #e4e4e4; }
-td { font-variant-numeric: tabular-nums; overflow-wrap: anywhere; }
+td { font-variant-numeric: tabular-nums; overflow-wrap: break-word; }
 thead th { border-bottom: 2px solid #888; vertical-align: bottom; }
 .red { color: #a00000; font-weight: 600; }
 tr.best td, tr.best th { background: #e8f4e8; }
@@ -64,6 +65,8 @@ pre { background: #f4f4f4; padding: 0.7em; }
 .matrices { display: flex; flex-wrap: wrap; gap: 0.6em 2em; }
 .matrix td { position: relative; text-align: right; border: 1px solid #fff; cursor: default; padding: 0.35em 0.7em; }
 .matrix td.best { outline: 3px solid #e00; outline-offset: -3px; }
+.scale { display: flex; align-items: center; gap: 0.6em; font-size: 0.9em; color: #555; }
+.scale span { width: 12em; height: 1em; border: 1px solid #888; }
 .matrix th { border: 0; text-align: right; font-weight: normal; }
 .matrix td span { display: none; position: absolute; z-index: 1; left: 1em; top: 105%; width: max-content;
   max-width: 17em; padding: 0.4em 0.7em; background: #fff; color: #1a1a1a; text-align: left; border: 1px solid #555;
@@ -274,9 +277,15 @@ def table(rows: Iterable[Sequence[object]], head: Sequence[object] = (), best: i
     return "\n".join([*lines, "</table></div>"])
 
 
-def folded(title: str, content: str) -> str:
+def collapsed(title: str, content: str) -> str:
     """Content that a press on its title shows, str."""
     return f"<details><summary>{escape(title)}</summary>\n{content}\n</details>"
+
+
+def color_scale(colors: Sequence[str], low: str, high: str, label: str) -> str:
+    """Bar of the colours of a table with the values at its ends, str."""
+    bar = f'<span style="background:linear-gradient(to right,{",".join(colors)})"></span>'
+    return f'<p class="scale">{escape(label)} {escape(low)} {bar} {escape(high)}</p>'
 
 
 def switched(pictures: Sequence[str]) -> str:

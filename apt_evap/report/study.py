@@ -11,9 +11,10 @@ from apt_evap import plot
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_kind
 from apt_evap.analysis.description import lens_text
+from apt_evap.crystallography.directions import plain_label
 from apt_evap.fit.study import Score, Study
 from apt_evap.report.origin import add_origin, origin
-from apt_evap.report.page import Page, escape, flat, folded, heading, paragraph, table, text_of
+from apt_evap.report.page import Page, collapsed, color_scale, escape, flat, heading, paragraph, table, text_of
 from apt_evap.report.pictures import blinking_pictures
 
 _COLORS = "viridis"  # of the matrix, as of `plot.ssim_matrix`
@@ -70,14 +71,13 @@ def write_study(
     if study.likeness.verdict == "alike":
         page.add(paragraph(f"The maps are alike: {study.likeness.reason}."))
     page.add(*(paragraph(text, "doubt red") for text in of_registration))
+    page.add(paragraph(f"{study.result[:1].upper()}{study.result[1:]}.", "result"))
+    page.add(_blinking(page, study))
     page.add(*(paragraph(text, "doubt") for text in (*others, *(f"Warning: {each}" for each in made["warnings"]))))
-    similarity = f"similarity {study.optimum.score}, unperturbed {study.baselines['unperturbed']}"
-    result = f"{study.grid.name} describes the measured map best with {study.point(study.best_cell)}; {similarity}."
-    page.add(paragraph(result[:1].upper() + result[1:]))
-    page.add(heading("Measured and simulated map"), _blinking(page, study), heading("Energies"), _energies(study))
-    page.add(*sections)
+    page.add(*_poles(page, study), *_evidence(page, study))
+    page.add(heading("Energies"), _energies(study), *sections)
     page.add(heading("Similarity with the measured map"), _scores(study))
-    page.add('<div class="matrices">', *_matrices(study), "</div>")
+    page.add('<div class="matrices">', *_matrices(study), "</div>", _scale(study))
     page.add(paragraph("Rows: standard deviation / mean. Columns: mean energy [eV]. Frame: the best point.", "note"))
     if figures is None:
         figures = {
@@ -89,7 +89,7 @@ def write_study(
     settings = content["settings"]
     comparison = {name: value for name, value in settings.items() if name not in _LONG}
     for name, part in (("Comparison", comparison), ("Simulated run", settings["run"])):
-        page.add(folded(name, table((key, text_of(value)) for key, value in flat(part).items())))
+        page.add(collapsed(name, table((key, text_of(value)) for key, value in flat(part).items())))
     add_origin(page, made)
     page.data("study", content)
     page.save(path)
@@ -152,9 +152,12 @@ def _energies(study):
     if mechanism == "combined":
         names["rollup_fraction"] = "roll-up fraction"
     after = {"true_mean": "mean", "true_standard_deviation": "standard deviation"}
-    names |= {name: f"{label} after truncation [eV]" for name, label in after.items()}
-    rows = [(label, f"{getattr(best, name):.4g}", refined.bounded(name)) for name, label in names.items()]
-    rows += [(name, f"{value:.4g}", refined.bounded(name)) for name, value in best.options.items()]
+    varied = [(label, f"{getattr(best, name):.4g}", refined.bounded(name)) for name, label in names.items()]
+    varied += [(name, f"{value:.4g}", refined.bounded(name)) for name, value in best.options.items()]
+    following = [
+        (f"{label} after truncation [eV]", f"{getattr(best, name):.4g}", refined.bounded(name))
+        for name, label in after.items()
+    ]
     run, real = study.provenance["run"], study.provenance.get("real_units")
     place = f"at {run['voltage']:g} V"
     if real is not None:
@@ -165,13 +168,15 @@ def _energies(study):
             factor, other = real["real_per_study"], operating
         for name, label in after.items():
             values = f"{getattr(best, name) * factor:.4g}", refined.scaled(name, factor)
-            rows.append((f"{label} after truncation, {other} [eV]", *values))
-    rows.append(("SSIM", best.score, refined.score))
+            following.append((f"{label} after truncation, {other} [eV]", *values))
+    following.append(("SSIM", best.score, refined.score))
     between = "between its points" + " (interval of 95 %)" * bool(refined.intervals)
+    head = f"{mechanism}, {place}", "best on the grid", between
     note = "Fitted energies scale with the assumed tip radius and voltage."
     if study.provenance.get("microscope"):
         note += f" The run is behind a {lens_text(study.provenance['microscope'])}."
-    return table(rows, (f"{mechanism}, {place}", "best on the grid", between)) + paragraph(note, "note")
+    more = collapsed("Energies after truncation, in both units", table(following, head))
+    return table(varied, head) + paragraph(note, "note") + more
 
 
 def _scores(study):
@@ -180,18 +185,57 @@ def _scores(study):
     scores = {**study.baselines, "optimum": study.optimum.score}
     labels = {"thermal": f"thermal, {study.settings.temperature:g} K", "optimum": "best"}
     rows = [(labels.get(name, name), scores[name], study.plain[name]) for name in names]
-    rows.append(("gain over unperturbed", study.gain, ""))
-    if study.ceiling is not None:
-        rows.append(("two halves of the measured ions", "", study.ceiling))
     head = ["Map", corrected, "uncorrected SSIM"]
     if not study.settings.allow_noise:
-        rows, head = [row[:2] if row[1] else (row[0], row[2]) for row in rows], head[:2]
+        rows, head = [row[:2] for row in rows], head[:2]
+    facts = f"Gain over unperturbed: {study.gain}."
+    if study.ceiling is not None:
+        facts += f" Two halves of the measured ions: {study.ceiling} (uncorrected)."
     width, height = study.measured.bin_size
     return table(rows, head) + paragraph(
-        f"{study.provenance['bins_compared']:,} bins of {width:.3g} × {height:.3g} mm compared, smoothed by "
+        f"{facts} {study.provenance['bins_compared']:,} bins of {width:.3g} × {height:.3g} mm compared, smoothed by "
         f"{study.settings.smoothing:.3g} mm. Errors: standard deviations of {study.settings.resamples} resamples.",
         "note",
     )
+
+
+def _scale(study):
+    """Colours of the matrices."""
+    low, high = float(study.ssim.min()), float(study.ssim.max())
+    shades = [matplotlib.colors.to_hex(matplotlib.colormaps[_COLORS](part)) for part in np.linspace(0, 1, 9)]
+    return color_scale(shades, f"{low:z.3f}", f"{high:z.3f}", "SSIM")
+
+
+def _poles(page, study):
+    """Both maps with the poles and zone lines of the simulated crystal."""
+    orientation, projection = study.orientation, study.projection
+    if orientation is None or projection is None:
+        return []
+    maps = {"measured": study.measured, "simulated": study.maps["optimum"]}
+    axes = plot.detector_maps([study.compared(each) for each in maps.values()], list(maps))
+    for ax in axes:
+        plot.poles(ax, orientation, projection, region=study.measured)
+    text = "Poles and zone lines of the simulated crystal, as registered, on both maps."
+    return [page.picture(axes[0].figure, text)]
+
+
+def _evidence(page, study):
+    """Folded maps, and what they say."""
+    scores = study.structure
+    if scores is None or not scores.evidence:
+        return []
+    parts = [paragraph(f"{scores.evidence[:1].upper()}{scores.evidence[1:]}.")]
+    maps = {"measured": scores.measured, "unperturbed": scores.unperturbed, "best": scores.optimum}
+    known = {title: each.folded for title, each in maps.items() if each.folded is not None}
+    if "measured" in known and len(known) > 1:
+        pole = plain_label(scores.plane)
+        parts.append(
+            page.picture(
+                plot.folded_maps(known)[0].figure,
+                f"Maps folded about the pole ({pole}) by its symmetry, {known['measured'].symmetry}, and flattened.",
+            )
+        )
+    return parts
 
 
 def _matrices(study):

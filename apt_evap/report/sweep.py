@@ -1,20 +1,24 @@
 """Report of a sweep: one row for each point, the best one first."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from apt_evap import plot
 from apt_evap._common.codec import for_json
 from apt_evap._common.types import AnyPath
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.fit.study import bounded_text
+from apt_evap.plot.maps import default_smoothing
 from apt_evap.report.origin import add_origin, origin
-from apt_evap.report.page import Markup, Page, heading, paragraph, table, text_of
+from apt_evap.report.page import Markup, Page, heading, paragraph, switched, table, text_of
 from apt_evap.report.pictures import blinking_pictures
 
 _STUDY = ("SSIM", "mean [eV]", "standard deviation / mean", "roll-up fraction", "real energy [eV]", "doubts")
+_MOST_SETTINGS, _MOST_MAPS = 4, 12  # in the pictures
 
 
 @dataclass(frozen=True)
@@ -33,6 +37,8 @@ class SweepRow:
         Result of `Study.to_dict`, also read from study.json; None without a comparison.
     maps : dict
         Maps by title with the same bins, which blink on one place; the first one is the measured one.
+    panels : dict
+        Simulated maps by the title of their emission, with the same titles and bins for all points.
     message : str
         What is missing or failed; empty for a complete point.
     """
@@ -42,6 +48,7 @@ class SweepRow:
     results: Mapping[str, Any] = field(default_factory=dict)
     study: Mapping[str, Any] | None = None
     maps: Mapping[str, DetectorMap] = field(default_factory=dict)
+    panels: Mapping[str, DetectorMap] = field(default_factory=dict)
     message: str = ""
 
     @property
@@ -74,7 +81,7 @@ def write_sweep(
     title : str
         Title of the page.
     pictures : int
-        Number of points whose maps are drawn, from the best one.
+        Number of points whose maps are drawn beside the measured one, from the best one.
     files : sequence of str or path-like
         Files of the sweep, whose names, sizes and SHA-256 are listed.
     command : str
@@ -109,11 +116,67 @@ def write_sweep(
                 "note",
             )
         )
+    if pictures:
+        page.add(*_course(page, rows), *_gallery(page, rows))
     for row in [row for row in rows if row.maps][:pictures]:
         page.add(heading(f"Maps of {row.name}"), blinking_pictures(page, row.maps, 5.0))
     add_origin(page, made)
     page.data("points", [_data(row) for row in rows])
     page.save(path)
+
+
+def _course(page, rows):
+    """Similarity against each setting that is a number; seeds only tell specimens apart."""
+    compared = [row for row in rows if row.study]
+    varied = [name for name in _names(row.settings for row in compared) if not name.endswith("seed")]
+    values = {name: [_number(row.settings.get(name)) for row in compared] for name in varied}
+    names = [name for name in varied if len({*values[name]} - {None}) > 1][:_MOST_SETTINGS]
+    if not names:
+        return []
+    figure = plot.new_figure((3.4 * len(names) + 0.6, 3.2))
+    for ax, name in zip(figure.subplots(1, len(names), squeeze=False, sharey=True)[0], names, strict=True):
+        points = [(x, row) for x, row in zip(values[name], compared, strict=True) if x is not None]
+        errors = [row.study["optimum"]["score"]["error"] or 0.0 for _, row in points]
+        ax.errorbar([x for x, _ in points], [row.similarity for _, row in points], errors, fmt="o", markersize=4)
+        units = {text.partition(" ")[2] for _, row in points if isinstance(text := row.settings[name], str)}
+        ax.set_xlabel(f"{name} [{units.pop()}]" if len(units) == 1 else name)
+        ax.grid(alpha=0.3)
+    figure.axes[0].set_ylabel("largest SSIM")
+    return [heading("Similarity against the settings"), page.picture(figure, alt="Similarity against the settings")]
+
+
+def _number(value):
+    """Value of a setting as a number, also of a text such as "18 a"; None if it is none."""
+    if isinstance(value, str):
+        try:
+            return float(value.partition(" ")[0])
+        except ValueError:
+            return None
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+def _gallery(page, rows):
+    """Maps of the first points, one picture for each emission."""
+    shown = [row for row in rows if row.panels][:_MOST_MAPS]
+    if not shown:
+        return []
+    drawn = []
+    for title in shown[0].panels:
+        maps = [row.panels[title] for row in shown]
+        maps = [each.smoothed(default_smoothing(each, each.ions)) if each.values.any() else each for each in maps]
+        axes = plot.detector_maps(
+            maps, [_short(row) for row in shown], columns=min(math.ceil(math.sqrt(len(shown))), 3), title=title
+        )
+        drawn.append(page.picture(axes[0].figure, alt=title))
+    parts = [heading("Maps"), switched(drawn) if len(drawn) > 1 else drawn[0]]
+    left = sum(bool(row.panels) for row in rows) - len(shown)
+    return [*parts, paragraph(f"{left} more points are in the file of the maps.", "note")] if left else parts
+
+
+def _short(row):
+    """Name of a point with its first settings, for a title."""
+    values = [f"{name.rpartition('.')[2]} {text_of(value)}" for name, value in row.settings.items()]
+    return "\n".join([row.name, *values[:2]])
 
 
 def _table(rows, compared):

@@ -18,6 +18,7 @@ from apt_evap._common.files import FileError, replace_file, sha256_of
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_count
 from apt_evap._version import __version__
+from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.emission.perturbations import described
 from apt_evap.fit.tips import TipFit, fit_tips
 from apt_evap.simulation.run import load
@@ -27,6 +28,7 @@ from apt_evap.sweep.planning import RUN, PointState, Sweep, csv_value
 INDEX, MAPS, FIT_TABLE, FIT, REPORT = "index.csv", "maps.h5", "fit.csv", "fit.json", "report.html"
 """Files of a collection."""
 DEFAULT_BINS = 128
+_DRAWN = 12  # points whose maps are in the report
 _OF_RUN = ("ended", "version", "created", "processor", "fingerprint")
 
 
@@ -98,7 +100,7 @@ def collect(
         fit = _compare(sweep, done)
         files += [str(sweep.folder / name) for name in (FIT_TABLE, FIT)]
     if done:
-        _write_report(sweep, states, rows, fit, command)
+        _write_report(sweep, states, rows, fit, command, target)
         files.append(str(sweep.folder / REPORT))
     wrong = {key: state.message for key, state in states.items() if state.name in ("damaged", "foreign")}
     return {"points": len(sweep.points), "done": len(done), "wrong": wrong, "files": files, "fit": fit}
@@ -136,7 +138,8 @@ def _write_index(sweep, states, rows):
     write(sweep.folder / INDEX, text.getvalue())
 
 
-def _write_report(sweep, states, rows, fit, command):
+def _write_report(sweep, states, rows, fit, command, maps_file):
+    panels = _panels(maps_file, _DRAWN)
     studies, failed = ({}, {}) if fit is None else (fit.studies, fit.failed)
     points = []
     for point in sweep.points:
@@ -153,6 +156,7 @@ def _write_report(sweep, states, rows, fit, command):
                 results={"ions": rows[point.key]["ions"]} if point.key in rows else {},
                 study=None if study is None else study.to_dict(),
                 maps=maps,
+                panels=panels.get(point.key, {}),
                 message=unfinished or failed.get(point.key, ""),
             )
         )
@@ -161,6 +165,21 @@ def _write_report(sweep, states, rows, fit, command):
         files.append(sweep.compare.measured)
     target = unlinked(sweep.folder / REPORT)
     report.write_sweep(points, target, title=f"Sweep {sweep.folder.name}", files=files, command=command)
+
+
+def _panels(path, most):
+    """Maps of the first points of a file of `write_maps`: by key, then by the title of the emission."""
+    found: dict[str, dict[str, DetectorMap]] = {}
+    with h5py.File(path) as file:
+        titles, keys = (file[name].asstr()[:] for name in ("title", "key"))
+        edges = [file[f"{axis}_edges"][:] for axis in "xy"]
+        for row, key in enumerate(keys[:most]):
+            counts = file["maps"][row]
+            found[str(key)] = {
+                str(title): DetectorMap.from_array(each, *edges, is_counts=True)
+                for title, each in zip(titles, counts, strict=True)
+            }
+    return found
 
 
 def write_maps(sweep: Sweep, keys: list[str], path: AnyPath, bins: int | None = None) -> None:

@@ -38,7 +38,8 @@ def test_points_in_the_order_of_their_similarity(study, tmp_path):
     ):  # fmt: skip
         assert each in text, each
     assert len(seen.all("tr", "best")) == 1 and len(seen.all("span", "red")) == 1
-    assert len(seen.all("img")) == 2 and all(each.startswith(("data:", "#")) for each in seen.addresses)
+    # measured and simulated map of the best point, and the similarity against the radius
+    assert len(seen.all("img")) == 3 and all(each.startswith(("data:", "#")) for each in seen.addresses)
     content = ae.report.read(tmp_path / "s.html")
     assert [row["name"] for row in content["points"]] == ["0b1d", "3f9c", "77aa"]
     assert content["points"][1]["study"] == json.loads(json.dumps(study.to_dict()))
@@ -61,3 +62,15 @@ def test_a_sweep_without_points_is_refused(tmp_path):
 def test_only_as_many_pictures_as_asked_for(study, tmp_path):
     ae.report.write_sweep(rows(study), tmp_path / "s.html", pictures=0)
     assert Reader((tmp_path / "s.html").read_text()).all("img") == []
+
+
+def test_maps_without_a_comparison_are_shown_for_every_emission(study, tmp_path):
+    points = [
+        ae.report.SweepRow(name, {"seed": seed}, panels={"unperturbed": study.measured, "rolled": study.measured})
+        for seed, name in enumerate("ab")
+    ]
+    ae.report.write_sweep([*points, ae.report.SweepRow("c", {"seed": 3}, message="failed")], tmp_path / "s.html")
+    seen = Reader((tmp_path / "s.html").read_text())
+    assert [each["alt"] for each in seen.all("img")] == ["unperturbed", "rolled"]
+    ae.report.write_sweep(points * 10, tmp_path / "s.html")
+    assert "8 more points are in the file of the maps." in Reader((tmp_path / "s.html").read_text()).text
