@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import math
 import shlex
 from pathlib import Path
 
@@ -22,19 +21,18 @@ from apt_evap.emission.perturbations import LateralVelocity, RollUp
 from apt_evap.indexing.index import Candidate
 from apt_evap.indexing.master_pattern import master_patterns
 from apt_evap.io.formats import read_ranges
-from apt_evap.registration.register import Registration, register
+from apt_evap.registration.register import register
 from apt_evap.report.measurement import measurement_section
 from apt_evap.report.page import Page
 from apt_evap.simulation.run import load
 from apt_evap.specimen.materials import material
 from apt_evap.twin.constants import constants_of
-from apt_evap.twin.start import ENERGY, HEIGHT, ROLLS, SHARPNESS
+from apt_evap.twin.start import ENERGY, HEIGHT, ROLLS, SHARPNESS, near
 
 SETTINGS, FACTS, RUN, REGISTRATION, STUDY, ANSWER = (
     "specimen.toml", "start.json", "run.h5", "registration.json", "study", "answer.txt",
 )  # fmt: skip
 _LARGEST = 1 << 24  # bytes of start.json
-_ROTATIONS, _SCALES, _TILT = (-5.0, 5.0), (0.94, 1.06), 3.0  # degrees, factor, degrees: bounds of the registration
 _FRACTIONS = "0.2,0.4,0.6,0.8,1"  # that roll up, in the fit
 
 
@@ -54,11 +52,7 @@ def execute(options: argparse.Namespace) -> int:
         emission: RollUp | LateralVelocity = LateralVelocity(ENERGY, HEIGHT)
         if rolls:
             emission = RollUp(ENERGY, best["rolled"], SHARPNESS, HEIGHT)
-        near = Registration(0.0, 1.0, tuple(best["centre"]))
-        # the indexing knows rotation, scale and place better than a search
-        registration = register(
-            run.hits(emission), measured_map, start=near, rotations=_ROTATIONS, scales=_SCALES, tolerance=_shift(best)
-        )
+        registration = register(run.hits(emission), measured_map, **near(best["centre"], best["scale"]))
         with replace_file(folder / REGISTRATION) as file:
             file.write((json.dumps(to_plain(registration), indent=1) + "\n").encode())
     told: list[str] = []
@@ -107,11 +101,6 @@ def _parsed(command, *arguments, options):
     given = make_parser().parse_args([command, *map(str, arguments), *threads])
     given.arguments = options.arguments
     return given
-
-
-def _shift(candidate):
-    """Largest shift of the registration [mm]."""
-    return math.radians(_TILT) * candidate["scale"]
 
 
 def _candidate(best, options):

@@ -1,6 +1,5 @@
 """Group of the page that writes the settings of a simulation of the measured specimen, and runs it."""
 
-import math
 import threading
 from collections.abc import Callable
 from functools import partial
@@ -18,8 +17,6 @@ from apt_evap.twin.start import Start
 
 INTERVAL = 500
 """Time between two looks at the run [ms]."""
-# bounds of the registration of the run: the indexing knows rotation, scale and place better than a search
-_ROTATIONS, _SCALES, _TILT = (-5.0, 5.0), (0.94, 1.06), math.radians(3.0)
 
 
 class Workbench:
@@ -121,9 +118,7 @@ class RunPanel:
         self.write.disabled = False
         self._say(text)
         if made is not None:
-            tolerance = _TILT * made.indexing.best.projection.scale
-            near = {"start": made.registration, "rotations": _ROTATIONS, "scales": _SCALES, "tolerance": tolerance}
-            self.bench.near[str(self.path.with_suffix(".h5"))] = near
+            self.bench.near[str(self.path.with_suffix(".h5"))] = made.near
             self._put_code(made.text)
 
     def _start_or_stop(self):

@@ -376,8 +376,10 @@ def _judged(measured, disc, material, patterns, found, proper, n, marked):
     next_best = max((float(np.clip(each.explained, 0, 1)) for _, each in found[1:]), default=0.0)
     decided = margin > DECIDED and (marked or next_best < RIVAL * best)
     numbers = f"{best:.2f} of the structure instead of {next_best:.2f} (margin {margin:.0f}; {DECIDED:g} is needed)"
-    if decided and not marked and measured.is_counts and measured.ions < LEAST_IONS:
+    if not marked and measured.is_counts and measured.ions < LEAST_IONS:
         decided, reason = False, f"{measured.ions:,} ions are too few to decide: {LEAST_IONS:,} are needed; {numbers}"
+    elif decided and best < next_best:
+        reason = f"only it fits the marks and the map (margin {margin:.0f}; {DECIDED:g} is needed)"
     elif decided:
         reason = f"it explains more than any other orientation, {numbers}"
     elif margin > DECIDED:

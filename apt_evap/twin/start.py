@@ -4,8 +4,10 @@ from __future__ import annotations  # help() then shows ArrayLike instead of its
 
 import math
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -35,9 +37,31 @@ ROLLS = 0.1
 """Fraction of the roll-up pattern below which no ion rolls up."""
 _SIMULATED_COMPRESSION = 1.03  # of free tips with R = 20 to 80 a: 1.02 to 1.045, measured with the master patterns
 _MARGIN = 1.1  # of the simulated field of view beyond the measured one
+# of the registration of a run: the indexing knows rotation, scale and place better than a search
+_ROTATIONS, _SCALES, _TILT = (-5.0, 5.0), (0.92, 1.08), math.radians(3.0)
 _ENDS = 1000  # ions at the beginning and at the end of a measurement, for its radii
 _PART = 0.2  # of the volume of the cap that may evaporate: the shape stays near the sphere
 _FEWEST, _MOST = 10_000, 150_000  # ions
+
+
+def near(centre: Sequence[float], scale: float) -> dict[str, Any]:
+    """Start and bounds of the registration of a run with the settings of a `Start`, for `register`.
+
+    Parameters
+    ----------
+    centre : sequence of float
+        Place of the axis on the map [mm].
+    scale : float
+        Of the indexed map [mm/rad].
+
+    Returns
+    -------
+    dict
+        start, rotations [degrees], scales, tolerance [mm].
+    """
+    x, y = centre
+    start = Registration(0.0, 1.0, (x, y))
+    return {"start": start, "rotations": _ROTATIONS, "scales": _SCALES, "tolerance": _TILT * scale}
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +79,8 @@ class Start:
         voltages.
     simulated_radius : float
         Radius of the simulated tip [nm].
-    registration : Registration
-        Where the simulated map is on the measured one, to begin a search.
+    near : dict
+        Where the simulated map is on the measured one, for `register`, see `near`.
     foresight : Foresight
         Time and memory that the simulation needs.
     """
@@ -65,7 +89,7 @@ class Start:
     indexing: Indexing
     radii: tuple[float, float]
     simulated_radius: float
-    registration: Registration
+    near: dict
     foresight: Foresight
 
     def __repr__(self) -> str:
@@ -151,8 +175,7 @@ def settings_of(
         raise ValueError(
             f"minutes must be at least {60 * (needs.hours or 0.0) / threads:.1f} for the smallest tip, got {minutes:g}"
         )
-    registration = Registration(0.0, 1.0, best.projection.centre)
-    return Start(text, indexing, radii, size * material.a, registration, needs)
+    return Start(text, indexing, radii, size * material.a, near(best.projection.centre, best.projection.scale), needs)
 
 
 def voltages_of(hits: Hits | None) -> Floats | None:
