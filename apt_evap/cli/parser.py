@@ -384,6 +384,11 @@ def _add_compare(commands: Any) -> None:
         metavar="R",
         help="a JSON file (such as study.json) or ROTATION,SCALE,DX,DY[,mirror] in degrees and mm; default: automatic",
     )
+    command.add_argument(
+        "--objective",
+        choices=("similarity", "folded"),
+        help="what is compared: the maps place by place (SSIM), the default, or both maps folded about a pole",
+    )
     command.add_argument("--bins", type=_integer(11, MAX_BINS), metavar="N", help="bins along the longer side")
     command.add_argument(
         "--smooth",

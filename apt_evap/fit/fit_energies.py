@@ -16,6 +16,7 @@ from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.energies import Thermal
 from apt_evap.emission.perturbations import LateralVelocity, Unperturbed
+from apt_evap.fit.comparison import FoldedComparison
 from apt_evap.fit.grid import EnergyGrid, maxima
 from apt_evap.fit.intervals import intervals as intervals_of
 from apt_evap.fit.search import EnergySearch, register_repeatedly
@@ -138,6 +139,11 @@ def fit_energies(
             registration, rounds = register_repeatedly(search)
         search.place(registration, settings.resamples)
         measure, missing = _pole_measure(search, registration, pole)
+        if settings.objective == "folded":
+            if measure is None:
+                raise ValueError(f"settings.objective is 'folded', but the maps show no pole to fold about: {missing}")
+            cells_of_pole = measure.cells(search.region)
+            search.comparison = FoldedComparison(search.region, search.comparison.settings, cells_of_pole)
         values, structures = search.matrix("energies", measure=measure)
         cells = maxima(values)
         best = search.refine(values, cells)[0]
@@ -156,7 +162,7 @@ def fit_energies(
     registration.warn_if_doubtful()
     if structure is not None and structure.lost:
         warnings.warn(
-            "the best map by SSIM has lost the zone lines of the measured map: contrasts "
+            f"the best map by {settings.score_name} has lost the zone lines of the measured map: contrasts "
             f"{_contrasts(structure.optimum)} in the rings about a pole, measured {_contrasts(structure.measured)}; "
             "SSIM rewards blur if the lines of both maps differ, see Study.structure",
             StructureWarning,

@@ -1,6 +1,6 @@
 """Settings of a fit: comparison, random draws and resampling of maps."""
 
-from apt_evap._common.codec import checked, count, number, settings, switch
+from apt_evap._common.codec import checked, choice, count, number, settings, switch
 from apt_evap._common.validation import check_seed
 from apt_evap.fit.defaults import MODEL_ERROR
 
@@ -33,6 +33,12 @@ class FitSettings:
         at_least=0,
         unit="mm",
     )
+    objective: str = choice(
+        'What is compared: "similarity", the structural similarity of both maps place by place, or "folded", the '
+        "concordance of both maps folded about a pole (`FoldedComparison`), which blur cannot win.",
+        ("similarity", "folded"),
+        default="similarity",
+    )
     data_range: float = number("Range of densities, as for `similarity`.", default=2.0, above=0)
     allow_noise: bool = switch(
         "Whether the similarity is corrected for the noise of both maps: the Poisson noise of measured counts, and the "
@@ -62,3 +68,8 @@ class FitSettings:
         default=MODEL_ERROR,
         at_least=0,
     )
+
+    @property
+    def score_name(self) -> str:
+        """What the scores are: "SSIM", or "concordance" of folded maps."""
+        return "concordance" if self.objective == "folded" else "SSIM"

@@ -9,20 +9,21 @@ from __future__ import annotations  # help() then shows ArrayLike instead of its
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from apt_evap._common.codec import to_plain
 from apt_evap._common.short_repr import short_repr
-from apt_evap._common.types import Floats
+from apt_evap._common.types import Floats, Integers
 from apt_evap.analysis.apex import image_compression
 from apt_evap.crystallography.directions import plain_label, plane_normals, poles
 from apt_evap.crystallography.orientation import Orientation
 from apt_evap.crystallography.symmetry import pole_symmetry
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.projection import Projection
-from apt_evap.maps.folded import FoldedMap, folded
+from apt_evap.maps.folded import FoldedMap, folded, symmetric_cells
 from apt_evap.maps.pole_frame import pole_frame
 from apt_evap.maps.pole_profiles import pole_profile
 from apt_evap.maps.profiles import Profile
@@ -34,6 +35,7 @@ LOST = 0.5
 """A ring has lost its structure if its contrast is below this fraction of the measured one."""
 SIGNIFICANT = 2.0
 """A measured contrast above this number of its errors, or a difference of misfits, is significant."""
+_CELL = 0.75  # degrees: half the width of a narrow line
 _FAMILIES = 3  # of largest spacing: their poles have wide dark facets
 _COVERED = 0.7  # fraction of the circle of the outermost ring inside the compared region
 _SECTORS = (72, 36, 24)  # of a ring: the most that its bins fill, and multiples of all folds
@@ -173,6 +175,12 @@ class PoleMeasure:
         rings = tuple(self._ring(map, ring, sectors, ions) for ring, sectors in self.rings)
         return Structure(rings, pole_profile(map, self.projection, self.pole, ions=ions), self._folded(map))
 
+    def cells(self, region: DetectorMap) -> Integers:
+        """Cells about the pole for a `FoldedComparison`, shape of the map."""
+        return symmetric_cells(
+            region, self.projection, self.pole, self.symmetry, self.toward, self.rings[-1][0][1], _CELL
+        )
+
     def _folded(self, map):
         try:
             return folded(map, self.projection, self.pole, self.symmetry, self.toward, reach=self.rings[-1][0][1])
@@ -260,6 +268,17 @@ class StructureScores(NamedTuple):
             values = ", ".join(f"{each:.1f}" for each in known.values())
             found.append(f"the lines have {values} of the measured amplitude at {degrees} degrees")
         return f"about the pole ({plain_label(self.plane)}) {', and '.join(found)}" if found else ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the scores and the structures in plain types, without the folded maps."""
+        without = {name: getattr(self, name)._replace(folded=None) for name in ("measured", "unperturbed", "optimum")}
+        folded = self.measured.folded
+        return to_plain(self._replace(**without)) | {
+            "disagrees": self.disagrees,
+            "lost": self.lost,
+            "ceiling": float("nan") if folded is None else folded.ceiling,
+            "evidence": self.evidence,
+        }
 
     @property
     def disagrees(self) -> bool:

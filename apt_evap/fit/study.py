@@ -200,7 +200,7 @@ class Study:
             results[name]["perturbation"] = described(getattr(self, name).perturbation)
         results["registration"]["doubtful"] = bool(self.registration.doubtful)
         scores = self.structure
-        results["structure"] = scores and to_plain(scores) | {"disagrees": scores.disagrees, "lost": scores.lost}
+        results["structure"] = scores and scores.to_dict()
         return for_json(results | {"settings": to_plain(self.settings) | self.provenance})
 
     def save(self, path: AnyPath) -> None:
@@ -248,7 +248,8 @@ class Study:
         return (
             f"<Study: maps {self.likeness.verdict}; {self.grid.name}{doubtful}, "
             f"best at {best.mean:g} eV, sigma/mean {best.relative_spread:g}{fraction}"
-            f"{edge}, SSIM {best.score}; {others};\n between points {between}; {self._structure()}{self._energies()}>"
+            f"{edge}, {self.settings.score_name} {best.score}; {others};\n between points {between}; "
+            f"{self._structure()}{self._energies()}>"
         )
 
     _repr_html_ = as_table
@@ -259,7 +260,7 @@ class Study:
         verdict = {"alike": "the maps are alike", "doubtful": "it is doubtful that the maps are alike"}
         first = f"{verdict.get(likeness.verdict, 'the maps are not alike')} ({likeness.reason}); {self.grid.name}, "
         first += f"best at {self.point(self.best_cell)}"
-        second = f"similarity {best.score}, unperturbed {self.baselines['unperturbed']}"
+        second = f"{self.settings.score_name} {best.score}, unperturbed {self.baselines['unperturbed']}"
         if self.settings.allow_noise:
             second += f"; uncorrected for noise {self.plain['optimum']}"
         second += f", two halves of the measured ions {self.ceiling}" if self.ceiling else ", ceiling not known"
@@ -294,7 +295,8 @@ class Study:
             text = f"{ions} roll up in part, a fraction of {refined.bounded('rollup_fraction')}, with {energy}"
         else:
             text = f"{ions} leave by {self.grid.name} with {energy}"
-        return text + "".join(f", {name} {refined.bounded(name)}" for name in refined.options)
+        varied = [name for name in refined.options if len(self.grid.options[name]) > 1]
+        return text + "".join(f", {name} {refined.bounded(name)}" for name in varied)
 
     def point(self, index: tuple[int, ...]) -> str:
         """Text of the energies and options at an index of the grid, str."""
@@ -315,7 +317,9 @@ class Study:
         text = f"rings about ({plain_label(scores.plane)}): contrasts {contrasts}, measured {measured}, misfit "
         text += f"{scores.misfit[scores.at_optimum]:.2f} ± {scores.errors[scores.at_optimum]:.2f}"
         if scores.disagrees:
-            text += f"; rings and SSIM disagree: rings are best at {self.point(scores.best)}, misfit "
+            text += (
+                f"; rings and {self.settings.score_name} disagree: rings are best at {self.point(scores.best)}, misfit "
+            )
             text += f"{scores.misfit[scores.best]:.2f} ± {scores.errors[scores.best]:.2f}"
         return f"{text};\n "
 
@@ -371,7 +375,7 @@ def bounded_text(
     -------
     str
     """
-    if interval is None:
+    if interval is None or interval[0] == interval[1]:  # not known, or given
         return f"{value * factor:.3g}"
     low, high = (bound * factor for bound in interval)
     below, above = open_ends or (False, False)

@@ -7,13 +7,14 @@ crystal, so they need neither the same bins nor the same projection.
 
 from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from apt_evap._common.types import Floats
+from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_choice, check_kind, check_number, check_seed
 from apt_evap.detection.detector_map import DetectorMap, gaussian, masked_gaussian
 from apt_evap.maps.pole_frame import Directions, axes_about, pole_frame, unit_vector
@@ -189,6 +190,44 @@ def folded(
         halves = first.correlation(second)
     number = float(hits[np.abs(place) <= reach].sum()) if frame.noise_known else float("nan")
     return FoldedMap(density, angles, symmetry, smoothing, number, halves)
+
+
+def symmetric_cells(
+    map: DetectorMap,
+    projection: Directions,
+    pole: ArrayLike,
+    symmetry: str,
+    toward: ArrayLike,
+    reach: float,
+    size: float,
+) -> Integers:
+    """Number of the cell about a pole to which every bin of a map belongs; symmetric places have the same cell.
+
+    Parameters
+    ----------
+    map, projection, pole, symmetry, toward, reach
+        As for `folded`.
+    size : float
+        Edge of a cell [degrees].
+
+    Returns
+    -------
+    ndarray of int
+        Shape of the map; -1 outside its mask and the reach.
+    """
+    frame = pole_frame(map, projection, pole, np.inf)
+    order = int(symmetry[0]) if symmetry[0].isdigit() else 1
+    azimuth = (2 * np.pi * frame.azimuth - _azimuth(unit_vector(pole), unit_vector(toward, "toward"))) % (
+        2 * np.pi / order
+    )
+    if "m" in symmetry:
+        azimuth = np.minimum(azimuth, 2 * np.pi / order - azimuth)
+    place = frame.angle * np.exp(1j * azimuth)
+    labels = np.full(map.values.shape, -1)
+    column, row = (np.floor(each / size).astype(int) for each in (place.real, place.imag))
+    width = 2 * math.ceil(reach / size) + 2
+    labels[map.mask] = np.where(frame.angle < reach, (row + width // 2) * width + column + width // 2, -1)
+    return labels
 
 
 def _azimuth(pole, toward):

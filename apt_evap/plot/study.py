@@ -82,7 +82,9 @@ def ssim_matrix(study: Study, axes: Sequence[Axes] | None = None, *, colormap: s
     add_colorbar(
         [ax.images[0] for ax in panels],
         list(panels),
-        label="noise-corrected SSIM" if study.settings.allow_noise else "SSIM",
+        label=f"noise-corrected {study.settings.score_name}"
+        if study.settings.allow_noise
+        else study.settings.score_name,
     )
     return panels
 
@@ -203,7 +205,7 @@ def _scores(study):
     """Text with the similarities."""
     corrected = study.settings.allow_noise
     lines = [
-        "SSIM with the measured map",
+        f"{study.settings.score_name} with the measured map",
         f"in {study.provenance['bins_compared']:,} bins" + ", noise-corrected" * corrected,
     ]
     if study.registration.doubtful:
@@ -218,7 +220,7 @@ def _scores(study):
         for name in ("measured", "unperturbed", "optimum"):
             rings = getattr(study.structure, name).rings
             lines.append(f"contrast of rings, {name}: " + ", ".join(f"{ring.contrast:.2f}" for ring in rings))
-        lines += ["RINGS AND SSIM DISAGREE"] * study.structure.disagrees
+        lines += [f"RINGS AND {study.settings.score_name.upper()} DISAGREE"] * study.structure.disagrees
     width, height = study.measured.bin_size
     lines.append(f"bins {width:.3g} × {height:.3g} mm, smoothed by {study.settings.smoothing:.3g} mm")
     return "\n".join(lines)

@@ -169,7 +169,7 @@ def _energies(study):
         for name, label in after.items():
             values = f"{getattr(best, name) * factor:.4g}", refined.scaled(name, factor)
             following.append((f"{label} after truncation, {other} [eV]", *values))
-    following.append(("SSIM", best.score, refined.score))
+    following.append((study.settings.score_name, best.score, refined.score))
     between = "between its points" + " (interval of 95 %)" * bool(refined.intervals)
     head = f"{mechanism}, {place}", "best on the grid", between
     note = "Fitted energies scale with the assumed tip radius and voltage."
@@ -180,12 +180,14 @@ def _energies(study):
 
 
 def _scores(study):
-    corrected = "noise-corrected SSIM" if study.settings.allow_noise else "SSIM"
+    corrected = (
+        f"noise-corrected {study.settings.score_name}" if study.settings.allow_noise else study.settings.score_name
+    )
     names = ("unperturbed", "thermal", "optimum")
     scores = {**study.baselines, "optimum": study.optimum.score}
     labels = {"thermal": f"thermal, {study.settings.temperature:g} K", "optimum": "best"}
     rows = [(labels.get(name, name), scores[name], study.plain[name]) for name in names]
-    head = ["Map", corrected, "uncorrected SSIM"]
+    head = ["Map", corrected, f"uncorrected {study.settings.score_name}"]
     if not study.settings.allow_noise:
         rows, head = [row[:2] for row in rows], head[:2]
     facts = f"Gain over unperturbed: {study.gain}."
@@ -203,7 +205,7 @@ def _scale(study):
     """Colours of the matrices."""
     low, high = float(study.ssim.min()), float(study.ssim.max())
     shades = [matplotlib.colors.to_hex(matplotlib.colormaps[_COLORS](part)) for part in np.linspace(0, 1, 9)]
-    return color_scale(shades, f"{low:z.3f}", f"{high:z.3f}", "SSIM")
+    return color_scale(shades, f"{low:z.3f}", f"{high:z.3f}", study.settings.score_name)
 
 
 def _poles(page, study):
@@ -263,7 +265,8 @@ def _matrix(study, title, values, errors, shares, best):
             shade = shades[row, column, :3]
             light = np.dot(shade, (0.299, 0.587, 0.114)) > 0.5
             score = Score(float(values[row, column]), float(errors[row, column]))
-            details = f"mean {mean:g} eV, standard deviation / mean {grid.relative_spreads[row]:.4g}: SSIM {score}"
+            details = f"mean {mean:g} eV, standard deviation / mean {grid.relative_spreads[row]:.4g}: "
+            details += f"{study.settings.score_name} {score}"
             if len(study.resampled):
                 details += f", best in {shares[row, column]:.0%} of the resamples"
             frame = ' class="best"' if (row, column) == best else ""

@@ -84,7 +84,7 @@ def test_everything_is_written(folder, capsys, rough_layout):
     out, _ = capsys.readouterr()
     first, second, *_, last = out.splitlines()
     assert len(out.splitlines()) <= 4
-    assert "alike" in first and "roll-up, best at" in first and "similarity" in second and "to study" in last
+    assert "alike" in first and "roll-up, best at" in first and "SSIM" in second and "to study" in last
     assert json.loads(Path("study/study.json").read_text())["likeness"]["verdict"] in first
     assert {path.name for path in Path("study").iterdir()} == FILES
     held = json.loads(Path("study/study.json").read_text())

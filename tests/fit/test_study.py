@@ -192,7 +192,15 @@ def test_a_hidden_fraction_is_found(run, other):
     assert abs(study.structure.best[0] - 2) <= 1
     assert f"probability {study.optimum.options['probability']:g}" in repr(study)
     assert len(ae.plot.ssim_matrix(study)) == 5
-    json.dumps(study.to_dict(), allow_nan=False)
+    assert study.structure.evidence.startswith("about the pole (111) the folded maps correlate to 0.")
+    text = json.dumps(study.to_dict(), allow_nan=False)
+    assert len(text) < 300_000  # without the folded maps
+    folded = fit_energies(
+        run, measured_map(other, hidden), PartlyRolled, means=(0.155,), relative_spreads=(1.0,), objective="folded",
+        options={"probability": (0.2, 0.4, 0.6, 0.8, 1.0)}, registration=HERE, replicas=4, resamples=20, progress=False,
+    )  # fmt: skip
+    assert folded.refined.options["probability"] == pytest.approx(0.6, abs=0.12)
+    assert "concordance" in repr(folded) and folded.lines()[1].startswith("concordance")
 
 
 @pytest.mark.slow
@@ -343,6 +351,8 @@ def test_no_pole_is_no_error(run, other):
     assert study.to_dict()["structure"] is None
     with pytest.raises(ValueError, match="no pole has 70% of a ring"):
         fit_energies(run, small, pole=(1, 1, 1), progress=False, **options)
+    with pytest.raises(ValueError, match="objective is 'folded', but the maps show no pole to fold about: no pole has"):
+        fit_energies(run, small, objective="folded", progress=False, **options)
 
 
 # ---- many maps at a time -------------------------------------------------------------------------------------------
