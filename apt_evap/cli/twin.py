@@ -3,6 +3,7 @@
 import argparse
 import json
 import shlex
+import warnings
 from pathlib import Path
 
 from apt_evap import plot
@@ -28,10 +29,12 @@ from apt_evap.simulation.run import load
 from apt_evap.specimen.materials import material
 from apt_evap.twin.constants import constants_of
 from apt_evap.twin.start import ENERGY, HEIGHT, ROLLS, SHARPNESS, near
+from apt_evap.warnings import RegistrationWarning
 
 SETTINGS, FACTS, RUN, REGISTRATION, STUDY, ANSWER = (
     "specimen.toml", "start.json", "run.h5", "registration.json", "study", "answer.txt",
 )  # fmt: skip
+_AT_BOUND = 0.01  # of the range
 _LARGEST = 1 << 24  # bytes of start.json
 _FRACTIONS = "0.2,0.4,0.6,0.8,1"  # that roll up, in the fit
 
@@ -52,7 +55,7 @@ def execute(options: argparse.Namespace) -> int:
         emission: RollUp | LateralVelocity = LateralVelocity(ENERGY, HEIGHT)
         if rolls:
             emission = RollUp(ENERGY, best["rolled"], SHARPNESS, HEIGHT)
-        registration = register(run.hits(emission), measured_map, **near(best["centre"], best["scale"]))
+        registration = _registered(run.hits(emission), measured_map, near(best["centre"], best["scale"]))
         with replace_file(folder / REGISTRATION) as file:
             file.write((json.dumps(to_plain(registration), indent=1) + "\n").encode())
     told: list[str] = []
@@ -93,6 +96,22 @@ def _start(options, folder):
         with replace_file(folder / FACTS) as file:
             file.write((json.dumps(summary(start), indent=1) + "\n").encode())
     return json.loads(read_small_file(folder / FACTS, _LARGEST, "the facts of a start"))
+
+
+def _registered(hits, measured_map, bounds):
+    """Registration of a run; its scale is that of the indexing if the maps do not determine one within the bounds."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", RegistrationWarning)
+        found = register(hits, measured_map, **bounds)
+    low, high = bounds["scales"]
+    if min(found.scale - low, high - found.scale) < _AT_BOUND * (high - low):
+        # poles of a smaller tip are wider, and a smaller scale makes them narrower again
+        say("note", f"the maps do not determine the scale of the registration within {low:g} to {high:g}: "
+                    "that of the indexing is kept")  # fmt: skip
+        return register(hits, measured_map, **(bounds | {"scales": 1.0}))
+    for each in caught:
+        warnings.warn(each.message, stacklevel=2)
+    return found
 
 
 def _parsed(command, *arguments, options):

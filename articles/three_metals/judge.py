@@ -38,6 +38,9 @@ METALS = {
     "W": Metal((0, 1, 1), 15.5, ((4, 7), (7, 11), (11, 15.5)),
                ((5.1, 7.0), (7.0, 9.5), (9.5, 12.7), (12.7, 15.5))),
     "Ni": Metal((1, 1, 1), 18.0, ((5, 9), (9, 14), (14, 18)), ()),
+    # two orientations explain the map of aluminium; both have a (111) pole at the same place
+    "Al": Metal((1, 1, 1), 12.0, ((5, 9), (9, 12)), ()),
+    "Al-2": Metal((1, 1, 1), 12.0, ((5, 9), (9, 12)), ()),
 }  # fmt: skip
 
 
@@ -47,6 +50,11 @@ def measured_of(metal, path):
         # three named poles; without them the map is undecided
         orientation = ae.Orientation("Ni", axis=(0.2926, 0.5418, 0.7879), rotation=155.31)
         return ae.read_map(path), orientation, ae.detection.Projection(26.1013, centre=(0.4029, -0.3919))
+    if metal.startswith("Al"):
+        found = ae.index(ae.read_map(path), "Al")
+        candidate = found.candidates[metal == "Al-2"]
+        print(candidate)
+        return found.map, candidate.orientation, candidate.projection
     ions = ae.read(path)
     map = ions.map(bins=256)
     found = ae.index(map, metal, distance=305.0)
@@ -133,22 +141,25 @@ def projection_of(run):
     return seen.compressed(compression)
 
 
-def simulated_maps(run, metal):
-    """Folded densities of every emission of a run."""
-    projection = projection_of(run)
-    orientation = ae.Orientation.from_settings(run.settings["tip"])
+def map_of(run, emission):
+    """Map of the field of view of the flights."""
     edges = np.linspace(-60, 60, 481)
     middle = (edges[1:] + edges[:-1]) / 2
     half_angle = run.settings["flights"]["field_of_view"]
     seen = np.hypot(middle, middle[:, None]) < run.detector.distance * np.tan(np.radians(half_angle))
-    found = {}
-    for name, emission in zip(EMISSIONS, run.perturbations, strict=True):
-        hits = run.hits(emission)
-        there = hits.detected & (np.hypot(hits.x, hits.y) < 60)
-        counts, _, _ = np.histogram2d(hits.y[there], hits.x[there], (edges, edges))
-        map = ae.DetectorMap.from_array(counts, edges, edges, is_counts=True, mask=seen)
-        found[name] = folded(map, orientation, projection, metal)
-    return found
+    hits = run.hits(emission)
+    there = hits.detected & (np.hypot(hits.x, hits.y) < 60)
+    counts, _, _ = np.histogram2d(hits.y[there], hits.x[there], (edges, edges))
+    return ae.DetectorMap.from_array(counts, edges, edges, is_counts=True, mask=seen)
+
+
+def simulated_maps(run, metal):
+    """Folded densities of every emission of a run."""
+    projection, orientation = projection_of(run), ae.Orientation.from_settings(run.settings["tip"])
+    return {
+        name: folded(map_of(run, emission), orientation, projection, metal)
+        for name, emission in zip(EMISSIONS, run.perturbations, strict=True)
+    }
 
 
 def main():

@@ -5,7 +5,7 @@
 One file for each metal, radius, rule and seed, `W_160_others_1.h5`; a file that is there is not made again. All atoms
 evaporate, only ions that can arrive in the measured field of view fly. Every emission is flown for the same ions, in
 the exact field. Energies are 0.35 eV in real units, sigma/mean 1, launches 0.1 nm above the site unless the name says
-otherwise.
+otherwise. With --wide, each ion gets its responses instead (`_wide.h5`), for any emission afterwards (`rules.py`).
 """
 
 import argparse
@@ -50,7 +50,7 @@ def emissions(scale):
     ]
 
 
-def simulated(metal, radius, rule, seed, skip, ions, threads):
+def simulated(metal, radius, rule, seed, skip, ions, threads, wide):
     """Run of one specimen; the second one has other atoms at the apex."""
     axis, half_angle = AXES[metal]
     material = ae.material(metal.partition("-")[0])
@@ -65,6 +65,8 @@ def simulated(metal, radius, rule, seed, skip, ions, threads):
     simulation = ae.Simulation(tip, flight_settings=seen, **common)
     for _ in simulation.emitter.advance(skip):
         pass
+    if wide:
+        return simulation.run(ions, progress=False)
     return simulation.run(ions, emissions(scale), responses=False, progress=False)
 
 
@@ -79,12 +81,14 @@ def main():
     parser.add_argument("--skip", type=int, default=110_000, help="events before the first ion that flies")
     parser.add_argument("--ions", type=int, default=300_000)
     parser.add_argument("--threads", type=int)
+    parser.add_argument("--wide", action="store_true", help="responses instead of flights of emissions")
     options = parser.parse_args()
-    path = options.runs / f"{options.metal}_{options.radius}_{options.rule}_{options.seed}.h5"
+    name = f"{options.metal}_{options.radius}_{options.rule}_{options.seed}{'_wide' * options.wide}.h5"
+    path = options.runs / name
     options.runs.mkdir(parents=True, exist_ok=True)
     if not path.exists():
         arguments = options.metal, options.radius, options.rule, options.seed, options.skip, options.ions
-        simulated(*arguments, options.threads).save(path)
+        simulated(*arguments, options.threads, options.wide).save(path)
 
 
 if __name__ == "__main__":

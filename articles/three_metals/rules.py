@@ -1,0 +1,77 @@
+"""Rules of emission on one run with wide responses, against a measured map: no rule needs a new run.
+
+    python runs.py RUNS W 160 --ions 200000 --wide
+    python rules.py W W3.epos RUNS/W_160_others_1_wide.h5
+
+The lines of the table are those of `judge.py`. A rule with a threshold rolls up the atoms whose strongest neighbour has
+more than this part of their charge (`ChargeRatio`); the others start from their sites, in random directions.
+"""
+
+import argparse
+import warnings
+
+import numpy as np
+from judge import METALS, folded, map_of, measured_of, projection_of, row
+from runs import HEIGHT
+
+import apt_evap as ae
+
+STEP = 0.01
+"""Width of the threshold of a charge ratio."""
+
+
+def rolled(energy, *, probability=1.0, sharpness=0.4, height=2 * HEIGHT, others=None):
+    """Roll-up with a mean energy of all ions [eV], unless that of the others is given."""
+    spread = ae.TruncatedNormal(energy, energy)
+    rest = spread if others is None else ae.TruncatedNormal(others, others)
+    return ae.RollUp(spread, probability, sharpness, height, others=rest)
+
+
+def rules(scale):
+    """Rules by name; `scale` is the simulated energy per real energy."""
+    found = {"unperturbed": ae.Unperturbed()}
+    for energy in (0.1, 0.2, 0.35, 0.7, 1.2):
+        found[f"all, {energy:g} eV"] = rolled(energy * scale)
+    for sharpness in (0.05, 0.15, 0.8):
+        found[f"all, sharpness {sharpness:g}"] = rolled(0.35 * scale, sharpness=sharpness)
+    for fraction in (0.5, 0.6, 0.8):
+        found[f"fraction {fraction:g}"] = rolled(0.35 * scale, probability=fraction)
+    for ratio in (0.50, 0.58, 0.62, 0.66, 0.70, 0.74, 0.78, 0.82, 0.86):
+        found[f"ratio > {ratio:.2f}, 0.2 eV"] = rolled(0.2 * scale, probability=ae.emission.ChargeRatio(ratio, STEP))
+    threshold = ae.emission.ChargeRatio(0.66, STEP)
+    for energy in (0.1, 0.35, 0.7):
+        found[f"ratio > 0.66, {energy:g} eV"] = rolled(energy * scale, probability=threshold)
+    for sharpness in (0.15, 0.8, 2.0):
+        found[f"ratio > 0.66, 0.2 eV, sharpness {sharpness:g}"] = rolled(
+            0.2 * scale, probability=threshold, sharpness=sharpness
+        )
+    found["ratio > 0.66, 0.2 eV, others 0.7 eV"] = rolled(0.2 * scale, probability=threshold, others=0.7 * scale)
+    for width in (0.03, 0.1):
+        wide = ae.emission.ChargeRatio(0.66, width)
+        found[f"ratio > 0.66, 0.2 eV, width {width:g}"] = rolled(0.2 * scale, probability=wide)
+    return found
+
+
+def main():
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("metal", choices=METALS)
+    parser.add_argument("measured", help="ions, or a map of densities")
+    parser.add_argument("run", help="with wide responses")
+    options = parser.parse_args()
+    warnings.simplefilter("ignore", ae.warnings.ResponseWarning)  # tails of the broad energies are extrapolated
+    metal = METALS[options.metal]
+    target = folded(*measured_of(options.metal, options.measured), metal)
+    row("measured", target, target, metal)
+    run = ae.load(options.run)
+    ratios = run.emissions.charge_ratios[:, 0, 0]
+    projection, orientation = projection_of(run), ae.Orientation.from_settings(run.settings["tip"])
+    scale = float(np.median(run.at_evaporation_field().energy_scales))
+    for name, rule in rules(scale).items():
+        threshold = getattr(getattr(rule, "probability", None), "threshold", None)
+        part = "" if threshold is None else f" ({np.mean(ratios > threshold):.2f} roll)"
+        row(name + part, folded(map_of(run, rule), orientation, projection, metal), target, metal)
+
+
+if __name__ == "__main__":
+    main()
