@@ -2,7 +2,7 @@
 
 from apt_evap._common.codec import checked, choice, count, number, settings, switch
 from apt_evap._common.validation import check_seed
-from apt_evap.fit.defaults import MODEL_ERROR
+from apt_evap.fit.defaults import FOLDED_MODEL_ERROR, MODEL_ERROR
 
 
 @settings
@@ -62,10 +62,11 @@ class FitSettings:
         at_most=1e5,
         unit="K",
     )
-    model_error: float = number(
-        "Relative increase of the misfit 1 - SSIM that the difference of the simulated from the measured specimen "
-        "explains, for the intervals; 0 for intervals by noise alone. The default was measured with twins.",
-        default=MODEL_ERROR,
+    model_error: float | None = number(
+        "Relative increase of the misfit 1 - SSIM, or 1 - concordance, that the difference of the simulated from the "
+        "measured specimen explains, for the intervals; 0 for intervals by noise alone. The default, 0.2 or 0.12, was "
+        "measured with twins.",
+        default=None,
         at_least=0,
     )
 
@@ -73,3 +74,10 @@ class FitSettings:
     def score_name(self) -> str:
         """What the scores are: "SSIM", or "concordance" of folded maps."""
         return "concordance" if self.objective == "folded" else "SSIM"
+
+    @property
+    def allowed_error(self) -> float:
+        """The model error, or its default."""
+        if self.model_error is not None:
+            return self.model_error
+        return FOLDED_MODEL_ERROR if self.objective == "folded" else MODEL_ERROR

@@ -17,5 +17,7 @@ from .rings import line_amplitude as line_amplitude
 from .rings import ring_statistics as ring_statistics
 from .similarity import Similarity as Similarity
 from .similarity import similarity_ceiling as similarity_ceiling
+from .traced_line import TracedLine as TracedLine
+from .traced_line import trace_line as trace_line
 from .zone_line import ZoneLine as ZoneLine
 from .zone_line import fit_zone_line as fit_zone_line

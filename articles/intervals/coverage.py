@@ -25,10 +25,11 @@ INSTRUMENT = ae.Registration(rotation=17.0, scale=0.4, shift=(3.0, -2.0))
 NAMES = ("mean", "relative_spread", "true_mean", "true_standard_deviation")
 
 
-def specimen(number, radius):
+def specimen(number, radius, same_radius=False):
     """Tip of Ni[111]; number 0 is the one that is fitted, with a radius in lattice constants."""
     random = np.random.default_rng((2026, number))
     sizes = np.ones(3) if number == 0 else random.uniform(1 - VARIATION, 1 + VARIATION, 3)
+    sizes[0] = 1.0 if same_radius else sizes[0]
     nickel = ae.material("Ni")
     tip = ae.Tip(
         nickel,
@@ -42,13 +43,13 @@ def specimen(number, radius):
     return tip
 
 
-def run_of(number, radius, ions, folder=None):
+def run_of(number, radius, ions, folder=None, same_radius=False):
     """Run of a specimen, stored in the folder."""
-    path = None if folder is None else folder / f"run{number}.h5"
+    path = None if folder is None else folder / f"run{number}{'_same' * same_radius}.h5"
     if path is not None and path.exists():
         return ae.load(path)
     simulation = ae.Simulation(
-        specimen(number, radius),
+        specimen(number, radius, same_radius),
         seed=number,
         n_threads=1,
         # to a tenth of a bin
@@ -86,9 +87,9 @@ def truth_of(energy):
     return dict(zip(NAMES, values, strict=True))
 
 
-def fitted(run, measured):
+def fitted(run, measured, objective="similarity"):
     """Study of a twin."""
-    settings = ae.fit.FitSettings(replicas=4, resamples=40)
+    settings = ae.fit.FitSettings(replicas=4, resamples=40, objective=objective)
     return ae.fit_energies(run, measured, None, settings, registration=INSTRUMENT, n_threads=1, progress=False)
 
 
@@ -110,6 +111,8 @@ def main():
     parser.add_argument("--twins", type=int, default=40)
     parser.add_argument("--radius", type=float, default=14.0, help="radius of the fitted specimen [a]")
     parser.add_argument("--ions", type=int, default=10_000)
+    parser.add_argument("--objective", choices=("similarity", "folded"), default="similarity")
+    parser.add_argument("--same-radius", action="store_true", help="twins with the radius of the fitted specimen")
     parser.add_argument("--model-errors", type=float, nargs="+", default=[0.0, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4])
     options = parser.parse_args()
     options.folder.mkdir(exist_ok=True)
@@ -117,8 +120,8 @@ def main():
     found = []
     for number in range(100, 100 + options.twins):
         energy = hidden_energy(number)
-        twin = run_of(number, options.radius, options.ions, options.folder)
-        study = fitted(run, measured_map(twin, energy))
+        twin = run_of(number, options.radius, options.ions, options.folder, options.same_radius)
+        study = fitted(run, measured_map(twin, energy), options.objective)
         truth = truth_of(energy)
         found.append([list(inside(study, truth, error).values()) for error in options.model_errors])
         print(number, {name: round(value, 3) for name, value in truth.items()}, flush=True)

@@ -277,6 +277,15 @@ CASES = [
         },
     ),
     (
+        ae.maps.trace_line,
+        {"map": grid, "ends": (5.0, 5.0, 15.0, 15.0), "width": 5.0},
+        {
+            "map": [*OBJECT, None],
+            "ends": [None, "x", 3, (0.0, 0.0), (1.0, 1.0, 1.0, 1.0), (NAN, 0.0, 1.0, 1.0)],
+            "width": POSITIVE,
+        },
+    ),
+    (
         ae.maps.line_amplitude,
         {"ring": azimuths, "measured": azimuths},
         {"ring": [*OBJECT, None], "measured": [*OBJECT, None], "shift": COUNT, "mirror": SWITCH},
