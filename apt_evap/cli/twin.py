@@ -110,7 +110,7 @@ def _registered(hits, measured_map, bounds):
                     "that of the indexing is kept")  # fmt: skip
         return register(hits, measured_map, **(bounds | {"scales": 1.0}))
     for each in caught:
-        warnings.warn(each.message, stacklevel=2)
+        warnings.warn(str(each.message), RegistrationWarning, stacklevel=2)
     return found
 
 

@@ -23,7 +23,7 @@ from apt_evap.crystallography.orientation import Orientation
 from apt_evap.crystallography.symmetry import pole_symmetry
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.projection import Projection
-from apt_evap.maps.folded import FoldedMap, folded, symmetric_cells
+from apt_evap.maps.folded_map import FoldedMap, folded, symmetric_cells
 from apt_evap.maps.pole_frame import pole_frame
 from apt_evap.maps.pole_profiles import pole_profile
 from apt_evap.maps.profiles import Profile

@@ -21,7 +21,7 @@ from apt_evap.indexing.marks import marks_of
 from apt_evap.indexing.master_pattern import MasterPattern, master_patterns
 from apt_evap.indexing.refine import Refined, bins_of, refine, resolution
 from apt_evap.indexing.search import Start, disc_of, misorientation, search
-from apt_evap.maps.folded import FoldedMap, folded
+from apt_evap.maps.folded_map import FoldedMap, folded
 from apt_evap.specimen.materials import as_material
 
 WIDEST, NARROWEST = 45.0, 12.0

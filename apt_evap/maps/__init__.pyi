@@ -1,6 +1,6 @@
 # The public names of this room: read by type checkers, and by the lazy loader in __init__.py.
-from .folded import FoldedMap as FoldedMap
-from .folded import folded as folded
+from .folded_map import FoldedMap as FoldedMap
+from .folded_map import folded as folded
 from .noise import effective_ions as effective_ions
 from .pole_profiles import pole_line_profile as pole_line_profile
 from .pole_profiles import pole_profile as pole_profile

@@ -3,7 +3,7 @@ from ._figure import add_colorbar as add_colorbar
 from ._figure import new_figure as new_figure
 from .candidates import indexing as indexing
 from .charges import charge_states as charge_states
-from .folded_maps import folded_maps as folded_maps
+from .folds import folded_maps as folded_maps
 from .histories import history as history
 from .histories import voltage_curve as voltage_curve
 from .limits import color_limits as color_limits

@@ -7,7 +7,7 @@ import pytest
 
 import apt_evap as ae
 from apt_evap.fit.comparison import FoldedComparison
-from apt_evap.maps.folded import symmetric_cells
+from apt_evap.maps.folded_map import symmetric_cells
 
 PLANE = ae.detection.Projection(100.0, compression=1.0)
 ORIENTATION = ae.Orientation("W", (0.1, 1.0, 1.05), 25.0)

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from apt_evap.maps.folded import FoldedMap
+from apt_evap.maps.folded_map import FoldedMap
 from apt_evap.plot._figure import OUTSIDE, add_colorbar, new_figure
 
 
