@@ -173,7 +173,7 @@ class PoleMeasure:
     def structure(self, map: DetectorMap, ions: float | None = None) -> Structure:
         """Structure of a map in the measured frame; `ions` as for `ring_statistics`."""
         rings = tuple(self._ring(map, ring, sectors, ions) for ring, sectors in self.rings)
-        return Structure(rings, pole_profile(map, self.projection, self.pole, ions=ions), self._folded(map))
+        return Structure(rings, pole_profile(map, self.projection, self.pole, ions=ions), self._folded(map, ions))
 
     def cells(self, region: DetectorMap) -> Integers:
         """Cells about the pole for a `FoldedComparison`, shape of the map."""
@@ -181,9 +181,11 @@ class PoleMeasure:
             region, self.projection, self.pole, self.symmetry, self.toward, self.rings[-1][0][1], _CELL
         )
 
-    def _folded(self, map):
+    def _folded(self, map, ions):
+        seed = 0 if ions is None else None  # two halves only for a ceiling, that of the measured map
+        about = self.pole, self.symmetry, self.toward
         try:
-            return folded(map, self.projection, self.pole, self.symmetry, self.toward, reach=self.rings[-1][0][1])
+            return folded(map, self.projection, *about, reach=self.rings[-1][0][1], seed=seed)
         except ValueError:  # no hits near the pole
             return None
 
