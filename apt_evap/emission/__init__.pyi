@@ -6,14 +6,15 @@ from .energies import Distribution as Distribution
 from .energies import Fixed as Fixed
 from .energies import Thermal as Thermal
 from .ion_random import IonRandom as IonRandom
-from .perturbations import ChargeRatio as ChargeRatio
 from .perturbations import Perturbation as Perturbation
-from .perturbations import RollProbability as RollProbability
 from .perturbations import TangentialPerturbation as TangentialPerturbation
 from .post_ionisation import PostIonisation as PostIonisation
 from .post_ionisation import charge_probabilities as charge_probabilities
 from .post_ionisation import charge_state_ratio as charge_state_ratio
 from .post_ionisation import field_of_ratio as field_of_ratio
+from .roll_probability import ChargeRatio as ChargeRatio
+from .roll_probability import Migration as Migration
+from .roll_probability import RollProbability as RollProbability
 from .surface_frame import launch_tangentially as launch_tangentially
 from .surface_frame import roll_ups as roll_ups
 from .surface_frame import rollup_direction as rollup_direction

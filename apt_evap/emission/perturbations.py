@@ -12,9 +12,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from apt_evap._common.codec import from_plain, is_settings, number, part, settings, to_plain, to_python
-from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_number
-from apt_evap._core.elementary import exponential, sine_and_cosine
+from apt_evap._core.elementary import sine_and_cosine
 from apt_evap.emission.emissions import Emissions, Launches, TangentialLaunches
 from apt_evap.emission.energies import (
     DISTRIBUTIONS,
@@ -26,6 +25,7 @@ from apt_evap.emission.energies import (
     draw_energies,
 )
 from apt_evap.emission.ion_random import IonRandom
+from apt_evap.emission.roll_probability import ChargeRatio, Migration, RollProbability
 from apt_evap.emission.surface_frame import (
     launch_tangentially,
     roll_ups,
@@ -36,7 +36,6 @@ from apt_evap.emission.surface_frame import (
 from apt_evap.units import speed_from_energy
 
 __all__ = [
-    "ChargeRatio",
     "Combined",
     "Emissions",
     "Fixed",
@@ -44,7 +43,6 @@ __all__ = [
     "LateralVelocity",
     "Launches",
     "Perturbation",
-    "RollProbability",
     "RollUp",
     "TangentialLaunches",
     "TangentialPerturbation",
@@ -80,44 +78,6 @@ class TangentialPerturbation(Perturbation, Protocol):
         These three as a tuple, or with shares of targets and heights as `TangentialLaunches`.
         """
         ...
-
-
-class RollProbability(Protocol):
-    """Interface of a probability that an ion rolls up."""
-
-    def probabilities(self, emissions: Emissions) -> Floats:
-        """Probability of each ion of a batch, from 0 to 1, shape (n,)."""
-        ...
-
-
-@settings
-class ChargeRatio:
-    """Probability of a roll-up by the charge of the strongest neighbour over that of the atom.
-
-    Notes
-    -----
-    p = 1 / (1 + exp(-(ratio - threshold) / width)).
-    """
-
-    threshold: float = number(
-        "Ratio at which half of the atoms roll up. In runs of fcc and bcc tips the median ratio is about 0.9.",
-        at_least=0,
-        at_most=10,
-    )
-    width: float = number("Width of the transition; 0 for a step.", default=0.0, at_least=0, at_most=10)
-
-    def probabilities(self, emissions: Emissions) -> Floats:
-        """Probability of each ion, shape (n,); 0 without a neighbour. ValueError if the emissions have no targets."""
-        if emissions.charge_ratios is None:
-            raise ValueError(
-                "ChargeRatio needs the charges of the neighbours, which this run does not have: run with "
-                "response_settings=ResponseSettings.wide()"
-            )
-        ratios = emissions.charge_ratios[:, 0, 0]
-        excess = np.where(np.isfinite(ratios), ratios, 0.0) - self.threshold
-        if self.width == 0.0:
-            return (excess > 0).astype(float)
-        return 1.0 / (1.0 + exponential(np.clip(-excess / self.width, -700.0, 700.0)))
 
 
 _HEIGHT = "Height of the start above the site, of a rolled ion above p_r. Above 0 it needs `ResponseSettings.wide`."
@@ -172,8 +132,9 @@ class _Rolling(_Tangential):
     """Base of the perturbations with a roll-up, and their options."""
 
     probability: RollProbability | float = part(
-        "Probability that an ion rolls up: one number, or an object such as `ChargeRatio`.",
+        "Probability that an ion rolls up: one number, or an object such as `ChargeRatio` and `Migration`.",
         ChargeRatio,
+        Migration,
         default=1.0,
         check=_probability,
         kind="float or RollProbability",

@@ -37,6 +37,7 @@ EXAMPLES = [
     ae.Unperturbed(0.1),
     ae.LateralVelocity(0.2),
     ae.RollUp(ae.emission.Thermal(20.0), ae.emission.ChargeRatio(0.9, 0.05), others=0.1, second_roll=0.2),
+    ae.RollUp(0.2, ae.emission.Migration(4.44, 35.0, temperature=60.0)),
     ae.Combined(0.2, 0.75, sharpness=0.4),
     ae.evaporation.ChargeSettings(tolerance=1e-3, sweep_interval=50),
     ae.FlightSettings(reach=2000.0),

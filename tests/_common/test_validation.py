@@ -609,6 +609,7 @@ CASES = [
         },
     ),
     (ae.emission.ChargeRatio, {"threshold": 0.9}, {}),
+    (ae.emission.Migration, {"cohesive_energy": 4.44, "field": 35.0}, {}),
     (
         ae.flight.WideDesign,
         {"place": 1, "velocity": 2, "height": 1, "mixed": 2},

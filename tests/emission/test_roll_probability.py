@@ -1,0 +1,91 @@
+"""The law of migration: its equation, its limits, and the electrostatics behind it."""
+
+import math
+import runpy
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from apt_evap.emission import Emissions, Migration
+from apt_evap.emission.roll_probability import AT_REST, BY_CHARGE
+from apt_evap.units import BOLTZMANN, ELEMENTARY_CHARGE
+
+SCRIPT = Path(__file__).parents[2] / "articles" / "three_metals" / "migration.py"
+
+
+def emissions_with(ratios):
+    """Emissions whose strongest neighbours have these charges."""
+    n = len(ratios)
+    of_targets = np.full((n, 1, 3), np.nan)
+    of_targets[:, 0, 0] = ratios
+    return Emissions(
+        positions=np.zeros((n, 3)),
+        normals=np.tile([0.0, 0.0, 1.0], (n, 1)),
+        neighbours=np.zeros((n, 3)),
+        charge_states=np.ones(n, int),
+        masses=np.ones(n),
+        ions=np.arange(n),
+        nearest_neighbour_distance=0.25,
+        targets=np.zeros((n, 1, 3, 3)),
+        charge_ratios=of_targets,
+    )
+
+
+def test_the_probability_is_that_of_two_barriers():
+    """Written once more with joules and metres, atom by atom."""
+    law = Migration(4.44, 35.0, 300.0, bonds_lost=0.4, polarizability=9e-41)
+    ratios = np.linspace(0.4, 1.2, 33)
+    expected = []
+    for ratio in ratios:
+        charge = AT_REST + BY_CHARGE * ratio
+        field = 35e9  # V/m
+        hop = 0.4 * 4.44 * ELEMENTARY_CHARGE - 0.5 * 9e-41 * field**2 * (charge**2 - 1)
+        kt = BOLTZMANN * ELEMENTARY_CHARGE * 300.0
+        expected.append(1 / (1 + math.exp((hop - 28 * kt) / kt)))
+    expected = np.array(expected)
+    assert expected.min() < 0.01 and expected.max() > 0.99
+    np.testing.assert_allclose(law.probabilities(emissions_with(ratios)), expected, rtol=1e-9)
+    at = law.probabilities(emissions_with([law.threshold, law.threshold + 0.1, np.nan]))
+    assert at[0] == pytest.approx(0.5) and at[1] > 0.95 and at[2] == 0.0
+
+
+def test_limits():
+    law = Migration(4.44, 35.0, 60.0)
+    cold = emissions_with(law.threshold + np.array([-0.02, 0.02]))
+    np.testing.assert_allclose(law.probabilities(cold), [0.0, 1.0], atol=1e-3)  # a step, not a coin
+    usual = emissions_with(np.linspace(0.3, 1.1, 9))
+    assert (replace(law, field=1.0).probabilities(usual) < 1e-100).all()  # no gain
+    assert (replace(law, field=150.0).probabilities(usual) > 0.999).all()
+    assert (replace(law, cohesive_energy=0.1).probabilities(usual) > 0.999).all()  # costs less than to leave
+    assert replace(law, cohesive_energy=0.1).threshold == 0.0
+    thresholds = [replace(law, temperature=t).threshold for t in (20.0, 80.0, 150.0)]
+    assert thresholds == sorted(thresholds, reverse=True)  # warm atoms hop more easily
+    doubled = replace(law, polarizability=2e-40, cohesive_energy=8.88, temperature=1e-3)
+    assert doubled.threshold == pytest.approx(replace(law, temperature=1e-3).threshold, rel=1e-5)  # only their ratio
+
+
+def test_three_metals():
+    """Tungsten rolls, aluminium does not: ratios of real surfaces are 0.4 to 1.0."""
+    tungsten, nickel, aluminium = Migration(8.90, 57.0), Migration(4.44, 35.0), Migration(3.39, 19.0)
+    assert tungsten.threshold == pytest.approx(0.66, abs=0.005)  # selected
+    assert tungsten.threshold < nickel.threshold < 0.9
+    assert aluminium.threshold > 1.2
+
+
+def test_it_needs_the_neighbours():
+    lonely = replace(emissions_with([0.5]), targets=None, charge_ratios=None)
+    with pytest.raises(ValueError, match=r"Migration needs the charges .*ResponseSettings\.wide"):
+        Migration(4.44, 35.0).probabilities(lonely)
+
+
+@pytest.mark.parametrize("metal", ["Ni", "W"])
+def test_the_charge_after_a_roll_up(metal):
+    """The line over the charge ratio, against solved charges: fcc and bcc at R = 12 a."""
+    ratio, charge, field = runpy.run_path(str(SCRIPT))["rolled"](metal, 12, 40, 500).T
+    line = AT_REST + BY_CHARGE * ratio
+    assert np.corrcoef(ratio, charge)[0, 1] > 0.8
+    assert np.std(charge - line) < 0.1
+    assert abs(np.mean(charge - line)) < 0.2  # lower on small tips: 0.03 at R = 40 a, 0.01 at 80 a
+    assert (field > 1.0).all()
