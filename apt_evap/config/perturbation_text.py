@@ -4,7 +4,7 @@ import tomllib
 from collections.abc import Mapping
 from typing import Any
 
-from apt_evap._common.codec import declared, to_plain
+from apt_evap._common.codec import declared, is_settings, to_plain, to_python
 from apt_evap._common.validation import short_text
 from apt_evap.config.toml_text import inline
 from apt_evap.emission.energies import Fixed, Thermal, TruncatedNormal
@@ -112,9 +112,13 @@ def title_of(perturbation: Any) -> str:
     for option in to_plain(perturbation, short=True):  # those that are not the default
         if option in fields and option not in ("energy", "rollup_fraction"):
             value, unit = getattr(perturbation, option), fields[option].unit
-            text = f"{value:g}" if isinstance(value, float) else _energy_text(value) or str(value)
+            text = f"{value:g}" if isinstance(value, float) else _energy_text(value) or _short(value)
             parts.append(" ".join(filter(None, (_WORDS.get(option, option.replace("_", " ")), text, unit))))
     return ", ".join(filter(None, parts))
+
+
+def _short(value):
+    return to_python(value, "") if is_settings(value) else str(value)
 
 
 def _energy_text(energy):

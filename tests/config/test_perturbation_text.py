@@ -46,7 +46,11 @@ def test_text_and_python_are_read_back(perturbation, text, python):
         (ae.RollUp(0.2, 0.5, others=ae.emission.Thermal(50)), "roll-up, 0.2 eV, probability 0.5, others 50 K"),
         (
             ae.RollUp(0.2, ae.emission.ChargeRatio(0.9)),
-            "roll-up, 0.2 eV, probability ChargeRatio(threshold=0.9, width=0.0)",
+            "roll-up, 0.2 eV, probability ChargeRatio(0.9)",
+        ),
+        (
+            ae.RollUp(0.2, ae.emission.Migration(4.44, 35.0)),
+            "roll-up, 0.2 eV, probability Migration(4.44, 35.0)",
         ),
         (ae.Unperturbed(0.1), "unperturbed, height 0.1 nm"),
     ],
