@@ -22,7 +22,7 @@ from apt_evap.emission.perturbations import LateralVelocity, RollUp
 from apt_evap.indexing.index import Candidate
 from apt_evap.indexing.master_pattern import master_patterns
 from apt_evap.io.formats import read_ranges
-from apt_evap.registration.register import register
+from apt_evap.registration.register import at_bound, register
 from apt_evap.report.measurement import measurement_section
 from apt_evap.report.page import Page
 from apt_evap.simulation.run import load
@@ -34,7 +34,6 @@ from apt_evap.warnings import RegistrationWarning
 SETTINGS, FACTS, RUN, REGISTRATION, STUDY, ANSWER = (
     "specimen.toml", "start.json", "run.h5", "registration.json", "study", "answer.txt",
 )  # fmt: skip
-_AT_BOUND = 0.01  # of the range
 _LARGEST = 1 << 24  # bytes of start.json
 _FRACTIONS = "0.2,0.4,0.6,0.8,1"  # that roll up, in the fit
 
@@ -104,7 +103,7 @@ def _registered(hits, measured_map, bounds):
         warnings.simplefilter("always", RegistrationWarning)
         found = register(hits, measured_map, **bounds)
     low, high = bounds["scales"]
-    if min(found.scale - low, high - found.scale) < _AT_BOUND * (high - low):
+    if at_bound(found.scale, (low, high)):
         # poles of a smaller tip are wider, and a smaller scale makes them narrower again
         say("note", f"the maps do not determine the scale of the registration within {low:g} to {high:g}: "
                     "that of the indexing is kept")  # fmt: skip

@@ -117,6 +117,11 @@ class Orientation:
         axis, rotation = (settings[name] if matrix[name] is None else matrix[name] for name in ("axis", "rotation"))
         return cls(matrix["material"], tuple(axis), rotation)
 
+    @classmethod
+    def known(cls, settings: Mapping[str, Any]) -> Orientation | None:
+        """Make the orientation as `from_settings`; None for a tip made from positions."""
+        return cls.from_settings(settings) if "axis" in settings else None
+
     def directions(self, crystal_directions: ArrayLike) -> Floats:
         """Rotate vectors from the frame of the crystal to the frame of the specimen, both of shape (n, 3)."""
         return check_array(crystal_directions, "crystal_directions", ("n", 3)) @ self.matrix.T

@@ -44,7 +44,7 @@ def examples_of(run: Run, point: Point, settings: DatasetSettings, split: str) -
     list of dict
     """
     real = run.at_evaporation_field() if run.units is None else run
-    orientation = Orientation.from_settings(run.settings["tip"]) if "axis" in run.settings["tip"] else None
+    orientation = Orientation.known(run.settings["tip"])
     projection = _projection(real) if orientation is not None else None
     about = {
         "run": point.key,

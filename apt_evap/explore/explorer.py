@@ -479,9 +479,8 @@ class Explorer:
     @cached_property
     def _pole(self):
         """Label, direction in the specimen and symmetry of the pole nearest to the axis."""
-        tip = self.run.settings["tip"]
-        if "axis" in tip:
-            orientation = Orientation.from_settings(tip)
+        orientation = Orientation.known(self.run.settings["tip"])
+        if orientation is not None:
             family = poles(orientation.material)
             directions = orientation.directions(family.normals)
             nearest = int(directions[:, 2].argmax())
@@ -536,12 +535,11 @@ class Explorer:
         """Whether both maps show the same crystal along the same axis, see `likeness`, and lie on each other."""
         assert shown.simulated is not None and shown.measured is not None and self.registration is not None
         arguments = shown.simulated, shown.measured, self.registration
-        tip = self.run.settings["tip"]
         try:
             projection = self._projection
         except ValueError:  # too few ions
             projection = None
-        orientation = Orientation.from_settings(tip) if "axis" in tip else None
+        orientation = Orientation.known(self.run.settings["tip"])
         found = likeness(*arguments, about=symmetric_places(orientation, projection))
         if found.verdict == "alike" and (why := misplaced(*arguments)):
             return found._replace(verdict="doubtful", reason=f"{found.reason}, but {why}: check the registration")

@@ -141,7 +141,7 @@ class FoldedComparison(Comparison):
 
     the correlation times 2 / (σ_x/σ_y + σ_y/σ_x): 1 for the same lines with the same contrast, 0 for none, negative
     for lines of the other sign (Lin, Biometrics 45, 255 (1989); the form of the noise correction is that of the
-    similarity). Lines of the measured contrast are best wherever they are, so blur does not win.
+    similarity). Lines of the measured contrast are best wherever they are, so blurring is not rewarded.
 
     Parameters
     ----------

@@ -35,7 +35,7 @@ class FitSettings:
     )
     objective: str = choice(
         'What is compared: "similarity", the structural similarity of both maps place by place, or "folded", the '
-        "concordance of both maps folded about a pole (`FoldedComparison`), which blur cannot win.",
+        "concordance of both maps folded about a pole (`FoldedComparison`), which does not reward blurring.",
         ("similarity", "folded"),
         default="similarity",
     )

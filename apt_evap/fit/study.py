@@ -134,8 +134,9 @@ class Study:
     maps : dict of DetectorMap
         Simulated maps in the measured frame: "unperturbed", "thermal", "optimum".
     structure : StructureScores or None
-        Second objective, which blur cannot win: contrast of the zone lines and darkness of a pole. None if no pole with
-        its rings is inside the compared region; ``provenance["structure"]`` contains the reason.
+        Second objective, which does not reward blurring: contrast of the zone lines and darkness of
+        a pole. None if no pole with its rings is inside the compared region; ``provenance["structure"]`` contains the
+        reason.
     settings : FitSettings
         Settings of the comparison, the random draws and the resampling.
     provenance : dict
@@ -174,9 +175,8 @@ class Study:
 
     @property
     def orientation(self) -> Orientation | None:
-        """Orientation of the simulated crystal; None for a specimen that is none."""
-        tip = self.provenance["run"]["tip"]
-        return Orientation.from_settings(tip) if "axis" in tip else None
+        """Orientation of the simulated crystal; None for a specimen made from positions."""
+        return Orientation.known(self.provenance["run"]["tip"])
 
     @property
     def projection(self) -> RegisteredProjection | None:

@@ -585,6 +585,11 @@ def _near(start, pole, tolerance, measured):
     return Near(anchor, place, check_number(tolerance, "tolerance", at_least=0, unit="mm"))
 
 
+def at_bound(value: float, ends: tuple[float, float]) -> bool:
+    """Whether a result of a search lies within 1 % of its range from one of the ends."""
+    return min(value - ends[0], ends[1] - value) < _AT_BOUND * (ends[1] - ends[0])
+
+
 def _bounds_reached(transform, rotations, scales, near):
     """What of a transform is within 1 % of a bound of the search, in words."""
     found = []
@@ -593,7 +598,7 @@ def _bounds_reached(transform, rotations, scales, near):
             low, high = ends
             if name == "rotation":
                 value = low + (value - low + 180.0) % 360.0 - 180.0 if value < low or value > high else value
-            if min(value - low, high - value) < _AT_BOUND * (high - low):
+            if at_bound(value, ends):
                 found.append(f"{name} {value:.4g} of {low:.4g} to {high:.4g}")
     if near is not None and near.tolerance > 0:
         away = transform.forth(near.anchor) - near.place

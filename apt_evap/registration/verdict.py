@@ -74,7 +74,7 @@ def likeness(
         Transform into the measured frame.
     about : sequence of array_like
         Places of poles in the simulated frame [mm], shape (2,) each: the symmetries are compared about the first one
-        around which both maps are known. By default the axis of the specimen, which has no symmetry if it is no pole.
+        around which both maps are known. By default the axis of the specimen; without a pole there it has no symmetry.
     seed : int
         Seed of the random halves of the measured counts.
 

@@ -53,6 +53,7 @@ def test_an_orientation_goes_straight_into_a_tip():
     orientation = Orientation.from_matrix("Ni", Rotation.from_rotvec([0.3, -0.7, 1.1]).as_matrix())
     tip = Tip("Ni", 2.0, axis=orientation.axis, rotation=orientation.rotation)
     assert Orientation.from_settings(json.loads(json.dumps(tip.settings))) == orientation
+    assert Orientation.known(tip.settings) == orientation and Orientation.known({"atoms": 3}) is None
     # atoms of one row of nearest neighbours in the crystal are so in the tip
     step = orientation.matrix @ [0, 0.176, 0.176]
     origin = np.argmin(np.linalg.norm(tip.positions, axis=1))
