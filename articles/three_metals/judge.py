@@ -55,7 +55,7 @@ def measured_of(metal, path):
         candidate = found.candidates[metal == "Al-2"]
         print(candidate)
         return found.map, candidate.orientation, candidate.projection
-    ions = ae.read(path)
+    ions = path if isinstance(path, ae.Hits) else ae.read(path)
     map = ions.map(bins=256)
     found = ae.index(map, metal, distance=305.0)
     print(found)
@@ -153,12 +153,17 @@ def map_of(run, emission):
     return ae.DetectorMap.from_array(counts, edges, edges, is_counts=True, mask=seen)
 
 
+def names_of(run):
+    """Names of the emissions of a run of `runs.py`."""
+    return ("unperturbed", "law of migration") if len(run.perturbations) == 2 else EMISSIONS
+
+
 def simulated_maps(run, metal):
     """Folded densities of every emission of a run."""
     projection, orientation = projection_of(run), ae.Orientation.from_settings(run.settings["tip"])
     return {
         name: folded(map_of(run, emission), orientation, projection, metal)
-        for name, emission in zip(EMISSIONS, run.perturbations, strict=True)
+        for name, emission in zip(names_of(run), run.perturbations, strict=True)
     }
 
 
@@ -180,6 +185,8 @@ def main():
         simulated = simulated_maps(run, metal)
         for name, each in simulated.items():
             row(name, each, target, metal)
+        if len(simulated) == 2:
+            continue
         for name in ("sharpness 0.15", "sharpness 0.4", "sharpness 2", "sharpness 0.4, height 0.2"):
             others = simulated["lateral, height 0.2" if name.endswith("height 0.2") else "lateral"]
             for part in FRACTIONS:

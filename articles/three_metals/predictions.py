@@ -13,8 +13,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from judge import map_of, projection_of
 
 import apt_evap as ae
+from apt_evap.crystallography import poles
 
 ENERGY, HEIGHT, SHARPNESS = 0.2, 0.2, 2.0  # eV, nm
 FIELD_OF_VIEW = 28.0  # degrees, half angle
@@ -72,6 +74,75 @@ def simulated(case, ions, threads):
     return simulation.run(ions, [ae.Unperturbed(), *rolls], responses=False, progress=False)
 
 
+def lines_about(pole, normals, labels):
+    """Directions of lines from a pole: those of one kind of azimuth together, named by the poles on them."""
+    groups = {}
+    cosines = normals @ pole
+    first = np.linalg.svd(pole[None])[2][1]
+    azimuths = np.degrees(np.arctan2(normals @ np.cross(pole, first), normals @ first)) % 360
+    for family in dict.fromkeys(labels):
+        for angle in np.unique(np.round(cosines[labels == family], 6)):
+            if not np.cos(np.radians(60)) < angle < np.cos(np.radians(4)):
+                continue
+            chosen = (labels == family) & (np.round(cosines, 6) == angle)
+            key = tuple(sorted({round(each) % 360 for each in azimuths[chosen]}))
+            groups.setdefault(key, ([], normals[chosen]))[0].append((np.degrees(np.arccos(angle)), family))
+    return [(", ".join(name for _, name in sorted(names)[:2]), toward) for names, toward in groups.values()]
+
+
+def across(map, projection, pole, toward, outer):
+    """Density on the line, 1 to 2 degrees beside it, and their errors, over that 3 to 6 degrees beside it."""
+    profile = ae.maps.pole_line_profile(map, projection, pole, toward, inner=4, outer=outer, width=12, bins=36)
+    away = np.abs(profile.position)
+    parts = []
+    for low, high in ((0, 0.67), (1, 2), (3, 6)):
+        chosen = (away >= low) & (away < high) & np.isfinite(profile.density)
+        mean = profile.density[chosen].mean()
+        parts.append((mean, np.sqrt(np.sum(profile.error[chosen] ** 2)) / np.count_nonzero(chosen)))
+    ground, error = parts[2]
+    return [(mean / ground, np.hypot(own, mean / ground * error) / ground) for mean, own in parts[:2]]
+
+
+def statement(line, flank):
+    """A line in a word."""
+    (centre, error), (side, side_error) = line, flank
+    if centre > 1.1 and centre - 1 > 3 * error:
+        return "bright"
+    if side < 0.9 and centre - side > max(0.1, 3 * np.hypot(error, side_error)):
+        return "dark doublet"
+    if centre < 0.9 and 1 - centre > 3 * error:
+        return "dark"
+    return "nothing"
+
+
+def judged(name, path):
+    """Print what the map of a run shows."""
+    case, run = CASES[name], ae.load(path)
+    orientation, projection = ae.Orientation.from_settings(run.settings["tip"]), projection_of(run)
+    found = poles(orientation.material, 10)
+    labels = np.array(["{" + "".join(str(each) for each in np.sort(np.abs(plane))) + "}" for plane in found.planes])
+    normals = orientation.directions(found.normals)
+    away = np.degrees(np.arccos(np.clip(normals[:, 2], -1, 1)))
+    near = [int(each) for each in np.argsort(away)[:2] if away[each] < 8] or [int(np.argmin(away))]
+    rows = run.perturbations
+    names = ["unperturbed", *(f"rule at {each:g} K, {part:.0%} roll" for each, part in zip(
+        case.temperatures, [law.probabilities(run.emissions[~run.not_flown]).mean() for law in laws(case)], strict=True
+    ))]  # fmt: skip
+    for rule, text in zip(rows, names, strict=True):
+        shown = map_of(run, rule)
+        for index in near:
+            pole, outer = normals[index], FIELD_OF_VIEW - 2 - away[index]
+            profile = ae.maps.pole_profile(shown, projection, pole, np.arange(0, min(outer, 14), 1.0))
+            radial = " ".join(f"{each:.2f}" for each in profile.density[:8])
+            print(f"{name}, {text}: {labels[index]}, density by degree {radial}")
+            if rule is rows[0] and len(rows) > 1:
+                continue
+            for towards, directions in lines_about(pole, normals, labels):
+                line, flank = across(shown, projection, pole, directions, min(outer, 16))
+                print(f"    {towards:16} on the line {line[0]:.2f} +- {line[1]:.2f}, beside it {flank[0]:.2f} +- "
+                      f"{flank[1]:.2f}: {statement(line, flank)}")  # fmt: skip
+
+
 def main():
     """Simulate, or print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -86,6 +157,8 @@ def main():
         path = options.runs / f"{name.replace(' ', '_')}.h5"
         if options.what == "simulate" and not path.exists():
             simulated(CASES[name], options.ions, options.threads).save(path)
+        if options.what == "judge" and path.exists():
+            judged(name, path)
 
 
 if __name__ == "__main__":

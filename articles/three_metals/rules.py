@@ -1,6 +1,6 @@
 """Rules of emission on one run with wide responses, against a measured map: no rule needs a new run.
 
-    python runs.py RUNS W 160 --ions 200000 --wide
+    python runs.py RUNS W 160 --ions 200000 --fly wide
     python rules.py W W3.epos RUNS/W_160_others_1_wide.h5
 
 The lines of the table are those of `judge.py`. A rule with a threshold rolls up the atoms whose strongest neighbour has
@@ -12,12 +12,37 @@ import warnings
 
 import numpy as np
 from judge import METALS, folded, map_of, measured_of, projection_of, row
-from runs import HEIGHT
+from runs import HEIGHT, migration
 
 import apt_evap as ae
 
 STEP = 0.01
 """Width of the threshold of a charge ratio."""
+
+
+FREE_ATOMS = {"W": 12.4e-40, "Ni": 6.8e-40, "Al": 9.8e-40}
+"""Polarisabilities of free atoms [F m^2]: `ae.material`; tungsten: Schwerdtfeger and Nagle, Mol. Phys. 117, 1200."""
+
+
+def laws(name):
+    """Thresholds of laws of rolling for a metal, each with its one constant from tungsten: threshold 0.66."""
+    tungsten, metal = migration("W"), migration(name)
+
+    def cost(law):  # of the hop, less the barrier of evaporation
+        return law.bonds_lost * law.cohesive_energy - 28.0 * ae.units.BOLTZMANN * law.temperature
+
+    def threshold(start, slope, tungsten_atom=1.0, metal_atom=1.0):
+        """The line of `migration.py`, and the polarisabilities of the atoms; that of tungsten fixes their unit."""
+        gained = (start + slope * tungsten.threshold) ** 2 - 1.0
+        gained *= cost(metal) / cost(tungsten) * tungsten.field**2 * tungsten_atom / (metal.field**2 * metal_atom)
+        return ((gained + 1.0) ** 0.5 - start) / slope
+
+    return {
+        "migration": metal.threshold,
+        "migration, field of the others": threshold(1.075, 0.358),
+        "migration, free atoms": threshold(1.27, 1.54, FREE_ATOMS["W"], FREE_ATOMS[name.partition("-")[0]]),
+        "one charge ratio": tungsten.threshold,
+    }
 
 
 def rolled(energy, *, probability=1.0, sharpness=0.4, height=2 * HEIGHT, others=None):
@@ -27,9 +52,15 @@ def rolled(energy, *, probability=1.0, sharpness=0.4, height=2 * HEIGHT, others=
     return ae.RollUp(spread, probability, sharpness, height, others=rest)
 
 
-def rules(scale):
+def rules(name, scale):
     """Rules by name; `scale` is the simulated energy per real energy."""
     found = {"unperturbed": ae.Unperturbed()}
+    for law, threshold in laws(name).items():
+        given = migration(name) if law == "migration" else ae.emission.ChargeRatio(threshold, 0.0015)
+        found[f"{law}, {threshold:.2f}"] = rolled(0.2 * scale, probability=given, sharpness=2.0)
+    for temperature in (20.0, 150.0):
+        law = migration(name, temperature=temperature)
+        found[f"migration at {temperature:g} K"] = rolled(0.2 * scale, probability=law, sharpness=2.0)
     for energy in (0.1, 0.2, 0.35, 0.7, 1.2):
         found[f"all, {energy:g} eV"] = rolled(energy * scale)
     for sharpness in (0.05, 0.15, 0.8):
@@ -67,8 +98,8 @@ def main():
     ratios = run.emissions.charge_ratios[:, 0, 0]
     projection, orientation = projection_of(run), ae.Orientation.from_settings(run.settings["tip"])
     scale = float(np.median(run.at_evaporation_field().energy_scales))
-    for name, rule in rules(scale).items():
-        threshold = getattr(getattr(rule, "probability", None), "threshold", None)
+    for name, rule in rules(options.metal, scale).items():
+        threshold = getattr(getattr(rule, "probability", None), "threshold", None)  # of a charge ratio, or a law
         part = "" if threshold is None else f" ({np.mean(ratios > threshold):.2f} roll)"
         row(name + part, folded(map_of(run, rule), orientation, projection, metal), target, metal)
 

@@ -5,7 +5,8 @@
 One file for each metal, radius, rule and seed, `W_160_others_1.h5`; a file that is there is not made again. All atoms
 evaporate, only ions that can arrive in the measured field of view fly. Every emission is flown for the same ions, in
 the exact field. Energies are 0.35 eV in real units, sigma/mean 1, launches 0.1 nm above the site unless the name says
-otherwise. With --wide, each ion gets its responses instead (`_wide.h5`), for any emission afterwards (`rules.py`).
+otherwise. With --fly wide, each ion gets its responses instead (`_wide.h5`), for any emission afterwards (`rules.py`);
+with --fly law, only the one rule for all metals is flown (`_law.h5`).
 """
 
 import argparse
@@ -24,6 +25,8 @@ AXES = {
     "Al": ((0.31, 0.61, 0.73), 26.7),
     "Al-2": ((0.39, 0.50, 0.77), 24.0),
 }
+COHESIVE_ENERGIES = {"W": 8.90, "Ni": 4.44, "Al": 3.39}
+"""[eV], Kittel, Introduction to Solid State Physics."""
 RULES = {
     "others": ae.ConstantPotential(law_field="others"),
     "charge": ae.ConstantPotential(),
@@ -50,7 +53,19 @@ def emissions(scale):
     ]
 
 
-def simulated(metal, radius, rule, seed, skip, ions, threads, wide):
+def migration(name, **changes):
+    """The law of migration for one of the metals."""
+    name = name.partition("-")[0]
+    return ae.emission.Migration(COHESIVE_ENERGIES[name], ae.material(name).evaporation_field, **changes)
+
+
+def one_law(name, scale):
+    """Unperturbed, and the one rule for all metals."""
+    energy = ae.TruncatedNormal(0.2 * scale, 0.2 * scale)
+    return [ae.Unperturbed(), ae.RollUp(energy, migration(name), 2.0, 2 * HEIGHT, others=energy)]
+
+
+def simulated(metal, radius, rule, seed, skip, ions, threads, kind):
     """Run of one specimen; the second one has other atoms at the apex."""
     axis, half_angle = AXES[metal]
     material = ae.material(metal.partition("-")[0])
@@ -65,9 +80,10 @@ def simulated(metal, radius, rule, seed, skip, ions, threads, wide):
     simulation = ae.Simulation(tip, flight_settings=seen, **common)
     for _ in simulation.emitter.advance(skip):
         pass
-    if wide:
+    if kind == "wide":
         return simulation.run(ions, progress=False)
-    return simulation.run(ions, emissions(scale), responses=False, progress=False)
+    flown = one_law(metal, scale) if kind == "law" else emissions(scale)
+    return simulation.run(ions, flown, responses=False, progress=False)
 
 
 def main():
@@ -81,14 +97,15 @@ def main():
     parser.add_argument("--skip", type=int, default=110_000, help="events before the first ion that flies")
     parser.add_argument("--ions", type=int, default=300_000)
     parser.add_argument("--threads", type=int)
-    parser.add_argument("--wide", action="store_true", help="responses instead of flights of emissions")
+    kinds = ("emissions", "wide", "law")
+    parser.add_argument("--fly", choices=kinds, default=kinds[0], help="eight emissions, responses, or the one law")
     options = parser.parse_args()
-    name = f"{options.metal}_{options.radius}_{options.rule}_{options.seed}{'_wide' * options.wide}.h5"
-    path = options.runs / name
+    kind = "" if options.fly == kinds[0] else f"_{options.fly}"
+    path = options.runs / f"{options.metal}_{options.radius}_{options.rule}_{options.seed}{kind}.h5"
     options.runs.mkdir(parents=True, exist_ok=True)
     if not path.exists():
         arguments = options.metal, options.radius, options.rule, options.seed, options.skip, options.ions
-        simulated(*arguments, options.threads, options.wide).save(path)
+        simulated(*arguments, options.threads, options.fly).save(path)
 
 
 if __name__ == "__main__":

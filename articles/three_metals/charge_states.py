@@ -1,0 +1,136 @@
+"""Charge states by place: W4+/W3+ towards {200}, towards {222} and elsewhere, measured and from the fields of runs.
+
+    python charge_states.py W_tap.raw RUNS/W_160_others_1_wide.h5 RUNS/W_160_charge_1_wide.h5 RUNS/W_160_Robin_1.h5
+
+An ion can lose another electron on the first nanometre of its flight. The events of a run are repeated, and the field
+just after each event is taken on the way of its ion, at some heights above its start. Kingham's curves turn the fields
+into ratios; one factor for all fields makes the ratio elsewhere the measured one, the two others are predictions.
+"""
+
+import argparse
+import warnings
+from pathlib import Path
+
+import numpy as np
+from judge import METALS, measured_of, projection_of
+from rules import rolled
+from runs import RULES
+from scipy.optimize import brentq
+
+import apt_evap as ae
+
+HEIGHTS = (0.0, 0.2, 0.4, 0.7, 1.0)  # nm above the start
+NEAR, FIRST = 1.7, 3.0  # degrees: half the width of a strip, and where it begins
+NAMES = ("towards {200}", "towards {222}", "elsewhere")
+
+
+def regions(directions, orientation):
+    """Masks of directions within the strips from [011] towards the {200} and the {222} poles, and of the rest."""
+    pole, _, toward = orientation.nearest_pole((0, 1, 1))
+    pole = np.asarray(pole) / np.linalg.norm(pole)
+    first = toward - np.dot(toward, pole) * pole  # towards [100], with {222} on the way
+    first = first / np.linalg.norm(first)
+    angle = np.degrees(np.arccos(np.clip(directions @ pole, -1, 1)))
+    azimuth = np.arctan2(directions @ np.cross(pole, first), directions @ first)
+    along, across = angle * np.cos(azimuth), angle * np.sin(azimuth)
+    inside = (angle > FIRST) & (angle < METALS["W"].reach)
+    strips = inside & (np.abs(along) < NEAR), inside & (np.abs(across) < NEAR)
+    return *strips, inside & ~strips[0] & ~strips[1]
+
+
+def measured(path):
+    """Print the measured ratios; returns that elsewhere."""
+    ions = ae.read(path)
+    length = np.hypot(305.0, np.hypot(ions.x, ions.y)) * ae.units.NM_PER_MM
+    time = ions.time_of_flight - 38.5  # ns, so that the peak of 184 W3+ is at 61.3 Da
+    ratio = ions.voltage * (ae.units.SPEED * time / length) ** 2
+    three, four = (ratio > 59) & (ratio < 62.6), (ratio > 45.2) & (ratio < 46.8)
+    beside = ((ratio > 43) & (ratio < 44.6)) | ((ratio > 47.4) & (ratio < 49.0))
+    _, orientation, projection = measured_of("W", ions[three])
+    found = []
+    for name, region in zip(
+        NAMES, regions(projection.directions(np.column_stack([ions.x, ions.y])), orientation), strict=True
+    ):
+        n, peak, ground = (np.count_nonzero(region & each) for each in (three, four, beside))
+        found.append((peak - ground / 2) / n)
+        print(f"measured {name}: {found[-1]:.4f} +- {np.sqrt(peak + ground / 4) / n:.4f}")
+    return found[-1]
+
+
+def fields_on_the_way(run, skip, starts, chosen):
+    """Fields at `HEIGHTS` above places of chosen ions [V/nm, at the voltage of the run], shape (n, places, heights).
+
+    `starts` has the shape (ions, places, 3); the events of the run are repeated.
+    """
+    rule = RULES[run.settings["rule"].get("law_field", "Robin")]
+    specimen = ae.Tip.from_settings(run.settings["tip"])
+    emitter = ae.evaporation.Emitter(specimen, run.voltage, n_threads=1, rule=rule)
+    emissions, found = run.emissions, np.full((len(run), starts.shape[1], len(HEIGHTS)), np.nan)
+    for _ in emitter.advance(skip):
+        pass
+    row = 0
+    for event in emitter.advance(len(run), batch_size=1):
+        if len(event) == 0:
+            continue
+        if row % 10_000 == 0:
+            np.testing.assert_allclose(emitter.tip.positions[event.site[0]], emissions.positions[row], atol=1e-9)
+        if chosen[row]:
+            points = starts[row][:, None] + np.outer(HEIGHTS, event.normals[0])
+            fields = emitter.field_at(points.reshape(-1, 3))
+            found[row] = np.linalg.norm(fields, axis=1).reshape(found[row].shape)
+        row += 1
+        if not chosen[row:].any():
+            break
+    return found[chosen]
+
+
+def simulated(path, skip, most, elsewhere):
+    """Print the ratios of a run at every height."""
+    run = ae.load(path)
+    scale = float(np.median(run.at_evaporation_field().energy_scales))
+    law = ae.emission.Migration(8.90, 57.0)
+    emission = run.perturbations[-1] if run.perturbations else rolled(0.2 * scale, probability=law, sharpness=2.0)
+    hits, projection = run.hits(emission), projection_of(run)
+    orientation = ae.Orientation.from_settings(run.settings["tip"])
+    directions = projection.directions(np.where(hits.detected[:, None], np.column_stack([hits.x, hits.y]), 0.0))
+    masks = [hits.detected & each for each in regions(directions, orientation)]
+    chosen = np.logical_or.reduce(masks)
+    chosen[most:] = False
+    masks = [each & chosen for each in masks]
+    print(f"{path.name}: {[int(each.sum()) for each in masks]} ions")
+    random = ae.emission.IonRandom(run.settings["seed"], run.emissions.ions)
+    starts = emission.launch(run.emissions, random).positions
+    places = np.stack([run.emissions.positions, starts], axis=1)
+    fields = fields_on_the_way(run, skip, places, chosen)
+    for name, at in (("site", 0), ("start", 1)):
+        for height, values in zip(HEIGHTS, fields[:, at].T, strict=True):
+            parts = [values[each[chosen]] for each in masks]
+            ends = [np.log(field / np.median(values)) for field in (20.0, 66.0)]
+            factor = np.exp(brentq(lambda log, rest=parts[2]: np.mean(ratio_of(np.exp(log) * rest)) - elsewhere, *ends))
+            ratios = " ".join(f"{np.mean(ratio_of(factor * each)):.4f}" for each in parts)
+            relative = " ".join(f"{np.mean(each) / np.mean(parts[2]):.3f}" for each in parts[:2])
+            print(f"{path.name} {height:.1f} nm above the {name}: {ratios}; mean fields {relative}", flush=True)
+
+
+def ratio_of(fields):
+    """W4+/W3+ by Kingham's curves, for fields [V/nm]."""
+    ratio = ae.emission.charge_state_ratio("W", 3, fields)
+    return np.minimum(ratio, 1e3) / (1 + np.minimum(ratio, 1e3))
+
+
+def main():
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("ions", help="measured, with all charge states")
+    parser.add_argument("runs", nargs="+", type=Path)
+    parser.add_argument("--skip", type=int, default=110_000, help="that of runs.py")
+    parser.add_argument("--most", type=int, default=100_000, help="ions of a run, arrived or not")
+    options = parser.parse_args()
+    warnings.simplefilter("ignore", ae.warnings.ResponseWarning)
+    elsewhere = measured(options.ions)
+    for path in options.runs:
+        simulated(path, options.skip, options.most, elsewhere)
+
+
+if __name__ == "__main__":
+    main()
