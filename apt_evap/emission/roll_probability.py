@@ -4,6 +4,8 @@ Both see the charge of the strongest neighbour over that of the atom. That is al
 depend on: see `Migration`.
 """
 
+from __future__ import annotations  # `Migration.of` returns one
+
 from typing import Protocol
 
 import numpy as np
@@ -12,6 +14,7 @@ from apt_evap._common.codec import number, settings
 from apt_evap._common.types import Floats
 from apt_evap._core.elementary import exponential
 from apt_evap.emission.emissions import Emissions
+from apt_evap.specimen.materials import Material, as_material
 from apt_evap.units import BOLTZMANN, ELEMENTARY_CHARGE
 
 EVAPORATION_BARRIER = 28.0
@@ -86,19 +89,6 @@ class Migration(_ByChargeRatio):
     because the field is higher there. The gain increases with the square of the field, the cost with the cohesive
     energy: most atoms of tungsten roll, none of aluminium. The other constants are the same for all metals.
 
-    Examples
-    --------
-    The charge ratio above which atoms roll, and which part of the atoms has it on a small tip:
-
-    >>> nickel = ae.emission.Migration(cohesive_energy=4.44, field=35.0)
-    >>> aluminium = ae.emission.Migration(cohesive_energy=3.39, field=19.0)
-    >>> print(f"{nickel.threshold:.2f} {aluminium.threshold:.2f}")
-    0.81 1.63
-    >>> tip = ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1))
-    >>> run = ae.Simulation(tip, seed=1, response_settings=ae.ResponseSettings.wide()).run(60)
-    >>> round(float(nickel.probabilities(run.emissions).mean()), 2)
-    0.77
-
     Notes
     -----
     .. math::
@@ -116,6 +106,20 @@ class Migration(_ByChargeRatio):
     fcc {111}, 2 of 4 on bcc {110}). :math:`\alpha` is an effective polarisability, selected with a measured map of
     tungsten: see :doc:`/results/three_metals`. Both the image of a dipole in the metal and the field between the sites
     are in it. All atoms have the same numbers: an alloy is not described.
+
+    Examples
+    --------
+    The charge ratio above which atoms roll, and which part of the atoms has it on a small tip:
+
+    >>> nickel, aluminium = ae.emission.Migration.of("Ni"), ae.emission.Migration.of("Al")
+    >>> ae.RollUp(0.2, nickel)
+    RollUp(0.2, Migration(4.44, 35.0))
+    >>> print(f"{nickel.threshold:.2f} {aluminium.threshold:.2f}")
+    0.81 1.63
+    >>> tip = ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1))
+    >>> run = ae.Simulation(tip, seed=1, response_settings=ae.ResponseSettings.wide()).run(60)
+    >>> round(float(nickel.probabilities(run.emissions).mean()), 2)
+    0.77
     """
 
     cohesive_energy: float = number(
@@ -129,6 +133,27 @@ class Migration(_ByChargeRatio):
     polarizability: float = number(
         "Effective polarisability of an atom on the surface.", default=1e-40, above=0, at_most=1e-30, unit="F m^2"
     )
+
+    @classmethod
+    def of(cls, material: Material | str, temperature: float = 80.0) -> Migration:
+        """Make the law of a metal, with its evaporation field.
+
+        Parameters
+        ----------
+        material : Material or str
+            With a cohesive energy; a str is looked up by `apt_evap.material`.
+        temperature : float
+            Of the specimen [K].
+
+        Raises
+        ------
+        ValueError
+            If the material has no cohesive energy.
+        """
+        crystal = as_material(material)
+        if crystal.cohesive_energy is None:
+            raise ValueError(f"material must have a cohesive_energy [eV], got {crystal!r}")
+        return cls(crystal.cohesive_energy, crystal.evaporation_field, temperature)
 
     def _of(self, ratios):
         charges = AT_REST + BY_CHARGE * ratios

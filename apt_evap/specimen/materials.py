@@ -61,6 +61,9 @@ class Material:
     polarizability: float | None = number(
         "Polarizability of the free atom.", default=None, above=0, at_most=1e-30, unit="F m^2"
     )
+    cohesive_energy: float | None = number(
+        "Energy per atom to take the crystal apart.", default=None, above=0, at_most=20, unit="eV"
+    )
     sources: Mapping[str, str] = checked(
         "Source of each number, by the name of the field.",
         "mapping of str to str",
@@ -91,7 +94,7 @@ def _element(name, structure, a, evaporation_field, charge_state, mass, *, field
         "charge_state": _TSONG,
         "mass": _IUPAC,
     }
-    sources |= {"c": _KITTEL} if "c" in more else {}
+    sources |= {name: _KITTEL for name in ("c", "cohesive_energy") if name in more}
     sources |= {"polarizability": _SHAIKH} if "polarizability" in more else {}
     return Material(name, structure, a, evaporation_field, charge_state, mass, sources=sources, **more)
 
@@ -99,15 +102,15 @@ def _element(name, structure, a, evaporation_field, charge_state, mass, *, field
 MATERIALS = {
     element.name: element
     for element in (
-        _element("Al", "fcc", 0.405, 19.0, 1, 26.982, polarizability=9.8e-40),
-        _element("Si", "diamond", 0.543, 33.0, 2, 28.085),
-        _element("Ti", "hcp", 0.295, 26.0, 2, 47.867, c=0.468),
-        _element("Fe", "bcc", 0.287, 33.0, 2, 55.845),
-        _element("Ni", "fcc", 0.352, 35.0, 1, 58.693, polarizability=6.8e-40),
-        _element("Cu", "fcc", 0.361, 30.0, 1, 63.546),
-        _element("W", "bcc", 0.316, 57.0, 3, 183.84, field_source=_MULLER),
-        _element("Pt", "fcc", 0.392, 48.0, 2, 195.08),
-        _element("Au", "fcc", 0.408, 53.0, 1, 196.97),
+        _element("Al", "fcc", 0.405, 19.0, 1, 26.982, polarizability=9.8e-40, cohesive_energy=3.39),
+        _element("Si", "diamond", 0.543, 33.0, 2, 28.085, cohesive_energy=4.63),
+        _element("Ti", "hcp", 0.295, 26.0, 2, 47.867, c=0.468, cohesive_energy=4.85),
+        _element("Fe", "bcc", 0.287, 33.0, 2, 55.845, cohesive_energy=4.28),
+        _element("Ni", "fcc", 0.352, 35.0, 1, 58.693, polarizability=6.8e-40, cohesive_energy=4.44),
+        _element("Cu", "fcc", 0.361, 30.0, 1, 63.546, cohesive_energy=3.49),
+        _element("W", "bcc", 0.316, 57.0, 3, 183.84, field_source=_MULLER, cohesive_energy=8.9),
+        _element("Pt", "fcc", 0.392, 48.0, 2, 195.08, cohesive_energy=5.84),
+        _element("Au", "fcc", 0.408, 53.0, 1, 196.97, cohesive_energy=3.81),
     )
 }
 """Known materials by name. Ni and Au are observed as 1+ and 2+: their evaporation fields are close."""

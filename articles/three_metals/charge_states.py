@@ -1,10 +1,12 @@
-"""Charge states by place: W4+/W3+ towards {200}, towards {222} and elsewhere, measured and from the fields of runs.
+"""Charge states by place: the ratio of two charges towards two families of poles and elsewhere.
 
-    python charge_states.py W_tap.raw RUNS/W_160_others_1_wide.h5 RUNS/W_160_charge_1_wide.h5 RUNS/W_160_Robin_1.h5
+    python charge_states.py W --ions W_tap.raw RUNS/W_160_others_1_wide.h5 RUNS/W_160_Robin_1.h5
+    python charge_states.py Ni RUNS/Ni_160_others_2_law.h5
 
 An ion can lose another electron on the first nanometre of its flight. The events of a run are repeated, and the field
-just after each event is taken on the way of its ion, at some heights above its start. Kingham's curves turn the fields
-into ratios; one factor for all fields makes the ratio elsewhere the measured one, the two others are predictions.
+just after each event is taken on the way of its ion, at some heights above its site and its start. Kingham's curves
+turn the fields into ratios. One factor for all fields makes the ratio elsewhere the measured one, or the one assumed
+in `METALS`; the two others are predictions.
 """
 
 import argparse
@@ -13,29 +15,46 @@ from pathlib import Path
 
 import numpy as np
 from judge import METALS, measured_of, projection_of
-from rules import rolled
-from runs import RULES
+from runs import RULES, one_law
 from scipy.optimize import brentq
 
 import apt_evap as ae
+from apt_evap.crystallography import poles
 
 HEIGHTS = (0.0, 0.2, 0.4, 0.7, 1.0)  # nm above the start
 NEAR, FIRST = 1.7, 3.0  # degrees: half the width of a strip, and where it begins
-NAMES = ("towards {200}", "towards {222}", "elsewhere")
+CHARGES = {  # lower charge, assumed ratio elsewhere, and the two families of poles
+    "W": (3, 0.003, ((0, 0, 2), (2, 2, 2))),
+    "Ni": (1, 1.0, ((0, 0, 2), (0, 2, 2))),
+    "Al": (1, 0.01, ((0, 0, 2), (0, 2, 2))),
+}
 
 
-def regions(directions, orientation):
-    """Masks of directions within the strips from [011] towards the {200} and the {222} poles, and of the rest."""
-    pole, _, toward = orientation.nearest_pole((0, 1, 1))
-    pole = np.asarray(pole) / np.linalg.norm(pole)
-    first = toward - np.dot(toward, pole) * pole  # towards [100], with {222} on the way
-    first = first / np.linalg.norm(first)
+def regions(directions, orientation, metal):
+    """Masks of directions: in the strips from the pole towards the poles of two families, and of the rest."""
+    pole = np.asarray(orientation.nearest_pole(METALS[metal].pole).direction)
     angle = np.degrees(np.arccos(np.clip(directions @ pole, -1, 1)))
-    azimuth = np.arctan2(directions @ np.cross(pole, first), directions @ first)
-    along, across = angle * np.cos(azimuth), angle * np.sin(azimuth)
-    inside = (angle > FIRST) & (angle < METALS["W"].reach)
-    strips = inside & (np.abs(along) < NEAR), inside & (np.abs(across) < NEAR)
+    inside = (angle > FIRST) & (angle < METALS[metal].reach)
+    found = poles(orientation.material, 10)
+    strips = []
+    for family in CHARGES[metal][2]:
+        member = (np.sort(np.abs(found.planes), axis=1) == family).all(axis=1)
+        normals = orientation.directions(found.normals[member])
+        strip = np.zeros(len(directions), bool)
+        for normal in normals[normals @ pole > (normals @ pole)[normals @ pole < 0.999].max() - 1e-6]:
+            along = normal - (normal @ pole) * pole
+            if np.linalg.norm(along) < 1e-6:
+                continue
+            along = along / np.linalg.norm(along)
+            beside = np.degrees(np.arcsin(np.clip(directions @ np.cross(pole, along), -1, 1)))
+            strip |= inside & (np.abs(beside) < NEAR) & (directions @ along > 0)
+        strips.append(strip)
     return *strips, inside & ~strips[0] & ~strips[1]
+
+
+def names_of(metal):
+    """Names of the regions."""
+    return [f"towards {{{''.join(str(each) for each in family)}}}" for family in CHARGES[metal][2]] + ["elsewhere"]
 
 
 def measured(path):
@@ -49,7 +68,7 @@ def measured(path):
     _, orientation, projection = measured_of("W", ions[three])
     found = []
     for name, region in zip(
-        NAMES, regions(projection.directions(np.column_stack([ions.x, ions.y])), orientation), strict=True
+        names_of("W"), regions(projection.directions(np.column_stack([ions.x, ions.y])), orientation, "W"), strict=True
     ):
         n, peak, ground = (np.count_nonzero(region & each) for each in (three, four, beside))
         found.append((peak - ground / 2) / n)
@@ -84,16 +103,15 @@ def fields_on_the_way(run, skip, starts, chosen):
     return found[chosen]
 
 
-def simulated(path, skip, most, elsewhere):
+def simulated(metal, path, skip, most, elsewhere):
     """Print the ratios of a run at every height."""
     run = ae.load(path)
     scale = float(np.median(run.at_evaporation_field().energy_scales))
-    law = ae.emission.Migration(8.90, 57.0)
-    emission = run.perturbations[-1] if run.perturbations else rolled(0.2 * scale, probability=law, sharpness=2.0)
+    emission = run.perturbations[-1] if run.perturbations else one_law(metal, scale)[-1]
     hits, projection = run.hits(emission), projection_of(run)
     orientation = ae.Orientation.from_settings(run.settings["tip"])
     directions = projection.directions(np.where(hits.detected[:, None], np.column_stack([hits.x, hits.y]), 0.0))
-    masks = [hits.detected & each for each in regions(directions, orientation)]
+    masks = [hits.detected & each for each in regions(directions, orientation, metal)]
     chosen = np.logical_or.reduce(masks)
     chosen[most:] = False
     masks = [each & chosen for each in masks]
@@ -102,34 +120,37 @@ def simulated(path, skip, most, elsewhere):
     starts = emission.launch(run.emissions, random).positions
     places = np.stack([run.emissions.positions, starts], axis=1)
     fields = fields_on_the_way(run, skip, places, chosen)
+    limits = ae.emission.field_of_ratio(metal, CHARGES[metal][0], np.array([1e-6, 50.0]))
     for name, at in (("site", 0), ("start", 1)):
         for height, values in zip(HEIGHTS, fields[:, at].T, strict=True):
             parts = [values[each[chosen]] for each in masks]
-            ends = [np.log(field / np.median(values)) for field in (20.0, 66.0)]
-            factor = np.exp(brentq(lambda log, rest=parts[2]: np.mean(ratio_of(np.exp(log) * rest)) - elsewhere, *ends))
-            ratios = " ".join(f"{np.mean(ratio_of(factor * each)):.4f}" for each in parts)
+            ends = [np.log(field / np.median(values)) for field in limits]
+            factor = np.exp(brentq(lambda log, rest=parts[2]: ratio_of(metal, np.exp(log) * rest) - elsewhere, *ends))
+            ratios = " ".join(f"{ratio_of(metal, factor * each):.4f}" for each in parts)
             relative = " ".join(f"{np.mean(each) / np.mean(parts[2]):.3f}" for each in parts[:2])
             print(f"{path.name} {height:.1f} nm above the {name}: {ratios}; mean fields {relative}", flush=True)
 
 
-def ratio_of(fields):
-    """W4+/W3+ by Kingham's curves, for fields [V/nm]."""
-    ratio = ae.emission.charge_state_ratio("W", 3, fields)
-    return np.minimum(ratio, 1e3) / (1 + np.minimum(ratio, 1e3))
+def ratio_of(metal, fields):
+    """Ratio of the numbers of the two charges by Kingham's curves, for the fields of many ions [V/nm]."""
+    ratio = np.minimum(ae.emission.charge_state_ratio(metal, CHARGES[metal][0], fields), 1e6)
+    share = np.mean(ratio / (1 + ratio))
+    return share / (1 - share)
 
 
 def main():
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("ions", help="measured, with all charge states")
+    parser.add_argument("metal", choices=CHARGES)
+    parser.add_argument("--ions", help="measured, with all charge states; tungsten only")
     parser.add_argument("runs", nargs="+", type=Path)
     parser.add_argument("--skip", type=int, default=110_000, help="that of runs.py")
     parser.add_argument("--most", type=int, default=100_000, help="ions of a run, arrived or not")
     options = parser.parse_args()
     warnings.simplefilter("ignore", ae.warnings.ResponseWarning)
-    elsewhere = measured(options.ions)
+    elsewhere = measured(options.ions) if options.ions else CHARGES[options.metal][1]
     for path in options.runs:
-        simulated(path, options.skip, options.most, elsewhere)
+        simulated(options.metal, path, options.skip, options.most, elsewhere)
 
 
 if __name__ == "__main__":

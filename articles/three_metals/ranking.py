@@ -16,7 +16,6 @@ import warnings
 import numpy as np
 from judge import METALS, folded, measured_of, projection_of
 from rules import rolled
-from runs import migration
 
 import apt_evap as ae
 from apt_evap.fit.comparison import Comparison
@@ -27,7 +26,7 @@ MEASURES = ("SSIM", "SSIM, noise-corrected", "folded correlation", "folded conco
 
 def wide_rules(metal, scale):
     """Ten rules for a run with wide responses; `scale` is the simulated energy per real energy."""
-    law = migration(metal)
+    law = ae.emission.Migration.of(metal.partition("-")[0])
     broad = ae.TruncatedNormal(1.2 * scale, 1.2 * scale)
     return {
         "unperturbed": ae.Unperturbed(),

@@ -12,7 +12,7 @@ import warnings
 
 import numpy as np
 from judge import METALS, folded, map_of, measured_of, projection_of, row
-from runs import HEIGHT, migration
+from runs import HEIGHT
 
 import apt_evap as ae
 
@@ -26,7 +26,7 @@ FREE_ATOMS = {"W": 12.4e-40, "Ni": 6.8e-40, "Al": 9.8e-40}
 
 def laws(name):
     """Thresholds of laws of rolling for a metal, each with its one constant from tungsten: threshold 0.66."""
-    tungsten, metal = migration("W"), migration(name)
+    tungsten, metal = (ae.emission.Migration.of(each) for each in ("W", name))
 
     def cost(law):  # of the hop, less the barrier of evaporation
         return law.bonds_lost * law.cohesive_energy - 28.0 * ae.units.BOLTZMANN * law.temperature
@@ -40,7 +40,7 @@ def laws(name):
     return {
         "migration": metal.threshold,
         "migration, field of the others": threshold(1.075, 0.358),
-        "migration, free atoms": threshold(1.27, 1.54, FREE_ATOMS["W"], FREE_ATOMS[name.partition("-")[0]]),
+        "migration, free atoms": threshold(1.27, 1.54, FREE_ATOMS["W"], FREE_ATOMS[name]),
         "one charge ratio": tungsten.threshold,
     }
 
@@ -56,10 +56,10 @@ def rules(name, scale):
     """Rules by name; `scale` is the simulated energy per real energy."""
     found = {"unperturbed": ae.Unperturbed()}
     for law, threshold in laws(name).items():
-        given = migration(name) if law == "migration" else ae.emission.ChargeRatio(threshold, 0.0015)
+        given = ae.emission.Migration.of(name) if law == "migration" else ae.emission.ChargeRatio(threshold, 0.0015)
         found[f"{law}, {threshold:.2f}"] = rolled(0.2 * scale, probability=given, sharpness=2.0)
     for temperature in (20.0, 150.0):
-        law = migration(name, temperature=temperature)
+        law = ae.emission.Migration.of(name, temperature)
         found[f"migration at {temperature:g} K"] = rolled(0.2 * scale, probability=law, sharpness=2.0)
     for energy in (0.1, 0.2, 0.35, 0.7, 1.2):
         found[f"all, {energy:g} eV"] = rolled(energy * scale)
@@ -98,7 +98,7 @@ def main():
     ratios = run.emissions.charge_ratios[:, 0, 0]
     projection, orientation = projection_of(run), ae.Orientation.from_settings(run.settings["tip"])
     scale = float(np.median(run.at_evaporation_field().energy_scales))
-    for name, rule in rules(options.metal, scale).items():
+    for name, rule in rules(options.metal.partition("-")[0], scale).items():
         threshold = getattr(getattr(rule, "probability", None), "threshold", None)  # of a charge ratio, or a law
         part = "" if threshold is None else f" ({np.mean(ratios > threshold):.2f} roll)"
         row(name + part, folded(map_of(run, rule), orientation, projection, metal), target, metal)

@@ -25,8 +25,6 @@ AXES = {
     "Al": ((0.31, 0.61, 0.73), 26.7),
     "Al-2": ((0.39, 0.50, 0.77), 24.0),
 }
-COHESIVE_ENERGIES = {"W": 8.90, "Ni": 4.44, "Al": 3.39}
-"""[eV], Kittel, Introduction to Solid State Physics."""
 RULES = {
     "others": ae.ConstantPotential(law_field="others"),
     "charge": ae.ConstantPotential(),
@@ -53,16 +51,13 @@ def emissions(scale):
     ]
 
 
-def migration(name, **changes):
-    """The law of migration for one of the metals."""
-    name = name.partition("-")[0]
-    return ae.emission.Migration(COHESIVE_ENERGIES[name], ae.material(name).evaporation_field, **changes)
-
-
 def one_law(name, scale):
     """Unperturbed, and the one rule for all metals."""
     energy = ae.TruncatedNormal(0.2 * scale, 0.2 * scale)
-    return [ae.Unperturbed(), ae.RollUp(energy, migration(name), 2.0, 2 * HEIGHT, others=energy)]
+    return [
+        ae.Unperturbed(),
+        ae.RollUp(energy, ae.emission.Migration.of(name.partition("-")[0]), 2.0, 2 * HEIGHT, others=energy),
+    ]
 
 
 def simulated(metal, radius, rule, seed, skip, ions, threads, kind):

@@ -10,6 +10,7 @@ import pytest
 
 from apt_evap.emission import Emissions, Migration
 from apt_evap.emission.roll_probability import AT_REST, BY_CHARGE
+from apt_evap.specimen.materials import material
 from apt_evap.units import BOLTZMANN, ELEMENTARY_CHARGE
 
 SCRIPT = Path(__file__).parents[2] / "articles" / "three_metals" / "migration.py"
@@ -68,10 +69,17 @@ def test_limits():
 
 def test_three_metals():
     """Tungsten rolls, aluminium does not: ratios of real surfaces are 0.4 to 1.0."""
-    tungsten, nickel, aluminium = Migration(8.90, 57.0), Migration(4.44, 35.0), Migration(3.39, 19.0)
+    tungsten, nickel, aluminium = (Migration.of(each) for each in ("W", "Ni", "Al"))
     assert tungsten.threshold == pytest.approx(0.66, abs=0.005)  # selected
     assert tungsten.threshold < nickel.threshold < 0.9
     assert aluminium.threshold > 1.2
+
+
+def test_a_metal_gives_its_numbers():
+    nickel = material("Ni")
+    assert Migration.of(nickel, 60.0) == Migration(nickel.cohesive_energy, nickel.evaporation_field, 60.0)
+    with pytest.raises(ValueError, match="material must have a cohesive_energy"):
+        Migration.of(replace(nickel, cohesive_energy=None))
 
 
 def test_it_needs_the_neighbours():

@@ -32,7 +32,7 @@ def test_mass_density_follows_from_lattice_and_mass(name):
 @pytest.mark.parametrize("entry", MATERIALS.values(), ids=lambda entry: entry.name)
 def test_every_number_has_its_source(entry):
     numbers = {"a", "evaporation_field", "charge_state", "mass", "structure"}
-    numbers |= {name for name in ("c", "polarizability") if getattr(entry, name) is not None}
+    numbers |= {name for name in ("c", "polarizability", "cohesive_energy") if getattr(entry, name) is not None}
     assert set(entry.sources) == numbers
     assert all(any(character.isdigit() for character in source) for source in entry.sources.values())
 
