@@ -1,7 +1,7 @@
-"""Measured and simulated maps of three metals, folded about their poles, beside each other.
+"""Measured maps of three metals and those of one law, folded about their poles, beside each other.
 
 python picture.py three_metals.png --W W3.epos RUNS/W_160_others_1_wide.h5 --Ni MAP.npz RUNS/Ni_160_others_1_wide.h5
-    --Al MAP.npz RUNS/Al_160_others_1.h5
+    --Al MAP.npz RUNS/Al_160_others_1_wide.h5
 """
 
 import argparse
@@ -10,41 +10,36 @@ import warnings
 import matplotlib.pyplot as plt
 import numpy as np
 from judge import METALS, folded, map_of, measured_of, projection_of
-from rules import STEP, rolled
+from runs import one_law
 
 import apt_evap as ae
 
-SAME = "charge ratio above 0.66,\n0.2 eV, sharpness 2"
-RULES = {"W": SAME, "Ni": SAME, "Al": "none rolls,\nlateral 0.35 eV"}
 TITLES = {"W": "tungsten [011]", "Ni": "nickel [111]", "Al": "aluminium [111], 47 mm/rad"}
 
 
 def pair_of(name, measured, path):
     """Folded measured map, and the simulated one."""
     run = ae.load(path)
-    if RULES[name] != SAME:
-        rule = run.perturbations[1]  # of runs.py: lateral velocities
-    else:
-        scale = float(np.median(run.at_evaporation_field().energy_scales))
-        rule = rolled(0.2 * scale, probability=ae.emission.ChargeRatio(0.66, STEP), sharpness=2.0)
+    rule = one_law(name, float(np.median(run.at_evaporation_field().energy_scales)))[-1]
+    part = rule.probability.probabilities(run.emissions[~run.not_flown]).mean()
     orientation = ae.Orientation.from_settings(run.settings["tip"])
     simulated = folded(map_of(run, rule), orientation, projection_of(run), METALS[name])
-    return folded(*measured_of(name, measured), METALS[name]), simulated
+    return folded(*measured_of(name, measured), METALS[name]), simulated, part
 
 
 def main():
     """Draw the picture."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("picture")
-    for name in RULES:
+    for name in TITLES:
         parser.add_argument(f"--{name}", nargs=2, required=True, metavar=("MEASURED", "RUN"))
     options = parser.parse_args()
     warnings.simplefilter("ignore", ae.warnings.ResponseWarning)
     figure, axes = plt.subplots(2, 3, figsize=(10.5, 7.2), layout="constrained")
-    for column, name in zip(axes.T, RULES, strict=True):
-        measured, simulated = pair_of(name, *getattr(options, name))
+    for column, name in zip(axes.T, TITLES, strict=True):
+        measured, simulated, part = pair_of(name, *getattr(options, name))
         end = measured.angles[-1]
-        text = f"{RULES[name]}\ncorrelation {simulated.correlation(measured):.2f}"
+        text = f"the law of migration: {part:.0%} roll\ncorrelation {simulated.correlation(measured):.2f}"
         for ax, each, title in zip(column, (measured, simulated), (TITLES[name], text), strict=True):
             image = ax.imshow(each.flattened, origin="lower", extent=(-end, end, -end, end), cmap="inferno",
                               vmin=0.4, vmax=1.7)  # fmt: skip

@@ -2,6 +2,7 @@
 
     python predictions.py simulate RUNS "Ni 001"     # or all of them, one after the other
     python predictions.py judge RUNS
+    python predictions.py draw RUNS                  # predictions.png
 
 Nothing is selected here: energy, height, sharpness and the two constants of `Migration` are those of tungsten and
 nickel; cohesive energies are Kittel's, fields those of `ae.material` (magnesium: Tsong). 300,000 atoms evaporate after
@@ -12,6 +13,7 @@ import argparse
 from pathlib import Path
 from typing import NamedTuple
 
+import matplotlib.pyplot as plt
 import numpy as np
 from judge import map_of, projection_of
 
@@ -141,16 +143,40 @@ def judged(name, path):
                       f"{flank[1]:.2f}: {statement(line, flank)}")  # fmt: skip
 
 
+def draw(runs, path):
+    """Maps of all cases that have a run, with their poles."""
+    shown = [(name, runs / f"{name.replace(' ', '_')}.h5") for name in CASES]
+    shown = [(name, file) for name, file in shown if file.exists()]
+    figure, axes = plt.subplots(-(-len(shown) // 3), 3, squeeze=False, layout="constrained", figsize=(11, 11.6))
+    for ax, (name, file) in zip(axes.flat, shown, strict=False):
+        run = ae.load(file)
+        map = map_of(run, run.perturbations[1])
+        part = laws(CASES[name])[0].probabilities(run.emissions[~run.not_flown]).mean()
+        metal, axis = name.split()
+        title = f"{metal} [{axis}], {part:.0%} roll"
+        ae.plot.detector_map(map.flattened(15.0).smoothed(0.9), ax, title=title, colorbar=False, caption=False)
+        half = run.detector.distance * np.tan(np.radians(FIELD_OF_VIEW - 1))
+        ax.set(xlim=(-half, half), ylim=(-half, half))
+        orientation = ae.Orientation.from_settings(run.settings["tip"])
+        ae.plot.poles(ax, orientation, projection_of(run), families=6, zone_families=(), size=7)
+    for ax in axes.flat[len(shown) :]:
+        ax.remove()
+    figure.savefig(path, dpi=100)
+
+
 def main():
     """Simulate, or print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("simulate", "judge"))
+    parser.add_argument("what", choices=("simulate", "judge", "draw"))
     parser.add_argument("runs", type=Path)
     parser.add_argument("cases", nargs="*", default=list(CASES))
     parser.add_argument("--ions", type=int, default=300_000)
     parser.add_argument("--threads", type=int)
     options = parser.parse_args()
     options.runs.mkdir(parents=True, exist_ok=True)
+    if options.what == "draw":
+        draw(options.runs, "predictions.png")
+        return
     for name in options.cases:
         path = options.runs / f"{name.replace(' ', '_')}.h5"
         if options.what == "simulate" and not path.exists():
