@@ -62,7 +62,7 @@ def simulation(name):
         return ae.Simulation(tip, seed=4, law=ae.Arrhenius(60.0), control=control), 2000, ()
     if name == "potential":
         tip = ae.Tip(nickel, apex_radius=12 * a, axis=(1, 1, 1))
-        rule = ae.ConstantPotential(charges="gaussian")
+        rule = ae.ConstantPotential(charges="gaussian", law_field="charge")
         return ae.Simulation(tip, seed=5, rule=rule, response_settings=ae.ResponseSettings(rolls=2)), 1500, ()
     if name == "alloy":
         radius = 12 * aluminium.a

@@ -148,7 +148,7 @@ class ConstantPotential:
     >>> tip = ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1))
     >>> run = ae.Simulation(tip, voltage=1000.0, rule=ae.ConstantPotential()).run(100)
     >>> print(f"{np.median(run.charges):.2f} e")
-    2.43 e
+    2.42 e
     """
 
     RELAXATION_TOLERANCE: ClassVar[float] = 8e-3
@@ -167,10 +167,11 @@ class ConstantPotential:
     )
     charges: str = choice("Point charges, or Gaussian charges with the same self term.", CHARGES, default="points")
     law_field: str = choice(
-        'Field that a law sees: "charge", 4 pi k_e q / s of the charge of an atom, or "others", twice the normal field '
-        "of all other charges at its place. With `Robin` the two are equal.",
+        'Field that a law sees: "others", twice the normal field of all other charges at the place of an atom, whose '
+        'lines are where measured ones are, or "charge", 4 pi k_e q / s of its own charge. With `Robin` the two are '
+        "equal.",
         LAW_SEES,
-        default="charge",
+        default="others",
     )
     tolerance: float = number(
         "Largest residual of the charges of a patch, relative to the mean charge of the patch.",

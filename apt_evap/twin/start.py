@@ -243,7 +243,6 @@ def _text(indexing, radii, size, lens, factor):
         "",
         "[rule]    # charges and law whose lines are where measured ones of tungsten are",
         'name = "ConstantPotential"',
-        'law_field = "others"',
         "",
         "[responses]",
         "wide = true    # for ions that roll onto a mean of their neighbours",

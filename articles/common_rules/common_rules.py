@@ -84,7 +84,7 @@ def main():
     size = options.radius * material.a
     axis = tuple(float(index) for index in options.axis.split())
     tip = ae.Tip(material, size, axis=axis, shank_length=2 * size, depth=8 * material.a)
-    rule = ae.ConstantPotential() if options.constant_potential else ae.Robin()
+    rule = ae.ConstantPotential(law_field="charge") if options.constant_potential else ae.Robin()
     rolls = 2 if options.second_roll > 0 else 1
     simulation = ae.Simulation(tip, seed=1, rule=rule, response_settings=ae.ResponseSettings.wide(rolls=rolls))
     pilot = simulation.run(256, responses=False, progress=False).at_evaporation_field()

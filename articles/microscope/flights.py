@@ -31,7 +31,7 @@ def surface(radius, shank, events, seed):
     """Emitter of Ni[111] at constant potential after some events; radius in lattice constants, shank in degrees."""
     nickel = ae.material("Ni")
     tip = ae.Tip(nickel, radius * nickel.a, axis=(1, 1, 1), shank_angle=shank, offset_seed=seed)
-    emitter = ae.evaporation.Emitter(tip, rule=ae.ConstantPotential())
+    emitter = ae.evaporation.Emitter(tip, rule=ae.ConstantPotential(law_field="charge"))
     for _ in emitter.advance(events):
         pass
     return emitter

@@ -36,7 +36,7 @@ HEIGHT = 0.1  # nm
 FIELDS = 19.0, 35.0  # evaporation fields of Al and Ni [V/nm]
 # charging rule, sharpness, and the fractions of Al and Ni that roll up
 RULES = {
-    "constant potential": (ae.ConstantPotential(), 2.0, (0.05, 0.6)),
+    "constant potential": (ae.ConstantPotential(law_field="charge"), 2.0, (0.05, 0.6)),
     "Robin": (ae.Robin(), 0.15, (0.05, 0.4)),
 }
 

@@ -68,7 +68,7 @@ def rolled(metal, radius, events, skip, seed=1):
     material = ae.material(metal)
     size = radius * material.a
     tip = ae.Tip(material, size, axis=AXES[metal], shank_length=size, depth=8 * material.a, offset_seed=seed)
-    emitter = ae.evaporation.Emitter(tip, rule=ae.ConstantPotential(law_field="others"), n_threads=1)
+    emitter = ae.evaporation.Emitter(tip, rule=ae.ConstantPotential(), n_threads=1)
     own, potential = self_term(emitter)
     for _ in emitter.advance(skip):
         pass

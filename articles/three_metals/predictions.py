@@ -62,7 +62,7 @@ def simulated(case, ions, threads):
     material = material_of(case)
     size = case.radius * material.a
     tip = ae.Tip(material, size, axis=case.axis, shank_length=size, depth=8 * material.a, offset_seed=1)
-    common = {"seed": 1, "rule": ae.ConstantPotential(law_field="others"), "n_threads": threads}
+    common = {"seed": 1, "rule": ae.ConstantPotential(), "n_threads": threads}
     common["response_settings"] = ae.ResponseSettings.wide()  # records the neighbours
     pilot = ae.Simulation(tip, **common).run(256, responses=False, progress=False)
     energy = ENERGY * float(np.median(pilot.at_evaporation_field().energy_scales))

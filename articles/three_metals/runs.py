@@ -26,8 +26,8 @@ AXES = {
     "Al-2": ((0.39, 0.50, 0.77), 24.0),
 }
 RULES = {
-    "others": ae.ConstantPotential(law_field="others"),
-    "charge": ae.ConstantPotential(),
+    "others": ae.ConstantPotential(),
+    "charge": ae.ConstantPotential(law_field="charge"),
     "Robin": ae.Robin(),
 }
 EMISSIONS = (

@@ -160,7 +160,7 @@ def test_all_atoms_have_the_potential_of_the_specimen(small_tip):
 
 
 def test_the_self_term_follows_from_the_area_per_atom(small_tip):
-    emitter = ae.evaporation.Emitter(small_tip, 1000.0, rule=ae.ConstantPotential())
+    emitter = ae.evaporation.Emitter(small_tip, 1000.0, rule=ae.ConstantPotential(law_field="charge"))
     robin = ae.evaporation.Emitter(small_tip, 1000.0)
     # the first estimate stops at a change of 1e-2
     assert emitter._core.rule.self_term == pytest.approx(LATTICE_SUM / np.sqrt(robin.area_per_atom), rel=2e-3)

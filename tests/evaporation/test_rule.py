@@ -113,8 +113,8 @@ def test_bad_parameters_of_robin_are_refused(bad):
 
 
 CONSTANT = [
+    ae.ConstantPotential(law_field="charge"),
     ae.ConstantPotential(),
-    ae.ConstantPotential(law_field="others"),
     ae.ConstantPotential(charges="gaussian", self_term=10.0),
     ae.ConstantPotential(self_term=4.0 / 0.352),  # some charges are negative
 ]
