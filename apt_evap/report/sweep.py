@@ -8,16 +8,17 @@ from typing import Any
 import numpy as np
 
 from apt_evap import plot
-from apt_evap._common.codec import for_json
+from apt_evap._common.codec import for_json, from_plain
 from apt_evap._common.types import AnyPath
 from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.fit.settings import FitSettings
 from apt_evap.fit.study import bounded_text
 from apt_evap.plot.maps import default_smoothing
 from apt_evap.report.origin import add_origin, origin
 from apt_evap.report.page import Markup, Page, heading, paragraph, switched, table, text_of
 from apt_evap.report.pictures import blinking_pictures
 
-_STUDY = ("SSIM", "mean [eV]", "standard deviation / mean", "roll-up fraction", "real energy [eV]", "doubts")
+_STUDY = ("mean [eV]", "standard deviation / mean", "roll-up fraction", "real energy [eV]", "doubts")
 _MOST_SETTINGS, _MOST_MAPS = 4, 12  # in the pictures
 
 
@@ -141,8 +142,13 @@ def _course(page, rows):
         units = {text.partition(" ")[2] for _, row in points if isinstance(text := row.settings[name], str)}
         ax.set_xlabel(f"{name} [{units.pop()}]" if len(units) == 1 else name)
         ax.grid(alpha=0.3)
-    figure.axes[0].set_ylabel("largest SSIM")
+    figure.axes[0].set_ylabel(f"largest {_score_name(compared)}")
     return [heading("Similarity against the settings"), page.picture(figure, alt="Similarity against the settings")]
+
+
+def _score_name(compared):
+    """What the scores of the studies are: "SSIM", or "concordance" of folded maps."""
+    return from_plain({"objective": compared[0].study["settings"]["objective"]}, FitSettings).score_name
 
 
 def _number(value):
@@ -181,7 +187,7 @@ def _short(row):
 
 def _table(rows, compared):
     settings, results = (_names(getattr(row, part) for row in rows) for part in ("settings", "results"))
-    of_study = _STUDY * compared
+    of_study = [_score_name([row for row in rows if row.study]), *_STUDY] if compared else []
     lines = []
     for row in rows:
         cells = [text_of(row.settings.get(name)) for name in settings]
@@ -196,7 +202,7 @@ def _table(rows, compared):
 
 def _study_cells(content):
     if content is None:
-        return [""] * len(_STUDY)
+        return [""] * (1 + len(_STUDY))
     score, refined = content["optimum"]["score"], content["refined"]
     error = f" ± {score['error']:.3f}" if score["error"] is not None else ""
     open_ends = refined["open_ends"]
