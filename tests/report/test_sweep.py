@@ -45,6 +45,17 @@ def test_points_in_the_order_of_their_similarity(study, tmp_path):
     assert content["points"][1]["study"] == json.loads(json.dumps(study.to_dict()))
 
 
+def test_the_score_has_the_name_of_its_objective(study, tmp_path):
+    points = rows(study)
+    for objective, name, other in (("similarity", "SSIM", "concordance"), ("folded", "concordance", "SSIM")):
+        for row in points:
+            if row.study:
+                row.study["settings"]["objective"] = objective
+        ae.report.write_sweep(points, tmp_path / "s.html", pictures=0)
+        table = Reader((tmp_path / "s.html").read_text()).text
+        assert name in table and other not in table
+
+
 def test_points_without_a_study(tmp_path):
     points = [ae.report.SweepRow(name, {"seed": seed}) for seed, name in enumerate("ab")]
     ae.report.write_sweep(points, tmp_path / "s.html")
