@@ -103,7 +103,7 @@ def trace_line(map: DetectorMap, ends: ArrayLike, *, width: float) -> TracedLine
     Raises
     ------
     ValueError
-        If an argument is outside its range, or there is no line whose height is above five of its errors.
+        If an argument is outside its range, or the height of the line is below five of its errors.
 
     Notes
     -----

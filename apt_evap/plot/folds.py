@@ -29,7 +29,7 @@ def folded_maps(maps: Mapping[str, FoldedMap], *, colormap: str = "inferno") -> 
     Raises
     ------
     ValueError
-        If there is no map, or the maps differ in symmetry or reach.
+        If no map is given, or the maps differ in symmetry or reach.
     """
     if not maps:
         raise ValueError("folded_maps needs at least one map, got none")

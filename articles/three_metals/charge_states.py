@@ -1,12 +1,12 @@
 """Charge states by place: the ratio of two charges towards two families of poles and elsewhere.
 
     python charge_states.py W --ions W_tap.raw RUNS/W_160_others_1_wide.h5 RUNS/W_160_Robin_1.h5
-    python charge_states.py Ni RUNS/Ni_160_others_2_law.h5
+    python charge_states.py Ni RUNS/Ni_160_others_1_wide.h5 --most 40000
 
 An ion can lose another electron on the first nanometre of its flight. The events of a run are repeated, and the field
 just after each event is taken on the way of its ion, at some heights above its site and its start. Kingham's curves
 turn the fields into ratios. One factor for all fields makes the ratio elsewhere the measured one, or the one assumed
-in `METALS`; the two others are predictions.
+in `CHARGES`; the two others are predictions.
 """
 
 import argparse
@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from judge import METALS, measured_of, projection_of
-from runs import RULES, one_law
+from runs import RULES, one_rule
 from scipy.optimize import brentq
 
 import apt_evap as ae
@@ -40,11 +40,11 @@ def regions(directions, orientation, metal):
     for family in CHARGES[metal][2]:
         member = (np.sort(np.abs(found.planes), axis=1) == family).all(axis=1)
         normals = orientation.directions(found.normals[member])
+        cosines = normals @ pole
+        others = cosines < 0.999
         strip = np.zeros(len(directions), bool)
-        for normal in normals[normals @ pole > (normals @ pole)[normals @ pole < 0.999].max() - 1e-6]:
+        for normal in normals[others & (cosines > cosines[others].max() - 1e-6)]:
             along = normal - (normal @ pole) * pole
-            if np.linalg.norm(along) < 1e-6:
-                continue
             along = along / np.linalg.norm(along)
             beside = np.degrees(np.arcsin(np.clip(directions @ np.cross(pole, along), -1, 1)))
             strip |= inside & (np.abs(beside) < NEAR) & (directions @ along > 0)
@@ -107,7 +107,7 @@ def simulated(metal, path, skip, most, elsewhere):
     """Print the ratios of a run at every height."""
     run = ae.load(path)
     scale = float(np.median(run.at_evaporation_field().energy_scales))
-    emission = run.perturbations[-1] if run.perturbations else one_law(metal, scale)[-1]
+    emission = run.perturbations[-1] if run.perturbations else one_rule(ae.emission.Migration.of(metal), scale)
     hits, projection = run.hits(emission), projection_of(run)
     orientation = ae.Orientation.from_settings(run.settings["tip"])
     directions = projection.directions(np.where(hits.detected[:, None], np.column_stack([hits.x, hits.y]), 0.0))

@@ -16,11 +16,11 @@ from typing import NamedTuple
 import matplotlib.pyplot as plt
 import numpy as np
 from judge import map_of, projection_of
+from runs import one_rule, prepared
 
 import apt_evap as ae
 from apt_evap.crystallography import poles
 
-ENERGY, HEIGHT, SHARPNESS = 0.2, 0.2, 2.0  # eV, nm
 FIELD_OF_VIEW = 28.0  # degrees, half angle
 
 
@@ -62,15 +62,8 @@ def simulated(case, ions, threads):
     material = material_of(case)
     size = case.radius * material.a
     tip = ae.Tip(material, size, axis=case.axis, shank_length=size, depth=8 * material.a, offset_seed=1)
-    common = {"seed": 1, "rule": ae.ConstantPotential(), "n_threads": threads}
-    common["response_settings"] = ae.ResponseSettings.wide()  # records the neighbours
-    pilot = ae.Simulation(tip, **common).run(256, responses=False, progress=False)
-    energy = ENERGY * float(np.median(pilot.at_evaporation_field().energy_scales))
-    spread = ae.TruncatedNormal(energy, energy)
-    rolls = [ae.RollUp(spread, law, SHARPNESS, HEIGHT, others=spread) for law in laws(case)]
-    simulation = ae.Simulation(tip, flight_settings=ae.FlightSettings(field_of_view=FIELD_OF_VIEW), **common)
-    for _ in simulation.emitter.advance(ions // 3):
-        pass
+    simulation, scale = prepared(tip, ae.ConstantPotential(), FIELD_OF_VIEW, ions // 3, threads=threads)
+    rolls = [one_rule(law, scale) for law in laws(case)]
     return simulation.run(ions, [ae.Unperturbed(), *rolls], responses=False, progress=False)
 
 
@@ -161,7 +154,7 @@ def draw(runs, path):
         ae.plot.poles(ax, orientation, projection_of(run), families=6, zone_families=(), size=7)
     for ax in axes.flat[len(shown) :]:
         ax.remove()
-    figure.savefig(path, dpi=100)
+    figure.savefig(path, dpi=75)
 
 
 def main():

@@ -15,12 +15,13 @@ from judge import METALS, folded, map_of, measured_of, projection_of, row
 from runs import HEIGHT
 
 import apt_evap as ae
+from apt_evap.emission.roll_probability import EVAPORATION_BARRIER
 
 STEP = 0.01
 """Width of the threshold of a charge ratio."""
 
 
-FREE_ATOMS = {"W": 12.4e-40, "Ni": 6.8e-40, "Al": 9.8e-40}
+FREE_ATOMS = {"W": 11.2e-40, "Ni": 6.8e-40, "Al": 9.8e-40}
 """Polarisabilities of free atoms [F m^2]: `ae.material`; tungsten: Schwerdtfeger and Nagle, Mol. Phys. 117, 1200."""
 
 
@@ -29,7 +30,7 @@ def laws(name):
     tungsten, metal = (ae.emission.Migration.of(each) for each in ("W", name))
 
     def cost(law):  # of the hop, less the barrier of evaporation
-        return law.bonds_lost * law.cohesive_energy - 28.0 * ae.units.BOLTZMANN * law.temperature
+        return law.bonds_lost * law.cohesive_energy - EVAPORATION_BARRIER * ae.units.BOLTZMANN * law.temperature
 
     def threshold(start, slope, tungsten_atom=1.0, metal_atom=1.0):
         """The line of `migration.py`, and the polarisabilities of the atoms; that of tungsten fixes their unit."""

@@ -51,13 +51,22 @@ def emissions(scale):
     ]
 
 
-def one_law(name, scale):
-    """Unperturbed, and the one rule for all metals."""
+def one_rule(law, scale):
+    """The one rule for all metals, with its law of rolling; `scale` as for `emissions`."""
     energy = ae.TruncatedNormal(0.2 * scale, 0.2 * scale)
-    return [
-        ae.Unperturbed(),
-        ae.RollUp(energy, ae.emission.Migration.of(name.partition("-")[0]), 2.0, 2 * HEIGHT, others=energy),
-    ]
+    return ae.RollUp(energy, law, 2.0, 2 * HEIGHT, others=energy)
+
+
+def prepared(tip, rule, half_angle, skip, seed=1, threads=None):
+    """Simulation of a tip after some events without flights, and the simulated energy per real energy."""
+    common = {"seed": seed, "rule": rule, "n_threads": threads}
+    common["response_settings"] = ae.ResponseSettings.wide()  # records the neighbours for the sharpness
+    pilot = ae.Simulation(tip, **common).run(256, responses=False, progress=False)
+    scale = float(np.median(pilot.at_evaporation_field().energy_scales))
+    simulation = ae.Simulation(tip, flight_settings=ae.FlightSettings(field_of_view=half_angle), **common)
+    for _ in simulation.emitter.advance(skip):
+        pass
+    return simulation, scale
 
 
 def simulated(metal, radius, rule, seed, skip, ions, threads, kind):
@@ -67,17 +76,11 @@ def simulated(metal, radius, rule, seed, skip, ions, threads, kind):
     size = radius * material.a
     shank = size if radius >= 160 else 2 * size
     tip = ae.Tip(material, size, axis=axis, shank_length=shank, depth=8 * material.a, offset_seed=seed)
-    common = {"seed": seed, "rule": RULES[rule], "n_threads": threads}
-    common["response_settings"] = ae.ResponseSettings.wide()  # records the neighbours for the sharpness
-    pilot = ae.Simulation(tip, **common).run(256, responses=False, progress=False)
-    scale = float(np.median(pilot.at_evaporation_field().energy_scales))
-    seen = ae.FlightSettings(field_of_view=half_angle)
-    simulation = ae.Simulation(tip, flight_settings=seen, **common)
-    for _ in simulation.emitter.advance(skip):
-        pass
+    simulation, scale = prepared(tip, RULES[rule], half_angle, skip, seed, threads)
     if kind == "wide":
         return simulation.run(ions, progress=False)
-    flown = one_law(metal, scale) if kind == "law" else emissions(scale)
+    law = ae.emission.Migration.of(material)
+    flown = [ae.Unperturbed(), one_rule(law, scale)] if kind == "law" else emissions(scale)
     return simulation.run(ions, flown, responses=False, progress=False)
 
 
