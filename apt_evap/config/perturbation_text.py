@@ -103,6 +103,13 @@ _WORDS = {"second_roll": "second roll-up"}  # of options in a title
 def title_of(perturbation: Any) -> str:
     """Title of a map for a perturbation (str), such as "roll-up, 0.155 ± 0.155 eV, probability 0.5"."""
     name = type(perturbation).__name__
+    if name == "Mixture":
+        weights = perturbation.weights or (1.0,) * len(perturbation.perturbations)
+        parts = [
+            f"{each / sum(weights):.2g} {title_of(one)}"
+            for one, each in zip(perturbation.perturbations, weights, strict=True)
+        ]
+        return "; ".join(parts)
     words = {"Unperturbed": "unperturbed", "LateralVelocity": "lateral velocity", "RollUp": "roll-up"}
     title = words.get(name, name)
     if name == "Combined":

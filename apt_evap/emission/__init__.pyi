@@ -6,6 +6,7 @@ from .energies import Distribution as Distribution
 from .energies import Fixed as Fixed
 from .energies import Thermal as Thermal
 from .ion_random import IonRandom as IonRandom
+from .perturbations import Mixture as Mixture
 from .perturbations import Perturbation as Perturbation
 from .perturbations import TangentialPerturbation as TangentialPerturbation
 from .post_ionisation import PostIonisation as PostIonisation

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from apt_evap._common.short_repr import short_repr
-from apt_evap._common.types import Booleans, Floats
+from apt_evap._common.types import Booleans, Floats, Integers
 from apt_evap._common.validation import check_array, check_number
 from apt_evap.units import FLIGHT_TIME
 
@@ -188,6 +188,41 @@ class TangentialLaunches(NamedTuple):
 
     def __repr__(self) -> str:
         return short_repr(self)
+
+
+def choose_launches(launches: Sequence[TangentialLaunches], chosen: Integers) -> TangentialLaunches:
+    """Launches of n ions, each from one of several.
+
+    Parameters
+    ----------
+    launches : sequence of TangentialLaunches
+        Each of all n ions.
+    chosen : ndarray of int, shape (n,)
+        Which one of them each ion has.
+
+    Returns
+    -------
+    TangentialLaunches
+        Shares, heights and second roll-ups are left at their default if all have it.
+    """
+    n = len(chosen)
+    rolls = max(
+        2 if each.twice is not None else 1 if each.shares is None else each.shares.shape[1] for each in launches
+    )
+    strongest = np.zeros((n, rolls, 3))
+    strongest[..., 0] = 1.0
+    defaults = {"shares": strongest, "heights": np.zeros(n), "twice": np.zeros(n, bool)}
+    columns = {}
+    for name in TangentialLaunches._fields:
+        given = [getattr(each, name) for each in launches]
+        if all(column is None for column in given):
+            continue
+        columns[name] = result = np.array(defaults.get(name, given[0]))
+        for k, column in enumerate(given):
+            if column is not None:
+                rows = chosen == k
+                (result[:, : column.shape[1]] if name == "shares" else result)[rows] = column[rows]
+    return TangentialLaunches(**columns)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -48,6 +48,11 @@ class IonRandom:
     def __repr__(self) -> str:
         return f"IonRandom(seed={self.seed}, {len(self._state)} ions)"
 
+    @property
+    def n_used(self) -> int:
+        """Number of columns that were returned so far."""
+        return self._column
+
     def from_start(self) -> IonRandom:
         """Return the same random numbers from the first column on."""
         other = copy(self)  # with the same columns

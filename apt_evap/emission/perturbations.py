@@ -7,14 +7,16 @@ Shaikh et al., arXiv 2509.13744; the probability of a roll-up and of a second on
 launch height are additions to it.
 """
 
+from collections.abc import Mapping, Sequence
+from copy import copy
 from typing import Any, Protocol
 
 import numpy as np
 
-from apt_evap._common.codec import from_plain, is_settings, number, part, settings, to_plain, to_python
-from apt_evap._common.validation import check_number
+from apt_evap._common.codec import checked, from_plain, is_settings, number, part, settings, to_plain, to_python
+from apt_evap._common.validation import check_array, check_number, short_text
 from apt_evap._core.elementary import sine_and_cosine
-from apt_evap.emission.emissions import Emissions, Launches, TangentialLaunches
+from apt_evap.emission.emissions import Emissions, Launches, TangentialLaunches, choose_launches
 from apt_evap.emission.energies import (
     DISTRIBUTIONS,
     Distribution,
@@ -42,6 +44,7 @@ __all__ = [
     "IonRandom",
     "LateralVelocity",
     "Launches",
+    "Mixture",
     "Perturbation",
     "RollUp",
     "TangentialLaunches",
@@ -305,7 +308,70 @@ class Combined(_Rolling, _Divided):
         return self._roll(emissions, random)
 
 
-PERTURBATIONS = (Unperturbed, LateralVelocity, RollUp, Combined)
+def _members(given, name):
+    """Perturbations of a mixture as a tuple."""
+    members = tuple(given) if isinstance(given, list | tuple) else ()
+    if len(members) < 2 or not all(callable(getattr(each, "tangential", None)) for each in members):
+        raise ValueError(
+            f"{name} must be two or more perturbations with a method `tangential`, such as (RollUp(0.2), "
+            f"LateralVelocity(0.2)), got {short_text(given)}"
+        )
+    return members
+
+
+def _weights(given, name):
+    return tuple(check_number(each, name, above=0) for each in check_array(given, name, ("n",)).tolist())
+
+
+def _read_members(plain, name):
+    return [perturbation_of(each) if isinstance(each, Mapping) else each for each in plain]
+
+
+@settings
+class Mixture(_Tangential):
+    """Each ion follows one of several perturbations, drawn by a random number of its own.
+
+    Examples
+    --------
+    Seven of ten ions roll up, the others leave in random directions with less energy:
+
+    >>> mixture = ae.emission.Mixture((ae.RollUp(0.4), ae.LateralVelocity(0.1)), (7, 3))
+    >>> run = ae.Simulation(ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1)), seed=1).run(100)
+    >>> hits, rolled = run.hits(mixture), run.hits(ae.RollUp(0.4))
+    >>> print(f"{np.mean(hits.x == rolled.x):.2f} of all ions rolled up and hit")
+    0.78 of all ions rolled up and hit
+    """
+
+    perturbations: Sequence[TangentialPerturbation] = checked(
+        "Two or more, with a method `tangential`. One that is followed has the same random numbers as alone.",
+        "sequence of perturbations",
+        _members,
+        read=_read_members,
+    )
+    weights: Sequence[float] | None = checked(
+        "Positive numbers in proportion to the parts of the ions, shape (n,); by default the parts are equal.",
+        "sequence of float",
+        _weights,
+        default=None,
+    )
+
+    def _check(self):
+        if self.weights is not None and len(self.weights) != len(self.perturbations):
+            raise ValueError(f"weights must be {len(self.perturbations)} numbers, got {len(self.weights)}")
+
+    def tangential(self, emissions: Emissions, random: IonRandom) -> TangentialLaunches:
+        """Launches of the perturbation that each ion follows: see `Combined.tangential`."""
+        copies = [copy(random) for _ in self.perturbations]
+        launches = [
+            TangentialLaunches(*each.tangential(emissions, its))
+            for each, its in zip(self.perturbations, copies, strict=True)
+        ]
+        u = random.uniform(max(its.n_used for its in copies) - random.n_used + 1)[:, -1]  # none of theirs
+        parts = np.cumsum(self.weights or np.ones(len(launches)))
+        return choose_launches(launches, np.searchsorted(parts[:-1] / parts[-1], u, side="right"))
+
+
+PERTURBATIONS = (Unperturbed, LateralVelocity, RollUp, Combined, Mixture)
 """The built-in perturbations."""
 
 

@@ -611,6 +611,14 @@ CASES = [
     (ae.emission.ChargeRatio, {"threshold": 0.9}, {}),
     (ae.emission.Migration, {"cohesive_energy": 4.44, "field": 35.0}, {}),
     (
+        ae.emission.Mixture,
+        {"perturbations": (ae.RollUp(0.2), ae.Unperturbed())},
+        {
+            "perturbations": [None, 3, "x", (), (ae.RollUp(0.2),), (ae.RollUp(0.2), "x")],
+            "weights": [3, "x", (1.0,), (1.0, -1.0), (1.0, NAN)],
+        },
+    ),
+    (
         ae.flight.WideDesign,
         {"place": 1, "velocity": 2, "height": 1, "mixed": 2},
         {

@@ -1,5 +1,6 @@
 import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -7,10 +8,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from apt_evap.emission.emissions import Emissions, Launches
+import apt_evap as ae
+from apt_evap._common.codec import to_plain
+from apt_evap.config.perturbation_text import read_perturbation, title_of, write_perturbation
+from apt_evap.emission.emissions import Emissions, Launches, TangentialLaunches
 from apt_evap.emission.energies import Fixed, Thermal, TruncatedNormal
 from apt_evap.emission.ion_random import IonRandom
-from apt_evap.emission.perturbations import Combined, LateralVelocity, RollUp, Unperturbed, described, perturbation_of
+from apt_evap.emission.perturbations import (
+    Combined,
+    LateralVelocity,
+    Mixture,
+    RollUp,
+    Unperturbed,
+    described,
+    perturbation_of,
+)
 from apt_evap.emission.surface_frame import launch_tangentially, rollup_direction, tangent_frame
 from apt_evap.units import SPEED
 
@@ -38,6 +50,7 @@ BUILT_IN = [
     Combined(ENERGY, 0.0),
     Combined(0.2, 1.0),
 ]
+MIXED = Mixture((RollUp(ENERGY, 0.4), LateralVelocity(0.1), Unperturbed()), (0.6, 0.3, 0.1))
 
 
 def emissions(n=400, seed=1, lonely=0.2):
@@ -67,7 +80,7 @@ def drawn(batch, seed=11):
     return u[:, 0], u[:, 1]
 
 
-@pytest.mark.parametrize("perturbation", [*BUILT_IN, Kick()], ids=lambda one: repr(one)[:40])
+@pytest.mark.parametrize("perturbation", [*BUILT_IN, MIXED, Kick()], ids=lambda one: repr(one)[:40])
 class TestContractOfEveryPerturbation:
     def test_a_launch_for_every_emission(self, perturbation):
         batch = emissions()
@@ -321,3 +334,126 @@ def test_launches_are_checked():
     batch = emissions(3, lonely=1)
     with pytest.raises(ValueError, match="positions"):
         launch_tangentially(batch, np.ones(3, dtype=bool), np.zeros(3), np.zeros(3))
+
+
+# ---- mixtures: each ion follows one perturbation, as if it were alone ----------------------------------------------
+
+THREE = (RollUp(0.4, 0.5), LateralVelocity(0.1, 0.05), Unperturbed())
+
+
+class Pushed:
+    """A perturbation of a user's own, along t1, with seven random numbers."""
+
+    def tangential(self, emissions, random):
+        u = random.uniform(7)
+        return np.zeros(len(u), bool), 1e4 + u[:, 6], np.zeros(len(u))
+
+
+def columns(perturbation, batch):
+    launches = TangentialLaunches(*perturbation.tangential(batch, IonRandom(5, batch.ions)))
+    heights = np.zeros(len(batch)) if launches.heights is None else launches.heights
+    return np.column_stack([launches.rolled, launches.first, launches.second, heights])
+
+
+def followed(mixture, batch):
+    """Which perturbation each ion follows; none of its launches is equal to that of another one."""
+    found = columns(mixture, batch)
+    alone = np.stack([columns(each, batch) for each in mixture.perturbations])
+    same = (alone == found).all(axis=2)
+    assert (same.sum(axis=0) == 1).all()
+    return same.argmax(axis=0)
+
+
+def test_each_ion_is_launched_as_by_one_of_the_perturbations():
+    batch = emissions(20_000, lonely=0.0)
+    mixture = Mixture((LateralVelocity(0.3), LateralVelocity(0.1), Unperturbed()), (5, 3, 2))
+    counts = np.bincount(followed(mixture, batch), minlength=3)
+    assert stats.chisquare(counts, len(batch) * np.array([0.5, 0.3, 0.2])).pvalue > 1e-3
+    equal = np.bincount(followed(Mixture(mixture.perturbations), batch), minlength=3)
+    assert stats.chisquare(equal).pvalue > 1e-3
+
+
+def test_the_choice_does_not_depend_on_the_energy():
+    """It has a random number of its own, whatever the perturbations take, also in a mixture of mixtures."""
+    batch = emissions(20_000, lonely=0.0)
+    energy = ae.TruncatedNormal(0.2, 0.2)
+    for mixture in (
+        Mixture((LateralVelocity(energy), Pushed())),
+        Mixture((Mixture((LateralVelocity(energy), Unperturbed())), LateralVelocity(0.7))),
+    ):
+        launches = columns(mixture, batch)
+        speeds = np.hypot(launches[:, 1], launches[:, 2])
+        alone = columns(LateralVelocity(energy), batch)
+        own = np.hypot(alone[:, 1], alone[:, 2])
+        chosen = speeds == own
+        # the energies of the ions that follow are a fair sample of all energies
+        assert 0.2 < chosen.mean() < 0.55
+        assert stats.ks_2samp(own[chosen], own[~chosen]).pvalue > 1e-3
+    outer = Mixture((Mixture((Pushed(), Unperturbed())), Mixture((LateralVelocity(0.2), LateralVelocity(0.3)))))
+    speeds = np.hypot(*columns(outer, batch)[:, 1:3].T)
+    quarters = [np.mean(speeds == 0), np.mean(speeds >= 1e4)]
+    assert quarters == pytest.approx([0.25, 0.25], abs=4 * np.sqrt(0.25 * 0.75 / len(batch)))
+
+
+def test_defaults_are_filled_in_where_one_perturbation_has_its_own():
+    batch = emissions(300, lonely=0.0)
+    mixture = Mixture(THREE)
+    launches = mixture.tangential(batch, IonRandom(5, batch.ions))
+    assert launches.shares is None and launches.twice is None
+    assert set(np.unique(launches.heights)) == {0.0, 0.05}
+    shares = np.tile([[[0.2, 0.5, 0.3]]], (300, 1, 1))
+
+    class Shared(Pushed):
+        def tangential(self, emissions, random):
+            rolled, first, second = super().tangential(emissions, random)
+            return TangentialLaunches(~rolled, first, second, shares, None, None)
+
+    class Twice(Pushed):
+        def tangential(self, emissions, random):
+            rolled, first, second = super().tangential(emissions, random)
+            return TangentialLaunches(~rolled, first, second, None, None, ~rolled)
+
+    both = Mixture((Shared(), Twice())).tangential(batch, IonRandom(5, batch.ions))
+    assert both.shares.shape == (300, 2, 3)
+    np.testing.assert_array_equal(both.shares[both.twice], np.tile([1.0, 0.0, 0.0], (both.twice.sum(), 2, 1)))
+    np.testing.assert_array_equal(both.shares[~both.twice, 0], shares[~both.twice, 0])
+    assert 100 < both.twice.sum() < 200
+
+
+def test_hits_of_responses_are_those_of_flights():
+    tip = ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1), offset_seed=2)
+    run = ae.Simulation(tip, seed=3, response_settings=ae.ResponseSettings.wide()).run(100, progress=False)
+    mixture = Mixture((RollUp(0.3, sharpness=0.4), LateralVelocity(0.2, 0.1), Combined(0.2, 0.5)), (2, 1, 1))
+    flown, fitted = run.hits(mixture), run.hits(mixture, by_response=True)
+    both = flown.detected & fitted.detected
+    assert both.sum() > 80
+    deviations = np.hypot(flown.x - fitted.x, flown.y - fitted.y)[both]
+    assert np.median(deviations) < 0.2  # mm; measured 0.06
+
+
+def test_a_mixture_is_settings():
+    mixture = Mixture(THREE, (6, 3, 1))
+    assert mixture.weights == (6.0, 3.0, 1.0)
+    assert perturbation_of(to_plain(mixture)) == mixture
+    assert read_perturbation(write_perturbation(mixture)) == mixture
+    assert title_of(mixture) == (
+        "0.6 roll-up, 0.4 eV, probability 0.5; 0.3 lateral velocity, 0.1 eV, height 0.05 nm; 0.1 unperturbed"
+    )
+    names = {"Mixture": Mixture, "RollUp": RollUp, "LateralVelocity": LateralVelocity, "Unperturbed": Unperturbed}
+    assert eval(repr(mixture), names) == mixture
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ((RollUp(0.2),), "perturbations must be two or more perturbations with a method `tangential`"),
+        (((RollUp(0.2),),), "perturbations must be two or more"),
+        (((RollUp(0.2), "Unperturbed"),), "perturbations must be two or more"),
+        ((THREE, (1, 2)), "weights must be 3 numbers, got 2"),
+        ((THREE, (1, 0, 2)), "weights must be a finite number > 0, got 0"),
+        ((THREE, 0.3), "weights must"),
+    ],
+)
+def test_errors(arguments, sentence):
+    with pytest.raises(ValueError, match=re.escape(sentence)):
+        Mixture(*arguments)
