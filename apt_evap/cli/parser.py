@@ -387,7 +387,7 @@ def _add_compare(commands: Any) -> None:
     command.add_argument(
         "--objective",
         choices=("similarity", "folded"),
-        help="what is compared: the maps place by place (SSIM), the default, or both maps folded about a pole",
+        help="what is compared: the maps place by place (SSIM), or folded about a pole, the default if they show one",
     )
     command.add_argument("--bins", type=_integer(11, MAX_BINS), metavar="N", help="bins along the longer side")
     command.add_argument(

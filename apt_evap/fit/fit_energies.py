@@ -139,11 +139,8 @@ def fit_energies(
             registration, rounds = register_repeatedly(search)
         search.place(registration, settings.resamples)
         measure, missing = _pole_measure(search, registration, pole)
-        if settings.objective == "folded":
-            if measure is None:
-                raise ValueError(f"settings.objective is 'folded', but the maps show no pole to fold about: {missing}")
-            cells_of_pole = measure.cells(search.region)
-            search.comparison = FoldedComparison(search.region, search.comparison.settings, cells_of_pole)
+        search.comparison = _comparison(search, measure, missing)
+        settings = search.comparison.settings
         values, structures = search.matrix("energies", measure=measure)
         cells = maxima(values)
         best = search.refine(values, cells)[0]
@@ -210,7 +207,7 @@ def fit_energies(
         measured=search.region,
         maps=maps,
         structure=structure,
-        settings=search.comparison.settings,
+        settings=settings,
         provenance=for_json(provenance),
     )
 
@@ -232,6 +229,22 @@ def _pole_measure(search, registration, pole):
         if pole is not None:
             raise
         return None, str(error)
+
+
+def _comparison(search, measure, missing):
+    """What the objective compares: by default folded maps, if there is a pole to fold about."""
+    wanted = search.settings.objective
+    if wanted == "similarity":
+        return search.comparison
+    try:
+        if measure is None:
+            raise ValueError(f"the maps show no pole to fold about: {missing}")
+        settings = replace(search.comparison.settings, objective="folded")
+        return FoldedComparison(search.region, settings, measure.cells(search.region))
+    except ValueError as error:
+        if wanted is None:
+            return search.comparison
+        raise ValueError(f"settings.objective is 'folded', but {error}") from error
 
 
 def _structure_scores(measure, search, structures, maps, cell):

@@ -63,7 +63,7 @@ class EnergySearch:
         self.region = region = replace(
             region, mask=mask, ions=int(region.values[mask].sum()) if region.is_counts else None, detected=None
         )
-        settings = replace(self.settings, resamples=resamples)
+        settings = replace(self.settings, resamples=resamples, objective=self.settings.objective or "similarity")
         if settings.flattening is None:
             area = mask.sum() * np.prod(region.bin_size)
             settings = replace(settings, flattening=FLATTENING * float(np.sqrt(area)))

@@ -33,11 +33,12 @@ class FitSettings:
         at_least=0,
         unit="mm",
     )
-    objective: str = choice(
-        'What is compared: "similarity", the structural similarity of both maps place by place, or "folded", the '
-        "concordance of both maps folded about a pole (`FoldedComparison`), which does not reward blurring.",
+    objective: str | None = choice(
+        'What is compared: "folded", the concordance of both maps folded about a pole (`FoldedComparison`), which does '
+        'not reward blurring, or "similarity", the structural similarity of both maps place by place. By default '
+        '"folded" if the maps show a pole to fold about, and "similarity" for several runs, whose poles may differ.',
         ("similarity", "folded"),
-        default="similarity",
+        default=None,
     )
     data_range: float = number("Range of densities, as for `similarity`.", default=2.0, above=0)
     allow_noise: bool = switch(

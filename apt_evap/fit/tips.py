@@ -152,7 +152,10 @@ def fit_tips(
     if not check_kind(runs, "runs", Mapping, "a mapping of runs by name"):
         raise ValueError("runs must contain at least one run, got none")
     settings = check_kind(FitSettings() if settings is None else settings, "settings", FitSettings, "FitSettings")
-    measured, settings = measured_map(measured, settings.bins), replace(settings, bins=None)
+    measured, settings = (
+        measured_map(measured, settings.bins),
+        replace(settings, bins=None, objective=settings.objective or "similarity"),
+    )
     registrations: dict[str, Registration] = {}
     failed: dict[str, str] = {}
     region = measured.mask

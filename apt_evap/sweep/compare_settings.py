@@ -59,6 +59,7 @@ class CompareSettings:
         name = table["measured"]
         if not isinstance(name, str) or not name:
             raise ValueError(f"[compare] measured must be a file name, got {short_text(name)}")
+        table = {"objective": "similarity"} | dict(table)  # specimens of a sweep may differ in their poles
         parts = {
             part: from_plain({key: table[key] for key in declared(kind) if key in table}, kind, what="[compare]")
             for part, kind in kinds.items()
