@@ -5,7 +5,8 @@
 Both maps are sampled about the same pole, at equal directions of the crystal, and folded by its symmetry. The measured
 directions are those of the indexing; the simulated ones have the image compression of the unperturbed ions. The
 correlation is that of flattened densities, smoothed by 0.6 degrees. A line of the table: correlation, azimuth of the
-bright line in ranges of the angle, amplitudes and contrasts of three rings, densities from the pole outwards.
+bright line in ranges of the angle, amplitudes and contrasts of three rings, densities from the pole outwards; for
+tungsten the densities on the lines towards {222} and {200}.
 """
 
 import argparse
@@ -108,6 +109,20 @@ def line_azimuths(folded, metal):
     return found
 
 
+def mirror_lines(folded):
+    """Density within 0.67 degrees of the mirror lines at 0 and 90 degrees of azimuth, over that 3 to 6 degrees beside.
+
+    About (011) of bcc they lead to {222} and {200}.
+    """
+    u, v = np.meshgrid(folded.angles, folded.angles)
+    found = []
+    for along, beside in ((u, np.abs(v)), (v, np.abs(u))):
+        there = np.isfinite(folded.density) & (along >= 4) & (along < 14)
+        on, away = (folded.density[there & (beside >= a) & (beside < b)].mean() for a, b in ((0, 0.67), (3, 6)))
+        found.append(on / away)
+    return found
+
+
 def radial(folded, metal):
     """Densities from the pole outwards, in bins of a quarter of the reach, in units of the mean."""
     angle, _ = polar(folded)
@@ -123,7 +138,8 @@ def row(name, folded, target, metal):
     amplitudes = " ".join(f"{amplitude(a, b):5.2f}" for a, b in zip(profiles, wanted, strict=True))
     azimuths = " ".join(f"{each:4.1f}" for each in line_azimuths(folded, metal))
     densities_ = " ".join(f"{each:.2f}" for each in radial(folded, metal))
-    print(f"{name:30} {folded.correlation(target):5.2f} | {azimuths} | {amplitudes} | {contrasts} | {densities_}")
+    ends = " | " + " ".join(f"{each:.2f}" for each in mirror_lines(folded)) if metal.line else ""
+    print(f"{name:30} {folded.correlation(target):5.2f} | {azimuths} | {amplitudes} | {contrasts} | {densities_}{ends}")
 
 
 def projection_of(run):

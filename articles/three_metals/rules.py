@@ -4,7 +4,9 @@
     python rules.py W W3.epos RUNS/W_160_others_1_wide.h5
 
 The lines of the table are those of `judge.py`. A rule with a threshold rolls up the atoms whose strongest neighbour has
-more than this part of their charge (`ChargeRatio`); the others start from their sites, in random directions.
+more than this part of their charge (`ChargeRatio`); the others start from their sites, in random directions. With
+--rivals, only the law of migration and rules that are not of its kind: forces of the neighbours, two equal targets,
+mixtures, and second roll-ups if the run covers them.
 """
 
 import argparse
@@ -15,7 +17,10 @@ from judge import METALS, folded, map_of, measured_of, projection_of, row
 from runs import HEIGHT
 
 import apt_evap as ae
+from apt_evap.emission.emissions import TangentialLaunches
+from apt_evap.emission.energies import draw_energies
 from apt_evap.emission.roll_probability import EVAPORATION_BARRIER
+from apt_evap.units import speed_from_energy
 
 STEP = 0.01
 """Width of the threshold of a charge ratio."""
@@ -51,6 +56,79 @@ def rolled(energy, *, probability=1.0, sharpness=0.4, height=2 * HEIGHT, others=
     spread = ae.TruncatedNormal(energy, energy)
     rest = spread if others is None else ae.TruncatedNormal(others, others)
     return ae.RollUp(spread, probability, sharpness, height, others=rest)
+
+
+class Pushed:
+    """Start from the site, away from the strongest neighbour, as the force of its charge does."""
+
+    def __init__(self, energy, height):
+        self.energy, self.height = energy, height
+
+    def tangential(self, emissions, random):
+        """See `Combined.tangential`."""
+        there, first, second = ae.emission.rollup_direction(emissions)
+        speed = speed_from_energy(draw_energies(self.energy, random.uniform(1)[:, 0]), emissions.masses)
+        heights = np.full(len(there), self.height)
+        return TangentialLaunches(np.zeros_like(there), -speed * first, -speed * second, None, heights)
+
+
+class Bridge:
+    """Roll-up by a law, onto the middle between the two strongest neighbours if their charges are nearly equal."""
+
+    def __init__(self, rule, least):
+        self.rule, self.least = rule, least
+
+    def tangential(self, emissions, random):
+        """See `Combined.tangential`."""
+        launches = self.rule.tangential(emissions, random)
+        shares = np.zeros((len(emissions), 1, 3))
+        shares[..., 0] = 1.0
+        shares[second_over_first(emissions) > self.least] = [0.5, 0.5, 0.0]
+        return launches._replace(shares=shares)
+
+
+class NotBetweenTwo:
+    """Probability of a law, but 0 for atoms whose two strongest neighbours have nearly equal charges."""
+
+    def __init__(self, law, most):
+        self.law, self.most = law, most
+
+    def probabilities(self, emissions):
+        """See `RollProbability`."""
+        return np.where(second_over_first(emissions) > self.most, 0.0, self.law.probabilities(emissions))
+
+
+def second_over_first(emissions):
+    """Charge of the second target over that of the first; 0 without a second one."""
+    ratios = emissions.charge_ratios[:, 0]
+    return np.nan_to_num(ratios[:, 1] / ratios[:, 0])
+
+
+def rivals(name, scale, rolls):
+    """The law of migration, and rules of other kinds."""
+    law = ae.emission.Migration.of(name)
+    energy = ae.TruncatedNormal(0.2 * scale, 0.2 * scale)
+    one = rolled(0.2 * scale, probability=law, sharpness=2.0)
+    sharp = rolled(0.2 * scale, probability=law, sharpness=0.0)
+    found = {"migration": one, "migration, sharpness 0": sharp}
+    for push in (0.2, 0.7):
+        found[f"pushed by the neighbour, {push:g} eV"] = Pushed(
+            ae.TruncatedNormal(push * scale, push * scale), 2 * HEIGHT
+        )
+    for least in (0.7, 0.9):
+        found[f"onto a bridge of two > {least:g}"] = Bridge(sharp, least)
+        found[f"not between two > {least:g}"] = rolled(
+            0.2 * scale, probability=NotBetweenTwo(law, least), sharpness=2.0
+        )
+    for part in (0.2, 0.4):
+        lateral = ae.LateralVelocity(energy, 2 * HEIGHT)
+        found[f"{part:g} at random, whatever the law"] = ae.emission.Mixture((one, lateral), (1 - part, part))
+        found[f"{part:g} onto the strongest"] = ae.emission.Mixture((one, sharp), (1 - part, part))
+    if rolls == 2:
+        for part in (0.3, 0.6, 1.0):
+            twice = ae.RollUp(energy, law, 2.0, 2 * HEIGHT, others=energy, second_roll=part)
+            found[f"second step {part:g}"] = twice
+    return found
 
 
 def rules(name, scale):
@@ -90,6 +168,7 @@ def main():
     parser.add_argument("metal", choices=METALS)
     parser.add_argument("measured", help="ions, or a map of densities")
     parser.add_argument("run", help="with wide responses")
+    parser.add_argument("--rivals", action="store_true", help="rules that are not a threshold")
     options = parser.parse_args()
     warnings.simplefilter("ignore", ae.warnings.ResponseWarning)  # tails of the broad energies are extrapolated
     metal = METALS[options.metal]
@@ -99,7 +178,9 @@ def main():
     ratios = run.emissions.charge_ratios[:, 0, 0]
     projection, orientation = projection_of(run), ae.Orientation.from_settings(run.settings["tip"])
     scale = float(np.median(run.at_evaporation_field().energy_scales))
-    for name, rule in rules(options.metal.partition("-")[0], scale).items():
+    metal_name = options.metal.partition("-")[0]
+    rolls = run.emissions.targets.shape[1]
+    for name, rule in (rivals(metal_name, scale, rolls) if options.rivals else rules(metal_name, scale)).items():
         threshold = getattr(getattr(rule, "probability", None), "threshold", None)  # of a charge ratio, or a law
         part = "" if threshold is None else f" ({np.mean(ratios > threshold):.2f} roll)"
         row(name + part, folded(map_of(run, rule), orientation, projection, metal), target, metal)

@@ -6,7 +6,8 @@ One file for each metal, radius, rule and seed, `W_160_others_1.h5`; a file that
 evaporate, only ions that can arrive in the measured field of view fly. Every emission is flown for the same ions, in
 the exact field. Energies are 0.35 eV in real units, sigma/mean 1, launches 0.1 nm above the site unless the name says
 otherwise. With --fly wide, each ion gets its responses instead (`_wide.h5`), for any emission afterwards (`rules.py`);
-with --fly law, only the one rule for all metals is flown (`_law.h5`).
+with --fly law, only the one rule for all metals is flown (`_law.h5`). The responses can also cover roll-ups onto second
+neighbours (--shells 2, `_wide_shells.h5`) and second roll-ups (--rolls 2, `_wide_rolls.h5`).
 """
 
 import argparse
@@ -57,10 +58,10 @@ def one_rule(law, scale):
     return ae.RollUp(energy, law, 2.0, 2 * HEIGHT, others=energy)
 
 
-def prepared(tip, rule, half_angle, skip, seed=1, threads=None):
+def prepared(tip, rule, half_angle, skip, seed=1, threads=None, **targets):
     """Simulation of a tip after some events without flights, and the simulated energy per real energy."""
     common = {"seed": seed, "rule": rule, "n_threads": threads}
-    common["response_settings"] = ae.ResponseSettings.wide()  # records the neighbours for the sharpness
+    common["response_settings"] = ae.ResponseSettings.wide(**targets)  # records the neighbours for the sharpness
     pilot = ae.Simulation(tip, **common).run(256, responses=False, progress=False)
     scale = float(np.median(pilot.at_evaporation_field().energy_scales))
     simulation = ae.Simulation(tip, flight_settings=ae.FlightSettings(field_of_view=half_angle), **common)
@@ -69,14 +70,14 @@ def prepared(tip, rule, half_angle, skip, seed=1, threads=None):
     return simulation, scale
 
 
-def simulated(metal, radius, rule, seed, skip, ions, threads, kind):
+def simulated(metal, radius, rule, seed, skip, ions, threads, kind, **targets):
     """Run of one specimen; the second one has other atoms at the apex."""
     axis, half_angle = AXES[metal]
     material = ae.material(metal.partition("-")[0])
     size = radius * material.a
     shank = size if radius >= 160 else 2 * size
     tip = ae.Tip(material, size, axis=axis, shank_length=shank, depth=8 * material.a, offset_seed=seed)
-    simulation, scale = prepared(tip, RULES[rule], half_angle, skip, seed, threads)
+    simulation, scale = prepared(tip, RULES[rule], half_angle, skip, seed, threads, **targets)
     if kind == "wide":
         return simulation.run(ions, progress=False)
     law = ae.emission.Migration.of(material)
@@ -97,13 +98,17 @@ def main():
     parser.add_argument("--threads", type=int)
     kinds = ("emissions", "wide", "law")
     parser.add_argument("--fly", choices=kinds, default=kinds[0], help="eight emissions, responses, or the one law")
+    parser.add_argument("--shells", type=int, default=1, help="shells of neighbours onto which atoms can roll, 1 or 2")
+    parser.add_argument("--rolls", type=int, default=1, help="roll-ups of an ion that the responses cover, 1 or 2")
     options = parser.parse_args()
+    targets = {name: getattr(options, name) for name in ("shells", "rolls")}
     kind = "" if options.fly == kinds[0] else f"_{options.fly}"
+    kind += "".join(f"_{name}" for name, count in targets.items() if count > 1)
     path = options.runs / f"{options.metal}_{options.radius}_{options.rule}_{options.seed}{kind}.h5"
     options.runs.mkdir(parents=True, exist_ok=True)
     if not path.exists():
         arguments = options.metal, options.radius, options.rule, options.seed, options.skip, options.ions
-        simulated(*arguments, options.threads, options.fly).save(path)
+        simulated(*arguments, options.threads, options.fly, **targets).save(path)
 
 
 if __name__ == "__main__":
