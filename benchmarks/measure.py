@@ -155,7 +155,7 @@ def evaporate(emitter, events):
     return time.perf_counter() - start - relaxations, relaxations
 
 
-def rates(radii=(20, 40, 80, 120), shank=2.0, ions=5000, threads=(1, 2), depth=8.0):
+def rates(radii=(20, 40, 80), shank=2.0, ions=10_000, threads=(1, 2), depth=8.0):
     """Time of an event, ions per second with one flight, with both responses and with wide ones, peak memory."""
     rows = []
     for radius in radii:

@@ -24,4 +24,6 @@ cdef class ConstantPotential(FieldRule):
     cdef double at(self, Octree tree, long slot) noexcept nogil
     cdef double corrections(self, Octree tree, long slot, const double* sources, long n) noexcept nogil
     cdef int patch_charges(self, Octree tree, double[:, ::1] normals, Patch* patch) except -1 nogil
-    cdef void spread_potential(self, const Hole* hole, const Patch* patch) noexcept nogil
+    cdef void act_on(self, const Hole* hole, long first, long m, long room, long n, const float* x, const float* y,
+                     const float* z, const float* change) noexcept nogil
+    cdef void correct_spread(self, const Hole* hole, const Patch* patch) noexcept nogil

@@ -25,7 +25,7 @@ from apt_evap._core.interactions cimport InteractionLists
 from apt_evap._core.octree cimport Octree
 from apt_evap._core.potentials cimport Potentials
 from apt_evap._core.robin cimport Robin, dot
-from apt_evap._core.rule cimport FieldRule, Hole, Patch
+from apt_evap._core.rule cimport FieldRule, Hole, Patch, merge
 from apt_evap._core.sources cimport sources_field, sources_potential
 
 
@@ -36,8 +36,8 @@ cdef extern from "kernels.h":
                              float*) noexcept nogil
     void patch_potential(long, const float*, const float*, const float*, long, const float*, const float*,
                          const float*, const float*, float*) noexcept nogil
-    void patch_field(long, const float*, const float*, const float*, long, const float*, const float*, const float*,
-                     const float*, float*, float*, float*) noexcept nogil
+    void patch_potential_and_field(long, const float*, const float*, const float*, long, const float*, const float*,
+                                   const float*, const float*, float*, float*, float*, float*) noexcept nogil
     float patch_dot(long, const float*, const float*) noexcept nogil
 
 
@@ -111,6 +111,7 @@ cdef class ConstantPotential(FieldRule):
     def __init__(self, double self_term, bint gaussian, bint sees_others, double tolerance):
         self.given, self.gaussian, self.sees_others, self.tolerance = self_term, gaussian, sees_others, tolerance
         self.area, self.self_term, self.n_iterations = 1.0, 0.0, 0
+        self.near = 1.6   # the potential of merged changes is less accurate than their field
         self.robin = Robin(tolerance, 8)
         self.field = np.zeros((1, 3))
         self.grow(512)
@@ -141,25 +142,27 @@ cdef class ConstantPotential(FieldRule):
             self.self_term = self.given if self.given > 0.0 else LATTICE_SUM / sqrt(self.robin.area)
         shape = gaussian_table(self.self_term * sqrt(M_PI / 2.0)) if self.gaussian else ()
         self.sums = Potentials(lists, *shape)
-        rough = Potentials(InteractionLists(tree, max(ROUGH_ANGLE, lists.opening_angle), n_threads), *shape)
-        charges, image = tree.charges.copy(), np.empty(n)
-        self.multiply(self.sums, charges, image, double_precision, n_threads)
-        multiple = potential * charges.sum() / dot(charges, image)   # the one with the smallest error
-        charges *= multiple
-        image *= multiple
+        angle = max(ROUGH_ANGLE, lists.opening_angle)
+        rough = Potentials(InteractionLists(tree, angle, n_threads, lists.disturbed), *shape)
+        charges, chosen = tree.charges.copy(), lists.slots
+        image = self.multiply(self.sums, charges, double_precision, n_threads)
+        if lists.disturbed is None:
+            multiple = potential * charges.sum() / dot(charges[chosen], image)   # the one with the smallest error
+            charges *= multiple
+            image *= multiple
         residuals = potential - image
         while True:
-            change = np.zeros(n)
+            change = np.zeros(len(chosen))
             sweeps, residual = self.correct(rough, change, residuals, charges.sum() / n, tolerance, sweeps, max_sweeps,
                                             double_precision, n_threads)
-            charges += change
+            charges[chosen] += change
             if residual < tolerance or sweeps >= max_sweeps:
                 break
-            self.multiply(self.sums, charges, image, double_precision, n_threads)
-            residuals = potential - image
+            residuals = potential - self.multiply(self.sums, charges, double_precision, n_threads)
         tree.charges = charges
-        self.value = np.zeros(tree.x.shape[0])
-        np.asarray(self.value)[:n] = potential - residuals
+        if lists.disturbed is None:
+            self.value = np.zeros(tree.x.shape[0])
+        np.asarray(self.value)[chosen] = potential - residuals
         if first or self.sees_others:
             self.fields_of(tree, lists, n_threads)
         if first:
@@ -168,19 +171,20 @@ cdef class ConstantPotential(FieldRule):
 
     def correct(self, Potentials rough, change, residuals, double mean, double tolerance, int sweeps, int max_sweeps,
                 bint double_precision, int n_threads):
-        """Conjugate gradients for the change of the charges that removes residuals, by rough potentials.
+        """Conjugate gradients for the change of the charges of the targets that removes residuals, by rough potentials.
 
         Returns the number of sweeps, counted on, and the larger of the last change of a charge and its error by the
         rough potentials, over the mean charge.
         """
         cdef double square, before, curvature, step, bound, last = np.inf
-        image = np.empty(len(change))
+        spread = np.zeros(rough.lists.tree.n_slots)
         preconditioned = self.preconditioned(residuals)
         direction = preconditioned.copy()
         square = dot(residuals, preconditioned)
         while sweeps < max_sweeps:
             sweeps += 1
-            self.multiply(rough, direction, image, double_precision, n_threads)
+            spread[rough.lists.slots] = direction
+            image = self.multiply(rough, spread, double_precision, n_threads)
             curvature = dot(direction, image)
             if not curvature > 0.0:
                 if square == 0.0:   # solved exactly
@@ -234,10 +238,11 @@ cdef class ConstantPotential(FieldRule):
         """Potential of each slot with that of its own charge, as kept up to date [e/nm], shape (capacity,)."""
         return np.asarray(self.value)
 
-    def multiply(self, Potentials sums, charges, image, bint double_precision, int n_threads):
-        """Potentials of all atoms with their self terms, for charges of either sign."""
+    def multiply(self, Potentials sums, charges, bint double_precision, int n_threads):
+        """Potentials of the targets of the lists with their self terms, for charges of all slots of either sign."""
+        image = np.empty(len(charges))
         sums.of(charges, image, double_precision, n_threads)
-        image += self.self_term * charges
+        return image[sums.lists.slots] + self.self_term * charges[sums.lists.slots]
 
     def indefinite(self):
         """Message of the error for a self term that is too small."""
@@ -247,10 +252,11 @@ cdef class ConstantPotential(FieldRule):
         )
 
     def fields_of(self, Octree tree, InteractionLists lists, int n_threads):
-        """Compute the field of all other charges at each slot."""
+        """Compute the field of all other charges at each target."""
         if tree.n_cancelling:   # these cells must not act as a whole
-            lists = InteractionLists(tree, lists.opening_angle, n_threads)
-        self.field = np.zeros((tree.x.shape[0], 3))
+            lists = InteractionLists(tree, lists.opening_angle, n_threads, lists.disturbed)
+        if lists.disturbed is None:
+            self.field = np.zeros((tree.x.shape[0], 3))
         lists.sweep(self.field, False, n_threads)
 
     def effective_area(self, Octree tree):
@@ -372,21 +378,25 @@ cdef class ConstantPotential(FieldRule):
 
     cdef int solve_patch(self, Octree tree, double[:, ::1] normals, const Hole* hole, Patch* patch) except -1 nogil:
         cdef long i, room = (hole.n + GROUP - 1) // GROUP * GROUP
+        cdef long near = min((hole.n_near + GROUP - 1) // GROUP * GROUP, room)
         cdef int slot
         if 4 * room > self.spreads.shape[0]:
             with gil:
                 self.spreads = np.empty(8 * room, np.float32)
         self.patch_charges(tree, normals, patch)
+        merge(tree, patch)
         for i in range(4 * room):
             self.spreads[i] = 0.0
-        self.spread_potential(hole, patch)
+        self.act_on(hole, 0, near, room, patch.stride, patch.x, patch.y, patch.z, patch.change)
+        self.act_on(hole, near, room - near, room, patch.n_merged, patch.merged_x, patch.merged_y,
+                    patch.merged_z, patch.merged_change)
+        if self.gaussian:
+            self.correct_spread(hole, patch)
         for i in range(hole.n):
             self.value[hole.slot[i]] += self.spreads[i]
         for i in range(patch.n):
             self.value[patch.slot[i]] += self.self_term * patch.change[i]
         if self.sees_others:
-            patch_field(room, hole.near_x, hole.near_y, hole.near_z, patch.stride, patch.x, patch.y, patch.z,
-                        patch.change, &self.spreads[room], &self.spreads[2 * room], &self.spreads[3 * room])
             for i in range(hole.n):
                 slot = hole.slot[i]
                 self.field[slot, 0] += self.spreads[room + i]
@@ -394,19 +404,26 @@ cdef class ConstantPotential(FieldRule):
                 self.field[slot, 2] += self.spreads[3 * room + i]
         return 0
 
-    cdef void spread_potential(self, const Hole* hole, const Patch* patch) noexcept nogil:
-        # Potential of the changes of the patch at the slots around the hole.
-        cdef long i, k, room = (hole.n + GROUP - 1) // GROUP * GROUP
+    cdef void act_on(self, const Hole* hole, long first, long m, long room, long n, const float* x,
+                     const float* y, const float* z, const float* change) noexcept nogil:
+        # Potentials, and fields if a law sees them, of n changes at m slots around the hole.
+        cdef float* at = &self.spreads[first]
+        if self.sees_others:
+            patch_potential_and_field(m, hole.near_x + first, hole.near_y + first, hole.near_z + first, n, x, y, z,
+                                      change, at, at + room, at + 2 * room, at + 3 * room)
+        else:
+            patch_potential(m, hole.near_x + first, hole.near_y + first, hole.near_z + first, n, x, y, z, change, at)
+
+    cdef void correct_spread(self, const Hole* hole, const Patch* patch) noexcept nogil:
+        # Differences between Gaussian and point charges in these potentials.
+        cdef long i, k
         cdef float dx, dy, dz, s, most = <float>self.sums.reach_squared
-        patch_potential(room, hole.near_x, hole.near_y, hole.near_z, patch.stride, patch.x, patch.y, patch.z,
-                        patch.change, &self.spreads[0])
-        if self.gaussian:
-            for i in range(hole.n):
-                for k in range(patch.n):
-                    dx, dy, dz = hole.near_x[i] - patch.x[k], hole.near_y[i] - patch.y[k], hole.near_z[i] - patch.z[k]
-                    s = dx * dx + dy * dy + dz * dz
-                    if SAME_PLACE < s < most:
-                        self.spreads[i] += patch.change[k] * <float>self.sums.difference(s)
+        for i in range(hole.n):
+            for k in range(patch.n):
+                dx, dy, dz = hole.near_x[i] - patch.x[k], hole.near_y[i] - patch.y[k], hole.near_z[i] - patch.z[k]
+                s = dx * dx + dy * dy + dz * dz
+                if SAME_PLACE < s < most:
+                    self.spreads[i] += patch.change[k] * <float>self.sums.difference(s)
 
     cdef int grow(self, long stride) except -1 nogil:
         if stride > self.residual.shape[0]:

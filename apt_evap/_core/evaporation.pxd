@@ -15,8 +15,11 @@ cdef class Evaporation:
     cdef readonly ChargingRule rule
     cdef readonly LawKernel law
     cdef readonly double potential, coulomb, field_unit, patch_radius, update_radius, opening_angle
-    cdef readonly object start          # start values of the last relaxation
+    cdef readonly object start          # start values of the last relaxation of the whole surface
     cdef readonly long n_removed, since_relaxation
+    cdef readonly long n_partial        # relaxations of a part since that of the whole surface
+    cdef long n_slots_before            # slots of the tree after the last relaxation
+    cdef readonly signed char[::1] disturbed   # (capacity,) 1 for slots near holes since the last relaxation
     cdef public long n_clipped          # negative charges that were set to 0
     cdef public long n_unsettled        # patches that did not converge
     cdef readonly Control control       # of the voltage
@@ -32,15 +35,18 @@ cdef class Evaporation:
     cdef Patch patch                    # slots whose charges are solved; its memory follows
     cdef int[::1] patch_slot
     cdef double[::1] patch_charge
-    cdef float[:, ::1] patch_float      # (4, room)
+    cdef float[:, ::1] patch_float      # (8, room)
+    cdef int[::1] far_slot              # (room,)
     cdef double[::1] strength, key      # (room,) of the patch, for the law
     cdef long long[::1] key_atom
     cdef int[::1] key_bonds
 
     cdef void make_room(self, long room)
+    cdef rank(self, double factor, log_rate_at, int n_threads)
     cdef Chooser ranked(self, double voltage_factor, int n_threads)
     cdef void strongest_neighbours(self, long atom, long leaving, long long* neighbour, double* charge) noexcept nogil
     cdef void join(self, int slot, double dx, double dy, double dz) noexcept nogil
+    cdef void near_first(self, Hole* hole) noexcept nogil
     cdef int surroundings(self, long atom) noexcept nogil
     cdef int judge(self, const int* slots, long n) except -1 nogil
     cdef int event(self, long atom, Journal journal) except -1 nogil

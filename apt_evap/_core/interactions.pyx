@@ -69,37 +69,53 @@ cdef class InteractionLists:
     Parameters
     ----------
     tree : Octree
-        A tree without atoms added after its build. Its charges may change later, but not its atoms.
+        Its charges may change later, but not its atoms.
     opening_angle : float
         A cell replaces its atoms if the full angle of its ball is smaller than this angle [rad].
     n_threads : int
         Number of threads.
+    disturbed : ndarray of int8, shape (n_slots,) or longer, optional
+        1 for slots that must be targets. All atoms of their block, a node with at most 1,024 atoms, are targets. By
+        default all atoms are.
+    samples : bool
+        Whether the atoms of the leaf in the middle of each other block are targets, too.
     """
 
-    def __init__(self, Octree tree, double opening_angle, int n_threads=1):
-        if tree.n_slots != tree.n_sorted:
-            raise ValueError("lists need a tree without inserted atoms")
-        cdef long node = 0, count = 0, group, chunk, n_chunks
-        cdef long[::1] chunk_node = np.empty(tree.n_nodes, np.int64), chunk_group = np.zeros(tree.n_nodes + 1, np.int64)
-        self.tree, self.opening_angle = tree, opening_angle
-        n_chunks = 0
+    def __init__(self, Octree tree, double opening_angle, int n_threads=1, const signed char[::1] disturbed=None,
+                 bint samples=False):
+        cdef long node = 0, leaf, n = 0, group, chunk, n_chunks = 0, n_blocks = 0
+        cdef long[::1] chunk_slot = np.zeros(tree.n_nodes + 1, np.int64), chunk_group = np.zeros(tree.n_nodes + 1, np.int64)
+        cdef int[::1] slots = np.empty(tree.n_slots, np.int32), targets
+        cdef long[:, ::1] blocks = np.empty((tree.n_nodes if samples else 0, 3), np.int64)
+        cdef bint whole
+        self.tree, self.opening_angle, self.disturbed = tree, opening_angle, disturbed
         while node < tree.n_nodes:
-            count = tree.last[node] - tree.first[node]
-            if count <= CHUNK or tree.skip[node] == node + 1:
-                chunk_node[n_chunks] = node
-                chunk_group[n_chunks + 1] = chunk_group[n_chunks] + (count + GROUP - 1) // GROUP
+            if tree.last[node] - tree.first[node] <= CHUNK or tree.skip[node] == node + 1:
+                whole = disturbed is None or self.has_disturbed(tree, node)
+                if whole:
+                    n = self.targets_of(tree, node, &slots[0], n)
+                elif samples:
+                    leaf = self.middle_of(tree, node)
+                    n = self.targets_of(tree, leaf, &slots[0], n)
+                    blocks[n_blocks, 0], blocks[n_blocks, 1], blocks[n_blocks, 2] = leaf, chunk_slot[n_chunks], n
+                    n_blocks += 1
+                chunk_slot[n_chunks + 1] = n
+                chunk_group[n_chunks + 1] = chunk_group[n_chunks] + (n - chunk_slot[n_chunks] + GROUP - 1) // GROUP
                 n_chunks += 1
                 node = tree.skip[node]
             else:
                 node += 1
+        self.blocks = np.asarray(blocks)[:n_blocks].copy()
         self.n_groups = chunk_group[n_chunks]
         self.members = np.empty((self.n_groups, GROUP), np.int32)
         self.ball = np.empty((self.n_groups, 4))
         self.starts = np.zeros((self.n_groups + 1, 3), np.int64)
-        cdef int[::1] slots = np.arange(tree.n_sorted, dtype=np.int32)
+        targets = slots[:n].copy()
+        self.slots = np.asarray(slots)[:n]
         for chunk in prange(n_chunks, nogil=True, schedule="dynamic", chunksize=4, num_threads=n_threads):
-            self.split(tree, &slots[tree.first[chunk_node[chunk]]],
-                       tree.last[chunk_node[chunk]] - tree.first[chunk_node[chunk]], chunk_group[chunk])
+            if chunk_slot[chunk] < chunk_slot[chunk + 1]:
+                self.split(tree, &targets[chunk_slot[chunk]], chunk_slot[chunk + 1] - chunk_slot[chunk],
+                           chunk_group[chunk])
         for group in prange(self.n_groups, nogil=True, schedule="dynamic", chunksize=16, num_threads=n_threads):
             self.walk(tree, group, opening_angle, NULL, NULL, &self.starts[group + 1, 0])
         starts = np.cumsum(np.asarray(self.starts), axis=0)
@@ -109,6 +125,51 @@ cdef class InteractionLists:
         for group in prange(self.n_groups, nogil=True, schedule="dynamic", chunksize=16, num_threads=n_threads):
             self.walk(tree, group, opening_angle, &self.cells[0] + self.starts[group, 0],
                       &self.ranges[0] + 2 * self.starts[group, 1], NULL)
+
+    cdef bint has_disturbed(self, Octree tree, long node) noexcept nogil:
+        # Whether a slot below a node is disturbed.
+        cdef long leaf, slot
+        for leaf in range(node, tree.skip[node]):
+            slot = tree.first[leaf] if tree.skip[leaf] == leaf + 1 else -1
+            while slot >= 0:
+                if self.disturbed[slot]:
+                    return True
+                slot = tree.following(leaf, slot)
+        return False
+
+    cdef long middle_of(self, Octree tree, long node) noexcept nogil:
+        # The leaf below a node that is nearest to the mean position of its leaves.
+        cdef double[3] mean
+        cdef double s, least = 1e30
+        cdef long leaf, best = node, n = 0
+        cdef int axis
+        for axis in range(3):
+            mean[axis] = 0.0
+        for leaf in range(node, tree.skip[node]):
+            if tree.skip[leaf] == leaf + 1:
+                n += 1
+                for axis in range(3):
+                    mean[axis] += tree.ball[leaf, axis]
+        for leaf in range(node, tree.skip[node]):
+            if tree.skip[leaf] == leaf + 1:
+                s = 0.0
+                for axis in range(3):
+                    s += (tree.ball[leaf, axis] - mean[axis] / n) ** 2
+                if s < least:
+                    best, least = leaf, s
+        return best
+
+    cdef long targets_of(self, Octree tree, long node, int* slots, long n) noexcept nogil:
+        # Adds the atoms below a node to the n slots listed so far; returns their number.
+        cdef long leaf, slot
+        for leaf in range(node, tree.skip[node]):
+            slot = tree.first[leaf] if tree.skip[leaf] == leaf + 1 else -1
+            while slot >= 0:
+                if tree.atom[slot] >= 0:
+                    slots[n] = <int>slot
+                    n += 1
+                slot = tree.following(leaf, slot)
+        return n
 
     cdef void split(self, Octree tree, int* slots, long n, long group) noexcept nogil:
         # Splits n slots across their longest side into halves of complete groups, down to groups numbered from `group`
@@ -168,9 +229,10 @@ cdef class InteractionLists:
 
     cdef void walk(self, Octree tree, long group, double opening_angle, int* cells, int* ranges, long* counts) noexcept nogil:
         # Lists of one group: accepted cells, and slots [begin, end) of the leaves whose atoms are summed one by one,
-        # adjacent ranges merged. Without lists it only counts cells, ranges and atoms.
+        # adjacent ranges merged; atoms added to a leaf later are ranges of one slot. Without lists it only counts
+        # cells, ranges and atoms.
         cdef const double* ball = &self.ball[group, 0]
-        cdef long node = 0, n_cells = 0, n_ranges = 0, n_atoms = 0, open_end = -1
+        cdef long node = 0, n_cells = 0, n_ranges = 0, n_atoms = 0, open_end = -1, slot
         cdef double dx, dy, dz, reach, factor = 2.0 / opening_angle if opening_angle > 0.0 else 1e30
         while node < tree.n_nodes:
             dx, dy, dz = ball[0] - tree.ball[node, 0], ball[1] - tree.ball[node, 1], ball[2] - tree.ball[node, 2]
@@ -189,6 +251,14 @@ cdef class InteractionLists:
                 if ranges != NULL:
                     ranges[2 * n_ranges - 1] = <int>open_end
                 n_atoms += tree.last[node] - tree.first[node]
+                slot = tree.extra[node]
+                while slot >= 0:
+                    if ranges != NULL:
+                        ranges[2 * n_ranges], ranges[2 * n_ranges + 1] = <int>slot, <int>slot + 1
+                    n_ranges += 1
+                    n_atoms += 1
+                    open_end = -1
+                    slot = tree.next_extra[slot]
                 node += 1
             else:
                 node += 1
@@ -196,12 +266,12 @@ cdef class InteractionLists:
             counts[0], counts[1], counts[2] = n_cells, n_ranges, n_atoms
 
     def sweep(self, double[:, ::1] field, bint double_precision=False, int n_threads=1):
-        """Field of all other atoms at each atom of the tree, from its current charges.
+        """Field of all other atoms at each target, from the current charges of the tree.
 
         Parameters
         ----------
         field : ndarray, shape (n, 3) or longer
-            Filled with the field [e/nm^2], in the order of the slots.
+            Filled with the field [e/nm^2], in the order of the slots; that of slots that are not targets is kept.
         double_precision : bool
             Sums in float64; otherwise in float32 (relative error about 1e-6).
         n_threads : int

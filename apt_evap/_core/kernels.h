@@ -206,4 +206,40 @@ APT_CLONES static void patch_potential(long m, const float *restrict targets_x, 
         memcpy(potential + k, sum, sizeof sum);
     }
 }
+
+/* Adds both; see patch_field. The inverse distance serves the potential and the field. */
+APT_CLONES static void patch_potential_and_field(
+    long m, const float *restrict targets_x, const float *restrict targets_y, const float *restrict targets_z, long n,
+    const float *restrict x, const float *restrict y, const float *restrict z, const float *restrict q,
+    float *restrict potential, float *restrict field_x, float *restrict field_y, float *restrict field_z)
+{
+    for (long k = 0; k < m; k += GROUP) {
+        float tx[GROUP], ty[GROUP], tz[GROUP], sum[GROUP], ex[GROUP], ey[GROUP], ez[GROUP];
+        memcpy(tx, targets_x + k, sizeof tx);
+        memcpy(ty, targets_y + k, sizeof ty);
+        memcpy(tz, targets_z + k, sizeof tz);
+        memcpy(sum, potential + k, sizeof sum);
+        memcpy(ex, field_x + k, sizeof ex);
+        memcpy(ey, field_y + k, sizeof ey);
+        memcpy(ez, field_z + k, sizeof ez);
+        for (long i = 0; i < n; i++) {
+            const float sx = x[i], sy = y[i], sz = z[i], charge = q[i];
+#pragma omp simd
+            for (int l = 0; l < GROUP; l++) {
+                const float dx = tx[l] - sx, dy = ty[l] - sy, dz = tz[l] - sz;
+                const float s = dx * dx + dy * dy + dz * dz;
+                const float inverse = s > (float)SAME_PLACE ? 1.0f / sqrtf(s) : 0.0f;
+                const float v = charge * inverse, w = v * inverse * inverse;
+                sum[l] += v;
+                ex[l] += w * dx;
+                ey[l] += w * dy;
+                ez[l] += w * dz;
+            }
+        }
+        memcpy(potential + k, sum, sizeof sum);
+        memcpy(field_x + k, ex, sizeof ex);
+        memcpy(field_y + k, ey, sizeof ey);
+        memcpy(field_z + k, ez, sizeof ez);
+    }
+}
 #endif

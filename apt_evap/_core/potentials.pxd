@@ -8,6 +8,7 @@ cdef class Potentials:
     cdef readonly InteractionLists lists
     cdef double[:, ::1] cells            # (n_nodes, MULTIPOLE) centre of the ball and moments about it
     cdef double[:, ::1] raw              # (n_nodes, 20) moments sum q, q d_i, q d_i d_j, q d_i d_j d_k
+    cdef signed char[::1] empty          # (n_nodes,) 1 for nodes without charges
     cdef const double[::1] gaussian      # potential of Gaussian less point charges by the squared distance, or empty
     cdef double per_square               # entries of this table per nm^2
     cdef double reach_squared            # squared distance of its last entry [nm^2]

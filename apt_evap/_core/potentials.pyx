@@ -81,17 +81,18 @@ cdef class Potentials:
         self.reach_squared = max(0, self.gaussian.shape[0] - 1) / per_square
         self.cells = np.zeros((lists.tree.n_nodes, MULTIPOLE))
         self.raw = np.zeros((lists.tree.n_nodes, 20))
+        self.empty = np.zeros(lists.tree.n_nodes, np.int8)
         np.asarray(self.cells)[:, :3] = np.asarray(lists.tree.ball)[:, :3]
 
     def of(self, const double[::1] charges, double[::1] potential, bint double_precision=False, int n_threads=1):
-        """Potential of all other atoms at each atom.
+        """Potential of all other atoms at each target of the lists.
 
         Parameters
         ----------
         charges : ndarray, shape (n,) or longer
             Charges in the order of the slots [e], of either sign.
         potential : ndarray, shape (n,) or longer
-            Filled with the potential [e/nm].
+            Filled with the potential [e/nm]; that of slots that are not targets is kept.
         double_precision : bool
             Sums in float64; otherwise partial sums in float32 (relative error about 1e-7).
         n_threads : int
@@ -120,7 +121,15 @@ cdef class Potentials:
         cdef long k
         for k in range(20):
             m[k] = 0.0
-        for k in range(tree.first[node], tree.last[node]):
+        self.empty[node] = True
+        k = tree.first[node]
+        while k >= 0 and self.empty[node]:
+            self.empty[node] = charges[k] == 0.0
+            k = tree.following(node, k)
+        if self.empty[node]:
+            return
+        k = tree.first[node]
+        while k >= 0:
             q = charges[k]
             x, y, z = tree.x[k] - tree.ball[node, 0], tree.y[k] - tree.ball[node, 1], tree.z[k] - tree.ball[node, 2]
             m[0] += q
@@ -143,6 +152,7 @@ cdef class Potentials:
             m[17] += q * y * y * z
             m[18] += q * y * z * z
             m[19] += q * z * z * z
+            k = tree.following(node, k)
 
     cdef void node_moments(self, Octree tree, long node) noexcept nogil:
         # Moments of the children, shifted to the centre of this node.
@@ -152,7 +162,12 @@ cdef class Potentials:
         cdef long k = node + 1, i
         for i in range(20):
             m[i] = 0.0
+        self.empty[node] = True
         while k < tree.skip[node]:
+            if self.empty[k]:
+                k = tree.skip[k]
+                continue
+            self.empty[node] = False
             c = &self.raw[k, 0]
             x, y = tree.ball[k, 0] - tree.ball[node, 0], tree.ball[k, 1] - tree.ball[node, 1]
             z = tree.ball[k, 2] - tree.ball[node, 2]
@@ -206,7 +221,7 @@ cdef class Potentials:
     cdef void correct(self, InteractionLists lists, Octree tree, long group, const double* charges,
                       double* potential) noexcept nogil:
         # Add the difference between Gaussian and point charges at small distances. Cells of one atom can be close, too.
-        cdef long index, node
+        cdef long index, node, slot
         for index in range(lists.starts[group, 1], lists.starts[group + 1, 1]):
             self.correct_range(lists, tree, group, lists.ranges[2 * index], lists.ranges[2 * index + 1], charges,
                                potential)
@@ -214,6 +229,10 @@ cdef class Potentials:
             node = lists.cells[index]
             if tree.last[node] - tree.first[node] <= tree.leaf_size:
                 self.correct_range(lists, tree, group, tree.first[node], tree.last[node], charges, potential)
+                slot = tree.extra[node]
+                while slot >= 0:
+                    self.correct_range(lists, tree, group, slot, slot + 1, charges, potential)
+                    slot = tree.next_extra[slot]
 
     cdef void correct_range(self, InteractionLists lists, Octree tree, long group, long first, long last,
                             const double* charges, double* potential) noexcept nogil:

@@ -1,5 +1,6 @@
 """Robin's rule, and the scalar product of the charging rules."""
 
+from apt_evap._core.interactions cimport InteractionLists
 from apt_evap._core.octree cimport Octree
 from apt_evap._core.rule cimport FieldRule, Patch
 
@@ -12,8 +13,12 @@ cdef class Robin(FieldRule):
     cdef readonly int window
     cdef readonly object point          # (1, 3) the point inside with the given potential [nm]
     cdef double clearance               # initial distance of this point from the surface [nm]
+    cdef double far_scale               # factor of the charges far from the holes since the whole surface was solved
     cdef float[::1] matrix, residual
 
-    cdef normal_field(self, const double[:, ::1] normals, long n)
+    cdef sample_fields(self, const double[:, ::1] normals, InteractionLists lists)
+    cdef scale_others(self, Octree tree, InteractionLists lists, ratios)
+    cdef double along(self, const double[:, ::1] normals, long i) noexcept nogil
+    cdef normal_field(self, Octree tree, const double[:, ::1] normals)
     cdef int grow(self, long stride) except -1 nogil
     cdef int patch_charges(self, Octree tree, double[:, ::1] normals, Patch* patch) except -1 nogil

@@ -22,6 +22,16 @@ cdef extern from "kernels.h":
     float patch_dot(long, const float*, const float*) noexcept nogil
 
 
+OUTLIER = 4.0
+"""Deviation of a ratio of fields from a smooth function over the median deviation, above which it is not used."""
+
+
+cdef smooth_functions(places):
+    # 1, z, z^2, z^3, x, y, x z and y z of places, shape (m, 3), for a change along a specimen and across it.
+    x, y, z = np.ascontiguousarray(places.T)
+    return [np.ones(len(z)), z, z * z, z * z * z, x, y, x * z, y * z]
+
+
 cdef double dot(const double[::1] first, const double[::1] second) noexcept nogil:
     # Scalar product; eight sums allow vectorisation in an order that does not depend on the processor.
     cdef double sums[8]
@@ -61,13 +71,23 @@ cdef class Robin(FieldRule):
         self.tolerance = tolerance
         self.window = window
         self.area = 1.0
-        self.clearance = 0.0
+        self.clearance, self.far_scale = 0.0, 1.0
         self.point = np.zeros((1, 3))
         self.grow(512)
 
     def begin(self, point):
         """Set the point inside the specimen with the given potential [nm], shape (3,)."""
         self.point = np.array(point, dtype=np.float64).reshape(1, 3)
+
+    @property
+    def samples(self):
+        """True: the area per atom is common to all charges, so that those far from the holes change as well."""
+        return True
+
+    @property
+    def far_change(self):
+        """Of the sum of the charges that are not targets."""
+        return abs(self.far_scale - 1.0)
 
     @property
     def state(self):
@@ -81,9 +101,18 @@ cdef class Robin(FieldRule):
     def solve(self, Octree tree, double[:, ::1] normals, InteractionLists lists, *, double potential, double tolerance,
               int max_sweeps=200, bint double_precision=False, int n_threads=1):
         """Iterate over the whole surface, then scale all charges to the potential: see `ChargingRule.solve`."""
+        others = np.zeros(tree.n_slots, bool)
+        if lists.disturbed is None:
+            self.far_scale = 1.0
+        else:
+            others[:] = tree.atoms >= 0
+            others[lists.slots] = False
+        before = tree.charges[others].sum()
         outcome = self.iterate(tree, normals, lists, tolerance=tolerance, max_sweeps=max_sweeps,
                                double_precision=double_precision, n_threads=n_threads)
         self.scale(tree, potential / (tree.charges / self.keep_inside(tree)).sum())
+        if before > 0.0:
+            self.far_scale *= tree.charges[others].sum() / before
         return outcome
 
     def scale(self, Octree tree, double factor):
@@ -133,7 +162,8 @@ cdef class Robin(FieldRule):
         normals : ndarray, shape (n, 3)
             Outward unit normals in the order of the slots.
         lists : InteractionLists
-            Interaction lists of this tree.
+            Interaction lists of this tree. In their blocks with samples, the fields of all atoms change by the ratio
+            of the fields of the samples.
         tolerance : float
             Largest change of a charge in a sweep, relative to the mean charge, at which to stop.
         max_sweeps : int
@@ -153,13 +183,19 @@ cdef class Robin(FieldRule):
         cdef long n = tree.n_slots
         cdef int sweeps = 0
         cdef double residual = np.inf
-        self.field = np.zeros((tree.x.shape[0], 3))
+        if lists.disturbed is None:
+            self.field = np.zeros((tree.x.shape[0], 3))
         charges = tree.charges
         total = charges.sum()
         maps, steps = [], []   # results of the last sweeps of Robin's iteration, and their changes
         for sweeps in range(1, max_sweeps + 1):
+            before = self.sample_fields(normals, lists)
             lists.sweep(self.field, double_precision, n_threads)
-            flux = np.maximum(self.normal_field(normals, n), 0.0)   # a site deep in a notch has no charge
+            if len(before):
+                after = self.sample_fields(normals, lists)
+                unknown = np.full(len(before), np.nan)
+                self.scale_others(tree, lists, np.divide(after, before, unknown, where=before > 0.0))
+            flux = np.maximum(self.normal_field(tree, normals), 0.0)   # a site deep in a notch has no charge
             if not flux.sum() > 0.0:
                 raise ValueError(f"the total charge of {n} surface atoms is not positive: normals must point outwards")
             self.area = 2.0 * M_PI * total / flux.sum()
@@ -175,13 +211,63 @@ cdef class Robin(FieldRule):
             tree.charges = mixed
         return sweeps, residual
 
-    cdef normal_field(self, const double[:, ::1] normals, long n):
-        # Field of all other charges along the normal of each slot [e/nm^2].
-        cdef double[::1] along = np.empty(n)
+    cdef sample_fields(self, const double[:, ::1] normals, InteractionLists lists):
+        # Mean field along the normals of the samples of each block [e/nm^2].
+        cdef double[::1] means = np.zeros(lists.blocks.shape[0])
+        cdef const int[::1] slots = lists.slots
+        cdef long block, k, begin, end
+        for block in range(lists.blocks.shape[0]):
+            begin, end = lists.blocks[block, 1], lists.blocks[block, 2]
+            for k in range(begin, end):
+                means[block] += self.along(normals, slots[k]) / (end - begin)
+        return np.asarray(means)
+
+    cdef scale_others(self, Octree tree, InteractionLists lists, ratios):
+        # Fields of the atoms that are not targets, scaled by a smooth function through the ratios of the samples.
+        # Blocks that deviate are left out: at the open end of the shank, a higher charge lowers the fields next to it.
+        cdef const double[::1] low, high, c
+        cdef signed char[::1] kept = np.zeros(tree.n_slots, np.int8)
+        cdef double x, y, z, scale
         cdef long i
-        for i in range(n):
-            along[i] = (self.field[i, 0] * normals[i, 0] + self.field[i, 1] * normals[i, 1]
-                        + self.field[i, 2] * normals[i, 2])
+        places = np.asarray(tree.ball)[np.asarray(lists.blocks)[:, 0], :3]
+        lowest, highest = places.min(axis=0), places.max(axis=0)
+        basis = smooth_functions((2.0 * places - lowest - highest) / np.maximum(highest - lowest, 1e-9))
+        used = np.isfinite(ratios)
+        for _ in range(2):
+            functions = basis[:min(len(basis), np.count_nonzero(used) // 2)]
+            if not functions:
+                return
+            gram = np.array([[dot(one[used], other[used]) for other in functions] for one in functions])
+            right = np.array([dot(one[used], ratios[used]) for one in functions])
+            gram += 1e-10 * np.trace(gram) * np.eye(len(gram))
+            eliminate(gram, right)
+            apart = np.abs(sum(factor * one for factor, one in zip(right, functions)) - ratios)
+            used &= apart <= OUTLIER * np.median(apart[used])
+        low, high = lowest, np.maximum(highest, lowest + 1e-9)
+        c = np.concatenate([right, np.zeros(len(basis) - len(right))])
+        np.asarray(kept)[lists.slots] = 1
+        for i in range(tree.n_slots):
+            if tree.atom[i] >= 0 and not kept[i]:
+                x = (2.0 * tree.x[i] - low[0] - high[0]) / (high[0] - low[0])
+                y = (2.0 * tree.y[i] - low[1] - high[1]) / (high[1] - low[1])
+                z = (2.0 * tree.z[i] - low[2] - high[2]) / (high[2] - low[2])
+                scale = c[0] + (c[1] + (c[2] + c[3] * z) * z) * z + (c[4] + c[6] * z) * x + (c[5] + c[7] * z) * y
+                self.field[i, 0] *= scale
+                self.field[i, 1] *= scale
+                self.field[i, 2] *= scale
+
+    cdef double along(self, const double[:, ::1] normals, long i) noexcept nogil:
+        # Field of all other charges along the normal of a slot [e/nm^2].
+        return (self.field[i, 0] * normals[i, 0] + self.field[i, 1] * normals[i, 1]
+                + self.field[i, 2] * normals[i, 2])
+
+    cdef normal_field(self, Octree tree, const double[:, ::1] normals):
+        # The same for all slots; 0 where an atom was removed.
+        cdef double[::1] along = np.zeros(tree.n_slots)
+        cdef long i
+        for i in range(tree.n_slots):
+            if tree.atom[i] >= 0:
+                along[i] = self.along(normals, i)
         return np.asarray(along)
 
     @cython.wraparound(True)

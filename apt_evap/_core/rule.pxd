@@ -10,13 +10,14 @@ from apt_evap._core.sources cimport Sources
 
 
 cdef struct Hole:
-    # The surroundings of an evaporated atom: slots whose fields are updated. Positions are relative to the hole; the
-    # arrays are padded to a multiple of GROUP with distant positions.
+    # The surroundings of an evaporated atom: slots whose fields are updated, first the near ones. Positions are relative
+    # to the hole; the arrays are padded to a multiple of GROUP with distant positions.
     double x                # position of the evaporated atom [nm]
     double y
     double z
     double charge           # its charge [e]
     long n
+    long n_near             # of these, the slots for which the atoms of the patch count one by one
     int* slot
     float* near_x           # [nm]
     float* near_y
@@ -34,12 +35,21 @@ cdef struct Patch:
     float* x                # relative to the hole [nm]
     float* y
     float* z
+    long n_merged           # the changes of the patch merged by four, for distant slots; padded as above
+    float* merged_change
+    float* merged_x
+    float* merged_y
+    float* merged_z
     long n_clipped          # negative charges that were set to 0
     bint unsettled          # whether the iteration did not converge
 
 
+cdef void merge(Octree tree, Patch* patch) noexcept nogil
+
+
 cdef class ChargingRule:
     cdef readonly double area           # area per surface atom at the last relaxation [nm^2]
+    cdef readonly double near           # distance over the radius of the patch, beyond which its changes are merged
 
     cdef void removed(self, Octree tree, const Hole* hole) noexcept nogil
     cdef int exposed(self, Octree tree, long slot, double opening_angle) except -1 nogil

@@ -15,6 +15,32 @@ cdef extern from "kernels.h":
                      const float*, float*, float*, float*) noexcept nogil
 
 
+cdef void merge(Octree tree, Patch* patch) noexcept nogil:
+    # Merge up to four successive changes of one sign in one leaf into one at their centre of charge.
+    cdef double x, y, z, total, change
+    cdef long i = 0, n = 0, end
+    cdef int leaf
+    cdef bint rises
+    while i < patch.n:
+        leaf, end, rises = tree.leaf[patch.slot[i]], min(i + 4, patch.n), patch.change[i] > 0.0
+        x = y = z = total = 0.0
+        while i < end and tree.leaf[patch.slot[i]] == leaf and (patch.change[i] > 0.0) == rises:
+            change = patch.change[i]
+            x += change * patch.x[i]
+            y += change * patch.y[i]
+            z += change * patch.z[i]
+            total += change
+            i += 1
+        if total != 0.0:
+            patch.merged_x[n], patch.merged_y[n] = <float>(x / total), <float>(y / total)
+            patch.merged_z[n], patch.merged_change[n] = <float>(z / total), <float>total
+            n += 1
+    patch.n_merged = (n + 7) // 8 * 8
+    for i in range(n, patch.n_merged):
+        patch.merged_x[i] = patch.merged_y[i] = patch.merged_z[i] = 1e6
+        patch.merged_change[i] = 0.0
+
+
 cdef class ChargingRule:
     """Interface of a charging rule: the distribution of the charge over the surface atoms.
 
@@ -24,7 +50,7 @@ cdef class ChargingRule:
 
     def solve(self, Octree tree, double[:, ::1] normals, InteractionLists lists, *, double potential, double tolerance,
               int max_sweeps=200, bint double_precision=False, int n_threads=1):
-        """Solve the charges of the whole surface at its potential.
+        """Solve the charges of the targets of the lists at the potential of the specimen; all others are fixed.
 
         Parameters
         ----------
@@ -33,7 +59,7 @@ cdef class ChargingRule:
         normals : ndarray, shape (n, 3)
             Outward unit normals in the order of the slots.
         lists : InteractionLists
-            Interaction lists of this tree.
+            Interaction lists of this tree. Without `disturbed`, the whole surface is solved.
         potential : float
             Potential of the specimen divided by the Coulomb constant [e/nm].
         tolerance : float
@@ -56,6 +82,19 @@ cdef class ChargingRule:
 
     def begin(self, point):
         """Set a point well inside the specimen [nm], shape (3,), before the first relaxation."""
+
+    @property
+    def samples(self):
+        """Whether `solve` needs samples of the other atoms to solve a part of the surface (bool).
+
+        None for a rule that solves only the whole surface.
+        """
+        return False
+
+    @property
+    def far_change(self):
+        """Relative change of what is far from the holes since the whole surface was solved (float)."""
+        return 0.0
 
     @property
     def state(self):
@@ -121,6 +160,7 @@ cdef class FieldRule(ChargingRule):
 
     def __cinit__(self, *args, **kwargs):
         sources_init(&self.sources)
+        self.near = 1.3
 
     def __dealloc__(self):
         sources_free(&self.sources)
@@ -144,7 +184,7 @@ cdef class FieldRule(ChargingRule):
         return 0
 
     cdef int solve_patch(self, Octree tree, double[:, ::1] normals, const Hole* hole, Patch* patch) except -1 nogil:
-        cdef long i, room = (hole.n + GROUP - 1) // GROUP * GROUP
+        cdef long i, near, room = (hole.n + GROUP - 1) // GROUP * GROUP
         cdef int slot
         cdef float *field_x
         cdef float *field_y
@@ -161,8 +201,13 @@ cdef class FieldRule(ChargingRule):
         field_x, field_y, field_z = &self.spread[0, 0], &self.spread[1, 0], &self.spread[2, 0]
         for i in range(room):
             field_x[i] = field_y[i] = field_z[i] = 0.0
-        patch_field(room, hole.near_x, hole.near_y, hole.near_z, patch.stride, patch.x, patch.y, patch.z, patch.change,
+        near = min((hole.n_near + GROUP - 1) // GROUP * GROUP, room)
+        patch_field(near, hole.near_x, hole.near_y, hole.near_z, patch.stride, patch.x, patch.y, patch.z, patch.change,
                     field_x, field_y, field_z)
+        merge(tree, patch)
+        patch_field(room - near, hole.near_x + near, hole.near_y + near, hole.near_z + near, patch.n_merged,
+                    patch.merged_x, patch.merged_y, patch.merged_z, patch.merged_change, field_x + near, field_y + near,
+                    field_z + near)
         for i in range(hole.n):
             slot = hole.slot[i]
             self.field[slot, 0] += field_x[i]
@@ -214,6 +259,11 @@ cdef class PythonRule(FieldRule):
         field_of(charges)
         change = float(np.abs(charges - before).max() / charges.mean())
         return 1, min(change, 0.5 * tolerance)   # the rule itself decides when to stop
+
+    @property
+    def samples(self):
+        """None: the wrapped rule solves the whole surface."""
+        return None
 
     def residuals(self, positions, normals, charges, chosen):
         """Residuals of the wrapped rule, if it has a method of this name: see `ChargingRule.residuals`."""

@@ -6,7 +6,7 @@ from libc.stdlib cimport free, malloc, realloc
 
 cdef int sources_init(Sources* sources) except -1 nogil:
     sources.n_atoms = sources.n_cells = 0
-    sources.capacity = 4096
+    sources.capacity = 4160   # not a power of two: the columns of a source would share one set of the cache
     sources.atoms = <double*>malloc(4 * sources.capacity * sizeof(double))
     sources.cells = <double*>malloc(CELL * sources.capacity * sizeof(double))
     sources.atom = <int*>malloc(sources.capacity * sizeof(int))

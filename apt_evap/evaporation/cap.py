@@ -64,14 +64,15 @@ def measure_cap(positions: Floats, normals: Floats, fields: Floats, evaporation_
     The fit of the sphere (`fit_sphere`) begins with atoms whose normals are within 45 degrees of the axis.
     """
     cosine = float(sine_and_cosine(math.radians(HALF_ANGLE))[1])
-    chosen = normals[:, 2] >= cosine
+    chosen = np.flatnonzero(normals[:, 2] >= cosine)
     radius = math.nan
     for _ in range(_ROUNDS):
-        if np.count_nonzero(chosen) < _FEWEST:
+        if len(chosen) < _FEWEST:
             return NO_CAP
         centre, radius = fit_sphere(positions[chosen])
-        from_centre = positions - centre
-        chosen = from_centre[:, 2] >= cosine * lengths(from_centre)
+        above = np.flatnonzero(positions[:, 2] >= centre[2])
+        from_centre = positions[above] - centre
+        chosen = above[from_centre[:, 2] >= cosine * lengths(from_centre)]
     fields = fields[chosen]
     weights = fields / fields.sum()  # fields are proportional to charges
     ratio = float((weights * fields / evaporation_fields[chosen]).sum())

@@ -39,6 +39,7 @@ __all__ = ["BATCH", "DONE", "EXHAUSTED", "SWEEP_DUE", "TOO_SHALLOW", "Batch", "E
 
 T = TypeVar("T")
 
+_SINGLE = 1e-6  # tolerance below which the rounding of float32 prevents convergence
 _SEED_STEP = 0x9FB21C651E98DF25  # events have other random numbers than the ions of the same seed
 
 _MAX_EVENTS = 10_000_000  # per call: 1.7 GB of results
@@ -378,28 +379,48 @@ class Emitter:
         tolerance = check_number(tolerance, "tolerance", above=0, at_most=1)
         return self._relax(tolerance, angle)
 
+    def relax_due(self) -> tuple[int, float]:
+        """Relax what `advance` relaxes when it is due: the surroundings of the holes, or the whole surface.
+
+        The whole surface is relaxed every `whole_interval` times, when its tree has no space for further atoms, and
+        when the charges far from the holes have changed by more than 1.5e-3. See `relax` for the results.
+        """
+        core, settings = self._core, self.settings
+        tolerance = check_number(settings.tolerance, "tolerance", above=0, at_most=1)
+        if core.whole_is_due or core.n_partial + 1 >= settings.whole_interval or tolerance < _SINGLE:
+            return self.relax()
+        outcome = core.relax_disturbed(
+            tolerance=tolerance,
+            opening_angle=settings.relaxation_angle,
+            n_threads=usable_threads(self.n_threads),
+        )
+        return self.relax() if core.whole_is_due else self._converged(outcome, tolerance)
+
     def _relax(self, tolerance, angle, start=None):
         counts = self.counts
-        self._relaxed = (tolerance, angle, counts["clipped"], counts["unsettled"])
         outcome = self._core.relax(
             tolerance=tolerance,
             opening_angle=angle,
-            double_precision=tolerance < 1e-6,  # below it the rounding of float32 prevents convergence
+            double_precision=tolerance < _SINGLE,
             n_threads=usable_threads(self.n_threads),
             start=start,
         )
+        self._relaxed = (tolerance, angle, counts["clipped"], counts["unsettled"], self._core.control.voltage_factor)
+        return self._converged(outcome, tolerance)
+
+    def _converged(self, outcome, tolerance):
         self._recorded, self._is_new = RECORD, True
         if not outcome[1] < tolerance:
             warnings.warn(
                 f"charges did not converge in {outcome[0]} sweeps: largest relative change {outcome[1]:.1g} "
                 f"(tolerance {tolerance:.1g})",
                 ChargesWarning,
-                stacklevel=3,
+                stacklevel=4,
             )
         return outcome
 
     def state(self) -> EmitterState:
-        """State from which the surface after the last relaxation can be rebuilt.
+        """State from which the surface after the last relaxation of the whole surface can be rebuilt.
 
         Returns
         -------
@@ -408,7 +429,7 @@ class Emitter:
         start = self._core.start
         sites = np.concatenate([np.empty(0, np.int64), *self._sites])
         self._sites = [sites]
-        tolerance, angle, clipped, unsettled = self._relaxed
+        tolerance, angle, clipped, unsettled, voltage_factor = self._relaxed
         return EmitterState(
             sites=sites[: start.n_removed],
             charges=start.charges,
@@ -420,7 +441,7 @@ class Emitter:
             clipped=clipped,
             unsettled=unsettled,
             rule_state=start.rule_state,
-            voltage_factor=self._core.control.voltage_factor,
+            voltage_factor=voltage_factor,
         )
 
     def restore(self, state: EmitterState) -> None:
@@ -429,7 +450,8 @@ class Emitter:
         Parameters
         ----------
         state : EmitterState
-            State of the other emitter: its surface after its last relaxation, from which events continue.
+            State of the other emitter: its surface after its last relaxation of the whole surface, from which events
+            continue.
 
         Raises
         ------
@@ -451,6 +473,19 @@ class Emitter:
         self._core.control.voltage_factor = state.voltage_factor
         start = Start(len(state.sites), state.charges, state.lonely, state.lonely_normals, state.rule_state)
         self._relax(state.tolerance, state.opening_angle, start)
+
+    def remove(self, sites: Integers) -> None:
+        """Remove atoms as if they had evaporated, and relax the whole surface.
+
+        Parameters
+        ----------
+        sites : ndarray of int, shape (n,)
+            Atoms in the order of their removal.
+        """
+        sites = np.ascontiguousarray(sites, np.int64)
+        self._core.remove(sites)
+        self._sites.append(sites)
+        self.relax()
 
     def hand_out_tree(self) -> None:
         """Add a copy of the tree to the next batch, for flights that have not followed the earlier events."""
@@ -494,8 +529,8 @@ class Emitter:
         Returns
         -------
         Batch
-            Its status is the reason for its end: DONE, SWEEP_DUE (call `relax` and continue), EXHAUSTED or TOO_SHALLOW
-            (call `deepen` and continue).
+            Its status is the reason for its end: DONE, SWEEP_DUE (call `relax_due` and continue), EXHAUSTED or
+            TOO_SHALLOW (call `deepen` and continue).
         """
         n = check_count(max_events, "max_events", at_least=1, at_most=_MAX_EVENTS)
         events, control = Events(self.tip.positions, n), self._rate_control
@@ -551,4 +586,4 @@ class Emitter:
                 return
             if batch.status in (SWEEP_DUE, TOO_SHALLOW):
                 with pause():
-                    self.relax() if batch.status == SWEEP_DUE else self.deepen()
+                    self.relax_due() if batch.status == SWEEP_DUE else self.deepen()

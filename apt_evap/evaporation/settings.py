@@ -41,8 +41,7 @@ class ChargeSettings:
         unit="d_nn",
     )
     sweep_interval: int | None = count(
-        "Events between two relaxations of the whole surface. By default 1/300 of the initial number of surface atoms, "
-        "but at least 100.",
+        "Events between two relaxations. By default 1/300 of the initial number of surface atoms, but at least 100.",
         default=None,
         at_least=1,
     )
@@ -64,6 +63,12 @@ class ChargeSettings:
         at_least=0,
         at_most=1.5,
         unit="rad",
+    )
+    whole_interval: int = count(
+        "Relaxations until the whole surface is relaxed. The others solve the atoms within `update_radius` of a hole "
+        "since the last one.",
+        default=10,
+        at_least=1,
     )
 
     def _check(self):

@@ -163,7 +163,7 @@ def folded(
     >>> maps = [run.hits(each).map(bins=60) for each in (ae.Unperturbed(), ae.RollUp(0.2))]
     >>> first, second = (ae.maps.folded(each, projection, *pole, reach=30) for each in maps)
     >>> print(first)
-    <FoldedMap of 359 ions: 2mm, up to 30 degrees, ceiling of a correlation 0.73>
+    <FoldedMap of 359 ions: 2mm, up to 30 degrees, ceiling of a correlation 0.71>
     >>> print(f"{first.correlation(second):.2f}")
     0.17
     """

@@ -10,7 +10,7 @@ from apt_evap.specimen.tip import Tip
 
 
 def surface_after(run: Run, n_threads: int | None = None) -> Emitter:
-    """Rebuild the surface of the specimen after the last relaxation of a run.
+    """Rebuild the surface of the specimen at the end of a run.
 
     Parameters
     ----------
@@ -22,8 +22,8 @@ def surface_after(run: Run, n_threads: int | None = None) -> Emitter:
     Returns
     -------
     Emitter
-        With the law `Extremal`: only its charges are those of the run. The ions after the last relaxation are still on
-        the surface.
+        With the law `Extremal`. Its charges are relaxed after the last ion; those of the run have an error since their
+        last relaxation.
 
     Raises
     ------
@@ -42,4 +42,7 @@ def surface_after(run: Run, n_threads: int | None = None) -> Emitter:
         rule=rule,
     )
     emitter.restore(run.state)
+    if len(run):
+        since = len(run.state.sites) - run.first_event - int(run.emissions.ions[0])
+        emitter.remove(run.site[max(since, 0) :])
     return emitter

@@ -56,6 +56,7 @@ int main(void)
     group_cells_potential_double(N, list, multipoles, origin, wide, zeros, potentials);
     patch_row_potential(N, fx, fy, fz, 5, 5, 5, 15, row_potential);
     patch_potential(N, fx, fy, fz, N - 1, fy, fz, fx, fq, row_potential);
+    patch_potential_and_field(N, fx, fy, fz, N - 1, fy, fz, fx, fq, row_potential, px, py, pz);
     add(potentials, sizeof potentials), add(row_potential, sizeof row_potential);
     add(sums, sizeof sums), add(wide_sums, sizeof wide_sums), add(e, sizeof e), add(row, sizeof row);
     add(&dot, sizeof dot), add(px, sizeof px), add(py, sizeof py), add(pz, sizeof pz);

@@ -313,7 +313,7 @@ def test_too_shallow(nickel):
         sites.append(batch.site)
         status = batch.status
         if status == SWEEP_DUE:
-            emitter.relax()
+            emitter.relax_due()
     assert status == TOO_SHALLOW
     sites = np.concatenate(sites)
     # up to then the events are those of the whole specimen: what is not held is never asked for

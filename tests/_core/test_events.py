@@ -31,7 +31,7 @@ def test_a_table_is_filled_from_call_to_call(small_tip):
     events = Events(small_tip.positions, 40)
     assert emitter._core.evaporate(events, 30) == SWEEP_DUE
     first = events.columns()
-    emitter.relax()
+    emitter.relax_due()
     assert emitter._core.evaporate(events, 30) == DONE
     assert emitter._core.evaporate(events, 30) == DONE  # a full table takes no more
     assert events.journal.n_events == emitter.counts["events"] == 40

@@ -17,7 +17,7 @@ from apt_evap.config.perturbation_text import read_perturbation, title_of
 from apt_evap.config.simulation_file import read_config
 from apt_evap.detection.detector import Detector
 from apt_evap.emission.energies import Fixed, Thermal, TruncatedNormal
-from apt_evap.emission.perturbations import Combined, LateralVelocity, RollUp, Unperturbed
+from apt_evap.emission.perturbations import Combined, LateralVelocity, Mixture, RollUp, Unperturbed
 from apt_evap.evaporation.settings import ChargeSettings
 from apt_evap.flight.crew import FlightSettings
 from apt_evap.io.tapsim_nodes import write_nodes
@@ -51,6 +51,7 @@ EVERY_KEY = {
         "patch_radius": 6.0,
         "update_radius": 10.0,
         "sweep_interval": 50,
+        "whole_interval": 4,
         "tolerance": 1e-3,
         "start_tolerance": 1e-6,
     },
@@ -134,7 +135,7 @@ def test_a_file_builds_the_same_simulation_as_python(tmp_path):
         voltage=800,
         seed=7,
         detector=Detector(90, 80),
-        charge_settings=ChargeSettings(0.5, 6.0, 10.0, 50, 1e-3, 1e-6),
+        charge_settings=ChargeSettings(0.5, 6.0, 10.0, 50, 1e-3, 1e-6, whole_interval=4),
         flight_settings=FlightSettings(0.4, 1e-2, 5000.0, 400),
         response_settings=config.response_settings,
         n_threads=1,
@@ -332,6 +333,9 @@ PERTURBATIONS = {
     "Combined:0.2,0.75": Combined(0.2, 0.75),
     "Combined:0.3,0.1,0.75": Combined(TruncatedNormal(0.3, 0.1), 0.75),
     '{name = "RollUp", energy = {name = "Thermal", temperature = 50}}': RollUp(Thermal(50)),
+    '{name = "Mixture", perturbations = [{name = "RollUp", energy = 0.4}, {name = "Unperturbed"}], weights = [7, 3]}': (
+        Mixture((RollUp(0.4), Unperturbed()), (7, 3))
+    ),
 }
 
 

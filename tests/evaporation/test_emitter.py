@@ -17,7 +17,7 @@ def by_hand(emitter, n):
         sites.append(batch.site)
         n -= len(batch)
         if batch.status == SWEEP_DUE:
-            emitter.relax()
+            emitter.relax_due()
         elif batch.status == TOO_SHALLOW:
             emitter.deepen()
         elif batch.status == EXHAUSTED:

@@ -166,7 +166,7 @@ def test_all_barriers_choose_nearly_the_same_atoms(tip12):
     assert 0 < max(shares["image_hump"]) < 0.04
     assert 0 < max(shares["parabolic"]) < 0.15
     assert 0 < max(shares["quadratic"]) < 0.10
-    assert min(more) > 0.15  # of twice the temperature
+    assert np.median(more) > 0.15  # of twice the temperature; less where one atom is far ahead of the others
 
 
 def test_the_spread_of_the_order_grows_with_the_temperature(tip12):
@@ -340,7 +340,7 @@ def test_a_relaxation_changes_the_voltage_only_to_the_second_order(tip12):
     assert sum(map(len, emitter.advance(350))) == 350
     before, after = emitter._core.control.voltage_factor * emitter.voltage, emitter.control_voltage
     emitter.relax()
-    assert abs(after / before - 1) > 2e-3
+    assert abs(after / before - 1) > 1e-3
     # measured 2e-5, of a change of 0.6 of the logarithm; 5e-6 is where the iteration stops
     assert emitter.control_voltage == pytest.approx(after, rel=5e-5)
 

@@ -14,7 +14,7 @@ import pytest
 import apt_evap as ae
 from apt_evap.config.simulation_file import read_config
 
-FINGERPRINT = "c10f372b622eda9c71898bc1640525062d8822489ef648c2ba1366fdf1546235"
+FINGERPRINT = "a75c895043d43c8bee9ed34cee90c5161c3bace0fbb7e30907d8a41df69ee2b1"
 PROGRAM = """
 import warnings
 
@@ -26,7 +26,8 @@ tip = ae.Tip(
     nickel, 5 * nickel.a, (1, 2, 3), solutes={"Al": 0.1}, seed=3, offset_seed=4, shank_angle=2.3, rotation=17.0
 )
 flown = ae.LateralVelocity(ae.TruncatedNormal(0.3, 0.2)), ae.Combined(ae.emission.Thermal(300.0), 0.4)
-simulation = ae.Simulation(tip, seed=2, detector=ae.Detector(100.0, 300.0, "equidistant"))
+relaxations = ae.evaporation.ChargeSettings(sweep_interval=20)  # the second to the fourth are those of a part
+simulation = ae.Simulation(tip, seed=2, detector=ae.Detector(100.0, 300.0, "equidistant"), charge_settings=relaxations)
 print(simulation.run(80, emissions=flown, progress=False).fingerprint())
 """
 
