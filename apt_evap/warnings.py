@@ -26,7 +26,7 @@ class RegistrationWarning(AptWarning):
 
 
 class StructureWarning(AptWarning):
-    """A best map by similarity that has lost the zone lines of the measured one."""
+    """A best map that has lost the zone lines of the measured one."""
 
 
 class SpecimenWarning(AptWarning):

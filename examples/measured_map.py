@@ -11,7 +11,7 @@ Each pole is given by its indices and its position on the map [mm]. For a map of
 
 By default the tip is small, R = 20 a, and the script takes a minute. With ``--full`` the tip has R = 80 a and 300,000
 ions, which take a quarter of an hour on two cores. The script writes the run. For every mechanism, it also writes the
-similarity matrix, the maps side by side, and a JSON file.
+scores, the maps side by side, and a JSON file.
 """
 
 # sphinx_gallery_thumbnail_path = '../articles/hidden_energies/figure6.png'
@@ -48,6 +48,7 @@ parser.add_argument(
 )
 parser.add_argument("--bins", type=int, help="bins along the longer side; default: those of the map")
 parser.add_argument("--smoothing", type=float, help="of both maps [mm]; default: half a bin, one bin for densities")
+parser.add_argument("--objective", choices=("folded", "similarity"), help="what is compared; default: folded")
 parser.add_argument("--run", help="use this run of a tip along the same axis, without a new simulation")
 parser.add_argument("--full", action="store_true", help="R = 80 a and 300,000 ions instead of R = 20 a and 20,000")
 parser.add_argument("-o", "--output", default="measured_map", help="folder; default: measured_map")
@@ -109,9 +110,9 @@ print(f"from poles: {start}\nfrom maps: {registration}, correlation {registratio
 
 np.set_printoptions(precision=3, suppress=True)
 for mechanism in options.mechanism or MECHANISMS:
-    settings = ae.fit.FitSettings(bins=options.bins, smoothing=options.smoothing)
+    settings = ae.fit.FitSettings(bins=options.bins, smoothing=options.smoothing, objective=options.objective)
     study = ae.fit_energies(run, measured, ae.fit.EnergyGrid(mechanism), settings, registration=registration)
-    print(f"\n{study}\n{study.ssim}")
+    print(f"\n{study}\n{study.scores}")
     study.save(folder / f"{mechanism}.json")
-    ae.plot.ssim_matrix(study)[0].figure.savefig(folder / f"{mechanism}_ssim.png")
+    ae.plot.score_matrix(study)[0].figure.savefig(folder / f"{mechanism}_scores.png")
     ae.plot.side_by_side(study)[0].figure.savefig(folder / f"{mechanism}_maps.png")

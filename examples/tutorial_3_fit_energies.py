@@ -62,11 +62,11 @@ ae.plot.overlay(guess, measured_map.smoothed(0.6), registration).figure.savefig(
 
 # %%
 # Both maps are compared on the same bins, in the region that both cover. Each map is divided by a strongly smoothed
-# copy of itself, which removes gradients across the detector, and smoothed by half a bin. The structural similarity
-# (SSIM) is 1 for equal maps and 0 for unrelated maps. The SSIM is corrected for the noise of both maps, which is known.
-# For the true energies, it is therefore about 1 within the error, although two noisy maps are never equal. In this
-# example, a small grid of energies is sufficient. Without ``means`` and ``relative_spreads``, the grid is that of
-# :cite:t:`Shaikh`.
+# copy of itself, which removes gradients across the detector, and smoothed by half a bin. Then both are folded about
+# the pole by its symmetry, which averages six parts of this map. Their concordance is 1 for equal lines of equal
+# contrast and 0 for unrelated maps. It is corrected for the noise of both maps, which is known. For the true energies,
+# it is therefore about 1 within the error, although two noisy maps are never equal. In this example, a small grid of
+# energies is sufficient. Without ``means`` and ``relative_spreads``, the grid is that of :cite:t:`Shaikh`.
 
 grid = ae.fit.EnergyGrid(
     "roll-up", means=(0.01, 0.0825, 0.155, 0.2275, 0.3), relative_spreads=(0.0316, 0.1, 0.316, 1.0, 3.16)
@@ -77,16 +77,16 @@ print(study)
 # %%
 # The frame shows the best energies on the grid, and the circle shows the interpolated optimum.
 
-ae.plot.ssim_matrix(study)[0].figure.savefig("ssim.png")
+ae.plot.score_matrix(study)[0].figure.savefig("scores.png")
 
 # %%
 # The errors come from 100 resamples of all measured and simulated ions, for which the analysis is repeated. The value
 # after ± is the standard deviation: how much the result of another measurement with the same number of ions would
-# differ. The intervals are wider: they contain all energies whose SSIM is below the best one by less than an allowance
+# differ. The intervals are wider: they contain all energies whose score is below the best one by less than an allowance
 # for specimens that differ from the simulated one (``model_error``), and they follow the ridge of equal true means. An
 # interval that ends at the end of the grid says "at most" or "at least". They do not include a mechanism that does not
 # apply to the metal. Two numbers show whether the optimum is credible: its gain over the unperturbed map, and its
-# difference from 1. The uncorrected SSIM is in ``plain``. For a good model, it is higher than the SSIM of two random
+# difference from 1. The uncorrected concordance is in ``plain``. For a good model, it is higher than that of two random
 # halves of the measured ions, because each half has the noise of half the ions.
 #
 # The mean and the width of the distribution can compensate each other. The true mean, that is, the mean of the energies
@@ -95,7 +95,8 @@ ae.plot.ssim_matrix(study)[0].figure.savefig("ssim.png")
 optimum = study.refined
 print(f"mean of the energies {optimum.bounded('true_mean')} eV, hidden {truth.energy.true_mean:.3g} eV")
 print(f"better than unperturbed by {study.gain}, in {study.gain_share:.0%} of the resamples")
-print(f"SSIM {study.optimum.score}; uncorrected {study.plain['optimum']}, two halves {study.ceiling}")
+score = study.settings.score_name
+print(f"{score} {study.optimum.score}; uncorrected {study.plain['optimum']}, two halves {study.ceiling}")
 
 # %%
 # The compared maps, and their central part magnified.

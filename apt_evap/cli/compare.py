@@ -30,7 +30,7 @@ from apt_evap.simulation.run_hdf5 import is_run
 from apt_evap.warnings import RegistrationWarning, StructureWarning
 
 _STUDY = "study.json"
-_TABLE = "ssim.csv"
+_TABLE = "scores.csv"
 OVERLAY, REPORT = "registration.png", "report.html"
 
 
@@ -149,13 +149,13 @@ def _write(study, run, folder, options, messages, sections):
 def _write_table(study, path):
     with open(path, "w", newline="") as file:
         table = csv.writer(file)
-        matrices = [study.ssim, study.errors, study.shares]
+        matrices = [study.scores, study.errors, study.shares]
         names = [
             *study.grid.options,
             "rollup_fraction",
             "relative_spread",
             "mean_eV",
-            "ssim",
+            "score",
             "error",
             "share_of_resamples",
         ]
@@ -174,7 +174,7 @@ def _overlay(study, run):
 
 
 _FIGURES = {
-    "ssim.png": lambda study, run: plot.ssim_matrix(study)[0].figure,
+    "scores.png": lambda study, run: plot.score_matrix(study)[0].figure,
     "maps.png": lambda study, run: plot.side_by_side(study)[0].figure,
     OVERLAY: _overlay,
 }

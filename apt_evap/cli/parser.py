@@ -347,13 +347,13 @@ def _add_compare(commands: Any) -> None:
     command = commands.add_parser(
         "compare",
         help="fit the emission energies of a run to a measured map",
-        description="Fit the emission energies of a run to a measured map: structural similarity for a grid of\n"
-        "energies, its maximum and errors, and for comparison the similarities without energy and with thermal\n"
-        "energies.",
+        description="Fit the emission energies of a run to a measured map: the score of both maps for a grid of\n"
+        "energies, its maximum and errors, and for comparison the scores without energy and with thermal\n"
+        "energies. The score is the concordance of maps folded about a pole, or the structural similarity.",
         epilog="writes to FOLDER:\n"
         "  study.json        results and all settings\n"
-        "  ssim.csv          similarity, error, fraction of the resamples and misfit of rings for every energy\n"
-        "  ssim.png          plot of the similarities\n"
+        "  scores.csv        score, error, fraction of the resamples and misfit of rings for every energy\n"
+        "  scores.png        plot of the scores\n"
         "  maps.png          measured, unperturbed and best map side by side, and an enlarged part\n"
         "  registration.png  overlay of the simulated map on the measured one\n"
         "  report.html       all of this in one file, with both maps on one place: send it around\n\n"

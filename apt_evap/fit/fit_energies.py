@@ -1,4 +1,4 @@
-"""Fit of the emission energies: the simulated map with the largest similarity to a measured one."""
+"""Fit of the emission energies: the simulated map that is most like a measured one."""
 
 import warnings
 from collections.abc import Sequence
@@ -48,12 +48,13 @@ def fit_energies(
     n_threads: int | None = None,
     progress: bool | None = None,
 ) -> Study:
-    r"""Find the emission energies with the largest similarity of a run to a measurement.
+    r"""Find the emission energies whose map of a run is most like a measured one.
 
     The maps for all energies follow from the responses of one run. They are transformed into the measured frame, binned
-    on the measured bins and compared by structural similarity in the common region: the mask of the measured map,
-    within the convex outlines (as in `DetectorMap.from_hits`) of the measured map, of the unperturbed map and of the
-    map in the middle of the grid. The region is the same for all energies.
+    on the measured bins, and compared by the concordance of maps folded about a pole, or by structural similarity
+    (`FitSettings.objective`). The compared region is the same for all energies: the mask of the measured map, within
+    the convex outlines (as in `DetectorMap.from_hits`) of the measured map, of the unperturbed map and of the map in
+    the middle of the grid.
 
     Parameters
     ----------
@@ -70,7 +71,7 @@ def fit_energies(
         grid, repeated with the best point until this is stable, and then refined to the largest similarity of this
         point.
     pole : sequence of int, optional
-        Miller indices of the pole for the second objective (`Study.structure`); by default the one with the most
+        Miller indices of the pole to fold about and of the rings (`Study.structure`); by default the one with the most
         complete rings inside the compared region.
     n_threads : int, optional
         Number of threads; by default the number of processors that this process may use. Results do not depend on it.
@@ -89,8 +90,8 @@ def fit_energies(
     Warns
     -----
     UserWarning
-        If the registration is doubtful, the run has too few ions for the bins, or the best map by similarity has lost
-        the structure of the measured one (`StructureWarning`).
+        If the registration is doubtful, the run has too few ions for the bins, or the best map has lost the structure
+        of the measured one (`StructureWarning`).
 
     Notes
     -----
@@ -161,7 +162,7 @@ def fit_energies(
         warnings.warn(
             f"the best map by {settings.score_name} has lost the zone lines of the measured map: contrasts "
             f"{_contrasts(structure.optimum)} in the rings about a pole, measured {_contrasts(structure.measured)}; "
-            "SSIM rewards blur if the lines of both maps differ, see Study.structure",
+            "see Study.structure",
             StructureWarning,
             stacklevel=2,
         )
@@ -192,7 +193,7 @@ def fit_energies(
     }
     return Study(
         grid=grid,
-        ssim=values[0],
+        scores=values[0],
         errors=resampled.std(axis=0, ddof=1) if settings.resamples > 1 else np.full(grid.shape, np.nan),
         shares=np.bincount(wins, minlength=values[0].size).reshape(grid.shape) / max(settings.resamples, 1),
         resampled=resampled,

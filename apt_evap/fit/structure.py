@@ -1,4 +1,4 @@
-"""Second objective of a fit of energies, which does not reward blurring: the contrast of zone lines and a dark pole.
+"""Rings about a pole in a fit of energies, which do not reward blurring: contrast of zone lines, and a dark pole.
 
 Structural similarity compares maps place by place. If lines of both maps differ in place or width, a blurred map can be
 more similar than a sharp one. The contrast of rings about a pole and the radial densities do not depend on places: blur

@@ -98,7 +98,7 @@ class Optimum:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Study:
-    """Similarity of simulated maps with a measured one for a grid of energies; result of `fit_energies`.
+    """Scores of simulated maps against a measured one for a grid of energies; result of `fit_energies`.
 
     Matrices have the shape (options, rollup fractions, relative standard deviations, means); without options the last
     three.
@@ -107,26 +107,27 @@ class Study:
     ----------
     grid : EnergyGrid
         Mechanism and energies.
-    ssim, errors : ndarray
-        Structural similarity at every point of the grid (noise-corrected unless switched off in `settings`), and its
-        standard deviation over the resamples. With the correction it is about 1 for the true energies: 0.97 to 1.06 in
-        twin experiments, and larger if both maps have common noise, such as two maps of one run.
+    scores, errors : ndarray
+        Concordance of folded maps, or structural similarity (`FitSettings.objective`), at every point of the grid
+        (noise-corrected unless switched off in `settings`), and its standard deviation over the resamples. With the
+        correction the similarity is about 1 for the true energies: 0.97 to 1.06 in twin experiments, and larger if both
+        maps have common noise, such as two maps of one run.
     shares : ndarray
         Fraction of the resamples in which a point is the best.
     resampled : ndarray
-        Similarities in every resample, shape (resamples, ...).
+        Scores in every resample, shape (resamples, ...).
     optimum, refined : Optimum
         The best point of the grid, and the maximum of a spline around it.
     baselines : dict of Score
-        Similarity of "unperturbed" and "thermal" maps.
+        Scores of the "unperturbed" and "thermal" maps.
     plain : dict of Score
-        Uncorrected structural similarity of "unperturbed", "thermal" and "optimum", for comparison with the ceiling.
+        Uncorrected scores of "unperturbed", "thermal" and "optimum", for comparison with the ceiling.
     gain : Score
-        Similarity of the optimum minus that of the unperturbed map, for paired resamples.
+        Score of the optimum minus that of the unperturbed map, for paired resamples.
     gain_share : float
         Fraction of the resamples in which the optimum is better than the unperturbed map.
     ceiling : Score or None
-        Uncorrected structural similarity of two random halves of the measured ions; None for a map of densities.
+        Uncorrected score of two random halves of the measured ions; None for a map of densities.
     registration : Registration
         Transform of simulated hits into the measured frame.
     measured : DetectorMap
@@ -134,9 +135,8 @@ class Study:
     maps : dict of DetectorMap
         Simulated maps in the measured frame: "unperturbed", "thermal", "optimum".
     structure : StructureScores or None
-        Second objective, which does not reward blurring: contrast of the zone lines and darkness of
-        a pole. None if no pole with its rings is inside the compared region; ``provenance["structure"]`` contains the
-        reason.
+        Rings about the pole: contrast of the zone lines, radial densities, and folded maps. None if no pole with its
+        rings is inside the compared region; ``provenance["structure"]`` contains the reason.
     settings : FitSettings
         Settings of the comparison, the random draws and the resampling.
     provenance : dict
@@ -144,7 +144,7 @@ class Study:
     """
 
     grid: EnergyGrid
-    ssim: np.ndarray
+    scores: np.ndarray
     errors: np.ndarray
     shares: np.ndarray
     resampled: np.ndarray
@@ -191,7 +191,7 @@ class Study:
 
     def to_dict(self) -> dict[str, Any]:
         """Return results and settings in plain types, NaN as None, dict."""
-        names = ("ssim", "errors", "shares", "gain_share", "optimum", "refined", "registration", "gain", "ceiling")
+        names = ("scores", "errors", "shares", "gain_share", "optimum", "refined", "registration", "gain", "ceiling")
         names += ("baselines", "plain", "real_energies", "likeness")
         results = to_plain({name: getattr(self, name) for name in names})
         results["made_by"] = f"apt_evap {__version__}"
@@ -307,7 +307,7 @@ class Study:
         return text + "".join(f", {name} {value:g}" for name, value in values.items())
 
     def _structure(self):
-        """Text of the second objective."""
+        """Text of the rings about the pole."""
         scores = self.structure
         if scores is None:
             return ""

@@ -27,5 +27,5 @@ from .specimens import cut as cut
 from .specimens import mark_atoms as mark_atoms
 from .specimens import specimen as specimen
 from .spectra import spectrum as spectrum
+from .study import score_matrix as score_matrix
 from .study import side_by_side as side_by_side
-from .study import ssim_matrix as ssim_matrix

@@ -1,4 +1,4 @@
-"""Plots of a study: similarity against energies, and the maps side by side."""
+"""Plots of a study: scores against energies, and the maps side by side."""
 
 from collections.abc import Sequence
 
@@ -17,8 +17,8 @@ from apt_evap.plot.maps import detector_map
 _MARK = "#00d0ff"  # visible on all colours of both maps
 
 
-def ssim_matrix(study: Study, axes: Sequence[Axes] | None = None, *, colormap: str = "viridis") -> NDArray[np.object_]:
-    """Draw the similarity with the measured map against mean and relative standard deviation of the energy.
+def score_matrix(study: Study, axes: Sequence[Axes] | None = None, *, colormap: str = "viridis") -> NDArray[np.object_]:
+    """Draw the score with the measured map against mean and relative standard deviation of the energy.
 
     A frame marks the best point of the grid. A circle marks the maximum between points, with its
     intervals of 95 %. A new figure has a legend.
@@ -49,14 +49,14 @@ def ssim_matrix(study: Study, axes: Sequence[Axes] | None = None, *, colormap: s
     if axes is None:
         down = -(-layers // across)
         figure = new_figure((0.75 * columns * across + 1.8, (0.62 * rows + 1.0) * down))
-        figure.suptitle(f"{grid.name}: structural similarity with the measured map", fontsize="medium")
+        figure.suptitle(f"{grid.name}: {study.settings.score_name} with the measured map", fontsize="medium")
         panels = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True).ravel()
     elif len(axes) == layers:
         panels = np.array(axes, object)
     else:
         raise ValueError(f"axes must be {layers}, one per roll-up fraction and option, got {len(axes)}")
-    limits = {"vmin": study.ssim.min(), "vmax": study.ssim.max()}
-    for ax, values, title in zip(panels, study.ssim.reshape(layers, rows, columns), grid.layers, strict=False):
+    limits = {"vmin": study.scores.min(), "vmax": study.scores.max()}
+    for ax, values, title in zip(panels, study.scores.reshape(layers, rows, columns), grid.layers, strict=False):
         image = ax.imshow(values, origin="lower", cmap=colormap, aspect="auto", **limits)
         for (row, column), value in np.ndenumerate(values):
             shade = image.cmap(image.norm(value))

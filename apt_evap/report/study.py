@@ -17,7 +17,7 @@ from apt_evap.report.origin import add_origin, origin
 from apt_evap.report.page import Page, collapsed, color_scale, escape, flat, heading, paragraph, table, text_of
 from apt_evap.report.pictures import blinking_pictures
 
-_COLORS = "viridis"  # of the matrix, as of `plot.ssim_matrix`
+_COLORS = "viridis"  # of the matrix, as of `plot.score_matrix`
 _LONG = ("run", "registered", "share_above_energy_limit")  # settings in tables of their own, or only for programs
 _RARE = 0.05
 """Largest fraction of resamples without gain, and of energies above the limit of the responses, without a doubt."""
@@ -203,7 +203,7 @@ def _scores(study):
 
 def _scale(study):
     """Colours of the matrices."""
-    low, high = float(study.ssim.min()), float(study.ssim.max())
+    low, high = float(study.scores.min()), float(study.scores.max())
     shades = [matplotlib.colors.to_hex(matplotlib.colormaps[_COLORS](part)) for part in np.linspace(0, 1, 9)]
     return color_scale(shades, f"{low:z.3f}", f"{high:z.3f}", study.settings.score_name)
 
@@ -243,7 +243,7 @@ def _evidence(page, study):
 def _matrices(study):
     """A table for each roll-up fraction and option."""
     *_, rows, columns = study.grid.shape
-    values, errors, shares = (each.reshape(-1, rows, columns) for each in (study.ssim, study.errors, study.shares))
+    values, errors, shares = (each.reshape(-1, rows, columns) for each in (study.scores, study.errors, study.shares))
     at = study.best_cell
     best = int(np.ravel_multi_index(at[:-2], study.grid.shape[:-2]))
     for layer, title in enumerate(study.grid.layers):
@@ -254,7 +254,7 @@ def _matrix(study, title, values, errors, shares, best):
     """Similarities for one roll-up fraction as a table; a cell shows its details under the pointer or the focus."""
     grid = study.grid
     colors = matplotlib.colormaps[_COLORS]
-    low, high = float(study.ssim.min()), float(study.ssim.max())
+    low, high = float(study.scores.min()), float(study.scores.max())
     shades = colors((values - low) / (high - low) if high > low else np.zeros_like(values))
     lines = ['<table class="matrix">']
     if title:

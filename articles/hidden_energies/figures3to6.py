@@ -93,7 +93,8 @@ for metal, path in (("Al", options.measured_al), ("Ni", options.measured_ni)):
     measured = measurement(metal, path)
     run = evaporate(metal, "run", seed=1)
     sources[metal] = {"simulated": repr(run), "measured": path or "twin", "map": repr(measured)}
-    mechanism, settings = CASES[metal][1], ae.fit.FitSettings(bins=bins, resamples=options.resamples)
+    mechanism = CASES[metal][1]
+    settings = ae.fit.FitSettings(bins=bins, resamples=options.resamples, objective="similarity")
     study = studies[f"{metal} {mechanism}"] = ae.fit_energies(run, measured, ae.fit.EnergyGrid(mechanism), settings)
     print(f"{metal}: {run};\n measured {measured};\n {study.registration}", flush=True)
     if metal == "Ni":
@@ -105,10 +106,10 @@ figure = ae.plot.new_figure((12.0, 5.0))
 for ax, (name, title) in zip(
     figure.subplots(1, 2), {"Al lateral": "Al[012], lateral", "Ni roll-up": "Ni[111], roll-up"}.items(), strict=True
 ):
-    ae.plot.ssim_matrix(studies[name], [ax])
+    ae.plot.score_matrix(studies[name], [ax])
     ax.set_title(title)
 figure.savefig(options.output / "figure3.png")
-ae.plot.ssim_matrix(studies["Ni combined"])[0].figure.savefig(options.output / "figure4.png")
+ae.plot.score_matrix(studies["Ni combined"])[0].figure.savefig(options.output / "figure4.png")
 for name, number in (("Al lateral", 5), ("Ni roll-up", 6)):
     study, (metal, mechanism) = studies[name], name.split()
     best, (_, _, mean, relative_spread) = study.optimum, CASES[metal]

@@ -55,14 +55,15 @@ def main():
         )
         print(f"\n{mechanism}: {HIDDEN[mechanism]}, {draws} draws of {len(other):,} ions\n{measured}", flush=True)
         start = time.perf_counter()
-        study = ae.fit_energies(run, measured, ae.fit.EnergyGrid(mechanism))
+        settings = ae.fit.FitSettings(objective="similarity")
+        study = ae.fit_energies(run, measured, ae.fit.EnergyGrid(mechanism), settings)
         print(f"{study}\nthe optimum is better than the unperturbed map in {study.gain_share:.0%} of the resamples")
         print(f"{study.registration}; true {instrument}\n{time.perf_counter() - start:.0f} s")
-        print(np.array2string(study.ssim[0], precision=3, suppress_small=True))
+        print(np.array2string(study.scores[0], precision=3, suppress_small=True))
         if options.output:
             options.output.mkdir(exist_ok=True)
             study.save(options.output / f"{mechanism}.json")
-            ae.plot.ssim_matrix(study)[0].figure.savefig(options.output / f"{mechanism}_ssim.png")
+            ae.plot.score_matrix(study)[0].figure.savefig(options.output / f"{mechanism}_scores.png")
             ae.plot.side_by_side(study)[0].figure.savefig(options.output / f"{mechanism}_maps.png")
 
 

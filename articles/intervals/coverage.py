@@ -101,7 +101,7 @@ def inside(study, truth, model_error):
         scale = np.log if name == "relative_spread" else np.asarray
         value = refined.options[name] if name in refined.options else getattr(refined, name)
         best.append(np.interp(scale(value), scale(axis), np.arange(len(axis))))
-    bounds = intervals(study.grid, np.concatenate([study.ssim[None], study.resampled]), best, model_error).bounds
+    bounds = intervals(study.grid, np.concatenate([study.scores[None], study.resampled]), best, model_error).bounds
     return {name: bounds[name][0] <= value <= bounds[name][1] for name, value in truth.items()}
 
 

@@ -78,7 +78,7 @@ def main():
             run,
             hits.map(64),
             ae.fit.EnergyGrid(rule, MEANS, RSDS, options=OPTIONS),
-            ae.fit.FitSettings(replicas=4, resamples=40),
+            ae.fit.FitSettings(replicas=4, resamples=40, objective="similarity"),
             registration=INSTRUMENT,
             n_threads=1,
             progress=False,

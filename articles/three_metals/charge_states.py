@@ -61,10 +61,10 @@ def measured(path):
     """Print the measured ratios; returns that elsewhere."""
     ions = ae.read(path)
     length = np.hypot(305.0, np.hypot(ions.x, ions.y)) * ae.units.NM_PER_MM
-    time = ions.time_of_flight - 38.5  # ns, so that the peak of 184 W3+ is at 61.3 Da
+    time = ions.time_of_flight - 38.5  # ns: W3+ is at 60.65 to 61.98 Da at the rim, and 0.7 Da higher on the axis
     ratio = ions.voltage * (ae.units.SPEED * time / length) ** 2
-    three, four = (ratio > 59) & (ratio < 62.6), (ratio > 45.2) & (ratio < 46.8)
-    beside = ((ratio > 43) & (ratio < 44.6)) | ((ratio > 47.4) & (ratio < 49.0))
+    three, four = (ratio > 59.0) & (ratio < 63.4), (ratio > 44.8) & (ratio < 47.2)
+    beside = ((ratio > 42.2) & (ratio < 44.6)) | ((ratio > 47.4) & (ratio < 49.8))
     _, orientation, projection = measured_of("W", ions[three])
     found = []
     for name, region in zip(

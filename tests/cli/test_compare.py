@@ -20,7 +20,7 @@ from apt_evap._common.codec import for_json
 from apt_evap.cli.main import main
 
 ROLLUP = ae.RollUp(ae.TruncatedNormal(0.2, 0.1))
-FILES = {"study.json", "ssim.csv", "ssim.png", "maps.png", "registration.png", "report.html"}
+FILES = {"study.json", "scores.csv", "scores.png", "maps.png", "registration.png", "report.html"}
 QUICK = ["--means", "0.1,0.2,0.3", "--relative_spreads", "0.5,1", "--replicas", "1", "--resamples", "4", "--bins", "24"]
 HERE = ["--registration", "0,1,0,0"]
 NO_PICTURES = pytest.mark.usefixtures("blank_pictures")
@@ -88,11 +88,11 @@ def test_everything_is_written(folder, capsys, rough_layout):
     assert json.loads(Path("study/study.json").read_text())["likeness"]["verdict"] in first
     assert {path.name for path in Path("study").iterdir()} == FILES
     held = json.loads(Path("study/study.json").read_text())
-    assert np.shape(held["ssim"]) == (1, 2, 3)
+    assert np.shape(held["scores"]) == (1, 2, 3)
     assert held["settings"]["replicas"] == 1 and held["settings"]["map_bins"] == [24, 24]
-    with open("study/ssim.csv", newline="") as file:
+    with open("study/scores.csv", newline="") as file:
         rows = list(csv.DictReader(file))
-    assert [float(row["ssim"]) for row in rows] == pytest.approx(np.ravel(held["ssim"]), rel=1e-5)
+    assert [float(row["score"]) for row in rows] == pytest.approx(np.ravel(held["scores"]), rel=1e-5)
     assert [float(row["mean_eV"]) for row in rows] == [0.1, 0.2, 0.3] * 2
     for name in FILES:
         if name.endswith(".png"):

@@ -182,16 +182,16 @@ def test_a_hidden_fraction_is_found(run, other):
         run, measured_map(other, hidden), PartlyRolled, means=(0.0825, 0.155, 0.2275), relative_spreads=(1.0,),
         options={"probability": (0.2, 0.4, 0.6, 0.8, 1.0)}, registration=HERE, replicas=4, resamples=20, progress=False,
     )  # fmt: skip
-    assert study.ssim.shape == (5, 1, 1, 3)
+    assert study.scores.shape == (5, 1, 1, 3)
     # between two specimens of 20 a, half a step of the grid
     assert study.refined.options["probability"] == pytest.approx(0.6, abs=0.12)
     low, high = study.refined.intervals["probability"]
     assert low <= 0.6 <= high
-    assert study.structure.misfit.shape == study.ssim.shape
+    assert study.structure.misfit.shape == study.scores.shape
     # and what blur cannot win finds it, too
     assert abs(study.structure.best[0] - 2) <= 1
     assert f"probability {study.optimum.options['probability']:g}" in repr(study)
-    assert len(ae.plot.ssim_matrix(study)) == 5
+    assert len(ae.plot.score_matrix(study)) == 5
     assert study.structure.evidence.startswith("about the pole (111) the folded maps correlate to 0.")
     text = json.dumps(study.to_dict(), allow_nan=False)
     assert len(text) < 300_000  # without the folded maps
@@ -296,7 +296,7 @@ def test_rings_of_a_study(twin):
     """The misfit excludes the map with other lines, and does not exclude the hidden energies."""
     study, _, truth = twin
     scores = study.structure
-    assert scores.plane == (1, 1, 1) and scores.misfit.shape == study.ssim.shape == scores.errors.shape
+    assert scores.plane == (1, 1, 1) and scores.misfit.shape == study.scores.shape == scores.errors.shape
     assert scores.misfit[scores.best] == scores.misfit.min()
     # with 15,000 ions the smallest misfit is 0.17, and the errors at the best map by SSIM are 0.13
     hidden = tuple(axis.index(value) for axis, value in zip(
@@ -360,7 +360,7 @@ def test_no_pole_is_no_error(run, other):
 
 
 @pytest.mark.parametrize("smoothing, flattening", [(0.0, 0.0), (2.5, 0.0), (0.0, 15.0), (3.0, 20.0)])
-def test_what_is_compared_is_what_ssim_compares(run, other, smoothing, flattening):
+def test_what_is_compared_is_what_similarity_compares(run, other, smoothing, flattening):
     x, y = np.meshgrid(EDGES[1:], EDGES[1:])
     measured = replace(seen(other, ROLLUP), mask=(x**2 + y**2 < 50**2) & (x < 30))
     comparison = Comparison(measured, FitSettings(smoothing=smoothing, flattening=flattening, resamples=0))
@@ -527,10 +527,10 @@ def test_hidden_energies_are_found(twin):
         tuple(axis.index(value) for axis, value in zip(axes, values, strict=True))
         for values in ((found.rollup_fraction, found.relative_spread, found.mean), truth)
     )
-    missed = study.ssim[best] - study.ssim[hidden_cell]
+    missed = study.scores[best] - study.scores[hidden_cell]
     error = np.std(study.resampled[(..., *best)] - study.resampled[(..., *hidden_cell)], ddof=1)
     assert missed <= 3 * error
-    assert study.optimum.score.value == study.ssim.max()
+    assert study.optimum.score.value == study.scores.max()
     # energies after the cut, which the map sees: within half a step of the grid
     assert abs(study.refined.true_mean - hidden.energy.true_mean) < 0.04
     for name, value in (("mean", truth[2]), ("relative_spread", truth[1]), ("true_mean", hidden.energy.true_mean)):
@@ -566,7 +566,7 @@ def test_unperturbed_is_clearly_less_alike(twin):
 
 def test_what_a_study_holds(twin):
     study, _, _ = twin
-    assert study.ssim.shape == study.errors.shape == study.shares.shape == (1, 6, 6)
+    assert study.scores.shape == study.errors.shape == study.shares.shape == (1, 6, 6)
     assert study.resampled.shape == (40, 1, 6, 6)
     assert study.shares.sum() == pytest.approx(1)
     assert study.errors == pytest.approx(study.resampled.std(axis=0, ddof=1))
@@ -592,7 +592,7 @@ def test_settings_are_recorded(twin, tmp_path):
     study, _, _ = twin
     study.save(tmp_path / "study.json")
     saved = json.loads((tmp_path / "study.json").read_text())
-    assert np.array(saved["ssim"]) == pytest.approx(study.ssim)
+    assert np.array(saved["scores"]) == pytest.approx(study.scores)
     assert saved["grid"]["means"] == list(study.grid.means)
     assert saved["optimum"]["perturbation"]["energy"]["mean"] == study.optimum.mean
     assert saved["registration"]["scale"] == 1
@@ -628,7 +628,7 @@ def test_a_study_of_a_run_in_real_units_finds_real_energies(run):
     one = fit_energies(run, measured, means=(0.1, 0.2, 0.4), **options)
     two = fit_energies(real, measured, means=tuple(factor * np.array([0.1, 0.2, 0.4])), **options)
     assert one.optimum.mean == 0.2 and two.optimum.mean == pytest.approx(0.2 * factor, rel=1e-12)
-    assert two.ssim == pytest.approx(one.ssim, abs=0.02)  # voltages differ by 1 % along the run
+    assert two.scores == pytest.approx(one.scores, abs=0.02)  # voltages differ by 1 % along the run
     assert two.real_energies[0] == pytest.approx(two.refined.true_mean, rel=1e-12)
     # the limit of the responses is a simulated energy: the same fractions are above it
     above = [np.array(each.provenance["share_above_energy_limit"]) for each in (one, two)]
@@ -676,7 +676,7 @@ def test_results_do_not_depend_on_threads(run, other):
         "resamples": 5,
     }
     one, two = (fit_energies(run, measured, n_threads=n, progress=False, **options) for n in (1, 2))
-    assert np.array_equal(one.ssim, two.ssim) and np.array_equal(one.resampled, two.resampled)
+    assert np.array_equal(one.scores, two.scores) and np.array_equal(one.resampled, two.resampled)
     assert one.to_dict() == two.to_dict()
 
 
@@ -693,9 +693,9 @@ def test_densities_have_no_noise_of_their_own(run, other):
     options |= {"smoothing": 2.0, "progress": False}
     a, b = (fit_energies(run, each, allow_noise=False, **options) for each in (counts, densities))
     noisy = fit_energies(run, densities, **options)
-    assert np.array_equal(noisy.ssim, b.ssim)  # with one draw there is no other noise
+    assert np.array_equal(noisy.scores, b.scores)  # with one draw there is no other noise
     assert b.ceiling is None and a.ceiling is not None
-    assert a.ssim == pytest.approx(b.ssim, abs=1e-12)
+    assert a.scores == pytest.approx(b.scores, abs=1e-12)
     assert b.errors.mean() < a.errors.mean() and (b.errors > 0).all()
 
 
@@ -705,7 +705,7 @@ def test_the_axis_of_the_rollup_fraction(run, other):
         run, measured, "combined", means=(0.1, 0.2, 0.3), relative_spreads=(0.5,), rollup_fractions=(0.0, 0.5, 0.9),
         registration=HERE, replicas=1, resamples=0, progress=False,
     )  # fmt: skip
-    assert study.ssim.shape == (3, 1, 3)
+    assert study.scores.shape == (3, 1, 3)
     assert max(steps_off(study, (0.9, 0.5, 0.2))) <= 1
     assert np.isnan(study.errors).all() and study.refined.intervals == {} and np.isnan(study.gain.error)
     assert "±" not in repr(study).split(";")[0]
@@ -731,7 +731,7 @@ def test_gradients_of_the_instrument_do_not_move_the_energies(run, other):
     flat = fit_energies(run, tilted, **options)
     assert max(steps_off(flat, (1.0, 1.0, 0.155))) <= 1
     flat, tilted = (fit_energies(run, tilted, flattening=each, objective="similarity", **options) for each in (None, 0))
-    assert flat.ssim.max() > tilted.ssim.max()
+    assert flat.scores.max() > tilted.scores.max()
 
 
 def test_studies_that_cannot_be(run, other):
@@ -754,17 +754,17 @@ def test_studies_that_cannot_be(run, other):
 @pytest.mark.parametrize("twin", ["roll-up"], indirect=True)
 def test_pictures(twin, tmp_path):
     study, _, _ = twin
-    axes = ae.plot.ssim_matrix(study)
+    axes = ae.plot.score_matrix(study)
     assert len(axes) == 1
     assert len(axes[0].texts) == 36
     (legend,) = axes[0].figure.legends
     labels = [text.get_text() for text in legend.get_texts()]
     assert labels == ["best on the grid", "best between its points, interval of 95 %"]
     given = axes[0].figure.add_subplot()
-    assert ae.plot.ssim_matrix(study, [given])[0] is given
+    assert ae.plot.score_matrix(study, [given])[0] is given
     given.remove()
     with pytest.raises(ValueError, match="axes"):
-        ae.plot.ssim_matrix(study, [given, given])
+        ae.plot.score_matrix(study, [given, given])
     parts = ae.plot.side_by_side(study, circle=(5, -5, 20))
     assert parts[3].get_xlim() == (-15, 25)
     # the measured map has a scale of its own, which its structure fills

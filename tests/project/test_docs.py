@@ -182,7 +182,7 @@ def test_figures_3_to_6_of_small_tips(folder, monkeypatch, capsys):
     for number in (3, 4, 5, 6):
         assert (folder / "out" / f"figure{number}.png").stat().st_size > 50_000
     results = json.loads((folder / "out" / "figures3to6.json").read_text())
-    shapes = {name: np.shape(study["ssim"]) for name, study in results["studies"].items()}
+    shapes = {name: np.shape(study["scores"]) for name, study in results["studies"].items()}
     assert shapes == {"Al lateral": (1, 6, 6), "Ni roll-up": (1, 6, 6), "Ni combined": (5, 6, 6)}
     for metal, axis in (("Al", [0, 1, 2]), ("Ni", [1, 1, 1])):
         simulated, twin = (ae.load(folder / "out" / f"{metal}_{name}_R8a.h5") for name in ("run", "twin"))
@@ -193,7 +193,7 @@ def test_figures_3_to_6_of_small_tips(folder, monkeypatch, capsys):
     # both mechanisms see the same region; roll-up alone is one of the five fractions
     alone, both = (results["studies"][name] for name in ("Ni roll-up", "Ni combined"))
     assert alone["registration"] == both["registration"]
-    assert alone["ssim"][0] == both["ssim"][4]
+    assert alone["scores"][0] == both["scores"][4]
     # nickel that rolled up looks like none that did not
     assert alone["optimum"]["score"]["value"] > alone["baselines"]["unperturbed"]["value"] + 0.5
     assert "| Ni combined | " in capsys.readouterr().out

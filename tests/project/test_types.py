@@ -74,7 +74,7 @@ ax = ae.plot.detector_map(moved, title="Ni [111]")
 ax.figure.savefig("ni111.png")
 ae.plot.detector_maps([moved, map_])[0].figure.savefig("both.png", dpi=200)
 study = ae.fit_energies(run, measured, ae.fit.EnergyGrid("roll-up"), registration=registration)
-ae.plot.ssim_matrix(study)[0].figure.savefig("ssim.png")
+ae.plot.score_matrix(study)[0].figure.savefig("scores.png")
 print(study.optimum.mean, study.registration.rotation, tip.positions[:, 2].max())
 ae.write("ni111.epos", hits)
 """

@@ -100,9 +100,9 @@ def test_the_numbers_of_the_study_are_shown(study, seen):
     ):  # fmt: skip
         assert text in seen.text, text
     cells = seen.all("td")
-    assert sum("tabindex" in cell for cell in cells) == study.ssim.size
+    assert sum("tabindex" in cell for cell in cells) == study.scores.size
     assert len(seen.all("td", "best")) == 1
-    for value, error in zip(study.ssim.ravel(), study.errors.ravel(), strict=True):
+    for value, error in zip(study.scores.ravel(), study.errors.ravel(), strict=True):
         assert f"SSIM {value:z.3f} ± {error:.3f}" in seen.text
 
 
