@@ -157,13 +157,13 @@ class Migration(_ByChargeRatio):
 
     def _at(self, ratios):
         charges = AT_REST + BY_CHARGE * ratios
-        gained = self._gain * (charges * charges - 1.0)
+        gained = self.polarization * (charges * charges - 1.0)
         kt = BOLTZMANN * self.temperature
         return _fermi(gained - self._cost, kt)
 
     @property
-    def _gain(self):
-        """Polarisation energy at the site, alpha F^2 / 2 [eV]."""
+    def polarization(self) -> float:
+        """Polarisation energy of an atom at its site, alpha F^2 / 2 [eV]."""
         return 0.5 * self.polarizability / (1e-18 * ELEMENTARY_CHARGE) * self.field**2  # F m^2 to e nm^2/V
 
     @property
@@ -174,5 +174,5 @@ class Migration(_ByChargeRatio):
     @property
     def threshold(self) -> float:
         """Charge ratio of the strongest neighbour above which an atom rolls up; 0 if all do."""
-        charge = max(self._cost / self._gain + 1.0, 0.0) ** 0.5
+        charge = max(self._cost / self.polarization + 1.0, 0.0) ** 0.5
         return max((charge - AT_REST) / BY_CHARGE, 0.0)

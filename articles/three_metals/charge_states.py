@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from judge import METALS, measured_of, projection_of
-from runs import RULES, one_rule
+from runs import RULES
 from scipy.optimize import brentq
 
 import apt_evap as ae
@@ -107,7 +107,7 @@ def simulated(metal, path, skip, most, elsewhere):
     """Print the ratios of a run at every height."""
     run = ae.load(path)
     scale = float(np.median(run.at_evaporation_field().energy_scales))
-    emission = run.perturbations[-1] if run.perturbations else one_rule(ae.emission.Migration.of(metal), scale)
+    emission = run.perturbations[-1] if run.perturbations else ae.RollUp.of_metal(metal, energy_scale=scale)
     hits, projection = run.hits(emission), projection_of(run)
     orientation = ae.Orientation.from_settings(run.settings["tip"])
     directions = projection.directions(np.where(hits.detected[:, None], np.column_stack([hits.x, hits.y]), 0.0))

@@ -10,7 +10,6 @@ import warnings
 import matplotlib.pyplot as plt
 import numpy as np
 from judge import METALS, folded, map_of, measured_of, projection_of
-from runs import one_rule
 
 import apt_evap as ae
 
@@ -21,7 +20,7 @@ def pair_of(name, measured, path):
     """Folded measured map, and the simulated one."""
     run = ae.load(path)
     scale = float(np.median(run.at_evaporation_field().energy_scales))
-    rule = one_rule(ae.emission.Migration.of(name), scale)
+    rule = ae.RollUp.of_metal(name, energy_scale=scale)
     part = rule.probability.probabilities(run.emissions[~run.not_flown]).mean()
     orientation = ae.Orientation.from_settings(run.settings["tip"])
     simulated = folded(map_of(run, rule), orientation, projection_of(run), METALS[name])

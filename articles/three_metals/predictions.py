@@ -4,9 +4,9 @@
     python predictions.py judge RUNS
     python predictions.py draw RUNS                  # predictions.png
 
-Nothing is selected here: energy, height, sharpness and the two constants of `Migration` are those of tungsten and
-nickel; cohesive energies are Kittel's, fields those of `ae.material` (magnesium: Tsong). 300,000 atoms evaporate after
-the first layer, those within the field of view fly.
+Nothing is selected here: all constants of `RollUp.of_metal` are those of tungsten and nickel; cohesive energies are
+Kittel's, fields those of `ae.material` (magnesium: Tsong). All atoms evaporate after a third as many without flights;
+those within the field of view fly.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from typing import NamedTuple
 import matplotlib.pyplot as plt
 import numpy as np
 from judge import map_of, projection_of
-from runs import one_rule, prepared
+from runs import prepared
 
 import apt_evap as ae
 from apt_evap.crystallography import poles
@@ -30,11 +30,11 @@ class Case(NamedTuple):
     metal: str
     axis: tuple[int, ...]
     temperatures: tuple[float, ...] = (60.0,)  # K
-    radius: int = 80  # in lattice constants
+    radius: int = 160  # in lattice constants
 
 
 CASES = {
-    "W 011": Case("W", (0, 1, 1), (60.0, 150.0), 100),
+    "W 011": Case("W", (0, 1, 1), (60.0, 150.0)),
     "Ni 001": Case("Ni", (0, 0, 1)),
     "Fe 001": Case("Fe", (0, 0, 1)),
     "Fe 025": Case("Fe", (0, 2, 5)),
@@ -42,7 +42,7 @@ CASES = {
     "Cu 111": Case("Cu", (1, 1, 1)),
     "Pt 001": Case("Pt", (0, 0, 1)),
     "Mg 0001": Case("Mg", (0, 0, 1), (40.0,)),
-    "Si 001": Case("Si", (0, 0, 1), radius=50),
+    "Si 001": Case("Si", (0, 0, 1), radius=100),
 }
 MAGNESIUM = ae.Material("Mg", "hcp", 0.321, 21.0, 2, 24.305, c=0.521, cohesive_energy=1.51)
 
@@ -63,7 +63,7 @@ def simulated(case, ions, threads):
     size = case.radius * material.a
     tip = ae.Tip(material, size, axis=case.axis, shank_length=size, depth=8 * material.a, offset_seed=1)
     simulation, scale = prepared(tip, ae.ConstantPotential(), FIELD_OF_VIEW, ions // 3, threads=threads)
-    rolls = [one_rule(law, scale) for law in laws(case)]
+    rolls = [ae.RollUp.of_metal(material, each, scale) for each in case.temperatures]
     return simulation.run(ions, [ae.Unperturbed(), *rolls], responses=False, progress=False)
 
 
@@ -163,7 +163,7 @@ def main():
     parser.add_argument("what", choices=("simulate", "judge", "draw"))
     parser.add_argument("runs", type=Path)
     parser.add_argument("cases", nargs="*", default=list(CASES))
-    parser.add_argument("--ions", type=int, default=300_000)
+    parser.add_argument("--ions", type=int, default=600_000, help="atoms that evaporate")
     parser.add_argument("--threads", type=int)
     options = parser.parse_args()
     options.runs.mkdir(parents=True, exist_ok=True)

@@ -25,7 +25,7 @@ MEASURES = ("SSIM", "SSIM, noise-corrected", "folded correlation", "folded conco
 
 
 def wide_rules(metal, scale):
-    """Ten rules for a run with wide responses; `scale` is the simulated energy per real energy."""
+    """Rules for a run with wide responses; `scale` is the simulated energy per real energy."""
     law = ae.emission.Migration.of(metal.partition("-")[0])
     broad = ae.TruncatedNormal(1.2 * scale, 1.2 * scale)
     return {
@@ -38,7 +38,8 @@ def wide_rules(metal, scale):
         "all, 1.2 eV": rolled(1.2 * scale),
         "fraction 0.6": rolled(0.35 * scale, probability=0.6),
         "fraction 0.3": rolled(0.35 * scale, probability=0.3),
-        "migration, sharpness 2": rolled(0.2 * scale, probability=law, sharpness=2.0),
+        "migration, 0.2 eV, sharpness 2": rolled(0.2 * scale, probability=law, sharpness=2.0),
+        "the rule of the metal": ae.RollUp.of_metal(metal.partition("-")[0], energy_scale=scale),
     }
 
 

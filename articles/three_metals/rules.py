@@ -108,9 +108,15 @@ def rivals(name, scale, rolls):
     """The law of migration, and rules of other kinds."""
     law = ae.emission.Migration.of(name)
     energy = ae.TruncatedNormal(0.2 * scale, 0.2 * scale)
+    polarization = law.polarization * scale
     one = rolled(0.2 * scale, probability=law, sharpness=2.0)
     sharp = rolled(0.2 * scale, probability=law, sharpness=0.0)
-    found = {"migration": one, "migration, sharpness 0": sharp}
+    found = {"the rule of the metal": ae.RollUp.of_metal(name, energy_scale=scale)}
+    for part in (0.22, 0.26, 0.3, 0.34):
+        for sharpness in (1.0, 1.5, 2.0):
+            rule = rolled(part * polarization, probability=law, sharpness=sharpness, others=0.35 * scale)
+            found[f"{part:g} of the polarisation, sharpness {sharpness:g}"] = rule
+    found |= {"migration, 0.2 eV, sharpness 2": one, "migration, 0.2 eV, sharpness 0": sharp}
     for push in (0.2, 0.7):
         found[f"pushed by the neighbour, {push:g} eV"] = Pushed(
             ae.TruncatedNormal(push * scale, push * scale), 2 * HEIGHT

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import apt_evap as ae
 from apt_evap.emission import Emissions, Migration
 from apt_evap.emission.roll_probability import AT_REST, BY_CHARGE
 from apt_evap.specimen.materials import material
@@ -80,6 +81,37 @@ def test_a_metal_gives_its_numbers():
     assert Migration.of(nickel, 60.0) == Migration(nickel.cohesive_energy, nickel.evaporation_field, 60.0)
     with pytest.raises(ValueError, match="material must have a cohesive_energy"):
         Migration.of(replace(nickel, cohesive_energy=None))
+
+
+def test_the_rule_of_a_metal():
+    tungsten, nickel, aluminium = (ae.RollUp.of_metal(each) for each in ("W", "Ni", "Al"))
+    # a quarter of alpha F^2 / 2, with alpha = 1e-40 F m^2 and F in V/m, in eV
+    assert tungsten.energy.mean == pytest.approx(0.25 * 0.5 * 1e-40 * (57e9) ** 2 / ELEMENTARY_CHARGE)
+    assert tungsten.energy.mean / nickel.energy.mean == pytest.approx((57 / 35) ** 2)
+    assert tungsten.others == nickel.others == aluminium.others  # those that do not roll
+    assert nickel.probability == Migration.of("Ni")
+    cold, scaled = ae.RollUp.of_metal("Ni", 20.0), ae.RollUp.of_metal("Ni", energy_scale=0.1)
+    assert cold == replace(nickel, probability=Migration.of("Ni", 20.0))
+    assert scaled.energy.mean == pytest.approx(0.1 * nickel.energy.mean)
+    assert scaled.others.mean == pytest.approx(0.1 * nickel.others.mean)
+    for wrong in (0.0, -1.0, math.nan, "x"):
+        with pytest.raises(ValueError, match="energy_scale"):
+            ae.RollUp.of_metal("Ni", energy_scale=wrong)
+    with pytest.raises(ValueError, match="material must have a cohesive_energy"):
+        ae.RollUp.of_metal(replace(material("Ni"), cohesive_energy=None))
+
+
+def test_the_rule_of_a_metal_on_a_run():
+    """In real units and at the simulated voltage: the same ions roll, and hit the same places."""
+    tip = ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1))
+    settings = ae.ResponseSettings.wide(energy_limit=20.0)  # 1 eV of a real specimen is 6 eV at this voltage
+    run = ae.Simulation(tip, seed=1, response_settings=settings).run(60, progress=False)
+    real = run.at_evaporation_field()
+    scale = float(np.median(real.energy_scales))
+    hits = run.hits(ae.RollUp.of_metal("Ni", energy_scale=scale)), real.hits(ae.RollUp.of_metal("Ni"))
+    apart = np.hypot(hits[0].x - hits[1].x, hits[0].y - hits[1].y)[hits[0].detected & hits[1].detected]
+    # mm; the factors of the ions differ from their median
+    assert len(apart) > 30 and np.median(apart) < 0.1 * np.nanmedian(np.hypot(hits[0].x, hits[0].y))
 
 
 def test_it_needs_the_neighbours():
