@@ -197,32 +197,51 @@ def rates(radii=(20, 40, 80), shank=2.0, ions=10_000, threads=(1, 2), depth=8.0)
 # ---- accuracy of events, flights and responses -----------------------------------------------------------------------
 
 
-def charge_errors(radius=40, shank=1.0, events=5000, n_threads=2):
-    """Charges after events, just after and just before a relaxation, against a converged solution."""
+def charge_errors(radii=(40, 80), shank=1.0, sections=6):
+    """Cost of events and errors of their charges, with relaxations of parts and of the whole surface; one thread.
+
+    Emitters that differ in `whole_interval` evaporate one section each in turn. A section has ten relaxations.
+    """
     rows = []
-    emitter = Emitter(nickel_tip(radius, shank), n_threads=n_threads)
-    interval = emitter.sweep_interval
-    for count in (events, interval - 1 - events % interval):
-        evaporate(emitter, count)
-        atoms, charges, since = emitter.atoms, emitter.charges.copy(), emitter._core.since_relaxation
-        emitter.relax(1e-10)
-        solution = np.zeros(len(emitter.tip))
-        solution[emitter.atoms] = emitter.charges
-        solution = solution[atoms]
-        error = (charges * (solution.sum() / charges.sum()) - solution) / solution.mean()
-        rows.append(
-            {
-                "events": emitter._core.n_removed,
-                "since the last relaxation": since,
-                "interval": interval,
-                "RMS": float(np.sqrt((error**2).mean())),
-                "largest": float(np.abs(error).max()),
-            }
-        )
-    return {
-        "title": f"error of charges relative to the mean charge, Ni[111], R = {radius} a, {len(emitter):,} atoms",
-        "rows": rows,
-    }
+    for radius in radii:
+        tip = nickel_tip(radius, shank)
+        for rule, exact in ((ae.Robin(), 1e-7), (ae.ConstantPotential(), 1e-6)):
+            emitters, times = {}, {10: [], 1: []}
+            for whole_interval in times:
+                settings = ae.evaporation.ChargeSettings(whole_interval=whole_interval)
+                emitters[whole_interval] = Emitter(tip, rule=rule, settings=settings, n_threads=1)
+            for _ in range(sections):
+                for number, emitter in emitters.items():
+                    times[number].append(evaporate(emitter, 10 * emitter.sweep_interval))
+            for number, emitter in emitters.items():
+                interval = emitter.sweep_interval
+                per_event = np.array(times[number]) / (10 * interval) * 1e6
+                row = {
+                    "R [a]": radius,
+                    "rule": type(rule).__name__,
+                    "whole interval": number,
+                    "events of a section": 10 * interval,
+                    "event and relaxation [us]": float(np.median(per_event.sum(axis=1))),
+                    "relaxation [us]": float(np.median(per_event[:, 1])),
+                }
+                # after five or six relaxations of parts; and before the second one after a converged solution
+                evaporate(emitter, 5 * interval)
+                row["RMS, after"], row["largest, after"] = charge_error(emitter, exact)
+                evaporate(emitter, 2 * interval - 1 - emitter._core.since_relaxation)
+                row["RMS, before"], row["largest, before"] = charge_error(emitter, exact)
+                rows.append(row)
+    return {"title": f"events without flights, Ni[111], shank {shank} R, medians of {sections} sections", "rows": rows}
+
+
+def charge_error(emitter, tolerance):
+    """RMS and largest error of the charges relative to their mean, against the converged solution."""
+    atoms, charges = emitter.atoms, emitter.charges.copy()
+    emitter.relax(tolerance)
+    solution = np.zeros(len(emitter.tip))
+    solution[emitter.atoms] = emitter.charges
+    solution = solution[atoms]
+    error = (charges * (solution.sum() / charges.sum()) - solution) / solution.mean()
+    return float(np.sqrt((error**2).mean())), float(np.abs(error).max())
 
 
 def flights(radii=(20, 40, 80, 120), shank=2.0, ions=256, group=17):
