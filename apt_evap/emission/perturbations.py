@@ -67,12 +67,15 @@ __all__ = [
 _PART_ALONG = 0.25
 """Mean energy along a roll-up, before truncation, over the polarisation energy of the atom at its site.
 
-Selected, as the next three, with maps of tungsten and nickel: parts of 0.22 to 0.30 with a sharpness of 1 to 1.5 give
-amplitudes of all lines within 0.65 and 1.33 of the measured ones, this one 0.79 to 1.23 (articles/three_metals).
+Selected, as the sharpness and the height, with maps of tungsten and nickel: parts of 0.22 to 0.30 with a sharpness of
+1 to 1.5 give amplitudes of all lines within 0.65 and 1.33 of the measured ones, this one 0.8 to 1.25
+(articles/three_metals).
 """
 _SHARPNESS = 1.0
-_HEIGHT_OF_METALS = 0.2  # nm
-_ENERGY_OF_OTHERS = 0.35  # eV, of ions that do not roll up
+_HEIGHT_OF_ROLLED = 0.2
+"""Height above the neighbour [nm]. Ions that do not roll up start from their sites, as maps of aluminium ask for."""
+_ENERGY_OF_OTHERS = 0.4
+"""Mean energy of ions that do not roll up, before truncation [eV]. Selected with a map of aluminium, 0.35 to 0.5."""
 
 
 class Perturbation(Protocol):
@@ -181,6 +184,13 @@ class _Rolling(_Tangential):
         at_least=0,
         at_most=1,
     )
+    others_height: float | None = number(
+        "Height of the start above the site of ions that do not roll up. By default that of the ions that do.",
+        default=None,
+        at_least=0,
+        at_most=1.0,
+        unit="nm",
+    )
 
     def _roll(self, emissions, random):
         """Launches with a roll-up of some ions."""
@@ -206,7 +216,10 @@ class _Rolling(_Tangential):
         random_speed = speed_from_energy(lateral, emissions.masses)
         sine, cosine = sine_and_cosine(2 * np.pi * u[:, 1])
         first, second = speed * first + random_speed * cosine, speed * second + random_speed * sine
-        return TangentialLaunches(rolled, first, second, shares, self._heights(n), twice)
+        heights = self._heights(n)
+        if self.others_height not in (None, self.height):
+            heights = np.where(rolled, self.height, self.others_height)
+        return TangentialLaunches(rolled, first, second, shares, heights, twice)
 
 
 @settings
@@ -275,8 +288,9 @@ class RollUp(_Rolling, _Energetic):
     def of_metal(cls, material: Material | str, temperature: float = 80.0, energy_scale: float = 1.0) -> RollUp:
         """Make the rule of a pure metal from its cohesive energy and evaporation field.
 
-        Which ions roll up follows from `Migration`. Their energies are a quarter of the polarisation energy at the
-        site, alpha F^2/2. The constants are the same for all metals: see :doc:`/results/three_metals`.
+        Which ions roll up follows from `Migration`. Their mean energy is a quarter of the polarisation energy at the
+        site, alpha F^2/2. The others start from their sites in random directions. The constants are the same for all
+        metals: see :doc:`/results/three_metals`.
 
         Parameters
         ----------
@@ -306,7 +320,7 @@ class RollUp(_Rolling, _Energetic):
             TruncatedNormal(mean * energy_scale, mean * energy_scale)
             for mean in (_PART_ALONG * law.polarization, _ENERGY_OF_OTHERS)
         )
-        return cls(rolled, law, _SHARPNESS, _HEIGHT_OF_METALS, others=others)
+        return cls(rolled, law, _SHARPNESS, _HEIGHT_OF_ROLLED, others=others, others_height=0.0)
 
     def tangential(self, emissions: Emissions, random: IonRandom) -> TangentialLaunches:
         """Which ions roll up, and the velocities along t1 and t2 [nm/ns]: see `Combined.tangential`."""

@@ -336,6 +336,22 @@ def test_launches_are_checked():
         launch_tangentially(batch, np.ones(3, dtype=bool), np.zeros(3), np.zeros(3))
 
 
+def test_ions_that_do_not_roll_can_have_a_height_of_their_own():
+    batch = emissions(400)
+    random = IonRandom(5, batch.ions)
+    usual, own = (
+        RollUp(0.3, 0.5, height=0.2, others=0.1, others_height=each).tangential(batch, random.from_start())
+        for each in (None, 0.05)
+    )
+    assert 50 < usual.rolled.sum() < 350 and (usual.heights == 0.2).all()
+    np.testing.assert_array_equal(own.heights, np.where(own.rolled, 0.2, 0.05))
+    for name in ("rolled", "first", "second"):
+        np.testing.assert_array_equal(getattr(own, name), getattr(usual, name))
+    low = RollUp(0.3, 0.5, others_height=0.1).tangential(batch, random.from_start())
+    np.testing.assert_array_equal(low.heights, np.where(low.rolled, 0.0, 0.1))
+    assert RollUp(0.3, 0.5, others_height=0.0).tangential(batch, random.from_start()).heights is None
+
+
 # ---- mixtures: each ion follows one perturbation, as if it were alone ----------------------------------------------
 
 THREE = (RollUp(0.4, 0.5), LateralVelocity(0.1, 0.05), Unperturbed())
