@@ -228,7 +228,7 @@ cdef class Evaporation:
         """Whether only `relax` can continue: for a new surface, an opened void, a full tree, or a rule in Python.
 
         Or for a change far from the holes above `FAR_CHANGE`, which samples do not follow well enough. A tree is full
-        if there is no space for twice the atoms that were exposed since the last relaxation.
+        if its space is below twice the number of atoms that were exposed since the last relaxation.
         """
         if self.since_relaxation >= NOT_RELAXED or self.atoms.opened or self.rule.samples is None:
             return True

@@ -688,7 +688,7 @@ def test_densities_have_no_noise_of_their_own(run, other):
         "relative_spreads": (1.0,),
         "registration": HERE,
         "replicas": 1,
-        "resamples": 30,
+        "resamples": 200,  # standard deviations within 5 %
     }
     options |= {"smoothing": 2.0, "progress": False}
     a, b = (fit_energies(run, each, allow_noise=False, **options) for each in (counts, densities))
@@ -696,7 +696,7 @@ def test_densities_have_no_noise_of_their_own(run, other):
     assert np.array_equal(noisy.scores, b.scores)  # with one draw there is no other noise
     assert b.ceiling is None and a.ceiling is not None
     assert a.scores == pytest.approx(b.scores, abs=1e-12)
-    assert b.errors.mean() < a.errors.mean() and (b.errors > 0).all()
+    assert (b.errors < a.errors).all() and (b.errors > 0).all()
 
 
 def test_the_axis_of_the_rollup_fraction(run, other):
