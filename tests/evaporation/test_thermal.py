@@ -166,7 +166,8 @@ def test_all_barriers_choose_nearly_the_same_atoms(tip12):
     assert 0 < max(shares["image_hump"]) < 0.04
     assert 0 < max(shares["parabolic"]) < 0.15
     assert 0 < max(shares["quadratic"]) < 0.10
-    assert np.median(more) > 0.15  # of twice the temperature; less where one atom is far ahead of the others
+    # of twice the temperature; measured 0.27 to 0.35, and 0.02 at one surface, where one atom is far ahead of the others
+    assert sorted(more)[1] > 0.15
 
 
 def test_the_spread_of_the_order_grows_with_the_temperature(tip12):
@@ -340,7 +341,7 @@ def test_a_relaxation_changes_the_voltage_only_to_the_second_order(tip12):
     assert sum(map(len, emitter.advance(350))) == 350
     before, after = emitter._core.control.voltage_factor * emitter.voltage, emitter.control_voltage
     emitter.relax()
-    assert abs(after / before - 1) > 1e-3
+    assert abs(after / before - 1) > 1e-3  # measured 1.4e-3
     # measured 2e-5, of a change of 0.6 of the logarithm; 5e-6 is where the iteration stops
     assert emitter.control_voltage == pytest.approx(after, rel=5e-5)
 
