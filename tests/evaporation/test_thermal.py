@@ -166,7 +166,7 @@ def test_all_barriers_choose_nearly_the_same_atoms(tip12):
     assert 0 < max(shares["image_hump"]) < 0.04
     assert 0 < max(shares["parabolic"]) < 0.15
     assert 0 < max(shares["quadratic"]) < 0.10
-    # of twice the temperature; measured 0.27 to 0.35, and 0.02 at one surface, where one atom is far ahead of the others
+    # of twice the temperature; measured 0.27 to 0.35, and 0.02 at one surface, where one atom is far ahead
     assert sorted(more)[1] > 0.15
 
 
