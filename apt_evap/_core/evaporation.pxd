@@ -48,6 +48,7 @@ cdef class Evaporation:
     cdef void join(self, int slot, double dx, double dy, double dz) noexcept nogil
     cdef void near_first(self, Hole* hole) noexcept nogil
     cdef int surroundings(self, long atom) noexcept nogil
+    cdef double hopping(self, double key, long atom) noexcept nogil
     cdef int judge(self, const int* slots, long n) except -1 nogil
     cdef int event(self, long atom, Journal journal) except -1 nogil
     cdef int expose(self, const int* fresh, int n_fresh, int gone, Journal journal) except -1 nogil

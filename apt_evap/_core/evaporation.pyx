@@ -271,6 +271,9 @@ cdef class Evaporation:
             bonds[slot] = self.surroundings(atom[slot])
         self.law.begin(self.field_unit * voltage_factor)
         self.law.keys(n, &strength[0], &atom[0], &bonds[0], &key[0])
+        if self.law.hop_bonds >= 0:
+            for slot in prange(n, nogil=True, schedule="static", num_threads=n_threads):
+                key[slot] = self.hopping(key[slot], atom[slot])
         for slot in range(n):
             if self.tree.atom[slot] < 0:
                 key[slot] = -INFINITY
@@ -353,6 +356,16 @@ cdef class Evaporation:
         # What the law learns of the bonds of an atom: their number, or their code.
         return self.atoms.bond_code[atom] if self.atoms.has_codes else self.atoms.bonds[atom]
 
+    cdef double hopping(self, double key, long atom) noexcept nogil:
+        # Key of an atom that may hop onto its strongest neighbour, from its key without hops.
+        cdef long long[TARGETS] neighbour
+        cdef double[TARGETS] charge
+        cdef int slot = self.slot_of[atom]
+        if slot < 0 or self.atoms.bonds[atom] > self.law.hop_bonds or not self.tree.q[slot] > 0.0:
+            return key
+        self.strongest_neighbours(atom, atom, neighbour, charge)
+        return self.law.hopping(key, charge[0] / self.tree.q[slot])
+
     cdef int judge(self, const int* slots, long n) except -1 nogil:
         # New keys of slots whose fields or bonds have changed.
         cdef long i
@@ -363,6 +376,9 @@ cdef class Evaporation:
             self.key_atom[i] = self.tree.atom[slots[i]]
             self.key_bonds[i] = self.surroundings(self.key_atom[i])
         self.law.keys(n, &self.strength[0], &self.key_atom[0], &self.key_bonds[0], &self.key[0])
+        if self.law.hop_bonds >= 0:
+            for i in range(n):
+                self.key[i] = self.hopping(self.key[i], self.key_atom[i])
         for i in range(n):
             self.chooser.key[slots[i]] = self.key[i]
         self.chooser.update(slots, n)

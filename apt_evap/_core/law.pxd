@@ -6,10 +6,12 @@ from apt_evap._core.octree cimport Octree
 
 cdef class LawKernel:
     cdef readonly object surroundings   # BondCodes if `key` needs the bonds by species; None: their number
+    cdef readonly int hop_bonds         # most nearest neighbours of an atom that can hop; -1: none can
 
     cdef double key(self, double strength, long long atom, int bonds) noexcept nogil
     cdef int keys(self, long n, const double* strength, const long long* atom, const int* bonds,
                   double* key) except -1 nogil
+    cdef double hopping(self, double key, double ratio) noexcept nogil
     cdef Chooser chooser(self, Octree tree, double[::1] key)
 
 
@@ -18,6 +20,7 @@ cdef class WeightedField(LawKernel):
     cdef const double[:, ::1] table     # (n_species, n_codes) weight by bonds; empty: does not depend on them
     cdef const int[::1] species         # (n_atoms,) rows of the table
     cdef bint by_bonds
+    cdef double at_rest, by_charge, gain_needed   # of a hop
 
     cdef double ratio(self, double strength, long long atom, int bonds) noexcept nogil
 

@@ -172,7 +172,12 @@ class Migration(_ByChargeRatio):
         return self.bonds_lost * self.cohesive_energy - EVAPORATION_BARRIER * BOLTZMANN * self.temperature
 
     @property
+    def gain_needed(self) -> float:
+        """phi^2 - 1 above which an atom rolls up."""
+        return self._cost / self.polarization
+
+    @property
     def threshold(self) -> float:
         """Charge ratio of the strongest neighbour above which an atom rolls up; 0 if all do."""
-        charge = max(self._cost / self.polarization + 1.0, 0.0) ** 0.5
+        charge = max(self.gain_needed + 1.0, 0.0) ** 0.5
         return max((charge - AT_REST) / BY_CHARGE, 0.0)

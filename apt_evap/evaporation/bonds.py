@@ -42,7 +42,8 @@ From first, second and third ionisation energies (NIST Atomic Spectra Database) 
 (Michaelson, J. Appl. Phys. 48, 4729, 1977).
 """
 
-_COORDINATION = {"fcc": (12, 6), "hcp": (12, 6), "bcc": (8, 6), "sc": (6, 12), "diamond": (4, 12)}
+COORDINATION = {"fcc": (12, 6), "hcp": (12, 6), "bcc": (8, 6), "sc": (6, 12), "diamond": (4, 12)}
+"""Nearest and second neighbours of an atom in the bulk."""
 _BITS = 4  # per count of neighbours: up to 15
 _LEAST = 0.1  # of the energy at a kink: repulsive bonds cannot lower the field below 1 %
 _MOST = 4  # counts: tables of 16^4 numbers
@@ -211,7 +212,7 @@ class PairEnergies:
         energies = []
         for index in (first, second):
             element = tip.elements[index]
-            near, far = _COORDINATION[tip.elements[0].structure]
+            near, far = COORDINATION[tip.elements[0].structure]
             cohesive = self._number(self.cohesive_energies, COHESIVE_ENERGIES, element.name, "cohesive_energies")
             energies.append(2.0 * cohesive / (near + self.second_weight * far))
         names = [tip.elements[index].name for index in (first, second)]

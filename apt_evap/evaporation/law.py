@@ -5,10 +5,11 @@ from typing import Any, Protocol, TypeGuard
 
 import numpy as np
 
-from apt_evap._common.codec import settings
+from apt_evap._common.codec import part, settings
 from apt_evap._common.types import Floats, Integers
 from apt_evap._core.law import LawKernel, PythonLaw, WeightedField
-from apt_evap.evaporation.bonds import BondField, bond_table, bonds_field
+from apt_evap.emission.roll_probability import AT_REST, BY_CHARGE, Migration
+from apt_evap.evaporation.bonds import COORDINATION, BondField, bond_table, bonds_field
 from apt_evap.evaporation.voltage import ThermalLaw, VoltageControl
 from apt_evap.specimen.tip import Tip
 
@@ -49,6 +50,12 @@ class Extremal:
     Equal ratios are ordered by the index of the atom. This is the low-temperature limit of the Arrhenius rate nu_0
     exp(-C (1 - F/F_evap)/kT) (Vurpillot et al., 2013).
 
+    Notes
+    -----
+    With `hop`, an atom leaves as soon as it can hop onto its strongest neighbour, from where it evaporates at once. A
+    kink atom (up to half of the bonds of the bulk) then needs only the field F_evap sqrt(g / (phi^2 - 1)), if phi^2 - 1
+    is above g: phi and g are those of `Migration`. Where strong neighbours are near, atoms leave at lower fields.
+
     Examples
     --------
     >>> tip = ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1))
@@ -58,14 +65,27 @@ class Extremal:
     """
 
     bonds: BondField | None = bonds_field()
+    hop: Migration | None = part(
+        "Barrier of a hop in the field, after which an atom leaves; by default atoms leave by evaporation only.",
+        Migration,
+        default=None,
+    )
+
+    def _check(self):
+        if self.hop is not None and not self.hop.gain_needed > 0:
+            raise ValueError(f"hop must have a barrier above that of evaporation, got {self.hop!r}")
 
     def kernel(self, tip: Tip) -> LawKernel:
         """Return the compiled law for a specimen: F / F_evap, 0 for atoms that cannot evaporate."""
         weight = np.where(tip.evaporable, 1.0 / tip.evaporation_fields[tip.species], 0.0)
-        return WeightedField(weight, *(() if self.bonds is None else bond_table(self.bonds, tip)))
+        table = (None, None, None) if self.bonds is None else bond_table(self.bonds, tip)
+        hop = None
+        if self.hop is not None:
+            hop = COORDINATION[tip.elements[0].structure][0] // 2, AT_REST, BY_CHARGE, self.hop.gain_needed
+        return WeightedField(weight, *table, hop)
 
     def keys(self, tip: Tip, atoms: Integers, fields: Floats, bonds: Integers) -> Floats:
-        """Return the ratio of field to evaporation field of the species of each atom: see `Law.keys`."""
+        """Return the ratio of field to evaporation field of the species of each atom, without hops: see `Law.keys`."""
         return np.where(tip.evaporable[atoms], fields / tip.evaporation_fields[tip.species[atoms]], 0.0)
 
 

@@ -6,7 +6,7 @@
 An ion can lose another electron on the first nanometre of its flight. The events of a run are repeated, and the field
 just after each event is taken on the way of its ion, at some heights above its site and its start. Kingham's curves
 turn the fields into ratios. One factor for all fields makes the ratio elsewhere the measured one, or the one assumed
-in `CHARGES`; the two others are predictions.
+in `CHARGES`; the two others are predictions. The fields that the law of evaporation saw are printed, too.
 """
 
 import argparse
@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from judge import METALS, measured_of, projection_of
-from runs import RULES
+from runs import LAWS, RULES
 from scipy.optimize import brentq
 
 import apt_evap as ae
@@ -83,7 +83,9 @@ def fields_on_the_way(run, skip, starts, chosen):
     """
     rule = RULES[run.settings["rule"].get("law_field", "Robin")]
     specimen = ae.Tip.from_settings(run.settings["tip"])
-    emitter = ae.evaporation.Emitter(specimen, run.voltage, n_threads=1, rule=rule)
+    given = run.settings["law"]
+    law = LAWS["bonds" if given["bonds"] else "hop" if given.get("hop") else "field"](specimen.elements[0])
+    emitter = ae.evaporation.Emitter(specimen, run.voltage, law, n_threads=1, rule=rule)
     emissions, found = run.emissions, np.full((len(run), starts.shape[1], len(HEIGHTS)), np.nan)
     for _ in emitter.advance(skip):
         pass
@@ -116,6 +118,8 @@ def simulated(metal, path, skip, most, elsewhere):
     chosen[most:] = False
     masks = [each & chosen for each in masks]
     print(f"{path.name}: {[int(each.sum()) for each in masks]} ions")
+    seen = [run.fields[each].mean() for each in masks]
+    print(f"{path.name}: fields that the law saw over those elsewhere {seen[0] / seen[2]:.3f} {seen[1] / seen[2]:.3f}")
     random = ae.emission.IonRandom(run.settings["seed"], run.emissions.ions)
     starts = emission.launch(run.emissions, random).positions
     places = np.stack([run.emissions.positions, starts], axis=1)

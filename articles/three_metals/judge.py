@@ -6,7 +6,8 @@ Both maps are sampled about the same pole, at equal directions of the crystal, a
 directions are those of the indexing; the simulated ones have the image compression of the unperturbed ions. The
 correlation is that of flattened densities, smoothed by 0.6 degrees. A line of the table: correlation, azimuth of the
 bright line in ranges of the angle, amplitudes and contrasts of three rings, densities from the pole outwards; for
-tungsten the densities on the lines towards {222} and {200}.
+tungsten the densities on the lines towards {222} and {200}. A run with responses is judged by `RollUp.of_metal`. With
+--errors, also the errors of counting of the contrasts, from 20 maps with other counts.
 """
 
 import argparse
@@ -142,6 +143,17 @@ def row(name, folded, target, metal):
     print(f"{name:30} {folded.correlation(target):5.2f} | {azimuths} | {amplitudes} | {contrasts} | {densities_}{ends}")
 
 
+def contrast_errors(map, orientation, projection, metal, seed=1):
+    """Contrasts of the rings and their errors of counting, as text."""
+    random, found = np.random.default_rng(seed), []
+    for _ in range(20):
+        counts = random.poisson(np.where(map.mask, map.values, 0))
+        other = ae.DetectorMap.from_array(counts, map.x_edges, map.y_edges, is_counts=True, mask=map.mask)
+        found.append([each.std() for each in rings(folded(other, orientation, projection, metal), metal)])
+    contrasts = [each.std() for each in rings(folded(map, orientation, projection, metal), metal)]
+    return " ".join(f"{each:.3f} +- {error:.3f}" for each, error in zip(contrasts, np.std(found, axis=0), strict=True))
+
+
 def projection_of(run):
     """Projection with the image compression of the unperturbed ions between 8 degrees and 2 degrees from the rim."""
     hits = run.hits(ae.Unperturbed())
@@ -169,18 +181,16 @@ def map_of(run, emission):
     return ae.DetectorMap.from_array(counts, edges, edges, is_counts=True, mask=seen)
 
 
-def names_of(run):
-    """Names of the emissions of a run of `runs.py`."""
-    return ("unperturbed", "law of migration") if len(run.perturbations) == 2 else EMISSIONS
-
-
-def simulated_maps(run, metal):
-    """Folded densities of every emission of a run."""
-    projection, orientation = projection_of(run), ae.Orientation.from_settings(run.settings["tip"])
-    return {
-        name: folded(map_of(run, emission), orientation, projection, metal)
-        for name, emission in zip(names_of(run), run.perturbations, strict=True)
-    }
+def emissions_of(run):
+    """Emissions of a run of `runs.py` by name; the one law for a run with responses."""
+    if len(run.perturbations) == len(EMISSIONS):
+        return dict(zip(EMISSIONS, run.perturbations, strict=True))
+    if run.perturbations:
+        rule = run.perturbations[-1]
+    else:
+        scale = float(np.median(run.at_evaporation_field().energy_scales))
+        rule = ae.RollUp.of_metal(run.settings["tip"]["material"]["name"], energy_scale=scale)
+    return {"unperturbed": ae.Unperturbed(), "law of migration": rule}
 
 
 def main():
@@ -189,18 +199,25 @@ def main():
     parser.add_argument("metal", choices=METALS)
     parser.add_argument("measured", help="ions, or a map of densities")
     parser.add_argument("runs", nargs="+", type=Path)
+    parser.add_argument("--errors", action="store_true", help="of the contrasts, by counting")
     options = parser.parse_args()
     metal = METALS[options.metal]
     map, orientation, projection = measured_of(options.metal, options.measured)
     target = folded(map, orientation, projection, metal)
     row("measured", target, target, metal)
     print(target)
+    if options.errors and map.is_counts:
+        print("contrasts", contrast_errors(map, orientation, projection, metal))
     for path in options.runs:
         run = ae.load(path)
         print(f"{path.name}: {len(run):,} ions")
-        simulated = simulated_maps(run, metal)
+        place = ae.Orientation.from_settings(run.settings["tip"]), projection_of(run)
+        maps = {name: map_of(run, emission) for name, emission in emissions_of(run).items()}
+        simulated = {name: folded(each, *place, metal) for name, each in maps.items()}
         for name, each in simulated.items():
             row(name, each, target, metal)
+            if options.errors:
+                print("contrasts", contrast_errors(maps[name], *place, metal))
         if len(simulated) == 2:
             continue
         for name in ("sharpness 0.15", "sharpness 0.4", "sharpness 2", "sharpness 0.4, height 0.2"):

@@ -7,8 +7,9 @@ evaporate, only ions that can arrive in the measured field of view fly. Every em
 the exact field. Energies are 0.35 eV in real units, sigma/mean 1, launches 0.1 nm above the site unless the name says
 otherwise. With --fly wide, each ion gets its responses instead (`_wide.h5`), for any emission afterwards (`rules.py`);
 with --fly law, only the one rule for all metals is flown (`_law.h5`). The responses can also cover roll-ups onto second
-neighbours (--shells 2, `_wide_shells.h5`) and second roll-ups (--rolls 2, `_wide_rolls.h5`). With --bonds second, the
-evaporation field depends on the bonds to first and second neighbours (`_bonds_second.h5`).
+neighbours (--shells 2, `_wide_shells.h5`) and second roll-ups (--rolls 2, `_wide_rolls.h5`). With --leave bonds, the
+field at which an atom leaves depends on its bonds to first and second neighbours; with --leave hop, an atom leaves as
+soon as it can hop.
 """
 
 import argparse
@@ -32,7 +33,11 @@ RULES = {
     "charge": ae.ConstantPotential(law_field="charge"),
     "Robin": ae.Robin(),
 }
-BONDS = {"none": None, "second": ae.evaporation.PairEnergies(second_weight=0.5)}
+LAWS = {
+    "field": lambda metal: ae.Extremal(),
+    "bonds": lambda metal: ae.Extremal(bonds=ae.evaporation.PairEnergies(second_weight=0.5)),
+    "hop": lambda metal: ae.Extremal(hop=ae.emission.Migration.of(metal)),
+}
 EMISSIONS = (
     "unperturbed", "lateral", "lateral, height 0.2", "strongest", "sharpness 0.15", "sharpness 0.4", "sharpness 2",
     "sharpness 0.4, height 0.2",
@@ -54,9 +59,9 @@ def emissions(scale):
     ]
 
 
-def prepared(tip, rule, half_angle, skip, seed=1, threads=None, bonds="none", **targets):
+def prepared(tip, rule, half_angle, skip, seed=1, threads=None, law=None, **targets):
     """Simulation of a tip after some events without flights, and the simulated energy per real energy."""
-    common = {"seed": seed, "rule": rule, "n_threads": threads, "law": ae.Extremal(bonds=BONDS[bonds])}
+    common = {"seed": seed, "rule": rule, "n_threads": threads, "law": law}
     common["response_settings"] = ae.ResponseSettings.wide(**targets)  # records the neighbours for the sharpness
     pilot = ae.Simulation(tip, **common).run(256, responses=False, progress=False)
     scale = float(np.median(pilot.at_evaporation_field().energy_scales))
@@ -66,18 +71,19 @@ def prepared(tip, rule, half_angle, skip, seed=1, threads=None, bonds="none", **
     return simulation, scale
 
 
-def simulated(metal, radius, rule, seed, skip, ions, threads, kind, **others):
+def simulated(metal, radius, rule, seed, skip, ions, threads, kind, leave, **targets):
     """Run of one specimen; the second one has other atoms at the apex."""
     axis, half_angle = AXES[metal]
     material = ae.material(metal.partition("-")[0])
     size = radius * material.a
     shank = size if radius >= 160 else 2 * size
     tip = ae.Tip(material, size, axis=axis, shank_length=shank, depth=8 * material.a, offset_seed=seed)
-    simulation, scale = prepared(tip, RULES[rule], half_angle, skip, seed, threads, **others)
+    law = LAWS[leave](material)
+    simulation, scale = prepared(tip, RULES[rule], half_angle, skip, seed, threads, law, **targets)
     if kind == "wide":
         return simulation.run(ions, progress=False)
-    law = ae.RollUp.of_metal(material, energy_scale=scale)
-    flown = [ae.Unperturbed(), law] if kind == "law" else emissions(scale)
+    rolls = ae.RollUp.of_metal(material, energy_scale=scale)
+    flown = [ae.Unperturbed(), rolls] if kind == "law" else emissions(scale)
     return simulation.run(ions, flown, responses=False, progress=False)
 
 
@@ -96,17 +102,17 @@ def main():
     parser.add_argument("--fly", choices=kinds, default=kinds[0], help="eight emissions, responses, or the one law")
     parser.add_argument("--shells", type=int, default=1, help="shells of neighbours onto which atoms can roll, 1 or 2")
     parser.add_argument("--rolls", type=int, default=1, help="roll-ups of an ion that the responses cover, 1 or 2")
-    parser.add_argument("--bonds", choices=BONDS, default="none", help="bonds of the evaporation field")
+    parser.add_argument("--leave", choices=LAWS, default="field", help="what decides which atom leaves next")
     options = parser.parse_args()
     targets = {name: getattr(options, name) for name in ("shells", "rolls")}
     kind = "" if options.fly == kinds[0] else f"_{options.fly}"
     kind += "".join(f"_{name}" for name, count in targets.items() if count > 1)
-    kind += "" if options.bonds == "none" else f"_bonds_{options.bonds}"
+    kind += "" if options.leave == "field" else f"_{options.leave}"
     path = options.runs / f"{options.metal}_{options.radius}_{options.rule}_{options.seed}{kind}.h5"
     options.runs.mkdir(parents=True, exist_ok=True)
     if not path.exists():
         arguments = options.metal, options.radius, options.rule, options.seed, options.skip, options.ions
-        simulated(*arguments, options.threads, options.fly, bonds=options.bonds, **targets).save(path)
+        simulated(*arguments, options.threads, options.fly, options.leave, **targets).save(path)
 
 
 if __name__ == "__main__":

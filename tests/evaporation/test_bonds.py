@@ -352,7 +352,7 @@ def test_a_run_with_bonds_is_saved_resumed_and_described(aluminium_copper, tmp_p
     run(50, tmp_path / "run.h5")
     assert run(80, tmp_path / "run.h5").fingerprint() == run(80).fingerprint()
     law = ae.load(tmp_path / "run.h5").settings["law"]
-    assert law == {"name": "Extremal", "bonds": {"name": type(bonds).__name__} | settings}
+    assert law == {"name": "Extremal", "bonds": {"name": type(bonds).__name__} | settings, "hop": None}
 
 
 # ---- bad input -----------------------------------------------------------------------------------------------------

@@ -4,9 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 import apt_evap as ae
 from apt_evap._core.law import PythonLaw, WeightedField
+from apt_evap.emission import Migration
 
 
 def sequence(emitter, events=60):
@@ -73,6 +75,62 @@ def test_parameters_of_a_law_are_in_the_settings(small_tip):
     assert run.settings["rule"] == {"name": "Robin", "tolerance": 1e-5, "window": 8}
 
 
+def test_the_field_at_which_an_atom_hops(tip12):
+    """The gain of a hop is alpha F^2 (phi^2 - 1)/2: it is enough where the field is lower by the root."""
+    law = Migration.of("Ni")
+    kernel = ae.Extremal(hop=law).kernel(tip12)
+    double = ((2 * law.gain_needed + 1) ** 0.5 - 1.27) / 1.54  # charge ratio at which phi^2 - 1 is twice as large
+    ratios = np.array([0.0, 0.9 * law.threshold, law.threshold, double])
+    keys = kernel.evaluate_hopping(np.full(4, 0.7), ratios)
+    assert keys == pytest.approx(0.7 * np.array([1.0, 1.0, 1.0, 2.0**0.5]), rel=1e-12)
+    # hotter or less bound atoms hop at lower fields, and those of aluminium do not hop at all
+    assert Migration.of("Ni", 150.0).gain_needed < law.gain_needed < Migration.of("Al").gain_needed
+    assert kernel.hop_bonds == 6 and ae.Extremal().kernel(tip12).hop_bonds == -1
+
+
+def hopping_keys(emitter, law):
+    """Keys of all surface atoms of pure nickel by the law with a hop, written in NumPy."""
+    tip, charges = emitter.tip, emitter.charges
+    pairs = cKDTree(emitter.positions).query_pairs(1.2 * tip.nearest_neighbour_distance, output_type="ndarray")
+    strongest = np.zeros(len(emitter))
+    np.maximum.at(strongest, pairs[:, 0], charges[pairs[:, 1]])
+    np.maximum.at(strongest, pairs[:, 1], charges[pairs[:, 0]])
+    gain = (1.27 + 1.54 * strongest / np.maximum(charges, 1e-9)) ** 2 - 1
+    hops = (emitter.bonds <= 6) & (strongest > 0) & (charges > 0) & (gain > law.gain_needed)
+    keys = ae.Extremal().keys(tip, emitter.atoms, emitter.fields, emitter.bonds)
+    return np.where(hops, keys * np.sqrt(gain / law.gain_needed), keys)
+
+
+@pytest.mark.parametrize("rule", [ae.Robin(), ae.ConstantPotential()])
+def test_the_next_atom_of_the_law_with_a_hop(tip12, rule):
+    """Against keys of all atoms in NumPy; keys beyond the patch around a hole are those before the event."""
+    law = Migration.of("Ni", 150.0)
+    emitter = ae.evaporation.Emitter(tip12, law=ae.Extremal(hop=law), rule=rule)
+    for _ in range(2):
+        atoms, keys = emitter.atoms, hopping_keys(emitter, law)
+        assert emitter.evaporate(1).site[0] == atoms[np.argmax(keys)]
+        for _ in range(30):
+            atoms, keys = emitter.atoms, hopping_keys(emitter, law)
+            assert keys[atoms == emitter.evaporate(1).site[0]] > (1 - 2e-3) * keys.max()
+        emitter.relax()
+    plain = ae.evaporation.Emitter(tip12, rule=rule)
+    assert not np.array_equal(sequence(plain), sequence(ae.evaporation.Emitter(tip12, law=emitter.law, rule=rule)))
+
+
+def test_a_hop_does_not_depend_on_threads_and_batches(tip12):
+    law = ae.Extremal(hop=Migration.of("Ni"))
+    one, three = (ae.evaporation.Emitter(tip12, law=law, n_threads=n) for n in (1, 3))
+    assert np.array_equal(sequence(one), np.concatenate([b.site for b in three.advance(60, batch_size=7)]))
+
+
+def test_atoms_that_cannot_hop_leave_as_without_the_law(tip12):
+    """Aluminium's barrier is above all gains."""
+    without, with_hop = (
+        ae.evaporation.Emitter(tip12, law=ae.Extremal(hop=each)) for each in (None, Migration.of("Al"))
+    )
+    assert np.array_equal(sequence(without), sequence(with_hop))
+
+
 class Bad:
     def __init__(self, value):
         self.value = value
@@ -94,3 +152,10 @@ class Bad:
 def test_bad_laws_are_refused(small_tip, law, message):
     with pytest.raises(ValueError, match=message):
         ae.evaporation.Emitter(small_tip, law=law)
+
+
+def test_a_hop_without_a_barrier_is_refused():
+    with pytest.raises(ValueError, match="hop must have a barrier above that of evaporation, got Migration"):
+        ae.Extremal(hop=Migration(0.1, 20.0, temperature=1000.0))
+    with pytest.raises(ValueError, match="hop must be a Migration or None"):
+        ae.Extremal(hop=0.66)
