@@ -34,7 +34,7 @@ class Case(NamedTuple):
 
 
 CASES = {
-    "W 011": Case("W", (0, 1, 1), (60.0, 150.0)),
+    "W 011": Case("W", (0, 1, 1), (60.0, 150.0), radius=100),
     "Ni 001": Case("Ni", (0, 0, 1)),
     "Fe 001": Case("Fe", (0, 0, 1)),
     "Fe 025": Case("Fe", (0, 2, 5)),

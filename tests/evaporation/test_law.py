@@ -123,6 +123,17 @@ def test_a_hop_does_not_depend_on_threads_and_batches(tip12):
     assert np.array_equal(sequence(one), np.concatenate([b.site for b in three.advance(60, batch_size=7)]))
 
 
+def test_a_run_with_hops_is_resumed_bit_by_bit(small_tip, tmp_path):
+    def run(n_ions, path=None):
+        law, charges = ae.Extremal(hop=Migration.of("Ni")), ae.evaporation.ChargeSettings(sweep_interval=30)
+        simulation = ae.Simulation(small_tip, seed=2, law=law, charge_settings=charges)
+        checkpoint = None if path is None else ae.simulation.Checkpoint(path, resume=True)
+        return simulation.run(n_ions, responses=False, progress=False, checkpoint=checkpoint)
+
+    run(50, tmp_path / "run.h5")
+    assert run(80, tmp_path / "run.h5").fingerprint() == run(80).fingerprint()
+
+
 def test_atoms_that_cannot_hop_leave_as_without_the_law(tip12):
     """Aluminium's barrier is above all gains."""
     without, with_hop = (
