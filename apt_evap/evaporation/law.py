@@ -54,7 +54,8 @@ class Extremal:
     -----
     With `hop`, an atom leaves as soon as it can hop onto its strongest neighbour, from where it evaporates at once. A
     kink atom (up to half of the bonds of the bulk) then needs only the field F_evap sqrt(g / (phi^2 - 1)), if phi^2 - 1
-    is above g: phi and g are those of `Migration`. Where strong neighbours are near, atoms leave at lower fields.
+    is above g: phi and g are those of `Migration`. Where strong neighbours are near, atoms leave at lower fields. With
+    `bonds`, F_evap is the field of the atom with its bonds.
 
     Examples
     --------
