@@ -15,10 +15,11 @@ from pathlib import Path
 
 import numpy as np
 from judge import METALS, measured_of, projection_of
-from runs import LAWS, RULES
+from runs import RULES
 from scipy.optimize import brentq
 
 import apt_evap as ae
+from apt_evap._common.codec import from_plain
 from apt_evap.crystallography import poles
 
 HEIGHTS = (0.0, 0.2, 0.4, 0.7, 1.0)  # nm above the start
@@ -83,8 +84,7 @@ def fields_on_the_way(run, skip, starts, chosen):
     """
     rule = RULES[run.settings["rule"].get("law_field", "Robin")]
     specimen = ae.Tip.from_settings(run.settings["tip"])
-    given = run.settings["law"]
-    law = LAWS["bonds" if given["bonds"] else "hop" if given.get("hop") else "field"](specimen.elements[0])
+    law = from_plain(run.settings["law"], ae.Extremal, what="the law")
     emitter = ae.evaporation.Emitter(specimen, run.voltage, law, n_threads=1, rule=rule)
     emissions, found = run.emissions, np.full((len(run), starts.shape[1], len(HEIGHTS)), np.nan)
     for _ in emitter.advance(skip):

@@ -103,7 +103,10 @@ def hopping_keys(emitter, law):
 
 @pytest.mark.parametrize("rule", [ae.Robin(), ae.ConstantPotential()])
 def test_the_next_atom_of_the_law_with_a_hop(tip12, rule):
-    """Against keys of all atoms in NumPy; keys beyond the patch around a hole are those before the event."""
+    """Against keys of all atoms in NumPy; keys beyond the patch around a hole are those before the event.
+
+    Measured over 60 events: the same atoms by Robin, at a constant potential one key that is 6e-5 below the largest.
+    """
     law = Migration.of("Ni", 150.0)
     emitter = ae.evaporation.Emitter(tip12, law=ae.Extremal(hop=law), rule=rule)
     for _ in range(2):
@@ -111,15 +114,17 @@ def test_the_next_atom_of_the_law_with_a_hop(tip12, rule):
         assert emitter.evaporate(1).site[0] == atoms[np.argmax(keys)]
         for _ in range(30):
             atoms, keys = emitter.atoms, hopping_keys(emitter, law)
-            assert keys[atoms == emitter.evaporate(1).site[0]] > (1 - 2e-3) * keys.max()
+            assert keys[atoms == emitter.evaporate(1).site[0]] > (1 - 5e-4) * keys.max()
         emitter.relax()
     plain = ae.evaporation.Emitter(tip12, rule=rule)
     assert not np.array_equal(sequence(plain), sequence(ae.evaporation.Emitter(tip12, law=emitter.law, rule=rule)))
 
 
-def test_a_hop_does_not_depend_on_threads_and_batches(tip12):
-    law = ae.Extremal(hop=Migration.of("Ni"))
-    one, three = (ae.evaporation.Emitter(tip12, law=law, n_threads=n) for n in (1, 3))
+def test_a_hop_does_not_depend_on_threads_and_batches(nickel):
+    size, law = 30 * nickel.a, ae.Extremal(hop=Migration.of("Ni"))
+    tip = ae.Tip(nickel, size, axis=(1, 1, 1), shank_length=size, depth=6 * nickel.a, offset_seed=1)
+    one, three = (ae.evaporation.Emitter(tip, law=law, n_threads=n) for n in (1, 3))
+    assert len(one) > 16_384  # keys of fewer atoms are computed by one thread
     assert np.array_equal(sequence(one), np.concatenate([b.site for b in three.advance(60, batch_size=7)]))
 
 
