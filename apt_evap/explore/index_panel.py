@@ -87,6 +87,7 @@ class IndexPanel:
         self.latest = Latest(lambda wish: wish())
         self.candidates: list[tuple[Orientation, Projection, str]] = []
         self._found: Indexing | None = None  # of the search that gave the candidates
+        self._asked: Any = None  # the fit whose candidates are to be shown, unless others come first
         self._make_widgets(material)
         self._make_drawings(fig)
         self._material_changed()
@@ -220,7 +221,8 @@ class IndexPanel:
             "centre": tuple(each.value or 0.0 for each in self.centre),
             "mirror": bool(self.options.active),
         }
-        self.latest.ask(partial(self._fit, marks, options))
+        self._asked = wish = marks, options
+        self.latest.ask(partial(self._fit, wish))
 
     def _search(self, button, start=None):
         """Search over all orientations by `index`, or refine one, in another process; marks narrow it."""
@@ -284,19 +286,26 @@ class IndexPanel:
             return "type a scale, or mark a second pole"
         return "mark a second pole, or points of a zone line through the first one" if marks.poles else HINT
 
-    def _fit(self, marks, options):
+    def _fit(self, wish):
+        marks, options = wish
+        rows, hint = [], ""
         try:
             found = marks.fits(**options)
         except ValueError as error:
-            self._later(partial(self._put, [], str(error)), 0)
-            return
-        rows = [(each.orientation, each.projection, f"RMS {each.rms:.2f} mm") for each in found]
-        exact = len(marks.poles) == 2 and not marks.lines and options["scale"] is None
-        hint = "two poles fit exactly: a third one decides" if exact else ""
-        self._later(partial(self._put, rows, hint), 0)
+            hint = str(error)
+        else:
+            rows = [(each.orientation, each.projection, f"RMS {each.rms:.2f} mm") for each in found]
+            if len(marks.poles) == 2 and not marks.lines and options["scale"] is None:
+                hint = "two poles fit exactly: a third one decides"
+
+        def put():
+            if self._asked is wish:  # the marks are still these
+                self._put(rows, hint)
+
+        self._later(put, 0)
 
     def _put(self, candidates, text, found=None):
-        self.candidates, self._found = candidates, found
+        self.candidates, self._found, self._asked = candidates, found, None
         self._hint = text
         options = []
         for number, (orientation, projection, quality) in enumerate(candidates):

@@ -91,7 +91,7 @@ class Marks:
             raise ValueError("places of the marks must be different")
         found: list[FittedOrientation] = []
         starts = sorted(self._starts(places, Projection(scale or 1.0, centre, mirror), scale is None))
-        for _, members, lines in starts[: _MOST if len(places) == 2 and not self.lines else _MOST // 2]:
+        for *_, members, lines in starts[:_MOST]:
             pairs = [
                 (self._crystal.planes[member], points) for member, points in zip(lines, self._points(), strict=True)
             ]
@@ -110,7 +110,11 @@ class Marks:
         return [np.array(points) for _, points in self.lines]
 
     def _starts(self, places, projection, free):
-        """Misfit [mm], members of the poles and of the lines, for each different member of the second mark."""
+        """Misfit [mm], distance from the usual field of view, members of the poles and of the lines.
+
+        One for each different member of the second mark. The misfit is rounded: members that fit equally well are not
+        to be ordered by rounding errors.
+        """
         normals = self._crystal.normals
         first = self._members[self.poles[0][0]][0]
         of_pole = len(places) > 1
@@ -126,9 +130,9 @@ class Marks:
                 scales = [float(np.linalg.norm(places[1] - places[0])) / angle * each for each in (0.9, 1.0, 1.1, 1.2)]
             tried = [self._matched(first, member, places, replace(projection, scale=scale)) for scale in scales]
             misfit, members, lines = min(tried)
-            # of equal fits those first whose field of view is as in instruments
-            usual = abs(math.log(np.linalg.norm(places, axis=1).max() / scales[0] / _LARGEST)) if simple else 0.0
-            yield misfit + usual, members, lines
+            misfit = 0.0 if simple and free else round(misfit, _DIGITS)  # two poles fit exactly by some scale
+            unusual = abs(math.log(np.linalg.norm(places, axis=1).max() / scales[1] / _LARGEST)) if free else 0.0
+            yield misfit, unusual, members, lines
 
     def _matched(self, first, member, places, projection):
         """Members next to the marks, if the first two marks are these members."""

@@ -58,6 +58,22 @@ def test_two_poles_have_several_candidates():
     assert all(each.rms > 1.0 for each in known[1:])  # mm
 
 
+def test_of_equal_fits_the_usual_field_of_view_comes_first():
+    """Three poles {200} about [111] fit at 54.7 degrees as they do at 125.3, where no instrument sees them."""
+    orientation = ae.Orientation("Ni", axis=(1, 1, 1), rotation=20.0)
+    normals = orientation.directions([(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)])
+    for noise in (0.0, 0.02):  # mm
+        places = ae.detection.Projection(60.0).places(normals)
+        places += np.random.default_rng(2).normal(0, noise, places.shape)
+        marks = Marks("Ni")
+        family = [marks.families.index(each) for each in ("111", "200")]
+        marks.poles = [(family[0], (0.0, 0.0)), *((family[1], tuple(each)) for each in places.tolist())]
+        for number in (3, 4):
+            found = Marks("Ni", marks.poles[:number]).fits()
+            scales = [each.projection.scale for each in found]
+            assert scales == pytest.approx([60.0, 60.0 * 54.7356 / 125.2644], rel=1e-3)
+
+
 def test_a_pole_and_a_zone_line_with_a_scale():
     orientation = ae.Orientation("Ni", axis=(0.2, 0.3, 1.0), rotation=-70.0)
     marks = marked(orientation, 1)

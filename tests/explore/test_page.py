@@ -423,6 +423,26 @@ def test_poles_are_clicked(measured):
     page.close()
 
 
+def test_a_fit_of_earlier_marks_is_not_shown(measured):
+    """Marks are faster than fits: what is shown is the fit of all marks, or of none."""
+    opened = Opened(Explorer(None, measured))
+    index = opened.page.index
+    index.material.value = "Ni"
+    shown = []
+    index.choice.on_change("options", lambda attr, old, new: shown.append(new))
+    for x, y in ((0.0, 0.0), (30.0, 0.0), (0.0, 30.0)):
+        index.add(x, y, of_line=False)
+    index._clear()  # before anything that was fitted can be put
+    opened.settle(lambda: not index.latest._busy)
+    assert index.candidates == [] and not any(shown) and len(index.lines.data["x"]) == 0
+    for x, y in ((0.0, 0.0), (30.0, 0.0), (0.0, 30.0)):
+        index.add(x, y, of_line=False)
+    opened.settle(lambda: index.candidates)
+    opened.settle(lambda: not index.latest._busy)
+    assert len(shown) == 1 and "two poles" not in index.text.text
+    opened.page.close()
+
+
 def test_the_orientation_is_searched():
     """The search is that of the library, in another process; its settings can be copied."""
     pattern = ae.indexing.master_patterns("fcc")[0]
