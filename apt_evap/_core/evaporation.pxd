@@ -44,11 +44,12 @@ cdef class Evaporation:
     cdef void make_room(self, long room)
     cdef rank(self, double factor, log_rate_at, int n_threads)
     cdef Chooser ranked(self, double voltage_factor, int n_threads)
-    cdef void strongest_neighbours(self, long atom, long leaving, long long* neighbour, double* charge) noexcept nogil
+    cdef void strongest_neighbours(self, long atom, long leaving, double stretch, long long* neighbour,
+                                   double* charge) noexcept nogil
     cdef void join(self, int slot, double dx, double dy, double dz) noexcept nogil
     cdef void near_first(self, Hole* hole) noexcept nogil
     cdef int surroundings(self, long atom) noexcept nogil
-    cdef double hopping(self, double key, long atom) noexcept nogil
+    cdef double hopping(self, double key, double strength, long atom) noexcept nogil
     cdef int judge(self, const int* slots, long n) except -1 nogil
     cdef int event(self, long atom, Journal journal) except -1 nogil
     cdef int expose(self, const int* fresh, int n_fresh, int gone, Journal journal) except -1 nogil

@@ -273,7 +273,7 @@ cdef class Evaporation:
         self.law.keys(n, &strength[0], &atom[0], &bonds[0], &key[0])
         if self.law.hop_bonds >= 0:
             for slot in prange(n, nogil=True, schedule="static", num_threads=n_threads):
-                key[slot] = self.hopping(key[slot], atom[slot])
+                key[slot] = self.hopping(key[slot], strength[slot], atom[slot])
         for slot in range(n):
             if self.tree.atom[slot] < 0:
                 key[slot] = -INFINITY
@@ -296,10 +296,11 @@ cdef class Evaporation:
 
     # ---- one event -------------------------------------------------------------------------------------------------
 
-    cdef void strongest_neighbours(self, long atom, long leaving, long long* neighbour, double* charge) noexcept nogil:
+    cdef void strongest_neighbours(self, long atom, long leaving, double stretch, long long* neighbour,
+                                   double* charge) noexcept nogil:
         # The TARGETS surface neighbours of an atom with the highest charges, in falling order; -1 if there are fewer or
-        # the atom is -1. Nearest neighbours, and with a `target_stretch` also those of the second shell. Those of another atom than the
-        # leaving one are neither it nor its neighbours.
+        # the atom is -1. Nearest neighbours, and with a stretch above 1 also those of the second shell. Those of another
+        # atom than the leaving one are neither it nor its neighbours.
         cdef int[MAX_NEAR] others
         cdef int n, i, k, m
         cdef long other
@@ -312,9 +313,9 @@ cdef class Evaporation:
         n = self.atoms.near(atom, others)
         for i in range(n):
             other = others[i]
-            if self.slot_of[other] < 0 or not self.atoms.bonded(atom, other, self.target_stretch):
+            if self.slot_of[other] < 0 or not self.atoms.bonded(atom, other, stretch):
                 continue
-            if atom != leaving and self.atoms.bonded(leaving, other, self.target_stretch):   # also the leaving one
+            if atom != leaving and self.atoms.bonded(leaving, other, stretch):   # also the leaving one
                 continue
             q = self.tree.q[self.slot_of[other]]
             for k in range(TARGETS):
@@ -356,15 +357,15 @@ cdef class Evaporation:
         # What the law learns of the bonds of an atom: their number, or their code.
         return self.atoms.bond_code[atom] if self.atoms.has_codes else self.atoms.bonds[atom]
 
-    cdef double hopping(self, double key, long atom) noexcept nogil:
-        # Key of an atom that may hop onto its strongest neighbour, from its key without hops.
+    cdef double hopping(self, double key, double strength, long atom) noexcept nogil:
+        # Key of an atom that may hop onto its strongest nearest neighbour, from its key without hops.
         cdef long long[TARGETS] neighbour
         cdef double[TARGETS] charge
         cdef int slot = self.slot_of[atom]
         if slot < 0 or self.atoms.bonds[atom] > self.law.hop_bonds or not self.tree.q[slot] > 0.0:
             return key
-        self.strongest_neighbours(atom, atom, neighbour, charge)
-        return self.law.hopping(key, charge[0] / self.tree.q[slot])
+        self.strongest_neighbours(atom, atom, 1.0, neighbour, charge)   # for which phi was solved, whatever rolls
+        return self.law.hopping(key, strength, charge[0] / self.tree.q[slot])
 
     cdef int judge(self, const int* slots, long n) except -1 nogil:
         # New keys of slots whose fields or bonds have changed.
@@ -378,7 +379,7 @@ cdef class Evaporation:
         self.law.keys(n, &self.strength[0], &self.key_atom[0], &self.key_bonds[0], &self.key[0])
         if self.law.hop_bonds >= 0:
             for i in range(n):
-                self.key[i] = self.hopping(self.key[i], self.key_atom[i])
+                self.key[i] = self.hopping(self.key[i], self.strength[i], self.key_atom[i])
         for i in range(n):
             self.chooser.key[slots[i]] = self.key[i]
         self.chooser.update(slots, n)
@@ -538,8 +539,8 @@ cdef class Evaporation:
                 event.fields = self.field_unit * self.rule.strength(self.tree, best)
                 for axis in range(3):
                     event.normals[axis] = self.normals[best, axis]
-                self.strongest_neighbours(leaving, leaving, event.targets[0], event.target_charges[0])
-                self.strongest_neighbours(event.targets[0][0], leaving, event.targets[1], event.target_charges[1])
+                self.strongest_neighbours(leaving, leaving, self.target_stretch, event.targets[0], event.target_charges[0])
+                self.strongest_neighbours(event.targets[0][0], leaving, self.target_stretch, event.targets[1], event.target_charges[1])
                 self.event(leaving, journal)
         return status
 

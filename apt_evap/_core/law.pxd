@@ -11,7 +11,7 @@ cdef class LawKernel:
     cdef double key(self, double strength, long long atom, int bonds) noexcept nogil
     cdef int keys(self, long n, const double* strength, const long long* atom, const int* bonds,
                   double* key) except -1 nogil
-    cdef double hopping(self, double key, double ratio) noexcept nogil
+    cdef double hopping(self, double key, double strength, double ratio) noexcept nogil
     cdef Chooser chooser(self, Octree tree, double[::1] key)
 
 
@@ -20,7 +20,7 @@ cdef class WeightedField(LawKernel):
     cdef const double[:, ::1] table     # (n_species, n_codes) weight by bonds; empty: does not depend on them
     cdef const int[::1] species         # (n_atoms,) rows of the table
     cdef bint by_bonds
-    cdef double at_rest, by_charge, gain_needed   # of a hop
+    cdef double at_rest, by_charge, gain_needed, hop_weight   # of a hop
 
     cdef double ratio(self, double strength, long long atom, int bonds) noexcept nogil
 

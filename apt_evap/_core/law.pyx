@@ -38,9 +38,9 @@ cdef class LawKernel:
             key[i] = self.key(strength[i], atom[i], bonds[i])
         return 0
 
-    cdef double hopping(self, double key, double ratio) noexcept nogil:
-        # Key of an atom with at most `hop_bonds` nearest neighbours, from its key without hops and the charge of its
-        # strongest neighbour over its own; 0 without one.
+    cdef double hopping(self, double key, double strength, double ratio) noexcept nogil:
+        # Key of an atom with at most `hop_bonds` nearest neighbours, from its key without hops, the field just outside
+        # and the charge of its strongest neighbour over its own; 0 without one.
         return key
 
     cdef Chooser chooser(self, Octree tree, double[::1] key):
@@ -54,9 +54,9 @@ cdef class LawKernel:
             self.keys(strength.shape[0], &strength[0], &atom[0], &bonds[0], &key[0])
         return np.asarray(key)
 
-    def evaluate_hopping(self, const double[::1] key, const double[::1] ratio):
+    def evaluate_hopping(self, const double[::1] key, const double[::1] strength, const double[::1] ratio):
         """Keys of atoms that may hop as in the sequence of events, shape (n,)."""
-        return np.array([self.hopping(key[i], ratio[i]) for i in range(key.shape[0])])
+        return np.array([self.hopping(key[i], strength[i], ratio[i]) for i in range(key.shape[0])])
 
 
 cdef class WeightedField(LawKernel):
@@ -73,13 +73,15 @@ cdef class WeightedField(LawKernel):
     species : ndarray of int32, shape (n_atoms,), optional
         Species of each atom, needed with a table.
     hop : tuple of float, optional
-        (n, a, b, g): an atom with up to n nearest neighbours hops before it evaporates if (a + b x)^2 - 1 > g, with the
-        charge x of its strongest neighbour over its own. Its key increases by the square root of the ratio of these.
+        (n, a, b, g, F_hop): an atom with up to n nearest neighbours hops at the field F_hop sqrt(g / (phi^2 - 1)) with
+        phi = a + b x and the charge x of its strongest neighbour over its own. Its key is the larger ratio of the field
+        to that of evaporation or of the hop.
     """
 
     def __init__(self, const double[::1] weight, surroundings=None, table=None, species=None, hop=None):
         if hop is not None:
-            self.hop_bonds, self.at_rest, self.by_charge, self.gain_needed = hop
+            self.hop_bonds, self.at_rest, self.by_charge, self.gain_needed, field = hop
+            self.hop_weight = 1.0 / field
         self.weight, self.surroundings, self.by_bonds = weight, surroundings, table is not None
         self.table = np.empty((0, 1)) if table is None else np.ascontiguousarray(table, np.float64)
         self.species = np.empty(0, np.int32) if species is None else np.ascontiguousarray(species, np.int32)
@@ -93,12 +95,12 @@ cdef class WeightedField(LawKernel):
     cdef double key(self, double strength, long long atom, int bonds) noexcept nogil:
         return self.ratio(strength, atom, bonds)
 
-    cdef double hopping(self, double key, double ratio) noexcept nogil:
+    cdef double hopping(self, double key, double strength, double ratio) noexcept nogil:
         # the gain increases with the square of the field: the field needed is lower by the root
         cdef double charge = self.at_rest + self.by_charge * ratio, gain = charge * charge - 1.0
-        if ratio <= 0.0 or gain <= self.gain_needed:
+        if key <= 0.0 or ratio <= 0.0 or gain <= 0.0:
             return key
-        return key * sqrt(gain / self.gain_needed)
+        return max(key, strength * self.hop_weight * sqrt(gain / self.gain_needed))
 
 
 cdef class ThermalRate(WeightedField):

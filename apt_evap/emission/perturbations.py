@@ -68,7 +68,7 @@ _PART_ALONG = 0.25
 """Mean energy along a roll-up, before truncation, over the polarisation energy of the atom at its site.
 
 Selected, as the sharpness and the height, with maps of tungsten and nickel: parts of 0.22 to 0.30 with a sharpness of
-1 to 1.5 give amplitudes of all lines within 0.65 and 1.33 of the measured ones, this one 0.8 to 1.25
+1 to 1.5 give amplitudes of all lines within 0.72 and 1.33 of the measured ones, this one 0.8 to 1.25
 (articles/three_metals).
 """
 _SHARPNESS = 1.0

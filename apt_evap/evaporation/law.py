@@ -1,5 +1,6 @@
 """Evaporation laws: the choice of the next atom to evaporate."""
 
+import math
 from collections.abc import Mapping
 from typing import Any, Protocol, TypeGuard
 
@@ -12,6 +13,8 @@ from apt_evap.emission.roll_probability import AT_REST, BY_CHARGE, Migration
 from apt_evap.evaporation.bonds import COORDINATION, BondField, bond_table, bonds_field
 from apt_evap.evaporation.voltage import ThermalLaw, VoltageControl
 from apt_evap.specimen.tip import Tip
+
+_SAME_FIELD = 0.01  # relative; the barrier of another metal differs by more
 
 
 class Law(Protocol):
@@ -52,10 +55,10 @@ class Extremal:
 
     Notes
     -----
-    With `hop`, an atom leaves as soon as it can hop onto its strongest neighbour, from where it evaporates at once. A
-    kink atom (up to half of the bonds of the bulk) then needs only the field F_evap sqrt(g / (phi^2 - 1)), if phi^2 - 1
-    is above g: phi and g are those of `Migration`. Where strong neighbours are near, atoms leave at lower fields. With
-    `bonds`, F_evap is the field of the atom with its bonds.
+    With `hop`, an atom leaves as soon as it can hop onto its strongest neighbour, from where it evaporates at once. The
+    hop of a kink atom (up to half of the bonds of the bulk) needs the field F sqrt(g / (phi^2 - 1)): F, phi and g are
+    those of `Migration`. The atom leaves at this field or at F_evap, whichever is lower. Where strong neighbours are
+    near, atoms leave at lower fields. `bonds` change F_evap only.
 
     Examples
     --------
@@ -77,13 +80,30 @@ class Extremal:
             raise ValueError(f"hop must have a barrier above that of evaporation, got {self.hop!r}")
 
     def kernel(self, tip: Tip) -> LawKernel:
-        """Return the compiled law for a specimen: F / F_evap, 0 for atoms that cannot evaporate."""
+        """Return the compiled law for a specimen: F / F_evap, 0 for atoms that cannot evaporate.
+
+        Raises
+        ------
+        ValueError
+            If `hop` is not the barrier of the metal of the specimen, or the specimen is not of one metal.
+        """
         weight = np.where(tip.evaporable, 1.0 / tip.evaporation_fields[tip.species], 0.0)
         table = (None, None, None) if self.bonds is None else bond_table(self.bonds, tip)
-        hop = None
-        if self.hop is not None:
-            hop = COORDINATION[tip.elements[0].structure][0] // 2, AT_REST, BY_CHARGE, self.hop.gain_needed
-        return WeightedField(weight, *table, hop)
+        return WeightedField(weight, *table, None if self.hop is None else self._hop_of(self.hop, tip))
+
+    def _hop_of(self, hop, tip):
+        """Most bonds of an atom that can hop, and the constants of its field."""
+        metals = [tip.elements[species] for species in np.unique(tip.species[tip.evaporable])]
+        if len(metals) != 1:
+            names = ", ".join(metal.name for metal in metals)
+            raise ValueError(f"hop is the barrier of one metal, but atoms of {names} can evaporate")
+        (metal,) = metals
+        if not math.isclose(hop.field, metal.evaporation_field, rel_tol=_SAME_FIELD):
+            raise ValueError(
+                f"hop must have the evaporation field of {metal.name}, {metal.evaporation_field:g} V/nm, got "
+                f"{hop.field:g} V/nm; ae.emission.Migration.of(material) has it"
+            )
+        return COORDINATION[metal.structure][0] // 2, AT_REST, BY_CHARGE, hop.gain_needed, hop.field
 
     def keys(self, tip: Tip, atoms: Integers, fields: Floats, bonds: Integers) -> Floats:
         """Return the ratio of field to evaporation field of the species of each atom, without hops: see `Law.keys`."""

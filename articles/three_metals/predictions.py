@@ -1,6 +1,7 @@
 """Maps of other metals by the rule of `README.md`, before anyone compares: one run for each.
 
     python predictions.py simulate RUNS "Ni 001"     # or all of them, one after the other
+    python predictions.py simulate RUNS "Ni 001" --specimen 2 --ions 330_000       # until 300,000 ions arrive
     python predictions.py judge RUNS
     python predictions.py draw RUNS                  # predictions.png
 
@@ -10,6 +11,7 @@ those within the field of view fly.
 """
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,6 +24,7 @@ import apt_evap as ae
 from apt_evap.crystallography import poles
 
 FIELD_OF_VIEW = 28.0  # degrees, half angle
+SKIP = 120_000  # atoms that evaporate before the first ion flies, about a third of a layer
 
 
 class Case(NamedTuple):
@@ -57,14 +60,19 @@ def laws(case):
     return [ae.emission.Migration.of(material_of(case), temperature) for temperature in case.temperatures]
 
 
-def simulated(case, ions, threads):
-    """Run of one case: unperturbed, and the rule at each temperature."""
+def simulated(case, ions, specimen, threads):
+    """Run of one case: unperturbed, and the rule at each temperature; another specimen has other atoms at the apex."""
     material = material_of(case)
     size = case.radius * material.a
-    tip = ae.Tip(material, size, axis=case.axis, shank_length=size, depth=8 * material.a, offset_seed=1)
-    simulation, scale = prepared(tip, ae.ConstantPotential(), FIELD_OF_VIEW, ions // 3, threads=threads)
+    tip = ae.Tip(material, size, axis=case.axis, shank_length=size, depth=8 * material.a, offset_seed=specimen)
+    simulation, scale = prepared(tip, ae.ConstantPotential(), FIELD_OF_VIEW, SKIP, specimen, threads)
     rolls = [ae.RollUp.of_metal(material, each, scale) for each in case.temperatures]
     return simulation.run(ions, [ae.Unperturbed(), *rolls], responses=False, progress=False)
+
+
+def files_of(runs, name):
+    """Files of the specimens of a case."""
+    return sorted(runs.glob(f"{name.replace(' ', '_')}_?.h5"))
 
 
 def lines_about(pole, normals, labels):
@@ -108,51 +116,86 @@ def statement(line, flank):
     return "nothing"
 
 
-def judged(name, path):
-    """Print what the map of a run shows."""
-    case, run = CASES[name], ae.load(path)
-    orientation, projection = ae.Orientation.from_settings(run.settings["tip"]), projection_of(run)
-    found = poles(orientation.material, 10)
+class Shown(NamedTuple):
+    """What the specimens of a case show."""
+
+    orientation: ae.Orientation
+    projections: list[ae.detection.Projection]
+    """That of all specimens together, then that of each."""
+    maps: list[list[ae.DetectorMap]]
+    """The same for each emission."""
+    parts: list[float]
+    """Part of the atoms that roll, at each temperature."""
+
+
+def shown_by(case, paths):
+    """Maps of all specimens together and of each, with their ions added up."""
+    runs = [ae.load(path) for path in paths]
+    projections = [projection_of(run) for run in runs]
+    mean = {name: np.mean([getattr(each, name) for each in projections]) for name in ("scale", "compression")}
+    maps = []
+    for number in range(1 + len(case.temperatures)):
+        own = [map_of(run, run.perturbations[number]) for run in runs]
+        counts = sum(each.counts for each in own)
+        both = ae.DetectorMap.from_array(counts, own[0].x_edges, own[0].y_edges, is_counts=True, mask=own[0].mask)
+        maps.append([both, *own])
+    flown = [run.emissions[~run.not_flown] for run in runs]
+    parts = [np.mean([law.probabilities(each).mean() for each in flown]) for law in laws(case)]
+    orientation = ae.Orientation.from_settings(runs[0].settings["tip"])
+    return Shown(orientation, [replace(projections[0], **mean), *projections], maps, parts)
+
+
+def judged(name, paths):
+    """Print what the maps of a case show: all specimens together, and in brackets each of them."""
+    case, shown = CASES[name], shown_by(CASES[name], paths)
+    found = poles(shown.orientation.material, 10)
     labels = np.array(["{" + "".join(str(each) for each in np.sort(np.abs(plane))) + "}" for plane in found.planes])
-    normals = orientation.directions(found.normals)
+    normals = shown.orientation.directions(found.normals)
     away = np.degrees(np.arccos(np.clip(normals[:, 2], -1, 1)))
     near = [int(each) for each in np.argsort(away)[:2] if away[each] < 8] or [int(np.argmin(away))]
-    rows = run.perturbations
     names = ["unperturbed", *(f"rule at {each:g} K, {part:.0%} roll" for each, part in zip(
-        case.temperatures, [law.probabilities(run.emissions[~run.not_flown]).mean() for law in laws(case)], strict=True
+        case.temperatures, shown.parts, strict=True
     ))]  # fmt: skip
-    for rule, text in zip(rows, names, strict=True):
-        shown = map_of(run, rule)
+    for text, maps in zip(names, shown.maps, strict=True):
+        print(f"{name}, {text}: {maps[0].shown_ions or maps[0].counts.sum()}")
         for index in near:
             pole, outer = normals[index], FIELD_OF_VIEW - 2 - away[index]
-            profile = ae.maps.pole_profile(shown, projection, pole, np.arange(0, min(outer, 14), 1.0))
-            radial = " ".join(f"{each:.2f}" for each in profile.density[:8])
-            print(f"{name}, {text}: {labels[index]}, density by degree {radial}")
-            if rule is rows[0] and len(rows) > 1:
+            radial = [
+                ae.maps.pole_profile(map, projection, pole, np.arange(0, min(outer, 14), 1.0)).density
+                for map, projection in zip(maps, shown.projections, strict=True)
+            ]
+            print(f"  {labels[index]}, density by degree", " ".join(f"{each:.2f}" for each in radial[0][:8]),
+                  *(f"({' '.join(f'{each:.2f}' for each in own[:4])})" for own in radial[1:]))  # fmt: skip
+            if text == names[0]:
                 continue
             for towards, directions in lines_about(pole, normals, labels):
-                line, flank = across(shown, projection, pole, directions, min(outer, 16))
+                line, flank = across(maps[0], shown.projections[0], pole, directions, min(outer, 16))
+                own = [
+                    across(map, projection, pole, directions, min(outer, 16))
+                    for map, projection in zip(maps[1:], shown.projections[1:], strict=True)
+                ]
+                each = [f"({a:.2f}, {b:.2f})" for (a, _), (b, _) in own]
+                words = [statement(*of_one) for of_one in own]
                 print(f"    {towards:16} on the line {line[0]:.2f} +- {line[1]:.2f}, beside it {flank[0]:.2f} +- "
-                      f"{flank[1]:.2f}: {statement(line, flank)}")  # fmt: skip
+                      f"{flank[1]:.2f}", *each, f"{statement(line, flank)}"
+                      f"{'' if len(set(words)) == 1 else ' (' + ', '.join(words) + ')'}")  # fmt: skip
 
 
 def draw(runs, path):
     """Maps of all cases that have a run, with their poles."""
-    shown = [(name, runs / f"{name.replace(' ', '_')}.h5") for name in CASES]
-    shown = [(name, file) for name, file in shown if file.exists()]
-    figure, axes = plt.subplots(-(-len(shown) // 3), 3, squeeze=False, layout="constrained", figsize=(11, 11.6))
-    for ax, (name, file) in zip(axes.flat, shown, strict=False):
-        run = ae.load(file)
-        map = map_of(run, run.perturbations[1])
-        part = laws(CASES[name])[0].probabilities(run.emissions[~run.not_flown]).mean()
+    files = {name: files_of(runs, name) for name in CASES}
+    files = {name: paths for name, paths in files.items() if paths}
+    figure, axes = plt.subplots(-(-len(files) // 3), 3, squeeze=False, layout="constrained", figsize=(11, 11.6))
+    for ax, (name, paths) in zip(axes.flat, files.items(), strict=False):
+        shown = shown_by(CASES[name], paths)
+        map, projection = shown.maps[1][0], shown.projections[0]
         metal, axis = name.split()
-        title = f"{metal} [{axis}], {part:.0%} roll"
+        title = f"{metal} [{axis}], {shown.parts[0]:.0%} roll"
         ae.plot.detector_map(map.flattened(15.0).smoothed(0.9), ax, title=title, colorbar=False, caption=False)
-        half = run.detector.distance * np.tan(np.radians(FIELD_OF_VIEW - 1))
+        half = projection.scale * projection.compression * np.tan(np.radians(FIELD_OF_VIEW - 1))
         ax.set(xlim=(-half, half), ylim=(-half, half))
-        orientation = ae.Orientation.from_settings(run.settings["tip"])
-        ae.plot.poles(ax, orientation, projection_of(run), families=6, zone_families=(), size=7)
-    for ax in axes.flat[len(shown) :]:
+        ae.plot.poles(ax, shown.orientation, projection, families=6, zone_families=(), size=7)
+    for ax in axes.flat[len(files) :]:
         ax.remove()
     figure.savefig(path, dpi=75)
 
@@ -163,7 +206,8 @@ def main():
     parser.add_argument("what", choices=("simulate", "judge", "draw"))
     parser.add_argument("runs", type=Path)
     parser.add_argument("cases", nargs="*", default=list(CASES))
-    parser.add_argument("--ions", type=int, default=600_000, help="atoms that evaporate")
+    parser.add_argument("--ions", type=int, default=360_000, help="atoms that evaporate and fly if they can arrive")
+    parser.add_argument("--specimen", type=int, default=1, help="1, 2, ...: other atoms at the apex")
     parser.add_argument("--threads", type=int)
     options = parser.parse_args()
     options.runs.mkdir(parents=True, exist_ok=True)
@@ -171,11 +215,12 @@ def main():
         draw(options.runs, "predictions.png")
         return
     for name in options.cases:
-        path = options.runs / f"{name.replace(' ', '_')}.h5"
-        if options.what == "simulate" and not path.exists():
-            simulated(CASES[name], options.ions, options.threads).save(path)
-        if options.what == "judge" and path.exists():
-            judged(name, path)
+        path = options.runs / f"{name.replace(' ', '_')}_{options.specimen}.h5"
+        if options.what == "simulate":
+            if not path.exists():
+                simulated(CASES[name], options.ions, options.specimen, options.threads).save(path)
+        elif paths := files_of(options.runs, name):
+            judged(name, paths)
 
 
 if __name__ == "__main__":

@@ -89,7 +89,8 @@ def test_the_rule_of_a_metal():
     assert tungsten.energy.mean == pytest.approx(0.25 * 0.5 * 1e-40 * (57e9) ** 2 / ELEMENTARY_CHARGE)
     assert tungsten.energy.mean / nickel.energy.mean == pytest.approx((57 / 35) ** 2)
     assert tungsten.others == nickel.others == aluminium.others  # those that do not roll
-    assert nickel.probability == Migration.of("Ni") and nickel.height > 0.0 == nickel.others_height
+    assert nickel.probability == Migration.of("Ni") and (nickel.height, nickel.others_height) == (0.2, 0.0)  # nm
+    assert nickel.sharpness == 1.0 and nickel.others.mean == 0.4  # eV
     cold, scaled = ae.RollUp.of_metal("Ni", 20.0), ae.RollUp.of_metal("Ni", energy_scale=0.1)
     assert cold == replace(nickel, probability=Migration.of("Ni", 20.0))
     assert scaled.energy.mean == pytest.approx(0.1 * nickel.energy.mean)

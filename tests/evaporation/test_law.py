@@ -1,6 +1,6 @@
 """Laws: the built-in one, and one of a user's own in Python, behind one contract."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -80,25 +80,33 @@ def test_the_field_at_which_an_atom_hops(tip12):
     law = Migration.of("Ni")
     kernel = ae.Extremal(hop=law).kernel(tip12)
     double = ((2 * law.gain_needed + 1) ** 0.5 - 1.27) / 1.54  # charge ratio at which phi^2 - 1 is twice as large
-    ratios = np.array([0.0, 0.9 * law.threshold, law.threshold, double])
-    keys = kernel.evaluate_hopping(np.full(4, 0.7), ratios)
-    assert keys == pytest.approx(0.7 * np.array([1.0, 1.0, 1.0, 2.0**0.5]), rel=1e-12)
+    ratios = np.array([0.0, 0.0, law.threshold, double])
+    ratios[1] = ((0.81 * law.gain_needed + 1) ** 0.5 - 1.27) / 1.54  # 0.81 times as large
+    hop = 0.7 * np.array([0.0, 0.9, 1.0, 2.0**0.5])
+    # ratios of the field to that of evaporation: of a kink, of an atom that is bound more, of one that cannot evaporate
+    for key, expected in ((0.7, np.maximum(hop, 0.7)), (0.6, np.maximum(hop, 0.6)), (0.0, 0 * hop)):
+        keys = kernel.evaluate_hopping(np.full(4, key), np.full(4, 0.7 * 35.0), ratios)
+        assert keys == pytest.approx(expected, rel=1e-12)
     # hotter or less bound atoms hop at lower fields, and those of aluminium do not hop at all
     assert Migration.of("Ni", 150.0).gain_needed < law.gain_needed < Migration.of("Al").gain_needed
     assert kernel.hop_bonds == 6 and ae.Extremal().kernel(tip12).hop_bonds == -1
 
 
-def hopping_keys(emitter, law):
-    """Keys of all surface atoms of pure nickel by the law with a hop, written in NumPy."""
+def hopping_keys(emitter, law, every=False):
+    """Keys of all surface atoms of pure nickel by the law with a hop, written in NumPy.
+
+    With `every`, no atom leaves without a hop that it can do at some field.
+    """
     tip, charges = emitter.tip, emitter.charges
     pairs = cKDTree(emitter.positions).query_pairs(1.2 * tip.nearest_neighbour_distance, output_type="ndarray")
     strongest = np.zeros(len(emitter))
     np.maximum.at(strongest, pairs[:, 0], charges[pairs[:, 1]])
     np.maximum.at(strongest, pairs[:, 1], charges[pairs[:, 0]])
     gain = (1.27 + 1.54 * strongest / np.maximum(charges, 1e-9)) ** 2 - 1
-    hops = (emitter.bonds <= 6) & (strongest > 0) & (charges > 0) & (gain > law.gain_needed)
+    hops = (emitter.bonds <= 6) & (strongest > 0) & (charges > 0)
     keys = ae.Extremal().keys(tip, emitter.atoms, emitter.fields, emitter.bonds)
-    return np.where(hops, keys * np.sqrt(gain / law.gain_needed), keys)
+    factor = np.where(hops, np.sqrt(gain / law.gain_needed), 0.0)
+    return keys * (factor if every else np.maximum(factor, 1.0))
 
 
 @pytest.mark.parametrize("rule", [ae.Robin(), ae.ConstantPotential()])
@@ -139,12 +147,56 @@ def test_a_run_with_hops_is_resumed_bit_by_bit(small_tip, tmp_path):
     assert run(80, tmp_path / "run.h5").fingerprint() == run(80).fingerprint()
 
 
-def test_atoms_that_cannot_hop_leave_as_without_the_law(tip12):
+def test_atoms_that_cannot_hop_leave_as_without_the_law():
     """Aluminium's barrier is above all gains."""
-    without, with_hop = (
-        ae.evaporation.Emitter(tip12, law=ae.Extremal(hop=each)) for each in (None, Migration.of("Al"))
-    )
+    tip = ae.Tip("Al", apex_radius=3.0, axis=(1, 1, 1), offset_seed=1)
+    without, with_hop = (ae.evaporation.Emitter(tip, law=ae.Extremal(hop=each)) for each in (None, Migration.of("Al")))
     assert np.array_equal(sequence(without), sequence(with_hop))
+
+
+@pytest.mark.parametrize(("metal", "bonds"), [("W", 4), ("Ni", 6), ("Ti", 6), ("Si", 2)])
+def test_kink_atoms_hop(metal, bonds):
+    """Half of the bonds of the bulk are those of a kink."""
+    material = replace(ae.material(metal), cohesive_energy=4.0)
+    tip = ae.Tip(material, apex_radius=1.5)
+    assert ae.Extremal(hop=Migration.of(material)).kernel(tip).hop_bonds == bonds
+
+
+def test_a_hop_does_not_depend_on_where_ions_can_roll(tip12):
+    """phi was solved for nearest neighbours; the second shell is for the responses of ions only."""
+    first, second = (
+        ae.evaporation.Emitter(tip12, law=ae.Extremal(hop=Migration.of("Ni")), target_shells=shells)
+        for shells in (1, 2)
+    )
+    assert np.array_equal(sequence(first), sequence(second))
+
+
+def test_bonds_change_the_field_of_evaporation_and_not_that_of_the_hop(tip12):
+    """With fields that bonds raise out of reach, all atoms leave by a hop; with low ones none does."""
+    law = Migration.of("Ni")
+
+    def keys_of(field, hop):
+        bonds = ae.evaporation.CoordinationTable({"Ni": dict.fromkeys(range(13), field)})
+        return ae.evaporation.Emitter(tip12, law=ae.Extremal(bonds=bonds, hop=hop))
+
+    assert np.array_equal(sequence(keys_of(1.0, law)), sequence(keys_of(1.0, None)))
+    high = keys_of(1e3, law)
+    atoms, plain = high.atoms, ae.Extremal().keys(tip12, high.atoms, high.fields, high.bonds)
+    hopping = hopping_keys(high, law, every=True)
+    assert not np.array_equal(hopping, plain) and high.evaporate(1).site[0] == atoms[np.argmax(hopping)]
+
+
+@pytest.mark.parametrize(
+    ("material", "options", "message"),
+    [
+        ("Ni", {"solutes": {"Al": 0.3}, "seed": 1}, "one metal, but atoms of Ni, Al can evaporate"),
+        ("Al", {}, "evaporation field of Al, 19 V/nm, got 35 V/nm"),
+    ],
+)
+def test_a_hop_of_another_metal_is_refused(material, options, message):
+    tip = ae.Tip(material, apex_radius=1.5, **options)
+    with pytest.raises(ValueError, match=message):
+        ae.evaporation.Emitter(tip, law=ae.Extremal(hop=Migration.of("Ni")))
 
 
 class Bad:
