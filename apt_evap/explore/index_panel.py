@@ -87,7 +87,7 @@ class IndexPanel:
         self.latest = Latest(lambda wish: wish())
         self.candidates: list[tuple[Orientation, Projection, str]] = []
         self._found: Indexing | None = None  # of the search that gave the candidates
-        self._asked: Any = None  # the fit whose candidates are to be shown, unless others come first
+        self._asked: Any = None  # the fit or search whose candidates are to be shown, unless others come first
         self._make_widgets(material)
         self._make_drawings(fig)
         self._material_changed()
@@ -241,11 +241,14 @@ class IndexPanel:
             each.disabled = True
         button.label = "searching" if start is None else "fitting"
 
+        self._asked = wish = arguments, options
+
         def put(found, text):
             for each in (self.search, self.refine):
                 each.disabled = False
             button.label = label
-            self._put_searched(found, text)
+            if self._asked is wish:  # no mark, fit or handle has changed
+                self._put_searched(found, text)
 
         def work():
             try:

@@ -440,6 +440,11 @@ def test_a_fit_of_earlier_marks_is_not_shown(measured):
     opened.settle(lambda: index.candidates)
     opened.settle(lambda: not index.latest._busy)
     assert len(shown) == 1 and "two poles" not in index.text.text
+    # nor is a search, which takes seconds
+    index._search(index.search)
+    index._clear()
+    opened.settle(lambda: not index.search.disabled)
+    assert index.candidates == [] and index.search.label == "search"
     opened.page.close()
 
 
