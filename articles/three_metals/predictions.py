@@ -1,7 +1,7 @@
 """Maps of other metals by the rule of `README.md`, before anyone compares: one run for each.
 
     python predictions.py simulate RUNS "Ni 001"     # or all of them, one after the other
-    python predictions.py simulate RUNS "Ni 001" --specimen 2 --ions 330_000       # until 300,000 ions arrive
+    python predictions.py simulate RUNS "Ni 001" --specimen 2 --ions 330_000       # other atoms at the apex
     python predictions.py judge RUNS
     python predictions.py draw RUNS                  # predictions.png
 
@@ -72,7 +72,7 @@ def simulated(case, ions, specimen, threads):
 
 def files_of(runs, name):
     """Files of the specimens of a case."""
-    return sorted(runs.glob(f"{name.replace(' ', '_')}_?.h5"))
+    return sorted(runs.glob(f"{name.replace(' ', '_')}_[0-9]*.h5"))
 
 
 def lines_about(pole, normals, labels):
@@ -125,7 +125,7 @@ class Shown(NamedTuple):
     maps: list[list[ae.DetectorMap]]
     """The same for each emission."""
     parts: list[float]
-    """Part of the atoms that roll, at each temperature."""
+    """Part of all atoms that roll, also of those outside the map, at each temperature."""
 
 
 def shown_by(case, paths):
@@ -139,8 +139,7 @@ def shown_by(case, paths):
         counts = sum(each.counts for each in own)
         both = ae.DetectorMap.from_array(counts, own[0].x_edges, own[0].y_edges, is_counts=True, mask=own[0].mask)
         maps.append([both, *own])
-    flown = [run.emissions[~run.not_flown] for run in runs]
-    parts = [np.mean([law.probabilities(each).mean() for each in flown]) for law in laws(case)]
+    parts = [np.concatenate([law.probabilities(run.emissions) for run in runs]).mean() for law in laws(case)]
     orientation = ae.Orientation.from_settings(runs[0].settings["tip"])
     return Shown(orientation, [replace(projections[0], **mean), *projections], maps, parts)
 
@@ -157,7 +156,7 @@ def judged(name, paths):
         case.temperatures, shown.parts, strict=True
     ))]  # fmt: skip
     for text, maps in zip(names, shown.maps, strict=True):
-        print(f"{name}, {text}: {maps[0].shown_ions or maps[0].counts.sum()}")
+        print(f"{name}, {text}: {maps[0].shown_ions}")
         for index in near:
             pole, outer = normals[index], FIELD_OF_VIEW - 2 - away[index]
             radial = [

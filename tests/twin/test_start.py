@@ -37,6 +37,7 @@ def test_the_settings_are_those_of_the_map(found, tmp_path):
     assert config.detector.width > 70.0
     panel = config.maps.panels[1].perturbation
     assert isinstance(panel, ae.RollUp) and panel.probability == pytest.approx(0.5, abs=0.15)
+    assert config.maps.panels[2].perturbation == ae.RollUp.of_metal("Ni")
     assert all("#" in line for line in start.text.splitlines() if line.startswith(("axis", "rotation", "apex", "ions")))
     assert np.isnan(start.radii).all() and "no voltages" in start.text
 
