@@ -411,6 +411,12 @@ def _add_compare(commands: Any) -> None:
     command.add_argument("--replicas", type=_integer(1), metavar="N", help="draws per ion; default: 4 to 16")
     command.add_argument("--resamples", type=_integer(0), metavar="N", help="resamples for errors; default: 200")
     command.add_argument("--seed", type=_integer(0), metavar="N", help="seed of the resamples; default: 0")
+    command.add_argument(
+        "--same-radius",
+        action="store_const",
+        const=True,
+        help="the specimen is known to have the radius of the run, within 5%%: narrower intervals of mean energies",
+    )
     command.add_argument("--threads", type=_integer(1), metavar="N", help="default: all processors")
     command.add_argument("--quiet", action="store_true", help="no progress bar, no summary")
     command.add_argument("--force", action="store_true", help="overwrite files not made by apt-evap")

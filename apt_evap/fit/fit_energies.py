@@ -145,7 +145,7 @@ def fit_energies(
         values, structures = search.matrix("energies", measure=measure)
         cells = maxima(values)
         best = search.refine(values, cells)[0]
-        bounds = intervals_of(grid, values, best, settings.allowed_error) if settings.resamples else None
+        bounds = intervals_of(grid, values, best, *settings.allowed_errors) if settings.resamples else None
         optimum = search.optimum(cells[0], bounds)
         refined = search.optimum(best, bounds)
         scores, plain_scores, maps = {}, {}, {}

@@ -7,8 +7,9 @@ end. Two errors count.
 best one by half of the deviation of their difference times its quantile.
 
 *The model*: the simulated specimen is not the measured one. Its misfit |1 - SSIM| remains at the best point, and at the
-true point it is larger by a fraction `MODEL_ERROR` of that. This fraction is measured (`defaults.MODEL_ERROR`). The
-misfit of few ions is uncertain, and could be 0 by accident: its largest value within the errors counts.
+true point it is larger by a fraction of that, which was measured with twins (`defaults.MODEL_ERROR`): smaller for mean
+energies than for their widths, which maps hardly see. The misfit of few ions is uncertain, and could be 0 by accident:
+its largest value within the errors counts.
 """
 
 from collections.abc import Sequence
@@ -21,6 +22,7 @@ from apt_evap._common.types import Booleans, Floats
 from apt_evap.emission.energies import TruncatedNormal
 from apt_evap.fit.grid import EnergyGrid
 
+_MEANS = "mean", "true_mean"
 _NARROW = 0.1  # relative standard deviation: below, energies differ by 10 %, speeds by 5 %, and maps do not change
 _NORMAL = 1.96  # quantile of 95 %
 _STEPS = 10  # of the interpolation in a step of the grid
@@ -36,7 +38,13 @@ class Intervals(NamedTuple):
     """Whether the lower and the upper bound are ends of the grid, so that the interval may continue beyond it."""
 
 
-def intervals(grid: EnergyGrid, similarities: Floats, best: Sequence[float], model_error: float) -> Intervals:
+def intervals(
+    grid: EnergyGrid,
+    similarities: Floats,
+    best: Sequence[float],
+    error_of_means: float,
+    error_of_others: float | None = None,
+) -> Intervals:
     """Intervals of the energies and options of a study.
 
     Parameters
@@ -47,8 +55,9 @@ def intervals(grid: EnergyGrid, similarities: Floats, best: Sequence[float], mod
         Similarities of all ions and of each resample on the grid, shape (1 + resamples, *grid.shape).
     best : sequence of float
         Position of the refined optimum in steps of the grid; the intervals contain it.
-    model_error : float
-        Relative increase of the misfit for the error of the model.
+    error_of_means, error_of_others : float
+        Relative increase of the misfit for the error of the model: for "mean" and "true_mean", and for all other
+        numbers; the same by default.
 
     Returns
     -------
@@ -59,13 +68,20 @@ def intervals(grid: EnergyGrid, similarities: Floats, best: Sequence[float], mod
     top = np.unravel_index(first.argmax(), first.shape)
     deficit = first[top] - first
     misfit = abs(1.0 - float(first[top]))
-    allowed = np.full(first.shape, model_error * misfit)
+    noise = np.zeros(first.shape)
     if len(resamples) > 1:
         at_top = resamples[(slice(None), *top)].reshape(-1, *[1] * first.ndim)
-        allowed += model_error * _NORMAL * at_top.std(ddof=1)
-        difference = at_top - resamples
-        allowed += 0.5 * _NORMAL * difference.std(axis=0, ddof=1)
-    return _bounds(grid, places, deficit <= allowed, best)
+        misfit += _NORMAL * float(at_top.std(ddof=1))
+        noise = 0.5 * _NORMAL * (at_top - resamples).std(axis=0, ddof=1)
+    means = _bounds(grid, places, deficit <= error_of_means * misfit + noise, best)
+    if error_of_others is None or error_of_others == error_of_means:
+        return means
+    others = _bounds(grid, places, deficit <= error_of_others * misfit + noise, best)
+    chosen = {name: means if name in _MEANS else others for name in others.bounds}
+    return Intervals(
+        {name: each.bounds[name] for name, each in chosen.items()},
+        {name: each.open_ends[name] for name, each in chosen.items()},
+    )
 
 
 def _interpolated(grid, values):

@@ -2,7 +2,12 @@
 
 from apt_evap._common.codec import checked, choice, count, number, settings, switch
 from apt_evap._common.validation import check_seed
-from apt_evap.fit.defaults import FOLDED_MODEL_ERROR, MODEL_ERROR
+from apt_evap.fit.defaults import (
+    FOLDED_MODEL_ERROR,
+    FOLDED_MODEL_ERROR_OF_MEANS,
+    MODEL_ERROR,
+    SAME_RADIUS_MODEL_ERROR_OF_MEANS,
+)
 
 
 @settings
@@ -65,10 +70,16 @@ class FitSettings:
     )
     model_error: float | None = number(
         "Relative increase of the misfit 1 - SSIM, or 1 - concordance, that the difference of the simulated from the "
-        "measured specimen explains, for the intervals; 0 for intervals by noise alone. The default, 0.2 or 0.12, was "
-        "measured with twins.",
+        "measured specimen explains, for the intervals; 0: by noise alone. By default 0.2, for folded maps "
+        "0.12, and for their mean energy and true mean 0.08. Measured with twins.",
         default=None,
         at_least=0,
+    )
+
+    same_radius: bool = switch(
+        "Whether the simulated specimen is known to have the radius of the measured one, within 5 %. The default model "
+        "error of the mean and the true mean is then 0.04 for folded maps.",
+        default=False,
     )
 
     @property
@@ -77,8 +88,11 @@ class FitSettings:
         return "concordance" if self.objective == "folded" else "SSIM"
 
     @property
-    def allowed_error(self) -> float:
-        """The model error, or its default."""
+    def allowed_errors(self) -> tuple[float, float]:
+        """Model error of the mean and the true mean, and of all other numbers."""
         if self.model_error is not None:
-            return self.model_error
-        return FOLDED_MODEL_ERROR if self.objective == "folded" else MODEL_ERROR
+            return self.model_error, self.model_error
+        if self.objective != "folded":
+            return MODEL_ERROR, MODEL_ERROR
+        means = SAME_RADIUS_MODEL_ERROR_OF_MEANS if self.same_radius else FOLDED_MODEL_ERROR_OF_MEANS
+        return means, FOLDED_MODEL_ERROR

@@ -25,11 +25,11 @@ INSTRUMENT = ae.Registration(rotation=17.0, scale=0.4, shift=(3.0, -2.0))
 NAMES = ("mean", "relative_spread", "true_mean", "true_standard_deviation")
 
 
-def specimen(number, radius, same_radius=False):
-    """Tip of Ni[111]; number 0 is the one that is fitted, with a radius in lattice constants."""
+def specimen(number, radius, within=VARIATION):
+    """Tip of Ni[111]; number 0 is the one that is fitted, with a radius in lattice constants; others are within it."""
     random = np.random.default_rng((2026, number))
     sizes = np.ones(3) if number == 0 else random.uniform(1 - VARIATION, 1 + VARIATION, 3)
-    sizes[0] = 1.0 if same_radius else sizes[0]
+    sizes[0] = 1 + (sizes[0] - 1) * within / VARIATION
     nickel = ae.material("Ni")
     tip = ae.Tip(
         nickel,
@@ -43,13 +43,13 @@ def specimen(number, radius, same_radius=False):
     return tip
 
 
-def run_of(number, radius, ions, folder=None, same_radius=False):
+def run_of(number, radius, ions, folder=None, within=VARIATION):
     """Run of a specimen, stored in the folder."""
-    path = None if folder is None else folder / f"run{number}{'_same' * same_radius}.h5"
+    path = None if folder is None else folder / f"run{number}_{within:g}.h5"
     if path is not None and path.exists():
         return ae.load(path)
     simulation = ae.Simulation(
-        specimen(number, radius, same_radius),
+        specimen(number, radius, within),
         seed=number,
         n_threads=1,
         # to a tenth of a bin
@@ -93,15 +93,20 @@ def fitted(run, measured, objective="similarity"):
     return ae.fit_energies(run, measured, None, settings, registration=INSTRUMENT, n_threads=1, progress=False)
 
 
-def inside(study, truth, model_error):
-    """Whether the interval of each number contains its hidden value, dict of bool."""
+def bounds_of(study, model_error):
+    """Interval of each number, for a model error."""
     refined = study.refined
     best = []
     for name, axis in study.grid.axes.items():
         scale = np.log if name == "relative_spread" else np.asarray
         value = refined.options[name] if name in refined.options else getattr(refined, name)
         best.append(np.interp(scale(value), scale(axis), np.arange(len(axis))))
-    bounds = intervals(study.grid, np.concatenate([study.scores[None], study.resampled]), best, model_error).bounds
+    return intervals(study.grid, np.concatenate([study.scores[None], study.resampled]), best, model_error).bounds
+
+
+def inside(study, truth, model_error):
+    """Whether the interval of each number contains its hidden value, dict of bool."""
+    bounds = bounds_of(study, model_error)
     return {name: bounds[name][0] <= value <= bounds[name][1] for name, value in truth.items()}
 
 
@@ -112,27 +117,31 @@ def main():
     parser.add_argument("--radius", type=float, default=14.0, help="radius of the fitted specimen [a]")
     parser.add_argument("--ions", type=int, default=10_000)
     parser.add_argument("--objective", choices=("similarity", "folded"), default="similarity")
-    parser.add_argument("--same-radius", action="store_true", help="twins with the radius of the fitted specimen")
-    parser.add_argument("--model-errors", type=float, nargs="+", default=[0.0, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4])
+    parser.add_argument("--within", type=float, default=VARIATION, help="part by which the radii of twins differ")
+    parser.add_argument("--model-errors", type=float, nargs="+", default=[0.0, 0.03, 0.08, 0.1, 0.12, 0.15, 0.2, 0.3])
     options = parser.parse_args()
     options.folder.mkdir(exist_ok=True)
     run = run_of(0, options.radius, options.ions, options.folder)
-    found = []
+    found, widths = [], []
     for number in range(100, 100 + options.twins):
         energy = hidden_energy(number)
-        twin = run_of(number, options.radius, options.ions, options.folder, options.same_radius)
+        twin = run_of(number, options.radius, options.ions, options.folder, options.within)
         study = fitted(run, measured_map(twin, energy), options.objective)
         truth = truth_of(energy)
         found.append([list(inside(study, truth, error).values()) for error in options.model_errors])
+        bounds = [bounds_of(study, error) for error in options.model_errors]
+        widths.append([[(each[name][1] - each[name][0]) / truth[name] for name in NAMES] for each in bounds])
         print(number, {name: round(value, 3) for name, value in truth.items()}, flush=True)
         print(study, flush=True)
     counts = np.sum(found, axis=0)
-    print(f"\n{len(found)} twins; model error, then the intervals that contain the hidden value")
-    for error, row in zip(options.model_errors, counts, strict=True):
+    print(f"\n{len(found)} twins; model error, intervals that contain the hidden value, their median width over it")
+    for error, row, width in zip(options.model_errors, counts, np.median(widths, axis=0), strict=True):
         shares = row / len(found)
         errors = np.sqrt(np.maximum(shares * (1 - shares), 1 / len(found)) / len(found))
-        texts = (f"{name} {s:.0%} ± {e:.0%}" for name, s, e in zip(NAMES, shares, errors, strict=True))
-        print(f"{error:5.2f}  {', '.join(texts)}")
+        texts = (
+            f"{name} {s:.0%} ± {e:.0%}, {w:.2f}" for name, s, e, w in zip(NAMES, shares, errors, width, strict=True)
+        )
+        print(f"{error:5.2f}  {'; '.join(texts)}")
 
 
 if __name__ == "__main__":

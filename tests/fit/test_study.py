@@ -268,6 +268,22 @@ def test_ends_of_the_grid_are_told():
     assert bounds["probability"] == (0.5, 1.0) and ends["probability"] == (True, False)  # there is no 1.1
 
 
+def test_means_have_an_error_of_their_own():
+    """Each number has the interval of its model error."""
+    grid = EnergyGrid("roll-up")
+    values = ridge(grid)
+    best = np.unravel_index(values[0].argmax(), grid.shape)
+    small, large, both = (intervals(grid, values, best, *errors) for errors in ((0.05,), (0.2,), (0.05, 0.2)))
+    for name in both.bounds:
+        chosen, other = (small, large) if name in ("mean", "true_mean") else (large, small)
+        assert both.bounds[name] == chosen.bounds[name] and both.open_ends[name] == chosen.open_ends[name]
+        assert name == "rollup_fraction" or chosen.bounds[name] != other.bounds[name] or name == "relative_spread"
+    assert ae.fit.FitSettings(objective="folded", same_radius=True).allowed_errors == (0.04, 0.12)
+    assert ae.fit.FitSettings(objective="folded").allowed_errors == (0.08, 0.12)
+    assert ae.fit.FitSettings(objective="similarity", same_radius=True).allowed_errors == (0.2, 0.2)
+    assert ae.fit.FitSettings(objective="folded", model_error=0.3, same_radius=True).allowed_errors == (0.3, 0.3)
+
+
 def test_intervals_by_noise_are_those_of_a_quadratic_maximum():
     """S = -(m - m0)^2 with m0 of each resample: 1.96 of its standard deviations to each side."""
     grid = EnergyGrid("roll-up", means=tuple(np.linspace(0.1, 0.9, 9)), relative_spreads=(0.01,))
