@@ -13,6 +13,7 @@ FLOWN = (
     ae.RollUp(ENERGY, sharpness=0.15, height=0.1),
     ae.RollUp(0.5, probability=0.6, sharpness=0.5, others=0.3),
     ae.RollUp(0.2, ae.emission.ChargeRatio(0.9, 0.05), height=0.05),
+    ae.RollUp(0.3, 0.5, height=0.2, others=ae.TruncatedNormal(0.4, 0.4), others_height=0.0),  # as `of_metal`
     ae.Combined(1.0, 0.6, probability=0.5, sharpness=0.05, height=0.2),
     ae.LateralVelocity(0.4, height=0.15),
     ae.Unperturbed(height=0.1),
