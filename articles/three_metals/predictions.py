@@ -193,7 +193,7 @@ def draw(runs, path):
         ae.plot.detector_map(map.flattened(15.0).smoothed(0.9), ax, title=title, colorbar=False, caption=False)
         half = projection.scale * projection.compression * np.tan(np.radians(FIELD_OF_VIEW - 1))
         ax.set(xlim=(-half, half), ylim=(-half, half))
-        ae.plot.poles(ax, shown.orientation, projection, families=6, zone_families=(), size=7)
+        ae.plot.poles(ax, shown.orientation, projection, families=6, zone_families=(), region=map, size=7)
     for ax in axes.flat[len(files) :]:
         ax.remove()
     figure.savefig(path, dpi=75)
