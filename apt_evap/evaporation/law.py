@@ -95,7 +95,7 @@ class Extremal:
         """Most bonds of an atom that can hop, and the constants of its field."""
         metals = [tip.elements[species] for species in np.unique(tip.species[tip.evaporable])]
         if len(metals) != 1:
-            names = ", ".join(metal.name for metal in metals)
+            names = ", ".join(metal.name for metal in metals) or "no metal"
             raise ValueError(f"hop is the barrier of one metal, but atoms of {names} can evaporate")
         (metal,) = metals
         if not math.isclose(hop.field, metal.evaporation_field, rel_tol=_SAME_FIELD):
