@@ -21,12 +21,13 @@ import apt_evap as ae
 from apt_evap.fit.intervals import intervals
 
 VARIATION = 0.2  # of radius, shank angle and surface threshold
+ERRORS = (0.0, 0.03, 0.04, 0.08, 0.1, 0.12, 0.15, 0.2, 0.25, 0.3, 0.4)  # of the model, by default
 INSTRUMENT = ae.Registration(rotation=17.0, scale=0.4, shift=(3.0, -2.0))
 NAMES = ("mean", "relative_spread", "true_mean", "true_standard_deviation")
 
 
 def specimen(number, radius, within=VARIATION):
-    """Tip of Ni[111]; number 0 is the one that is fitted, with a radius in lattice constants; others are within it."""
+    """Tip of Ni[111]; number 0 is fitted, with a radius in lattice constants; those of others differ by a part."""
     random = np.random.default_rng((2026, number))
     sizes = np.ones(3) if number == 0 else random.uniform(1 - VARIATION, 1 + VARIATION, 3)
     sizes[0] = 1 + (sizes[0] - 1) * within / VARIATION
@@ -104,9 +105,8 @@ def bounds_of(study, model_error):
     return intervals(study.grid, np.concatenate([study.scores[None], study.resampled]), best, model_error).bounds
 
 
-def inside(study, truth, model_error):
+def inside(bounds, truth):
     """Whether the interval of each number contains its hidden value, dict of bool."""
-    bounds = bounds_of(study, model_error)
     return {name: bounds[name][0] <= value <= bounds[name][1] for name, value in truth.items()}
 
 
@@ -118,7 +118,7 @@ def main():
     parser.add_argument("--ions", type=int, default=10_000)
     parser.add_argument("--objective", choices=("similarity", "folded"), default="similarity")
     parser.add_argument("--within", type=float, default=VARIATION, help="part by which the radii of twins differ")
-    parser.add_argument("--model-errors", type=float, nargs="+", default=[0.0, 0.03, 0.08, 0.1, 0.12, 0.15, 0.2, 0.3])
+    parser.add_argument("--model-errors", type=float, nargs="+", default=ERRORS)
     options = parser.parse_args()
     options.folder.mkdir(exist_ok=True)
     run = run_of(0, options.radius, options.ions, options.folder)
@@ -128,8 +128,8 @@ def main():
         twin = run_of(number, options.radius, options.ions, options.folder, options.within)
         study = fitted(run, measured_map(twin, energy), options.objective)
         truth = truth_of(energy)
-        found.append([list(inside(study, truth, error).values()) for error in options.model_errors])
         bounds = [bounds_of(study, error) for error in options.model_errors]
+        found.append([list(inside(each, truth).values()) for each in bounds])
         widths.append([[(each[name][1] - each[name][0]) / truth[name] for name in NAMES] for each in bounds])
         print(number, {name: round(value, 3) for name, value in truth.items()}, flush=True)
         print(study, flush=True)

@@ -25,7 +25,7 @@ def test_hidden_energies_lie_inside_the_intervals(made_once):
         energy = coverage.hidden_energy(number)
         study = coverage.fitted(run, coverage.measured_map(twin, energy))
         for error in inside:
-            inside[error] += sum(coverage.inside(study, coverage.truth_of(energy), error).values())
+            inside[error] += sum(coverage.inside(coverage.bounds_of(study, error), coverage.truth_of(energy)).values())
     # 24 intervals; of 96 % coverage, two or less are missed in 93 %, and the numbers of a twin are not independent
     assert inside[MODEL_ERROR] >= 21
     assert inside[0.0] <= 14  # of 23 twins, less than half without the error of the model
