@@ -4,7 +4,7 @@
     python tools/same_bits.py BASE --times 5     the same, and pairs of timed runs
 
 The runs: Ni[111], R = 20 a, with responses; two phases at a temperature with a controlled voltage; a constant
-potential with responses for two roll-ups; a random alloy with a user-defined perturbation; a shell with R = 60 a that
+potential with wide responses; a random alloy with a user-defined perturbation; a shell with R = 60 a that
 is deepened. Compared are `Run.fingerprint`, and the hits of the ions: unperturbed and rolled up. The exit code is 1 if
 one differs.
 """
@@ -63,7 +63,7 @@ def simulation(name):
     if name == "potential":
         tip = ae.Tip(nickel, apex_radius=12 * a, axis=(1, 1, 1))
         rule = ae.ConstantPotential(charges="gaussian", law_field="charge")
-        return ae.Simulation(tip, seed=5, rule=rule, response_settings=ae.ResponseSettings(rolls=2)), 1500, ()
+        return ae.Simulation(tip, seed=5, rule=rule, response_settings=ae.ResponseSettings.wide()), 1500, ()
     if name == "alloy":
         radius = 12 * aluminium.a
         tip = ae.Tip(aluminium, apex_radius=radius, axis=(0, 1, 2), solutes={"Ni": 0.05}, seed=3, offset_seed=5)
@@ -82,7 +82,7 @@ for name in sys.argv[1:]:
     start = time.perf_counter()
     run = case.run(ions, emissions, progress=False)
     seconds = time.perf_counter() - start
-    rolled = ae.RollUp(ae.TruncatedNormal(0.155, 0.155), **({"second_roll": 0.3} if name == "potential" else {}))
+    rolled = ae.RollUp(ae.TruncatedNormal(0.155, 0.155), **({"sharpness": 0.3} if name == "potential" else {}))
     hashes = {"run": run.fingerprint()} | {repr(each): digest(run.hits(each)) for each in (ae.Unperturbed(), rolled)}
     if name != "phases":
         hashes["real units"] = digest(run.at_evaporation_field().hits(rolled))

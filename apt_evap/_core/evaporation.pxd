@@ -44,7 +44,7 @@ cdef class Evaporation:
     cdef void make_room(self, long room)
     cdef rank(self, double factor, log_rate_at, int n_threads)
     cdef Chooser ranked(self, double voltage_factor, int n_threads)
-    cdef void strongest_neighbours(self, long atom, long leaving, double stretch, long long* neighbour,
+    cdef void strongest_neighbours(self, long atom, double stretch, long long* neighbour,
                                    double* charge) noexcept nogil
     cdef void join(self, int slot, double dx, double dy, double dz) noexcept nogil
     cdef void near_first(self, Hole* hole) noexcept nogil

@@ -296,11 +296,10 @@ cdef class Evaporation:
 
     # ---- one event -------------------------------------------------------------------------------------------------
 
-    cdef void strongest_neighbours(self, long atom, long leaving, double stretch, long long* neighbour,
+    cdef void strongest_neighbours(self, long atom, double stretch, long long* neighbour,
                                    double* charge) noexcept nogil:
-        # The TARGETS surface neighbours of an atom with the highest charges, in falling order; -1 if there are fewer or
-        # the atom is -1. Nearest neighbours, and with a stretch above 1 also those of the second shell. Those of another
-        # atom than the leaving one are neither it nor its neighbours.
+        # The TARGETS surface neighbours of an atom with the highest charges, in descending order; -1 if there are fewer.
+        # Nearest neighbours, and with a stretch above 1 also those of the second shell.
         cdef int[MAX_NEAR] others
         cdef int n, i, k, m
         cdef long other
@@ -308,14 +307,10 @@ cdef class Evaporation:
         for k in range(TARGETS):
             neighbour[k] = -1
             charge[k] = 0.0
-        if atom < 0:
-            return
         n = self.atoms.near(atom, others)
         for i in range(n):
             other = others[i]
             if self.slot_of[other] < 0 or not self.atoms.bonded(atom, other, stretch):
-                continue
-            if atom != leaving and self.atoms.bonded(leaving, other, stretch):   # also the leaving one
                 continue
             q = self.tree.q[self.slot_of[other]]
             for k in range(TARGETS):
@@ -364,7 +359,7 @@ cdef class Evaporation:
         cdef int slot = self.slot_of[atom]
         if slot < 0 or self.atoms.bonds[atom] > self.law.hop_bonds or not self.tree.q[slot] > 0.0:
             return key
-        self.strongest_neighbours(atom, atom, 1.0, neighbour, charge)   # for which phi was solved, whatever rolls
+        self.strongest_neighbours(atom, 1.0, neighbour, charge)   # for which phi was solved, whatever rolls
         return self.law.hopping(key, strength, charge[0] / self.tree.q[slot])
 
     cdef int judge(self, const int* slots, long n) except -1 nogil:
@@ -539,8 +534,7 @@ cdef class Evaporation:
                 event.fields = self.field_unit * self.rule.strength(self.tree, best)
                 for axis in range(3):
                     event.normals[axis] = self.normals[best, axis]
-                self.strongest_neighbours(leaving, leaving, self.target_stretch, event.targets[0], event.target_charges[0])
-                self.strongest_neighbours(event.targets[0][0], leaving, self.target_stretch, event.targets[1], event.target_charges[1])
+                self.strongest_neighbours(leaving, self.target_stretch, event.targets, event.target_charges)
                 self.event(leaving, journal)
         return status
 

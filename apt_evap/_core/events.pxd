@@ -4,8 +4,7 @@ from apt_evap._core.journal cimport Journal
 
 
 cdef enum:
-    ROLLS = 2     # steps of an atom before its flight
-    TARGETS = 3   # neighbours onto which an atom may roll in each
+    TARGETS = 3   # neighbours onto which an atom may roll before its flight
 
 
 cdef struct Event:
@@ -15,8 +14,8 @@ cdef struct Event:
     double charges
     double fields
     double[3] normals
-    long long[ROLLS][TARGETS] targets
-    double[ROLLS][TARGETS] target_charges
+    long long[TARGETS] targets
+    double[TARGETS] target_charges
     double waits
     double rises
     unsigned char detached

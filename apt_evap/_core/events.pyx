@@ -21,12 +21,11 @@ COLUMNS = (
     Column("fields", np.float64, (), "V/nm", "Field just outside the surface before evaporation."),
     Column("normals", np.float64, (3,), None, "Outward unit normal."),
     Column(
-        "targets", np.int64, (ROLLS, TARGETS), None,
-        "Indices of the atoms onto which an atom may roll in a first and in a second step; -1 if there are fewer. "
-        "First: its surface nearest neighbours with the highest charges, in falling order. Second: the same for the "
-        "strongest of them, without the atom and its neighbours.",
+        "targets", np.int64, (TARGETS,), None,
+        "Indices of the atoms onto which an atom may roll: its surface nearest neighbours with the highest charges, "
+        "in descending order; -1 if there are fewer.",
     ),
-    Column("target_charges", np.float64, (ROLLS, TARGETS), "e", "Their charges; 0 if there are fewer."),
+    Column("target_charges", np.float64, (TARGETS,), "e", "Their charges; 0 if there are fewer."),
     Column(
         "waits", np.float64, (), "s",
         "Time before the event; with pulses, time at the top of pulses. 0 for a detached atom.",

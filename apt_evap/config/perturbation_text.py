@@ -97,9 +97,6 @@ def _numbers_of(settings):
             yield value
 
 
-_WORDS = {"second_roll": "second roll-up"}  # of options in a title
-
-
 def title_of(perturbation: Any) -> str:
     """Title of a map for a perturbation (str), such as "roll-up, 0.155 ± 0.155 eV, probability 0.5"."""
     name = type(perturbation).__name__
@@ -120,7 +117,7 @@ def title_of(perturbation: Any) -> str:
         if option in fields and option not in ("energy", "rollup_fraction"):
             value, unit = getattr(perturbation, option), fields[option].unit
             text = f"{value:g}" if isinstance(value, float) else _energy_text(value) or _short(value)
-            parts.append(" ".join(filter(None, (_WORDS.get(option, option.replace("_", " ")), text, unit))))
+            parts.append(" ".join(filter(None, (option.replace("_", " "), text, unit))))
     return ", ".join(filter(None, parts))
 
 

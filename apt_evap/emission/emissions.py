@@ -36,12 +36,10 @@ class Emissions:
     nearest_neighbour_distance : float
         [nm], of the matrix.
     targets : array_like, optional
-        Positions of the three targets of each roll-up, in falling order of their charges [nm], shape (n, rolls, 3, 3);
-        NaN if there are fewer. The targets of the first roll-up are the surface nearest neighbours, the strongest one
-        that of `neighbours`. Those of a second one are the surface neighbours of the strongest neighbour that are
-        neither the atom nor neighbours of it.
+        Positions of the three targets of a roll-up, the surface neighbours with the highest charges, in descending
+        order [nm], shape (n, 3, 3); NaN if there are fewer. The first one is that of `neighbours`.
     charge_ratios : array_like, optional
-        Their charges over that of the atom, shape (n, rolls, 3); NaN if there are fewer.
+        Their charges over that of the atom, shape (n, 3); NaN if there are fewer.
     rollup_distances : array_like, optional
         Distance of each rolled-up ion from its neighbour [nm], shape (n,); by default `nearest_neighbour_distance`.
 
@@ -79,11 +77,8 @@ class Emissions:
         if (self.targets is None) != (self.charge_ratios is None):
             raise ValueError("targets and charge_ratios must be given together, got one of them")
         if self.targets is not None:
-            targets = check_array(self.targets, "targets", (n, "rolls", 3, 3), finite=False)
-            if targets.shape[1] not in (1, 2):
-                raise ValueError(f"targets must be those of 1 or 2 roll-ups, got {targets.shape[1]}")
-            ratios = check_array(self.charge_ratios, "charge_ratios", (n, targets.shape[1], 3), finite=False)
-            values |= {"targets": targets, "charge_ratios": ratios}
+            values["targets"] = check_array(self.targets, "targets", (n, 3, 3), finite=False)
+            values["charge_ratios"] = check_array(self.charge_ratios, "charge_ratios", (n, 3), finite=False)
         if self.rollup_distances is not None:
             values["rollup_distances"] = check_array(self.rollup_distances, "rollup_distances", (n,))
         deviation = np.abs(np.linalg.norm(values["normals"], axis=1) - 1)
@@ -123,29 +118,6 @@ class Emissions:
         """Whether each atom has a neighbour to roll onto, bool (n,)."""
         return np.isfinite(self.neighbours).all(axis=1)
 
-    @property
-    def can_roll_twice(self) -> Booleans:
-        """Whether each atom has a target of a second roll-up, bool (n,); ValueError if these are not known."""
-        return np.isfinite(self.strongest_targets(1)).all(axis=1)
-
-    def targets_of(self, roll: int) -> Floats:
-        """Targets of the first roll-up (0) or the second one (1) [nm], shape (n, 3, 3); ValueError if not known."""
-        if self.targets is not None and roll < self.targets.shape[1]:
-            return self.targets[:, roll]
-        if roll:
-            raise ValueError(
-                "a second roll-up needs its targets, which this run does not have: run with "
-                "response_settings=ResponseSettings(rolls=2) or ResponseSettings.wide(rolls=2)"
-            )
-        raise ValueError(
-            "shares of several neighbours need the targets of the roll-up, which this run does not have: run with "
-            "response_settings=ResponseSettings.wide()"
-        )
-
-    def strongest_targets(self, roll: int) -> np.ndarray:
-        """The strongest of `targets_of` each atom [nm], shape (n, 3); NaN if there is none."""
-        return self.targets_of(roll)[:, 0] if roll else self.neighbours
-
     def kept(self, key: Hashable, compute: Callable[[], T]) -> T:
         """Result of a function of these emissions: that of the last call if the key is the same, computed otherwise.
 
@@ -180,11 +152,9 @@ class TangentialLaunches(NamedTuple):
     second: Floats
     """Velocities along t2, shape (n,)."""
     shares: Floats | None = None
-    """Shares of the three targets of each roll-up, shape (n, rolls, 3), sum 1; by default the first only."""
+    """Shares of the three targets of the roll-up, shape (n, 3), sum 1; by default the first only."""
     heights: Floats | None = None
     """Heights of the launches above the usual start [nm], shape (n,); by default 0."""
-    twice: Booleans | None = None
-    """Whether each ion rolled up twice, shape (n,), a part of `rolled`; by default none did."""
 
     def __repr__(self) -> str:
         return short_repr(self)
@@ -203,15 +173,10 @@ def choose_launches(launches: Sequence[TangentialLaunches], chosen: Integers) ->
     Returns
     -------
     TangentialLaunches
-        Shares, heights and second roll-ups are left at their default if all have it.
+        Shares and heights are left at their default if all have it.
     """
     n = len(chosen)
-    rolls = max(
-        2 if each.twice is not None else 1 if each.shares is None else each.shares.shape[1] for each in launches
-    )
-    strongest = np.zeros((n, rolls, 3))
-    strongest[..., 0] = 1.0
-    defaults = {"shares": strongest, "heights": np.zeros(n), "twice": np.zeros(n, bool)}
+    defaults = {"shares": np.tile([1.0, 0.0, 0.0], (n, 1)), "heights": np.zeros(n)}
     columns = {}
     for name in TangentialLaunches._fields:
         given = [getattr(each, name) for each in launches]
@@ -221,7 +186,7 @@ def choose_launches(launches: Sequence[TangentialLaunches], chosen: Integers) ->
         for k, column in enumerate(given):
             if column is not None:
                 rows = chosen == k
-                (result[:, : column.shape[1]] if name == "shares" else result)[rows] = column[rows]
+                result[rows] = column[rows]
     return TangentialLaunches(**columns)
 
 

@@ -1,10 +1,9 @@
 """Perturbations of the emission: start position of an ion, and its velocity along the surface.
 
 A perturbation is any object with one method, ``launch(emissions, random) -> Launches``, over a batch of
-emissions. The built-in ones use up to four random numbers per ion: the first is the quantile of the energy, the second
-gives the azimuth, the third decides whether the ion rolls up, the fourth whether it does so twice. The model is that of
-Shaikh et al., arXiv 2509.13744; the probability of a roll-up and of a second one, the sharpness of the target and the
-launch height are additions to it.
+emissions. The built-in ones use up to three random numbers per ion: the first is the quantile of the energy, the second
+gives the azimuth, the third decides whether the ion rolls up. The model is that of Shaikh et al., arXiv 2509.13744; the
+probability of a roll-up, the sharpness of the target and the launch height are additions to it.
 """
 
 from __future__ import annotations  # `RollUp.of_metal` returns one
@@ -175,15 +174,6 @@ class _Rolling(_Tangential):
         kind="distribution or float [eV]",
         default=None,
     )
-    second_roll: float = number(
-        "Probability that an ion that rolls up rolls once more, from above its strongest neighbour onto the strongest "
-        "one of those beyond, and starts there, in the direction of this last step. Beyond are the surface neighbours "
-        "of the neighbour that are not neighbours of the site; an ion without any rolls once. Above 0 it needs "
-        "responses with ``rolls=2`` (`ResponseSettings`).",
-        default=0.0,
-        at_least=0,
-        at_most=1,
-    )
     others_height: float | None = number(
         "Height of the start above the site of ions that do not roll up. By default that of the ions that do.",
         default=None,
@@ -196,17 +186,13 @@ class _Rolling(_Tangential):
         """Launches with a roll-up of some ions."""
         n = len(emissions)
         certain = self.probability == 1.0
-        u = random.uniform(4 if self.second_roll else 2 if certain else 3)
-        possible, along, across, shares = roll_ups(emissions, self.sharpness, 2 if self.second_roll else 1)
-        rolled, first, second = possible[:, 0].copy(), along[:, 0], across[:, 0]
+        u = random.uniform(2 if certain else 3)
+        possible, first, second, shares = roll_ups(emissions, self.sharpness)
+        rolled = possible.copy()
         if not certain:
             given = self.probability
             wanted = u[:, 2] < (given if isinstance(given, float) else given.probabilities(emissions))
             rolled = rolled & wanted
-        twice = None
-        if self.second_roll:
-            twice = rolled & possible[:, 1] & (u[:, 3] < self.second_roll)
-            first, second = np.where(twice, along[:, 1], first), np.where(twice, across[:, 1], second)
         energies = draw_energies(self.energy, u[:, 0])
         fraction = getattr(self, "rollup_fraction", 1.0)
         rolling = np.where(rolled, fraction * energies, 0.0)
@@ -219,7 +205,7 @@ class _Rolling(_Tangential):
         heights = self._heights(n)
         if self.others_height not in (None, self.height):
             heights = np.where(rolled, self.height, self.others_height)
-        return TangentialLaunches(rolled, first, second, shares, heights, twice)
+        return TangentialLaunches(rolled, first, second, shares, heights)
 
 
 @settings
@@ -368,7 +354,7 @@ class Combined(_Rolling, _Divided):
         -------
         TangentialLaunches
             Whether each ion rolls up, its velocity along t1 and t2 of `tangent_frame` [nm/ns], each of shape (n,),
-            and if they are not the default, the shares of the targets, the heights, and which ions roll up twice.
+            and if they are not the default, the shares of the targets, and the heights.
         """
         return self._roll(emissions, random)
 

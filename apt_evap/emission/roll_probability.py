@@ -46,7 +46,7 @@ class _ByChargeRatio:
                 f"{type(self).__name__} needs the charges of the neighbours, which this run does not have: run with "
                 "response_settings=ResponseSettings.wide()"
             )
-        ratios = emissions.charge_ratios[:, 0, 0]
+        ratios = emissions.charge_ratios[:, 0]
         there = np.isfinite(ratios)
         return np.where(there, self._at(np.where(there, ratios, 0.0)), 0.0)
 

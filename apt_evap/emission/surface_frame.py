@@ -44,22 +44,22 @@ def tangent_frame(normals: ArrayLike) -> tuple[Floats, Floats]:
 
 
 class RollUps(NamedTuple):
-    """Directions of the successive roll-ups of n atoms, and the shares of their targets."""
+    """Directions of the roll-ups of n atoms, and the shares of their targets."""
 
     possible: Booleans
-    """Whether there is a target to roll onto, shape (n, rolls)."""
+    """Whether there is a target to roll onto, shape (n,)."""
     first: Floats
-    """Components of the directions along t1 of `tangent_frame`, see `rollup_direction`, shape (n, rolls)."""
+    """Components of the directions along t1 of `tangent_frame`, see `rollup_direction`, shape (n,)."""
     second: Floats
-    """Components along t2, shape (n, rolls)."""
+    """Components along t2, shape (n,)."""
     shares: Floats | None
-    """Shares of the targets, see `target_shares`, shape (n, rolls, 3); None for the strongest ones only."""
+    """Shares of the targets, see `target_shares`, shape (n, 3); None for the strongest ones only."""
 
 
-def roll_ups(emissions: Emissions, sharpness: float = 0.0, rolls: int = 1) -> RollUps:
+def roll_ups(emissions: Emissions, sharpness: float = 0.0) -> RollUps:
     """Roll-ups of a batch, computed once as long as the arguments stay the same.
 
-    The result takes 17 bytes per atom and roll-up, and 24 more with a sharpness.
+    The result takes 17 bytes per atom, and 24 more with a sharpness.
 
     Parameters
     ----------
@@ -67,8 +67,6 @@ def roll_ups(emissions: Emissions, sharpness: float = 0.0, rolls: int = 1) -> Ro
         A batch of n.
     sharpness : float
         See `target_shares`.
-    rolls : int
-        Number of successive roll-ups, 1 or 2.
 
     Returns
     -------
@@ -80,33 +78,27 @@ def roll_ups(emissions: Emissions, sharpness: float = 0.0, rolls: int = 1) -> Ro
     ValueError
         If the targets that this needs are not known.
     """
-    return emissions.kept(("roll_ups", sharpness, rolls), lambda: _roll_ups(emissions, sharpness, rolls))
+    return emissions.kept(("roll_ups", sharpness), lambda: _roll_ups(emissions, sharpness))
 
 
-def _roll_ups(emissions, sharpness, rolls):
-    shares = None if sharpness == 0.0 else target_shares(emissions, sharpness, rolls)
-    directions = [rollup_direction(emissions, shares, roll) for roll in range(rolls)]
-    possible, first, second = (np.stack(each, axis=1) for each in zip(*directions, strict=True))
-    found = RollUps(possible, first, second, shares)
-    for array in found:
+def _roll_ups(emissions, sharpness):
+    shares = None if sharpness == 0.0 else target_shares(emissions, sharpness)
+    result = RollUps(*rollup_direction(emissions, shares), shares)
+    for array in result:
         if array is not None:
             array.flags.writeable = False
-    return found
+    return result
 
 
-def rollup_direction(
-    emissions: Emissions, shares: Floats | None = None, roll: int = 0
-) -> tuple[Booleans, Floats, Floats]:
+def rollup_direction(emissions: Emissions, shares: Floats | None = None) -> tuple[Booleans, Floats, Floats]:
     """Ions that can roll up, and the direction of their roll-up.
 
     Parameters
     ----------
     emissions : Emissions
         A batch of n.
-    shares : ndarray, shape (n, rolls, 3), optional
+    shares : ndarray, shape (n, 3), optional
         Shares of the targets, see `target_shares`; by default the strongest ones only.
-    roll : int
-        0 for the first roll-up, from the site, or 1 for the second one, from the first rolled-up position.
 
     Returns
     -------
@@ -120,30 +112,24 @@ def rollup_direction(
     ValueError
         If the targets that this needs are not known.
     """
-    there = emissions.can_roll_twice if roll else emissions.can_roll
-    before = _place(emissions, shares, roll - 1) if roll else emissions.positions
-    return there, *_direction(emissions, there, _place(emissions, shares, roll) - before)
-
-
-def _direction(emissions, there, steps):
-    """Components along t1 and t2 of steps (n, 3), as unit vectors perpendicular to the normal; zero where not there."""
-    step = np.where(there[:, None], steps, 0.0)
+    possible = emissions.can_roll
+    step = np.where(possible[:, None], _place(emissions, shares) - emissions.positions, 0.0)
     # the lift d n of the rolled-up position is along the normal and drops out
     along = [products(step, tangent) for tangent in tangent_frame(emissions.normals)]
     length = np.sqrt(along[0] * along[0] + along[1] * along[1])
     straight = length < 1e-9 * emissions.nearest_neighbour_distance
     scale = np.where(straight, 0.0, 1 / np.where(straight, 1.0, length))
-    return along[0] * scale, along[1] * scale
+    return possible, along[0] * scale, along[1] * scale
 
 
-def _place(emissions, shares, roll):
+def _place(emissions, shares):
     """The target of a roll-up, or the mean of the targets with these shares; shape (n, 3)."""
     if shares is None:
-        return emissions.strongest_targets(roll)
-    return _mean_targets(emissions, shares[:, roll, None], roll)[:, 0]
+        return emissions.neighbours
+    return _mean_targets(emissions, shares[:, None])[:, 0]
 
 
-def rolled_positions(emissions: Emissions, shares: Floats | None = None, roll: int = 0) -> Floats:
+def rolled_positions(emissions: Emissions, shares: Floats | None = None) -> Floats:
     """Positions p_r = s + d n, one nearest neighbour distance d above the place s that each ion rolls onto.
 
     Between two phases, d is the mean of their distances.
@@ -152,17 +138,15 @@ def rolled_positions(emissions: Emissions, shares: Floats | None = None, roll: i
     ----------
     emissions : Emissions
         A batch of n.
-    shares : ndarray, shape (n, rolls, 3), optional
+    shares : ndarray, shape (n, 3), optional
         Shares of the targets; by default s is the strongest neighbour.
-    roll : int
-        0 after the first roll-up, 1 after the second one, with the same d.
 
     Returns
     -------
     ndarray, shape (n, 3)
         Positions [nm]; NaN for an ion without a neighbour.
     """
-    return _place(emissions, shares, roll) + _lift(emissions)
+    return _place(emissions, shares) + _lift(emissions)
 
 
 def _lift(emissions):
@@ -172,7 +156,7 @@ def _lift(emissions):
     return emissions.rollup_distances[:, None] * emissions.normals
 
 
-def target_shares(emissions: Emissions, sharpness: float, rolls: int = 1) -> Floats:
+def target_shares(emissions: Emissions, sharpness: float) -> Floats:
     r"""Shares of the three strongest surface nearest neighbours in the place onto which an atom rolls.
 
     Parameters
@@ -181,12 +165,10 @@ def target_shares(emissions: Emissions, sharpness: float, rolls: int = 1) -> Flo
         A batch of n, with its targets.
     sharpness : float
         :math:`\tau`; 0 for the strongest neighbour only.
-    rolls : int
-        Number of successive roll-ups, 1 or 2.
 
     Returns
     -------
-    ndarray, shape (n, rolls, 3)
+    ndarray, shape (n, 3)
         0 for missing neighbours; the first is 1 for an atom without any.
 
     Raises
@@ -201,10 +183,9 @@ def target_shares(emissions: Emissions, sharpness: float, rolls: int = 1) -> Flo
     with the charges :math:`q_j` of the neighbours in falling order. Where two of them are nearly equal, an atom moves
     onto the bridge or hollow between them.
     """
-    check_kind(emissions, "emissions", "targets_of", "Emissions")
+    check_kind(emissions, "emissions", Emissions, "Emissions")
     n, ratios = len(emissions), emissions.charge_ratios
-    shares = np.zeros((n, rolls, 3))
-    shares[..., 0] = 1.0
+    shares = np.tile([1.0, 0.0, 0.0], (n, 1))
     if sharpness == 0.0 or n == 0:
         return shares
     if ratios is None:
@@ -212,17 +193,20 @@ def target_shares(emissions: Emissions, sharpness: float, rolls: int = 1) -> Flo
             "a sharpness > 0 needs the targets of the roll-up, which this run does not have: run with "
             "response_settings=ResponseSettings.wide()"
         )
-    emissions.targets_of(rolls - 1)  # ValueError if they are not known
-    ratios = ratios[:, :rolls]
-    there = np.isfinite(ratios[..., 1:])
-    relative = np.where(there, ratios[..., 1:], 0.0) / np.where(ratios[..., :1] > 0, ratios[..., :1], 1.0)
-    shares[..., 1:] = np.where(there, exponential((relative - 1.0) / sharpness), 0.0)
-    return shares / (shares[..., 0] + shares[..., 1] + shares[..., 2])[..., None]
+    known = np.isfinite(ratios[:, 1:])
+    relative = np.where(known, ratios[:, 1:], 0.0) / np.where(ratios[:, :1] > 0, ratios[:, :1], 1.0)
+    shares[:, 1:] = np.where(known, exponential((relative - 1.0) / sharpness), 0.0)
+    return shares / (shares[:, 0] + shares[:, 1] + shares[:, 2])[:, None]
 
 
-def _mean_targets(emissions, shares, roll):
+def _mean_targets(emissions, shares):
     """Weighted means of the targets, shares (n or 1, m, 3) -> (n, m, 3); a missing target is replaced by the first."""
-    targets = emissions.targets_of(roll)
+    targets = emissions.targets
+    if targets is None:
+        raise ValueError(
+            "shares of several neighbours need the targets of the roll-up, which this run does not have: run with "
+            "response_settings=ResponseSettings.wide()"
+        )
     targets = np.where(np.isfinite(targets), targets, targets[:, :1])
     mean = shares[..., 0, None] * targets[:, None, 0]
     for k in (1, 2):
@@ -230,7 +214,7 @@ def _mean_targets(emissions, shares, roll):
     return mean
 
 
-def shared_positions(emissions: Emissions, shares: Floats, roll: int = 0) -> Floats:
+def shared_positions(emissions: Emissions, shares: Floats) -> Floats:
     """Positions one nearest neighbour distance above weighted means of the targets.
 
     Parameters
@@ -239,15 +223,13 @@ def shared_positions(emissions: Emissions, shares: Floats, roll: int = 0) -> Flo
         A batch of n, with its targets.
     shares : ndarray, shape (n or 1, m, 3)
         Shares of the targets.
-    roll : int
-        0 for targets of the first roll-up, 1 for those of the second one.
 
     Returns
     -------
     ndarray, shape (n, m, 3)
         Positions [nm]; NaN for an ion without a neighbour.
     """
-    return _mean_targets(emissions, shares, roll) + _lift(emissions)[:, None]
+    return _mean_targets(emissions, shares) + _lift(emissions)[:, None]
 
 
 def along_surface(normals: ArrayLike, first: Floats, second: Floats) -> Floats:
@@ -277,7 +259,6 @@ def launch_tangentially(
     second: Floats,
     shares: Floats | None = None,
     heights: Floats | None = None,
-    twice: Booleans | None = None,
 ) -> Launches:
     """Launches with velocities along the surface.
 
@@ -289,7 +270,7 @@ def launch_tangentially(
         Whether an ion starts at its rolled-up position, see `rolled_positions`, or at its site, shape (n,).
     first, second : array_like
         Velocity along t1 and t2 of `tangent_frame` [nm/ns], shape (n,).
-    shares, heights, twice : ndarray, optional
+    shares, heights : ndarray, optional
         As in `TangentialLaunches`.
 
     Returns
@@ -297,8 +278,6 @@ def launch_tangentially(
     Launches
     """
     positions = np.where(np.asarray(rolled)[:, None], rolled_positions(emissions, shares), emissions.positions)
-    if twice is not None:
-        positions = np.where(np.asarray(twice)[:, None], rolled_positions(emissions, shares, roll=1), positions)
     if heights is not None:
         positions = positions + np.asarray(heights)[:, None] * emissions.normals
     return Launches(

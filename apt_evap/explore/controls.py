@@ -43,7 +43,6 @@ CONTROLS = (
     Control("relative_spread", "standard deviation / mean", 0.0, 3.2, 0.05, 1.0),
     Control("rollup_fraction", "roll-up fraction of the energy", 0.0, 1.0, 0.05, 0.5),
     Control("probability", "probability of a roll-up", 0.0, 1.0, 0.05, 1.0),
-    Control("second_roll", "probability of a second roll-up", 0.0, 1.0, 0.05, 0.0),
     Control("sharpness", "sharpness of the target", 0.0, 3.0, 0.05, 0.0),
     Control("height", "launch height [nm]", 0.0, 0.2, 0.005, 0.0),
     Control("others", "mean energy without roll-up [eV]", 0.0, 1.0, 0.005, 0.0),

@@ -246,8 +246,6 @@ class Explorer:
     def controls(self, mechanism: str) -> tuple[Control, ...]:
         """Controls of a mechanism that this run serves: sharpness and height need wide responses."""
         settings, found = self.run.response_settings, controls_of(mechanism)
-        if settings.rolls == 1:
-            found = tuple(each for each in found if each.name != "second_roll")
         if not settings.is_wide:
             return tuple(each for each in found if each.name not in ("sharpness", "height"))
         return tuple(replace(each, high=settings.height) if each.name == "height" else each for each in found)

@@ -19,7 +19,7 @@ from apt_evap.flight.response import ResponseSettings
 MARGIN = 0.5
 """Margin in units of the largest predicted deviation from the flight at rest from the site. Measured: launches end up
 to 0.39 of it closer to the axis than all predictions (20,300 ions; Ni, Al, W, Ni with 15 % W, a particle of Ni in Al;
-five axes; R = 8 and 16 a; linear and wide responses, second roll-ups, energies up to 0.3, 1.5 and 4 eV)."""
+five axes; R = 8 and 16 a; linear and wide responses, energies up to 0.3, 1.5 and 4 eV)."""
 LEAST_MARGIN = 0.5
 """Further margin for errors that do not depend on the energy, such as those of the scouts themselves [degrees]."""
 
@@ -43,7 +43,7 @@ def stereographic_rim(half_angle: float) -> float:
 
 
 def scouts_of(emissions: Emissions, settings: ResponseSettings) -> Scouts:
-    """Scouts from the site and from the places of the roll-ups.
+    """Scouts from the site and from the places of the roll-up.
 
     Parameters
     ----------
@@ -56,12 +56,11 @@ def scouts_of(emissions: Emissions, settings: ResponseSettings) -> Scouts:
     -------
     Scouts
     """
-    places = [emissions.positions[:, None]]
-    for roll in range(settings.rolls):
-        if settings.is_wide:
-            places.append(shared_positions(emissions, np.eye(3)[None], roll))
-        else:
-            places.append(rolled_positions(emissions, roll=roll)[:, None])
+    if settings.is_wide:
+        rolled = shared_positions(emissions, np.eye(3)[None])
+    else:
+        rolled = rolled_positions(emissions)[:, None]
+    places = [emissions.positions[:, None], rolled]
     fastest = np.sqrt(2.0 * settings.energy_limit / emissions.charge_states)
     first = along_surface(emissions.normals, fastest, np.zeros_like(fastest))
     second = along_surface(emissions.normals, np.zeros_like(fastest), fastest)

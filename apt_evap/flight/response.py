@@ -91,13 +91,6 @@ class ResponseSettings:
         at_least=1,
         at_most=2,
     )
-    rolls: int = count(
-        "Roll-ups of an ion that the responses cover: 1, or 2 for a `second_roll` of the perturbations, with "
-        "additional launches of the design `rolled` from the place after the second one.",
-        default=1,
-        at_least=1,
-        at_most=2,
-    )
 
     def _check(self):
         if isinstance(self.site, WideDesign) != isinstance(self.rolled, WideDesign):
@@ -129,13 +122,11 @@ class ResponseSettings:
 
         Notes
         -----
-        Second neighbours and the targets of a second roll-up are farther apart, so that the polynomials need more
-        terms. For Ni[111], R = 12 a, 100 ions, up to 0.35 eV, the median deviations from flights are then 0.005 to 0.03
-        mm after one roll-up and 0.007 to 0.09 mm after two, on a detector at 100 mm; with the terms for nearest
-        neighbours, they would be 0.07 to 0.16 mm and 0.05 to 0.28 mm.
+        Second neighbours are farther apart, so that the polynomials need more terms. For Ni[111], R = 12 a, 100 ions,
+        up to 0.35 eV, the median deviations from flights are then 0.02 to 0.09 mm on a detector at 100 mm; with the
+        terms for nearest neighbours, they would be 0.11 to 0.18 mm.
         """
-        far = 2 in (others.get("shells"), others.get("rolls"))
-        rolled = WideDesign(4, 2, 2, 4) if far else WideDesign(3, 2, 2, 3)
+        rolled = WideDesign(4, 2, 2, 4) if others.get("shells") == 2 else WideDesign(3, 2, 2, 3)
         return cls(site=WideDesign(0, 4, 3, 4), rolled=rolled, height=height, **others)
 
     @classmethod
@@ -154,14 +145,9 @@ class ResponseSettings:
         return isinstance(self.rolled, WideDesign)
 
     @property
-    def has_targets(self) -> bool:
-        """Whether a run needs the `targets` of its emissions: otherwise ions roll onto their `neighbours` only."""
-        return self.is_wide or self.rolls == 2
-
-    @property
-    def designs(self) -> tuple[Design | WideDesign, ...]:
-        """Designs of the launches from the site, and after one roll-up or more."""
-        return (self.site, *[self.rolled] * self.rolls)
+    def designs(self) -> tuple[Design | WideDesign, Design | WideDesign]:
+        """Designs of the launches from the site, and after a roll-up."""
+        return self.site, self.rolled
 
     def variables(self, launches: TangentialLaunches, masses: ArrayLike) -> Floats:
         """Variables of the designs for n launches, shape (n, 5); ValueError if the responses do not serve them."""
@@ -170,10 +156,7 @@ class ResponseSettings:
         velocities = self.reduced(np.column_stack([launches.first, launches.second]), masses)
         variables[:, FIRST_VELOCITY], variables[:, SECOND_VELOCITY] = velocities.T
         if launches.shares is not None:
-            variables[:, [SECOND, THIRD]] = launches.shares[:, 0, 1:]
-        if launches.twice is not None:
-            beyond = 0.0 if launches.shares is None else launches.shares[:, 1, 1:]
-            variables[:, [SECOND, THIRD]] = np.where(launches.twice[:, None], beyond, variables[:, [SECOND, THIRD]])
+            variables[:, [SECOND, THIRD]] = launches.shares[:, 1:]
         if launches.heights is not None:
             variables[:, HEIGHT] = launches.heights / (self.height or 1.0)
         if not self.is_wide and variables[:, [SECOND, THIRD, HEIGHT]].any():
@@ -202,10 +185,10 @@ class Responses:
     site : ndarray of float32, shape (n, 3, coefficients)
         Coefficients of three quantities, for launches from the site: the two components of the stereographic direction,
         and the time of flight times the cosine of the polar angle [ns].
-    rolled : ndarray of float32, shape (n, rolls, 3, coefficients)
-        The same for launches from the position after each roll-up.
-    residuals : ndarray of float32, shape (n, 1 + rolls)
-        Residual of each fit [mm].
+    rolled : ndarray of float32, shape (n, 3, coefficients)
+        The same for launches from the rolled-up position.
+    residuals : ndarray of float32, shape (n, 2)
+        Residuals of the two fits [mm].
     not_flown : ndarray of bool, shape (n,), optional
         Ions that cannot arrive in the field of view of the flights: all their numbers are NaN. None if all ions were
         flown.
@@ -216,15 +199,10 @@ class Responses:
     residuals: np.ndarray
     not_flown: np.ndarray | None = None
 
-    def __post_init__(self):
-        # in memory, the ions of each roll-up are together, as `evaluate` reads them: it takes a quarter less time
-        by_roll = np.ascontiguousarray(np.moveaxis(self.rolled, 1, 0))
-        object.__setattr__(self, "rolled", np.moveaxis(by_roll, 0, 1))
-
     def __repr__(self) -> str:
         n, _, coefficients = self.site.shape
-        rolled = f"{self.rolled.shape[3]} rolled up" + ("" if self.rolled.shape[1] == 1 else " once or twice")
-        return f"<Responses: {n:,} ions, {coefficients} coefficients from the site, {rolled}>"
+        rolled = self.rolled.shape[2]
+        return f"<Responses: {n:,} ions, {coefficients} coefficients from the site, {rolled} rolled up>"
 
 
 class ResponseModel:
@@ -257,17 +235,17 @@ class ResponseModel:
         settings, n = self.settings, len(emissions)
         fastest = np.sqrt(2.0 * settings.energy_limit / emissions.charge_states)[:, None]
         groups = []
-        for roll, design in enumerate(settings.designs, -1):  # -1: from the site
+        for rolled, design in zip((False, True), settings.designs, strict=True):
             launches = np.zeros((len(design.launches), len(VARIABLES)))
             launches[:, list(design.columns)] = design.launches
-            if roll < 0:
+            if not rolled:
                 starts = np.broadcast_to(emissions.positions[:, None], (n, len(launches), 3))
             elif settings.is_wide:
                 second, third = launches[:, SECOND], launches[:, THIRD]
                 shares = np.stack([1.0 - second - third, second, third], axis=1)[None]
-                starts = shared_positions(emissions, shares, roll)
+                starts = shared_positions(emissions, shares)
             else:
-                starts = np.broadcast_to(rolled_positions(emissions, roll=roll)[:, None], (n, len(launches), 3))
+                starts = np.broadcast_to(rolled_positions(emissions)[:, None], (n, len(launches), 3))
             if settings.is_wide:
                 starts = starts + (settings.height * launches[:, HEIGHT])[:, None] * emissions.normals[:, None]
             velocities = along_surface(
@@ -304,9 +282,9 @@ class ResponseModel:
             coefficients.append(_in_rows(polynomials, flown))
             # a small change of the stereographic direction is half as large on a plane at unit distance
             residuals.append(_in_rows(2.0 * self.detector.distance * residual, flown))
-        site, *rolled = coefficients
-        all_residuals = np.stack(residuals, axis=1).astype(np.float32)
-        return Responses(site, np.stack(rolled, axis=1), all_residuals, None if flown is None else ~flown)
+        both_residuals = np.stack(residuals, axis=1).astype(np.float32)
+        site, rolled = coefficients
+        return Responses(site, rolled, both_residuals, None if flown is None else ~flown)
 
     def evaluate(
         self,
@@ -358,15 +336,9 @@ class ResponseModel:
                 stacklevel=4,
             )
         values = np.empty((len(velocities), 3))
-        twice = np.zeros(len(velocities), bool) if launches.twice is None else launches.twice
-        if self.settings.rolls == 1 and twice.any():
-            raise ValueError(
-                "the responses of this run serve one roll-up, got ions that roll up twice: run with "
-                "response_settings=ResponseSettings(rolls=2) or ResponseSettings.wide(rolls=2)"
-            )
-        starts = (~launches.rolled, launches.rolled & ~twice, twice)
-        polynomials = (responses.site, *np.moveaxis(responses.rolled, 1, 0))
-        for design, coefficients, mask in zip(self.settings.designs, polynomials, starts, strict=False):
+        starts = (~launches.rolled, launches.rolled)
+        polynomials = (responses.site, responses.rolled)
+        for design, coefficients, mask in zip(self.settings.designs, polynomials, starts, strict=True):
             ions = slice(None) if mask.all() else mask
             values[ions] = design.evaluate(coefficients[ions], variables[ions][:, list(design.columns)])
         return directions_and_times(values)
@@ -376,8 +348,7 @@ class ResponseModel:
         inexact = ~(responses.residuals <= self.settings.bound)
         if responses.not_flown is not None:
             inexact &= ~responses.not_flown[:, None]
-        flagged = inexact[:, 0] | (inexact[:, 1] & emissions.can_roll)
-        return flagged if self.settings.rolls == 1 else flagged | (inexact[:, 2] & emissions.can_roll_twice)
+        return inexact[:, 0] | (inexact[:, 1] & emissions.can_roll)
 
 
 def _in_rows(values, rows):

@@ -53,8 +53,6 @@ class Column(NamedTuple):
     """Unit of the numbers."""
     derived: bool = False
     """Whether it follows from the other columns, so that the fingerprint does not contain it."""
-    roll_names: tuple[str, ...] = ()
-    """Of a column with an axis of roll-ups: the name of each roll-up in the fingerprint, "" if it is not in it."""
 
 
 _EVENTS = {column.name: column for column in events.COLUMNS}
@@ -94,15 +92,13 @@ OPTIONAL = (
 
 
 def target_columns(settings: ResponseSettings) -> list[Column]:
-    """Columns of the targets of the roll-ups."""
-    if not settings.has_targets:
+    """Columns of the targets of the roll-ups; without wide responses, the only target is in `neighbours`."""
+    if not settings.is_wide:
         return []
-    columns = []
-    for name, row, unit in (("targets", (3, 3), "nm"), ("charge_ratios", (3,), None)):
-        # without wide responses, the target of a first roll-up is in `neighbours`
-        names = (f"emissions/{name}" if settings.is_wide else "", f"emissions/second_{name}")
-        columns.append(Column(f"emissions/{name}", np.float64, (settings.rolls, *row), unit, roll_names=names))
-    return columns
+    return [
+        Column("emissions/targets", np.float64, (3, 3), "nm"),
+        Column("emissions/charge_ratios", np.float64, (3,)),
+    ]
 
 
 def flown_columns(number: int) -> tuple[Column, ...]:
@@ -114,11 +110,10 @@ def flown_columns(number: int) -> tuple[Column, ...]:
 def response_columns(settings: ResponseSettings) -> list[Column]:
     """Columns of the responses."""
     site, rolled = (len(design.exponents) for design in (settings.site, settings.rolled))
-    rolls = settings.rolls
     return [
         Column("responses/site", np.float32, (3, site)),
-        Column("responses/rolled", np.float32, (rolls, 3, rolled), roll_names=("responses/rolled", "responses/twice")),
-        Column("responses/residuals", np.float32, (1 + rolls,), "mm"),
+        Column("responses/rolled", np.float32, (3, rolled)),
+        Column("responses/residuals", np.float32, (2,), "mm"),
     ]
 
 
@@ -134,17 +129,6 @@ def columns_of(run: Any, every: Iterable[Column]) -> dict[str, np.ndarray]:
         values = None if holder is None else getattr(holder, name)
         if values is not None:
             arrays[column.path] = values
-    return arrays
-
-
-def hashed_columns_of(run: Any, every: Iterable[Column]) -> dict[str, np.ndarray]:
-    """Arrays of the fingerprint by name; each roll-up is an array of its own."""
-    hashed = [column for column in every if not column.derived]
-    arrays = columns_of(run, hashed)
-    for column in hashed:
-        if column.roll_names and column.path in arrays:
-            by_roll = np.moveaxis(arrays.pop(column.path), 1, 0)
-            arrays |= {name: values for name, values in zip(column.roll_names, by_roll, strict=False) if name}
     return arrays
 
 

@@ -44,7 +44,6 @@ from apt_evap.simulation.columns import (
     Flown,
     columns_of,
     flown_columns,
-    hashed_columns_of,
     parts_of,
     response_columns,
     target_columns,
@@ -279,7 +278,7 @@ class Run:
             and voltages of a control, flown perturbations and responses, but not the real units, which follow from
             them. By design it does not depend on the machine.
         """
-        columns = hashed_columns_of(self, self.every_column)
+        columns = columns_of(self, (column for column in self.every_column if not column.derived))
         hashed = hashlib.sha256()
         for name in sorted(columns):
             values = np.array(columns[name], order="C")

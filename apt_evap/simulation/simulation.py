@@ -341,19 +341,17 @@ class Simulation:
     def _emissions(self, batch, ions):
         species = self.tip.species[batch.site]
         positions = self.tip.positions
-        settings = self.response_settings
-        atoms, charges = batch.targets[:, : settings.rolls], batch.target_charges[:, : settings.rolls]
-        there = atoms >= 0
-        targets = np.where(there[..., None], positions[atoms], np.nan)
+        known = batch.targets >= 0
+        targets = np.where(known[..., None], positions[batch.targets], np.nan)
         columns = {}
-        if settings.has_targets:
+        if self.response_settings.is_wide:
             with np.errstate(divide="ignore", invalid="ignore"):
-                ratios = charges / batch.charges[:, None, None]
-            columns = {"targets": targets, "charge_ratios": np.where(there, ratios, np.nan)}
+                ratios = batch.target_charges / batch.charges[:, None]
+            columns = {"targets": targets, "charge_ratios": np.where(known, ratios, np.nan)}
         return Emissions(
             positions=positions[batch.site],
             normals=batch.normals,
-            neighbours=np.ascontiguousarray(targets[:, 0, 0]),
+            neighbours=np.ascontiguousarray(targets[:, 0]),
             charge_states=self.tip.charge_states[species],
             masses=self.tip.masses[species],
             ions=ions,
@@ -368,7 +366,7 @@ class Simulation:
         if (distances == distances[0]).all():
             return None
         own = self.tip.phase_at(batch.site)
-        target = batch.targets[:, 0, 0]
+        target = batch.targets[:, 0]
         other = np.where(target >= 0, self.tip.phase_at(target), own)
         return 0.5 * (distances[own] + distances[other])
 

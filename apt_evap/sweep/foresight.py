@@ -15,8 +15,8 @@ _BYTES_PER_ION = 500  # measured: peak memory with 12,000 and 2,000 ions (R = 20
 # of speeds in docs/accuracy_and_speed.rst within 7 %, from R = 20 to 120 a, times 2 for a slower or busy processor.
 _REFERENCE = 21_591  # surface atoms
 _WITH_RESPONSES = 2 * 1.34, 2 * 0.51
-# Of other responses than the usual 30 launches and 25 coefficients: processor times per ion of 43, 119, 187 and 326
-# launches were 1.22, 2.10, 2.86 and 4.59 times as long (R = 20 a); coefficients are three float32.
+# Of other responses than the usual 30 launches and 25 coefficients: processor times per ion of 119 and 187 launches
+# were 2.10 and 2.86 times as long (R = 20 a); coefficients are three float32.
 _LAUNCHES, _PER_LAUNCH = 30, 1 / 82
 _COEFFICIENTS, _BYTES_PER_COEFFICIENT = 25, 12
 _ONE_FLIGHT = 2 * 0.32, 2 * 0.10

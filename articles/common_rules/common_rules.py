@@ -3,8 +3,8 @@
     python articles/common_rules/common_rules.py Ni 80 "0.302 0.540 0.786" MAP.npz --pole -9.6 -0.3 --scale 25.8
 
 The tip has a radius of 80 a and the given axis. The pole of the measured map is at a position [mm], with a scale
-[mm/rad]. Every rule is flown for the same ions; for a fraction that rolls up, once or twice, every ion takes one of
-several hits by random numbers. The azimuth between the patterns is the one with the largest correlation for ``--like``:
+[mm/rad]. Every rule is flown for the same ions; for a fraction that rolls up, every ion takes one of
+two hits by random numbers. The azimuth between the patterns is the one with the largest correlation for ``--like``:
 "all, strongest neighbour" for nickel, "none rolls" for aluminium.
 """
 
@@ -22,18 +22,15 @@ BINS, HALF = 800, 150.0
 MOST_TILTED = 28.0  # degrees: the rings of a pole are inside the map
 
 
-def launches(scale, sharpness, twice):
+def launches(scale, sharpness):
     """Perturbations by name; `scale` is the simulated energy per real energy."""
     energy = ae.TruncatedNormal(ENERGY * scale, ENERGY * scale)
-    found = {
+    return {
         "unperturbed": ae.Unperturbed(),
         "all, strongest neighbour": ae.RollUp(energy),
         "none rolls": ae.LateralVelocity(energy, HEIGHT),
         "all roll": ae.RollUp(energy, 1.0, sharpness, HEIGHT),
     }
-    if twice:
-        found["all roll twice"] = ae.RollUp(energy, 1.0, sharpness, HEIGHT, second_roll=1.0)
-    return found
 
 
 def counts(x, y):
@@ -71,7 +68,6 @@ def main():
     parser.add_argument("--ions", type=int, default=102_400)
     parser.add_argument("--constant-potential", action="store_true", help="charges; default: Robin's")
     parser.add_argument("--sharpness", type=float, default=0.15, help="of the target of a roll-up")
-    parser.add_argument("--second-roll", type=float, default=0.0, help="part of the ions that roll which roll twice")
     parser.add_argument("--like", default="all, strongest neighbour", help="rule that gives the azimuth")
     options = parser.parse_args()
     measured, place = ae.read_map(options.measured), ae.detection.Projection(options.scale, centre=tuple(options.pole))
@@ -85,10 +81,9 @@ def main():
     axis = tuple(float(index) for index in options.axis.split())
     tip = ae.Tip(material, size, axis=axis, shank_length=2 * size, depth=8 * material.a)
     rule = ae.ConstantPotential(law_field="charge") if options.constant_potential else ae.Robin()
-    rolls = 2 if options.second_roll > 0 else 1
-    simulation = ae.Simulation(tip, seed=1, rule=rule, response_settings=ae.ResponseSettings.wide(rolls=rolls))
+    simulation = ae.Simulation(tip, seed=1, rule=rule, response_settings=ae.ResponseSettings.wide())
     pilot = simulation.run(256, responses=False, progress=False).at_evaporation_field()
-    emissions = launches(float(np.median(pilot.energy_scales)), options.sharpness, rolls == 2)
+    emissions = launches(float(np.median(pilot.energy_scales)), options.sharpness)
     for _ in simulation.emitter.advance(options.skip):
         pass
     run = simulation.run(options.ions, list(emissions.values()), responses=False)
@@ -107,15 +102,10 @@ def main():
         return rings, ae.maps.pole_profile(found, projection, pole).density
 
     places = {name: (each.x, each.y) for name, each in hits.items()}
-    u, v = np.random.default_rng(3).random((2, len(run)))
+    u = np.random.default_rng(3).random(len(run))
     for fraction in FRACTIONS:
-        chosen = np.where(u >= fraction, 0, np.where(v >= options.second_roll, 1, 2))
         places[f"rules, fraction {fraction:g}"] = tuple(
-            np.choose(
-                chosen,
-                [getattr(hits[each], name) for each in ("none rolls", "all roll", "all roll twice")[: 1 + rolls]],
-            )
-            for name in "xy"
+            np.where(u < fraction, getattr(hits["all roll"], name), getattr(hits["none rolls"], name)) for name in "xy"
         )
     mirror, shift = turn(structure(*places[options.like])[0], target)
     wanted = ae.maps.pole_profile(measured, place).density

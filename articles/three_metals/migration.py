@@ -45,7 +45,7 @@ def after_roll(emitter, event, own, potential):
         See `self_term`.
     """
     tip, normal = emitter.tip, event.normals[0]
-    target = tip.positions[event.targets[0, 0, 0]] + tip.nearest_neighbour_distance * normal
+    target = tip.positions[event.targets[0, 0]] + tip.nearest_neighbour_distance * normal
     positions = emitter.positions
     near = positions[np.linalg.norm(positions - tip.positions[event.site[0]], axis=1) < PATCH]
     distances = np.linalg.norm(near[:, None] - near[None], axis=2)
@@ -74,12 +74,12 @@ def rolled(metal, radius, events, skip, seed=1):
         pass
     found = []
     for event in emitter.advance(20 * events, batch_size=1):
-        if len(event) == 0 or event.targets[0, 0, 0] < 0:
+        if len(event) == 0 or event.targets[0, 0] < 0:
             continue
         if tip.positions[event.site[0], 2] < emitter.positions[:, 2].max() - 0.25 * size:
             continue  # within about 40 degrees of the apex
         charge, field = after_roll(emitter, event, own, potential)
-        ratio = event.target_charges[0, 0, 0] / event.charges[0]
+        ratio = event.target_charges[0, 0] / event.charges[0]
         found.append((ratio, charge / event.charges[0], field / event.fields[0]))
         if len(found) == events:
             break

@@ -81,8 +81,7 @@ class Bridge:
     def tangential(self, emissions, random):
         """See `Combined.tangential`."""
         launches = self.rule.tangential(emissions, random)
-        shares = np.zeros((len(emissions), 1, 3))
-        shares[..., 0] = 1.0
+        shares = np.tile([1.0, 0.0, 0.0], (len(emissions), 1))
         shares[second_over_first(emissions) > self.least] = [0.5, 0.5, 0.0]
         return launches._replace(shares=shares)
 
@@ -100,11 +99,11 @@ class NotBetweenTwo:
 
 def second_over_first(emissions):
     """Charge of the second target over that of the first; 0 without a second one."""
-    ratios = emissions.charge_ratios[:, 0]
+    ratios = emissions.charge_ratios
     return np.nan_to_num(ratios[:, 1] / ratios[:, 0])
 
 
-def rivals(name, scale, rolls):
+def rivals(name, scale):
     """The law of migration, and rules of other kinds."""
     law = ae.emission.Migration.of(name)
     energy = ae.TruncatedNormal(0.2 * scale, 0.2 * scale)
@@ -130,10 +129,6 @@ def rivals(name, scale, rolls):
         lateral = ae.LateralVelocity(energy, 2 * HEIGHT)
         found[f"{part:g} at random, whatever the law"] = ae.emission.Mixture((one, lateral), (1 - part, part))
         found[f"{part:g} onto the strongest"] = ae.emission.Mixture((one, sharp), (1 - part, part))
-    if rolls == 2:
-        for part in (0.3, 0.6, 1.0):
-            twice = ae.RollUp(energy, law, 2.0, 2 * HEIGHT, others=energy, second_roll=part)
-            found[f"second step {part:g}"] = twice
     return found
 
 
@@ -181,12 +176,11 @@ def main():
     target = folded(*measured_of(options.metal, options.measured), metal)
     row("measured", target, target, metal)
     run = ae.load(options.run)
-    ratios = run.emissions.charge_ratios[:, 0, 0]
+    ratios = run.emissions.charge_ratios[:, 0]
     projection, orientation = projection_of(run), ae.Orientation.from_settings(run.settings["tip"])
     scale = float(np.median(run.at_evaporation_field().energy_scales))
     metal_name = options.metal.partition("-")[0]
-    rolls = run.emissions.targets.shape[1]
-    for name, rule in (rivals(metal_name, scale, rolls) if options.rivals else rules(metal_name, scale)).items():
+    for name, rule in (rivals(metal_name, scale) if options.rivals else rules(metal_name, scale)).items():
         threshold = getattr(getattr(rule, "probability", None), "threshold", None)  # of a charge ratio, or a law
         part = "" if threshold is None else f" ({np.mean(ratios > threshold):.2f} roll)"
         row(name + part, folded(map_of(run, rule), orientation, projection, metal), target, metal)

@@ -7,9 +7,8 @@ evaporate, only ions that can arrive in the measured field of view fly. Every em
 the exact field. Energies are 0.35 eV in real units, sigma/mean 1, launches 0.1 nm above the site unless the name says
 otherwise. With --fly wide, each ion gets its responses instead (`_wide.h5`), for any emission afterwards (`rules.py`);
 with --fly law, only the one rule for all metals is flown (`_law.h5`). The responses can also cover roll-ups onto second
-neighbours (--shells 2, `_wide_shells.h5`) and second roll-ups (--rolls 2, `_wide_rolls.h5`). With --leave bonds, the
-field at which an atom leaves depends on its bonds to first and second neighbours; with --leave hop, an atom leaves as
-soon as it can hop.
+neighbours (--shells 2, `_wide_shells.h5`). With --leave bonds, the field at which an atom leaves depends on its bonds
+to first and second neighbours; with --leave hop, an atom leaves as soon as it can hop.
 """
 
 import argparse
@@ -59,10 +58,10 @@ def emissions(scale):
     ]
 
 
-def prepared(tip, rule, half_angle, skip, seed=1, threads=None, law=None, **targets):
+def prepared(tip, rule, half_angle, skip, seed=1, threads=None, law=None, shells=1):
     """Simulation of a tip after some events without flights, and the simulated energy per real energy."""
     common = {"seed": seed, "rule": rule, "n_threads": threads, "law": law}
-    common["response_settings"] = ae.ResponseSettings.wide(**targets)  # records the neighbours for the sharpness
+    common["response_settings"] = ae.ResponseSettings.wide(shells=shells)  # records the neighbours for the sharpness
     pilot = ae.Simulation(tip, **common).run(256, responses=False, progress=False)
     scale = float(np.median(pilot.at_evaporation_field().energy_scales))
     simulation = ae.Simulation(tip, flight_settings=ae.FlightSettings(field_of_view=half_angle), **common)
@@ -71,7 +70,7 @@ def prepared(tip, rule, half_angle, skip, seed=1, threads=None, law=None, **targ
     return simulation, scale
 
 
-def simulated(metal, radius, rule, seed, skip, ions, threads, kind, leave, **targets):
+def simulated(metal, radius, rule, seed, skip, ions, threads, kind, leave, shells):
     """Run of one specimen; the second one has other atoms at the apex."""
     axis, half_angle = AXES[metal]
     material = ae.material(metal.partition("-")[0])
@@ -79,7 +78,7 @@ def simulated(metal, radius, rule, seed, skip, ions, threads, kind, leave, **tar
     shank = size if radius >= 160 else 2 * size
     tip = ae.Tip(material, size, axis=axis, shank_length=shank, depth=8 * material.a, offset_seed=seed)
     law = LAWS[leave](material)
-    simulation, scale = prepared(tip, RULES[rule], half_angle, skip, seed, threads, law, **targets)
+    simulation, scale = prepared(tip, RULES[rule], half_angle, skip, seed, threads, law, shells)
     if kind == "wide":
         return simulation.run(ions, progress=False)
     rolls = ae.RollUp.of_metal(material, energy_scale=scale)
@@ -101,18 +100,16 @@ def main():
     kinds = ("emissions", "wide", "law")
     parser.add_argument("--fly", choices=kinds, default=kinds[0], help="eight emissions, responses, or the one law")
     parser.add_argument("--shells", type=int, default=1, help="shells of neighbours onto which atoms can roll, 1 or 2")
-    parser.add_argument("--rolls", type=int, default=1, help="roll-ups of an ion that the responses cover, 1 or 2")
     parser.add_argument("--leave", choices=LAWS, default="field", help="what decides which atom leaves next")
     options = parser.parse_args()
-    targets = {name: getattr(options, name) for name in ("shells", "rolls")}
     kind = "" if options.fly == kinds[0] else f"_{options.fly}"
-    kind += "".join(f"_{name}" for name, count in targets.items() if count > 1)
+    kind += "_shells" if options.shells > 1 else ""
     kind += "" if options.leave == "field" else f"_{options.leave}"
     path = options.runs / f"{options.metal}_{options.radius}_{options.rule}_{options.seed}{kind}.h5"
     options.runs.mkdir(parents=True, exist_ok=True)
     if not path.exists():
         arguments = options.metal, options.radius, options.rule, options.seed, options.skip, options.ions
-        simulated(*arguments, options.threads, options.fly, options.leave, **targets).save(path)
+        simulated(*arguments, options.threads, options.fly, options.leave, options.shells).save(path)
 
 
 if __name__ == "__main__":

@@ -41,7 +41,6 @@ def test_text_and_python_are_read_back(perturbation, text, python):
     ("perturbation", "title"),
     [
         (ae.RollUp(NORMAL), "roll-up, 0.155 ± 0.1 eV"),
-        (ae.RollUp(0.2, second_roll=0.3), "roll-up, 0.2 eV, second roll-up 0.3"),
         (ae.RollUp(NORMAL, 0.5, 0.1, 0.05), "roll-up, 0.155 ± 0.1 eV, probability 0.5, sharpness 0.1, height 0.05 nm"),
         (ae.RollUp(0.2, 0.5, others=ae.emission.Thermal(50)), "roll-up, 0.2 eV, probability 0.5, others 50 K"),
         (

@@ -56,7 +56,7 @@ EVERY_KEY = {
         "start_tolerance": 1e-6,
     },
     "flights": {"opening_angle": 0.4, "tolerance": 1e-2, "reach": 5000.0, "max_steps": 400},
-    "responses": {"energy_limit": 1.0, "bound": 0.1, "wide": False, "shells": 2, "rolls": 2},
+    "responses": {"energy_limit": 1.0, "bound": 0.1, "wide": False, "shells": 2},
     "maps": {
         "bins": 40,
         "smoothing": 2,
@@ -144,7 +144,7 @@ def test_a_file_builds_the_same_simulation_as_python(tmp_path):
     assert simulation.settings == same.settings
     assert (simulation.tip.positions == tip.positions).all() and (simulation.tip.species == tip.species).all()
     assert (config.response_settings.energy_limit, config.response_settings.bound) == (1.0, 0.1)
-    assert config.response_settings.shells == config.response_settings.rolls == 2
+    assert config.response_settings.shells == 2
     # without responses the maps are of perturbations flown in the run
     assert config.emissions == (Unperturbed(), RollUp(Fixed(0.2)))
     assert [panel.title for panel in config.maps.panels] == ["none", "roll-up, 0.2 eV"]

@@ -415,25 +415,19 @@ def test_defaults_are_filled_in_where_one_perturbation_has_its_own():
     batch = emissions(300, lonely=0.0)
     mixture = Mixture(THREE)
     launches = mixture.tangential(batch, IonRandom(5, batch.ions))
-    assert launches.shares is None and launches.twice is None
+    assert launches.shares is None
     assert set(np.unique(launches.heights)) == {0.0, 0.05}
-    shares = np.tile([[[0.2, 0.5, 0.3]]], (300, 1, 1))
 
     class Shared(Pushed):
         def tangential(self, emissions, random):
             rolled, first, second = super().tangential(emissions, random)
-            return TangentialLaunches(~rolled, first, second, shares, None, None)
+            return TangentialLaunches(~rolled, first, second, np.tile([0.2, 0.5, 0.3], (len(emissions), 1)))
 
-    class Twice(Pushed):
-        def tangential(self, emissions, random):
-            rolled, first, second = super().tangential(emissions, random)
-            return TangentialLaunches(~rolled, first, second, None, None, ~rolled)
-
-    both = Mixture((Shared(), Twice())).tangential(batch, IonRandom(5, batch.ions))
-    assert both.shares.shape == (300, 2, 3)
-    np.testing.assert_array_equal(both.shares[both.twice], np.tile([1.0, 0.0, 0.0], (both.twice.sum(), 2, 1)))
-    np.testing.assert_array_equal(both.shares[~both.twice, 0], shares[~both.twice, 0])
-    assert 100 < both.twice.sum() < 200
+    both = Mixture((Shared(), Unperturbed())).tangential(batch, IonRandom(5, batch.ions))
+    assert both.shares.shape == (300, 3) and both.heights is None
+    np.testing.assert_array_equal(both.shares[both.rolled], np.tile([0.2, 0.5, 0.3], (both.rolled.sum(), 1)))
+    np.testing.assert_array_equal(both.shares[~both.rolled], np.tile([1.0, 0.0, 0.0], ((~both.rolled).sum(), 1)))
+    assert 100 < both.rolled.sum() < 200
 
 
 def test_hits_of_responses_are_those_of_flights():

@@ -20,8 +20,8 @@ SCRIPT = Path(__file__).parents[2] / "articles" / "three_metals" / "migration.py
 def emissions_with(ratios):
     """Emissions whose strongest neighbours have these charges."""
     n = len(ratios)
-    of_targets = np.full((n, 1, 3), np.nan)
-    of_targets[:, 0, 0] = ratios
+    of_targets = np.full((n, 3), np.nan)
+    of_targets[:, 0] = ratios
     return Emissions(
         positions=np.zeros((n, 3)),
         normals=np.tile([0.0, 0.0, 1.0], (n, 1)),
@@ -30,7 +30,7 @@ def emissions_with(ratios):
         masses=np.ones(n),
         ions=np.arange(n),
         nearest_neighbour_distance=0.25,
-        targets=np.zeros((n, 1, 3, 3)),
+        targets=np.zeros((n, 3, 3)),
         charge_ratios=of_targets,
     )
 

@@ -456,22 +456,17 @@ def test_controls_and_perturbations_are_the_same(mechanism):
 
 
 def test_controls_are_those_that_the_run_serves(run):
-    options = {"second_roll", "sharpness", "height"}
-    for settings, served in (
-        (ae.ResponseSettings(), set()),
-        (ae.ResponseSettings(rolls=2), {"second_roll"}),
-        (ae.ResponseSettings.wide(), {"sharpness", "height"}),
-        (ae.ResponseSettings.wide(rolls=2), options),
-    ):
+    options = {"sharpness", "height"}
+    for settings, served in ((ae.ResponseSettings(), set()), (ae.ResponseSettings.wide(), options)):
         names = {each.name for each in Explorer(replace(run, response_settings=settings)).controls("roll-up")}
         assert names & options == served
 
 
 def test_maps_follow_every_option(small_tip):
-    settings = ae.ResponseSettings.wide(rolls=2)
+    settings = ae.ResponseSettings.wide()
     run = ae.Simulation(small_tip, seed=2, response_settings=settings).run(60, progress=False)
     explorer = Explorer(run)
-    for options in ({}, {"sharpness": 0.15}, {"sharpness": 0.15, "second_roll": 0.5}, {"second_roll": 0.5}, {}):
+    for options in ({}, {"sharpness": 0.15}, {"sharpness": 0.15, "probability": 0.5}, {"probability": 0.5}, {}):
         perturbation = ae.RollUp(ENERGY, **options)
         expected = run[:].hits(perturbation)  # a new run, which knows nothing of the previous ones
         assert np.array_equal(explorer.hits(View(perturbation, 24, 0.0)).x, expected.x, equal_nan=True)

@@ -203,28 +203,6 @@ def test_a_hidden_fraction_is_found(run, other):
     assert "concordance" in repr(folded) and folded.lines()[1].startswith("concordance")
 
 
-@pytest.mark.slow
-def test_hidden_second_rolls_are_found(nickel):
-    """0.8 of the ions roll, and 0.7 of these twice: both numbers are found on another specimen."""
-    runs = []
-    for number in (1, 2):
-        tip = ae.Tip(nickel, apex_radius=20 * nickel.a, axis=(1, 1, 1), shank_length=20 * nickel.a, offset_seed=number)
-        settings = ae.ResponseSettings(rolls=2)
-        runs.append(ae.Simulation(tip, seed=number, response_settings=settings).run(15_000, progress=False))
-    energy = ae.TruncatedNormal(0.155, 0.155)
-    study = fit_energies(
-        runs[0], seen(runs[1], ae.RollUp(energy, 0.8, others=energy, second_roll=0.7)),
-        lambda energy, **options: ae.RollUp(energy, others=energy, **options),
-        means=(0.155,), relative_spreads=(1.0,), registration=HERE, replicas=4, resamples=20, progress=False,
-        options={"probability": (0.0, 0.2, 0.4, 0.6, 0.8, 1.0), "second_roll": (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)},
-    )  # fmt: skip
-    for name, value in (("probability", 0.8), ("second_roll", 0.7)):
-        # half a step of the grid; measured 0.75 and 0.65
-        assert study.refined.options[name] == pytest.approx(value, abs=0.1)
-        low, high = study.refined.intervals[name]
-        assert low <= value <= high
-
-
 # ---- intervals -----------------------------------------------------------------------------------------------------
 
 

@@ -28,10 +28,6 @@ WIDE = (
 KINDS = {
     "linear": (ae.ResponseSettings(), EMISSIONS),
     "wide": (ae.ResponseSettings.wide(), EMISSIONS + WIDE),
-    "two roll-ups": (
-        ae.ResponseSettings.wide(rolls=2),
-        (*EMISSIONS, *WIDE, ae.RollUp(1.5, second_roll=1.0), ae.RollUp(1.5, sharpness=0.5, second_roll=1.0)),
-    ),
 }
 
 

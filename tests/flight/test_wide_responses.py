@@ -46,11 +46,11 @@ def test_the_limits_of_the_options_are_the_usual_launches(run):
     usual = ae.RollUp(ENERGY).tangential(run.emissions, ae.emission.IonRandom(1, run.emissions.ions))
     soft = ae.RollUp(ENERGY, sharpness=1e-6).tangential(run.emissions, ae.emission.IonRandom(1, run.emissions.ions))
     # equal charges are the only neighbours with a share
-    ratios = run.emissions.charge_ratios[:, 0]
+    ratios = run.emissions.charge_ratios
     unequal = ~(ratios[:, 1] > ratios[:, 0] * (1 - 1e-4))
     assert unequal.sum() > 100
     np.testing.assert_allclose(soft.first[unequal], usual.first[unequal], rtol=1e-9, atol=1e-12)
-    assert (soft.shares[unequal, 0, 0] > 1 - 1e-9).all()
+    assert (soft.shares[unequal, 0] > 1 - 1e-9).all()
     never = ae.RollUp(ENERGY, probability=0.0).tangential(run.emissions, ae.emission.IonRandom(1, run.emissions.ions))
     assert not never.rolled.any() and not np.hypot(never.first, never.second).any()
     others = ae.RollUp(0.7, probability=0.0, others=ENERGY)
@@ -60,25 +60,25 @@ def test_the_limits_of_the_options_are_the_usual_launches(run):
 
 def test_shares_and_targets(run):
     emissions = run.emissions
-    assert emissions.targets.shape == (120, 1, 3, 3) and emissions.charge_ratios.shape == (120, 1, 3)
-    np.testing.assert_array_equal(emissions.targets[:, 0, 0], emissions.neighbours)
-    ratios = emissions.charge_ratios[:, 0]
+    assert emissions.targets.shape == (120, 3, 3) and emissions.charge_ratios.shape == (120, 3)
+    np.testing.assert_array_equal(emissions.targets[:, 0], emissions.neighbours)
+    ratios = emissions.charge_ratios
     known = np.isfinite(ratios).all(axis=1)
     assert known.sum() > 90 and (np.diff(ratios[known], axis=1) <= 0).all()
-    shares = ae.emission.target_shares(emissions, 0.2)[:, 0]
+    shares = ae.emission.target_shares(emissions, 0.2)
     np.testing.assert_allclose(shares.sum(axis=1), 1.0, rtol=1e-14)
     np.testing.assert_allclose(
         shares[known, 1] / shares[known, 0], np.exp((ratios[known, 1] / ratios[known, 0] - 1) / 0.2), rtol=1e-12
     )
     middle = shared_positions(emissions, np.full((1, 1, 3), 1 / 3))[:, 0]
-    expected = emissions.targets[:, 0].mean(axis=1) + emissions.nearest_neighbour_distance * emissions.normals
+    expected = emissions.targets.mean(axis=1) + emissions.nearest_neighbour_distance * emissions.normals
     np.testing.assert_allclose(middle[known], expected[known], rtol=1e-12)
 
 
 def test_the_probability_is_that_of_the_ions(run):
     random = ae.emission.IonRandom(3, run.emissions.ions)
     p = ae.emission.ChargeRatio(0.85, 0.1).probabilities(run.emissions)
-    ratios = np.nan_to_num(run.emissions.charge_ratios[:, 0, 0])
+    ratios = np.nan_to_num(run.emissions.charge_ratios[:, 0])
     np.testing.assert_allclose(p, 1 / (1 + np.exp(-(ratios - 0.85) / 0.1)), rtol=1e-12)
     rolled = ae.RollUp(0.1, ae.emission.ChargeRatio(0.85, 0.1)).tangential(run.emissions, random).rolled
     u = ae.emission.IonRandom(3, run.emissions.ions).uniform(3)[:, 2]
@@ -98,7 +98,7 @@ def test_a_run_comes_back_from_its_file(run, tmp_path):
         again = loaded.hits(perturbation, by_response=True)
         np.testing.assert_array_equal(again.x, run.hits(perturbation, by_response=True).x)
     half = ae.Run.join([replace(loaded), replace(run)])
-    assert half.emissions.targets.shape == (240, 1, 3, 3)
+    assert half.emissions.targets.shape == (240, 3, 3)
 
 
 def test_runs_without_wide_responses_say_so(tip12):
