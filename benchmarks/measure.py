@@ -338,7 +338,7 @@ def place_errors(radius=40, shank=1.0, events=5000, ions=200, n_threads=2):
 def response_errors(radii=(20, 80), shank=2.0, events=5000, ions=200, n_threads=2):
     """Hit positions from responses against flights, for energies up to 1.5 eV that are not in the design."""
     rows = []
-    energies = [ae.emission.Fixed(energy) for energy in (0.05, 0.2, 0.5, 0.8, 1.1, 1.5)]
+    energies = [0.05, 0.2, 0.5, 0.8, 1.1, 1.5]
     for radius in radii:
         simulation = ae.Simulation(nickel_tip(radius, shank), seed=1, n_threads=n_threads)
         evaporate(simulation.emitter, events)

@@ -186,9 +186,7 @@ def checked(
 @dataclass_transform(frozen_default=True, field_specifiers=(number, count, switch, choice, vector, part, checked))
 def settings(cls: T) -> T:
     """Make a class of settings: a frozen dataclass that checks its fields, with its parameters in the docstring."""
-    own = "__init__" in vars(cls)
-    if not own:
-        cls.__post_init__ = _check_all  # type: ignore[attr-defined]
+    cls.__post_init__ = _check_all  # type: ignore[attr-defined]
     dataclass(frozen=True, repr=cls.__repr__ is object.__repr__)(cls)
     cls.__doc__ = _documented(cls)
     cls._settings_class = cls  # type: ignore[attr-defined]
@@ -261,7 +259,7 @@ def to_plain(thing: Any, *, short: bool = False) -> Any:
     """
 
     def plain(each):
-        return to_plain(getattr(each, "as_argument", each) if short else each, short=short)
+        return to_plain(each, short=short)
 
     if thing is None or isinstance(thing, bool | int | float | str):
         return thing
@@ -350,8 +348,7 @@ def from_plain(plain: Any, *kinds: type, what: str = "settings") -> Any:
     for key, setting in declared(kind).items():
         if key in values and setting.read is not None and values[key] is not None:
             values[key] = setting.read(values[key], key)
-    make: Any = getattr(kind, "_from_fields", kind)  # of a class whose constructor differs from its fields
-    return make(**values)
+    return kind(**values)
 
 
 def changed(thing: U, values: Mapping[str, Any]) -> U:
@@ -370,8 +367,7 @@ def changed(thing: U, values: Mapping[str, Any]) -> U:
 def to_python(thing: Any, package: str = "ae.") -> str:
     """Python expression of settings, with this prefix of classes (str); fields with their default are left out.
 
-    After a prefix, a class that is not in the front row of names is written with its room: ``ae.emission.Thermal``. A
-    value with an attribute ``as_argument`` is written as this, such as a number for `Fixed`.
+    After a prefix, a class that is not a top-level name is written with its package: ``ae.emission.Thermal``.
     """
     return _python(thing, package)
 
@@ -390,7 +386,7 @@ def _python(thing, package=""):
         same = _same(content, default)
         by_name = by_name or bool(item.kw_only) or same
         if not same:
-            text = _python(getattr(content, "as_argument", content), package)
+            text = _python(content, package)
             parts.append(f"{item.name}={text}" if by_name else text)
     return f"{_name(type(thing), package)}({', '.join(parts)})"
 

@@ -1,7 +1,5 @@
 """Memory that a specimen needs."""
 
-from apt_evap._common.wording import argument
-
 # Measured: the peak memory to build and charge a specimen and fly 300 ions agrees within 15 % with the first two
 # numbers, for 18 specimens (five lattices, 0.4 to 28 million atoms, complete or a shell). The third number is 150 to
 # 215 for 1 to 8 threads.
@@ -53,7 +51,7 @@ def check_copies(surface_atoms: float, n_threads: int) -> None:
     """Check that the copies of the surface, one per thread, fit into the free memory (ValueError)."""
     _check(
         copied_memory(surface_atoms, n_threads),
-        f"{argument('n_threads', n_threads)}, each with a copy of {surface_atoms:.2g} surface atoms,",
+        f"{n_threads} threads, each with a copy of {surface_atoms:.2g} surface atoms,",
         "use fewer threads",
     )
 

@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
 
-from apt_evap._common.wording import options_of_a_shell
 from apt_evap.cli._output import (
     INTERRUPTED,
     TERMINATED,
@@ -18,16 +17,6 @@ from apt_evap.cli._output import (
     open_missing_streams,
     say,
 )
-
-_OPTIONS = {
-    "partial": "--partial",
-    "resume": "--resume",
-    "overwrite": "--force",
-    "byte_order": "--byte-order",
-    "format": "--format",
-    "n_threads": "--threads",
-    "n_ions": "--ions",
-}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -44,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit code, see `apt_evap.cli.parser.EXIT_CODES`.
     """
     open_missing_streams()
-    with warnings.catch_warnings(), options_of_a_shell(_OPTIONS), _terminated_like_interrupted() as terminated:
+    with warnings.catch_warnings(), _terminated_like_interrupted() as terminated:
         warnings.showwarning = lambda message, *_, **__: say("warning", message)
         try:
             code = _execute(arguments)

@@ -7,7 +7,7 @@ from typing import Any
 from apt_evap._common.codec import declared, is_settings, to_plain, to_python
 from apt_evap._common.validation import short_text
 from apt_evap.config.toml_text import inline
-from apt_evap.emission.energies import Fixed, Thermal, TruncatedNormal
+from apt_evap.emission.energies import Thermal, TruncatedNormal
 from apt_evap.emission.perturbations import Perturbation, perturbation_of
 
 
@@ -116,7 +116,8 @@ def title_of(perturbation: Any) -> str:
     for option in to_plain(perturbation, short=True):  # those that are not the default
         if option in fields and option not in ("energy", "rollup_fraction"):
             value, unit = getattr(perturbation, option), fields[option].unit
-            text = f"{value:g}" if isinstance(value, float) else _energy_text(value) or _short(value)
+            number = isinstance(value, float) and option != "others"
+            text = f"{value:g}" if number else _energy_text(value) or _short(value)
             parts.append(" ".join(filter(None, (option.replace("_", " "), text, unit))))
     return ", ".join(filter(None, parts))
 
@@ -126,9 +127,9 @@ def _short(value):
 
 
 def _energy_text(energy):
-    """Text of a built-in energy distribution, empty for any other."""
-    if isinstance(energy, Fixed):
-        return f"{energy.energy:g} eV"
+    """Text of an energy or of a built-in distribution, empty for any other."""
+    if isinstance(energy, float):
+        return f"{energy:g} eV"
     if isinstance(energy, Thermal):
         return f"{energy.temperature:g} K"
     if isinstance(energy, TruncatedNormal):

@@ -3,7 +3,6 @@ from .emissions import Emissions as Emissions
 from .emissions import Launches as Launches
 from .emissions import TangentialLaunches as TangentialLaunches
 from .energies import Distribution as Distribution
-from .energies import Fixed as Fixed
 from .energies import Thermal as Thermal
 from .ion_random import IonRandom as IonRandom
 from .perturbations import Mixture as Mixture

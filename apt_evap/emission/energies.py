@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from apt_evap._common.codec import number, settings
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_array, short_text
+from apt_evap._common.validation import check_array, check_number, short_text
 from apt_evap._core.elementary import logarithm, normal_quantile
 from apt_evap.units import BOLTZMANN
 
@@ -25,7 +25,7 @@ _PI = Decimal("3.141592653589793238462643383279502884197169399375105820974944592
 
 
 class Distribution(Protocol):
-    """Interface of an energy distribution, such as `TruncatedNormal`, `Fixed` and `Thermal`."""
+    """Interface of an energy distribution, such as `TruncatedNormal` and `Thermal`."""
 
     def quantile(self, u: Floats) -> Floats:
         """Energy [eV] below which the fraction `u` (in (0, 1), any shape) of the distribution lies."""
@@ -100,22 +100,6 @@ class TruncatedNormal:
 
 
 @settings
-class Fixed:
-    """The same energy for every ion."""
-
-    energy: float = number("Energy.", at_least=0, at_most=HIGHEST_ENERGY, unit="eV")
-
-    @property
-    def as_argument(self) -> float:
-        """The energy: a perturbation takes the number alone."""
-        return self.energy
-
-    def quantile(self, u: ArrayLike) -> Floats:
-        """Return the energy [eV] in the shape of `u`."""
-        return np.full(np.shape(u), self.energy)
-
-
-@settings
 class Thermal:
     """Energy of the thermal motion along the surface: exponential, with the mean k T.
 
@@ -132,22 +116,24 @@ class Thermal:
         return -BOLTZMANN * self.temperature * logarithm(1.0 - np.asarray(u, dtype=np.float64))
 
 
-DISTRIBUTIONS = (TruncatedNormal, Fixed, Thermal)
+DISTRIBUTIONS = (TruncatedNormal, Thermal)
 """The built-in distributions."""
 
 
-def as_distribution(energy: Any, name: str = "energy") -> Distribution:
-    """Return a distribution unchanged, a number [eV] as `Fixed`; ValueError otherwise."""
+def check_energy(energy: Any, name: str) -> Distribution | float:
+    """Return a distribution, or one number for all ions [eV]; ValueError otherwise."""
     if isinstance(energy, Real) and not isinstance(energy, bool):
-        return Fixed(energy)  # type: ignore[arg-type]  # any real number; checked by Fixed
+        return check_number(energy, name, at_least=0, at_most=HIGHEST_ENERGY, unit="eV")
     if not callable(getattr(energy, "quantile", None)):
         raise ValueError(f"{name} must be a number [eV] or have a method quantile(u), got {short_text(energy)}")
     return energy
 
 
-def draw_energies(distribution: Distribution, u: Floats) -> Floats:
-    """Energies of a distribution [eV] at the uniform numbers `u`, shape (n,); ValueError if negative or not finite."""
-    energies = check_array(distribution.quantile(u), f"quantiles of {distribution!r}", (len(u),))
+def draw_energies(energy: Distribution | float, u: Floats) -> Floats:
+    """Energies [eV] at the uniform numbers `u`, shape (n,); ValueError if negative or not finite."""
+    if isinstance(energy, float):
+        return np.full(len(u), energy)
+    energies = check_array(energy.quantile(u), f"quantiles of {energy!r}", (len(u),))
     if energies.size and energies.min() < 0:
-        raise ValueError(f"quantiles of {distribution!r} must be >= 0 [eV], got {energies.min()}")
+        raise ValueError(f"quantiles of {energy!r} must be >= 0 [eV], got {energies.min()}")
     return energies

@@ -21,10 +21,9 @@ from apt_evap.emission.emissions import Emissions, Launches, TangentialLaunches,
 from apt_evap.emission.energies import (
     DISTRIBUTIONS,
     Distribution,
-    Fixed,
     Thermal,
     TruncatedNormal,
-    as_distribution,
+    check_energy,
     draw_energies,
 )
 from apt_evap.emission.ion_random import IonRandom
@@ -42,7 +41,6 @@ from apt_evap.units import speed_from_energy
 __all__ = [
     "Combined",
     "Emissions",
-    "Fixed",
     "IonRandom",
     "LateralVelocity",
     "Launches",
@@ -141,7 +139,7 @@ class _Energetic:
     energy: Distribution | float = part(
         "Energy E: any object with `quantile(u)`, or one number for all ions.",
         *DISTRIBUTIONS,
-        check=as_distribution,
+        check=check_energy,
         kind="distribution or float [eV]",
     )
 
@@ -170,7 +168,7 @@ class _Rolling(_Tangential):
         "Energy, in a random direction along the surface, of ions that do not roll up. By default they start at rest "
         "(`RollUp`), or with the random part of E (`Combined`).",
         *DISTRIBUTIONS,
-        check=as_distribution,
+        check=check_energy,
         kind="distribution or float [eV]",
         default=None,
     )
@@ -245,7 +243,7 @@ class LateralVelocity(_Tangential, _Energetic):
     def tangential(self, emissions: Emissions, random: IonRandom) -> TangentialLaunches:
         """No ion rolls up; velocities along t1 and t2 [nm/ns]: see `Combined.tangential`."""
         u, n = random.uniform(2), len(emissions)
-        speed = speed_from_energy(draw_energies(self.energy, u[:, 0]), emissions.masses)  # type: ignore[arg-type]
+        speed = speed_from_energy(draw_energies(self.energy, u[:, 0]), emissions.masses)
         sine, cosine = sine_and_cosine(2 * np.pi * u[:, 1])
         return TangentialLaunches(np.zeros(n, dtype=bool), speed * cosine, speed * sine, None, self._heights(n))
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from apt_evap._common.validation import check_choice, short_text
-from apt_evap.emission.energies import Fixed, TruncatedNormal
+from apt_evap.emission.energies import TruncatedNormal
 from apt_evap.emission.perturbations import Combined, LateralVelocity, Perturbation, RollUp, Unperturbed
 
 MECHANISMS = {"unperturbed": Unperturbed, "lateral": LateralVelocity, "roll-up": RollUp, "combined": Combined}
@@ -116,7 +116,7 @@ def perturbation_of(mechanism: str, values: Mapping[str, float]) -> Perturbation
 
 
 def _distribution(mean, relative_spread):
-    return TruncatedNormal(mean, round(relative_spread * mean, _DIGITS)) if relative_spread * mean > 0 else Fixed(mean)
+    return TruncatedNormal(mean, round(relative_spread * mean, _DIGITS)) if relative_spread * mean > 0 else mean
 
 
 def values_of(perturbation: Perturbation) -> tuple[str, dict[str, float]]:
@@ -163,8 +163,8 @@ def values_of(perturbation: Perturbation) -> tuple[str, dict[str, float]]:
 
 
 def _mean_and_relative_spread(energy):
-    if isinstance(energy, Fixed):
-        return energy.energy, 0.0
+    if isinstance(energy, float):
+        return energy, 0.0
     if isinstance(energy, TruncatedNormal) and energy.mean > 0:
         return energy.mean, energy.standard_deviation / energy.mean
     raise ValueError(

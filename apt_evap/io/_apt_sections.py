@@ -10,7 +10,6 @@ import numpy as np
 
 from apt_evap._common.files import FileError, TruncatedFile
 from apt_evap._common.types import AnyPath
-from apt_evap._common.wording import argument
 from apt_evap.warnings import DataWarning
 
 SIGNATURE = b"APT\0"
@@ -92,7 +91,7 @@ def read_sections(file: BinaryIO, path: AnyPath, partial: bool) -> tuple[int, li
             problem += f" of {end}" if name else ""
             if not partial:
                 raise TruncatedFile(
-                    f"{problem}; {argument('partial', True)} reads the {len(sections)} complete sections before it"
+                    f"{problem}; partial=True (--partial) reads the {len(sections)} complete sections before it"
                 )
             warnings.warn(f"{problem}; only the {len(sections)} sections before it are read", DataWarning, stacklevel=6)
             break

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from apt_evap._common.files import FileError, TruncatedFile, open_for_reading, replace_file
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_choice, check_switch, short_text
-from apt_evap._common.wording import argument
 from apt_evap.detection.hits import Hits, Outcome
 from apt_evap.warnings import DataWarning
 
@@ -313,12 +312,12 @@ def write_words(path: AnyPath, columns: Any, row_size: int, chosen: Any) -> None
 
 def _wrong_size(path, size, row_size, kind, rival):
     n, tail = divmod(size, row_size)
-    advice = f"{argument('partial', True)} reads the complete ions"
+    advice = "partial=True (--partial) reads the complete ions"
     if rival and size % rival[1] == 0:
         # an incomplete copy often ends at a block of the disk, a size that also fits a .pos
         kind_too = rival[0].split()[-1]
         advice += (
-            f"; its size fits the {rival[1]} bytes per ion of {rival[0]} ({argument('format', kind_too)} reads it so)"
+            f"; its size fits the {rival[1]} bytes per ion of {rival[0]} (format={kind_too!r} (--format) reads it so)"
         )
     return TruncatedFile(
         f"{str(path)!r} ends in the middle of an ion: {n} complete ions of {row_size} bytes as in {kind} and "
@@ -333,7 +332,7 @@ def _check_byte_order(path, words, order):
         raise FileError(
             f"{str(path)!r} appears to be {other}-endian (as {order}-endian its first row is "
             f"{words.view(_ORDERS[order] + 'f4')[0].tolist()}), expected {order}-endian; "
-            f"{argument('byte_order', other)} reads it; {argument('byte_order', order)} skips this check"
+            f"byte_order={other!r} (--byte-order) reads it; byte_order={order!r} skips this check"
         )
 
 

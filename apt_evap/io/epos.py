@@ -12,7 +12,6 @@ import numpy as np
 
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_choice
-from apt_evap._common.wording import argument
 from apt_evap.detection.hits import Hits
 from apt_evap.io._pulses import PulseCheck, first_from_equal, pulses_from_first, whole_pulses
 from apt_evap.io._records import check_any, choose, choose_fields, open_words, write_words
@@ -174,8 +173,7 @@ class _Survey:
         self.kilovolts = self._unit == "kV" or (self._unit is None and bool(highest < _LEAST))
         if self.kilovolts and self._unit is None and decisive in self.present:
             warnings.warn(
-                f"{str(path)!r}: voltages of at most {highest:.4g} are taken for kV; "
-                f"{argument('voltage_unit', 'V')} reads them in V",
+                f"{str(path)!r}: voltages of at most {highest:.4g} are taken for kV; voltage_unit='V' reads them in V",
                 DataWarning,
                 stacklevel=5,
             )
@@ -252,7 +250,7 @@ def write_epos(path: AnyPath, hits: Hits) -> None:
     if highest < _LEAST:
         warnings.warn(
             f"{str(path)!r}: voltages of at most {highest:.4g} V can be taken for kV: the format does not contain "
-            f"their unit; {argument('voltage_unit', 'V')} reads them in V",
+            f"their unit; voltage_unit='V' reads them in V",
             DataWarning,
             stacklevel=3,
         )

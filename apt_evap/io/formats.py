@@ -11,7 +11,6 @@ from typing import Any
 from apt_evap._common.files import FileError, TruncatedFile, check_path, open_for_reading
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_count, check_kind, short_text
-from apt_evap._common.wording import argument
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.io._apt_sections import SIGNATURE
@@ -228,9 +227,7 @@ def read_ranges(path: AnyPath, *, format: str | None = None) -> Ranges:
     if format is not None:
         suffix = "." + check_kind(format, "format", str, "a suffix such as '.rng'").lower().lstrip(".")
         if suffix not in RANGE_FORMATS:
-            raise FileError(
-                f"format of {str(path)!r} must be one of {', '.join(RANGE_FORMATS)}, got {argument('format', format)}"
-            )
+            raise FileError(f"format of {str(path)!r} must be one of {', '.join(RANGE_FORMATS)}, got format={format!r}")
     return RANGE_FORMATS.get(suffix, read_rrng)(path)
 
 
@@ -294,5 +291,5 @@ def _by_suffix(path, format, doing):
     for candidate in FORMATS:
         if candidate.suffix == suffix.lower():
             return candidate
-    source = f"suffix {suffix!r}" if format is None else argument("format", format)
+    source = f"suffix {suffix!r}" if format is None else f"format={format!r}"
     raise FileError(f"format of {str(path)!r} must be one of {_suffixes(doing)}, got {source}")

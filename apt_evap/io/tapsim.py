@@ -13,7 +13,6 @@ import numpy as np
 from apt_evap._common.files import FileError, TruncatedFile, open_for_reading, replace_file
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_switch
-from apt_evap._common.wording import argument
 from apt_evap.detection.hits import Hits
 from apt_evap.warnings import DataWarning
 
@@ -169,7 +168,7 @@ def _fits(value, kind):
 
 def _truncated(path, n):
     return TruncatedFile(
-        f"{str(path)!r} ends in the middle of a row after {n} complete rows; {argument('partial', True)} reads the "
+        f"{str(path)!r} ends in the middle of a row after {n} complete rows; partial=True (--partial) reads the "
         "complete rows"
     )
 

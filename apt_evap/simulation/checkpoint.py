@@ -25,7 +25,6 @@ import numpy as np
 from apt_evap._common.files import FileError, check_path, check_regular, is_unfinished, move_file
 from apt_evap._common.interrupts import uninterrupted
 from apt_evap._common.validation import check_count, check_number, check_switch
-from apt_evap._common.wording import argument
 from apt_evap.emission.perturbations import described
 from apt_evap.evaporation.state import EmitterState
 from apt_evap.simulation.run import PART_NAME, Run, load, part_paths
@@ -270,7 +269,7 @@ class Keeper:
             raise FileError(f"the run in {name!r} cannot be resumed: some of its ions are missing")
         if len(run) > n_ions:
             raise FileError(
-                f"{argument('n_ions')} must be >= {len(run):,}, the number of ions of the run so far, got {n_ions:,}"
+                f"n_ions (--ions) must be >= {len(run):,}, the number of ions of the run so far, got {n_ions:,}"
             )
         if not parts and run.state is None:
             raise FileError(f"the run in {name!r} cannot be resumed: the file contains no state")
@@ -281,8 +280,8 @@ class Keeper:
 
     def _refuse_loss(self, parts, n_ions):
         """Refuse to replace ions that the new run would not contain."""
-        name, replaces = str(self._checkpoint.path), f"{argument('overwrite', True)} replaces it"
-        choices = f"{argument('resume', True)} continues it, {replaces}"
+        name, replaces = str(self._checkpoint.path), "overwrite=True (--force) replaces it"
+        choices = f"resume=True (--resume) continues it, {replaces}"
         if parts:
             ions = sum(map(count_ions, parts))
             raise FileError(

@@ -182,9 +182,16 @@ class CoreShell:
         return np.maximum(-distance, distance - self.thickness)
 
 
+def _check_regions(regions, name):
+    regions = check_sequence(regions, name, "regions")
+    if len(regions) == 0:
+        raise ValueError(f"{name} must contain at least one region, got none")
+    return tuple(check_region(region, name) for region in regions)
+
+
 @settings
 class Union:
-    """All points that are in any of several regions: ``Union(first, second)``.
+    """All points that are in any of several regions: ``Union((first, second))``.
 
     Their union has a distance only if each of them has one.
     """
@@ -192,22 +199,9 @@ class Union:
     regions: tuple = checked(
         "At least one region or function of points.",
         "regions",
-        lambda regions, name: tuple(check_region(region, name) for region in regions),
+        _check_regions,
         read=lambda plain, name: [region_of(each, name) for each in check_sequence(plain, name, "regions")],
     )
-
-    def __init__(self, *regions: Any) -> None:
-        if not regions:
-            raise ValueError("regions must contain at least one region, got none")
-        object.__setattr__(self, "regions", tuple(check_region(region, "regions") for region in regions))
-
-    @classmethod
-    def _from_fields(cls, regions):
-        """Union of a sequence of regions, as a file contains it."""
-        return cls(*regions)
-
-    def __repr__(self) -> str:
-        return f"Union({', '.join(map(repr, self.regions))})"
 
     def contains(self, points: Floats) -> Booleans:
         """Whether points (n, 3) [nm] are in any of the regions, bool (n,)."""

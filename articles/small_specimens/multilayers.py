@@ -23,7 +23,7 @@ NICKEL = ae.material("Ni")
 
 def evaporate(normal, bounds, field, ions, radius):
     """Run of a tip with layers between bounds along a normal [nm]."""
-    region = ae.specimen.Union(*(ae.specimen.Layer(lower, upper, normal=normal) for lower, upper in bounds))
+    region = ae.specimen.Union([ae.specimen.Layer(lower, upper, normal=normal) for lower, upper in bounds])
     layers = ae.specimen.Phase("layers", ae.material("Al", a=NICKEL.a), region, evaporation_field=field)
     tip = ae.Tip(
         phases=[ae.specimen.Phase("Ni", NICKEL), layers], apex_radius=radius, axis=(0, 0, 1), shank_length=2 * radius,

@@ -32,7 +32,6 @@ from apt_evap._common.codec import (
 NICKEL = ae.material("Ni")
 EXAMPLES = [
     ae.TruncatedNormal(0.1, 0.2),
-    ae.emission.Fixed(0.3),
     ae.emission.Thermal(50.0),
     ae.Unperturbed(0.1),
     ae.LateralVelocity(0.2),
@@ -60,7 +59,7 @@ EXAMPLES = [
     NICKEL,
     ae.Orientation(NICKEL, (1, 1, 1), 10.0),
     ae.specimen.Ellipsoid((0, 0, 1), (1, 2, 3)),
-    ae.specimen.CoreShell(ae.specimen.Union(ae.specimen.Sphere((0, 0, 2), 1.2), ae.specimen.Layer(0.0, 1.0)), 0.5),
+    ae.specimen.CoreShell(ae.specimen.Union((ae.specimen.Sphere((0, 0, 2), 1.2), ae.specimen.Layer(0.0, 1.0))), 0.5),
     ae.specimen.Segregation(0.01, 0.2, 0.4, ae.specimen.HalfSpace((2, 0, 0), (1, 0, 0))),
     ae.specimen.Superlattice("L1_2", {"Al": 0.8, "Ti": 0.2}),
     ae.specimen.UnitCell(("Al", None, {"Al": 0.5, "Ti": 0.5}, None)),
@@ -118,7 +117,7 @@ class Pulse:
     on: bool = switch("Whether.", default=True)
     form: str = choice("Form.", ("round", "flat"), default="round")
     place: tuple = vector("Where.", 2, default=(0.0, 1.0), at_least=0, unit="nm")
-    inner: ae.emission.Fixed | None = part("Another.", ae.emission.Fixed, default=None)
+    inner: ae.emission.Thermal | None = part("Another.", ae.emission.Thermal, default=None)
     names: dict = checked("Names.", "mapping", lambda names, name: dict(names), default={})
 
     def _check(self):
@@ -209,5 +208,5 @@ def test_plain_forms_of_other_objects():
     assert to_plain(Law()) == {"name": "Law", "power": 2.0}
     assert to_plain({1: np.arange(2), "a": 1 + 2j, "f": len}) == {"1": [0, 1], "a": [1.0, 2.0], "f": "builtins.len"}
     assert for_json([np.nan, np.inf, 1.0]) == [None, None, 1.0]
-    assert to_plain({ae.emission.Fixed(1.0): 0.5}) == [[{"name": "Fixed", "energy": 1.0}, 0.5]]
+    assert to_plain({ae.emission.Thermal(1.0): 0.5}) == [[{"name": "Thermal", "temperature": 1.0}, 0.5]]
     assert not is_settings(type("Mine", (ae.Unperturbed,), {})())

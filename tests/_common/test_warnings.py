@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap._common.wording import argument, options_of_a_shell
 
 PACKAGE = Path(ae.__file__).parent
 WITHOUT_CLASS = ("simulation", "evaporation")  # rooms whose warnings do not have one yet
@@ -47,12 +46,3 @@ def test_a_class_of_warnings_can_be_ignored(tmp_path):
         warnings.simplefilter("error")
         warnings.simplefilter("ignore", ae.warnings.AptWarning)
         ae.write(tmp_path / "ions.epos", hits)
-
-
-def test_arguments_are_named_as_the_reader_writes_them():
-    assert argument("n_ions") == "n_ions"
-    assert argument("partial", True) == "partial=True" and argument("format", ".pos") == "format='.pos'"
-    with options_of_a_shell({"partial": "--partial", "format": "--format"}):
-        assert argument("partial", True) == "--partial" and argument("format", ".pos") == "--format .pos"
-        assert argument("depth", 2.0) == "depth=2.0"
-    assert argument("partial", True) == "partial=True"

@@ -187,7 +187,7 @@ def test_a_run_is_made_longer_by_resume(folder, made, capsys):
     assert "seed is 1 in the stored run, 2 in the new one" in failed(
         capsys, "run", "small.toml", "--resume", "--seed", "2", "--quiet"
     )
-    assert "--ions must be >= 60, the number of ions of the run so far, got 50" in failed(
+    assert "(--ions) must be >= 60, the number of ions of the run so far, got 50" in failed(
         capsys, "run", "small.toml", "--resume", "--ions", "50", "--quiet"
     )
 
@@ -198,7 +198,7 @@ def test_an_unfinished_run_is_resumed_or_replaced_as_requested(folder, made, cap
     (folder / "small.h5.unfinished").mkdir()
     os.rename("small.h5", "small.h5.unfinished/ions-000000000000.h5")
     message = failed(capsys, "run", "small.toml", "--quiet")
-    assert "unfinished run of 25 ions" in message and "--resume continues it, --force replaces it" in message
+    assert "unfinished run of 25 ions" in message and "(--resume) continues it" in message
     assert main(["info", "small.h5.unfinished"]) == 0
     told = capsys.readouterr().out
     assert "unfinished run of 25 ions" in told and "continue with the same command and --resume" in told
@@ -227,16 +227,14 @@ def test_a_second_run_overwrites_the_first_but_nobody_elses_files(folder, capsys
 
     with_seed = (
         "small.h5' contains a run with other settings (seed is 1 in the stored run, 2 in the new one): "
-        "--force replaces it"
+        "overwrite=True (--force) replaces it"
     )
     assert with_seed in failed(capsys, *quick, "--seed", "2")
-    assert "small.h5' contains a run of 5 ions, more than the requested 4: --force" in failed(
+    assert "small.h5' contains a run of 5 ions, more than the requested 4: overwrite=True (--force)" in failed(
         capsys, *quick, "--ions", "4"
     )
     load("small.h5").ended_by("interrupted").save("small.h5")
-    assert "an incomplete run of 5 ions (interrupted): --resume continues it, --force replaces it" in (
-        failed(capsys, *quick)
-    )
+    assert "an incomplete run of 5 ions (interrupted): resume=True (--resume)" in (failed(capsys, *quick))
     assert main([*quick, "--force"]) == 0
 
     (folder / "small.png").write_bytes(b"a photograph")
@@ -543,7 +541,7 @@ def test_info_of_measured_ions(measured, capsys):
 def test_info_of_what_cannot_be_read(measured, made, capsys):
     measured.write_bytes(measured.read_bytes()[:-10])
     assert "ions.epos' ends in the middle of an ion: 3999 complete ions" in (text := failed(capsys, "info", measured))
-    assert "--partial reads the complete ions" in text
+    assert "partial=True (--partial) reads the complete ions" in text
     assert main(["info", "ions.epos", "--partial", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["ions"] == 3999
     Path("cut.h5").write_bytes(made.read_bytes()[:5000])

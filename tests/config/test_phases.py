@@ -58,7 +58,7 @@ def test_phases_of_a_file_are_those_of_the_script(tmp_path):
         ae.specimen.Phase(
             "gamma prime",
             nickel,
-            region=ae.specimen.Union(ae.specimen.Sphere((0, 0, 2), 1.2), ae.specimen.CoreShell(core, 0.5)),
+            region=ae.specimen.Union((ae.specimen.Sphere((0, 0, 2), 1.2), ae.specimen.CoreShell(core, 0.5))),
             order=ae.specimen.Superlattice("L1_2", {"Al": 0.8, "Ti": 0.2}),
             evaporation_field={"Al": 28.0},
         ),

@@ -16,7 +16,7 @@ from apt_evap.config.map_panels import MapSettings, Panel
 from apt_evap.config.perturbation_text import read_perturbation, title_of
 from apt_evap.config.simulation_file import read_config
 from apt_evap.detection.detector import Detector
-from apt_evap.emission.energies import Fixed, Thermal, TruncatedNormal
+from apt_evap.emission.energies import Thermal, TruncatedNormal
 from apt_evap.emission.perturbations import Combined, LateralVelocity, Mixture, RollUp, Unperturbed
 from apt_evap.evaporation.settings import ChargeSettings
 from apt_evap.flight.crew import FlightSettings
@@ -62,7 +62,7 @@ EVERY_KEY = {
         "smoothing": 2,
         "panels": [
             {"title": "none", "perturbation": "Unperturbed"},
-            {"perturbation": {"name": "RollUp", "energy": {"name": "Fixed", "energy": 0.2}}},
+            {"perturbation": {"name": "RollUp", "energy": 0.2}},
         ],
     },
 }
@@ -146,7 +146,7 @@ def test_a_file_builds_the_same_simulation_as_python(tmp_path):
     assert (config.response_settings.energy_limit, config.response_settings.bound) == (1.0, 0.1)
     assert config.response_settings.shells == 2
     # without responses the maps are of perturbations flown in the run
-    assert config.emissions == (Unperturbed(), RollUp(Fixed(0.2)))
+    assert config.emissions == (Unperturbed(), RollUp(0.2))
     assert [panel.title for panel in config.maps.panels] == ["none", "roll-up, 0.2 eV"]
 
 

@@ -5,8 +5,9 @@ import pytest
 from scipy import special, stats
 from scipy.integrate import quad
 
-from apt_evap.emission.energies import Fixed, Thermal, TruncatedNormal, normal_probability
+from apt_evap.emission.energies import Thermal, TruncatedNormal, draw_energies, normal_probability
 from apt_evap.emission.ion_random import IonRandom
+from apt_evap.emission.perturbations import RollUp
 from apt_evap.units import BOLTZMANN
 
 
@@ -54,7 +55,7 @@ def test_quantiles_are_above_zero():
     for energy in (TruncatedNormal(0.0, 1.0), TruncatedNormal(1e-3, 100.0), Thermal(20.0)):
         found = energy.quantile(edge)
         assert (found > 0).all() and np.isfinite(found).all()
-    np.testing.assert_array_equal(Fixed(0.2).quantile(edge), [0.2] * 3)
+    np.testing.assert_array_equal(draw_energies(0.2, edge), [0.2] * 3)
 
 
 def test_thermal_energy_is_that_of_two_normal_velocities():
@@ -72,7 +73,7 @@ def test_thermal_energy_is_that_of_two_normal_velocities():
     [
         (lambda: TruncatedNormal(-0.1, 0.1), "mean must be"),
         (lambda: TruncatedNormal(0.1, 0), "standard_deviation must be"),
-        (lambda: Fixed(-1), "energy must be"),
+        (lambda: RollUp(-1), "energy must be"),
         (lambda: Thermal(0), "temperature must be"),
     ],
 )

@@ -12,7 +12,7 @@ import apt_evap as ae
 from apt_evap._common.codec import to_plain
 from apt_evap.config.perturbation_text import read_perturbation, title_of, write_perturbation
 from apt_evap.emission.emissions import Emissions, Launches, TangentialLaunches
-from apt_evap.emission.energies import Fixed, Thermal, TruncatedNormal
+from apt_evap.emission.energies import Thermal, TruncatedNormal
 from apt_evap.emission.ion_random import IonRandom
 from apt_evap.emission.perturbations import (
     Combined,
@@ -283,7 +283,7 @@ def test_bad_settings_are_refused_in_one_sentence(make, message):
 
 
 def test_plain_number_in_settings_is_a_fixed_energy():
-    assert perturbation_of({"name": "RollUp", "energy": 0.3}) == RollUp(Fixed(0.3))
+    assert perturbation_of({"name": "RollUp", "energy": 0.3}) == RollUp(0.3)
 
 
 @pytest.mark.parametrize(

@@ -100,7 +100,7 @@ def test_tables_that_are_wrong(tmp_path):
     for binary in (False, True):
         data, _ = tapsim_table(3, binary)
         path.write_bytes(data[:-20])
-        with pytest.raises(TruncatedFile, match="middle of a row after 2 complete rows; partial=True reads"):
+        with pytest.raises(TruncatedFile, match=r"middle of a row after 2 complete rows; partial=True .* reads"):
             ae.read(path)
         assert ae.read(path, partial=True).ion.tolist() == [0, 1]
 

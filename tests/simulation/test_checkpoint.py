@@ -304,7 +304,7 @@ def unfinished(tmp_path):
 
 
 def test_an_unfinished_run_is_not_thrown_away_unasked(unfinished):
-    with pytest.raises(ae.FileError, match=r"unfinished run of 60 ions beside it.*resume=True continues it"):
+    with pytest.raises(ae.FileError, match=r"unfinished run of 60 ions beside it.*\(--resume\) continues it"):
         interrupted(unfinished, ())
     run = interrupted(unfinished, (), overwrite=True)
     assert len(run) == len(ae.load(unfinished)) == 90
@@ -330,14 +330,14 @@ def test_other_settings_are_refused(unfinished):
 @pytest.mark.parametrize(
     ("there", "message"),
     [
-        ({"n_ions": 90}, "contains a run of 90 ions, more than the requested 60: overwrite=True replaces it"),
+        ({"n_ions": 90}, "contains a run of 90 ions, more than the requested 60: overwrite=True .* replaces it"),
         (
             {"n_ions": 60, "voltage": 900.0},
             r"other settings \(voltage is 900\.0 in the stored run, 1000\.0 in the new one\): overwrite",
         ),
         (
             {"n_ions": 60, "ended": "interrupted"},
-            r"an incomplete run of 60 ions \(interrupted\): resume=True continues it",
+            r"an incomplete run of 60 ions \(interrupted\): resume=True \(--resume\) continues it",
         ),
     ],
 )

@@ -12,7 +12,7 @@ BUILT_IN = (
     ae.Unperturbed(),
     ae.LateralVelocity(ae.emission.Thermal(60.0)),
     ae.RollUp(ENERGY),
-    ae.Combined(ae.emission.Fixed(0.3), 0.75),
+    ae.Combined(0.3, 0.75),
 )
 
 
@@ -141,7 +141,7 @@ def test_save_and_load(run, tmp_path):
     for name in ("seed", "voltage", "detector", "response_settings", "elements", "ended", "provenance"):
         assert getattr(loaded, name) == getattr(run, name), name
     assert loaded.settings["tip"] == run.settings["tip"]
-    others = (ae.RollUp(ae.emission.Fixed(0.2)), ae.Combined(ENERGY, 0.5), ae.LateralVelocity(0.1))
+    others = (ae.RollUp(0.2), ae.Combined(ENERGY, 0.5), ae.LateralVelocity(0.1))
     for perturbation in (*BUILT_IN, *others):
         assert same_hits(run.hits(perturbation), loaded.hits(perturbation))
     # a user's own comes back as what is known of it, and can be asked for by that

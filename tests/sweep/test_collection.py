@@ -69,7 +69,7 @@ def test_the_maps_are_those_of_the_runs(sweep, collected):
         frame = ae.DetectorMap.from_array(np.ones((24, 24)), edges, file["y_edges"][:])
         for row, key in enumerate(done):
             run = ae.load(sweep.folder_of(key) / "run.h5")
-            for column, perturbation in enumerate((ae.Unperturbed(), ae.RollUp(ae.emission.Fixed(0.3)))):
+            for column, perturbation in enumerate((ae.Unperturbed(), ae.RollUp(0.3))):
                 expected = ae.DetectorMap.from_hits(run.hits(perturbation), like=frame, position_step=None)
                 assert (file["maps"][row, column] == expected.values).all() and expected.values.sum() > 0
         assert file["tip_offset_seed"].asstr()[:].tolist() == ["1", "1", "2", ""]  # the last point has none
