@@ -4,7 +4,7 @@ Only additions, multiplications, divisions and square roots in a fixed order are
 every processor (IEEE 754). The order of summation of BLAS and LAPACK depends on the processor.
 """
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import math
 from typing import Any

@@ -1,6 +1,6 @@
 """Shape of the cap, image compression and field factor, from the ions of a run."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import math
 from collections.abc import Sequence

@@ -1,6 +1,6 @@
 """Charge state ratios: maps over the detector, the course during a run, and the field that follows from them."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace

@@ -5,7 +5,7 @@ on the critical surface, about half a nanometre outside. The probability is that
 barrier in the field there. The ions then fly to the screen.
 """
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, field

@@ -1,6 +1,6 @@
 """Tracks on the detector of selected ions of a run, for varying launch energy and direction."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 from typing import NamedTuple
 

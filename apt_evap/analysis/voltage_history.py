@@ -1,6 +1,6 @@
 """Evaporation voltage of the ions of a run, and the course of a quantity over the ions."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 from typing import NamedTuple
 

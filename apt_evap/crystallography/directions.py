@@ -1,6 +1,6 @@
 """Poles and zone axes of a crystal: the lattice planes visible on a map, their directions and labels."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from itertools import permutations, product

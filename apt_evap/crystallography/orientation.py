@@ -1,6 +1,6 @@
 """Orientation of the crystal of a specimen, and its fit to poles on a map."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence

@@ -1,6 +1,6 @@
 """Point group of a crystal, and the parts of it that keep a direction or the axis of a specimen."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 from typing import Any, NamedTuple
 

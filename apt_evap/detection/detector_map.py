@@ -1,6 +1,6 @@
 """Maps of the hits on the detector, with bins that avoid stripes from the quantisation of measured coordinates."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, replace

@@ -5,7 +5,7 @@ in the plane of the grid and measured places on the detector. Between them, the 
 affine in each triangle of a Delaunay triangulation.
 """
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 from dataclasses import dataclass, field
 

@@ -1,6 +1,6 @@
 """Simulated or measured ions: columns of equal length, one row per ion."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping

@@ -12,7 +12,7 @@ The directions at the end of flights are stereographic, s = tan(theta / 2) (cos,
 finite also for ions that fly parallel to a plane detector or away from it, where the position on it diverges.
 """
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace

@@ -1,6 +1,6 @@
 """Times of flight: from a time to a mass, and the errors of the measured times."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 from functools import cached_property
 

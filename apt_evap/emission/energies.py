@@ -1,6 +1,6 @@
 """Energy distributions: any object with a method `quantile(u)`."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import math
 from decimal import Decimal, localcontext

@@ -1,6 +1,6 @@
 """Random numbers keyed by seed and ion number: independent of the batches and of the number of threads."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 from copy import copy
 

@@ -10,7 +10,7 @@ ions, as a function of the field F::
 CSR is 0 below F = 0.256 a / (b + 0.256), and infinite from F = a. It grows about as F^30 where it is 1.
 """
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 from collections.abc import Sequence
 

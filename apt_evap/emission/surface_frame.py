@@ -1,6 +1,6 @@
 """Start position and direction of an ion on the surface: the tangent frame and the roll-ups."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 from typing import NamedTuple
 

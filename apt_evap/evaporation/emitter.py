@@ -1,6 +1,6 @@
 """The emitter: the charged surface of a specimen, and the sequence of its evaporating atoms."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator

@@ -1,6 +1,6 @@
 """The choice of conditions: ions that leave between the pulses, and what they do to a measured composition."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import math
 from collections.abc import Mapping

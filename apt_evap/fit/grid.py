@@ -1,6 +1,6 @@
 """Energies of a study: a grid of distributions for one mechanism, and the maximum between its points."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from itertools import product

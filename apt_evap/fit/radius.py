@@ -1,6 +1,6 @@
 """Radius of a tip from its map: the width of a pole and the contrast of its zone lines, for a family of runs over R."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,6 +1,6 @@
 """Search of `fit_energies`: similarities of the maps of a run with a measured one, and the registration."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace

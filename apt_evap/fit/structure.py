@@ -5,7 +5,7 @@ more similar than a sharp one. The contrast of rings about a pole and the radial
 reduces the contrast, and fills the pole.
 """
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass

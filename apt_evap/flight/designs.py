@@ -4,7 +4,7 @@ The variables of a launch are: the shares of the second and the third target of 
 of `tangent_frame` in units of the largest velocity, and the height above the usual start in units of the largest one.
 """
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import functools
 import itertools

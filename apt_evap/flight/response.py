@@ -10,7 +10,7 @@ cosine of the polar angle. They are smoother than the detector position, which d
 the detector.
 """
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence

@@ -1,6 +1,6 @@
 """Which crystal direction is where on a map: the search, its refinement, and what the map decides."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import math
 from collections.abc import Sequence

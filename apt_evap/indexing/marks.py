@@ -1,6 +1,6 @@
 """Marks of a user on a map: poles and zone lines, named or only pointed at, and how an orientation explains them."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import math
 from collections.abc import Sequence

@@ -5,7 +5,7 @@ each ion counts 48 times for the cubic lattices. The density of one run falls wi
 The pattern is what remains after division by this decrease.
 """
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import math
 from collections.abc import Sequence

@@ -5,7 +5,7 @@ the crystal does not have, such as gradients over the detector, is averaged out.
 crystal, so they need neither the same bins nor the same projection.
 """
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import math
 from dataclasses import dataclass

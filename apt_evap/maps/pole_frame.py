@@ -1,6 +1,6 @@
 """Bins of a map in the frame of a pole: angle from the pole, azimuth, hits and solid angle."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 from typing import NamedTuple, Protocol
 

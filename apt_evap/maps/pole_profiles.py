@@ -1,6 +1,6 @@
 """Profiles about a pole in degrees of crystal angle: density against the angle from it, and across its zone lines."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 from collections.abc import Sequence
 

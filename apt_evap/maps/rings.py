@@ -5,7 +5,7 @@ rings about a pole shows the lines themselves: its standard deviation is their c
 dark lines, its maximum the height of the bright ones.
 """
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass

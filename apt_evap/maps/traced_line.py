@@ -1,6 +1,6 @@
 """Direction and place of a zone line on a map, with errors: lines need not meet in a pole."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import math
 from dataclasses import dataclass

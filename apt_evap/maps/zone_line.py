@@ -1,6 +1,6 @@
 """Width of a zone line, fitted to a profile across it."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 from dataclasses import dataclass
 

@@ -1,6 +1,6 @@
 """A reconstruction: from the side, from the tip, its course along the depth and its composition."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import numpy as np
 from matplotlib.axes import Axes

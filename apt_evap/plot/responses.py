@@ -1,6 +1,6 @@
 """Hits of selected ions for increasing energy of the perturbation."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 from typing import Any
 

@@ -1,6 +1,6 @@
 """Surface atoms of a specimen, seen from any direction, and slices of a specimen."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any

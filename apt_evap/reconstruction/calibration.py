@@ -1,6 +1,6 @@
 """Calibration of a reconstruction: image compression from poles, spacing of lattice planes from distances of ions."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field

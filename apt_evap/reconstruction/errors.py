@@ -1,6 +1,6 @@
 """Errors of reconstructed positions against the true sites of the ions."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import math
 from collections.abc import Sequence

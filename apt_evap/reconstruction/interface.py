@@ -1,6 +1,6 @@
 """Composition about an interface: width of a step, and excess of a segregated element."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field

@@ -1,6 +1,6 @@
 """Where the ions of a place on the detector came from, counted in simulated runs, and the correction by it."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import math
 from collections.abc import Sequence

@@ -1,6 +1,6 @@
 """Shape and composition of a reconstructed precipitate against the truth."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import math
 from collections.abc import Sequence

@@ -4,7 +4,7 @@ Every ion leaves the surface of a spherical cap that recedes along the axis. Its
 distance from the centre of the detector, and its depth from the volume of all ions before it.
 """
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence

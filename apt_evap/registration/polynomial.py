@@ -5,7 +5,7 @@ conj(w) of first order (anisotropy), and those of second and third order. Measur
 0.1 mm by the cubic terms, where similarity transforms leave 0.7 to 0.9 mm.
 """
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 from typing import Any, NamedTuple
 

@@ -1,6 +1,6 @@
 """Registration: rotation, scale, shift and mirror that transform a simulated map into the frame of a measured one."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence

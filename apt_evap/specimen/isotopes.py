@@ -6,7 +6,7 @@ Wieser, Pure Appl. Chem. 83, 397 (2011), which lie inside. Masses: AME2020 (Wang
 (2021)), rounded to 1e-4 Da.
 """
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 from collections.abc import Sequence
 

@@ -1,6 +1,6 @@
 """Crystal lattices: unit cells, orientations, and the lattice points inside a shape."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence

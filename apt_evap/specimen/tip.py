@@ -1,6 +1,6 @@
 """The specimen: a crystal (or any arrangement of atoms) in the shape of a tip."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,6 +1,6 @@
 """Constants of a measurement with errors, what each depends on, and checks by observables that were not used."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace

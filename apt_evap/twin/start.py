@@ -1,6 +1,6 @@
 """Settings of a simulation from a measured map: axis, rotation, radius, detector, emission, each with its origin."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import math
 import tomllib

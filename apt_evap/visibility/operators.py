@@ -1,6 +1,6 @@
 """Origin operators: how far the ions of a feature and of its surroundings are shifted and blurred, and the emulator."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import itertools
 import json

@@ -1,6 +1,6 @@
 """Short-range order: the Warren-Cowley parameter, and the order that evaporation alone feigns."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass

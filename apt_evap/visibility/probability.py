@@ -1,6 +1,6 @@
 """Probability that an analysis finds a feature, and how wrong size and composition come out."""
 
-from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
+from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
