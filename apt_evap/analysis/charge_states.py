@@ -11,10 +11,9 @@ from numpy.typing import ArrayLike
 
 from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_array, check_choice, check_count, check_kind, short_text
-from apt_evap.detection.binning import count
+from apt_evap.detection.binning import MAX_BINS, count
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
-from apt_evap.detection.limits import MAX_BINS
 from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.emission.post_ionisation import RATIO_PARAMETERS, field_of_ratio
 from apt_evap.specimen.isotopes import ISOTOPES, mean_mass

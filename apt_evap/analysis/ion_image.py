@@ -25,7 +25,6 @@ from apt_evap._common.validation import (
     check_values,
     short_text,
 )
-from apt_evap.analysis.gas_names import GASES as GAS_NAMES
 from apt_evap.detection.detector import Detector
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits, Outcome
@@ -80,10 +79,8 @@ class ImagingGas:
 
 
 # ionisation energies: NIST Atomic Spectra Database; best image fields: Mueller and Tsong, Field Ion Microscopy (1969)
-_ENERGIES_AND_FIELDS = ((24.587, 44.0), (21.565, 35.0), (15.760, 22.0), (15.426, 22.0))
-GASES = MappingProxyType(
-    {name: ImagingGas(name, *pair) for name, pair in zip(GAS_NAMES, _ENERGIES_AND_FIELDS, strict=True)}
-)
+_GASES = (("He", 24.587, 44.0), ("Ne", 21.565, 35.0), ("Ar", 15.760, 22.0), ("H2", 15.426, 22.0))
+GASES = MappingProxyType({name: ImagingGas(name, energy, field) for name, energy, field in _GASES})
 """Imaging gases by name."""
 
 

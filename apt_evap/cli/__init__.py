@@ -1,1 +1,1 @@
-"""The command line `apt-evap`: one module per command; all arguments are defined in `parser`."""
+"""The command line `apt-evap`: one module per command, with its arguments."""

@@ -12,6 +12,20 @@ _FOLDERS = ("FOLDER", "DIR")
 _FILES = re.compile(r"(MEASURED|OUT|R|(\w*\.)?FILE(\.\w+)?|[A-Z]+\.\w+)")
 
 
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.description = (
+        "Print a script that lets a shell complete commands, options and file names. It needs shtab:\n"
+        "pip install 'apt_evap[completion]'. The script itself needs nothing."
+    )
+    parser.epilog = (
+        "examples:\n"
+        "  apt-evap completion bash > ~/.local/share/bash-completion/completions/apt-evap\n"
+        "  apt-evap completion zsh > ~/.zfunc/_apt-evap    # a folder in fpath, before compinit"
+    )
+    parser.add_argument("shell", choices=("bash", "zsh", "fish", "tcsh"), help="name of the shell")
+
+
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
     try:

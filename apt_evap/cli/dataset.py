@@ -3,9 +3,33 @@
 import argparse
 from pathlib import Path
 
+from apt_evap.cli._options import add_speech, integer_type
 from apt_evap.cli._output import say, tell, tell_json
 from apt_evap.dataset.making import ABOUT, make, plan_set, verify
 from apt_evap.sweep.foresight import hours_text
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.description = (
+        "Run the simulations of a study file, record their ions as an instrument would, and write them\n"
+        "with the truth: for machine learning and statistics. Time and size are foretold. The command can be killed\n"
+        "and started again at any time; equal studies give equal bytes. For the folder of a data set, verify it."
+    )
+    parser.epilog = (
+        "example:\n"
+        "  apt-evap dataset study.toml --plan              runs, examples, hours, size; runs nothing\n"
+        "  apt-evap dataset study.toml -o set --workers 2  make the set, or finish it\n"
+        "  apt-evap dataset set                            verify its checksums"
+    )
+    parser.add_argument("study", metavar="STUDY.toml", help="study file with a table [dataset], or a data set")
+    parser.add_argument("-o", "--output", metavar="FOLDER", help="default: name of the study with _set")
+    parser.add_argument("--plan", action="store_true", help="only foretell time and size")
+    parser.add_argument("--workers", type=integer_type(1), default=1, metavar="N", help="processes; default: 1")
+    parser.add_argument(
+        "--without-failed", action="store_true", help="leave out runs that have failed, instead of an error"
+    )
+    add_speech(parser)
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -5,12 +5,22 @@ import ast
 from pathlib import Path
 
 from apt_evap._common.files import FileError, check_path, open_for_reading, replace_file
+from apt_evap.cli._options import add_speech
 from apt_evap.cli._output import tell, tell_json
 
 # in a wheel inside the package, in the repository beside it
 _PACKAGE = Path(__file__).parents[1]
 _PLACES = (_PACKAGE / "examples", _PACKAGE.parent / "examples")
 _SUFFIXES = (".py", ".toml")
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.description = "List the examples of the package: settings files and Python scripts. With --to, copy them."
+    parser.epilog = "example: apt-evap examples --to apt_examples && apt-evap run apt_examples/ni111.toml"
+    parser.add_argument("--to", metavar="FOLDER", help="copy the examples to this folder")
+    parser.add_argument("--force", action="store_true", help="overwrite files that differ from the examples")
+    add_speech(parser)
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -14,13 +14,48 @@ from typing import Any
 from apt_evap._common.codec import to_python
 from apt_evap._common.optional_imports import optional_import
 from apt_evap.cli._files import in_real_units, ions_of_map, lens_of, read, read_registration
+from apt_evap.cli._options import add_reading, add_real_units, bounds_type, integer_type, number_type
 from apt_evap.cli._output import put, say
 from apt_evap.config.perturbation_text import read_perturbation
+from apt_evap.detection.binning import MAX_BINS
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.explore.controls import values_of
 from apt_evap.explore.explorer import Explorer, View
 from apt_evap.io.formats import read as read_file
 from apt_evap.simulation.run import Run, load
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.description = (
+        "Show the map of a run in the browser, with sliders for the emission, a measured map, or both.\n"
+        "Files can also be opened on the page. Needs the extra of the package: pip install 'apt_evap[explore]'. The\n"
+        "page is served to this machine only, under an address that is printed. Ctrl-C ends the explorer. On it,\n"
+        "buttons copy a command or Python lines that give the same maps."
+    )
+    parser.epilog = (
+        "example:\n"
+        "  apt-evap explore\n"
+        "  apt-evap explore W_tap.raw\n"
+        "  apt-evap explore ni111.h5\n"
+        "  apt-evap explore ni111.h5 R5083.epos --mass 27,29 --registration R5083_study/study.json"
+    )
+    parser.add_argument("run", metavar="RUN.h5", nargs="?", help="a run with responses")
+    parser.add_argument("file", metavar="MEASURED", nargs="?", help="measured ions (.epos, ...) or a map (.npz)")
+    parser.add_argument(
+        "--registration",
+        metavar="R",
+        help="a JSON file (such as study.json) or ROTATION,SCALE,DX,DY[,mirror] in degrees and mm; default: search",
+    )
+    parser.add_argument("--perturbation", metavar="P", help="at the start, as for map; default: RollUp:0.155,0.155")
+    parser.add_argument("--bins", type=integer_type(11, MAX_BINS), metavar="N", help="bins along the longer side")
+    parser.add_argument("--smooth", type=number_type("mm"), metavar="MM", help="sigma of a Gaussian; default: one bin")
+    parser.add_argument("--flatten", type=number_type("mm"), metavar="MM", help="sigma for flattening; default: none")
+    parser.add_argument("--simulated", type=bounds_type, metavar="FIRST,LAST", help="ions of the run; default: all")
+    parser.add_argument("--port", type=integer_type(0, 65535), default=0, metavar="N", help="default: a free one")
+    parser.add_argument("--no-browser", dest="browser", action="store_false", help="only print the address")
+    add_real_units(parser)
+    add_reading(parser)
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -6,12 +6,36 @@ from pathlib import Path
 
 from apt_evap._common.files import FileError, check_path
 from apt_evap.cli._files import in_real_units, read, select
+from apt_evap.cli._options import add_reading, add_real_units, add_speech, number_type
 from apt_evap.cli._output import tell, tell_json
 from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.timing import Timing
 from apt_evap.io.formats import write
 from apt_evap.simulation.run import Run
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.description = (
+        "Write the ions that hit the detector, of a run or of a measurement, as a file of ions. The\n"
+        "suffix of FILE selects the format. In real units an .epos has the voltages, times of flight, mass-to-charge\n"
+        "ratios and pulses that an instrument could have written."
+    )
+    parser.epilog = (
+        "example: apt-evap export ni111.h5 --real-units --perturbation RollUp:0.36,0.36 -o ni111.epos\n"
+        "         apt-evap export R5083.epos -o R5083.nxs --elements Si,O"
+    )
+    parser.add_argument("file", metavar="IONS", help="a run (.h5) or measured ions (.epos, ...)")
+    parser.add_argument("-o", "--output", metavar="FILE", help="default: the name of IONS with .epos")
+    parser.add_argument("--elements", metavar="NAME,...", help="of the specimen, for .nxs; default: those of the run")
+    parser.add_argument("--perturbation", metavar="P", help="as for map; default: the first one of the run")
+    add_real_units(parser)
+    parser.add_argument("--temperature", type=number_type("K"), metavar="K", help="adds energy deficits to the times")
+    parser.add_argument("--jitter", type=number_type("ns"), metavar="NS", help="error of the times; default: none")
+    add_reading(parser)
+    parser.add_argument("--force", action="store_true", help="overwrite an existing file")
+    add_speech(parser)
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -11,12 +11,38 @@ import numpy as np
 from apt_evap._common.files import FileError
 from apt_evap.analysis.description import UNITS, describe, describe_atoms
 from apt_evap.cli._files import read, select, selects
+from apt_evap.cli._options import FILE_HELP, add_reading
 from apt_evap.cli._output import put
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.io.specimens import read_atoms, specimen_format, tip_of
 from apt_evap.simulation.run import Run
 from apt_evap.simulation.stop_reason import StopReason
 from apt_evap.warnings import SpecimenWarning
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.description = (
+        "Summarise a run (for an unfinished run, give the folder), a file of ions, a map, or a specimen\n"
+        "(LAMMPS, TAPSim, ASE)."
+    )
+    parser.epilog = (
+        "example: apt-evap info ni111.h5\n         apt-evap info R5083.epos --json | jq .columns.voltage\n"
+        "         apt-evap info precipitate.lmp --types 1=Al,2=Cu"
+    )
+    parser.add_argument("file", metavar="FILE", help=FILE_HELP)
+    add_reading(parser)
+    parser.add_argument(
+        "--types", type=_types, metavar="1=Al,2=Cu", help="elements of the types of a specimen that have no names"
+    )
+    parser.add_argument("--json", action="store_true", help="as JSON, for programs; units as in the text output")
+
+
+def _types(text: str) -> list[tuple[str, str]]:
+    pairs = [(part.partition("=")[0], part.partition("=")[2]) for part in text.split(",")]
+    if not all(key and name for key, name in pairs):
+        raise argparse.ArgumentTypeError(f"must be types with their elements, such as 1=Al,2=Cu, got {text!r}")
+    return pairs
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -60,10 +60,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _execute(arguments):
     """Run a command. Its module and all it needs are imported here, where Ctrl-C is handled."""
-    parser = import_module("apt_evap.cli.parser").make_parser()
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    module = import_module("apt_evap.cli.parser")
+    command = next((word for word in arguments if word in module.COMMANDS), "")
     try:
-        options = parser.parse_args(arguments)
-        options.arguments = list(sys.argv[1:] if arguments is None else arguments)
+        options = module.make_parser(command).parse_args(arguments)
+        options.arguments = arguments
     except SystemExit as stop:  # --help and --version
         return stop.code or 0
     return import_module(f"apt_evap.cli.{options.command}").execute(options)

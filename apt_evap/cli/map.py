@@ -8,7 +8,7 @@ from typing import Any
 
 from apt_evap._common.codec import from_plain
 from apt_evap.analysis.apex import image_compression
-from apt_evap.analysis.ion_image import field_ion_image
+from apt_evap.analysis.ion_image import GASES, field_ion_image
 from apt_evap.cli._files import (
     check_output,
     in_real_units,
@@ -21,11 +21,20 @@ from apt_evap.cli._files import (
     selects,
     with_masses,
 )
+from apt_evap.cli._options import (
+    FILE_HELP,
+    add_reading,
+    add_real_units,
+    add_speech,
+    integer_type,
+    number_type,
+    numbers_type,
+)
 from apt_evap.cli._output import say, tell, tell_json
 from apt_evap.config.map_panels import MapSettings, Panel
 from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.crystallography.orientation import Orientation
-from apt_evap.detection.binning import shown_bins
+from apt_evap.detection.binning import MAX_BINS, shown_bins
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.projection import Projection
@@ -37,6 +46,70 @@ from apt_evap.simulation.run import Run
 from apt_evap.simulation.surface import surface_after
 
 _IMAGE_BINS = 512  # along a side of a field-ion image: a spot at R = 7 nm is 3 bins wide
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.description = "Draw detector maps of a run or of measured ions, or a map."
+    parser.epilog = (
+        "example:\n"
+        "  apt-evap map R5083.epos --bins 128\n"
+        "  apt-evap map R5083.epos --ranges R5083.rrng --species Si --voltage 4000, --circle 15 -o silicon.png\n"
+        "  apt-evap map ni111.h5 --perturbation Unperturbed --perturbation RollUp:0.3,0.1 -o energies.png\n"
+        "  apt-evap map ni111.h5 --field-ion Ne -o image.png\n"
+        "  apt-evap map ni111.h5 --poles\n"
+        "  apt-evap map R5083.epos --poles W --axis 0,1,1 --distance 90\n\n"
+        "a perturbation is NAME, NAME:NUMBERS or a TOML table:\n"
+        "  Unperturbed              RollUp:0.2 (eV, all ions)    RollUp:0.155,0.155 (mean, standard deviation)\n"
+        "  LateralVelocity:0.3,0.1  Combined:0.155,0.155,0.75 (the last number is the roll-up fraction)\n"
+        '  \'{name = "RollUp", energy = {name = "Thermal", temperature = 50}}\''
+    )
+    parser.add_argument("file", metavar="FILE", help=FILE_HELP)
+    add_reading(parser)
+    parser.add_argument(
+        "-o", "--output", metavar="MAP.png", help=".png, .pdf or .svg; default: FILE_map.png in this folder"
+    )
+    parser.add_argument(
+        "--bins",
+        type=integer_type(1, MAX_BINS),
+        metavar="N",
+        help="bins along the longer side; default: about sqrt(ions)",
+    )
+    parser.add_argument("--smooth", type=number_type("mm"), metavar="MM", help="sigma of a Gaussian; default: one bin")
+    parser.add_argument(
+        "--perturbation",
+        action="append",
+        metavar="P",
+        help="perturbation of the ions of a run; repeat it for maps side by side",
+    )
+    parser.add_argument(
+        "--field-ion",
+        nargs="?",
+        const="Ne",
+        choices=GASES,
+        metavar="GAS",
+        help="field-ion image of the surface at the end of a run, in He, Ne, Ar or H2; default: Ne",
+    )
+    group = parser.add_argument_group("crystal", "Poles and zone lines over the map.")
+    group.add_argument(
+        "--poles",
+        nargs="?",
+        const="",
+        metavar="NAME",
+        help="draw them, of a run or of a crystal such as W; where they are is searched as by apt-evap index",
+    )
+    group.add_argument(
+        "--axis",
+        type=numbers_type,
+        metavar="H,K,L",
+        help="pole near the centre of the map, or with --rotation the axis",
+    )
+    group.add_argument("--rotation", type=float, metavar="DEGREES", help="of the crystal about its axis; no search")
+    group.add_argument("--scale", type=number_type("mm/rad"), metavar="S", help="scale of the map [mm/rad]")
+    group.add_argument("--distance", type=number_type("mm"), metavar="MM", help="flight length of the instrument")
+    add_real_units(parser)
+    parser.add_argument("--force", action="store_true", help="overwrite a file not made by apt-evap")
+    add_speech(parser)
 
 
 def execute(options: argparse.Namespace) -> int:

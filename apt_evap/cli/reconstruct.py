@@ -18,16 +18,77 @@ from apt_evap.cli._files import (
     select,
     with_masses,
 )
+from apt_evap.cli._options import add_reading, add_real_units, add_speech, integer_type
 from apt_evap.cli._output import tell, tell_json
 from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.detection.hits import Hits
 from apt_evap.io.formats import read_ranges
 from apt_evap.reconstruction.constants import run_constants
 from apt_evap.reconstruction.origins import OriginTable
-from apt_evap.reconstruction.reconstruct import reconstruct
+from apt_evap.reconstruction.reconstruct import FRAMES, PROJECTIONS, PROTOCOLS, reconstruct
 from apt_evap.simulation.run import Run
 from apt_evap.specimen.lattice import atom_density
 from apt_evap.specimen.materials import MATERIALS, material
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.description = (
+        "Reconstruct the positions of ions in the specimen from their hits and their sequence, and write\n"
+        "them as .pos, .epos, .xyz or .vtp. A run has its own constants; its true sites give the errors."
+    )
+    parser.epilog = (
+        "example:\n"
+        "  apt-evap reconstruct R5083.epos --element Si --distance 90 --efficiency 0.57 -o R5083.pos\n"
+        "  apt-evap reconstruct R5083.epos --element Si --distance 90 --ranges R5083.rrng --picture R5083.png\n"
+        "  apt-evap reconstruct ni111.h5 --real-units\n"
+        "  apt-evap reconstruct R5083.epos --atomic-volume 0.02 --distance 90 --radius shank --initial-radius 30 \\\n"
+        "      --shank-angle 5"
+    )
+    parser.add_argument("file", metavar="FILE", help="measured ions (.epos, ...) or a run (.h5)")
+    parser.add_argument("-o", "--output", metavar="OUT", help="default: FILE_reconstructed.pos in this folder")
+    parser.add_argument(
+        "--frame", choices=FRAMES, default="depth", help="z is the depth, or goes out of the specimen; default: depth"
+    )
+    parser.add_argument(
+        "--picture",
+        metavar="P.png",
+        help="draw side view, top view, depth profile and composition; --ranges gives the species of measured ions",
+    )
+    constants = parser.add_argument_group("constants", "The defaults of a run are its own constants.")
+    constants.add_argument("--protocol", choices=PROTOCOLS, default="cap", help="depth increment; default: cap")
+    constants.add_argument(
+        "--projection", choices=PROJECTIONS, help="angle on the cap; default: bas, of a run compressed"
+    )
+    constants.add_argument("--distance", type=float, metavar="MM", help="flight length; default: that of the run")
+    constants.add_argument(
+        "--detector-radius",
+        type=float,
+        metavar="MM",
+        help="default: that of the outermost ion, of a run half its width",
+    )
+    constants.add_argument(
+        "--compression", type=float, metavar="XI", help="image compression; default: 1.5, of a run its own"
+    )
+    constants.add_argument("--efficiency", type=float, default=1.0, metavar="ETA", help="of the detector; default: 1")
+    constants.add_argument("--element", metavar="NAME", help="material that gives the atomic volume and the field")
+    constants.add_argument("--atomic-volume", type=float, metavar="NM3", help="default: that of the element")
+    constants.add_argument(
+        "--radius", default="voltage", metavar="R", help="voltage, shank, or a constant radius [nm]; default: voltage"
+    )
+    constants.add_argument("--field-factor", type=float, metavar="KF", help="default: 3.3, of a run its own")
+    constants.add_argument("--evaporation-field", type=float, metavar="F", help="[V/nm]; default: that of the element")
+    constants.add_argument(
+        "--smoothing", type=integer_type(1), default=1, metavar="N", help="ions in the mean of the voltage; default: 1"
+    )
+    constants.add_argument("--origins", metavar="TABLE.npz", help="correct lateral positions by a table of origins")
+    constants.add_argument("--initial-radius", type=float, metavar="NM", help="for --radius shank")
+    constants.add_argument("--shank-angle", type=float, metavar="DEGREES", help="for --radius shank; half the opening")
+    parser.add_argument("--perturbation", metavar="P", help="of a run, as for map; default: the first one of the run")
+    add_real_units(parser)
+    add_reading(parser)
+    parser.add_argument("--force", action="store_true", help="overwrite an existing file")
+    add_speech(parser)
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -10,6 +10,7 @@ from apt_evap._common.files import FileError, check_path
 from apt_evap._common.progress import progress_bar
 from apt_evap.analysis.description import real_units_line
 from apt_evap.cli._files import check_output, is_picture, picture_path, save_picture
+from apt_evap.cli._options import add_speech, integer_type, number_type
 from apt_evap.cli._output import INTERRUPTED, say, tell, tell_json
 from apt_evap.cli.map import run_maps, summaries
 from apt_evap.config.simulation_file import config_of, read_document
@@ -23,6 +24,39 @@ from apt_evap.sweep.foresight import foresee
 SECONDS_BETWEEN_LINES = 60.0
 _BAR = "{percentage:3.0f}%|{bar:20}| {n_fmt} of {total_fmt} ions, {remaining} left"
 _CONTINUE = "the same command with --resume continues"
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.description = (
+        "Run the simulation of a TOML file, save the run and draw its detector maps.\n"
+        "Ctrl-C or SIGTERM ends the simulation and saves the ions so far. During the simulation checkpoints are\n"
+        "stored in RUN.h5.unfinished. After a crash --resume continues from there, with the same bits as an\n"
+        "uninterrupted run. The progress bar shows: charges (RMS residual relative to the mean charge); fractions\n"
+        "of the last ions that missed, never left the tip, or are flagged (inexact responses). Without a terminal:\n"
+        "one line per minute."
+    )
+    parser.epilog = "example: apt-evap run examples/ni111.toml -o ni.h5 --ions 5000"
+    parser.add_argument("config", metavar="CONFIG.toml")
+    parser.add_argument("-o", "--output", metavar="RUN.h5", help="default: output in the file, or its name with .h5")
+    parser.add_argument(
+        "--ions", type=integer_type(1), metavar="N", help="number of atoms to evaporate; default: ions in the file"
+    )
+    parser.add_argument("--threads", type=integer_type(1), metavar="N", help="default: all processors")
+    parser.add_argument("--seed", type=integer_type(0), metavar="N", help="default: seed in the file")
+    parser.add_argument("--map", metavar="MAP.png", help="picture of the maps; default: beside the run")
+    parser.add_argument("--resume", action="store_true", help="continue an unfinished run, or extend a run")
+    parser.add_argument(
+        "--checkpoint",
+        type=number_type("min"),
+        default=10.0,
+        metavar="MINUTES",
+        help="time between two checkpoints; default: 10",
+    )
+    add_speech(parser)
+    parser.add_argument(
+        "--force", action="store_true", help="overwrite unfinished and other runs, and files not made by apt-evap"
+    )
 
 
 def execute(options: argparse.Namespace) -> int:

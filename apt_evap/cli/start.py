@@ -6,9 +6,30 @@ from pathlib import Path
 from apt_evap._common.files import check_path
 from apt_evap._common.threads import thread_count
 from apt_evap.cli._files import check_output, lens_of
+from apt_evap.cli._options import add_indexing, add_reading, add_specimen, add_speech
 from apt_evap.cli._output import tell, tell_json
 from apt_evap.cli.index import indexed
 from apt_evap.twin.start import MARK, Start, settings_of
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.description = (
+        "Index a measured map, and write a settings file for a simulation of its specimen: axis,\n"
+        "rotation, radius, detector and emission, with the origin of every number as a comment."
+    )
+    parser.epilog = (
+        "example:\n"
+        "  apt-evap start R5083.epos --element Ni --distance 90 -o specimen.toml\n"
+        "  apt-evap run specimen.toml"
+    )
+    parser.add_argument("file", metavar="FILE", help="measured ions (.epos, ...) or a map (.npz)")
+    parser.add_argument("-o", "--output", metavar="FILE.toml", help="default: the name of FILE with .toml")
+    add_reading(parser)
+    add_indexing(parser)
+    add_specimen(parser)
+    parser.add_argument("--force", action="store_true", help="overwrite a file not made by this command")
+    add_speech(parser)
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -6,7 +6,9 @@ import shlex
 
 from apt_evap._common.codec import to_plain
 from apt_evap._common.files import FileError
+from apt_evap.cli._options import SHAPE, add_speech, integer_type
 from apt_evap.cli._output import put, say, tell, tell_json
+from apt_evap.detection.binning import MAX_BINS
 from apt_evap.sweep.batch_system import largest_array, scripts, submit
 from apt_evap.sweep.collection import collect
 from apt_evap.sweep.foresight import hours_text
@@ -14,6 +16,59 @@ from apt_evap.sweep.overview import status
 from apt_evap.sweep.planning import STATES, open_sweep, plan
 from apt_evap.sweep.pool import work_locally, work_with_dask
 from apt_evap.sweep.worker import retry, work, work_on
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.description = (
+        "Run all points of a study file: all combinations of some settings, and single points. Every\n"
+        "point has a folder of its own, and can be run by any process that sees it."
+    )
+    parser.epilog = (
+        "example:\n"
+        "  apt-evap sweep plan study.toml                          folders, memory and hours; runs nothing\n"
+        "  apt-evap sweep work study.toml --workers 4              on this machine\n"
+        "  apt-evap sweep submit study.toml --scheduler slurm      on a cluster\n"
+        "  apt-evap sweep status study.toml\n"
+        "  apt-evap sweep collect study.toml                       tables, maps, a report, fit to a measured map"
+    )
+    actions = parser.add_subparsers(title="actions", metavar="ACTION", dest="action", required=True)
+
+    def add(name, text, **options):
+        action = actions.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.", **options, **SHAPE)
+        action.add_argument("study", metavar="STUDY.toml", help="study file, or the folder of its sweep")
+        return action
+
+    add_speech(add("plan", "make the folder of a sweep, and foresee memory and hours; nothing is run"))
+    work = add("work", "work on the points that are open")
+    where = work.add_mutually_exclusive_group()
+    where.add_argument("--workers", type=integer_type(1), default=1, metavar="N", help="processes; default: 1")
+    where.add_argument("--point", action="append", metavar="KEY", help="only this point, by its key or number")
+    where.add_argument("--scheduler", choices=("dask",), help="let the workers of a Dask cluster work")
+    work.add_argument("--address", metavar="TCP", help="address of the scheduler of Dask")
+    work.add_argument("--retry", action="store_true", help="also try failed points again")
+    add_speech(work)
+    submit = add("submit", "submit the open points to a batch system, as job arrays")
+    submit.add_argument("--scheduler", choices=("slurm", "pbs"), default="slurm", help="default: slurm")
+    submit.add_argument("--dry-run", action="store_true", help="only print the scripts")
+    submit.add_argument("--template", metavar="JOB.sh", help="script with placeholders such as @KEYS@ and @COMMAND@")
+    submit.add_argument("--submit-command", metavar="COMMAND", help="default: sbatch --parsable, or qsub")
+    submit.add_argument(
+        "--option", action="append", metavar="OPTION", help="of the batch system, such as --option=--partition=short"
+    )
+    submit.add_argument(
+        "--at-once", type=integer_type(1), metavar="N", help="tasks of an array that run at once (slurm)"
+    )
+    submit.add_argument(
+        "--largest-array", type=integer_type(1), metavar="N", help="default: as the system allows, or 1000"
+    )
+    add_speech(submit)
+    add("status", "show the states of all points").add_argument("--json", action="store_true", help="as JSON")
+    gather = add("collect", "collect the finished points: table, maps, report, and the fit to a measured map")
+    gather.add_argument("--maps", metavar="MAPS.h5", help="default: maps.h5 in the folder of the sweep")
+    gather.add_argument("--bins", type=integer_type(1, MAX_BINS), metavar="N", help="default: bins in [maps], or 128")
+    gather.add_argument("--no-compare", action="store_true", help="without the comparison of [compare]")
+    add_speech(gather)
 
 
 def execute(options: argparse.Namespace) -> int:

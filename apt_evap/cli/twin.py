@@ -11,6 +11,7 @@ from apt_evap._common.codec import to_plain
 from apt_evap._common.files import FileError, check_path, read_small_file, replace_file
 from apt_evap.cli import run as run_command
 from apt_evap.cli._files import lens_of
+from apt_evap.cli._options import add_indexing, add_reading, add_specimen, number_type
 from apt_evap.cli._output import put, say
 from apt_evap.cli.compare import compare
 from apt_evap.cli.index import map_of
@@ -36,6 +37,35 @@ SETTINGS, FACTS, RUN, REGISTRATION, STUDY, ANSWER = (
 )  # fmt: skip
 _LARGEST = 1 << 24  # bytes of start.json
 _FRACTIONS = "0.2,0.4,0.6,0.8,1"  # that roll up, in the fit
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.description = (
+        "Index a measured map, simulate its specimen, register the simulated map on the measured one, fit\n"
+        "the emission, and write a report. The same command continues after an interruption."
+    )
+    parser.epilog = (
+        "writes to FOLDER:\n"
+        "  specimen.toml, start.json   settings of the simulation, and the indexing\n"
+        "  run.h5, run.png             the simulation\n"
+        "  registration.json, study/   as of apt-evap compare; study/report.html has it all\n"
+        "  answer.txt                  constants of the measurement, what they depend on, and checks\n\n"
+        "example:\n"
+        "  apt-evap twin R5083.epos --element Ni --distance 90 --minutes 10\n"
+        "  apt-evap twin map.npz --element Ni --pole=-9.6,-0.4,1,1,1 --pole 2.4,6.2,1,1,3 --pole=-7.5,-13.5,1,3,1"
+    )
+    parser.add_argument("file", metavar="FILE", help="measured ions (.epos, ...) or a map (.npz)")
+    parser.add_argument("-o", "--output", metavar="FOLDER", help="default: FILE_twin in this folder")
+    add_reading(parser)
+    add_indexing(parser)
+    add_specimen(parser).add_argument(
+        "--efficiency",
+        type=number_type("1"),
+        default=0.5,
+        metavar="ETA",
+        help="part of the evaporated atoms that are among the selected ions, for the angle of the shank; default: 0.5",
+    )
 
 
 def execute(options: argparse.Namespace) -> int:

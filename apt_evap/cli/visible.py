@@ -3,8 +3,22 @@
 import argparse
 import math
 
+from apt_evap.cli._options import add_speech, integer_type
 from apt_evap.cli._output import tell, tell_json
 from apt_evap.visibility.settings_file import estimate_of_file
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.description = (
+        "Simulate a feature of a specimen, such as a precipitate, emulate many twins of it, and apply an\n"
+        "analysis to them: the probability that it finds the feature, the number of ions that this needs,\n"
+        "bias and scatter of size and composition. The Python file of the analysis is run."
+    )
+    parser.epilog = "example: apt-evap visible particle.toml --json"
+    parser.add_argument("config", metavar="FILE.toml", help="settings of a simulation, with a table [visibility]")
+    parser.add_argument("--threads", type=integer_type(1), metavar="N", help="default: all processors")
+    add_speech(parser)
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -5,8 +5,8 @@ from typing import Any
 from apt_evap._common.codec import checked, count, from_plain, number, settings
 from apt_evap._common.validation import check_kind, check_number, check_sequence, short_text
 from apt_evap.config.perturbation_text import read_perturbation, title_of
+from apt_evap.detection.binning import MAX_BINS
 from apt_evap.detection.detector import Detector
-from apt_evap.detection.limits import MAX_BINS
 from apt_evap.emission.energies import TruncatedNormal
 from apt_evap.emission.perturbations import RollUp, Unperturbed
 

@@ -8,8 +8,9 @@ import skimage
 
 from apt_evap._common.types import Booleans, Floats, Integers
 from apt_evap._common.validation import check_array, check_count, check_number, short_text
-from apt_evap.detection.limits import MAX_BINS
 
+MAX_BINS = 16384
+"""Largest number of bins along a side: 2 GB of counts."""
 _CHUNK = 1 << 16
 
 FEWEST_SHOWN = 128

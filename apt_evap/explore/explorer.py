@@ -18,10 +18,9 @@ from apt_evap.config.perturbation_text import write_perturbation
 from apt_evap.crystallography.directions import poles
 from apt_evap.crystallography.orientation import Orientation
 from apt_evap.crystallography.symmetry import pole_symmetry
-from apt_evap.detection.binning import bins_for, field_of_view
+from apt_evap.detection.binning import MAX_BINS, bins_for, field_of_view
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
-from apt_evap.detection.limits import MAX_BINS
 from apt_evap.detection.projection import Projection
 from apt_evap.emission.perturbations import Perturbation, RollUp, TruncatedNormal, Unperturbed
 from apt_evap.explore.controls import MECHANISMS, Control, controls_of, perturbation_of

@@ -14,7 +14,16 @@ from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_array, check_choice, check_kind
 from apt_evap.emission.energies import TruncatedNormal
 from apt_evap.emission.perturbations import Combined, LateralVelocity, Perturbation, RollUp
-from apt_evap.fit.defaults import MEANS, MECHANISMS, ROLLUP_FRACTIONS, RSDS
+
+MEANS = (0.01, 0.0825, 0.155, 0.2275, 0.3, 0.3725)
+"""Means of the paper's grid [eV]: from 0.01 to 0.3725 in even steps."""
+RSDS = (0.01, 0.0316, 0.1, 0.316, 1.0, 3.16)
+"""Relative standard deviations of the paper's grid: from 0.01 to 3.16, two per decade."""
+ROLLUP_FRACTIONS = (0.0, 0.25, 0.5, 0.75, 1.0)
+"""Roll-up fractions of the energy in the paper's grid."""
+
+MECHANISMS = ("roll-up", "lateral", "combined")
+"""Mechanisms of emission: `RollUp`, `LateralVelocity` or `Combined`."""
 
 _RESERVED = ("energy", "mean", "relative_spread", "rollup_fraction", "true_mean", "true_standard_deviation")
 _HALVES = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])

@@ -2,12 +2,22 @@
 
 from apt_evap._common.codec import checked, choice, count, number, settings, switch
 from apt_evap._common.validation import check_seed
-from apt_evap.fit.defaults import (
-    FOLDED_MODEL_ERROR,
-    FOLDED_MODEL_ERROR_OF_MEANS,
-    MODEL_ERROR,
-    SAME_RADIUS_MODEL_ERROR_OF_MEANS,
-)
+
+MODEL_ERROR = 0.2
+"""Relative increase of the misfit 1 - SSIM from the best to the true point, by the error of the model.
+
+Measured (roll-up, Ni[111], R = 14 a, 10,000 ions, 23 twins with other origins, and radii, shanks and surface thresholds
+within 20 %, each fitted by five specimens): median 0.12, 95 % below 0.24, largest 0.31. With 0.2, the intervals contain
+the hidden sigma/mean in 96 %, and the hidden true mean in 98 % of the 115 fits."""
+FOLDED_MODEL_ERROR = 0.12
+"""The same for 1 - concordance of folded maps.
+
+Measured (50 twins as above, one specimen fitted): the intervals contain the hidden sigma/mean and true standard
+deviation in 98 and 98 %, with 0.10 in 92 and 92 %."""
+FOLDED_MODEL_ERROR_OF_MEANS = 0.08
+"""The same for the mean and the true mean, which maps see better: in 100 and 96 %, with 0.04 in 96 and 86 %."""
+SAME_RADIUS_MODEL_ERROR_OF_MEANS = 0.04
+"""The same for 50 twins with radii within 5 %: 100 and 98 %, with 0.03 98 and 94 %."""
 
 
 @settings

@@ -7,8 +7,8 @@ import numpy as np
 
 from apt_evap._common.files import FileError, open_for_reading
 from apt_evap._common.types import AnyPath
+from apt_evap.detection.binning import MAX_BINS
 from apt_evap.detection.detector_map import DetectorMap
-from apt_evap.detection.limits import MAX_BINS
 
 _MAX_BYTES = 8 * MAX_BINS**2
 _MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 1e-3}

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from apt_evap._common.validation import check_array, check_count, check_number
+from apt_evap.detection.binning import MAX_BINS
 from apt_evap.detection.detector_map import DetectorMap
-from apt_evap.detection.limits import MAX_BINS
 from apt_evap.maps.pole_frame import Directions, pole_frame, unit_vector
 from apt_evap.maps.profiles import Profile
 

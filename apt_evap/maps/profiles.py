@@ -10,9 +10,9 @@ import scipy
 from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence
+from apt_evap.detection.binning import MAX_BINS
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
-from apt_evap.detection.limits import MAX_BINS
 
 
 class Profile(NamedTuple):

@@ -28,7 +28,6 @@ from apt_evap.detection.hits import Hits
 from apt_evap.io.formats import write
 from apt_evap.microscope.lens import LAST_ANGLE
 from apt_evap.microscope.local_electrode import LocalElectrode
-from apt_evap.reconstruction.choices import FRAMES, PROJECTIONS, PROTOCOLS
 from apt_evap.reconstruction.density import CapDensity, density_of
 from apt_evap.reconstruction.errors import (
     FREE,
@@ -42,6 +41,15 @@ from apt_evap.reconstruction.errors import (
 from apt_evap.reconstruction.origins import OriginTable
 from apt_evap.simulation.real_units import trailing_mean
 from apt_evap.simulation.run import Run
+
+PROTOCOLS = ("cap", "bas")
+"""Depth increments: of the spherical cap, exact; with the area of the detector, of Bas et al."""
+
+PROJECTIONS = ("bas", "equidistant", "compressed")
+"""Relations between the distance on the detector and the angle on the cap."""
+
+FRAMES = ("depth", "specimen")
+"""Direction of z: the depth, or out of the specimen."""
 
 _RIGHT_ANGLE = math.pi / 2
 _WIDEST = math.radians(89.0)  # rim of the field of view, at the largest compression that is fitted

@@ -1,0 +1,184 @@
+"""Options of several commands, and the types of their values."""
+
+import argparse
+from collections.abc import Callable
+from math import inf, isfinite
+from typing import Any
+
+SHAPE: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
+"""Options of every parser: texts as they are written, no abbreviations."""
+FILE_HELP = "a run (.h5), measured ions (.epos, ...) or a map (.npz)"
+"""Help of an argument for any file."""
+
+
+def add_reading(parser: argparse.ArgumentParser) -> Any:
+    """Add options for reading a file and selecting ions; return the first group."""
+    group = parser.add_argument_group("reading of files")
+    group.add_argument("--format", metavar="SUFFIX", help="read ions in this format, such as .pos")
+    group.add_argument("--partial", action="store_true", default=None, help="read a truncated file to its last ion")
+    group.add_argument("--byte-order", choices=("big", "little"), help="byte order of .pos and .epos files")
+    group.add_argument("--arrays", metavar="V,X,Y[,MASK]", help="names in an .npz: values, edges in x and y, mask")
+    group.add_argument("--unit", metavar="UNIT", help="unit of the edges in an .npz: mm, cm, m or um")
+    group.add_argument(
+        "--undistort", metavar="GRID.csv", help="calibration grid of the instrument, such as a reflectron"
+    )
+    selection = parser.add_argument_group("selection of ions", "LOW <= value < HIGH; LOW or HIGH may be omitted: 27,")
+    selection.add_argument("--mass", type=bounds_type, metavar="LOW,HIGH", help="mass-to-charge ratio [Da]")
+    selection.add_argument("--voltage", type=bounds_type, metavar="LOW,HIGH", help="DC voltage [V]")
+    selection.add_argument(
+        "--ions", type=bounds_type, metavar="FIRST,LAST", help="in the order of the file, from 0; LAST is not included"
+    )
+    selection.add_argument("--circle", type=_circle, metavar="R[,X,Y]", help="radius and centre on the detector [mm]")
+    selection.add_argument("--box", type=_box, metavar="X0,X1,Y0,Y1", help="rectangle on the detector [mm]")
+    selection.add_argument("--ranges", metavar="FILE.rrng", help="or .rng, .env: ranges of mass, for --species")
+    selection.add_argument(
+        "--species", metavar="NAME[,NAME]", help="ions of these names, such as Si: in --ranges, or of a run"
+    )
+    return group
+
+
+def add_indexing(parser: argparse.ArgumentParser) -> None:
+    """Add options of the crystal on a measured map."""
+    group = parser.add_argument_group("crystal")
+    group.add_argument("--element", metavar="NAME", required=True, help="the crystal, such as Ni")
+    group.add_argument("--distance", type=number_type("mm"), metavar="MM", help="flight length of the instrument")
+    group.add_argument(
+        "--scales",
+        type=numbers_type,
+        metavar="LOW,HIGH",
+        help="bounds of the scale of the map [mm/rad], if it is known",
+    )
+    group.add_argument(
+        "--pole", type=_mark(2), action="append", metavar="X,Y[,H,K,L]", help="a pole that you see [mm]; repeat it"
+    )
+    group.add_argument(
+        "--line",
+        type=_mark(4),
+        action="append",
+        metavar="X,Y,X,Y[,U,V,W]",
+        help="two points of a zone line that you see [mm], and its zone axis if you know it; repeat it",
+    )
+
+
+def add_specimen(parser: argparse.ArgumentParser) -> Any:
+    """Add options of the simulated specimen; return their group."""
+    group = parser.add_argument_group("specimen")
+    group.add_argument(
+        "--minutes", type=float, default=10.0, metavar="N", help="time that the simulation may take; default: 10"
+    )
+    group.add_argument("--field-factor", type=float, metavar="KF", help="for the radius from the voltage; default: 3.3")
+    group.add_argument("--lens", metavar="L", help="microscope that gives the field factor, as for apt-evap export")
+    group.add_argument("--threads", type=integer_type(1), metavar="N", help="default: all processors")
+    return group
+
+
+def add_real_units(parser: argparse.ArgumentParser) -> None:
+    """Add the option for real units."""
+    parser.add_argument(
+        "--real-units",
+        nargs="?",
+        const="cap",
+        choices=("cap", "site"),
+        metavar="REFERENCE",
+        help="true V, eV and ns: the evaporation field is reached by the mean of the cap (cap, the default) or by the "
+        "evaporating atom (site)",
+    )
+    parser.add_argument(
+        "--lens",
+        metavar="L",
+        help="microscope around the specimen: local-electrode or plane-electrode, with changed fields of "
+        "LocalElectrode such as local-electrode:shank_angle=7,distance=60e3 [degrees, nm]; for a run in real units",
+    )
+
+
+def add_speech(parser: argparse.ArgumentParser) -> None:
+    """Add options for the messages of a parser: text, JSON or none."""
+    speech = parser.add_mutually_exclusive_group()
+    speech.add_argument("--quiet", action="store_true", help="only warnings and errors")
+    speech.add_argument("--json", action="store_true", help="one line of JSON that names the written files")
+
+
+def integer_type(least: int, largest: int | None = None) -> Callable[[str], int]:
+    """Integer within bounds."""
+
+    def integer(text):
+        try:
+            number = int(text)
+        except ValueError:
+            number = least - 1
+        if number < least or (largest is not None and number > largest):
+            bounds = f">= {least}" if largest is None else f"from {least} to {largest}"
+            raise argparse.ArgumentTypeError(f"must be an integer {bounds}, got {text!r}")
+        return number
+
+    return integer
+
+
+def number_type(unit: str) -> Callable[[str], float]:
+    """Finite number >= 0."""
+
+    def number(text):
+        try:
+            value = float(text)
+        except ValueError:
+            value = -1.0
+        if not 0 <= value < inf:
+            raise argparse.ArgumentTypeError(f"must be a number [{unit}] >= 0, got {text!r}")
+        return value
+
+    return number
+
+
+def numbers_type(text: str) -> tuple[float, ...]:
+    """Numbers separated by commas."""
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be numbers separated by commas, got {text!r}") from None
+
+
+def bounds_type(text: str) -> tuple[float | None, float | None]:
+    """Two bounds, None for an omitted one."""
+    try:
+        low, high = (float(part) if part.strip() else None for part in text.split(","))
+        ordered = low is None or high is None or low <= high
+        if not ordered or not all(bound is None or isfinite(bound) for bound in (low, high)):
+            raise ValueError
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be two increasing numbers, such as 27,29.5, got {text!r}") from None
+    return low, high
+
+
+def _circle(text: str) -> tuple[float, tuple[float, ...]]:
+    """Radius and centre of a circle."""
+    try:
+        radius, *centre = (float(part) for part in text.split(","))
+        if radius <= 0 or len(centre) not in (0, 2) or not all(map(isfinite, (radius, *centre))):
+            raise ValueError
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be a radius, or R,X,Y, such as 15,0,-2 [mm], got {text!r}") from None
+    return radius, tuple(centre) or (0.0, 0.0)
+
+
+def _box(text: str) -> tuple[float, ...]:
+    """Bounds of a rectangle in x and in y."""
+    try:
+        left, right, lower, upper = (float(part) for part in text.split(","))
+        if not (left < right and lower < upper and all(map(isfinite, (left, right, lower, upper)))):
+            raise ValueError
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be X0,X1,Y0,Y1, such as -5,5,0,8 [mm], got {text!r}") from None
+    return left, right, lower, upper
+
+
+def _mark(n: int) -> Callable[[str], tuple[Any, ...]]:
+    """`n` coordinates, and perhaps three or four indices after them."""
+
+    def mark(text):
+        numbers = numbers_type(text)
+        indices = numbers[n:]
+        if len(numbers) < n or len(indices) not in (0, 3, 4) or any(each != round(each) for each in indices):
+            raise argparse.ArgumentTypeError(f"must be {n} coordinates [mm], perhaps with indices, got {text!r}")
+        return (*numbers[:n], tuple(int(each) for each in indices)) if indices else numbers
+
+    return mark
