@@ -1,16 +1,13 @@
-"""Damage run and state files at random, load each, and compare what comes back value by value.
+"""Damage files of runs, ions, data sets and operators at random, read each, and compare what comes back.
 
-python tools/fuzz_runs.py [--mutants 20000] [--seed 1] [--processes 2] [--run RUN.h5] [--state STATE.h5]
+python tools/fuzz_runs.py [--mutants 20000] [--seed 1] [--processes 2] [--run RUN.h5]
 
-Each mutant is loaded in a child process. It must come back as the original or be refused by a FileError. Mutants whose
-digest was made again after the damage are counted separately: nothing can notice their damage for certain, but it
-should end in a FileError or in other values, and in no crash. Exit code 1 if a mutant with the digest of the original
-is silently wrong, hangs, or ends in a crash or in another error.
+Each mutant is read in a child process. It must come back as the original or be refused by a FileError. Exit code 1 if
+one is silently wrong, hangs, or ends in a crash or in another error.
 """
 
 import argparse
 import hashlib
-import io
 import json
 import multiprocessing
 import os
@@ -27,24 +24,43 @@ from pathlib import Path
 import numpy as np
 
 import apt_evap as ae
-from apt_evap.simulation.run_hdf5 import count_ions, is_run, read_state, write_state
-from apt_evap.storage import digested_hdf5
-from apt_evap.storage.digested_hdf5 import tail_of
+from apt_evap.dataset.fields import TEXT, Field
+from apt_evap.dataset.shards import key_in, read_table, write_shard
+from apt_evap.simulation.run_hdf5 import count_ions, is_run
+from apt_evap.visibility.operators import OriginOperators
 
 KINDS = ("flipped bits", "zeroed range", "random range", "truncation", "insertion", "deletion")
 GOOD = ("as the original", "FileError")
 SECONDS, MEMORY = 20, 6 << 30  # of one mutant
+SCHEMA = {
+    "examples": (Field("ions", np.int64, ""), Field("settings", TEXT, "")),
+    "ions": (Field("example", np.uint32, ""), Field("position", np.float32, "", "nm", (3,))),
+}
 
 
 def make_files(folder):
-    """A run with all that a file may hold, and the state it ends in."""
+    """A file of each kind, and how it is read: a run with all that it may contain, ions, a data set, and operators."""
     tip = ae.Tip("Ni", apex_radius=1.8, axis=(1, 1, 1), shank_length=1.8, depth=1.2, solutes={"Al": 0.1}, seed=1)
     settings, monitor = ae.evaporation.ChargeSettings(sweep_interval=20), ae.simulation.Monitor(interval=20)
     simulation = ae.Simulation(tip, seed=1, n_threads=1, charge_settings=settings, monitor=monitor)
     run = simulation.run(60, [ae.RollUp(0.2), ae.Unperturbed()], progress=False)
     run.save(folder / "run.h5")
-    write_state(folder / "state.h5", run.state, run.first_event)
-    return folder / "run.h5", folder / "state.h5"
+    ae.write(folder / "ions.nxs", run.hits(ae.RollUp(0.2)), elements=["Ni", "Al"])
+    random = np.random.default_rng(1)
+    tables = {
+        "examples": {"ions": np.array([500, 300]), "settings": ["one " * 300, "other"]},
+        "ions": {"example": np.repeat([0, 1], [500, 300]).astype("u4"), "position": random.random((800, 3), "f4")},
+    }
+    write_shard(folder, "train-0000", tables, SCHEMA, "hdf5", "0123456789abcdef")
+    shapes = (1, 2, 4, 5, 3), (1, 2, 4, 5, 3, 3), (1, 8, 8)
+    arrays = (random.random(shape) for shape in shapes)
+    OriginOperators({"size": np.array([1.0])}, ("Al", "Ni"), *arrays, 3.0, {"a": "b"}).save(folder / "operators.h5")
+    return {
+        "run.h5": load_run,
+        "ions.nxs": ae.read,
+        "train-0000.h5": load_shard,
+        "operators.h5": OriginOperators.load,
+    }
 
 
 def values_of(thing):
@@ -66,12 +82,19 @@ def load_run(path):
     return ae.load(path)
 
 
+def load_shard(path):
+    """Read the tables of a file of a data set, the ions also in part."""
+    folder, name = path.parent, path.stem
+    tables = [read_table(folder, name, table, SCHEMA, "hdf5") for table in SCHEMA]
+    return key_in(folder, name, SCHEMA, "hdf5"), tables, read_table(folder, name, "ions", SCHEMA, "hdf5", slice(9, 70))
+
+
 def mutant(content, random):
     """Damaged content, and the kind of the damage."""
     kind = KINDS[int(random.integers(len(KINDS)))]
     n = len(content)
     place = int(random.integers(n))
-    length = int(random.integers(1, 2 ** int(random.integers(1, 11))))
+    length = int(random.integers(1, 2 ** int(random.integers(1, 15))))
     damaged, after = bytearray(content), content[place + length :]
     if kind == "flipped bits":
         for at in (place, *random.integers(n, size=int(random.integers(3)))):
@@ -89,13 +112,6 @@ def mutant(content, random):
     return bytes(damaged), kind
 
 
-def sealed(content, tail):
-    """An HDF5 file with a digest that fits it."""
-    file = io.BytesIO(content)
-    end = digested_hdf5._end(len(content), tail)
-    return content + digested_hdf5._digest(file, len(content), end) + end
-
-
 def outcome_of(path, load, original):
     """How reading a mutant ends."""
     try:
@@ -106,9 +122,8 @@ def outcome_of(path, load, original):
         return f"{type(error).__name__}: {error!s:.60}"
 
 
-def try_some(numbers, seed, content, load, original, seal, folder, original_path):
+def try_some(numbers, seed, content, load, original, folder):
     """Outcomes of some mutants; a child that dies takes one with it, and another child goes on behind that."""
-    inner, tail = content[: -digested_hdf5._TAIL.size], tail_of(original_path)
     path, done = Path(folder) / f"{os.getpid()}.h5", []
     while len(done) < len(numbers):
         reader, writer = os.pipe()
@@ -120,8 +135,8 @@ def try_some(numbers, seed, content, load, original, seal, folder, original_path
             with os.fdopen(writer, "w") as told:
                 for number in numbers[len(done) :]:
                     signal.alarm(SECONDS)
-                    damaged, kind = mutant(inner if seal else content, np.random.default_rng([seed, number]))
-                    path.write_bytes(sealed(damaged, tail) if seal else damaged)
+                    damaged, kind = mutant(content, np.random.default_rng([seed, number]))
+                    path.write_bytes(damaged)
                     print(json.dumps([kind, None]), file=told, flush=True)
                     print(json.dumps([kind, outcome_of(path, load, original)]), file=told, flush=True)
             os._exit(0)
@@ -136,12 +151,12 @@ def try_some(numbers, seed, content, load, original, seal, folder, original_path
     return list(zip(numbers, done, strict=True))
 
 
-def fuzz(name, path, load, options, seal, folder):
+def fuzz(path, load, options, folder):
     """Try all mutants of a file; return whether all ended well."""
     original = values_of(load(path))
     content, began = path.read_bytes(), time.perf_counter()
     numbers = [list(range(k, options.mutants, 50 * options.processes)) for k in range(50 * options.processes)]
-    same = (options.seed, content, load, original, seal, folder, path)
+    same = (options.seed, content, load, original, folder)
     context = multiprocessing.get_context("fork")
     with context.Pool(options.processes) as pool:
         parts = pool.starmap(try_some, [(part, *same) for part in numbers if part], chunksize=1)
@@ -150,8 +165,7 @@ def fuzz(name, path, load, options, seal, folder):
         counts[kind, outcome] += 1
         firsts.setdefault(outcome, number)
     seconds = time.perf_counter() - began
-    how = "digest made again" if seal else "as damaged"
-    print(f"{name} ({len(content):,} bytes), {how}: {options.mutants:,} mutants in {seconds:.0f} s")
+    print(f"{path.name} ({len(content):,} bytes): {options.mutants:,} mutants in {seconds:.0f} s")
     for outcome in sorted(firsts):
         by_kind = ", ".join(f"{kind} {counts[kind, outcome]:,}" for kind in KINDS if counts[kind, outcome])
         total = sum(counts[kind, outcome] for kind in (*KINDS, "?"))
@@ -163,19 +177,16 @@ def fuzz(name, path, load, options, seal, folder):
 def main():
     """Damage the files as often as the command line says."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--mutants", type=int, default=1000, help="of each file, and as many with a new digest")
+    parser.add_argument("--mutants", type=int, default=1000, help="of each file")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--run", type=Path, help="a run file instead of the one that is made here")
-    parser.add_argument("--state", type=Path, help="a state file instead of the one that is made here")
+    parser.add_argument("--run", type=Path, help="a run file in addition to those that are made here")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        run, state = make_files(Path(folder))
-        files = ("run file", options.run or run, load_run), ("state file", options.state or state, read_state)
-        well = True
-        for name, path, load in files:
-            well &= fuzz(name, path, load, options, False, folder)
-            fuzz(name, path, load, options, True, folder)
+        files = {Path(folder, name): load for name, load in make_files(Path(folder)).items()}
+        if options.run:
+            files[options.run] = load_run
+        well = all([fuzz(path, load, options, folder) for path, load in files.items()])
     sys.exit(not well)
 
 

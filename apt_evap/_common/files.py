@@ -2,9 +2,7 @@
 
 import hashlib
 import os
-import re
 import secrets
-import socket
 import stat
 import time
 from collections.abc import Iterator
@@ -14,12 +12,8 @@ from typing import Any, BinaryIO
 
 from apt_evap._common.types import AnyPath
 
-try:
-    import fcntl
-except ImportError:  # not on this system: temporary files of killed processes remain
-    fcntl = None  # type: ignore[assignment]
-
-_ABANDONED_AFTER = 60.0  # seconds: a new file may not be locked yet
+_ABANDONED_AFTER = 3600.0  # seconds since the last byte was written
+_WAIT_FOR_NOBODY = getattr(os, "O_NONBLOCK", 0)
 
 
 class FileError(ValueError):
@@ -120,8 +114,7 @@ def sha256_of(path: AnyPath) -> str:
 def replace_file(path: AnyPath) -> Iterator[BinaryIO]:
     """Write a file under a temporary name in the same folder, and rename it when it is complete.
 
-    A file that is overwritten keeps its mode. The temporary name is random and never that of an existing file or link.
-    Temporary files of killed processes for the same file are removed.
+    A file that is overwritten keeps its mode. What killed processes left of the same file is removed after an hour.
 
     Parameters
     ----------
@@ -139,41 +132,28 @@ def replace_file(path: AnyPath) -> Iterator[BinaryIO]:
         If the file cannot be written, or is not a regular file. The temporary file is then removed.
     """
     path = check_path(path)
-    aside = None
+    part = None
     try:
         target = Path(os.path.realpath(path))
         mode = _mode_of(target)
-        _remove_abandoned(target)
-        name = target.with_name(f".{_stem(target)}.{_host()}.{secrets.token_hex(8)}.part")
-        descriptor = os.open(name, _NEW_FILE, 0o666 if mode is None else 0o600)
-        aside = name
-        with open(descriptor, "w+b") as file:
-            if mode is not None:
-                os.fchmod(descriptor, mode)
-            with suppress(OSError):
-                _lock(descriptor)
+        remove_abandoned(target)
+        name = target.with_name(f"{_before(target)}{secrets.token_hex(8)}.part")
+        with open(name, "x+b") as file:
+            part = name
             yield file
             file.flush()
-            os.fsync(descriptor)  # the bytes must be on the disk before the name, in case of a power cut
-            os.replace(name, target)
-            aside = None
+            os.fsync(file.fileno())  # the bytes must be on the disk before the name, in case of a power cut
+        if mode is not None:
+            part.chmod(mode)
+        os.replace(part, target)
+        part = None
         flush_folder(target.parent)
     except OSError as error:
         raise FileError(f"cannot write {str(path)!r}: {_reason(error)}") from error
     finally:
-        if aside is not None:
+        if part is not None:
             with suppress(OSError):
-                aside.unlink()
-
-
-_NEW_FILE = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
-_WAIT_FOR_NOBODY = getattr(os, "O_NONBLOCK", 0)
-_UNFINISHED = re.compile(r"\..*\.[\w-]*\.[0-9a-f]{16}\.part")
-
-
-def is_unfinished(name: str) -> bool:
-    """Whether a name is that of a temporary file of `replace_file`."""
-    return _UNFINISHED.fullmatch(name) is not None
+                part.unlink()
 
 
 def _open_regular(path, flags):
@@ -204,56 +184,21 @@ def _mode_of(target):
     return stat.S_IMODE(status.st_mode) & 0o777
 
 
-def _stem(target):
-    return target.name[:40]  # the complete temporary name must not be too long for the file system
-
-
-def _host():
-    return re.sub(r"[^\w-]", "-", socket.gethostname(), flags=re.ASCII)[:40]
-
-
-def _lock(descriptor):
-    """Lock a file until it is closed; OSError if another process has locked it."""
-    if fcntl is not None:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
-def _remove_abandoned(target):
-    """Remove temporary files of killed processes for a file: files of this user that are not locked."""
-    if fcntl is None:
-        return
+def remove_abandoned(target: Path, after: float = _ABANDONED_AFTER) -> None:
+    """Remove the temporary files of killed processes for a file, to which nothing was written for some time [s]."""
+    before = _before(target)
     with suppress(OSError):
-        for entry in os.scandir(target.parent):
-            if entry.name.startswith(f".{_stem(target)}.") and is_unfinished(entry.name):
+        for name in os.listdir(target.parent):
+            if name.startswith(before) and len(name) == len(before) + 21 and name.endswith(".part"):
+                part = target.with_name(name)
                 with suppress(OSError):
-                    _remove_if_abandoned(target.with_name(entry.name))
+                    if time.time() - part.stat().st_mtime > after:
+                        part.unlink()
 
 
-def _remove_if_abandoned(path):
-    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | _WAIT_FOR_NOBODY)
-    try:
-        status = os.fstat(descriptor)
-        check_regular(status)
-        if status.st_uid == os.geteuid() and time.time() - status.st_mtime > _ABANDONED_AFTER:
-            _lock(descriptor)
-            path.unlink()
-    finally:
-        os.close(descriptor)
-
-
-def move_file(written: Path, target: Path) -> None:
-    """Rename a complete file; if `target` exists, it is replaced and its mode is kept.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be renamed, or `target` is not a regular file.
-    """
-    mode = _mode_of(target)
-    if mode is not None:
-        os.chmod(written, mode)
-    os.replace(written, target)
-    flush_folder(target.parent)
+def _before(target):
+    """Beginning of the names of temporary files, which must not be too long for the file system."""
+    return f".{target.name[:40]}."
 
 
 def flush_folder(folder: AnyPath) -> None:

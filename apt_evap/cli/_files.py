@@ -60,14 +60,14 @@ def _read(options):
         if getattr(options, name) is not None:
             what = "ions" if is_map else "a map in an .npz file"
             raise ValueError(f"--{name} is for {what}, got {options.file!r}")
-    if path.is_dir():
-        return load(path)  # an unfinished run
+    if path.suffix == ".unfinished":
+        return load(path)
     try:
         parameters = {key: value for key, value in parameters.items() if value is not None}
         return read_file(options.file, format=options.format, **parameters)
     except FileError as error:
         unfinished = Path(f"{path}.unfinished")
-        if unfinished.is_dir() and not path.exists():
+        if unfinished.exists() and not path.exists():
             raise FileError(f"{error}; an unfinished run is in {str(unfinished)!r}") from error
         raise
 

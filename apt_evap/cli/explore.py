@@ -92,8 +92,8 @@ def _with_file(options, path):
 
 def _run_in(path):
     """The run of a file, None if it contains something else."""
-    if os.path.isdir(path):
-        return load(path)  # unfinished
+    if path.endswith(".unfinished"):
+        return load(path)
     content = read_file(path) if path.lower().endswith(".h5") else None
     return content if isinstance(content, Run) else None
 

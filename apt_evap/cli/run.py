@@ -82,7 +82,7 @@ def execute(options: argparse.Namespace) -> int:
     tell(options, f"{str(simulation.tip).strip('<>')}; {len(simulation.emitter):,} atoms on the surface")
     began = time.perf_counter()
     checkpoint = Checkpoint(output, options.checkpoint, resume=options.resume, overwrite=options.force)
-    replaced, unfinished = output.exists(), checkpoint.folder.exists()
+    replaced, unfinished = output.exists(), checkpoint.unfinished.exists()
     n_previous = checkpoint.ions_there() if options.resume else 0
     if 0 < n_previous < n_ions:
         tell(options, f"resumed at {n_previous:,} of {n_ions:,} ions")
@@ -124,7 +124,7 @@ def _simulate(options, config, simulation, checkpoint, n_ions, n_previous):
             )
     except KeyboardInterrupt:
         if ions := checkpoint.ions_there():
-            where = checkpoint.folder if checkpoint.folder.exists() else checkpoint.path
+            where = checkpoint.unfinished if checkpoint.unfinished.exists() else checkpoint.path
             say("note", f"{ions:,} of {n_ions:,} ions are in {str(where)!r}; {_CONTINUE}")
         raise
     except RunInterrupted as error:

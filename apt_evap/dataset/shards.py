@@ -5,14 +5,13 @@ import json
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 
 from apt_evap._common.files import FileError, open_for_reading, replace_file
 from apt_evap._common.optional_imports import optional_import
 from apt_evap.dataset.examples import Rows, typed
 from apt_evap.dataset.fields import TEXT, Field
-from apt_evap.storage.digested_hdf5 import tail_of, write_hdf5
+from apt_evap.storage.checked_hdf5 import label_of, open_hdf5, put_field, write_hdf5
 
 Schema = dict[str, tuple[Field, ...]]
 _KIND = "dataset"
@@ -53,22 +52,16 @@ def write_shard(folder: Path, name: str, tables: dict[str, Rows], schema: Schema
         with write_hdf5(folder / names["ions"], _KIND, len(tables["examples"]["ions"]), key) as file:
             for table, fields in schema.items():
                 for field in fields:
-                    _put(file, f"{table}/{field.name}", tables[table][field.name], field)
+                    values = tables[table][field.name]
+                    values = np.array(values, object) if field.dtype == TEXT else values
+                    dataset = put_field(file, f"{table}/{field.name}", values, field.unit)
+                    dataset.attrs["description"] = field.text
         return
     parquet = optional_import("pyarrow.parquet", "a data set in Parquet")
     for table, fields in schema.items():
         content = _arrow(tables[table], fields).replace_schema_metadata({_KEY: key.encode()})
         with replace_file(folder / names[table]) as file:
             parquet.write_table(content, file, row_group_size=_ROWS, compression="zstd", version="2.6")
-
-
-def _put(file, path, values, field):
-    is_text = field.dtype == TEXT
-    values = np.array(values, dtype=object) if is_text else values
-    dataset = file.create_dataset(path, data=values, dtype=h5py.string_dtype() if is_text else None, track_times=False)
-    dataset.attrs["description"] = field.text
-    if field.unit:
-        dataset.attrs["units"] = field.unit
 
 
 def _arrow(columns, fields):
@@ -98,8 +91,8 @@ def key_in(folder: Path, name: str, schema: Schema, suffix: str) -> str | None:
             return None
         try:
             if suffix == "hdf5":
-                tail = tail_of(path)
-                keys.add(tail.note if tail is not None and tail.kind == _KIND else None)
+                label = label_of(path)
+                keys.add(label.note if label is not None and label.kind == _KIND else None)
             else:
                 parquet = optional_import("pyarrow.parquet", "a data set in Parquet")
                 with open_for_reading(path) as opened:
@@ -134,8 +127,8 @@ def read_table(folder: Path, name: str, table: str, schema: Schema, suffix: str,
     path = folder / file_names(name, schema, suffix)[table]
     try:
         if suffix == "hdf5":
-            with h5py.File(path, "r", locking=False) as file:
-                return {field.name: _taken(file[f"{table}/{field.name}"], field, rows) for field in schema[table]}
+            with open_hdf5(path, "a data set") as file:
+                return {field.name: _taken(file, f"{table}/{field.name}", field, rows) for field in schema[table]}
         parquet = optional_import("pyarrow.parquet", "a data set in Parquet")
         with open_for_reading(path) as opened:
             content = parquet.read_table(opened)
@@ -146,8 +139,9 @@ def read_table(folder: Path, name: str, table: str, schema: Schema, suffix: str,
         ) from error
 
 
-def _taken(dataset, field, rows):
-    return list(dataset.asstr()[rows]) if field.dtype == TEXT else dataset[rows]
+def _taken(file, path, field, rows):
+    values = file.read(path, None if field.dtype == TEXT else field.dtype, (None, *field.row), rows)
+    return [text.decode() for text in values.tolist()] if field.dtype == TEXT else values
 
 
 def _plain(column, field):

@@ -6,9 +6,9 @@ from typing import Any
 from apt_evap._common.files import FileError, check_path
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import short_text
-from apt_evap.io.nxapm import read_nxapm
+from apt_evap.io.nxapm import KIND, read_nxapm
 from apt_evap.io.pyccapt import is_pyccapt, read_pyccapt
-from apt_evap.storage.digested_hdf5 import open_hdf5, tail_of
+from apt_evap.storage.checked_hdf5 import open_hdf5
 
 
 def read_hdf5(path: AnyPath, *, columns: Sequence[str] | None = None) -> Any:
@@ -31,23 +31,18 @@ def read_hdf5(path: AnyPath, *, columns: Sequence[str] | None = None) -> Any:
         If the file is missing, damaged, or of another kind.
     """
     name = str(check_path(path))
-    tail = tail_of(path)
-    if tail is not None and tail.kind == "run":
+    with open_hdf5(path) as file:
+        kind = file.label.kind if file.label else ""
+        known = kind == KIND or is_pyccapt(file)
+    if kind == "run":
         from apt_evap.simulation.run import load  # reading ions does not import the simulation
 
         if columns is not None:
             raise FileError(f"{name!r}: reading a run takes no columns, got {short_text(columns)}")
         return load(path)
-    if tail is not None:
-        return read_nxapm(path, columns=columns)
-    with open_hdf5(path) as file:
-        try:
-            known = is_pyccapt(file)
-        except (OSError, RuntimeError, ValueError, KeyError):
-            known = False
     if not known:
         raise FileError(
             f"{name!r} is an HDF5 file of unknown kind, expected a run, ions in NXapm written by this package, or a "
             "file of PyCCAPT"
         )
-    return read_pyccapt(path, columns=columns)
+    return read_nxapm(path, columns=columns) if kind == KIND else read_pyccapt(path, columns=columns)

@@ -10,32 +10,19 @@ from typing import Any
 
 import numpy as np
 
-from apt_evap._common.files import FileError, check_path
+from apt_evap._common.files import FileError
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_kind, check_sequence, short_text
 from apt_evap._version import __version__
 from apt_evap.detection.hits import Hits
 from apt_evap.io._records import check_columns
 from apt_evap.io._texts import ELEMENTS
-from apt_evap.storage.digested_hdf5 import CheckedFile, first_line, open_hdf5, write_hdf5
-from apt_evap.storage.nexus import (
-    ENTRY,
-    HITS,
-    IONS,
-    MASSES,
-    MULTIPLICITY,
-    TIMES,
-    put_field,
-    put_group,
-    put_nxapm,
-    put_text,
-)
+from apt_evap.storage.checked_hdf5 import CheckedFile, open_hdf5, put_field, put_text, write_hdf5
+from apt_evap.storage.nexus import ENTRY, HITS, IONS, MASSES, MULTIPLICITY, TIMES, put_group, put_nxapm
 
-FORMAT = "apt_evap ions 1"
+KIND = "ions"
 _OWN = f"{ENTRY}/ions"
-_ROWS = 4096  # rows with a common checksum
 _NAMED = {"time_of_flight": TIMES, "mass_to_charge": MASSES, "multiplicity": MULTIPLICITY, "ion": IONS}
-_READ_ERRORS = (OSError, KeyError, IndexError, RuntimeError, TypeError, ValueError, AttributeError, OverflowError)
 _UNITS = {"x": "mm", "y": "mm", "voltage": "V", "pulse_voltage": "V", "positions": "nm"}
 
 
@@ -72,7 +59,7 @@ def write_nxapm(path: AnyPath, hits: Hits, *, elements: Sequence[str], start_tim
     if hits.x is not None and hits.y is not None and hits.x.dtype == hits.y.dtype:
         positions = np.column_stack([hits.x, hits.y])
         names = [name for name in names if name not in ("x", "y")]
-    with write_hdf5(path, "ions", len(hits)) as file:
+    with write_hdf5(path, KIND, len(hits)) as file:
         put_nxapm(
             file,
             ions=np.arange(len(hits)) if hits.ion is None else hits.ion,
@@ -86,7 +73,6 @@ def write_nxapm(path: AnyPath, hits: Hits, *, elements: Sequence[str], start_tim
             is_simulation=hits.outcome is not None or hits.site is not None,
         )
         own = put_group(file, _OWN, "NXcollection")
-        put_text(own, "format", FORMAT)
         put_text(own, "columns", json.dumps(hits.columns))
         put_text(own, "source", hits.source or "unknown")
         if hits.extent is not None:
@@ -94,9 +80,9 @@ def write_nxapm(path: AnyPath, hits: Hits, *, elements: Sequence[str], start_tim
         for name in names:
             put_field(own, name, getattr(hits, name), _UNITS.get(name))
         numeric = {name: values for name, values in hits.extra.items() if values.dtype.kind in "biuf"}
+        put_text(own, "extra", json.dumps([[name, hits.units.get(name)] for name in numeric]))
         for index, (name, values) in enumerate(numeric.items()):
-            dataset = put_field(own, f"extra_{index}", values, hits.units.get(name))
-            put_text(dataset, "name", name)
+            put_field(own, f"extra_{index}", values, hits.units.get(name)).attrs["name"] = name
 
 
 def _time(text):
@@ -133,28 +119,21 @@ def read_nxapm(path: AnyPath, *, columns: Sequence[str] | None = None) -> Hits:
     FileError
         If the file is missing, unreadable, damaged or not such a file, or has no such column.
     """
-    name = str(check_path(path))
-    try:
-        with open_hdf5(path) as file:
-            if _OWN not in file or file.text("format", _OWN) != FORMAT:
-                raise FileError(f"{name!r} is not an NXapm file of this package: it has no group {_OWN!r}")
-            return _read(file, name, columns)
-    except FileError:
-        raise
-    except _READ_ERRORS as error:
-        raise FileError(f"cannot read {name!r} as NXapm: {first_line(error)}") from error
+    with open_hdf5(path, "NXapm") as file:
+        if file.label is None or file.label.kind != KIND:
+            raise FileError(f"{file.name!r} is not an NXapm file of this package: it has no group {_OWN!r}")
+        return _read(file, columns)
 
 
-def _read(file: CheckedFile, path: str, columns: Sequence[str] | None) -> Hits:
-    own = file.attributes(_OWN)
-    stored = json.loads(file.text("columns", _OWN))
-    extra, units, index = {}, {}, 0
-    while (dataset := f"{_OWN}/extra_{index}") in file:
-        extra[file.text("name", dataset)] = dataset
-        if "units" in file.attributes(dataset):
-            units[file.text("name", dataset)] = file.text("units", dataset)
-        index += 1
-    chosen = check_columns(columns, (*stored, *extra), path)
+def _read(file: CheckedFile, columns: Sequence[str] | None) -> Hits:
+    extent = file.attribute("extent", _OWN)
+    stored = file.json(f"{_OWN}/columns")
+    extra, units = {}, {}
+    for index, (name, unit) in enumerate(file.json(f"{_OWN}/extra")):
+        extra[name] = f"{_OWN}/extra_{index}"
+        if unit:
+            units[name] = unit
+    chosen = check_columns(columns, (*stored, *extra), file.name)
     values: dict[str, Any] = {}
     if HITS in file and {"x", "y"} & set(chosen):
         values = dict(zip(("x", "y"), numbers(file, HITS).T, strict=True))
@@ -162,20 +141,19 @@ def _read(file: CheckedFile, path: str, columns: Sequence[str] | None) -> Hits:
     for name in stored:
         if name in chosen and name not in values:
             values[name] = numbers(file, _NAMED.get(name, f"{_OWN}/{name}"))
-    source = file.text("source", _OWN)
+    source = file.text(f"{_OWN}/source")
     return Hits(
         **values,
         extra={name: numbers(file, dataset) for name, dataset in extra.items() if name in chosen},
         units={name: unit for name, unit in units.items() if name in chosen},
-        source=path if source == "unknown" else source,
-        extent=tuple(float(value) for value in own["extent"]) if "extent" in own else None,  # type: ignore[arg-type]
+        source=file.name if source == "unknown" else source,
+        extent=None if extent is None else tuple(float(value) for value in extent),  # type: ignore[arg-type]
     )
 
 
 def numbers(file: CheckedFile, path: str) -> Any:
     """Read a complete dataset of numbers of any type, with one or more values per row, in native byte order."""
-    item = file.dataset(path, None, None)
-    if item.dtype.kind not in "biuf" or not item.shape:
-        raise ValueError(f"{path} must contain numbers, got {item.dtype} of shape {item.shape}")
-    values = item[()]
+    values = file.read(path, None, None)
+    if values.dtype.kind not in "biuf" or not values.shape:
+        raise ValueError(f"{path} must contain numbers, got {values.dtype} of shape {values.shape}")
     return values.astype(values.dtype.newbyteorder("="), copy=False)

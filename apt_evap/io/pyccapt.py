@@ -8,17 +8,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from apt_evap._common.files import FileError, check_path
+from apt_evap._common.files import FileError
 from apt_evap._common.types import AnyPath
 from apt_evap.detection.hits import Hits
 from apt_evap.io._pulses import first_from_equal, pulses_from_first
 from apt_evap.io._records import check_any, check_columns
 from apt_evap.io.nxapm import numbers
-from apt_evap.storage.digested_hdf5 import CheckedFile, first_line, open_hdf5
+from apt_evap.storage.checked_hdf5 import CheckedFile, open_hdf5
 
 _MM_PER_CM = 10.0
 _MAX_BLOCKS = 100
-_READ_ERRORS = (OSError, KeyError, IndexError, RuntimeError, TypeError, ValueError, AttributeError, OverflowError)
 # names in the group dld, of the newest version first, and factors to the units of `Hits`
 _INSTRUMENT = {
     "x": (("x",), _MM_PER_CM),
@@ -79,20 +78,14 @@ def read_pyccapt(path: AnyPath, *, columns: Sequence[str] | None = None) -> Hits
     FileError
         If the file is missing, unreadable or not such a file, or has no such column.
     """
-    name = str(check_path(path))
-    try:
-        with open_hdf5(path) as file:
-            if "dld" in file:
-                found = _instrument(file)
-            elif "df" in file:
-                found = _calibrated(file, name)
-            else:
-                raise FileError(f"{name!r} is not a file of PyCCAPT: it has neither a group 'dld' nor a group 'df'")
-        return _hits(found, name, columns)
-    except FileError:
-        raise
-    except _READ_ERRORS as error:
-        raise FileError(f"cannot read {name!r} as a file of PyCCAPT: {first_line(error)}") from error
+    with open_hdf5(path, "a file of PyCCAPT") as file:
+        if "dld" in file:
+            found = _instrument(file)
+        elif "df" in file:
+            found = _calibrated(file, file.name)
+        else:
+            raise FileError(f"{file.name!r} is not a file of PyCCAPT: it has neither a group 'dld' nor a group 'df'")
+        return _hits(found, file.name, columns)
 
 
 def _instrument(file):
@@ -118,10 +111,10 @@ def _calibrated(file, path):
     for index in range(_MAX_BLOCKS):
         if f"df/block{index}_items" not in file:
             break
-        items = file.dataset(f"df/block{index}_items", None, None)
+        items = file.read(f"df/block{index}_items", None, None)
         if items.dtype.kind != "S" or len(items.shape) != 1:
             raise ValueError(f"df/block{index}_items must contain the names of columns")
-        names = [name.decode("utf-8", "replace") for name in items[()].tolist()]
+        names = [name.decode("utf-8", "replace") for name in items.tolist()]
         known += names
         if not any(name in wanted for name in names):
             continue  # a block of texts or lists

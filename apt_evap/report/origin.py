@@ -23,7 +23,7 @@ def describe_file(path: AnyPath) -> dict[str, Any]:
     Parameters
     ----------
     path : str or path-like
-        A file, or the folder of an unfinished run, which has no checksum.
+        The file.
 
     Returns
     -------
@@ -36,8 +36,6 @@ def describe_file(path: AnyPath) -> dict[str, Any]:
         If the file cannot be read.
     """
     path = check_path(path)
-    if path.is_dir():
-        return {"name": path.name, "bytes": None, "sha256": None}
     with open_for_reading(path) as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]  # an unbuffered file
         return {"name": path.name, "bytes": file.tell(), "sha256": digest}
@@ -99,10 +97,7 @@ def add_origin(page: Page, content: Mapping[str, Any]) -> None:
     if content["command"]:
         page.add(f"<pre>{escape(content['command'])}</pre>")
     if content["files"]:
-        rows = [
-            (each["name"], *((f"{each['bytes']:,}", each["sha256"]) if each["sha256"] else ("", "an unfinished run")))
-            for each in content["files"]
-        ]
+        rows = [(each["name"], f"{each['bytes']:,}", each["sha256"]) for each in content["files"]]
         page.add(table(rows, ("File", "Bytes", "SHA-256")))
     versions = {"written by": content["made_by"], "written at": content["created"], **content["system"]}
     page.add(collapsed("Versions", table((name, text_of(value)) for name, value in versions.items())))

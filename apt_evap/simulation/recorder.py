@@ -10,7 +10,7 @@ from tqdm.auto import tqdm
 from apt_evap._common.files import FileError
 from apt_evap._core.evaporation import EXHAUSTED, SWEEP_DUE
 from apt_evap.evaporation.emitter import Batch, Emitter
-from apt_evap.simulation.checkpoint import Keeper
+from apt_evap.simulation.checkpoint import CheckpointWriter
 from apt_evap.simulation.history import History
 from apt_evap.simulation.monitor import Monitor, Watch
 from apt_evap.simulation.run import Run
@@ -60,7 +60,7 @@ class RunNotSaved(FileError):
 
 
 class Recorder:
-    """The parts of a run, in memory and, with a `Keeper`, on the disk.
+    """The parts of a run, in memory and, with a `CheckpointWriter`, on the disk.
 
     A context manager. At its end, even after an error, it waits for pending flights and stores the ions in `run`.
 
@@ -76,7 +76,7 @@ class Recorder:
         Ions evaporated so far, including those before the run.
     progress : bool or callable, optional
         As in `Simulation.run`.
-    keeper : Keeper or None
+    writer : CheckpointWriter or None
         Storage of the parts, with the ions so far of a resumed run.
     """
 
@@ -87,11 +87,12 @@ class Recorder:
         n_ions: int,
         n_evaporated: int,
         progress: bool | Callable[[int, int], object] | None,
-        keeper: Keeper | None,
+        writer: CheckpointWriter | None,
     ) -> None:
-        self._emitter, self._n_ions, self._keeper = emitter, n_ions, keeper
-        self._stored = [keeper.previous] if keeper and keeper.previous else []
+        self._emitter, self._n_ions, self._writer = emitter, n_ions, writer
+        self._stored = [writer.previous] if writer and writer.previous else []
         self._new, self._latest, self._flying = [], [], []
+        self._state = self._stored[0].state if self._stored else None
         self._first_event = self._stored[0].first_event if self._stored else emitter.counts["events"]
         self._started = len(self)
         interval = settings.interval or 10 * emitter.sweep_interval
@@ -138,7 +139,7 @@ class Recorder:
         if batch.status == SWEEP_DUE and self._monitor.due(ions):
             self._land()
             self._monitor.look(self._emitter, ions)
-        if self._keeper and self._keeper.due(self._started):
+        if self._writer and self._writer.due(self._started):
             self._land()
             self._store()
 
@@ -164,23 +165,20 @@ class Recorder:
             self._new.append(Run.join(self._latest))
             self._latest = []
 
-    def _joined(self):
+    def _all(self, ended):
+        """All ions so far as one run, with the last state whose events are all among them."""
         self._gather()
-        # the history is added to the last part: `take` returns it only once
-        if self._new:
-            joined = Run.join(self._new)
-            self._new = [replace(joined, history=History.join([joined.history, self._monitor.take()]))]
-        return self._new
+        run = Run.join([*self._stored, *self._new])
+        run = replace(run, history=History.join([run.history, self._monitor.take()]))  # which returns a check once
+        self._stored, self._new = [run], []
+        state = self._emitter.state()
+        if len(state.sites) <= self._first_event + len(run):
+            self._state = state
+        return replace(run, state=self._state, first_event=self._first_event, ended=str(ended))
 
     def _store(self):
-        if self._keeper and len(self) > sum(map(len, self._stored)):
-            if self._keeper.write(self._joined()[0], self._emitter.state(), self._first_event):
-                self._stored += self._new
-                self._new = []
-
-    def _all(self, ended):
-        run = Run.join([*self._stored, *self._joined()])
-        return replace(run, state=self._emitter.state(), first_event=self._first_event, ended=str(ended))
+        if self._writer and len(self):
+            self._writer.write(self._all(self._ending))
 
     # ---- the context -----------------------------------------------------------------------------------------------
 
@@ -207,9 +205,9 @@ class Recorder:
 
     def _finish(self):
         self.run = self._all(self._ending)
-        if self._keeper and not self._keeper.complete:
+        if self._writer and not self._writer.complete:
             try:
-                self._keeper.finish(self.run)
+                self._writer.finish(self.run)
             except FileError as error:
                 raise RunNotSaved(str(error), self.run) from error
 

@@ -7,14 +7,12 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apt_evap._common.codec import changed, from_plain, to_plain
-from apt_evap._common.files import FileError, check_path
 from apt_evap._common.notebook import as_table
 from apt_evap._common.small_matrices import squared_lengths
 from apt_evap._common.types import AnyPath, Booleans, Floats, Integers
@@ -52,7 +50,6 @@ from apt_evap.simulation.history import CapHistory, History
 from apt_evap.simulation.provenance import joined, provenance_now
 from apt_evap.simulation.real_units import OperatingPoint, RealColumns, RealUnits, in_real_units, random_of
 from apt_evap.simulation.run_hdf5 import read_run, write_run
-from apt_evap.simulation.stop_reason import StopReason
 from apt_evap.warnings import RunWarning
 
 _RIM_SAMPLES = 16  # ions, and azimuths, for which the rim of the field of view is followed to a detector
@@ -720,12 +717,12 @@ class Run:
 
 
 def load(path: AnyPath) -> Run:
-    """Read a run from an HDF5 file of `Run.save`, or from the folder of an unfinished run.
+    """Read a run from an HDF5 file of `Run.save`, or from that of an unfinished run.
 
     Parameters
     ----------
     path : str or path-like
-        The file; or the folder beside it, whose name ends in ".unfinished" (see `Checkpoint`).
+        The file; or the one beside it, whose name ends in ".unfinished" (see `Checkpoint`).
 
     Returns
     -------
@@ -743,40 +740,7 @@ def load(path: AnyPath) -> Run:
     >>> ae.load("ni111.h5")
     <Run: 100 ions of Ni at 1000 V; responses, 0 of them flagged>
     """
-    path = check_path(path)
-    return _load_parts(path) if path.is_dir() else Run(**read_run(path))
-
-
-def _load_parts(folder):
-    parts, names = [], []
-    for path in part_paths(folder):
-        part = Run(**read_run(path))
-        if parts and (name := _difference(parts[0], part)):
-            raise FileError(f"{str(path)!r} belongs to another run than {names[0]!r}: its {name} differ")
-        parts.append(part)
-        names.append(path.name)
-    if not parts:
-        raise FileError(f"{str(folder)!r} contains no run: expected files {PART_NAME.format(0)!r} and so on")
-    return Run.join(parts).ended_by(StopReason.UNFINISHED)
-
-
-def _difference(one, other):
-    """Name of the first property that differs between two parts of one run; "" if there is none."""
-    pairs = {
-        "settings": (one.settings, other.settings),
-        "elements": (one.elements, other.elements),
-        "perturbations": tuple([described(each) for each in run.perturbations] for run in (one, other)),
-        "responses": (one.responses is None, other.responses is None),
-    }
-    return next((name for name, (first, second) in pairs.items() if first != second), "")
-
-
-PART_NAME = "ions-{:012d}.h5"
-
-
-def part_paths(folder: Path) -> list[Path]:
-    """Files of an unfinished run in the order of their ions."""
-    return sorted(folder.glob("ions-*.h5"))
+    return Run(**read_run(path))
 
 
 def _describe(perturbation):

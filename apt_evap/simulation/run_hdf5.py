@@ -4,13 +4,12 @@ Groups and fields have the names of NeXus NXapm if it defines one; see `apt_evap
 """
 
 import json
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
 from apt_evap._common.codec import from_plain, to_plain
-from apt_evap._common.files import FileError, check_path
+from apt_evap._common.files import FileError
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_count, check_number, check_seed
 from apt_evap.detection.detector import Detector
@@ -31,11 +30,10 @@ from apt_evap.simulation.history import CapHistory, History
 from apt_evap.simulation.provenance import provenance_now
 from apt_evap.simulation.real_units import RealUnits
 from apt_evap.simulation.stop_reason import StopReason
-from apt_evap.storage.digested_hdf5 import first_line, open_hdf5, tail_of, write_hdf5
-from apt_evap.storage.nexus import ENTRY, IONS, put_field, put_group, put_nxapm, put_text
+from apt_evap.storage.checked_hdf5 import label_of, open_hdf5, put_field, put_text, write_hdf5
+from apt_evap.storage.nexus import ENTRY, IONS, put_group, put_nxapm
 
-FORMAT = "apt_evap run 1"
-_RUN, _STATE = "run", "state"  # kinds of files
+_RUN = "run"  # kind of file
 
 _SIMULATION = f"{ENTRY}/simulation"
 _OWN = "NXcollection"
@@ -47,7 +45,6 @@ _STATE_ARRAYS = {
     "lonely": (np.int64, (None,)),
     "lonely_normals": (np.float64, (None, 3)),
 }
-_READ_ERRORS = (OSError, KeyError, IndexError, RuntimeError, TypeError, ValueError, AttributeError, OverflowError)
 
 
 def _place(column):
@@ -63,7 +60,6 @@ def write_run(path: AnyPath, run: Any) -> None:
     """Write a Run to a file, which is either complete or absent; FileError if it cannot be written."""
     complete = run.ended in (StopReason.COMPLETE, StopReason.EXHAUSTED)
     with write_hdf5(path, _RUN, len(run), run.provenance.get("settings", "") if complete else "") as file:
-        put_text(file, "format", FORMAT)
         _write(file, run)
 
 
@@ -75,10 +71,6 @@ def _put(group, name, values, unit=None):
 
 
 def _write(file, run):
-    put_text(file, "provenance", json.dumps(run.provenance))
-    put_text(file, "settings", json.dumps(run.settings))
-    put_text(file, "elements", json.dumps(run.elements))
-    put_text(file, "ended", run.ended)
     file.attrs["nearest_neighbour_distance"] = run.emissions.nearest_neighbour_distance
     first, tip = run.hits(run.first_perturbation), run.settings["tip"]
     provenance = {**provenance_now(), **run.provenance}
@@ -96,6 +88,9 @@ def _write(file, run):
         shank_angle=tip.get("shank_angle"),
     )
     simulation = put_group(file, _SIMULATION, _OWN)
+    for name in ("settings", "elements", "provenance"):
+        put_text(simulation, name, json.dumps(getattr(run, name)))
+    put_text(simulation, "ended", run.ended)
     put_text(simulation, "perturbation", json.dumps(described(run.first_perturbation)))
     every = run.every_column
     for column, values in zip(every, columns_of(run, every).values(), strict=True):
@@ -115,21 +110,11 @@ def _write(file, run):
 
 
 def _put_state(group, state, first_event):
-    for name, value in vars(state).items():
-        if name in _STATE_ARRAYS:
-            _put(group, name, value, _UNITS.get(name))
-        elif name != "rule_state":
-            group.attrs[name] = value
-    for name, value in state.rule_state.items():
-        group.attrs[name] = value
-    group.attrs["first_event"] = first_event
-
-
-def write_state(path: AnyPath, state: Any, first_event: int) -> None:
-    """Write an EmitterState to a separate file, which is either complete or absent."""
-    with write_hdf5(path, _STATE, len(state.sites)) as file:
-        put_text(file, "format", FORMAT)
-        _put_state(file, state, first_event)
+    for name in _STATE_ARRAYS:
+        _put(group, name, getattr(state, name), _UNITS.get(name))
+    numbers = {name: value for name, value in vars(state).items() if name not in _STATE_ARRAYS}
+    numbers["first_event"] = first_event
+    put_text(group, "numbers", json.dumps(numbers, default=lambda value: np.asarray(value).tolist()))
 
 
 # ---- reading -------------------------------------------------------------------------------------------------------
@@ -137,63 +122,42 @@ def write_state(path: AnyPath, state: Any, first_event: int) -> None:
 
 def read_run(path: AnyPath) -> dict[str, Any]:
     """Read the arguments of a Run from a file; FileError if it is missing, damaged or not a run."""
-    with _reading(path, _RUN) as file:
-        return _read(file)
-
-
-def read_state(path: AnyPath) -> tuple[EmitterState, int]:
-    """Read an EmitterState from a separate file, and the number of atoms evaporated before the first ion of its run."""
-    with _reading(path, _STATE) as file:
-        return _read_state(file, "")
+    with open_hdf5(path, "a run") as file:
+        label = file.label
+        if label is None or label.kind != _RUN:
+            raise FileError(f"{file.name!r} is not a run{f', but {label.kind!r}' if label else ''}")
+        return _read(file, label.rows)
 
 
 def count_ions(path: AnyPath) -> int:
-    """Number of ions of the run in a file, from its last bytes; FileError if it is not a run."""
-    tail = tail_of(path)
-    if tail is None or tail.kind != _RUN:
+    """Number of ions of the run in a file, without reading them; FileError if it is not a run."""
+    label = label_of(path)
+    if label is None or label.kind != _RUN:
         raise FileError(f"{str(path)!r} is not a run")
-    return tail.rows
+    return label.rows
 
 
 def is_run(path: AnyPath) -> bool:
-    """Whether a file is a run, even if it is damaged."""
+    """Whether a file is a run, even if its columns are damaged."""
     try:
-        tail = tail_of(path)
+        label = label_of(path)
     except FileError:
         return False
-    return tail is not None and tail.kind == _RUN
+    return label is not None and label.kind == _RUN
 
 
-@contextmanager
-def _reading(path, kind):
-    name = str(check_path(path))
-    try:
-        with open_hdf5(path) as file:
-            if file.tail is None or file.tail.kind != kind:
-                found = "another HDF5 file" if file.tail is None else repr(file.tail.kind)
-                raise FileError(f"{name!r} is not a {kind}: expected {FORMAT!r}, got {found}")
-            found = file.text("format")
-            if found != FORMAT:
-                raise FileError(f"{name!r} is a {kind} in another format: expected {FORMAT!r}, got {found!r}")
-            yield file
-    except FileError:
-        raise
-    except _READ_ERRORS as error:
-        raise FileError(f"cannot read {name!r} as a {kind}: {first_line(error)}") from error
-
-
-def _read(file):
-    settings = json.loads(file.text("settings"))
-    elements = tuple(json.loads(file.text("elements")))
+def _read(file, n):
+    settings = file.json(f"{_SIMULATION}/settings")
+    elements = tuple(file.json(f"{_SIMULATION}/elements"))
     response_settings = from_plain(settings["responses"], ResponseSettings, what="responses")
     optional = (*OPTIONAL, *target_columns(response_settings))
     perturbations, columns = [], [*ALWAYS, *(column for column in optional if _place(column) in file)]
     while (group := f"{_SIMULATION}/flown/{len(perturbations)}") in file:
         columns += flown_columns(len(perturbations))
-        perturbations.append(_known(json.loads(file.text("perturbation", group))))
+        perturbations.append(_known(file.json(f"{group}/perturbation")))
     if f"{_SIMULATION}/responses" in file:
         columns += response_columns(response_settings)
-    arrays, n = {}, file.tail.rows
+    arrays = {}
     for column in columns:
         stored = np.int8 if column.dtype is np.bool_ else column.dtype
         arrays[column.path] = file.read(_place(column), stored, (n, *column.row)).astype(column.dtype, copy=False)
@@ -201,11 +165,11 @@ def _read(file):
     _check_index(arrays["phase"], "phase", len(settings["tip"].get("phases", ())) or 1)
     units = None
     if "real/voltages" in arrays:
-        units = from_plain(json.loads(file.text("units", f"{_SIMULATION}/real")), RealUnits)
+        units = from_plain(file.json(f"{_SIMULATION}/real/units"), RealUnits)
     state, first_event = None, 0
     if f"{_SIMULATION}/state" in file:
-        state, first_event = _read_state(file, f"{_SIMULATION}/state")
-    return parts_of(arrays, float(file.attributes()["nearest_neighbour_distance"])) | {
+        state, first_event = _read_state(file)
+    return parts_of(arrays, float(file.attribute("nearest_neighbour_distance"))) | {
         "perturbations": tuple(perturbations),
         "seed": check_seed(settings["seed"]),
         "voltage": check_voltage(settings["voltage"]),
@@ -218,8 +182,8 @@ def _read(file):
         "units": units,
         "state": state,
         "first_event": first_event,
-        "ended": file.text("ended"),
-        "provenance": dict(json.loads(file.text("provenance"))),
+        "ended": file.text(f"{_SIMULATION}/ended"),
+        "provenance": dict(file.json(f"{_SIMULATION}/provenance")),
     }
 
 
@@ -235,26 +199,21 @@ def _read_table(file, group, names):
     return ions, *(file.read(f"{group}/{name}", float, (len(ions),)) for name in names[1:])
 
 
-def _read_state(file, group):
-    before = f"{group}/" if group else ""
-    arrays = {name: file.read(before + name, dtype, shape) for name, (dtype, shape) in _STATE_ARRAYS.items()}
-    attributes = file.attributes(group)
-    # not those of a separate file, or the class of the group, a text of variable length (see `put_text`)
-    numbers = {name: attributes[name] for name in attributes if name not in ("format", "digest", "NX_class")}
-    own = {name: numbers.pop(name) for name in ("deepened", "tolerance", "opening_angle", "clipped", "unsettled")}
-    factor = check_number(float(numbers.pop("voltage_factor", 1.0)), "voltage_factor", above=0)
-    first_event = check_count(int(numbers.pop("first_event")), "first_event")
+def _read_state(file):
+    group = f"{_SIMULATION}/state"
+    arrays = {name: file.read(f"{group}/{name}", dtype, shape) for name, (dtype, shape) in _STATE_ARRAYS.items()}
+    numbers = file.json(f"{group}/numbers")
     state = EmitterState(
         **arrays,
-        deepened=tuple(int(event) for event in np.ravel(own["deepened"])),
-        tolerance=check_number(float(own["tolerance"]), "tolerance", above=0),
-        opening_angle=check_number(float(own["opening_angle"]), "opening_angle", at_least=0),
-        clipped=check_count(int(own["clipped"]), "clipped"),
-        unsettled=check_count(int(own["unsettled"]), "unsettled"),
-        rule_state=numbers,
-        voltage_factor=factor,
+        deepened=tuple(int(event) for event in numbers["deepened"]),
+        tolerance=check_number(numbers["tolerance"], "tolerance", above=0),
+        opening_angle=check_number(numbers["opening_angle"], "opening_angle", at_least=0),
+        clipped=check_count(numbers["clipped"], "clipped"),
+        unsettled=check_count(numbers["unsettled"], "unsettled"),
+        rule_state={name: np.array(value)[()] for name, value in numbers["rule_state"].items()},
+        voltage_factor=check_number(numbers["voltage_factor"], "voltage_factor", above=0),
     )
-    return state, first_event
+    return state, check_count(numbers["first_event"], "first_event")
 
 
 def _known(description):

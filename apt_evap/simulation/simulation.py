@@ -32,7 +32,7 @@ from apt_evap.flight.crew import WHOLE_DETECTOR, FlightCrew, FlightSettings, che
 from apt_evap.flight.field_of_view import scouts_of
 from apt_evap.flight.landing import land
 from apt_evap.flight.response import ResponseModel, ResponseSettings
-from apt_evap.simulation.checkpoint import Checkpoint, Keeper
+from apt_evap.simulation.checkpoint import Checkpoint, CheckpointWriter
 from apt_evap.simulation.columns import Clock, Flown
 from apt_evap.simulation.history import CapHistory
 from apt_evap.simulation.monitor import Monitor
@@ -217,32 +217,32 @@ class Simulation:
             return self._run(n_ions, emissions, responses, progress, batch_size, None)
         if not isinstance(checkpoint, Checkpoint):
             checkpoint = Checkpoint(checkpoint)
-        with Keeper(checkpoint, self.settings, emissions, responses, n_ions) as keeper:
-            return self._run(n_ions, emissions, responses, progress, batch_size, keeper)
+        with CheckpointWriter(checkpoint, self.settings, emissions, responses, n_ions) as writer:
+            return self._run(n_ions, emissions, responses, progress, batch_size, writer)
 
     def __reduce__(self):
         raise TypeError("a Simulation cannot be pickled or copied: save its run, and make a new simulation")
 
-    def _run(self, n_ions, emissions, responses, progress, batch_size, keeper):
+    def _run(self, n_ions, emissions, responses, progress, batch_size, writer):
         if not self._running.acquire(blocking=False):
             raise ValueError(
                 "a run of this simulation is active in another thread: wait for it, or make another simulation"
             )
         try:
-            return self._run_alone(n_ions, emissions, responses, progress, batch_size, keeper)
+            return self._run_alone(n_ions, emissions, responses, progress, batch_size, writer)
         finally:
             self._running.release()
 
-    def _run_alone(self, n_ions, emissions, responses, progress, batch_size, keeper):
-        self._catch_up(keeper.previous if keeper else None)
+    def _run_alone(self, n_ions, emissions, responses, progress, batch_size, writer):
+        self._catch_up(writer.previous if writer else None)
         self.emitter.hand_out_tree()  # atoms may have evaporated without flights before
-        if not (keeper and keeper.previous):
+        if not (writer and writer.previous):
             self.emitter.hand_out_cap()
         backlog = BACKLOG if self.n_threads > 1 else 0
         with (
             self._crew.at_work(),
             interruptible() as interrupted,
-            Recorder(self.emitter, self.monitor, n_ions, self.n_evaporated, progress, keeper) as recorder,
+            Recorder(self.emitter, self.monitor, n_ions, self.n_evaporated, progress, writer) as recorder,
         ):
             for batch in self.emitter.advance(recorder.missing, batch_size, self._crew.paused):
                 part = self._start_flights(batch, emissions, responses)

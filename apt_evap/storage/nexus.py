@@ -2,7 +2,8 @@
 
 Written for the application definition NXapm as in the NeXus definitions v2026.01. The validator of pynxtools 0.16
 (``pynx validate``) accepts these files without a warning. Data for which NXapm has no name are in groups of the class
-NXcollection, which are not validated. https://fairmat-nfdi.github.io/nexus_definitions/classes/applications/NXapm.html
+NXcollection, which are not validated. Texts of NeXus have variable length, because the validator does not accept bytes.
+They are not needed to read a file. https://fairmat-nfdi.github.io/nexus_definitions/classes/applications/NXapm.html
 """
 
 from collections.abc import Sequence
@@ -10,6 +11,8 @@ from typing import Any
 
 import h5py
 import numpy as np
+
+from apt_evap.storage.checked_hdf5 import put_field
 
 DEFINITIONS = "v2026.01"
 """Version of the NeXus definitions."""
@@ -21,21 +24,6 @@ TIMES = f"{ATOM_PROBE}/voltage_and_bowl/raw_tof"
 MASSES = f"{ATOM_PROBE}/mass_to_charge_conversion/mass_to_charge"
 MULTIPLICITY = f"{ATOM_PROBE}/hit_finding/hit_multiplicity"
 _FRAME = f"{ENTRY}/laboratory_reference_frame"
-_LONGEST_TEXT = 60_000  # bytes: HDF5 allows 64 kB in an attribute
-
-
-def put_text(item: Any, name: str, text: str) -> None:
-    """Write a text attribute of fixed length, which h5py returns as bytes.
-
-    Texts of variable length lie in a heap, and HDF5 hangs or crashes if it is damaged. Measured with randomly changed
-    files: 3 of 960 with variable length, none of 2,640 with fixed length. The texts of NeXus have variable length all
-    the same, because the validator does not accept bytes. They are not needed to read a file.
-    """
-    content = text.encode()
-    if len(content) > _LONGEST_TEXT:
-        item.attrs[name] = text
-    else:
-        item.attrs.create(name, content, dtype=h5py.string_dtype("utf-8", max(1, len(content))))
 
 
 def put_group(parent: Any, name: str, nexus_class: str) -> Any:
@@ -43,14 +31,6 @@ def put_group(parent: Any, name: str, nexus_class: str) -> Any:
     group = parent.create_group(name)
     group.attrs["NX_class"] = nexus_class
     return group
-
-
-def put_field(group: Any, name: str, values: Any, units: str | None = None) -> Any:
-    """Write an array, a number or a text as a dataset, with its unit."""
-    dataset = group.create_dataset(name, data=values if isinstance(values, str) else np.asarray(values))
-    if units:
-        dataset.attrs["units"] = units
-    return dataset
 
 
 def put_nxapm(

@@ -21,7 +21,7 @@ from apt_evap.config.simulation_file import Config, config_of, key_of, read_docu
 from apt_evap.config.tables import check_table
 from apt_evap.config.toml_text import toml_text
 from apt_evap.simulation.checkpoint import Checkpoint
-from apt_evap.storage.digested_hdf5 import tail_of
+from apt_evap.storage.checked_hdf5 import label_of
 from apt_evap.sweep.claims import Claim, Claims
 from apt_evap.sweep.compare_settings import CompareSettings
 from apt_evap.sweep.files import unlinked, write
@@ -170,15 +170,15 @@ class Sweep:
         if there:
             name = str(folder / RUN)
             try:
-                tail = tail_of(folder / RUN)
+                label = label_of(folder / RUN)
             except FileError as error:
                 return PointState("damaged", claims, str(error))
-            if tail is None or tail.kind != "run" or tail.note is None:
+            if label is None or label.kind != "run":
                 return PointState("damaged", claims, f"{name!r} is not a complete file of a run")
-            if tail.note == key:
+            if label.note == key:
                 return PointState("done", claims)
-            if tail.note:
-                return PointState("foreign", claims, f"{name!r} is the run of other settings: {tail.note}")
+            if label.note:
+                return PointState("foreign", claims, f"{name!r} is the run of other settings: {label.note}")
         if last and last.end and last.end["code"] not in (RETRY, *INTERRUPTED) and last.end["code"] >= 0:
             if last.end["code"] > 0:
                 return PointState("failed", claims, last.end["message"] or f"exit code {last.end['code']}")

@@ -13,14 +13,13 @@ import numpy as np
 import scipy
 
 from apt_evap._common.codec import from_plain
-from apt_evap._common.files import FileError
 from apt_evap._common.types import AnyPath, Booleans, Floats, Integers
 from apt_evap._common.validation import check_array, check_choice, check_kind, check_number, check_seed
 from apt_evap.detection.instrument import Instrument
 from apt_evap.emission.perturbations import Perturbation
 from apt_evap.specimen.phases import Phase
 from apt_evap.specimen.tip import Tip
-from apt_evap.storage.digested_hdf5 import open_hdf5, write_hdf5
+from apt_evap.storage.checked_hdf5 import open_hdf5, put_field, put_text, write_hdf5
 from apt_evap.visibility.cases import (
     VARIABLES,
     check_feature,
@@ -121,11 +120,11 @@ class OriginOperators:
         """
         with write_hdf5(path, _KIND, self.means[..., 0, 0, 0, 0].size) as file:
             for name in ("means", "covariances", "recorded"):
-                file[name] = getattr(self, name)
+                put_field(file, name, getattr(self, name))
             for name, values in self.axes.items():
-                file[f"axes/{name}"] = values
+                put_field(file, f"axes/{name}", values)
             names = {"elements": self.elements, "axes": list(self.axes), "depth": self.depth}
-            file.attrs["settings"] = json.dumps(names | dict(self.settings))
+            put_text(file, "settings", json.dumps(names | dict(self.settings)))
 
     @classmethod
     def load(cls, path: AnyPath) -> OriginOperators:
@@ -145,16 +144,13 @@ class OriginOperators:
         FileError
             If it is missing, damaged or has other content.
         """
-        with open_hdf5(path) as file:
-            try:
-                settings = json.loads(file.text("settings"))
-                axes = {name: file.read(f"axes/{name}", np.float64, (None,)) for name in settings.pop("axes")}
-                means, covariances, recorded = (
-                    file.read(name, np.float64, None) for name in ("means", "covariances", "recorded")
-                )
-                elements, depth = tuple(settings.pop("elements")), settings.pop("depth")
-            except (KeyError, ValueError) as error:
-                raise FileError(f"{str(path)!r} does not contain origin operators: {error}") from error
+        with open_hdf5(path, "origin operators") as file:
+            settings = file.json("settings")
+            axes = {name: file.read(f"axes/{name}", np.float64, (None,)) for name in settings.pop("axes")}
+            means, covariances, recorded = (
+                file.read(name, np.float64, None) for name in ("means", "covariances", "recorded")
+            )
+            elements, depth = tuple(settings.pop("elements")), settings.pop("depth")
         return cls(axes, elements, means, covariances, recorded, depth, settings)
 
     def _case(self):

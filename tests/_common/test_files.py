@@ -1,7 +1,7 @@
-"""Files that are read and replaced: regular ones only, whole or not at all, nobody else's touched."""
+"""Files that are read and replaced: regular ones only, complete or not at all."""
 
-import fcntl
 import os
+import resource
 import stat
 import threading
 import time
@@ -50,31 +50,6 @@ def test_the_size_of_a_small_file_is_bounded(tmp_path):
 
 
 # ---- writing -------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("kind", ["link", "file", "folder"])
-def test_nothing_that_lies_there_is_written_to(tmp_path, monkeypatch, kind):
-    """Not even where the random part of the name is known."""
-    monkeypatch.setattr("secrets.token_hex", lambda n: "0" * 2 * n)
-    write(tmp_path / "o.pos", b"first")
-    victim = tmp_path / "victim"
-    victim.write_bytes(b"precious")
-    seen = []
-    with replace_file(tmp_path / "o.pos"):
-        seen += [name for name in names(tmp_path) if name.endswith(".part")]
-    planted = tmp_path / seen[0]
-    {"link": lambda: planted.symlink_to(victim), "file": planted.touch, "folder": planted.mkdir}[kind]()
-    with pytest.raises(FileError, match=r"cannot write .*o\.pos': File exists"):
-        write(tmp_path / "o.pos")
-    assert victim.read_bytes() == b"precious" and planted.name in names(tmp_path)
-
-
-def test_names_differ_from_time_to_time_and_name_no_process(tmp_path):
-    seen = set()
-    for _ in range(5):
-        with replace_file(tmp_path / "o.pos"):
-            seen |= set(names(tmp_path)) - {"o.pos"}
-    assert len(seen) == 5 and not any(f".{os.getpid()}." in name for name in seen)
 
 
 def test_two_threads_and_one_file(tmp_path):
@@ -155,14 +130,38 @@ def test_errors_leave_nothing_behind(tmp_path):
 
 
 def test_what_a_killed_process_left_is_removed(tmp_path):
-    left = tmp_path / f".a.png.host.{'0' * 16}.part"
-    others = [f".a.png.host.{'1' * 16}.part", ".a.png.part", ".a.png.old.part", f".b.png.host.{'0' * 16}.part"]
-    for path in (left, *(tmp_path / name for name in others)):
-        path.touch()
-        os.utime(path, (time.time() - 3600,) * 2)
-    fresh = tmp_path / f".a.png.host.{'2' * 16}.part"
+    left, others = f".a.png.{'0' * 16}.part", [".a.png.part", ".a.png.old.part", f".b.png.{'0' * 16}.part"]
+    for name in (left, *others):
+        (tmp_path / name).touch()
+        os.utime(tmp_path / name, (time.time() - 4000,) * 2)
+    fresh = tmp_path / f".a.png.{'2' * 16}.part"
     fresh.touch()
-    with open(tmp_path / others[0]) as at_work:  # by another process
-        fcntl.flock(at_work, fcntl.LOCK_EX)
-        write(tmp_path / "a.png")
+    write(tmp_path / "a.png")
     assert names(tmp_path) == sorted(["a.png", fresh.name, *others])
+
+
+def test_a_file_is_closed_before_it_is_renamed(tmp_path, monkeypatch):
+    """Windows renames no open file."""
+    opened, replace = [], os.replace
+
+    def check(source, target):
+        assert opened[0].closed
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", check)
+    with replace_file(tmp_path / "a.png") as file:
+        opened.append(file)
+    assert names(tmp_path) == ["a.png"]
+
+
+def test_a_full_disk_is_one_sentence_and_leaves_nothing(tmp_path):
+    """A limit on the size of files, which meets a write as a full disk does."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (5000, before[1]))
+    try:
+        for n_bytes in (6000, 6_000_000):  # written at the end, or while the block runs
+            with pytest.raises(FileError, match=r"cannot write .*a\.png': File too large"):
+                write(tmp_path / "a.png", bytes(n_bytes))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert names(tmp_path) == []

@@ -80,8 +80,7 @@ def check_structure(path, own, is_simulation, elements):
             assert positions.shape == (len(ions), 2) and positions.attrs["units"] == "mm"
             assert file[positions.attrs["depends_on"]].attrs["NX_class"] == "NXcoordinate_system"
         assert dict(file.attrs).keys() <= {
-            "NX_class", "digest", "format", "provenance", "settings", "elements", "ended",
-            "nearest_neighbour_distance",
+            "NX_class", "format", "rows", "note", "nearest_neighbour_distance",
         }  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import resource
 import signal
 import subprocess
@@ -19,8 +20,7 @@ import pytest
 from tqdm.auto import tqdm
 
 import apt_evap as ae
-from apt_evap.simulation import run_hdf5
-from apt_evap.simulation.checkpoint import Keeper
+from apt_evap._common.locks import FileLock
 
 ENERGY = ae.TruncatedNormal(0.155, 0.155)
 HERE = str(Path(ae.__file__).parents[1])  # the package under test, installed or not
@@ -76,11 +76,11 @@ def run_small(path, n_ions=90, resume=False, **options):
 
 
 def datasets(path):
-    """Every dataset of a file but its time, by name: its type, its shape and its bytes."""
+    """Every dataset of a file but its time and provenance, by name: its type, its shape and its bytes."""
     found = {}
 
     def note(name, item):
-        if isinstance(item, h5py.Dataset) and name != "entry1/start_time":
+        if isinstance(item, h5py.Dataset) and name not in ("entry1/start_time", "entry1/simulation/provenance"):
             values = np.asarray(item[()])
             found[name] = (values.dtype.str, values.shape, values.tobytes())
 
@@ -120,24 +120,23 @@ def test_killed_at_random_moments_and_resumed_it_has_the_same_bits(tmp_path, pro
     kills, whole, shortest, over = [], 0, None, False
     while len(kills) < n_kills or whole < 3 or over or any("unfinished" in name for name in os.listdir(tmp_path)):
         path = tmp_path / f"{whole}.h5"
-        folder = Path(f"{path}.unfinished")
-        spared = shortest is None or over or (len(kills) >= n_kills and folder.exists())
+        unfinished = Path(f"{path}.unfinished")
+        spared = shortest is None or over or (len(kills) >= n_kills and unfinished.exists())
         began = time.monotonic()
         code = processes.run(work, path, kill_after=None if spared else random.uniform(0, 0.6 * shortest))
         if code == -signal.SIGKILL:
-            kills.append(len(list(folder.glob("ions-*.h5"))))
-            over = path.exists() and not folder.exists()  # hit after its end: another one begins
+            kills.append(ae.simulation.Checkpoint(path).ions_there())
+            over = path.exists() and not unfinished.exists()  # hit after its end: another one begins
             continue
         assert code == 0
         shortest = time.monotonic() - began if shortest is None else shortest
         assert differing(path, tmp_path / "uninterrupted.h5") == []
-        assert not folder.exists()
+        assert not unfinished.exists()
         whole, over = whole + 1, False
-    print(f"checkpoints there at each of {len(kills)} kills: {kills}; {whole} runs to the end, alone {shortest:.1f} s")
+    print(f"ions there at each of {len(kills)} kills: {kills}; {whole} runs to the end, alone {shortest:.1f} s")
     assert whole >= 3  # the first, which is not killed, and two that were
-    assert max(kills) > n_kills // 6  # they hit runs that had come some way
-    leftover = [name for name in os.listdir(tmp_path) if "unfinished" in name]
-    assert leftover == []
+    assert max(kills) > N_IONS // 6  # they hit runs that had come some way
+    assert sorted(os.listdir(tmp_path)) == sorted([*(f"{k}.h5" for k in range(whole)), "uninterrupted.h5"])
 
 
 def crash(path, number, late):
@@ -173,7 +172,7 @@ def test_killed_at_every_rename(tmp_path, processes, late):
         if not left:
             break
     assert not left
-    assert number >= 3 * 2 + 3  # three parts with their states, the whole file, its place, the folder
+    assert number == 3 + 1  # three checkpoints and the whole file
     assert not [name for name in os.listdir(tmp_path) if "unfinished" in name]
 
 
@@ -286,12 +285,57 @@ def test_a_file_of_somebody_else_is_not_overwritten(tmp_path):
     assert [item.name for item in tmp_path.iterdir()] == ["run.h5"]
 
 
-def test_one_process_at_a_time(tmp_path):
-    checkpoint = ae.simulation.Checkpoint(tmp_path / "run.h5")
-    with Keeper(checkpoint, {}, (), True, 90):
-        with pytest.raises(ae.FileError, match=rf"run\.h5' is being written by process {os.getpid()} on "):
-            run_small(tmp_path / "run.h5")
+def hold(path):
+    """Take the lock of a run, say so, and keep it until killed."""
+    lock = FileLock(Path(f"{path}.lock"), "run.h5")
+    path.with_name("held").touch()
+    time.sleep(100)
+    lock.release()
+
+
+@KILLABLE
+def test_one_process_at_a_time(tmp_path, processes):
+    path = tmp_path / "run.h5"
+    threading.Thread(target=processes.run, args=(hold, path), kwargs={"kill_after": 5}).start()
+    while not (tmp_path / "held").exists():
+        time.sleep(0.01)
+    with pytest.raises(ae.FileError, match=r"run\.h5' is being written by process \d+ on .*; wait for it or choose"):
+        run_small(path)
+    assert not path.exists()
+    while True:  # the lock of a killed process is none
+        try:
+            assert len(run_small(path)) == 90
+            break
+        except ae.FileError:
+            time.sleep(0.1)
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["held", "run.h5"]
+
+
+def test_one_thread_at_a_time(tmp_path):
+    lock = FileLock(tmp_path / "run.h5.lock", "run.h5")
+    with pytest.raises(ae.FileError, match=rf"run\.h5' is being written by process {os.getpid()} on "):
+        run_small(tmp_path / "run.h5")
+    lock.release()
     assert len(run_small(tmp_path / "run.h5")) == 90
+
+
+def test_a_lock_that_its_owner_just_removed_is_not_taken(tmp_path, monkeypatch):
+    """The second opens the file, the first removes it and a third makes another: the second must see the third."""
+    first, path = FileLock(tmp_path / "lock", "run.h5"), tmp_path / "lock"
+    take, others = FileLock._lock, []
+
+    def late(lock, file):
+        if not others:
+            others.append(None)
+            first.release()
+            others.append(FileLock(path, "run.h5"))
+        take(lock, file)
+
+    monkeypatch.setattr(FileLock, "_lock", late)
+    with pytest.raises(ae.FileError, match="is being written by"):
+        FileLock(path, "run.h5")
+    others[1].release()
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.fixture
@@ -420,42 +464,21 @@ def test_settings_that_are_refused(options, message):
 # ---- files and folders of others -----------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def planted(tmp_path):
-    """A folder where that of an unfinished run goes, and a file to be destroyed."""
-    (tmp_path / "victim.txt").write_text("precious")
-    (tmp_path / "run.h5.unfinished").mkdir()
-    return tmp_path / "run.h5.unfinished" / "lock"
-
-
-@pytest.mark.parametrize(
-    ("plant", "reason"),
-    [
-        (lambda lock: lock.symlink_to(lock.parents[1] / "victim.txt"), "Too many levels of symbolic links"),
-        (lambda lock: lock.symlink_to("/nonexistent/x"), "Too many levels of symbolic links"),
-        (lambda lock: os.link(lock.parents[1] / "victim.txt", lock), "its lock has a second name"),
-        (lambda lock: lock.write_text("precious"), "is not the lock file of a run: it contains 'precious'"),
-        (lambda lock: lock.mkdir(), "Is a directory"),
-        (os.mkfifo, "Not a regular file"),
-    ],
-)
-def test_a_lock_is_a_file_of_this_program(tmp_path, planted, plant, reason):
-    plant(planted)
-    with pytest.raises(ae.FileError, match=rf"run\.h5\.unfinished.*{reason}"):
+@pytest.mark.parametrize("name", ["run.h5.lock", "run.h5.unfinished"])
+@pytest.mark.parametrize("kind", ["link", "folder", "pipe", "text"])
+def test_only_files_of_this_program_are_replaced(tmp_path, name, kind):
+    place, victim = tmp_path / name, tmp_path / "victim.txt"
+    victim.write_text("precious")
+    {
+        "link": lambda: place.symlink_to(victim),
+        "folder": place.mkdir,
+        "pipe": lambda: os.mkfifo(place),
+        "text": lambda: place.write_text("precious"),
+    }[kind]()
+    with pytest.raises(ae.FileError, match=re.escape(name)):
         run_small(tmp_path / "run.h5")
-    assert (tmp_path / "victim.txt").read_text() == "precious"
-    assert planted.is_symlink() or planted.exists()
-
-
-@pytest.mark.parametrize("kind", ["file", "link"])
-def test_what_is_not_a_folder_is_refused(tmp_path, kind):
-    folder = tmp_path / "run.h5.unfinished"
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "ions-000000000000.h5").write_text("precious")
-    folder.write_text("precious") if kind == "file" else folder.symlink_to("other")
-    with pytest.raises(ae.FileError, match=r"cannot write .*run\.h5\.unfinished': Not a folder"):
-        small().run(30, responses=False, checkpoint=ae.simulation.Checkpoint(tmp_path / "run.h5", overwrite=True))
-    assert (tmp_path / "other" / "ions-000000000000.h5").read_text() == "precious"
+    assert victim.read_text() == "precious" and os.path.lexists(place)
+    assert kind != "text" or place.read_text() == "precious"
 
 
 def test_an_output_that_is_a_pipe_is_refused_before_the_run(tmp_path):
@@ -465,20 +488,6 @@ def test_an_output_that_is_a_pipe_is_refused_before_the_run(tmp_path):
     assert [item.name for item in tmp_path.iterdir()] == ["run.h5"]
 
 
-@pytest.mark.parametrize("names", [(), ("notes.txt",), ("notes.txt", "folder")])
-def test_folders_and_files_of_others_stay(tmp_path, names):
-    folder = tmp_path / "run.h5.unfinished"
-    folder.mkdir()
-    for name in names:
-        (folder / name).touch() if "." in name else (folder / name).mkdir()
-    run_small(tmp_path / "run.h5")
-    assert len(ae.load(tmp_path / "run.h5")) == 90
-    assert sorted(item.name for item in folder.iterdir()) == sorted(names)
-    with pytest.raises(ae.FileError, match="more than the requested 30"):
-        run_small(tmp_path / "run.h5", 30)
-    assert sorted(item.name for item in folder.iterdir()) == sorted(names)
-
-
 def test_a_run_that_is_overwritten_keeps_its_mode(tmp_path):
     run_small(tmp_path / "run.h5")
     (tmp_path / "run.h5").chmod(0o640)
@@ -486,31 +495,7 @@ def test_a_run_that_is_overwritten_keeps_its_mode(tmp_path):
     assert (tmp_path / "run.h5").stat().st_mode & 0o777 == 0o640
 
 
-def test_names_may_hold_signs_of_patterns(tmp_path):
-    path = tmp_path / "run[1]*.h5"
-    (tmp_path / f".{path.name}.unfinished.123.gone").mkdir()
-    run_small(path)
-    assert [item.name for item in tmp_path.iterdir()] == [path.name]
-
-
 # ---- what does not belong together ---------------------------------------------------------------------------------
-
-
-def test_parts_of_two_runs_are_not_joined(unfinished, tmp_path):
-    folder = Path(f"{unfinished}.unfinished")
-    for options, flown, what in (
-        ({"seed": 6}, [Interrupting()], "settings"),
-        ({}, [ae.RollUp(0.2)], "perturbations"),
-    ):
-        simulation = ae.Simulation(small().tip, n_threads=1, **{"seed": 5} | options)
-        simulation.run(60, responses=False, progress=False)
-        part = simulation.run(30, flown, responses=False, progress=False)
-        part.save(folder / "ions-000000000060.h5")
-        for action in (lambda: ae.load(folder), lambda: interrupted(unfinished, (), resume=True)):
-            with pytest.raises(
-                ae.FileError, match=rf"060\.h5' belongs to another run than 'ions-0+\.h5': its {what} differ"
-            ):
-                action()
 
 
 @pytest.mark.parametrize(
@@ -546,55 +531,17 @@ def test_a_run_knows_all_systems_it_was_computed_on(tmp_path):
 # ---- damaged files -------------------------------------------------------------------------------------------------
 
 
-def damage(path, name, row=0):
-    """Turn the bits of a byte in a row of a dataset."""
-    with h5py.File(path) as file:
-        dataset = file[name]
-        place = dataset.id.get_offset() + row * (dataset.nbytes // len(dataset))
-    with open(path, "r+b") as file:
-        file.seek(place)
-        byte = file.read(1)[0]
-        file.seek(place)
-        file.write(bytes([byte ^ 0xFF]))
-
-
-def test_a_damaged_part_is_named(unfinished):
-    folder = Path(f"{unfinished}.unfinished")
-    first = sorted(folder.glob("ions-*.h5"))[0]
-    first.write_bytes(first.read_bytes()[:2000])
-    with pytest.raises(ae.FileError, match=first.name):
-        interrupted(unfinished, (), resume=True)
-    with pytest.raises(ae.FileError, match=first.name):
-        ae.load(folder)
-
-
-def test_a_damaged_state_is_made_again(unfinished):
-    path = Path(f"{unfinished}.unfinished") / "state.h5"
-    damage(path, "charges")
-    with pytest.warns(UserWarning, match=r"state\.h5.*all events are recomputed"):
-        interrupted(unfinished, (), resume=True)
-    interrupted(unfinished.with_name("whole.h5"), ())
-    assert differing(unfinished, unfinished.with_name("whole.h5")) == []
-
-
-@KILLABLE
-def test_a_state_that_would_crash_hdf5_is_made_again(unfinished):
-    """Zeros in the index of a dataset: HDF5 reads beyond its memory there, were it to look."""
-    path = Path(f"{unfinished}.unfinished") / "state.h5"
-    content = path.read_bytes()
-    whole = bytearray(content)
-    for place in range(0, len(content) - 47, 173):
-        if not any(content[place : place + 47]):
-            continue
-        path.write_bytes(content[:place] + bytes(47) + content[place + 47 :])
-        with pytest.raises(ae.FileError, match="is damaged"):
-            run_hdf5.read_state(path)
-    whole[0x6EB : 0x6EB + 47] = bytes(47)
-    path.write_bytes(whole)
-    with pytest.warns(ae.warnings.DataWarning, match=r"state\.h5' is damaged.*all events are recomputed"):
-        interrupted(unfinished, (), resume=True)
-    interrupted(unfinished.with_name("whole.h5"), ())
-    assert differing(unfinished, unfinished.with_name("whole.h5")) == []
+@pytest.mark.parametrize("place", [0.001, 0.5])
+def test_a_damaged_checkpoint_is_named(unfinished, place):
+    path = Path(f"{unfinished}.unfinished")
+    content = bytearray(path.read_bytes())
+    content[int(place * len(content))] ^= 1
+    path.write_bytes(content)
+    for action in (lambda: ae.load(path), lambda: interrupted(unfinished, (), resume=True)):
+        with pytest.raises(ae.FileError, match=r"run\.h5\.unfinished' is damaged"):
+            action()
+    assert path.read_bytes() == content
+    assert len(interrupted(unfinished, (), overwrite=True)) == 90
 
 
 def serve():
@@ -605,7 +552,7 @@ def serve():
         child = os.fork()
         if child == 0:
             try:
-                {"work": work, "crash": crash}[name](Path(path), *map(int, numbers))
+                {"work": work, "crash": crash, "hold": hold}[name](Path(path), *map(int, numbers))
             except BaseException:
                 traceback.print_exc()
                 os._exit(1)

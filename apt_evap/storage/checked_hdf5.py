@@ -1,0 +1,312 @@
+"""HDF5 files in which every byte that is read has a checksum, so that damage is an error and never other values.
+
+In the format of HDF5 1.10, headers, attributes and indices have checksums. Arrays are in chunks with the filter deflate
+of level 0, which does not compress: its Adler-32 is compared whenever a chunk is read. Texts have a fixed length. Those
+of variable length are in a heap without checksums; only NeXus needs some, which are never read.
+
+The checksum of the filter fletcher32 does not suffice: that of zeros is zero, and a hole in a file passes for data.
+"""
+
+import io
+import json
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any, BinaryIO, NamedTuple
+
+import h5py
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from apt_evap._common.files import FileError, check_path, open_for_reading, replace_file
+from apt_evap._common.types import AnyPath
+
+_FORMAT = "apt_evap {} 1"
+_CHUNK = 1 << 20  # bytes; HDF5 keeps chunks up to this size while rows of them are read
+_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+_FOREIGN = "data outside the file are not read"
+_READ_ERRORS = (KeyError, IndexError, RuntimeError, TypeError, ValueError, AttributeError, OverflowError)
+
+
+class Label(NamedTuple):
+    """What the first header of a file tells of its content."""
+
+    kind: str
+    """Kind of content, such as "run"."""
+    rows: int
+    """Number of its rows."""
+    note: str
+    """What the writer noted of it, such as the key of its settings."""
+
+
+# ---- writing -------------------------------------------------------------------------------------------------------
+
+
+class _Sink:
+    """A file for HDF5, which cannot close a file if writing fails: the first error is kept and raised afterwards."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file, self.error = file, None
+
+    def _do(self, method, *arguments):
+        if self.error is None:
+            try:
+                return getattr(self._file, method)(*arguments)
+            except OSError as error:
+                self.error = error
+        return 0
+
+    def __getattr__(self, method):
+        return partial(self._do, method)
+
+
+@contextmanager
+def write_hdf5(path: AnyPath, kind: str, rows: int, note: str = "") -> Iterator[h5py.File]:
+    """Write an HDF5 file with checksums, which is either complete or absent.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file to write or overwrite.
+    kind : str
+        Kind of content, for `label_of`.
+    rows : int
+        Number of its rows.
+    note : str
+        What else `label_of` should tell, in some hundred characters.
+
+    Yields
+    ------
+    h5py.File
+        For `put_field` and `put_text`.
+
+    Raises
+    ------
+    FileError
+        If it cannot be written.
+    """
+    with replace_file(path) as target:
+        sink = _Sink(target)
+        try:
+            with h5py.File(sink, "w", libver=("v110", "v110")) as file:
+                for name, text in (("format", _FORMAT.format(kind)), ("note", note)):
+                    file.attrs.create(name, text.encode(), dtype=h5py.string_dtype("utf-8", max(1, len(text.encode()))))
+                file.attrs["rows"] = rows
+                yield file
+        finally:
+            if sink.error is not None:
+                raise sink.error
+
+
+def put_field(group: Any, name: str, values: Any, units: str | None = None) -> Any:
+    """Write numbers or texts as a dataset, with their unit; only arrays have checksums, others are not read again."""
+    values = np.asarray(values)
+    if values.ndim and values.dtype.kind in "OU":
+        values = np.char.encode(values.astype(str), "utf-8")
+        values = values.astype(h5py.string_dtype("utf-8", max(1, values.dtype.itemsize)))
+    if values.size and values.ndim:
+        number = -(-values.nbytes // _CHUNK)
+        chunks = (-(-len(values) // number), *values.shape[1:])
+        dataset = group.create_dataset(name, data=values, chunks=chunks, compression="gzip", compression_opts=0)
+    else:
+        dataset = group.create_dataset(name, data=values if values.dtype.kind != "U" else str(values))
+    if units:
+        dataset.attrs["units"] = units
+    return dataset
+
+
+def put_text(group: Any, name: str, text: str) -> None:
+    """Write a text as a dataset of one row."""
+    put_field(group, name, [text])
+
+
+# ---- reading -------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def open_hdf5(path: AnyPath, what: str = "HDF5") -> "Iterator[CheckedFile]":
+    """Open an HDF5 file, also one of another program, which may have no checksums.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file.
+    what : str
+        Expected content, for messages.
+
+    Yields
+    ------
+    CheckedFile
+
+    Raises
+    ------
+    FileError
+        If the file is missing, unreadable, damaged or not HDF5, or if its content is not as expected: errors in the
+        block become one sentence.
+    """
+    name = str(check_path(path))
+    with open_for_reading(path) as raw, io.BufferedReader(raw) as file:  # type: ignore[type-var]
+        size = file.seek(0, io.SEEK_END)
+        file.seek(0)
+        if file.read(len(_SIGNATURE)) != _SIGNATURE:
+            raise FileError(f"cannot read {name!r} as {what}: it is not an HDF5 file")
+        with _damage(name):
+            opened = h5py.File(file, "r")
+        with opened:
+            try:
+                yield CheckedFile(opened, name, size)
+            except FileError:
+                raise
+            except _READ_ERRORS as error:
+                raise FileError(f"cannot read {name!r} as {what}: {_first_line(error)}") from error
+
+
+@contextmanager
+def _damage(name):
+    """Turn any error of HDF5 into one sentence."""
+    try:
+        yield
+    except Exception as error:
+        raise FileError(f"{name!r} is damaged: {_first_line(error)}") from error
+
+
+def _first_line(error):
+    return (str(error.args[0] if error.args else "") or type(error).__name__).splitlines()[0]
+
+
+def label_of(path: AnyPath) -> Label | None:
+    """Kind, rows and note of a file of `write_hdf5`; None for an HDF5 file of another program.
+
+    Raises
+    ------
+    FileError
+        If the file is missing, unreadable, damaged or not HDF5.
+    """
+    with open_hdf5(path) as file:
+        return file.label
+
+
+class CheckedFile:
+    """An open HDF5 file, of which nothing is read that lies outside of it or is larger than it.
+
+    Parameters
+    ----------
+    file : h5py.File
+        Open for reading.
+    name : str
+        Its name.
+    size : int
+        Its size [bytes].
+    """
+
+    def __init__(self, file: h5py.File, name: str, size: int) -> None:
+        self._file, self.name, self._size = file, name, size
+
+    @property
+    def label(self) -> Label | None:
+        """Kind, rows and note of the content; None for a file of another program."""
+        kind, rows, note = (self.attribute(name) for name in ("format", "rows", "note"))
+        if not (isinstance(kind, bytes) and isinstance(rows, np.integer) and isinstance(note, bytes)):
+            return None
+        before, _, after = _FORMAT.partition("{}")
+        kind = kind.decode(errors="replace").removeprefix(before).removesuffix(after)
+        return Label(kind, int(rows), note.decode(errors="replace"))
+
+    def __contains__(self, path: str) -> bool:
+        group, _, name = path.rpartition("/")
+        return (not group or group in self) and name in self._names(self._item(group))
+
+    def attribute(self, name: str, path: str = "") -> Any:
+        """Attribute of a group or dataset; None if it is missing."""
+        item = self._item(path)
+        with _damage(self.name):
+            return item.attrs[name] if name in item.attrs else None
+
+    def text(self, path: str) -> str:
+        """Text of a dataset of `put_text`; KeyError or ValueError if it is missing or something else."""
+        values = self.read(path, None, (1,))
+        if values.dtype.kind != "S":
+            raise ValueError(f"{path} must be a text, got {values.dtype}")
+        return values[0].decode()
+
+    def json(self, path: str) -> Any:
+        """Content of a text in JSON; otherwise as `text`."""
+        return json.loads(self.text(path))
+
+    def read(
+        self,
+        path: str,
+        dtype: DTypeLike | None,
+        shape: tuple[int | None, ...] | None,
+        rows: slice = slice(None),
+    ) -> NDArray[Any]:
+        """Check the type, the shape and the place of a dataset, and read it.
+
+        Parameters
+        ----------
+        path : str
+            Name of the dataset, with the names of its groups.
+        dtype : dtype or None
+            Expected type; None for any numbers and texts of fixed length.
+        shape : tuple or None
+            Expected shape; None stands for any length, or for any shape.
+        rows : slice
+            Rows to read.
+
+        Returns
+        -------
+        ndarray
+
+        Raises
+        ------
+        KeyError, ValueError
+            If it is missing or not as expected.
+        FileError
+            If it is damaged.
+        """
+        item = self._item(path)
+        if not isinstance(item, h5py.Dataset):
+            raise ValueError(f"{path} is not a dataset")
+        with _damage(self.name):
+            stored, found, plist = item.dtype, item.shape, item.id.get_create_plist()
+            chunks, layout, external = item.chunks or (), plist.get_layout(), plist.get_external_count()
+            filters = {number: values for number, _, values, _ in map(plist.get_filter, range(plist.get_nfilters()))}
+            n_bytes = item.id.get_storage_size()
+        if dtype is not None and stored.newbyteorder("=") != np.dtype(dtype):
+            raise ValueError(f"{path} must contain {np.dtype(dtype)}, got {stored}")
+        if stored.hasobject:
+            raise ValueError(f"{path} must contain numbers or texts of fixed length, got {stored}")
+        expected = (None,) * len(found or ()) if shape is None else shape
+        fits = found is not None and len(found) == len(expected)
+        if not fits or any(a != b for a, b in zip(found, expected, strict=True) if b is not None):
+            lengths = ", ".join("any" if length is None else str(length) for length in expected)
+            raise ValueError(f"{path} must have shape ({lengths}), got {found}")
+        if external or layout == h5py.h5d.VIRTUAL:
+            raise ValueError(f"{path} is in another file: {_FOREIGN}")
+        if max(math.prod(found), math.prod(chunks)) * stored.itemsize > self._size:
+            raise ValueError(f"{path} has shape {found}, more than the {self._size} bytes of the file")
+        if filters.pop(h5py.h5z.FILTER_DEFLATE, (0,))[0] or filters.keys() - {h5py.h5z.FILTER_FLETCHER32}:
+            raise ValueError(f"{path} is compressed or filtered: h5repack -f NONE writes a copy that is not")
+        if n_bytes < math.prod(found) * stored.itemsize:
+            raise ValueError(f"{path} is incomplete")
+        with _damage(self.name):
+            return item[rows] if found else item[()]
+
+    def _names(self, item):
+        """Names in a group; HDF5 takes a name that it cannot look up for one that is missing."""
+        with _damage(self.name):
+            return set(item) if isinstance(item, h5py.Group) else set()
+
+    def _item(self, path):
+        item = self._file
+        for part in filter(None, path.split("/")):
+            if part not in self._names(item):
+                raise KeyError(f"{path} is missing")
+            with _damage(self.name):
+                link = item.get(part, getlink=True)
+            if not isinstance(link, h5py.HardLink):
+                raise ValueError(f"{path} is a link: {_FOREIGN}")
+            with _damage(self.name):
+                item = item[part]
+        return item
