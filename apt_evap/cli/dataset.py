@@ -4,8 +4,8 @@ import argparse
 from pathlib import Path
 
 from apt_evap.cli._output import say, tell, tell_json
+from apt_evap.config.cost_estimate import hours_text
 from apt_evap.dataset.making import ABOUT, make, plan_set, verify
-from apt_evap.sweep.foresight import hours_text
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -543,7 +543,7 @@ def _add_sweep(commands: Any) -> None:
         epilog="example:\n"
         "  apt-evap sweep plan study.toml                          folders, memory and hours; runs nothing\n"
         "  apt-evap sweep work study.toml --workers 4              on this machine\n"
-        "  apt-evap sweep submit study.toml --scheduler slurm      on a cluster\n"
+        "  apt-evap sweep work study.toml --point 3                as one task of a cluster\n"
         "  apt-evap sweep status study.toml\n"
         "  apt-evap sweep collect study.toml                       tables, maps, a report, fit to a measured map",
         **_SHAPE,
@@ -555,26 +555,20 @@ def _add_sweep(commands: Any) -> None:
         action.add_argument("study", metavar="STUDY.toml", help="study file, or the folder of its sweep")
         return action
 
-    _add_speech(add("plan", "make the folder of a sweep, and foresee memory and hours; nothing is run"))
-    work = add("work", "work on the points that are open")
+    _add_speech(add("plan", "make the folder of a sweep, and estimate memory and hours; nothing is run"))
+    work = add("work", "run the points that are waiting")
     where = work.add_mutually_exclusive_group()
     where.add_argument("--workers", type=_integer(1), default=1, metavar="N", help="processes; default: 1")
-    where.add_argument("--point", action="append", metavar="KEY", help="only this point, by its key or number")
+    where.add_argument(
+        "--point",
+        action="append",
+        metavar="KEY",
+        help="only this point, by its key or number from 0, in this process; may be repeated",
+    )
     where.add_argument("--scheduler", choices=("dask",), help="let the workers of a Dask cluster work")
     work.add_argument("--address", metavar="TCP", help="address of the scheduler of Dask")
     work.add_argument("--retry", action="store_true", help="also try failed points again")
     _add_speech(work)
-    submit = add("submit", "submit the open points to a batch system, as job arrays")
-    submit.add_argument("--scheduler", choices=("slurm", "pbs"), default="slurm", help="default: slurm")
-    submit.add_argument("--dry-run", action="store_true", help="only print the scripts")
-    submit.add_argument("--template", metavar="JOB.sh", help="script with placeholders such as @KEYS@ and @COMMAND@")
-    submit.add_argument("--submit-command", metavar="COMMAND", help="default: sbatch --parsable, or qsub")
-    submit.add_argument(
-        "--option", action="append", metavar="OPTION", help="of the batch system, such as --option=--partition=short"
-    )
-    submit.add_argument("--at-once", type=_integer(1), metavar="N", help="tasks of an array that run at once (slurm)")
-    submit.add_argument("--largest-array", type=_integer(1), metavar="N", help="default: as the system allows, or 1000")
-    _add_speech(submit)
     add("status", "show the states of all points").add_argument("--json", action="store_true", help="as JSON")
     gather = add("collect", "collect the finished points: table, maps, report, and the fit to a measured map")
     gather.add_argument("--maps", metavar="MAPS.h5", help="default: maps.h5 in the folder of the sweep")
