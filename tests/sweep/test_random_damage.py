@@ -26,9 +26,7 @@ ions = 10
 [maps]
 bins = 8
 """
-STUDY = (
-    'base = "base.toml"\neach = { checkpoint = 5 }\n[sweep]\n"tip.offset_seed" = [1, 2]\n"simulation.seed" = [0, 1]\n'
-)
+STUDY = 'base = "base.toml"\neach = {checkpoint = 5}\n[sweep]\n"tip.offset_seed" = [1, 2]\n"simulation.seed" = [0, 1]\n'
 VALUES = [
     None, 0, 1, -1, 1.5, 1e400, -1e400, float("nan"), 10**400, True, "", "x", "../../..", "../../../victim", "\ud800",
     "$(touch PWN)", "`touch PWN`;", "a\nb", "a\x00b", "\x1b[2J", [], {}, [1], {"a": 1}, [[[]]], "1" * 10_000, ...,

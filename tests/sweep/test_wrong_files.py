@@ -17,6 +17,7 @@ import apt_evap as ae
 from apt_evap._common.files import FileError
 from apt_evap.cli.main import main
 from apt_evap.config.simulation_file import key_of
+from apt_evap.simulation.checkpoint import Checkpoint
 from apt_evap.sweep.collection import collect
 from apt_evap.sweep.planning import open_sweep, plan, retry, status
 from apt_evap.sweep.point_folder import run_point
@@ -96,17 +97,17 @@ def test_the_unfinished_run_of_another_point_is_not_continued(fresh, part):
     """It names no settings of a point yet: its own settings are compared."""
     one, other = (fresh.folder_of(key) for key in fresh.keys)
     run = fresh.config_of(other.name).simulation(n_threads=1)
-    run.run(15, responses=True, progress=False, checkpoint=ae.Checkpoint(other / "run.h5"))
+    run.run(15, responses=True, progress=False, checkpoint=Checkpoint(other / "run.h5"))
     if part == "run.h5":
         (other / part).rename(one / part)
     else:
         program = (
             "import sys; from apt_evap.config.simulation_file import read_config\n"
-            "import apt_evap as ae, os\n"
+            "from apt_evap.simulation.checkpoint import Checkpoint; import os\n"
             "simulation = read_config(sys.argv[1] + '/settings.toml').simulation(n_threads=1)\n"
             "def kill(ions, all_ions): ions < 10 or os.kill(os.getpid(), 9)\n"
             "simulation.run(20, responses=True, progress=kill, batch_size=4,\n"
-            "               checkpoint=ae.Checkpoint(sys.argv[1] + '/run.h5', 0, overwrite=True))"
+            "               checkpoint=Checkpoint(sys.argv[1] + '/run.h5', 0, overwrite=True))"
         )
         killed = subprocess.run([sys.executable, "-c", program, str(other)], capture_output=True)
         assert killed.returncode == -signal.SIGKILL, killed.stderr
