@@ -71,7 +71,7 @@ def _work_on_points(options, sweep):
     for text in texts.values():
         tell(options, text)
     tell_json(options, {key: state.name for key, state in states.items()})
-    if unfinished := [text for key, text in texts.items() if states[key].name not in ("done", "running")]:
+    if unfinished := [text for key, text in texts.items() if states[key].name != "done"]:
         raise ValueError(f"point {'; '.join(unfinished)}")
     return 0
 

@@ -34,8 +34,8 @@ ABOUT, SHEET, SUMS = "dataset.json", "README.md", "SHA256SUMS"
 """Files of a data set beside those of its examples."""
 _MAX_BYTES = 1 << 30
 _SHARD = re.compile(rf"({'|'.join(SPLITS)})-\d{{4,}}(\.h5|\.\w+\.parquet)")
-# Measured for 30 runs of 2,000 ions with responses: 507 bytes per ion, 95 kB for the picture and the other files
-_RUN_BYTES_PER_ION, _RUN_BYTES = 510, 1e5
+# Measured for runs of 60 to 2,000 ions with responses: 470 to 507 bytes per ion, 56 kB for the rest
+_RUN_BYTES_PER_ION, _RUN_BYTES = 510, 6e4
 _TEXT_BYTES, _FILE_BYTES = 4000, 40_000  # measured: 2.5 kB of texts in an example, 20 kB of HDF5 in an empty file
 # Measured there: 2 s for 30 examples, with the import of the package; doubled as the times of the runs
 _RECORDING = 6e-5  # seconds per ion and example
@@ -236,7 +236,7 @@ def make(
     worked = {}
     if n_waiting:
         note(f"{n_waiting:,} of {len(sweep.points):,} runs are missing")
-        worked = work(sweep, keys, workers)
+        worked = work(sweep, keys, workers if workers > 1 else None)
     states = {key: state for key in keys if (state := sweep.state(key)).name != "done"}
     failed = [key for key, state in states.items() if state.name == "failed"]
     if without_failed and len(failed) == len(states):

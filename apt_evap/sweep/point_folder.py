@@ -30,6 +30,7 @@ SETTINGS, RUN, WORK, LOCK = "settings.toml", "run.h5", "work.json", "lock"
 """Files of a point."""
 STATES = ("done", "running", "waiting", "failed", "wrong")
 """States of a point."""
+_AT_WORK = "a process works on it"
 _MAX_BYTES = 1 << 20
 _OPEN_LOCK = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
 _LOCK_TRIES, _LOCK_WAIT = 10, 0.05  # `state_of` locks for an instant [s]
@@ -71,7 +72,9 @@ def write_text(path: Path, text: str) -> None:
 def state_of(folder: Path) -> PointState:
     """State of a point, from the files in its folder."""
     state = _stored_state(folder)
-    return replace(state, name="running") if state.name == "waiting" and _is_locked(folder) else state
+    if state.name == "waiting" and _is_locked(folder):
+        return replace(state, name="running", message=_AT_WORK)
+    return state
 
 
 def _stored_state(folder):
@@ -129,7 +132,7 @@ def run_point(folder: AnyPath, threads: int = 1, checkpoint: float = 10.0) -> Po
     try:
         with _locked(unlinked(folder)) as is_free:
             if not is_free:
-                return PointState("running")
+                return PointState("running", _AT_WORK)
             state = _stored_state(folder)
             if state.name != "waiting":
                 return state

@@ -22,12 +22,8 @@ _KILLED = PointState("waiting", "its process was killed, perhaps for lack of mem
 _MOST_KILLED = 3  # processes in succession: something is wrong on this machine
 
 
-def work(sweep: Sweep, keys: Sequence[str] | None = None, workers: int = 1) -> dict[str, PointState]:
-    """Run all waiting points in processes of this machine.
-
-    Each point has a process of its own. If it is killed, the other points go on, and the next call continues the point
-    from its last checkpoint. A script that calls this function needs ``if __name__ == "__main__":``, as for all uses of
-    `multiprocessing`.
+def work(sweep: Sweep, keys: Sequence[str] | None = None, workers: int | None = None) -> dict[str, PointState]:
+    """Run all waiting points.
 
     Parameters
     ----------
@@ -35,8 +31,10 @@ def work(sweep: Sweep, keys: Sequence[str] | None = None, workers: int = 1) -> d
         The sweep.
     keys : sequence of str, optional
         Keys of the points; all by default.
-    workers : int
-        Number of processes at a time.
+    workers : int, optional
+        Number of points that run at a time, each in a process of its own. If it is killed, the other points go on, and
+        the next call continues the point from its last checkpoint. A script needs ``if __name__ == "__main__":``, as
+        for all uses of `multiprocessing`. By default the points run in this process.
 
     Returns
     -------
@@ -50,10 +48,12 @@ def work(sweep: Sweep, keys: Sequence[str] | None = None, workers: int = 1) -> d
     ValueError
         If three processes in succession were killed.
     """
-    check_count(workers, "workers", at_least=1)
     keys = [key for key in (sweep.keys if keys is None else keys) if sweep.state(key).name == "waiting"]
-    states, killed = {}, 0
     job = sweep.job.threads, sweep.job.checkpoint
+    if workers is None:
+        return {key: run_point(sweep.folder_of(key), *job) for key in keys}
+    check_count(workers, "workers", at_least=1)
+    states, killed = {}, 0
     with _stopped_by_interrupts() as stop, _threads_of_libraries(job[0]), ThreadPoolExecutor(workers) as pool:
         futures = {pool.submit(_in_a_process, stop, sweep.folder_of(key), *job): key for key in keys}
         try:
