@@ -239,7 +239,17 @@ def csv_value(value: Any) -> str:
 
 
 def retry(sweep: Sweep) -> int:
-    """Let all failed points wait for another try; return their number.
+    """Let all failed points wait for another try.
+
+    Parameters
+    ----------
+    sweep : Sweep
+        The sweep.
+
+    Returns
+    -------
+    int
+        Number of these points.
 
     Raises
     ------

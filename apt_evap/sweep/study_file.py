@@ -106,7 +106,7 @@ def folder_of_study(path: AnyPath) -> Path:
     Raises
     ------
     FileError
-        If it is neither of both.
+        If it is neither.
     """
     path = check_path(path)
     if not path.is_dir() and not path.suffix:

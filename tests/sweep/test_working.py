@@ -30,7 +30,7 @@ ions = 60
 bins = 32
 """
 TWO = 'base = "base.toml"\neach = { checkpoint = 0 }\n[sweep]\n"tip.offset_seed" = [1, 2]\n'
-LONG = SMALL.replace("ions = 60", "ions = 2000")
+LONG = SMALL.replace("ions = 60", "ions = 1000")
 TWO_LONG = TWO.replace("checkpoint = 0", "checkpoint = 0.001")
 
 
@@ -103,7 +103,7 @@ def test_an_interrupt_saves_all_ions_and_the_next_call_continues(tmp_path, numbe
     assert process.wait(60) == 128 + number, process.stderr.read()
     assert "Traceback" not in process.stderr.read()
     for row in status(sweep)["table"]:
-        assert row["state"] == "waiting" and 0 < row["ions"] < 2000 and row["seconds"] > 0
+        assert row["state"] == "waiting" and 0 < row["ions"] < 1000 and row["seconds"] > 0
         assert (sweep.folder_of(row["key"]) / "run.h5").exists()  # not only the last checkpoint
     work(sweep, workers=2)
     check_done(sweep)
