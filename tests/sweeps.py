@@ -1,19 +1,18 @@
-"""A sweep of twelve small points, and what must be true of its journal after workers were killed."""
+"""A sweep of twelve small points, and what must be true of it after processes were killed."""
 
-import contextlib
-import datetime
 import os
 import random
 import signal
+import subprocess
+import sys
 import threading
-import time
 from pathlib import Path
 
 import apt_evap as ae
 from apt_evap.config.simulation_file import read_config
 from apt_evap.simulation.run import load
-from apt_evap.sweep.claims import Claims
 from apt_evap.sweep.planning import plan
+from apt_evap.sweep.point_folder import run_point
 
 BASE = """
 [tip]
@@ -29,7 +28,7 @@ bins = 32
 """
 TWELVE = """
 base = "base.toml"
-each = { checkpoint = 0, tries = 50 }
+each = { checkpoint = 0 }
 
 [sweep]
 "tip.axis" = [[0, 0, 1], [1, 1, 1], [0, 1, 2]]
@@ -46,15 +45,15 @@ def planned(folder, study=TWELVE, base=BASE):
 
 
 def do(sweep, key):
-    """Run a point in this process, as a worker would."""
-    claims = Claims(sweep.folder_of(key))
-    claim = claims.take(len(claims.all()), 0)
-    config = read_config(sweep.folder_of(key) / "settings.toml")
-    run = config.simulation(n_threads=1).run(config.n_ions, config.emissions, progress=False)
-    run = config.as_saved(run)
-    run.save(sweep.folder_of(key) / "run.h5")
-    claims.end(claim, code=0, seconds=36.0, ions=len(run), message="")
-    return run
+    """Run a point in this process; return its run."""
+    assert run_point(sweep.folder_of(key)).name == "done"
+    return load(sweep.folder_of(key) / "run.h5")
+
+
+def command(sweep, *options, **environment):
+    """`apt-evap sweep work` as a process."""
+    words = [sys.executable, "-P", "-m", "apt_evap.cli", "sweep", "work", str(sweep.folder), "--quiet", *options]
+    return subprocess.Popen(words, env=os.environ | environment, stderr=subprocess.PIPE, text=True)
 
 
 def poison(sweep, key):
@@ -78,16 +77,21 @@ def write_dump(path, radius=1.1):
 
 
 class Killer:
-    """Ends the owner of a random running point, or its run, every few seconds, at most a number of times.
+    """Kills a random process every few seconds while the block lasts.
 
-    The kinds are worker and run (by SIGKILL), and SIGTERM (to the worker). They take turns, so that a fast machine,
-    where a sweep sees few ends, sees all of them.
+    Parameters
+    ----------
+    processes : callable
+        Returns the numbers of the processes that may be killed.
+    seconds : float
+        Mean time between two of them [s].
+    most : int
+        Largest number.
     """
 
-    def __init__(self, sweep, seconds, most=1000, seed=1, kinds=("worker",)):
-        self.sweep, self.seconds, self.most, self.kinds = sweep, seconds, most, kinds
-        self.count = dict.fromkeys(kinds, 0)
-        self.killed, self.runs = {}, []  # times by process, and the runs that they had started
+    def __init__(self, processes, seconds, most=1000, seed=1):
+        self.processes, self.seconds, self.most = processes, seconds, most
+        self.killed = []
         self._random, self._stop = random.Random(seed), threading.Event()
         self._thread = threading.Thread(target=self._kill)
 
@@ -100,46 +104,14 @@ class Killer:
         self._thread.join()
 
     def _kill(self):
-        while not self._stop.wait(self.seconds * self._random.uniform(0.5, 1.5)):
-            states = [state for _, state in self.sweep.states() if state.name == "running"]
-            if states and sum(self.count.values()) < self.most:
-                pid = self._random.choice(states).claims[-1].owner.get("pid")
-                if pid:
-                    with contextlib.suppress(ProcessLookupError):
-                        self._kill_one(pid, min(self.kinds, key=self.count.__getitem__))
-
-    def _kill_one(self, pid, kind):
-        children = living_children(pid)
-        if kind == "run":
-            for child in children:
-                os.kill(child, signal.SIGKILL)
-        elif kind == "worker":
-            self.runs += children
-            self.killed.setdefault(pid, time.time())
-            os.kill(pid, signal.SIGKILL)
-        else:
-            os.kill(pid, signal.SIGTERM)
-        self.count[kind] += bool(children) or kind != "run"
-
-
-def check_journal(sweep, killed):
-    """Every point was finished once, and a try began only after the end, or the death, of the try before.
-
-    A worker that is killed after its run was written leaves no end.
-    """
-    lost = 0
-    for point, state in sweep.states():
-        assert state.name == "done", (str(point), state)
-        assert all(claim.end is None or claim.end["code"] != 0 for claim in state.claims[:-1])
-        lost += state.claims[-1].end is None
-        for before, after in zip(state.claims, state.claims[1:], strict=False):
-            began = datetime.datetime.fromisoformat(after.owner["began"]).timestamp()
-            if before.end is None:
-                lost += 1
-                assert killed[before.owner["pid"]] <= began
-            else:
-                assert datetime.datetime.fromisoformat(before.end["ended"]).timestamp() <= began
-    return lost
+        while not self._stop.wait(self.seconds * self._random.uniform(0.5, 1.5)) and len(self.killed) < self.most:
+            if numbers := self.processes():
+                number = self._random.choice(numbers)
+                try:
+                    os.kill(number, signal.SIGKILL)
+                except ProcessLookupError:
+                    continue
+                self.killed.append(number)
 
 
 def single_fingerprint(sweep, key):
@@ -154,17 +126,10 @@ def check_bits(sweep, keys=None):
         assert load(sweep.folder_of(key) / "run.h5").fingerprint() == single_fingerprint(sweep, key)
 
 
-def no_flock(folder):
-    """A folder for PYTHONPATH that takes flock away from all processes, as on some file systems of clusters."""
-    folder = Path(folder) / "no_flock"
-    folder.mkdir()
-    (folder / "sitecustomize.py").write_text(
-        "import errno, fcntl\n\n"
-        "def flock(*arguments):\n"
-        '    raise OSError(errno.ENOTSUP, "Operation not supported")\n\n'
-        "fcntl.flock = flock\n"
-    )
-    return folder
+def check_done(sweep):
+    """All points are done, by no other runs than their own."""
+    assert {state.name for _, state in sweep.states()} == {"done"}
+    check_bits(sweep)
 
 
 def living_children(pid):

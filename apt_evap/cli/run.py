@@ -13,13 +13,13 @@ from apt_evap.cli._files import check_output, is_picture, picture_path, save_pic
 from apt_evap.cli._options import add_speech, integer_type, number_type
 from apt_evap.cli._output import INTERRUPTED, say, tell, tell_json
 from apt_evap.cli.map import run_maps, summaries
+from apt_evap.config.cost_estimate import estimate_cost
 from apt_evap.config.simulation_file import config_of, read_document
 from apt_evap.plot.maps import specimen_title
 from apt_evap.simulation.checkpoint import Checkpoint
 from apt_evap.simulation.recorder import RunInterrupted
 from apt_evap.simulation.run_hdf5 import is_run
 from apt_evap.simulation.stop_reason import StopReason
-from apt_evap.sweep.foresight import foresee
 
 SECONDS_BETWEEN_LINES = 60.0
 _BAR = "{percentage:3.0f}%|{bar:20}| {n_fmt} of {total_fmt} ions, {remaining} left"
@@ -76,7 +76,7 @@ def execute(options: argparse.Namespace) -> int:
     check_output(picture, is_picture, options.force)
 
     n_ions = config.n_ions
-    tell(options, f"{foresee(config, 1)} of one thread")
+    tell(options, f"{estimate_cost(config, 1)} of one thread")
     tell(options, "building the specimen and relaxing the charges of its surface")
     simulation = config.simulation(n_threads=options.threads)
     tell(options, f"{str(simulation.tip).strip('<>')}; {len(simulation.emitter):,} atoms on the surface")

@@ -8,14 +8,12 @@ from apt_evap._common.codec import to_plain
 from apt_evap._common.files import FileError
 from apt_evap.cli._options import SHAPE, add_speech, integer_type
 from apt_evap.cli._output import put, say, tell, tell_json
+from apt_evap.config.cost_estimate import hours_text
 from apt_evap.detection.binning import MAX_BINS
-from apt_evap.sweep.batch_system import largest_array, scripts, submit
 from apt_evap.sweep.collection import collect
-from apt_evap.sweep.foresight import hours_text
-from apt_evap.sweep.overview import status
-from apt_evap.sweep.planning import STATES, open_sweep, plan
-from apt_evap.sweep.pool import work_locally, work_with_dask
-from apt_evap.sweep.worker import retry, work, work_on
+from apt_evap.sweep.planning import open_sweep, plan, retry, status
+from apt_evap.sweep.point_folder import STATES, run_point
+from apt_evap.sweep.working import work, work_with_dask
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,7 +26,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "example:\n"
         "  apt-evap sweep plan study.toml                          folders, memory and hours; runs nothing\n"
         "  apt-evap sweep work study.toml --workers 4              on this machine\n"
-        "  apt-evap sweep submit study.toml --scheduler slurm      on a cluster\n"
+        "  apt-evap sweep work study.toml --point 3                as one task of a cluster\n"
         "  apt-evap sweep status study.toml\n"
         "  apt-evap sweep collect study.toml                       tables, maps, a report, fit to a measured map"
     )
@@ -39,30 +37,20 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         action.add_argument("study", metavar="STUDY.toml", help="study file, or the folder of its sweep")
         return action
 
-    add_speech(add("plan", "make the folder of a sweep, and foresee memory and hours; nothing is run"))
-    work = add("work", "work on the points that are open")
+    add_speech(add("plan", "make the folder of a sweep, and estimate memory and hours; nothing is run"))
+    work = add("work", "run the points that are waiting")
     where = work.add_mutually_exclusive_group()
     where.add_argument("--workers", type=integer_type(1), default=1, metavar="N", help="processes; default: 1")
-    where.add_argument("--point", action="append", metavar="KEY", help="only this point, by its key or number")
+    where.add_argument(
+        "--point",
+        action="append",
+        metavar="KEY",
+        help="only this point, by its key or number from 0, in this process; may be repeated",
+    )
     where.add_argument("--scheduler", choices=("dask",), help="let the workers of a Dask cluster work")
     work.add_argument("--address", metavar="TCP", help="address of the scheduler of Dask")
     work.add_argument("--retry", action="store_true", help="also try failed points again")
     add_speech(work)
-    submit = add("submit", "submit the open points to a batch system, as job arrays")
-    submit.add_argument("--scheduler", choices=("slurm", "pbs"), default="slurm", help="default: slurm")
-    submit.add_argument("--dry-run", action="store_true", help="only print the scripts")
-    submit.add_argument("--template", metavar="JOB.sh", help="script with placeholders such as @KEYS@ and @COMMAND@")
-    submit.add_argument("--submit-command", metavar="COMMAND", help="default: sbatch --parsable, or qsub")
-    submit.add_argument(
-        "--option", action="append", metavar="OPTION", help="of the batch system, such as --option=--partition=short"
-    )
-    submit.add_argument(
-        "--at-once", type=integer_type(1), metavar="N", help="tasks of an array that run at once (slurm)"
-    )
-    submit.add_argument(
-        "--largest-array", type=integer_type(1), metavar="N", help="default: as the system allows, or 1000"
-    )
-    add_speech(submit)
     add("status", "show the states of all points").add_argument("--json", action="store_true", help="as JSON")
     gather = add("collect", "collect the finished points: table, maps, report, and the fit to a measured map")
     gather.add_argument("--maps", metavar="MAPS.h5", help="default: maps.h5 in the folder of the sweep")
@@ -78,18 +66,18 @@ def execute(options: argparse.Namespace) -> int:
 
 def _plan(options):
     sweep = plan(options.study)
-    hours = [needs.hours for needs in sweep.foresights]
-    memory = [needs.memory for needs in sweep.foresights if needs.memory is not None]
+    hours = [cost.hours for cost in sweep.estimates]
+    memory = [cost.memory for cost in sweep.estimates if cost.memory is not None]
     content = {
         "folder": str(sweep.folder),
         "points": [
-            {"key": point.key, "values": point.values, **to_plain(needs)}
-            for point, needs in zip(sweep.points, sweep.foresights, strict=True)
+            {"key": point.key, "values": point.values, **to_plain(cost)}
+            for point, cost in zip(sweep.points, sweep.estimates, strict=True)
         ],
     }
     if not (options.quiet or options.json):
-        for point, needs in zip(sweep.points, sweep.foresights, strict=True):
-            put(f"{point.key}  {needs}  {point}")
+        for point, cost in zip(sweep.points, sweep.estimates, strict=True):
+            put(f"{point.key}  {cost}  {point}")
         most = f", {max(memory) / 1e9:.2g} GB at most" if memory else ""
         total = "" if None in hours else f", about {hours_text(sum(hours))} of one worker"
         put(f"{len(sweep.points):,} points in {sweep.folder}{most}{total}")
@@ -101,62 +89,35 @@ def _work(options):
     sweep = open_sweep(options.study)
     if options.retry:
         tell(options, f"{retry(sweep):,} failed points are tried again")
+    if options.address is not None and options.scheduler is None:
+        raise ValueError(f"--address is only for --scheduler dask, got {options.address!r}")
+    if options.point is not None:
+        return _work_on_points(options, sweep)
     if options.scheduler == "dask":
         if options.address is None:
             raise ValueError("--scheduler dask needs --address, such as tcp://10.0.0.1:8786")
-        work_with_dask(sweep, options.address)
-    elif options.address is not None:
-        raise ValueError(f"--address is only for --scheduler dask, got {options.address!r}")
-    elif options.point is not None:
-        keys = [sweep.check_key(point) for point in options.point]
-        states = {key: work_on(sweep, key) for key in keys}
-        for key, state in states.items():
-            tell(options, f"{key}: {state.name}{f', {state.message}' if state.message else ''}")
-        wrong = ("failed", "damaged", "foreign")
-        failed = [f"{key}: {state.message}" for key, state in states.items() if state.name in wrong]
-        tell_json(options, {key: state.name for key, state in states.items()})
-        if failed:
-            raise ValueError(f"point {'; '.join(failed)}")
-        return 0
-    elif options.workers > 1:
-        work_locally(sweep, options.workers)
+        states = work_with_dask(sweep, options.address)
     else:
-        work(sweep)
+        states = work(sweep, workers=options.workers)
+    for key, state in states.items():
+        if state.name == "waiting":
+            say("note", f"point {key} will continue: {state.message}")
     content = status(sweep)
     _tell_counts(options, content)
     tell_json(options, {"folder": content["folder"], **content["counts"]})
     return 0
 
 
-def _submit(options):
-    sweep = open_sweep(options.study)
-    keys = [point.key for point, state in sweep.states() if state.name == "open"]
-    if not keys:
-        tell(options, "no point is open: nothing to submit")
-        tell_json(options, {"jobs": [], "points": 0})
-        return 0
-    largest = options.largest_array or (largest_array(options.scheduler) if not options.dry_run else None)
-    texts = scripts(
-        sweep,
-        keys,
-        options.scheduler,
-        template=options.template,
-        options=options.option or (),
-        at_once=options.at_once,
-        **({} if largest is None else {"largest": largest}),
-    )
-    if options.dry_run:
-        if options.json:
-            tell_json(options, {"scripts": texts, "points": len(keys)})
-        else:
-            put("\n".join(texts).removesuffix("\n"))
-        return 0
-    answers = submit(sweep, texts, options.scheduler, options.submit_command)
-    for path, answer in answers:
-        tell(options, f"submitted {path}: {answer}")
-    tell_json(
-        options, {"jobs": [{"script": str(path), "answer": answer} for path, answer in answers], "points": len(keys)}
-    )
+def _work_on_points(options, sweep):
+    """Run points in this process, as in a job of a batch system, which should see whether they are done."""
+    keys = [sweep.check_key(point) for point in options.point]
+    states = {key: run_point(sweep.folder_of(key), sweep.job.threads, sweep.job.checkpoint) for key in keys}
+    texts = {key: f"{key}: {state.name}{f', {state.message}' * bool(state.message)}" for key, state in states.items()}
+    for text in texts.values():
+        tell(options, text)
+    tell_json(options, {key: state.name for key, state in states.items()})
+    if unfinished := [text for key, text in texts.items() if states[key].name != "done"]:
+        raise ValueError(f"point {'; '.join(unfinished)}")
     return 0
 
 
@@ -168,26 +129,24 @@ def _status(options):
     for row in content["table"]:
         values = ", ".join(f"{path} = {json.dumps(value)}" for path, value in row["values"].items())
         message = f"  {row['message']}" if row["message"] else ""
-        tries = f"{row['tries']} {'try' if row['tries'] == 1 else 'tries'}"
-        put(f"{row['key']}  {row['state']:7}  {row['ions']:,} of {row['n_ions']:,} ions, {tries}  {values}{message}")
+        put(f"{row['key']}  {row['state']:7}  {row['ions']:,} of {row['n_ions']:,} ions  {values}{message}")
     _tell_counts(argparse.Namespace(quiet=False, json=False), content)
     return 0
 
 
 def _tell_counts(options, content):
     counts = content["counts"]
-    shown = [name for name in STATES if counts[name] or name not in ("damaged", "foreign")]
+    shown = [name for name in STATES if counts[name] or name != "wrong"]
     text = ", ".join(f"{counts[name]:,} {name}" for name in shown)
     left = content["hours_left"]
     hours = f"; about {hours_text(left)} of one worker left" if left else ""
     tell(options, f"{content['points']:,} points: {text}{hours}")
-    wrong = [row for row in content["table"] if row["state"] in ("failed", "damaged", "foreign")]
-    for row in wrong[:3]:
+    for row in [row for row in content["table"] if row["state"] in ("failed", "wrong")][:3]:
         say("note", f"point {row['key']}, {row['state']}: {row['message']}")
     if counts["failed"]:
         say("note", "after the reason is removed, apt-evap sweep work --retry tries failed points again")
-    if counts["damaged"] or counts["foreign"]:
-        say("note", "after a damaged or foreign run.h5 is removed, apt-evap sweep work runs its point again")
+    if counts["wrong"]:
+        say("note", "after a wrong file is removed, apt-evap sweep work runs its point again")
 
 
 def _collect(options):
@@ -216,4 +175,4 @@ def _collect(options):
     return 0
 
 
-_ACTIONS = {"plan": _plan, "work": _work, "submit": _submit, "status": _status, "collect": _collect}
+_ACTIONS = {"plan": _plan, "work": _work, "status": _status, "collect": _collect}

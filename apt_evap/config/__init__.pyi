@@ -1,4 +1,5 @@
 # The public names of this room: read by type checkers, and by the lazy loader in __init__.py.
+from .cost_estimate import CostEstimate as CostEstimate
 from .lens_text import read_lens as read_lens
 from .map_panels import MapSettings as MapSettings
 from .map_panels import Panel as Panel

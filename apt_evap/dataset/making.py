@@ -23,20 +23,19 @@ from apt_evap.dataset.fields import chosen_tables
 from apt_evap.dataset.settings import SPLITS, DatasetSettings, read_instrument
 from apt_evap.dataset.shards import Schema, file_names, key_in, key_of_shard, read_table, write_shard
 from apt_evap.simulation.run import load
-from apt_evap.sweep.overview import status
-from apt_evap.sweep.planning import RUN, Sweep, plan
-from apt_evap.sweep.pool import work_locally
+from apt_evap.sweep.planning import Sweep, plan, status
+from apt_evap.sweep.point_folder import RUN
 from apt_evap.sweep.sampling import drawn
 from apt_evap.sweep.study_file import Point, SweepStudy, read_study
-from apt_evap.sweep.worker import work
+from apt_evap.sweep.working import work
 
 FORMAT = "apt_evap dataset 1"
 ABOUT, SHEET, SUMS = "dataset.json", "README.md", "SHA256SUMS"
 """Files of a data set beside those of its examples."""
 _MAX_BYTES = 1 << 30
 _SHARD = re.compile(rf"({'|'.join(SPLITS)})-\d{{4,}}(\.h5|\.\w+\.parquet)")
-# Measured for 30 runs of 2,000 ions with responses: 507 bytes per ion, 95 kB for the picture and the other files
-_RUN_BYTES_PER_ION, _RUN_BYTES = 510, 1e5
+# Measured for runs of 60 to 2,000 ions with responses: 470 to 507 bytes per ion, 56 kB for the rest
+_RUN_BYTES_PER_ION, _RUN_BYTES = 510, 6e4
 _TEXT_BYTES, _FILE_BYTES = 4000, 40_000  # measured: 2.5 kB of texts in an example, 20 kB of HDF5 in an empty file
 # Measured there: 2 s for 30 examples, with the import of the package; doubled as the times of the runs
 _RECORDING = 6e-5  # seconds per ion and example
@@ -90,13 +89,13 @@ class PlannedSet:
     def hours(self) -> float | None:
         """Time of one worker that is left, within a factor of 3 [h]; None if it is not known."""
         left = status(self.sweep)["hours_left"]
-        ions = sum(needs.ions for needs in self.sweep.foresights)
+        ions = sum(cost.ions for cost in self.sweep.estimates)
         return None if left is None else left + _RECORDING * ions * self.settings.per_run / 3600
 
     @property
     def bytes(self) -> int:
         """Largest size of the data set: all ions within the field of view, before any compression [bytes]."""
-        ions = sum(needs.ions for needs in self.sweep.foresights)
+        ions = sum(cost.ions for cost in self.sweep.estimates)
         rows = {"examples": 1, "poles": 24 * self.settings.families, "zone_lines": 13}  # as many as there can be
         rows["cap"] = 1 + ions // len(self.sweep.points) // 100
         sizes = {name: sum(field.bytes for field in fields) for name, fields in self.schema.items()}
@@ -109,8 +108,8 @@ class PlannedSet:
     @property
     def run_bytes(self) -> int:
         """Size of the runs in the folder of the sweep, which the finished data set does not need [bytes]."""
-        foresights = self.sweep.foresights
-        return int(_RUN_BYTES * len(foresights) + _RUN_BYTES_PER_ION * sum(needs.ions for needs in foresights))
+        estimates = self.sweep.estimates
+        return int(_RUN_BYTES * len(estimates) + _RUN_BYTES_PER_ION * sum(cost.ions for cost in estimates))
 
 
 def plan_set(path: AnyPath) -> PlannedSet:
@@ -233,13 +232,11 @@ def make(
     shards = planned.shards
     missing = [shard for shard in shards if _key_in(planned, folder, shard) != shard.key]
     keys = [point.key for shard in missing for point in shard.points]
-    n_open = sum(sweep.state(key).name in ("open", "running") for key in keys)
-    if n_open:
-        note(f"{n_open:,} of {len(sweep.points):,} runs are missing")
-        if workers > 1:
-            work_locally(sweep, workers)
-        else:
-            work(sweep, keys)
+    n_waiting = sum(sweep.state(key).name in ("waiting", "running") for key in keys)
+    worked = {}
+    if n_waiting:
+        note(f"{n_waiting:,} of {len(sweep.points):,} runs are missing")
+        worked = work(sweep, keys, workers if workers > 1 else None)
     states = {key: state for key in keys if (state := sweep.state(key)).name != "done"}
     failed = [key for key, state in states.items() if state.name == "failed"]
     if without_failed and len(failed) == len(states):
@@ -248,7 +245,8 @@ def make(
         missing = [shard for shard in shards if _key_in(planned, folder, shard) != shard.key]
     elif states:
         key, state = next(iter(states.items()))
-        message = f", {state.message}" if state.message else ""
+        message = state.message or (worked[key].message if key in worked else "")
+        message = f", {message}" if message else ""
         remedy = "; --without-failed leaves them out" if len(failed) == len(states) else ""
         raise FileError(
             f"{len(states):,} of {len(sweep.points):,} runs are not done, such as {key}: {state.name}{message}{remedy}"

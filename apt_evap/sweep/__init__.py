@@ -1,4 +1,4 @@
-"""Sweeps: many runs from one study file, shared by any number of processes."""
+"""Sweeps: many runs from one study file, by processes of one machine or of a cluster."""
 
 import lazy_loader
 

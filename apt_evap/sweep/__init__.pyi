@@ -1,19 +1,13 @@
 # The public names of this room: read by type checkers, and by the lazy loader in __init__.py.
-from .batch_system import scripts as scripts
-from .batch_system import submit as submit
-from .claims import Claim as Claim
-from .claims import Claims as Claims
 from .collection import collect as collect
-from .foresight import Foresight as Foresight
-from .overview import status as status
-from .planning import PointState as PointState
 from .planning import Sweep as Sweep
 from .planning import open_sweep as open_sweep
 from .planning import plan as plan
-from .pool import work_locally as work_locally
-from .pool import work_with_dask as work_with_dask
+from .planning import retry as retry
+from .planning import status as status
+from .point_folder import PointState as PointState
+from .point_folder import run_point as run_point
 from .study_file import JobSettings as JobSettings
 from .study_file import Point as Point
-from .worker import retry as retry
-from .worker import work as work
-from .worker import work_on as work_on
+from .working import work as work
+from .working import work_with_dask as work_with_dask

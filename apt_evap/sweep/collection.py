@@ -22,8 +22,8 @@ from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.emission.perturbations import described
 from apt_evap.fit.tips import TipFit, fit_tips
 from apt_evap.simulation.run import load
-from apt_evap.sweep.files import unlinked, write
-from apt_evap.sweep.planning import RUN, PointState, Sweep, csv_value
+from apt_evap.sweep.planning import Sweep, csv_value
+from apt_evap.sweep.point_folder import RUN, PointState, unlinked, write_text
 
 INDEX, MAPS, FIT_TABLE, FIT, REPORT = "index.csv", "maps.h5", "fit.csv", "fit.json", "report.html"
 """Files of a collection."""
@@ -43,13 +43,13 @@ def collect(
 ) -> dict[str, Any]:
     """Collect the results of the finished points of a sweep.
 
-    Writes ``index.csv`` (all points: key, settings that differ, state, tries, ions, end, version, processor,
+    Writes ``index.csv`` (all points: key, settings that differ, state, ions, end, version, processor,
     fingerprint of the bits), ``maps.h5`` (see `write_maps`) and, with a table ``[compare]``, ``fit.csv`` and
     ``fit.json`` (see `fit_tips`) to the folder of the sweep. ``report.html`` has all of this on one page, with the maps
     of the points that fit best (see `report.write_sweep`).
 
     Only runs of the settings of their points are collected. A point whose run cannot be read, or is that of another
-    point, is "damaged" or "foreign" in the tables, with the reason.
+    point, is "wrong" in the tables, with the reason.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def collect(
     Returns
     -------
     dict
-        points, done (numbers), wrong (reasons by key of damaged and foreign points), files (list of str),
+        points, done (numbers), wrong (reasons by key of wrong points), files (list of str),
         fit (`TipFit` or None).
 
     Raises
@@ -85,8 +85,10 @@ def collect(
     rows: dict[str, dict[str, Any]] = {}
     for key, state in states.items():
         if state.name == "done":
-            states[key], row = _read(sweep, key, state)
-            rows |= {key: row} if states[key].name == "done" else {}
+            try:
+                rows[key] = _row(sweep, key)
+            except FileError as error:
+                states[key] = PointState("wrong", str(error))
     done, fit = list(rows), None
     note(f"{len(done):,} of {len(sweep.points):,} points are done")
     _write_index(sweep, states, rows)
@@ -102,26 +104,23 @@ def collect(
     if done:
         _write_report(sweep, states, rows, fit, command, target)
         files.append(str(sweep.folder / REPORT))
-    wrong = {key: state.message for key, state in states.items() if state.name in ("damaged", "foreign")}
+    wrong = {key: state.message for key, state in states.items() if state.name == "wrong"}
     return {"points": len(sweep.points), "done": len(done), "wrong": wrong, "files": files, "fit": fit}
 
 
-def _read(sweep, key, state):
-    """State of a finished point after its run was read completely, and its row."""
+def _row(sweep, key):
+    """Results of a point from its run, which is read completely; FileError if it is wrong."""
     path = sweep.folder_of(key) / RUN
-    try:
-        run = load(path)
-    except FileError as error:
-        return PointState("damaged", state.claims, str(error)), {}
+    run = load(path)
     if run.provenance.get("settings") != key:
-        return PointState("foreign", state.claims, f"{str(path)!r} is the run of other settings"), {}
+        raise FileError(f"{str(path)!r} is the run of other settings")
     systems = run.provenance.get("systems") or [{}]
-    return state, {
+    return {
         "ions": len(run),
         "ended": run.ended or "as planned",
         "version": run.provenance.get("version", ""),
         "created": run.provenance.get("created", ""),
-        "processor": "; ".join(dict.fromkeys(each.get("processor", "") for each in systems)),
+        "processor": "; ".join(dict.fromkeys(system.get("processor", "") for system in systems)),
         "fingerprint": run.fingerprint(),
     }
 
@@ -129,13 +128,13 @@ def _read(sweep, key, state):
 def _write_index(sweep, states, rows):
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    table.writerow(["key", *sweep.paths, "state", "tries", "message", "ions", *_OF_RUN])
+    table.writerow(["key", *sweep.paths, "state", "message", "ions", *_OF_RUN])
     for point in sweep.points:
         state, row = states[point.key], rows.get(point.key, {})
         values = [csv_value(sweep.value(point, path)) for path in sweep.paths]
         of_run = [row.get(name, "") for name in ("ions", *_OF_RUN)]
-        table.writerow([point.key, *values, state.name, state.tries, state.message, *of_run])
-    write(sweep.folder / INDEX, text.getvalue())
+        table.writerow([point.key, *values, state.name, state.message, *of_run])
+    write_text(sweep.folder / INDEX, text.getvalue())
 
 
 def _write_report(sweep, states, rows, fit, command, maps_file):
@@ -169,17 +168,17 @@ def _write_report(sweep, states, rows, fit, command, maps_file):
 
 def _panels(path, most):
     """Maps of the first points of a file of `write_maps`: by key, then by the title of the emission."""
-    found: dict[str, dict[str, DetectorMap]] = {}
+    panels: dict[str, dict[str, DetectorMap]] = {}
     with h5py.File(path) as file:
         titles, keys = (file[name].asstr()[:] for name in ("title", "key"))
         edges = [file[f"{axis}_edges"][:] for axis in "xy"]
         for row, key in enumerate(keys[:most]):
             counts = file["maps"][row]
-            found[str(key)] = {
-                str(title): DetectorMap.from_array(each, *edges, is_counts=True)
-                for title, each in zip(titles, counts, strict=True)
+            panels[str(key)] = {
+                str(title): DetectorMap.from_array(values, *edges, is_counts=True)
+                for title, values in zip(titles, counts, strict=True)
             }
-    return found
+    return panels
 
 
 def write_maps(sweep: Sweep, keys: list[str], path: AnyPath, bins: int | None = None) -> None:
@@ -223,7 +222,7 @@ def write_maps(sweep: Sweep, keys: list[str], path: AnyPath, bins: int | None = 
             for column, panel in enumerate(panels):
                 hits = run.hits(panel.perturbation)
                 counts[row, column] = hits.map(like=grid, position_step=None).values if hits.detected.any() else 0
-        # dimensions are scales of their own name, as in netCDF-4
+        # each dimension is a scale of the same name, as in netCDF-4
         _put(file, "point", np.arange(len(keys)))
         _put(file, "perturbation", [json.dumps(described(panel.perturbation)) for panel in panels])
         edges = grid.x_edges
@@ -270,7 +269,7 @@ def _compare(sweep: Sweep, keys: list[str]) -> TipFit:
     for row in rows:
         values = [csv_value(sweep.value(sweep.by_key[row["run"]], path)) for path in sweep.paths]
         table.writerow([row["run"], *values, *(_cell(value) for value in list(row.values())[1:])])
-    write(sweep.folder / FIT_TABLE, text.getvalue())
+    write_text(sweep.folder / FIT_TABLE, text.getvalue())
     content = {
         "made_by": f"apt_evap {__version__}",
         "compare": settings.to_table() | {"sha256": sha256_of(settings.measured)},
@@ -280,7 +279,7 @@ def _compare(sweep: Sweep, keys: list[str]) -> TipFit:
         "table": rows,
         "studies": {key: study.to_dict() for key, study in fit.studies.items()},
     }
-    write(sweep.folder / FIT, json.dumps(content, indent=1, allow_nan=False) + "\n")
+    write_text(sweep.folder / FIT, json.dumps(content, indent=1, allow_nan=False) + "\n")
     return fit
 
 

@@ -79,9 +79,9 @@ class CompareSettings:
 
     def to_table(self) -> dict[str, Any]:
         """Return the table, dict."""
-        own = to_plain(self.grid, short=True) | to_plain(self.settings, short=True)
-        del own["name"]
-        return {"measured": self.measured, "select": self.select, **own, **self.reading}
+        table = to_plain(self.grid, short=True) | to_plain(self.settings, short=True)
+        del table["name"]
+        return {"measured": self.measured, "select": self.select, **table, **self.reading}
 
     def read(self) -> Hits | DetectorMap:
         """Measured ions or map; FileError if the file cannot be read or contains neither."""

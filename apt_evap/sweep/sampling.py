@@ -20,7 +20,7 @@ from apt_evap.specimen.materials import Material
 AXIS, RANDOM = "tip.axis", "random"
 """The setting that can be random, and the word for it."""
 SEEDS = ("simulation.seed", "tip.seed", "tip.offset_seed")
-"""Seeds that every sample has of its own."""
+"""Seeds, which differ between samples."""
 _DIGITS = 6  # of a drawn number: the same text, and the same key of a point, on every machine
 _DECIMALS = 5  # of a random axis: 0.001 degrees
 _BITS = 30  # of Sobol' points: 1e9 samples
@@ -62,7 +62,7 @@ class RandomAxis:
             vector = np.linalg.solve(direction_vectors("hcp", material.a, material.c).T, vector)
         else:
             vector = np.sort(np.abs(vector))
-        return [float(each) for each in np.round(vector, _DECIMALS)]
+        return [float(index) for index in np.round(vector, _DECIMALS)]
 
 
 def is_option(value: Any) -> bool:
@@ -107,12 +107,13 @@ _KINDS = ("uniform", "log_uniform", "integer", "choice")
 def _bounds(content, name):
     """Two numbers in increasing order and their unit, "" if they have none."""
     if isinstance(content, list) and len(content) == 2:
-        if all(isinstance(each, int | float) and not isinstance(each, bool) for each in content):
-            numbers, units = [float(each) for each in content], {""}
+        if all(isinstance(bound, int | float) and not isinstance(bound, bool) for bound in content):
+            numbers, units = [float(bound) for bound in content], {""}
         else:
-            found = [_LENGTH.fullmatch(each) if isinstance(each, str) else None for each in content]
+            lengths = [_LENGTH.fullmatch(bound) if isinstance(bound, str) else None for bound in content]
             try:
-                numbers, units = [float(each[1]) for each in found], {each[2] for each in found}  # type: ignore[index]
+                numbers = [float(length[1]) for length in lengths]  # type: ignore[index]
+                units = {length[2] for length in lengths}  # type: ignore[index]
             except (TypeError, ValueError):
                 numbers, units = [], set()
         if len(units) == 1 and np.isfinite(numbers).all() and numbers[0] < numbers[1]:
@@ -174,14 +175,14 @@ def samples(options: Mapping[str, Option], n: int, seed: int) -> list[dict[str, 
     list of dict
     """
     points = sobol(n, sum(option.width for option in options.values()), seed)
-    found = []
+    sampled = []
     for number, coordinates in enumerate(points.tolist()):
         values, first = {}, 0
         for path, option in options.items():
             values[path] = option.value(coordinates[first : first + option.width])
             first += option.width
-        found.append(values | {path: seed_of(seed, number, path) for path in SEEDS})
-    return found
+        sampled.append(values | {path: seed_of(seed, number, path) for path in SEEDS})
+    return sampled
 
 
 def drawn(thing: Any, random: np.random.Generator, name: str) -> Any:
@@ -204,8 +205,8 @@ def drawn(thing: Any, random: np.random.Generator, name: str) -> Any:
         option = option_of(thing, name)
         return option.value(random.random(option.width).tolist())
     if isinstance(thing, Mapping):
-        return {key: drawn(each, random, f"{name}.{key}") for key, each in thing.items()}
-    return [drawn(each, random, name) for each in thing] if isinstance(thing, list) else thing
+        return {key: drawn(value, random, f"{name}.{key}") for key, value in thing.items()}
+    return [drawn(value, random, name) for value in thing] if isinstance(thing, list) else thing
 
 
 def has_options(thing: Any) -> bool:

@@ -5,7 +5,6 @@ import hashlib
 import itertools
 import json
 import os
-import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,17 +14,16 @@ from apt_evap._common.codec import count, from_plain, number, settings
 from apt_evap._common.files import FileError, check_path, sha256_of
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_count, check_seed, short_text
+from apt_evap.config.cost_estimate import CostEstimate, estimate_cost
 from apt_evap.config.simulation_file import Config, config_of, key_of, read_document
 from apt_evap.config.tables import check_keys, check_table
 from apt_evap.sweep.compare_settings import CompareSettings
-from apt_evap.sweep.foresight import Foresight, foresee
 from apt_evap.sweep.sampling import AXIS, RandomAxis, option_of, samples
 
 MAX_POINTS = 100_000  # a larger product is a typing error
 POINTS = "points"
 """Folder of the points in that of a sweep."""
 _FIXED = ("output", "maps")  # not settings of the simulation
-_LINE_ENDS = ("Cc", "Zl", "Zp")  # categories of characters that end a line of a script, and other control characters
 
 
 @settings
@@ -39,17 +37,6 @@ class JobSettings:
         at_least=1,
     )
     checkpoint: float = number("Time between two checkpoints.", default=10.0, at_least=0, unit="min")
-    hours: float | None = number(
-        "Time limit of a job of a batch system. An interrupted run continues in the next job.",
-        default=None,
-        above=0,
-        unit="h",
-    )
-    tries: int = count(
-        "Number of tries in succession that are killed without a new checkpoint, after which a point counts as failed.",
-        default=3,
-        at_least=1,
-    )
 
 
 @dataclass(frozen=True)
@@ -61,7 +48,7 @@ class Point:
     key : str
         First 12 digits of the SHA-256 of the complete settings, see `key_of`.
     values : dict
-        What this point has of its own: values by path, such as ``{"tip.axis": [1, 1, 1]}``.
+        Settings in which this point differs from the base: values by path, such as ``{"tip.axis": [1, 1, 1]}``.
     document : dict
         Complete settings, as in a file of `apt-evap run`. The file of a specimen is relative to the folder of the
         point, and has its SHA-256.
@@ -90,9 +77,9 @@ class SweepStudy:
         All points, each once.
     configs : tuple of Config
         Their settings, validated.
-    foresights : tuple of Foresight
-        What each of them needs.
-    each : JobSettings
+    estimates : tuple of CostEstimate
+        Cost of each point.
+    job : JobSettings
         How each point is run.
     compare : CompareSettings or None
         Comparison with a measured map.
@@ -106,8 +93,8 @@ class SweepStudy:
     base: Path
     points: tuple[Point, ...]
     configs: tuple[Config, ...]
-    foresights: tuple[Foresight, ...]
-    each: JobSettings
+    estimates: tuple[CostEstimate, ...]
+    job: JobSettings
     compare: CompareSettings | None
     sha256: str
     dataset: dict
@@ -119,15 +106,12 @@ def folder_of_study(path: AnyPath) -> Path:
     Raises
     ------
     FileError
-        If it is neither of both, or the name contains control characters, which would begin a new line in a script.
+        If it is neither.
     """
     path = check_path(path)
     if not path.is_dir() and not path.suffix:
         raise FileError(f"{str(path)!r} is neither a study file such as 'study.toml' nor the folder of a sweep")
-    folder = path.resolve() if path.is_dir() else path.resolve().with_suffix("")
-    if any(unicodedata.category(letter) in _LINE_ENDS for letter in str(folder)):
-        raise FileError(f"the folder of a sweep must have a name without control characters, got {str(folder)!r}")
-    return folder
+    return path.resolve() if path.is_dir() else path.resolve().with_suffix("")
 
 
 def read_study(path: AnyPath) -> SweepStudy:
@@ -167,7 +151,7 @@ def read_study(path: AnyPath) -> SweepStudy:
             raise ValueError(f"base must be a file name such as 'ni111.toml', got {short_text(base)}")
         for name in ("each", "compare", "dataset", "sweep"):
             check_table(table.get(name, {}), name)
-        each = from_plain(table.get("each", {}), JobSettings, what="[each]")
+        job = from_plain(table.get("each", {}), JobSettings, what="[each]")
         compare = CompareSettings.of(table["compare"], path.parent) if "compare" in table else None
         if compare is not None and not Path(compare.measured).is_file():
             raise ValueError(f"[compare] measured must be an existing file, got {short_text(compare.measured)}")
@@ -181,11 +165,11 @@ def read_study(path: AnyPath) -> SweepStudy:
     config_of(settings, base_path)  # an error of the base is not that of a point
     points: dict[str, Point] = {}
     configs: list[Config] = []
-    foresights: list[Foresight] = []
+    estimates: list[CostEstimate] = []
     place, digests = folder_of_study(path) / POINTS / "point", {}
     for values in choices:
         try:
-            values = _own(values, settings, base_path)
+            values = _fitting(values, settings, base_path)
             document = with_values(settings, values)
             config = config_of(document, base_path)
             if "path" in config.tip:
@@ -195,7 +179,7 @@ def read_study(path: AnyPath) -> SweepStudy:
                 _check_responses(config, compare)
                 points[key] = Point(key, values, document)
                 configs.append(config)
-                foresights.append(foresee(config, each.threads))
+                estimates.append(estimate_cost(config, job.threads))
         except ValueError as error:
             raise FileError(f"{str(path)!r}, {Point('', values, {})}: {error}") from error
     content = path.read_bytes() + base_path.read_bytes() + "".join(digests.values()).encode()
@@ -205,16 +189,16 @@ def read_study(path: AnyPath) -> SweepStudy:
         base_path,
         tuple(points.values()),
         tuple(configs),
-        tuple(foresights),
-        each,
+        tuple(estimates),
+        job,
         compare,
         sha256,
         table.get("dataset", {}),
     )
 
 
-def _own(values, settings, path):
-    """Values of a point: with the axis for its crystal, and the seeds that its specimen takes."""
+def _fitting(values, settings, path):
+    """Values of a point that fit the specimen: an axis of the crystal, and only seeds that the specimen takes."""
     table = settings["tip"]
     if "file" in table:
         values = {key: value for key, value in values.items() if key not in ("tip.seed", "tip.offset_seed")}
@@ -323,6 +307,19 @@ def with_values(document: dict[str, Any], values: Mapping[str, Any]) -> dict[str
         last: Any = _number(names[-1], table) if isinstance(table, list) else names[-1]
         table[last] = copy.deepcopy(value)
     return document
+
+
+def value_at(document: Mapping[str, Any], path: str) -> Any:
+    """Value of settings at a path, None if it is missing."""
+    value: Any = document
+    for name in path.split("."):
+        if isinstance(value, list) and name.isdecimal() and int(name) < len(value):
+            value = value[int(name)]
+        elif isinstance(value, Mapping) and name in value:
+            value = value[name]
+        else:
+            return None
+    return value
 
 
 def _number(name, entries):

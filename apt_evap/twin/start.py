@@ -16,6 +16,7 @@ from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import AnyPath, Floats
 from apt_evap._common.validation import check_count, check_kind, check_number
 from apt_evap._version import __version__
+from apt_evap.config.cost_estimate import CostEstimate, estimate_cost
 from apt_evap.config.perturbation_text import write_perturbation
 from apt_evap.config.simulation_file import config_of
 from apt_evap.detection.hits import Hits
@@ -25,7 +26,6 @@ from apt_evap.indexing.search import disc_of
 from apt_evap.microscope.local_electrode import LocalElectrode
 from apt_evap.registration.register import Registration
 from apt_evap.specimen.lattice import atom_density
-from apt_evap.sweep.foresight import Foresight, foresee
 
 MARK = "# Settings of a simulation, made from a measured map by apt_evap"
 """Beginning of the first line of the text."""
@@ -88,7 +88,7 @@ class Start:
         Radius of the simulated tip [nm].
     near : dict
         Where the simulated map is on the measured one, for `register`, see `near`.
-    foresight : Foresight
+    foresight : CostEstimate
         Time and memory that the simulation needs.
     """
 
@@ -97,7 +97,7 @@ class Start:
     radii: tuple[float, float]
     simulated_radius: float
     near: dict
-    foresight: Foresight
+    foresight: CostEstimate
 
     def __repr__(self) -> str:
         return short_repr(self)
@@ -175,7 +175,7 @@ def settings_of(
     sizes = [size for size in RADII if not size * material.a > radius] or [RADII[-1]]
     for size in sizes:
         text = _text(indexing, radii, size, lens, factor)
-        needs = foresee(config_of(tomllib.loads(text), Path("settings.toml")), threads)
+        needs = estimate_cost(config_of(tomllib.loads(text), Path("settings.toml")), threads)
         if needs.hours is not None and needs.hours <= budget:
             break
     else:

@@ -719,7 +719,7 @@ CASES = [
         {"profile": [3, "x", [1.0], [(0.0, 20.0)], [(0.0, 20.0), (0.0, 30.0)], [(0.0, 20.0), (50.0, 10.0)]]},
     ),
     (ae.simulation.RealUnits, {"field_reference": "cap", "operating_field": 35.0}, {}),
-    (ae.sweep.Foresight, {"ions": 10}, {}),
+    (ae.config.CostEstimate, {"ions": 10}, {}),
 ]
 NEEDS_A_RUN = [
     (

@@ -21,7 +21,6 @@ from apt_evap.cli.main import main
 from apt_evap.dataset.making import make, plan_set, split_of, verify
 from apt_evap.dataset.settings import DatasetSettings
 from apt_evap.simulation.run import load
-from apt_evap.sweep.claims import Claims
 
 BASE = """
 [tip]
@@ -56,7 +55,7 @@ def planned(folder, study=STUDY, base=BASE, runs=True):
     (folder / "study.toml").write_text(study)
     plan = plan_set(folder / "study.toml")
     for key, state in [(point.key, state) for point, state in plan.sweep.states()]:
-        if runs and state.name == "open":
+        if runs and state.name == "waiting":
             do(plan.sweep, key)
     return plan
 
@@ -236,8 +235,7 @@ def test_runs_that_fail_are_named_or_left_out(tmp_path):
     key = plan.sweep.keys[0]
     folder = plan.sweep.folder_of(key)
     (folder / "run.h5").unlink()
-    claims = Claims(folder)
-    claims.end(claims.take(len(claims.all()), 0), code=2, seconds=1.0, ions=0, message="too few atoms")
+    (folder / "work.json").write_text('{"seconds": 1.0, "error": "too few atoms"}')
     with pytest.raises(FileError, match=key):
         make(plan, tmp_path / "set")
     content = make(plan, tmp_path / "set", without_failed=True)

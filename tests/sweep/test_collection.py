@@ -10,8 +10,7 @@ import apt_evap as ae
 from apt_evap.cli.main import main
 from apt_evap.sweep import collection as collection_module
 from apt_evap.sweep.collection import collect
-from apt_evap.sweep.overview import status
-from apt_evap.sweep.planning import open_sweep
+from apt_evap.sweep.planning import open_sweep, status
 
 BASE = """
 [tip]
@@ -92,7 +91,7 @@ def test_the_index_has_all_points(sweep, collected):
     with open(sweep.folder / "index.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["key"] for row in rows] == list(sweep.keys)
-    assert [row["state"] for row in rows] == ["done", "open", "done", "done", "done"]
+    assert [row["state"] for row in rows] == ["done", "waiting", "done", "done", "done"]
     run = ae.load(sweep.folder_of(rows[2]["key"]) / "run.h5")
     assert rows[2]["fingerprint"] == run.fingerprint() and rows[2]["ions"] == "150"
     assert rows[2]["tip.axis"] == "[1, 1, 1]" and rows[1]["fingerprint"] == ""
@@ -113,11 +112,13 @@ def test_xarray_opens_the_maps(sweep, collected):
 
 
 def test_status_corrects_the_hours_by_those_of_finished_points(sweep):
+    for key in sweep.keys:
+        (sweep.folder_of(key) / "work.json").write_text('{"seconds": 36.0, "error": ""}')
     content = status(sweep)
-    assert content["counts"] == {"done": 4, "running": 0, "open": 1, "failed": 0, "damaged": 0, "foreign": 0}
-    foreseen = [needs.hours for needs in sweep.foresights]
-    speed = np.median([0.01 / hours for number, hours in enumerate(foreseen) if number != 1])
-    assert content["hours_left"] == pytest.approx(foreseen[1] * speed)
+    assert content["counts"] == {"done": 4, "running": 0, "waiting": 1, "failed": 0, "wrong": 0}
+    estimated = [cost.hours for cost in sweep.estimates]
+    speed = np.median([0.01 / hours for number, hours in enumerate(estimated) if number != 1])
+    assert content["hours_left"] == pytest.approx(estimated[1] * speed)
     json.dumps(content)
 
 

@@ -8,7 +8,7 @@ from apt_evap._common.files import FileError
 from apt_evap.cli.main import main
 from apt_evap.config.simulation_file import read_config
 from apt_evap.sweep.planning import open_sweep, plan
-from apt_evap.sweep.worker import work
+from apt_evap.sweep.point_folder import run_point
 
 BASE = """
 [tip]
@@ -35,7 +35,8 @@ def test_a_file_relative_to_the_base_is_found_from_each_point(tmp_path, dump):
     (tmp_path / "settings" / "base.toml").write_text(BASE.replace("tip.dump", "../tip.dump"))
     (tmp_path / "study.toml").write_text(TWO.replace("base.toml", "settings/base.toml"))
     sweep = plan(tmp_path / "study.toml")
-    assert work(sweep)["done"] == 2
+    for key in sweep.keys:
+        do(sweep, key)
     check_bits(sweep)
     (tmp_path / "elsewhere").mkdir()  # settings and specimen may be moved together
     for name in ("tip.dump", "study"):
@@ -67,9 +68,8 @@ def test_another_specimen_under_the_same_name_makes_new_points(tmp_path, dump):
 def test_a_specimen_that_changes_between_plan_and_work_is_refused(tmp_path, dump):
     sweep = planned(tmp_path, TWO, BASE)
     write_dump(dump, radius=1.4)
-    assert work(sweep)["failed"] == 2
-    state = sweep.state(sweep.keys[0])
-    assert "tip.dump" in state.message and "sha256" in state.message
+    state = run_point(sweep.folder_of(sweep.keys[0]))
+    assert state.name == "failed" and "tip.dump" in state.message and "sha256" in state.message
     assert not (sweep.folder_of(sweep.keys[0]) / "run.h5").exists()
 
 
@@ -78,7 +78,9 @@ def test_a_file_swept_by_its_name(tmp_path, dump):
     sweep = planned(tmp_path, 'base = "base.toml"\n[sweep]\n"tip.file" = ["tip.dump", "large.dump"]\n', BASE)
     atoms = [len(sweep.config_of(key).specimen()) for key in sweep.keys]
     assert len(set(sweep.keys)) == 2 and atoms[0] < atoms[1]
-    assert [sweep.value(point, "tip.file") for point in sweep.points] == ["tip.dump", "large.dump"]
+    assert [sweep.value(point, "tip.file") for point in sweep.points] == [
+        f"../../../{name}" for name in ("tip.dump", "large.dump")
+    ]
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@ from sweeps import BASE
 
 from apt_evap._common.files import FileError
 from apt_evap.config.simulation_file import key_of
-from apt_evap.sweep.study_file import JobSettings, read_study, with_values
+from apt_evap.sweep.study_file import JobSettings, read_study, value_at, with_values
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def test_all_combinations_and_single_points(study):
     }
     assert read.configs[5].law.temperature == 50.0
     assert len({point.key for point in read.points}) == 6
-    assert read.each == JobSettings()
+    assert read.job == JobSettings()
 
 
 def test_a_point_is_there_once(study):
@@ -69,6 +69,12 @@ def test_entries_of_lists_have_numbers():
     document = {"phases": [{"name": "matrix"}, {"region": {"radius": 1.0, "centre": [0, 0, 5]}}]}
     changed = with_values(document, {"phases.1.region.radius": 2.0, "phases.1.region.centre.2": 6})
     assert changed["phases"][1] == {"region": {"radius": 2.0, "centre": [0, 0, 6]}}
+    assert (
+        value_at(changed, "phases.1.region.centre") == [0, 0, 6] and value_at(changed, "phases.1.region.centre.2") == 6
+    )
+    assert (
+        value_at(changed, "phases.2") is value_at(changed, "phases.x") is value_at(changed, "phases.0.name.x") is None
+    )
     wrong = {"phases.2.name": "2", "phases.name": "name", "phases.-1.name": "-1", "phases.1.region.centre.3": "3"}
     for path, name in wrong.items():
         with pytest.raises(ValueError, match=f"'{name}'"):

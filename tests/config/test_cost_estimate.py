@@ -1,9 +1,9 @@
-"""Memory and hours foreseen for a run."""
+"""Estimates of the memory and hours of a run."""
 
 import pytest
 
+from apt_evap.config.cost_estimate import estimate_cost
 from apt_evap.config.simulation_file import read_config
-from apt_evap.sweep.foresight import foresee
 
 BASE = """
 [tip]
@@ -15,9 +15,9 @@ ions = 10_000
 """
 
 
-def foreseen(tmp_path, text=""):
+def estimated(tmp_path, text=""):
     (tmp_path / "run.toml").write_text(BASE + text)
-    return foresee(read_config(tmp_path / "run.toml"), 1)
+    return estimate_cost(read_config(tmp_path / "run.toml"), 1)
 
 
 @pytest.mark.parametrize(
@@ -25,7 +25,7 @@ def foreseen(tmp_path, text=""):
     [("wide = true", 2.10, 60), ("wide = true\nshells = 2", 2.86, 108)],
 )
 def test_responses_with_more_launches_take_longer(tmp_path, table, ratio, coefficients):
-    usual, other = foreseen(tmp_path), foreseen(tmp_path, f"[responses]\n{table}\n")
+    usual, other = estimated(tmp_path), estimated(tmp_path, f"[responses]\n{table}\n")
     # measured ratios; the time before the first ion is small
     assert other.hours / usual.hours == pytest.approx(ratio, rel=0.12)
     assert other.memory - usual.memory == pytest.approx(12 * coefficients * 10_000)

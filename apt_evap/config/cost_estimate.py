@@ -26,8 +26,8 @@ _START_OF_PROGRAM = 3.0  # seconds, with the pictures of the maps
 
 
 @settings
-class Foresight:
-    """Foreseen needs of a run.
+class CostEstimate:
+    """Estimated cost of a run.
 
     Approximate numbers; None if the specimen is not a tip of this package's own shape.
     """
@@ -54,8 +54,8 @@ def hours_text(hours: float) -> str:
     return f"{hours:.2g} h" if hours >= 1 else f"{60 * hours:.2g} min"
 
 
-def foresee(config: Config, threads: int) -> Foresight:
-    """Foresee what the run of a file of settings needs.
+def estimate_cost(config: Config, threads: int) -> CostEstimate:
+    """Estimate memory and time of the run of a file of settings.
 
     Parameters
     ----------
@@ -66,22 +66,22 @@ def foresee(config: Config, threads: int) -> Foresight:
 
     Returns
     -------
-    Foresight
+    CostEstimate
     """
     try:
         atoms, surface = foreseen_atoms(**config.tip)
     except TypeError:  # a specimen without apex_radius
-        return Foresight(config.n_ions, None, None, None, None)
+        return CostEstimate(config.n_ions, None, None, None, None)
     memory = _PROGRAM + needed_memory(atoms, surface) + copied_memory(surface, threads)
     bytes_per_ion, flights, per_flight = _BYTES_PER_ION, max(1, len(config.emissions)), _ONE_FLIGHT
     if config.responses:
         designs = config.response_settings.designs
-        launches = sum(len(each.launches) for each in designs)
-        coefficients = sum(len(each.exponents) for each in designs)
+        launches = sum(len(design.launches) for design in designs)
+        coefficients = sum(len(design.exponents) for design in designs)
         bytes_per_ion += _BYTES_PER_COEFFICIENT * (coefficients - _COEFFICIENTS)
         flights, per_flight = 1 + _PER_LAUNCH * (launches - _LAUNCHES), _WITH_RESPONSES
     memory += bytes_per_ion * config.n_ions
     base, slope = (flights * value for value in per_flight)
     per_ion = max(_LEAST, base + slope * math.log(surface / _REFERENCE))
     seconds = _START_OF_PROGRAM + _START * surface + 1e-3 * per_ion * config.n_ions
-    return Foresight(config.n_ions, atoms, surface, memory, seconds / 3600)
+    return CostEstimate(config.n_ions, atoms, surface, memory, seconds / 3600)
