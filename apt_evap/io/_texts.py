@@ -11,22 +11,24 @@ import warnings
 import zlib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from apt_evap._common.files import FileError, open_for_reading, read_small_file
+from apt_evap._common.files import FileError, check_path, open_for_reading, read_small_file
 from apt_evap._common.types import AnyPath, Floats
 from apt_evap.warnings import DataWarning
 
 _MAX_BYTES = 1 << 22
-ELEMENTS = frozenset(
+SYMBOLS = tuple(
     "H He Li Be B C N O F Ne Na Mg Al Si P S Cl Ar K Ca Sc Ti V Cr Mn Fe Co Ni Cu Zn Ga Ge As Se Br Kr Rb Sr Y Zr Nb "
     "Mo Tc Ru Rh Pd Ag Cd In Sn Sb Te I Xe Cs Ba La Ce Pr Nd Pm Sm Eu Gd Tb Dy Ho Er Tm Yb Lu Hf Ta W Re Os Ir Pt Au "
     "Hg Tl Pb Bi Po At Rn Fr Ra Ac Th Pa U Np Pu Am Cm Bk Cf Es Fm Md No Lr Rf Db Sg Bh Hs Mt Ds Rg Cn Nh Fl Mc Lv Ts "
     "Og".split()
 )
-"""Chemical symbols."""
+"""Chemical symbols in the order of the atomic numbers."""
+ELEMENTS = frozenset(SYMBOLS)
 
 
 def read_bytes(path: AnyPath, what: str, at_most: int = _MAX_BYTES) -> bytes:
@@ -54,7 +56,7 @@ def read_bytes(path: AnyPath, what: str, at_most: int = _MAX_BYTES) -> bytes:
     data = read_small_file(path, at_most, what)
     if not data:
         raise FileError(f"{str(path)!r} is empty (0 bytes), expected {what}")
-    kind = compression(data)
+    kind = _compression(data)
     if kind:
         limit = min(at_most, max(_SMALL, _EXPANSION * len(data)))
         try:
@@ -70,7 +72,7 @@ def read_head(path: AnyPath, size: int) -> bytes:
     """First bytes of a file, as `read_bytes` would return them; those of the file if it cannot be decompressed."""
     with open_for_reading(path) as file:
         head = file.read(size)
-        kind = compression(head)
+        kind = _compression(head)
         if kind in _OPENERS:
             file.seek(0)
             with suppress(OSError, EOFError, ValueError, zlib.error, lzma.LZMAError):
@@ -81,6 +83,7 @@ def read_head(path: AnyPath, size: int) -> bytes:
 _SMALL = 1 << 24  # bytes that any compressed file may have after decompression
 _EXPANSION = 200  # of text by compression; measured: 3 to 10 for coordinates, 1,000 for zeros
 _MAGIC = {b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"\xfd7zXZ\0": "xz", b"(\xb5/\xfd": "zstd", b"PK\3\4": "zip"}
+_SUFFIXES = (".gz", ".bz2", ".xz", ".zst", ".zip")
 _OPENERS: dict[str, Callable[[Any], Any]] = {
     "gzip": lambda file: gzip.GzipFile(fileobj=file),
     "bzip2": bz2.BZ2File,
@@ -95,9 +98,21 @@ _MARKS = {
 }
 
 
-def compression(head: bytes) -> str:
+def _compression(head):
     """Name of the compression of a file by its first bytes, "" for none."""
     return next((name for magic, name in _MAGIC.items() if head.startswith(magic)), "")
+
+
+def is_compressed(path: AnyPath) -> bool:
+    """Whether a file begins like a compressed one."""
+    with open_for_reading(path) as file:
+        return bool(_compression(file.read(8)))
+
+
+def without_compression(path: AnyPath) -> Path:
+    """Path without the suffix of a compression: "a.dump" of "a.dump.gz"."""
+    path = check_path(path)
+    return path.with_suffix("") if path.suffix.lower() in _SUFFIXES else path
 
 
 def _opened(kind, file):

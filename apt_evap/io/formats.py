@@ -8,13 +8,14 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from apt_evap._common.files import FileError, TruncatedFile, check_path, open_for_reading
+from apt_evap._common.files import FileError, TruncatedFile, check_path
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_count, check_kind, short_text
 from apt_evap._common.wording import argument
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.io._apt_sections import SIGNATURE
+from apt_evap.io._texts import read_head, without_compression
 from apt_evap.io.apt import chunk_apt, read_apt
 from apt_evap.io.csv import write_csv
 from apt_evap.io.env import read_env
@@ -81,6 +82,14 @@ FORMATS = (
 
 RANGE_FORMATS = {".rrng": read_rrng, ".rng": read_rng, ".env": read_env}
 """Readers of files of mass ranges, by suffix."""
+
+_CAMECA = "raw files of CAMECA are not documented in public: export .epos or .apt from AP Suite"
+_ADVICE = dict.fromkeys((".str", ".rhit", ".hits", ".root"), _CAMECA)
+_ADVICE |= dict.fromkeys(RANGE_FORMATS, "it contains ranges of mass: read_ranges and --ranges read it")
+_ADVICE |= {
+    ".ato": "those of Rouen have several layouts, and do not say which one it is: convert it to .epos",
+    ".ops": "convert it to .epos, .pos or .apt",
+}
 
 
 def read(path: AnyPath, *, format: str | None = None, columns: Sequence[str] | None = None, **options: Any) -> Any:
@@ -224,7 +233,7 @@ def read_ranges(path: AnyPath, *, format: str | None = None) -> Ranges:
     FileError
         If the file is missing or unreadable, has no ranges, or contains an invalid line, or the format is unknown.
     """
-    suffix = check_path(path).suffix.lower()
+    suffix = without_compression(path).suffix.lower()
     if format is not None:
         suffix = "." + check_kind(format, "format", str, "a suffix such as '.rng'").lower().lstrip(".")
         if suffix not in RANGE_FORMATS:
@@ -235,8 +244,7 @@ def read_ranges(path: AnyPath, *, format: str | None = None) -> Ranges:
 
 
 def _to_read(path, format):
-    with open_for_reading(path) as file:
-        head = file.read(64)
+    head = read_head(path, 64)
     chosen = _by_content(head) if format is None else None
     if chosen is None:
         chosen = _by_suffix(path, format, "read")
@@ -294,5 +302,9 @@ def _by_suffix(path, format, doing):
     for candidate in FORMATS:
         if candidate.suffix == suffix.lower():
             return candidate
+    if format is None and doing == "read" and (inner := without_compression(path)) != check_path(path):
+        raise FileError(f"{str(path)!r} is compressed: decompress it to read it as {inner.name!r}")
+    if format is None and doing == "read" and suffix.lower() in _ADVICE:
+        raise FileError(f"{str(path)!r} cannot be read as ions; {_ADVICE[suffix.lower()]}")
     source = f"suffix {suffix!r}" if format is None else argument("format", format)
     raise FileError(f"format of {str(path)!r} must be one of {_suffixes(doing)}, got {source}")

@@ -112,7 +112,7 @@ def _warn_of_charges(path, low, high, species):
 
     An ion of n atoms and charge n squared, which has the same mass-to-charge ratio, does not exist.
     """
-    singles: dict[str, list[tuple[int, float, float]]] = {}
+    singles = {}
     for first, last, ions in zip(low, high, species, strict=True):
         if len(ions) == 1:
             ((name, n),) = ions.items()

@@ -72,6 +72,14 @@ def warn_of_direction(positions: Floats) -> None:
     )
 
 
+def warn_of_shape(positions: Floats) -> None:
+    """Warn of the direction of a specimen, and of several bodies, for atoms [nm] whose materials are not known."""
+    if len(positions) >= _CROWD:
+        distances = scipy.spatial.cKDTree(positions).query(positions[:: len(positions) // _CROWD], k=2)[0][:, 1]
+        warn_of_bodies(positions, float(np.median(distances)))
+    warn_of_direction(positions)
+
+
 def check_spacing(distance: float, expected: Sequence[float], names: Sequence[str], n: int) -> None:
     """Refuse positions in a wrong unit, and warn of other distances between atoms that no crystal of them has.
 

@@ -108,8 +108,8 @@ def test_info_of_a_specimen(needle, tmp_path, monkeypatch, capsys):
 
 def test_info_of_a_specimen_without_ase(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "ase.io", None)
-    (tmp_path / "tip.xyz").write_text("2\n\nNi 0 0 0\nNi 0 0 2\n")
-    assert main(["info", str(tmp_path / "tip.xyz")]) == 2 and "ase" in capsys.readouterr().err
+    (tmp_path / "tip.cif").write_text("data_tip\n")
+    assert main(["info", str(tmp_path / "tip.cif")]) == 2 and "ase" in capsys.readouterr().err
 
 
 def test_positions_in_another_unit_are_refused(needle):
