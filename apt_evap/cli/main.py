@@ -24,6 +24,8 @@ _OPTIONS = {
     "resume": "--resume",
     "overwrite": "--force",
     "byte_order": "--byte-order",
+    "detector_unit": "--unit",
+    "voltage_unit": "--voltage-unit",
     "format": "--format",
     "n_threads": "--threads",
     "n_ions": "--ions",

@@ -59,6 +59,7 @@ _EXTRA: dict[str, tuple[str, float, str]] = {
     "normal": ("normal", 1, ""),
     "apex": ("apex", _NM_PER_M, "nm"),
 }
+WRITTEN = ("x", "y", "time_of_flight", "voltage", "positions", "ion", "site", *_EXTRA)
 
 
 def read_tapsim(path: AnyPath, *, partial: bool = False) -> Hits:
