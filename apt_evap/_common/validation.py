@@ -18,10 +18,43 @@ _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 100
 
 
+def without_mask(value: Any, name: str, dtype: DTypeLike = np.float64) -> Any:
+    """Return an array whose masked values are NaN; other values unchanged.
+
+    NumPy drops the mask in conversions, so that missing values would become numbers.
+
+    Parameters
+    ----------
+    value : array_like
+        Input of the user, perhaps a masked array, or a sequence of these.
+    name : str
+        Name of the argument, for the message.
+    dtype : dtype
+        Type that the array is converted to.
+
+    Returns
+    -------
+    array_like
+
+    Raises
+    ------
+    ValueError
+        If values are masked and `dtype` has no NaN.
+    """
+    if isinstance(value, list | tuple) and any(np.ma.isMaskedArray(part) for part in value):
+        value = np.ma.array(value)
+    if not np.ma.is_masked(value):
+        return value
+    if not np.issubdtype(dtype, np.inexact):
+        count = int(np.ma.count_masked(value))
+        raise ValueError(f"{name} must have no masked values, got {count:,} of {value.size:,}")
+    return np.ma.filled(value if value.dtype.kind == "f" else value.astype(np.float64), np.nan)
+
+
 def check_values(value: Any, name: str, *, finite: bool = True) -> NDArray[np.float64]:
     """Return a number, or an array of numbers of any shape, as an array, or raise an error that names the argument."""
     try:
-        values = np.asarray(value)
+        values = np.asarray(without_mask(value, name))
     except ValueError:  # rows of different lengths
         values = np.empty(0, object)
     if values.dtype.kind not in "iuf":
@@ -58,6 +91,7 @@ def check_array(
     ValueError
         Names the argument, its value and the expected type and shape.
     """
+    value = without_mask(value, name, dtype)
     expected_shape = "(" + ", ".join(str(length) for length in shape) + ("," if len(shape) == 1 else "") + ")"
     try:
         original = np.asarray(value)

@@ -48,7 +48,7 @@ def read(options: argparse.Namespace) -> Hits | Run | DetectorMap:
 
 
 def _read(options):
-    parameters = {"partial": options.partial, "byte_order": options.byte_order, "unit": options.unit}
+    parameters = {name: getattr(options, name) for name in ("partial", "byte_order", "voltage_unit")}
     if options.arrays is not None:
         names = options.arrays.split(",")
         if len(names) not in (3, 4):
@@ -56,10 +56,11 @@ def _read(options):
         parameters |= dict(zip(("values", "x_edges", "y_edges", "mask"), names, strict=False))
     path = Path(options.file)
     is_map = (options.format or path.suffix).lower().lstrip(".") == "npz"
-    for name in _SELECTING if is_map else ("arrays", "unit"):
+    parameters["unit" if is_map else "detector_unit"] = options.unit
+    for name in (*_SELECTING, "voltage_unit") if is_map else ("arrays",):
         if getattr(options, name) is not None:
             what = "ions" if is_map else "a map in an .npz file"
-            raise ValueError(f"--{name} is for {what}, got {options.file!r}")
+            raise ValueError(f"--{name.replace('_', '-')} is for {what}, got {options.file!r}")
     if path.suffix == ".unfinished":
         return load(path)
     try:

@@ -18,7 +18,8 @@ def add_reading(parser: argparse.ArgumentParser) -> Any:
     group.add_argument("--partial", action="store_true", default=None, help="read a truncated file to its last ion")
     group.add_argument("--byte-order", choices=("big", "little"), help="byte order of .pos and .epos files")
     group.add_argument("--arrays", metavar="V,X,Y[,MASK]", help="names in an .npz: values, edges in x and y, mask")
-    group.add_argument("--unit", metavar="UNIT", help="unit of the edges in an .npz: mm, cm, m or um")
+    group.add_argument("--unit", metavar="UNIT", help="unit on the detector in an .npz, .epos or .raw: mm, cm, m or um")
+    group.add_argument("--voltage-unit", choices=("V", "kV"), help="unit of the voltages in an .epos")
     group.add_argument(
         "--undistort", metavar="GRID.csv", help="calibration grid of the instrument, such as a reflectron"
     )

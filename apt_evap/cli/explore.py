@@ -199,7 +199,7 @@ def _run_code(options):
     return f"ae.load({options.run!r})" + (f".at_evaporation_field({', '.join(arguments)})" if arguments else "")
 
 
-_READING = ("format", "byte_order", "arrays", "unit")
+_READING = ("format", "byte_order", "voltage_unit", "arrays", "unit")
 _OTHERS = ("ranges", "species", "partial", "circle", "box", "undistort")
 _SELECTION = {"ions": "ion", "mass": "mass_to_charge", "voltage": "voltage"}
 
@@ -230,8 +230,8 @@ def _measured_code(options):
         parameters = {name: value for name, value in names if value} | ({"unit": options.unit} if options.unit else {})
         return f"ae.read_map({_call(options.file, parameters)})"
     parameters = {
-        name: getattr(options, name) for name in ("format", "partial", "byte_order") if getattr(options, name)
-    }
+        name: value for name in ("format", "partial", "byte_order", "voltage_unit") if (value := getattr(options, name))
+    } | ({"detector_unit": options.unit} if options.unit else {})
     code = f"ae.read({_call(options.file, parameters)})"
     for name, column in _SELECTION.items():
         if (bounds := getattr(options, name)) is not None:

@@ -11,7 +11,7 @@ from apt_evap.cli._output import tell, tell_json
 from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.timing import Timing
-from apt_evap.io.formats import write
+from apt_evap.io.formats import left_out, write
 from apt_evap.simulation.run import Run
 
 
@@ -49,8 +49,14 @@ def execute(options: argparse.Namespace) -> int:
     if not len(detected):
         raise ValueError(f"none of the {len(hits):,} ions of {options.file!r} hit the detector: nothing to write")
     write(output, detected, **_writing(output, content, options))
-    tell(options, f"wrote {len(detected):,} ions to {output}")
-    tell_json(options, {"wrote": str(output), "file": options.file, "ions": len(detected)})
+    lost, zeros = left_out(output, detected)
+    without = (
+        f", without {', '.join(lost)}" if lost and detected.outcome is not None else ""
+    )  # measured: see the warning
+    without += f", with zeros for {', '.join(zeros)}" if zeros else ""
+    tell(options, f"wrote {len(detected):,} ions to {output}{without}")
+    counts = {"ions": len(detected), "left_out": list(lost), "zeros": list(zeros)}
+    tell_json(options, {"wrote": str(output), "file": options.file} | counts)
     return 0
 
 

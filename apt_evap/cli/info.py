@@ -14,9 +14,11 @@ from apt_evap.cli._files import read, select, selects
 from apt_evap.cli._options import FILE_HELP, add_reading
 from apt_evap.cli._output import put
 from apt_evap.detection.detector_map import DetectorMap
-from apt_evap.io.specimens import read_atoms, specimen_format, tip_of
+from apt_evap.io._texts import without_compression
+from apt_evap.io.specimens import read_atoms, specimen_format, tip_of, types_of
 from apt_evap.simulation.run import Run
 from apt_evap.simulation.stop_reason import StopReason
+from apt_evap.specimen.orientation_check import warn_of_shape
 from apt_evap.warnings import SpecimenWarning
 
 
@@ -74,24 +76,27 @@ def _specimen(options):
     if options.format is not None or not path.is_file():
         return None
     kind = specimen_format(path)
-    if kind == "ase" and path.suffix.lower() not in _SPECIMENS:
+    if kind == "ase" and without_compression(path).suffix.lower() not in _SPECIMENS:
         return None
-    try:
-        atoms, given = read_atoms(path), dict(options.types or ())
-    except ImportError as error:
-        raise FileError(str(error)) from error
-    kinds = [each for each, _ in Counter(atoms.types).most_common()]
-    number = {each: k for k, each in enumerate(kinds)}
-    numbers = np.array([number[each] for each in atoms.types])
-    contents = {"format": kind} | describe_atoms(atoms.positions, numbers, [given.get(each, each) for each in kinds])
+    obstacles, materials = [], dict(options.types or ())
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always", SpecimenWarning)
         try:
-            contents["evaporable"] = int(tip_of(path, atoms, given).evaporable.sum())
-            obstacles = []
+            atoms = read_atoms(path)
+        except ImportError as error:
+            raise FileError(str(error)) from error
+        types = types_of(atoms, materials)
+        kinds = [name for name, _ in Counter(types).most_common()]
+        number = {name: k for k, name in enumerate(kinds)}
+        numbers, names = np.array([number[name] for name in types]), [materials.get(name, name) for name in kinds]
+        contents = {"format": kind} | describe_atoms(atoms.positions, numbers, names)
+        try:
+            contents["evaporable"] = int(tip_of(path, atoms, materials).evaporable.sum())
         except FileError as error:
             obstacles = [str(error)]
-    return contents | {"obstacles_to_a_simulation": obstacles + [str(doubt.message) for doubt in doubts]}
+            warn_of_shape(atoms.positions)
+    obstacles += dict.fromkeys(str(doubt.message) for doubt in doubts)
+    return contents | {"obstacles_to_a_simulation": obstacles}
 
 
 def _lines(summary, indent=0, of_columns=False):

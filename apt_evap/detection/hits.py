@@ -14,7 +14,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from apt_evap._common.notebook import as_table
 from apt_evap._common.types import Booleans, Column
-from apt_evap._common.validation import check_array, check_kind, check_number, check_seed, did_you_mean, short_text
+from apt_evap._common.validation import (
+    check_array,
+    check_kind,
+    check_number,
+    check_seed,
+    did_you_mean,
+    short_text,
+    without_mask,
+)
 from apt_evap.detection.binning import find_quantisations
 from apt_evap.detection.dataframe import to_dataframe
 from apt_evap.detection.detector_map import DetectorMap
@@ -361,7 +369,7 @@ class Hits:
     def __getitem__(self, selection: slice | ArrayLike) -> Hits:
         """Return the selected ions as `Hits`; takes a slice, a mask, indices or one index."""
         if not isinstance(selection, slice):
-            index = np.asarray(selection)
+            index = np.asarray(without_mask(selection, "a selection of Hits", bool))
             if index.size == 0 and index.dtype == float:
                 index = index.astype(np.intp)
             if index.ndim > 1 or index.dtype.kind not in "biu":
@@ -387,6 +395,7 @@ def _column(name, value):
     """Validate one column and convert it to its type."""
     if name in _INTEGER:
         if isinstance(value, np.ndarray) and value.ndim == 1 and value.dtype == _INTEGER[name]:
+            value = without_mask(value, name, value.dtype)
             return np.ascontiguousarray(value)  # no conversion needed
         return check_array(value, name, ("n",), dtype=_INTEGER[name])
     dtype = getattr(value, "dtype", None)
@@ -397,7 +406,7 @@ def _column(name, value):
 
 def _extra(name, value):
     """Validate one of the further columns."""
-    column = np.asarray(value)
+    column = np.asarray(without_mask(value, f"extra[{name!r}]", getattr(value, "dtype", np.float64)))
     if column.ndim not in (1, 2) or column.dtype == object:
         raise ValueError(f"extra[{name!r}] must be an array of shape (n,) or (n, k), got {short_text(value)}")
     return column

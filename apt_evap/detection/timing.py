@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from apt_evap._common.codec import choice, number, part, settings
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_array, check_number, check_switch
+from apt_evap._common.validation import check_array, check_number, check_switch, check_values
 from apt_evap._core.elementary import exponential, logarithm, normal_quantile
 from apt_evap.units import BOLTZMANN, NM_PER_MM, SPEED
 
@@ -63,7 +63,8 @@ def mass_to_charge(
     L for 50 nm and 100 mm.
     """
     distance = check_number(distance, "distance", above=0, unit="mm")
-    voltage, time, x, y = (np.asarray(value, dtype=np.float64) for value in (voltage, time_of_flight, x, y))
+    columns = {"voltage": voltage, "time_of_flight": time_of_flight, "x": x, "y": y}
+    voltage, time, x, y = (check_values(value, name, finite=False) for name, value in columns.items())
     across = x * x + y * y
     if check_switch(curved, "curved"):
         across = 0.0 * across  # keeps NaN

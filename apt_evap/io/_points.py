@@ -53,9 +53,14 @@ def points_and_data(path: AnyPath, hits: Hits) -> tuple[Booleans | slice, Floats
     chosen = finite if n_omitted else slice(None)
     data = {_NAMES.get(name, name): getattr(hits, name) for name in hits.columns if name != "positions"}
     for name, values in hits.extra.items():
-        if values.dtype.kind in "iuf" or (values.dtype.kind == "U" and values.ndim == 1):
+        if is_data(name, values):
             data[distinct(name, data)] = values
     return chosen, positions[chosen], {name: values[chosen] for name, values in data.items()}
+
+
+def is_data(name: str, values: NDArray[Any]) -> bool:
+    """Whether points can have a column: numbers, or one text for each."""
+    return values.dtype.kind in "iuf" or (values.dtype.kind == "U" and values.ndim == 1)
 
 
 def numbered(texts: NDArray[Any]) -> tuple[list[str], NDArray[np.int32]]:

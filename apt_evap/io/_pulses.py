@@ -1,5 +1,7 @@
 """Pulses of the ions: checks of the conventions of the formats, and conversion to pulse_id and multiplicity."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -130,6 +132,26 @@ def first_from_every(multiplicity: NDArray[np.integer]) -> NDArray[np.uint32] | 
         return None
     within = np.arange(len(runs)) - np.repeat(first, runs[first])
     return np.where(within % multiplicity == 0, multiplicity, 0).astype(np.uint32)
+
+
+def ions_per_pulse(numbers: NDArray[Any]) -> tuple[NDArray[np.uint32] | None, str]:
+    """Ions per pulse for the first ion of each pulse and 0 for the others, from numbers for the first or for all ions.
+
+    Returns
+    -------
+    ions : ndarray of uint32 or None
+        None if the numbers are inconsistent.
+    problem : str
+        What is inconsistent.
+    """
+    if numbers.dtype.kind not in "iu":
+        return None, f"it has values of type {numbers.dtype}"
+    check = PulseCheck()
+    check.add(numbers)
+    problem = check.problem(False)
+    if not problem and numbers.min() >= 0:
+        return numbers.astype(np.uint32), ""
+    return first_from_every(numbers), problem
 
 
 def whole_pulses(ions: NDArray[np.integer]) -> int:

@@ -15,6 +15,8 @@ from apt_evap._common.validation import check_choice, check_switch, short_text
 from apt_evap.detection.hits import Hits, Outcome
 from apt_evap.warnings import DataWarning
 
+MM = {"mm": 1.0, "cm": 10.0, "m": 1e3, "um": 1e-3}
+"""Units of lengths on a detector [mm]."""
 _CHUNK = 1 << 14
 _SURVEY = 1 << 16
 _ORDERS = {"big": ">", "little": "<"}
@@ -228,6 +230,17 @@ def choose_fields(
     chosen = check_columns(columns, available, path)
     needed = {*chosen, *(other for name in chosen for other in also.get(name, ()))}
     return chosen, {name: field for name, field in fields.items() if name in needed}
+
+
+def in_mm(columns: dict[str, Any], detector_unit: str) -> dict[str, Any]:
+    """Columns whose detector coordinates x and y are converted to mm, dict of ndarray."""
+    factor = MM[check_choice(detector_unit, "detector_unit (--unit)", MM)]
+    if factor == 1.0:
+        return columns
+    with np.errstate(over="ignore"):
+        return {
+            name: v * np.float32(factor) if name in ("x", "y") and v is not None else v for name, v in columns.items()
+        }
 
 
 def check_any(chosen: Any, path: AnyPath) -> None:

@@ -1,24 +1,38 @@
-"""Text files: reading and decoding, numbers with decimal commas, formulas of molecular ions."""
+"""Text files: decompression and decoding, tables, numbers with decimal commas, formulas of molecular ions."""
 
+import bz2
+import codecs
+import gzip
+import io
+import lzma
+import math
 import re
+import warnings
+import zlib
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from apt_evap._common.files import FileError, read_small_file
-from apt_evap._common.types import AnyPath
+from apt_evap._common.files import FileError, check_path, open_for_reading, read_small_file
+from apt_evap._common.types import AnyPath, Floats
+from apt_evap.warnings import DataWarning
 
 _MAX_BYTES = 1 << 22
-ELEMENTS = frozenset(
+SYMBOLS = tuple(
     "H He Li Be B C N O F Ne Na Mg Al Si P S Cl Ar K Ca Sc Ti V Cr Mn Fe Co Ni Cu Zn Ga Ge As Se Br Kr Rb Sr Y Zr Nb "
     "Mo Tc Ru Rh Pd Ag Cd In Sn Sb Te I Xe Cs Ba La Ce Pr Nd Pm Sm Eu Gd Tb Dy Ho Er Tm Yb Lu Hf Ta W Re Os Ir Pt Au "
     "Hg Tl Pb Bi Po At Rn Fr Ra Ac Th Pa U Np Pu Am Cm Bk Cf Es Fm Md No Lr Rf Db Sg Bh Hs Mt Ds Rg Cn Nh Fl Mc Lv Ts "
     "Og".split()
 )
-"""Chemical symbols."""
+"""Chemical symbols in the order of the atomic numbers."""
+ELEMENTS = frozenset(SYMBOLS)
 
 
-def read_text(path: AnyPath, what: str, at_most: int = _MAX_BYTES) -> str:
-    """Read a complete text file in UTF-8, UTF-16 or Latin-1.
+def read_bytes(path: AnyPath, what: str, at_most: int = _MAX_BYTES) -> bytes:
+    """Read a complete file, decompressed if it is compressed by gzip, bzip2 or xz, and texts of UTF-16 in UTF-8.
 
     Parameters
     ----------
@@ -27,24 +41,145 @@ def read_text(path: AnyPath, what: str, at_most: int = _MAX_BYTES) -> str:
     what : str
         Expected content, for messages.
     at_most : int
-        Largest allowed size [bytes].
+        Largest allowed size [bytes], also after decompression.
 
     Returns
     -------
-    str
+    bytes
+        Without a byte order mark.
 
     Raises
     ------
     FileError
-        If it is missing, unreadable, empty or too large.
+        If it is missing, unreadable, empty, too large, compressed in another way, or expands more than 200 times.
     """
     data = read_small_file(path, at_most, what)
     if not data:
         raise FileError(f"{str(path)!r} is empty (0 bytes), expected {what}")
+    kind = _compression(data)
+    if kind:
+        limit = min(at_most, max(_SMALL, _EXPANSION * len(data)))
+        try:
+            data = _opened(kind, io.BytesIO(data)).read(limit + 1)
+        except (OSError, EOFError, ValueError, zlib.error, lzma.LZMAError) as error:
+            raise FileError(f"{str(path)!r} cannot be decompressed by {kind}: {error}, expected {what}") from error
+        if len(data) > limit:
+            raise FileError(f"{str(path)!r} has more than {limit:,} bytes after decompression, expected {what}")
+    return _in_utf8(data)
+
+
+def read_head(path: AnyPath, size: int) -> bytes:
+    """First bytes of a file, as `read_bytes` would return them; those of the file if it cannot be decompressed."""
+    with open_for_reading(path) as file:
+        head = file.read(size)
+        kind = _compression(head)
+        if kind in _OPENERS:
+            file.seek(0)
+            with suppress(OSError, EOFError, ValueError, zlib.error, lzma.LZMAError):
+                head = _opened(kind, file).read(size)
+    return _in_utf8(head)
+
+
+_SMALL = 1 << 24  # bytes that any compressed file may have after decompression
+_EXPANSION = 200  # of text by compression; measured: 3 to 10 for coordinates, 1,000 for zeros
+_MAGIC = {b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"\xfd7zXZ\0": "xz", b"(\xb5/\xfd": "zstd", b"PK\3\4": "zip"}
+_SUFFIXES = (".gz", ".bz2", ".xz", ".zst", ".zip")
+_OPENERS: dict[str, Callable[[Any], Any]] = {
+    "gzip": lambda file: gzip.GzipFile(fileobj=file),
+    "bzip2": bz2.BZ2File,
+    "xz": lzma.LZMAFile,
+}
+_MARKS = {
+    codecs.BOM_UTF8: "utf-8-sig",
+    codecs.BOM_UTF32_LE: "utf-32",  # before UTF-16, whose mark it begins with
+    codecs.BOM_UTF32_BE: "utf-32",
+    codecs.BOM_UTF16_LE: "utf-16",
+    codecs.BOM_UTF16_BE: "utf-16",
+}
+
+
+def _compression(head):
+    """Name of the compression of a file by its first bytes, "" for none."""
+    return next((name for magic, name in _MAGIC.items() if head.startswith(magic)), "")
+
+
+def is_compressed(path: AnyPath) -> bool:
+    """Whether a file begins like a compressed one."""
+    with open_for_reading(path) as file:
+        return bool(_compression(file.read(8)))
+
+
+def without_compression(path: AnyPath) -> Path:
+    """Path without the suffix of a compression: "a.dump" of "a.dump.gz"."""
+    path = check_path(path)
+    return path.with_suffix("") if path.suffix.lower() in _SUFFIXES else path
+
+
+def _opened(kind, file):
+    if kind not in _OPENERS:
+        raise ValueError(f"only {', '.join(_OPENERS)} are supported")
+    return _OPENERS[kind](file)
+
+
+def _in_utf8(data):
+    """Bytes without a byte order mark; UTF-16 and UTF-32 become UTF-8, all others stay."""
+    encoding = next((name for mark, name in _MARKS.items() if data.startswith(mark)), "")
+    if not encoding and len(data) >= 8:  # UTF-16 without a mark: every second byte of ASCII is zero
+        for start, name in ((1, "utf-16-le"), (0, "utf-16-be")):
+            if not any(data[start:32:2]) and all(data[1 - start : 32 : 2]):
+                encoding = name
+    return data.decode(encoding, "replace").encode() if encoding else data
+
+
+def read_text(path: AnyPath, what: str, at_most: int = _MAX_BYTES) -> str:
+    """Read a complete text file in UTF-8, UTF-16 or Latin-1, which may be compressed, see `read_bytes`."""
+    data = read_bytes(path, what, at_most)
     try:
-        return data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
+        return data.decode()
     except UnicodeDecodeError:
         return data.decode("latin-1")
+
+
+def read_numbers(path: AnyPath, what: str, names: Sequence[str], at_most: int = _MAX_BYTES) -> dict[str, Floats]:
+    """Read a text table of numbers, one row per line, separated by spaces, tabulators, semicolons or commas.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file. Empty lines and lines that begin with # are left out.
+    what : str
+        Expected content, for messages.
+    names : sequence of str
+        Names of the columns; a line with fewer or more numbers is an error.
+    at_most : int
+        Largest allowed size [bytes].
+
+    Returns
+    -------
+    dict of ndarray
+        Columns by name, float64 (n,).
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read, has no row, or a line does not contain these numbers.
+    """
+    rows = []
+    for at, line in enumerate(read_text(path, what, at_most).splitlines(), 1):
+        cells = re.split(r"[\s;,]+", line.strip())
+        if cells == [""] or cells[0].startswith("#"):
+            continue
+        try:
+            row = [float(cell) for cell in cells]
+        except ValueError:
+            row = []
+        if len(row) != len(names) or not all(map(math.isfinite, row)):
+            wanted = f"{len(names)} numbers ({', '.join(names)})"
+            raise FileError(f"{str(path)!r}, line {at}: expected {wanted} as in {what}, got {line.strip()!r:.60}")
+        rows.append(row)
+    if not rows:
+        raise FileError(f"{str(path)!r} has no numbers, expected {what}")
+    return dict(zip(names, np.ascontiguousarray(np.array(rows).T), strict=True))
 
 
 def number(text: str, what: str, where: str) -> float:
@@ -85,3 +220,50 @@ def atoms_of(name: str) -> dict[str, int]:
     for element, n in parts:
         atoms[element] = atoms.get(element, 0) + int(n or 1)
     return {element: n for element, n in atoms.items() if n}
+
+
+def species_name(word: str, known: Collection[str], where: str) -> str:
+    """Name of a species that a file may write in upper or lower case.
+
+    The text itself if it is one of the names in the file, otherwise the only one that differs in case, a formula such
+    as "CO", or a chemical symbol in upper or lower case: "CO" is never cobalt if the file has both.
+
+    Parameters
+    ----------
+    word : str
+        Text in the file.
+    known : collection of str
+        Names that the file lists.
+    where : str
+        File and line, for a warning.
+
+    Returns
+    -------
+    str
+
+    Warns
+    -----
+    DataWarning
+        If several names differ from the text in their case only.
+    """
+    if word in known:
+        return word
+    similar = [name for name in known if name.casefold() == word.casefold()]
+    if len(set(similar)) == 1:
+        return similar[0]
+    symbol = word.capitalize()
+    name = word if atoms_of(word) or symbol not in ELEMENTS else symbol
+    if similar:
+        warnings.warn(
+            f"{where}: {word!r} may be any of {', '.join(similar)}, it is read as {name}", DataWarning, stacklevel=4
+        )
+    return name
+
+
+def atoms_in(species: Mapping[str, int]) -> dict[str, int]:
+    """Number of atoms of each element in an ion, whose species may be molecules; other names stay."""
+    elements: dict[str, int] = {}
+    for name, n in species.items():
+        for element, count in (atoms_of(name) or {name: 1}).items():
+            elements[element] = elements.get(element, 0) + n * count
+    return elements

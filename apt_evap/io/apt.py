@@ -13,32 +13,37 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from apt_evap._common.files import TruncatedFile, open_for_reading
+from apt_evap._common.files import FileError, TruncatedFile, open_for_reading
 from apt_evap._common.types import AnyPath
 from apt_evap.detection.hits import Hits
 from apt_evap.io._apt_sections import read_sections
-from apt_evap.io._pulses import PulseCheck, first_from_every, pulses_from_first, whole_pulses
+from apt_evap.io._pulses import ions_per_pulse, pulses_from_first, whole_pulses
 from apt_evap.io._records import check_columns, fill
 from apt_evap.warnings import DataWarning
 
-# sections, in lower case, that are columns of Hits: name, number of values per ion, unit
-_KNOWN = {
-    "tofc": ("time_of_flight", 1, "ns"),
-    "mass": ("mass_to_charge", 1, "Da"),
-    "xdet_mm": ("x", 1, "mm"),
-    "ydet_mm": ("y", 1, "mm"),
-    "position": ("positions", 3, "nm"),
-    "multiplicity": ("multiplicity", 1, None),
+# columns of Hits: number of values per ion, unit, and names of their sections in lower case, the preferred one first
+_COLUMNS: dict[str, tuple[int, str | None, tuple[str, ...]]] = {
+    "time_of_flight": (1, "ns", ("tofc", "epos tof", "tof", "time of flight")),
+    "mass_to_charge": (1, "Da", ("mass",)),
+    "voltage": (1, "V", ("voltage", "v")),
+    "pulse_voltage": (1, "V", ("pulse voltage", "vap")),
+    "x": (1, "mm", ("xdet_mm",)),
+    "y": (1, "mm", ("ydet_mm",)),
+    "positions": (3, "nm", ("position",)),
+    "pulses": (1, None, ("pulsedelta", "delta pulse")),
+    "multiplicity": (1, None, ("multiplicity",)),
 }
+_COUNTS = ("pulses", "multiplicity")
 _DETECTOR = "detector coordinates"
 
-# dimension and power of ten
+# dimension and power of ten of each unit, in lower case
 _UNITS = {
-    **{name: ("length", power) for name, power in {"m": 0, "cm": -2, "mm": -3, "um": -6, "µm": -6, "μm": -6}.items()},
-    **{name: ("length", power) for name, power in {"nm": -9, "Å": -10, "pm": -12}.items()},
-    **{name: ("time", power) for name, power in {"s": 0, "ms": -3, "us": -6, "µs": -6, "μs": -6}.items()},
+    **{name: ("length", power) for name, power in {"m": 0, "cm": -2, "mm": -3, "um": -6, "\u03bcm": -6}.items()},
+    **{name: ("length", power) for name, power in {"nm": -9, "\u00e5": -10, "angstrom": -10, "pm": -12}.items()},
+    **{name: ("time", power) for name, power in {"s": 0, "ms": -3, "us": -6, "\u03bcs": -6}.items()},
     **{name: ("time", power) for name, power in {"ns": -9, "ps": -12}.items()},
-    **{name: ("mass", power) for name, power in {"Da": 0, "u": 0, "amu": 0, "kDa": 3}.items()},
+    **{name: ("mass", power) for name, power in {"da": 0, "u": 0, "amu": 0, "kda": 3}.items()},
+    **{name: ("voltage", power) for name, power in {"v": 0, "kv": 3, "mv": -3}.items()},
 }
 
 
@@ -55,10 +60,10 @@ class _Column:
 def read_apt(path: AnyPath, *, columns: Sequence[str] | None = None, partial: bool = False) -> Hits:
     """Read an .apt file.
 
-    The sections tofc, Mass, XDet_mm and YDet_mm (or Detector Coordinates), Position and Multiplicity are converted to
-    columns of `Hits`, in its units. All other sections, and those with an unknown unit, are stored unchanged in
-    ``extra`` under their own names, with their units in ``units``. A second section with the same name is called
-    "name (2)".
+    The sections of IVAS and AP Suite for times of flight, masses, voltages, detector coordinates, positions and pulses
+    are converted to columns of `Hits`, in its units; a section without a unit has these units. All other sections, and
+    those with an unknown unit, are stored unchanged in ``extra`` under their own names, with their units in ``units``.
+    Upper or lower case of names and units does not matter. A second section with the same name is called "name (2)".
 
     Parameters
     ----------
@@ -155,55 +160,54 @@ class _Grouping:
 
 def _assign(sections, path):
     """Targets of all sections."""
+    targets = {}
+    named = {section.name.casefold(): section for section in reversed(sections)}
+    for target, (values, unit, names) in _COLUMNS.items():
+        for name in names:
+            if name in named and _fits(named[name], target, values, unit, path):
+                targets.setdefault(named[name].name, [(target, None)])
+                break
+    pair = named.get(_DETECTOR)
+    if pair is not None and not {"xdet_mm", "ydet_mm"} & set(named) and _fits(pair, "x", 2, "mm", path):
+        targets[pair.name] = [("x", 0), ("y", 1)]
     assigned = []
-    targets = set()
-    names = {section.name.casefold() for section in sections}
     for section in sections:
-        name = section.name.casefold()
-        columns = [_KNOWN[name]] if name in _KNOWN else []
-        if name == _DETECTOR and not {"xdet_mm", "ydet_mm"} & names:
-            columns = [("x", 2, "mm"), ("y", 2, "mm")]
-        problem = ""
-        factors = [_factor(section.unit, unit) for _, _, unit in columns]
-        if any(section.values != values for _, values, _ in columns):
-            problem = f"{section.values} values per ion"
-        elif None in factors:
-            problem = f"the unknown unit {section.unit!r}"
-        elif columns and section.dtype.kind not in ("iu" if columns[0][0] == "multiplicity" else "iuf"):
-            problem = f"values of type {section.dtype}"
-        if problem:
-            warnings.warn(
-                f"{str(path)!r}: section {section.name!r} has {problem}, so it is stored in extra, not {columns[0][0]}",
-                DataWarning,
-                stacklevel=5,
-            )
-        if problem or not columns or targets & {target for target, _, _ in columns}:
-            assigned.append(_Column(section, None))
-            continue
-        for index, ((target, values, _), factor) in enumerate(zip(columns, factors, strict=True)):
-            targets.add(target)
-            assigned.append(_Column(section, target, factor, index if values == 2 else None))
+        for target, part in targets.get(section.name, [(None, None)]):
+            factor = 1.0 if target is None else _factor(section.unit, _COLUMNS[target][1])
+            assigned.append(_Column(section, target, factor, part))
     return assigned
 
 
+def _fits(section, target, values, unit, path):
+    """Whether a section can be a column of Hits; a warning says why not."""
+    problem = ""
+    if section.values != values:
+        problem = f"{section.values} values per ion"
+    elif _factor(section.unit, unit) is None:
+        problem = f"the unknown unit {section.unit!r}"
+    elif section.dtype.kind not in ("iu" if target in _COUNTS else "iuf"):
+        problem = f"values of type {section.dtype}"
+    if problem:
+        warnings.warn(
+            f"{str(path)!r}: section {section.name!r} has {problem}, so it is stored in extra, not {target}",
+            DataWarning,
+            stacklevel=6,
+        )
+    return not problem
+
+
 def _factor(unit, target):
-    """Conversion factor between two units; None if it is not known."""
-    if target is None:
+    """Conversion factor between two units; None if it is not known. A missing unit is the target."""
+    if target is None or not unit:
         return 1.0
-    dimension, power = _UNITS.get(unit, (None, 0))
-    target_dimension, target_power = _UNITS[target]
+    dimension, power = _UNITS.get(unit.casefold(), (None, 0))
+    target_dimension, target_power = _UNITS[target.casefold()]
     return 10.0 ** (power - target_power) if dimension == target_dimension else None
 
 
 def _ions(file, path, grouping, n):
     """Ions per pulse for the first ion of each pulse and 0 for the others; None, with a warning, if inconsistent."""
-    numbers = _values(file, path, grouping.section, 0, n)
-    check = PulseCheck()
-    check.add(numbers)
-    problem = check.problem(False)
-    if not problem and numbers.min() >= 0:
-        return numbers.astype(np.uint32)
-    ions = first_from_every(numbers)
+    ions, problem = ions_per_pulse(_values(file, path, grouping.section, 0, n))
     if ions is None:
         warnings.warn(
             f"{str(path)!r}: pulses unknown, so its Multiplicity is stored in extra: it does not contain the number of "
@@ -228,6 +232,11 @@ def _hits(file, path, chosen, grouping, ions, start, stop, first_pulse=0):
         if column.factor != 1:
             with np.errstate(over="ignore"):
                 part = part * (part.dtype.type(column.factor) if part.dtype.kind == "f" else column.factor)
+        if column.target == "pulses" and part.dtype.kind == "i" and part.min() < 0:
+            raise FileError(
+                f"{str(path)!r}: section {section.name!r} must be the number of pulses since the last ion, >= 0, got "
+                f"{part.min()}; choose other columns by their names"
+            )
         columns[column.target] = part
     if grouping and ions is not None:
         pulse_id, multiplicity = pulses_from_first(ions, first_pulse)

@@ -5,9 +5,10 @@ import io
 
 import numpy as np
 
-from apt_evap._common.files import FileError, read_small_file
+from apt_evap._common.files import FileError
 from apt_evap._common.types import AnyPath
 from apt_evap.detection.distortion import DistortionGrid
+from apt_evap.io._texts import read_text
 
 _COLUMNS = ("detectorX", "detectorY", "gridX", "gridY")
 _MAX_BYTES = 1 << 24  # a crossing takes about 40 bytes
@@ -30,7 +31,7 @@ def read_grid(path: AnyPath) -> DistortionGrid:
     FileError
         If the file is missing or too large, a column is missing, a value is not a number, or the crossings are no grid.
     """
-    text = read_small_file(path, _MAX_BYTES, "a calibration grid").decode("utf-8-sig", errors="replace")
+    text = read_text(path, "a calibration grid", _MAX_BYTES)
     rows = [row for row in csv.reader(io.StringIO(text)) if any(cell.strip() for cell in row)]
     header = [cell.strip().lower() for cell in rows[0]] if rows else []
     missing = [name for name in _COLUMNS if name.lower() not in header]

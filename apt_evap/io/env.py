@@ -9,7 +9,7 @@ import numpy as np
 from apt_evap._common.files import FileError
 from apt_evap._common.types import AnyPath
 from apt_evap.detection.mass_ranges import Ranges
-from apt_evap.io._texts import atoms_of, colour, count, number, read_text
+from apt_evap.io._texts import atoms_of, colour, count, number, read_text, species_name
 
 _NM3_PER_CUBIC_ANGSTROM = 1e-3
 
@@ -57,8 +57,8 @@ def read_env(path: AnyPath) -> Ranges:
     for where, (name, *parts) in rest[:n_species]:
         if len(parts) < 3:
             raise FileError(f"{where}: expected a species and its colour, got {' '.join([name, *parts])!r:.60}")
-        colours[name] = colour(parts[:3], where)
-    rows = [_range(where, parts) for where, parts in rest[n_species : n_species + n_ranges]]
+        colours[species_name(name, (), where)] = colour(parts[:3], where)
+    rows = [_range(where, parts, colours) for where, parts in rest[n_species : n_species + n_ranges]]
     names, low, high, volume = zip(*rows, strict=True)
     return Ranges(
         names,
@@ -71,7 +71,7 @@ def read_env(path: AnyPath) -> Ranges:
     )
 
 
-def _range(where, parts):
+def _range(where, parts, species):
     if len(parts) < 3:
         raise FileError(f"{where}: expected a species and two bounds [Da], got {' '.join(parts)!r:.60}")
     name, *cells = parts
@@ -79,4 +79,4 @@ def _range(where, parts):
     if not low < high:
         raise FileError(f"{where}: expected two bounds [Da], the lower one first, got {low:g} and {high:g}")
     volume = number(cells[2], "a volume [Angstrom^3]", where) * _NM3_PER_CUBIC_ANGSTROM if len(cells) > 2 else np.nan
-    return name, low, high, volume
+    return species_name(name, species, where), low, high, volume

@@ -14,7 +14,7 @@ from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_choice
 from apt_evap.detection.hits import Hits
 from apt_evap.io._pulses import PulseCheck, first_from_equal, pulses_from_first, whole_pulses
-from apt_evap.io._records import check_any, choose, choose_fields, open_words, write_words
+from apt_evap.io._records import MM, check_any, choose, choose_fields, in_mm, open_words, write_words
 from apt_evap.warnings import DataWarning
 
 _ROW = 44
@@ -29,6 +29,7 @@ _FIELDS = {
     "pulses": (9, 1, "u4"),
     "ions": (10, 1, "u4"),
 }
+WRITTEN = tuple(_FIELDS)[:-1]
 _UNITS = ("V", "kV")
 _LEAST = 100.0  # [V]: instruments have higher voltages, and files in kV lower numbers
 _COLUMNS = (*tuple(_FIELDS)[:-1], "pulse_id", "multiplicity")
@@ -43,6 +44,7 @@ def read_epos(
     partial: bool = False,
     byte_order: str | None = None,
     voltage_unit: str | None = None,
+    detector_unit: str = "mm",
 ) -> Hits:
     """Read an .epos file.
 
@@ -62,6 +64,8 @@ def read_epos(
         None reads big-endian and checks the byte order.
     voltage_unit : {None, "V", "kV"}
         Unit of the voltages in the file. By default V, or kV if all voltages are below 100, with a warning.
+    detector_unit : {"mm", "cm", "m", "um"}
+        Unit of the detector coordinates in the file; some programs write cm.
 
     Returns
     -------
@@ -77,7 +81,7 @@ def read_epos(
         If the size is not a multiple of 44 bytes and `partial` is False.
     """
     chosen, fields = choose_fields(columns, _COLUMNS, _FIELDS, path, _WITH)
-    survey = _Survey(voltage_unit)
+    survey = _Survey(voltage_unit, detector_unit)
     with _open(path, partial, byte_order) as words:
         block = words.read(fields)
         survey.add(block)
@@ -93,6 +97,7 @@ def chunk_epos(
     partial: bool = False,
     byte_order: str | None = None,
     voltage_unit: str | None = None,
+    detector_unit: str = "mm",
 ) -> Iterator[Hits]:
     """Read an .epos file in `Hits` of at most `rows` ions in complete pulses; otherwise as `read_epos`.
 
@@ -110,7 +115,7 @@ def chunk_epos(
     """
     chosen, fields = choose_fields(columns, _COLUMNS, _FIELDS, path, _WITH)
     fields = {**fields, "ions": _FIELDS["ions"]}
-    survey = _Survey(voltage_unit)
+    survey = _Survey(voltage_unit, detector_unit)
     with _open(path, partial, byte_order) as words:
         for block in words.survey(fields):
             survey.add(block)
@@ -144,8 +149,11 @@ def chunk_epos(
 class _Survey:
     """Properties of the complete file: columns of zeros, unit of the voltages, consistency of the pulses."""
 
-    def __init__(self, voltage_unit: str | None) -> None:
-        self._unit = voltage_unit if voltage_unit is None else check_choice(voltage_unit, "voltage_unit", _UNITS)
+    def __init__(self, voltage_unit: str | None, detector_unit: str) -> None:
+        self.detector_unit = check_choice(detector_unit, "detector_unit (--unit)", MM)
+        self._unit = (
+            voltage_unit if voltage_unit is None else check_choice(voltage_unit, "voltage_unit (--voltage-unit)", _UNITS)
+        )
         self.present = set()
         self.highest = {}
         self.pulses = PulseCheck()
@@ -195,6 +203,7 @@ class _Survey:
 def _hits(block, survey, chosen, path, first_pulse=0):
     """Hits of a block of complete pulses."""
     columns = {name: values for name, values in block.items() if name in survey.present}
+    columns = in_mm(columns, survey.detector_unit)
     if survey.kilovolts:
         with np.errstate(over="ignore"):
             for name in {"voltage", "pulse_voltage"} & set(columns):

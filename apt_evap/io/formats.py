@@ -4,42 +4,59 @@ A new format needs one module with a reader, a writer or both, and one line in `
 """
 
 import inspect
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from apt_evap._common.files import FileError, TruncatedFile, check_path, open_for_reading
+import numpy as np
+from numpy.typing import NDArray
+
+from apt_evap._common.files import FileError, TruncatedFile, check_path
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_count, check_kind, short_text
+from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.io._apt_sections import SIGNATURE
+from apt_evap.io._points import is_data
+from apt_evap.io._texts import read_head, without_compression
 from apt_evap.io.apt import chunk_apt, read_apt
 from apt_evap.io.csv import write_csv
 from apt_evap.io.env import read_env
+from apt_evap.io.epos import WRITTEN as EPOS
 from apt_evap.io.epos import chunk_epos, read_epos, write_epos
 from apt_evap.io.npz import read_map
+from apt_evap.io.pos import WRITTEN as POS
 from apt_evap.io.pos import chunk_pos, read_pos, write_pos
 from apt_evap.io.raw import chunk_raw, read_raw
 from apt_evap.io.rng import read_rng
 from apt_evap.io.rrng import read_rrng
 from apt_evap.io.tapsim import SIGNATURE as TAPSIM
+from apt_evap.io.tapsim import WRITTEN as TAPSIM_COLUMNS
 from apt_evap.io.tapsim import read_tapsim, write_tapsim
 from apt_evap.io.vtp import write_vtp
 from apt_evap.io.xyz import write_xyz
+from apt_evap.warnings import DataWarning
 
 __all__ = ["FORMATS", "RANGE_FORMATS", "FileError", "Format", "TruncatedFile", "chunks", "read", "read_ranges", "write"]
 
 
 @dataclass(frozen=True)
 class Format:
-    """A file format: suffix (also its name), first bytes, reader, writer, and reader in chunks."""
+    """A file format: suffix (also its name), first bytes, reader, writer, reader in chunks, and what is written.
+
+    `fixed` are the columns that the writer always writes, as zeros if they are missing; empty if it writes those of the
+    ions. `keeps` tells whether it writes a column, by its name and values.
+    """
 
     suffix: str
     signature: bytes | None
     read: Callable | None = None
     write: Callable | None = None
     chunks: Callable | None = None
+    fixed: tuple[str, ...] = ()
+    keeps: Callable[[str, NDArray[Any]], bool] = lambda name, values: True
 
 
 # imported on demand, so that other formats do not import HDF5
@@ -63,23 +80,33 @@ def _write_nxapm(path, hits, *, elements=(), start_time=None):
     write_nxapm(path, hits, elements=elements, start_time=start_time)
 
 
+_GROUPING = ("pulse_id", "multiplicity")
+_WIDEST = 500.0  # [mm]: of a detector; those of atom probes have 80 to 120
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 FORMATS = (
     Format(".h5", _HDF5, _read_hdf5),
-    Format(".nxs", _HDF5, _read_nxapm, _write_nxapm),
-    Format(".epos", None, read_epos, write_epos, chunk_epos),
-    Format(".pos", None, read_pos, write_pos, chunk_pos),
+    Format(".nxs", _HDF5, _read_nxapm, _write_nxapm, keeps=lambda name, values: values.dtype.kind in "biuf"),
+    Format(".epos", None, read_epos, write_epos, chunk_epos, EPOS, lambda name, _: name in (*EPOS, *_GROUPING)),
+    Format(".pos", None, read_pos, write_pos, chunk_pos, POS, lambda name, _: name in POS),
     Format(".apt", SIGNATURE, read_apt, None, chunk_apt),
     Format(".raw", None, read_raw, None, chunk_raw),
     Format(".npz", b"PK", read_map),
-    Format(".xyz", None, None, write_xyz),
-    Format(".vtp", None, None, write_vtp),
+    Format(".xyz", None, None, write_xyz, keeps=is_data),
+    Format(".vtp", None, None, write_vtp, keeps=is_data),
     Format(".csv", None, None, write_csv),
-    Format(".tapsim", TAPSIM, read_tapsim, write_tapsim),
+    Format(".tapsim", TAPSIM, read_tapsim, write_tapsim, keeps=lambda name, _: name in TAPSIM_COLUMNS),
 )
 
 RANGE_FORMATS = {".rrng": read_rrng, ".rng": read_rng, ".env": read_env}
 """Readers of files of mass ranges, by suffix."""
+
+_CAMECA = "raw files of CAMECA are not documented in public: export .epos or .apt from AP Suite"
+_ADVICE = dict.fromkeys((".str", ".rhit", ".hits", ".root"), _CAMECA)
+_ADVICE |= dict.fromkeys(RANGE_FORMATS, "it contains ranges of mass: read_ranges and --ranges read it")
+_ADVICE |= {
+    ".ato": "those of Rouen have several layouts, and do not say which one it is: convert it to .epos",
+    ".ops": "convert it to .epos, .pos or .apt",
+}
 
 
 def read(path: AnyPath, *, format: str | None = None, columns: Sequence[str] | None = None, **options: Any) -> Any:
@@ -96,7 +123,8 @@ def read(path: AnyPath, *, format: str | None = None, columns: Sequence[str] | N
     **options
         Options of the reader of the format: ``partial=True`` reads the complete ions of a truncated file (the complete
         sections of an .apt), ``byte_order="little"`` a .pos or .epos in the wrong byte
-        order, ``voltage_unit="V"`` an .epos with voltages below 100 V; for an .npz the options of `read_map`.
+        order, ``voltage_unit="V"`` an .epos with voltages below 100 V, ``detector_unit="cm"`` an .epos or .raw with
+        detector coordinates in cm; for an .npz the options of `read_map`.
 
     Returns
     -------
@@ -121,7 +149,9 @@ def read(path: AnyPath, *, format: str | None = None, columns: Sequence[str] | N
     array([29., 29., 58.], dtype=float32)
     """
     chosen = _to_read(path, format)
-    return chosen.read(path, **_options(path, chosen, chosen.read, columns, options))
+    content = chosen.read(path, **_options(path, chosen, chosen.read, columns, options))
+    _warn_of_size(path, content)
+    return content
 
 
 def chunks(
@@ -157,7 +187,39 @@ def chunks(
     chosen = _to_read(path, format)
     if chosen.chunks is None:
         raise FileError(f"{str(path)!r} cannot be read in chunks: the format {chosen.suffix} does not support it")
-    return chosen.chunks(path, rows, **_options(path, chosen, chosen.chunks, columns, options))
+    parts = chosen.chunks(path, rows, **_options(path, chosen, chosen.chunks, columns, options))
+    return _with_warning_of_size(path, parts)
+
+
+def _with_warning_of_size(path, parts):
+    warned = False
+    for part in parts:
+        warned = warned or _warn_of_size(path, part)
+        yield part
+        del part
+
+
+def _warn_of_size(path, content):
+    """Warn if a measured map or ions are farther apart than any detector is wide."""
+    if isinstance(content, Hits) and content.outcome is None and content.x is not None and content.y is not None:
+        detected = content.detected
+        size = tuple(
+            float(values.max(where=detected, initial=-np.inf)) - float(values.min(where=detected, initial=np.inf))
+            for values in (content.x, content.y)
+        )
+    elif isinstance(content, DetectorMap):
+        x_min, x_max, y_min, y_max = content.extent
+        size = (x_max - x_min, y_max - y_min)
+    else:
+        return False
+    if max(size) > _WIDEST:
+        warnings.warn(
+            f"{str(path)!r} has detector coordinates in {size[0]:.4g} x {size[1]:.4g} mm, no detector is wider than "
+            f"{_WIDEST:g} mm: are they in mm?",
+            DataWarning,
+            stacklevel=3,
+        )
+    return max(size) > _WIDEST
 
 
 def write(path: AnyPath, hits: Hits, *, format: str | None = None, **options: Any) -> None:
@@ -171,7 +233,8 @@ def write(path: AnyPath, hits: Hits, *, format: str | None = None, **options: An
     hits : Hits
         The ions. A .pos or .epos does not contain ions that did not hit the detector or have values that are not
         finite; an .xyz or .vtp does not contain ions whose positions are not finite. A warning gives the number of
-        ions left out. The other formats contain all ions.
+        ions left out. The other formats contain all ions. For measured ions, a warning names the columns for which the
+        format has no place.
     format : str, optional
         Suffix of the format, such as ".pos", for any name of the file.
     **options
@@ -201,6 +264,31 @@ def write(path: AnyPath, hits: Hits, *, format: str | None = None, **options: An
         raise ValueError(f"hits must be Hits, such as run.hits(perturbation), got {short_text(hits)}")
     _check_options(path, chosen, "writing", _known(chosen.write, "hits"), options)
     chosen.write(path, hits, **options)
+    lost, _ = left_out(path, hits, format=format)
+    if lost and hits.outcome is None and hits.ion is None:
+        warnings.warn(
+            f"{str(path)!r} is without the columns {', '.join(lost)}, for which a {chosen.suffix} file has no place",
+            DataWarning,
+            stacklevel=2,
+        )
+
+
+def left_out(path: AnyPath, hits: Hits, *, format: str | None = None) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Columns that a file of this format does not contain, and missing ones that it contains as zeros.
+
+    Parameters
+    ----------
+    path, hits, format
+        As for `write`.
+
+    Returns
+    -------
+    left_out, zeros : tuple of str
+    """
+    chosen = _by_suffix(path, format, "write")
+    columns = {name: getattr(hits, name) for name in hits.columns} | hits.extra
+    lost = tuple(name for name, values in columns.items() if not chosen.keeps(name, values))
+    return lost, tuple(name for name in chosen.fixed if name not in columns)
 
 
 def read_ranges(path: AnyPath, *, format: str | None = None) -> Ranges:
@@ -223,7 +311,7 @@ def read_ranges(path: AnyPath, *, format: str | None = None) -> Ranges:
     FileError
         If the file is missing or unreadable, has no ranges, or contains an invalid line, or the format is unknown.
     """
-    suffix = check_path(path).suffix.lower()
+    suffix = without_compression(path).suffix.lower()
     if format is not None:
         suffix = "." + check_kind(format, "format", str, "a suffix such as '.rng'").lower().lstrip(".")
         if suffix not in RANGE_FORMATS:
@@ -232,8 +320,7 @@ def read_ranges(path: AnyPath, *, format: str | None = None) -> Ranges:
 
 
 def _to_read(path, format):
-    with open_for_reading(path) as file:
-        head = file.read(64)
+    head = read_head(path, 64)
     chosen = _by_content(head) if format is None else None
     if chosen is None:
         chosen = _by_suffix(path, format, "read")
@@ -291,5 +378,9 @@ def _by_suffix(path, format, doing):
     for candidate in FORMATS:
         if candidate.suffix == suffix.lower():
             return candidate
+    if format is None and doing == "read" and (inner := without_compression(path)) != check_path(path):
+        raise FileError(f"{str(path)!r} is compressed: decompress it to read it as {inner.name!r}")
+    if format is None and doing == "read" and suffix.lower() in _ADVICE:
+        raise FileError(f"{str(path)!r} cannot be read as ions; {_ADVICE[suffix.lower()]}")
     source = f"suffix {suffix!r}" if format is None else f"format={format!r}"
     raise FileError(f"format of {str(path)!r} must be one of {_suffixes(doing)}, got {source}")

@@ -9,9 +9,9 @@ from apt_evap._common.files import FileError, open_for_reading
 from apt_evap._common.types import AnyPath
 from apt_evap.detection.binning import MAX_BINS
 from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.io._records import MM
 
 _MAX_BYTES = 8 * MAX_BINS**2
-_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 1e-3}
 
 
 def read_map(
@@ -86,11 +86,11 @@ def read_map(
     for axis, name in (("x_edges", x_edges), ("y_edges", y_edges)):
         name = choose(f"edges in {axis[0]} ({axis}_mm)", name, [each for each in arrays if each.startswith(axis)])
         length = unit if unit is not None else name.rpartition("_")[2]
-        if length not in _MM:
-            raise FileError(f"{str(path)!r}: the unit of {name} must be one of {', '.join(_MM)}, got {length!r}")
+        if length not in MM:
+            raise FileError(f"{str(path)!r}: the unit of {name} must be one of {', '.join(MM)}, got {length!r}")
         if arrays[name].dtype.kind not in "iuf":
             raise FileError(f"{str(path)!r}: {name} must contain numbers, got {arrays[name].dtype}")
-        edges.append(arrays[name] * _MM[length])
+        edges.append(arrays[name] * MM[length])
     masks = [name for name, array in arrays.items() if array.shape == plane.shape and array.dtype == bool]
     inside = arrays[choose("mask", mask, masks)] if mask is not None or masks else None
     is_counts = values == "counts" and plane.dtype.kind in "iu"

@@ -11,6 +11,7 @@ from apt_evap.io._records import check_columns, choose, open_words, write_words
 
 _ROW = 16
 _FIELDS = {"positions": (0, 3, "f4"), "mass_to_charge": (3, 1, "f4")}
+WRITTEN = tuple(_FIELDS)
 
 
 def read_pos(

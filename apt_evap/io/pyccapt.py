@@ -11,7 +11,7 @@ import numpy as np
 from apt_evap._common.files import FileError
 from apt_evap._common.types import AnyPath
 from apt_evap.detection.hits import Hits
-from apt_evap.io._pulses import first_from_equal, pulses_from_first
+from apt_evap.io._pulses import first_from_equal, ions_per_pulse, pulses_from_first
 from apt_evap.io._records import check_any, check_columns
 from apt_evap.io.nxapm import numbers
 from apt_evap.storage.checked_hdf5 import CheckedFile, open_hdf5
@@ -42,6 +42,8 @@ _CALIBRATED = {
     "calibrated_time_of_flight": (("t_c (ns)",), 1.0),
     "uncalibrated_mass_to_charge": (("mc_uc (Da)",), 1.0),
     "start_counter": (("start_counter",), 1.0),
+    "pulses": (("delta_p",), 1.0),
+    "multi": (("multi",), 1.0),
 }
 _POSITIONS = ("position_x", "position_y", "position_z")
 _EXTRA = {
@@ -49,15 +51,19 @@ _EXTRA = {
     "calibrated_time_of_flight": "ns",
     "uncalibrated_mass_to_charge": "Da",
     "start_counter": "",
+    "multi": "",
 }
+_CONTINUOUS = ("x", "y", "time_of_flight")  # integers are raw counts of the detector
 _KEPT = ("x", "y", "pulse_voltage")  # columns that may be zero for all ions
 
 
 def read_pyccapt(path: AnyPath, *, columns: Sequence[str] | None = None) -> Hits:
     """Read an HDF5 file of PyCCAPT, of the instrument or of the calibration.
 
-    Consecutive ions with the same start counter belong to one pulse. Other columns of zeros are treated as absent. In
-    files of early versions the column ``pulse`` is the pulse voltage or the power of the laser, read as a voltage.
+    Consecutive ions with the same start counter belong to one pulse; without start counters, the column multi of the
+    calibration is used. Other columns of zeros are treated as absent. Integers as coordinates or times are raw counts
+    of the detector, and an error: their scale depends on the version of PyCCAPT. In files of early versions the column
+    ``pulse`` is the pulse voltage or the power of the laser, read as a voltage.
 
     Parameters
     ----------
@@ -70,8 +76,8 @@ def read_pyccapt(path: AnyPath, *, columns: Sequence[str] | None = None) -> Hits
     -------
     Hits
         With x, y [mm], time_of_flight [ns], voltage, pulse_voltage [V], pulse_id and multiplicity; after a calibration
-        also mass_to_charge [Da] and positions [nm]. ``extra`` contains "start_counter", "laser_pulse" [pJ],
-        "calibrated_time_of_flight" [ns] and "uncalibrated_mass_to_charge" [Da] if they exist.
+        also mass_to_charge [Da], positions [nm] and pulses. ``extra`` contains "start_counter", "laser_pulse" [pJ],
+        "calibrated_time_of_flight" [ns], "uncalibrated_mass_to_charge" [Da] and, if it is not used, "multi".
 
     Raises
     ------
@@ -106,6 +112,11 @@ def _one_column(values, name):
 
 def _calibrated(file, path):
     """Columns of the DataFrame df, which pandas stores as blocks of columns of the same type."""
+    if "df/table" in file:
+        raise FileError(
+            f"{path!r} contains a table of pandas (format='table'), expected format='fixed', as PyCCAPT writes it: "
+            "to_hdf(path, key='df', format='fixed')"
+        )
     wanted = {name: (column, factor) for column, (names, factor) in _CALIBRATED.items() for name in reversed(names)}
     known, found = [], {}
     for index in range(_MAX_BLOCKS):
@@ -134,7 +145,9 @@ def _calibrated(file, path):
 
 
 def _scaled(values, factor):
-    return values * factor if factor != 1.0 else np.ascontiguousarray(values)
+    if factor == 1.0 or values.dtype.kind != "f":  # integers as coordinates are refused
+        return np.ascontiguousarray(values)
+    return values * factor
 
 
 def _hits(found, path, columns):
@@ -145,12 +158,21 @@ def _hits(found, path, columns):
     lengths = {name: len(values) for name, values in found.items()}
     if len(set(lengths.values())) > 1:
         raise FileError(f"{path!r}: columns of PyCCAPT must have equal lengths, got {lengths}")
+    counts = [name for name in _CONTINUOUS if name in found and found[name].dtype.kind in "iu"]
+    if counts:
+        raise FileError(
+            f"{path!r}: {', '.join(counts)} are integers, raw counts of the detector, expected cm and ns: convert them "
+            "with the constants of this instrument (in PyCCAPT 78 or 80 mm for 2,450 bins, and 6.858 ps)"
+        )
     found = {name: values for name, values in found.items() if name in _KEPT or values.any()}
     if all(name in found for name in _POSITIONS):
         found["positions"] = np.column_stack([found.pop(name) for name in _POSITIONS])
     found = {name: values for name, values in found.items() if name not in _POSITIONS}
     if "start_counter" in found and len(found["x"]):
         found["pulse_id"], found["multiplicity"] = pulses_from_first(first_from_equal(found["start_counter"]))
+    elif "multi" in found and (ions := ions_per_pulse(found["multi"])[0]) is not None:
+        found["pulse_id"], found["multiplicity"] = pulses_from_first(ions)
+        found.pop("multi")
     chosen = check_columns(columns, tuple(found), path)
     requested = {name: found[name] for name in chosen}
     check_any(requested, path)

@@ -12,7 +12,7 @@ import numpy as np
 from apt_evap._common.types import AnyPath
 from apt_evap.detection.hits import Hits
 from apt_evap.io._pulses import first_from_equal, pulses_from_first
-from apt_evap.io._records import check_any, choose_fields, open_words
+from apt_evap.io._records import check_any, choose_fields, in_mm, open_words
 from apt_evap.warnings import DataWarning
 
 _ROW = 32
@@ -32,7 +32,12 @@ _WITH = {"pulse_id": ("pulse_number",), "multiplicity": ("pulse_number",)}
 
 
 def read_raw(
-    path: AnyPath, *, columns: Sequence[str] | None = None, partial: bool = False, byte_order: str | None = None
+    path: AnyPath,
+    *,
+    columns: Sequence[str] | None = None,
+    partial: bool = False,
+    byte_order: str | None = None,
+    detector_unit: str = "mm",
 ) -> Hits:
     """Read a Stuttgart .raw file.
 
@@ -49,6 +54,8 @@ def read_raw(
         Read the complete ions of a file that ends in the middle of an ion.
     byte_order : {None, "big", "little"}
         None reads little-endian and checks the byte order.
+    detector_unit : {"mm", "cm", "m", "um"}
+        Unit of the detector coordinates in the file.
 
     Returns
     -------
@@ -67,7 +74,7 @@ def read_raw(
     with _open(path, partial, byte_order) as words:
         block = words.read(fields)
         grouped = "pulse_number" in block and _grouped([block["pulse_number"]], path)
-        return _hits(block, grouped, chosen, path)
+        return _hits(in_mm(block, detector_unit), grouped, chosen, path)
 
 
 def chunk_raw(
@@ -77,6 +84,7 @@ def chunk_raw(
     columns: Sequence[str] | None = None,
     partial: bool = False,
     byte_order: str | None = None,
+    detector_unit: str = "mm",
 ) -> Iterator[Hits]:
     """Read a .raw file in `Hits` of at most `rows` ions in complete pulses; otherwise as `read_raw`.
 
@@ -107,7 +115,7 @@ def chunk_raw(
 
         first_pulse = 0
         for block in words.blocks(fields, rows, keep, ahead=1):  # one more row, to see whether the last pulse ends
-            yield _hits(block, grouped, chosen, path, first_pulse)
+            yield _hits(in_mm(block, detector_unit), grouped, chosen, path, first_pulse)
             first_pulse += np.count_nonzero(first_from_equal(block["pulse_number"]))
             del block
 

@@ -11,7 +11,7 @@ import numpy as np
 from apt_evap._common.files import FileError
 from apt_evap._common.types import AnyPath
 from apt_evap.detection.mass_ranges import Ranges
-from apt_evap.io._texts import atoms_of, colour, count, formula, number, read_text
+from apt_evap.io._texts import atoms_in, colour, count, formula, number, read_text, species_name
 from apt_evap.warnings import DataWarning
 
 
@@ -64,7 +64,7 @@ def read_rng(path: AnyPath) -> Ranges:
         np.array([high for (_, high), _ in rows]),
         None,
         tuple(paint or colours.get(own, "") for (_, paint), own in zip(named, species, strict=True)),
-        tuple(_elements(atoms) for _, atoms in rows),
+        tuple(atoms_in(atoms) for _, atoms in rows),
         source=str(path),
     )
 
@@ -88,12 +88,12 @@ def _table(lines, path):
         short, *parts = line.split()
         if len(parts) < 3:
             raise FileError(f"{where}, line {at}: expected a species and its colour, got {line!r:.60}")
-        shorts.append(short)
-        colours[short] = colour(parts[:3], f"{where}, line {at}")
+        shorts.append(species_name(short, (), f"{where}, line {at}"))
+        colours[shorts[-1]] = colour(parts[:3], f"{where}, line {at}")
     at, line = lines[2 * n_species + 1]
     if not line.startswith("-"):
         raise FileError(f"{where}, line {at}: expected a line of dashes with the species, got {line!r:.60}")
-    columns = line.split()[1:] or shorts
+    columns = [species_name(name, shorts, f"{where}, line {at}") for name in line.split()[1:]] or shorts
     if len(columns) != n_species:
         raise FileError(f"{where}, line {at}: expected {n_species} species after the dashes, got {len(columns)}")
     rows, n_rows = {}, 0
@@ -119,12 +119,3 @@ def _row(cells, columns, where):
         if n := count(cell, "a number of atoms", where):
             atoms[name] = atoms.get(name, 0) + n
     return (low, high), atoms
-
-
-def _elements(atoms):
-    """Atoms of each element; a column may itself be a molecular ion."""
-    elements = {}
-    for name, n in atoms.items():
-        for element, each in (atoms_of(name) or {name: 1}).items():
-            elements[element] = elements.get(element, 0) + n * each
-    return elements

@@ -1,8 +1,8 @@
 """The .rrng format: ranges of mass over charge state as INI text.
 
 Larson et al., Local Electrode Atom Probe Tomography (Springer, 2013), appendix A. The order of sections, lines and
-parts of a line, upper or lower case, and spaces do not matter. Volume and colour may be missing, and the decimal
-separator may be a comma.
+parts of a line, and spaces do not matter, upper or lower case only where several names differ by it, such as Co and CO.
+Volume and colour may be missing, and the decimal separator may be a comma.
 """
 
 import re
@@ -13,7 +13,8 @@ import numpy as np
 from apt_evap._common.files import FileError
 from apt_evap._common.types import AnyPath
 from apt_evap.detection.mass_ranges import Ranges
-from apt_evap.io._texts import formula, number, read_text
+from apt_evap.io._texts import atoms_in, atoms_of, formula, number, read_text, species_name
+from apt_evap.specimen.isotopes import ISOTOPES
 from apt_evap.warnings import DataWarning
 
 
@@ -28,7 +29,8 @@ def read_rrng(path: AnyPath) -> Ranges:
     Returns
     -------
     Ranges
-        In the order of the file. The name of a range is its ``Name`` or, if missing, its elements, such as "CrO2".
+        In the order of the file. The name of a range is its ``Name`` or, if missing, its atoms, such as "CrO2".
+        Molecules such as ``SiO2:1`` count with their atoms.
 
     Raises
     ------
@@ -36,13 +38,13 @@ def read_rrng(path: AnyPath) -> Ranges:
         If the file is missing or unreadable, has no ranges, or contains an invalid line.
     """
     lines = _lines(read_text(path, "the text of an .rrng file"))
-    elements = {}
-    for section, _, key, value in lines:
-        if section == "ions" and re.fullmatch(r"ion\s*[0-9]+", key) and value:
-            element = value.split()[0]
-            elements.setdefault(element.casefold(), element)
+    ions = [
+        value.split()[0]
+        for section, _, key, value in lines
+        if section == "ions" and re.fullmatch(r"ion\s*[0-9]+", key) and value
+    ]
     parts = [
-        _range(value, elements, f"{str(path)!r}, line {at}")
+        _range(value, ions, f"{str(path)!r}, line {at}")
         for section, at, key, value in lines
         if section == "ranges" and re.fullmatch(r"range\s*[0-9]+", key)
     ]
@@ -53,7 +55,8 @@ def read_rrng(path: AnyPath) -> Ranges:
         warnings.warn(
             f"{str(path)!r} states {numbers[0]:.20} ranges but contains {len(parts)}", DataWarning, stacklevel=2
         )
-    names, low, high, volume, colour, composition = zip(*parts, strict=True)
+    names, low, high, volume, colour, composition, species = zip(*parts, strict=True)
+    _warn_of_charges(path, low, high, species)
     return Ranges(names, np.array(low), np.array(high), np.array(volume), colour, composition, source=str(path))
 
 
@@ -71,10 +74,10 @@ def _lines(text):
     return assignments
 
 
-def _range(text, elements, where):
+def _range(text, ions, where):
     """Read "13.8745 14.2410 Vol:0.02003 Si:1 Color:CCCCCC"."""
     bounds = []
-    name, volume, colour, composition = "", np.nan, "", {}
+    name, volume, colour, species = "", np.nan, "", {}
     # "Vol : 0.02" is "Vol:0.02", but the value may also be missing; a pattern for spaces before a colon would need
     # quadratic time for many spaces
     compact = ":".join([part.rstrip() for part in text.split(":")])
@@ -91,13 +94,38 @@ def _range(text, elements, where):
         elif word == "name":
             name = value
         elif re.fullmatch(r"[0-9]{1,4}", value):
-            element = elements.get(word, key.capitalize())
-            composition[element] = composition.get(element, 0) + int(value)
+            ion = species_name(key, ions, where)
+            species[ion] = species.get(ion, 0) + int(value)
         else:
             raise FileError(f"{where}: expected a number of atoms such as {key}:1, got {part!r:.60}")
     if len(bounds) != 2 or not bounds[0] < bounds[1]:
         raise FileError(f"{where}: expected two bounds [Da], the lower one first, got {bounds!s:.60} in {text!r:.60}")
-    composition = {element: count for element, count in composition.items() if count}
-    if not (name or composition):
+    species = {ion: count for ion, count in species.items() if count}
+    if not (name or species):
         raise FileError(f"{where}: expected an element such as Si:1, or Name:..., got {text!r:.60}")
-    return name or formula(composition), *bounds, volume, colour, composition
+    composition = atoms_in(species) or atoms_of(name)
+    return name or formula(composition), *bounds, volume, colour, composition, species
+
+
+def _warn_of_charges(path, low, high, species):
+    """Warn if numbers of atoms are charge states, as one program writes them: "Co:2" at half the mass of cobalt.
+
+    An ion of n atoms and charge n squared, which has the same mass-to-charge ratio, does not exist.
+    """
+    singles = {}
+    for first, last, ions in zip(low, high, species, strict=True):
+        if len(ions) == 1:
+            ((name, n),) = ions.items()
+            singles.setdefault(name, []).append((n, n * first, n * last))
+    for name, ranges in singles.items():
+        masses = [mass for mass, _ in ISOTOPES.get(name, ())]
+        for n, first, last in ranges:
+            others = [0.5 * (start + end) for m, start, end in ranges if m != n]
+            if n > 1 and any(first <= mass <= last for mass in masses + others):
+                warnings.warn(
+                    f"{str(path)!r}: {name}:{n} from {first / n:g} to {last / n:g} Da has the mass of {name} with "
+                    f"{n} charges, but is read as {n} atoms: the number must be that of the atoms",
+                    DataWarning,
+                    stacklevel=3,
+                )
+                return

@@ -1,6 +1,7 @@
 """Specimens from files: LAMMPS, TAPSim, and all formats that ASE reads."""
 
 import os
+import tempfile
 import warnings
 from collections import Counter
 from collections.abc import Mapping
@@ -8,18 +9,29 @@ from typing import Any
 
 import numpy as np
 
-from apt_evap._common.files import FileError, check_path, open_for_reading
+from apt_evap._common.files import FileError, check_path
 from apt_evap._common.optional_imports import optional_import
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_choice, check_kind
-from apt_evap.io.lammps import Atoms, is_data, is_dump, read_data, read_dump
+from apt_evap.io._texts import is_compressed, read_bytes, read_head, without_compression
+from apt_evap.io.lammps import Atoms, checked_frame, is_data, is_dump, read_data, read_dump
 from apt_evap.io.tapsim_nodes import is_nodes, read_nodes
+from apt_evap.io.xyz_atoms import is_xyz, read_xyz
+from apt_evap.specimen.ase_atoms import warn_of_occupancy
 from apt_evap.specimen.materials import Material, as_material
 from apt_evap.specimen.tip import Tip
 
-SPECIMEN_FORMATS = ("lammps-dump", "lammps-data", "tapsim", "ase")
+SPECIMEN_FORMATS = ("lammps-dump", "lammps-data", "tapsim", "xyz", "ase")
+_READERS: dict[str, Any] = {"lammps-dump": read_dump, "lammps-data": read_data, "tapsim": read_nodes, "xyz": read_xyz}
 _HEAD = 1 << 14  # bytes that show the format
-_OPTIONS = {"lammps-dump": ("units", "frame"), "lammps-data": ("units", "style"), "tapsim": (), "ase": ()}
+_MAX_BYTES = 1 << 32
+_OPTIONS = {
+    "lammps-dump": ("units", "frame"),
+    "lammps-data": ("units", "style"),
+    "tapsim": (),
+    "xyz": ("units", "frame"),
+    "ase": ("frame",),
+}
 
 
 def read_tip(
@@ -34,8 +46,8 @@ def read_tip(
 ) -> Tip:
     r"""Read a specimen from a file, with its axis along +z.
 
-    Text dumps and data files of LAMMPS and node files of TAPSim are recognised by their content. All other files are
-    read by ASE, if it is installed.
+    Text dumps and data files of LAMMPS and node files of TAPSim are recognised by their content, also if they are
+    compressed by gzip, bzip2 or xz. Files .xyz are read, too, and all others by ASE, if it is installed.
 
     Parameters
     ----------
@@ -43,13 +55,14 @@ def read_tip(
         The file.
     types : mapping, optional
         Material of each type in the file, such as ``{1: "Al", 2: "Cu"}``. The types of LAMMPS and TAPSim are numbers,
-        and a number without a name is an error. A type that is a chemical symbol in the file may be omitted.
+        and a number without a name is an error. A type that is a chemical symbol in the file may be omitted. If the
+        file of LAMMPS has names and numbers, both may be used.
     format : str, optional
-        lammps-dump, lammps-data, tapsim or ase; by default recognised by the content.
+        lammps-dump, lammps-data, tapsim, xyz or ase; by default recognised by the content.
     units : str, optional
         Units of LAMMPS: metal (the default), real, electron, nano, micro, cgs or si.
     frame : int, optional
-        Frame of a dump, from 0; by default the last one.
+        Frame of a dump or trajectory, from 0; by default the last one.
     style : str, optional
         Style of the section Atoms of a data file, if the file does not state it.
     **options
@@ -93,10 +106,16 @@ def read_atoms(path: AnyPath, format: str | None = None, **given: Any) -> Atoms:
             takes = ", ".join(_OPTIONS[kind]) or "no such options"
             raise FileError(f"{name!r}: reading a specimen of format {kind} takes {takes}, got {key!r}")
     if kind == "ase":
-        atoms = _read_ase(path)  # in Angstrom
+        atoms = _read_ase(path, **given)  # in Angstrom
         return Atoms(atoms.get_positions() / 10, atoms.get_chemical_symbols(), atoms.arrays.get("evaporable"))
-    reader: Any = {"lammps-dump": read_dump, "lammps-data": read_data, "tapsim": read_nodes}[kind]
-    return reader(path, **given)
+    return _READERS[kind](path, **given)
+
+
+def types_of(atoms: Atoms, names: Mapping[str, Any]) -> list[str]:
+    """Type of each atom: its number if `names` has one for this number, otherwise the name in the file."""
+    if atoms.numbers is None or not any(key in names for key in set(atoms.numbers)):
+        return list(atoms.types)
+    return [number if number in names else name for number, name in zip(atoms.numbers, atoms.types, strict=True)]
 
 
 def tip_of(path: AnyPath, atoms: Atoms, names: Mapping[str, Material | str], **options: Any) -> Tip:
@@ -104,10 +123,16 @@ def tip_of(path: AnyPath, atoms: Atoms, names: Mapping[str, Material | str], **o
     name = str(path)
     if atoms.evaporable is not None:
         options = {"evaporable": atoms.evaporable} | options
-    kinds = [each for each, _ in Counter(atoms.types).most_common()]
+    types = types_of(atoms, names)
+    kinds = [kind for kind, _ in Counter(types).most_common()]
     for key in names:
         if key not in kinds:
             raise FileError(f"{name!r} has no atoms of type {key!r}, only of {', '.join(kinds)!s:.100}")
+    if kinds == ["C"] and "C" not in names and atoms.numbers is not None:
+        raise FileError(
+            f"{name!r} has the element C for all atoms, as LAMMPS writes it without names of elements: give those of "
+            "the column type, such as types={1: 'Al'}"
+        )
     unnamed = [each for each in kinds if each not in names and not each[:1].isalpha()]
     if unnamed:
         raise FileError(
@@ -118,7 +143,7 @@ def tip_of(path: AnyPath, atoms: Atoms, names: Mapping[str, Material | str], **o
     try:
         arguments: dict[str, Any] = {
             "positions": atoms.positions,
-            "species": np.array([number[each] for each in atoms.types], np.int32),
+            "species": np.array([number[kind] for kind in types], np.int32),
             "elements": [as_material(names.get(each, each), "types") for each in kinds],
         }
         return Tip.from_positions(**(arguments | options))
@@ -128,25 +153,53 @@ def tip_of(path: AnyPath, atoms: Atoms, names: Mapping[str, Material | str], **o
 
 def specimen_format(path: AnyPath) -> str:
     """Format of a file of a specimen by its content; "ase" if it is not one of the others, str."""
-    with open_for_reading(path) as file:
-        head = file.read(_HEAD).decode("latin-1")
+    head = read_head(path, _HEAD).decode("latin-1")
     if is_dump(head):
         return "lammps-dump"
     if is_nodes(path):
         return "tapsim"
-    return "lammps-data" if is_data(head) else "ase"
+    if is_data(head):
+        return "lammps-data"
+    return "xyz" if is_xyz(without_compression(path).suffix.lower(), head) else "ase"
 
 
-def _read_ase(path):
+def _read_ase(path, frame=-1):
+    """Atoms of ASE, from a file of any format that it knows."""
+    head = read_head(path, 64)
+    if head.startswith(b"---") and b"LAMMPS" in head:
+        raise FileError(f"{str(path)!r} is a LAMMPS dump in YAML, expected one of style custom or atom, or a data file")
+    frame = checked_frame(frame, None, f"{str(path)!r}")
     read = optional_import("ase.io", "reading this specimen").read
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            # neither "@" nor "-" in a name has a meaning of its own here
-            atoms = read(os.path.abspath(path), do_not_split_by_at_sign=True)
-        if not hasattr(atoms, "get_chemical_symbols"):
-            raise ValueError("it contains no atoms")
-    except Exception as error:  # every format of ASE has its own errors
-        reason = (str(error) or type(error).__name__).splitlines()[0]
-        raise FileError(f"cannot read {str(path)!r} as a specimen: {reason:.200}") from error
+    filetype = optional_import("ase.io.formats", "reading this specimen").filetype
+    kind = "no format"
+    with tempfile.TemporaryDirectory() as folder:
+        source = os.path.abspath(path)
+        if is_compressed(path):
+            source = os.path.join(folder, without_compression(path).name)
+            with open(source, "wb") as file:
+                file.write(read_bytes(path, "a file of atoms", _MAX_BYTES))
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                kind = filetype(source)
+                if kind.startswith("lammps"):
+                    raise FileError(
+                        f"{str(path)!r} is a file of the format {kind}, whose types ASE reads as atomic numbers, "
+                        "expected a text dump or a data file of LAMMPS"
+                    )
+                # neither "@" nor "-" in a name has a meaning of its own here
+                atoms = read(source, index=frame, do_not_split_by_at_sign=True)
+            if not hasattr(atoms, "get_chemical_symbols"):
+                raise ValueError("it contains no atoms")
+        except FileError:
+            raise
+        except Exception as error:  # every format of ASE has its own errors
+            if frame != -1 and isinstance(error, IndexError | StopIteration):
+                raise FileError(f"{str(path)!r} has no frame {frame}") from error
+            reason = f"{type(error).__name__}: {error}".splitlines()[0]
+            raise FileError(
+                f"cannot read {str(path)!r} as a specimen: expected a dump or data file of LAMMPS, nodes of TAPSim, "
+                f".xyz, or a format of ASE with chemical symbols, which takes it for {kind} and says: {reason:.150}"
+            ) from error
+    warn_of_occupancy(atoms)
     return atoms

@@ -10,13 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from apt_evap._common.files import FileError, TruncatedFile, open_for_reading, replace_file
+from apt_evap._common.files import FileError, TruncatedFile, replace_file
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_switch
 from apt_evap.detection.hits import Hits
+from apt_evap.io._texts import read_bytes
 from apt_evap.warnings import DataWarning
 
 SIGNATURE = b"TAPSIM RESULTS DATA"
+_MAX_BYTES = 1 << 36
 _HEADER = 1 << 16  # bytes that contain the header
 _CHUNK = 1 << 14
 _NM_PER_M, _MM_PER_M, _NS_PER_S, _V_PER_NM = 1e9, 1e3, 1e9, 1e-9
@@ -56,6 +58,7 @@ _EXTRA: dict[str, tuple[str, float, str]] = {
     "normal": ("normal", 1, ""),
     "apex": ("apex", _NM_PER_M, "nm"),
 }
+WRITTEN = ("x", "y", "time_of_flight", "voltage", "positions", "ion", "site", *_EXTRA)
 
 
 def read_tapsim(path: AnyPath, *, partial: bool = False) -> Hits:
@@ -84,18 +87,14 @@ def read_tapsim(path: AnyPath, *, partial: bool = False) -> Hits:
         If it ends in the middle of a row and `partial` is False.
     """
     check_switch(partial, "partial")
-    with open_for_reading(path) as file:
-        head = file.read(_HEADER)
-        if not head.startswith(SIGNATURE):
-            raise FileError(f"{str(path)!r} does not begin like a result table of TAPSim, expected {SIGNATURE!r}")
-        match = re.search(rb"^(ASCII|BINARY)\r?\n", head, re.MULTILINE)
-        if match is None:
-            raise FileError(f"{str(path)!r} has no line ASCII or BINARY after its header, as in a table of TAPSim")
-        file.seek(match.end())
-        parts = []
-        while more := file.read(1 << 20):
-            parts.append(more)
-    data = b"".join(parts)
+    data = read_bytes(path, "a result table of TAPSim", _MAX_BYTES)
+    head = data[:_HEADER]
+    if not head.startswith(SIGNATURE):
+        raise FileError(f"{str(path)!r} does not begin like a result table of TAPSim, expected {SIGNATURE!r}")
+    match = re.search(rb"^(ASCII|BINARY)\r?\n", head, re.MULTILINE)
+    if match is None:
+        raise FileError(f"{str(path)!r} has no line ASCII or BINARY after its header, as in a table of TAPSim")
+    data = data[match.end() :]
     if match[1] == b"BINARY":
         rows = _binary(data, path, partial)
     else:

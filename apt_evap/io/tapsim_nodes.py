@@ -10,10 +10,11 @@ import re
 
 import numpy as np
 
-from apt_evap._common.files import FileError, TruncatedFile, open_for_reading, read_small_file, replace_file
+from apt_evap._common.files import FileError, TruncatedFile, replace_file
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_kind, check_number, check_switch
 from apt_evap.evaporation.thermal import Arrhenius
+from apt_evap.io._texts import read_bytes, read_head
 from apt_evap.io.lammps import Atoms
 from apt_evap.specimen.tip import Tip
 
@@ -29,8 +30,7 @@ _SPECIMEN, _CHUNK = 1000.0, 1 << 14
 
 def is_nodes(path: AnyPath) -> bool:
     """Whether a file begins like a node file of TAPSim."""
-    with open_for_reading(path) as file:
-        return _HEADER.match(file.read(1 << 12)) is not None
+    return _HEADER.match(read_head(path, 1 << 12)) is not None
 
 
 def read_nodes(path: AnyPath) -> Atoms:
@@ -53,7 +53,7 @@ def read_nodes(path: AnyPath) -> Atoms:
     TruncatedFile
         If it ends before its last node.
     """
-    data = read_small_file(path, _MAX_BYTES, "a node file of TAPSim")
+    data = read_bytes(path, "a node file of TAPSim", _MAX_BYTES)
     match = _HEADER.match(data[: 1 << 12])
     if match is None:
         raise FileError(f"{str(path)!r} does not begin like a node file of TAPSim, such as b'ASCII 1000 0 0'")

@@ -12,7 +12,15 @@ from numpy.typing import ArrayLike
 
 from apt_evap._common.codec import checked, from_plain, number, part, settings, switch, vector
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence, check_switch
+from apt_evap._common.validation import (
+    check_array,
+    check_count,
+    check_kind,
+    check_number,
+    check_sequence,
+    check_switch,
+    check_values,
+)
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.registration.correlation_search import (
@@ -131,7 +139,7 @@ class Registration:
         x, y : ndarray
             Measured detector coordinates [mm].
         """
-        z = np.asarray(x, float) + 1j * np.asarray(y, float)
+        z = check_values(x, "x", finite=False) + 1j * check_values(y, "y", finite=False)
         z = self.transform.forth(z)
         if self.distortion is not None:
             z = self.distortion.forth(z)
@@ -150,7 +158,7 @@ class Registration:
         x, y : ndarray
             Simulated detector coordinates [mm].
         """
-        z = np.asarray(x, float) + 1j * np.asarray(y, float)
+        z = check_values(x, "x", finite=False) + 1j * check_values(y, "y", finite=False)
         if self.distortion is not None:
             z = self.distortion.back(z)
         z = self.transform.back(z)

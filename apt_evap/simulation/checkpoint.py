@@ -167,7 +167,7 @@ class CheckpointWriter:
 
     def _refuse_loss(self, n_ions):
         """Refuse to replace ions that the new run would not contain."""
-        name, replaces = self._name, f"overwrite=True (--force) replaces it"
+        name, replaces = self._name, "overwrite=True (--force) replaces it"
         choices = f"resume=True (--resume) continues it, {replaces}"
         unfinished, target = self._checkpoint.unfinished, self._checkpoint.path
         try:

@@ -1,5 +1,6 @@
 """Conversion of specimens to and from Atoms objects of ASE, an optional package."""
 
+import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from apt_evap._common.optional_imports import optional_import
 from apt_evap._common.types import Floats
 from apt_evap.specimen.materials import Material, as_material
+from apt_evap.warnings import SpecimenWarning
 
 if TYPE_CHECKING:
     import ase
@@ -37,9 +39,15 @@ def from_atoms(atoms: "ase.Atoms", materials: Mapping[str, Material] | None = No
     ------
     ValueError
         If it is not an Atoms object, if a symbol has no material, or if the atoms are a shell.
+
+    Warns
+    -----
+    SpecimenWarning
+        If sites are occupied partially.
     """
     if not all(hasattr(atoms, name) for name in ("get_chemical_symbols", "get_positions", "arrays")):
         raise ValueError(f"atoms must be an ase.Atoms object, got {atoms!r:.80}")
+    warn_of_occupancy(atoms)
     if np.any(atoms.arrays.get("support", False)):
         raise ValueError("atoms must be a complete specimen, got a shell: its inner side would count as a surface")
     symbols = atoms.get_chemical_symbols()
@@ -54,6 +62,29 @@ def from_atoms(atoms: "ase.Atoms", materials: Mapping[str, Material] | None = No
     if "evaporable" in atoms.arrays:
         arguments["evaporable"] = atoms.arrays["evaporable"]
     return arguments
+
+
+def warn_of_occupancy(atoms: "ase.Atoms") -> None:
+    """Warn of sites that are occupied partially, as in a CIF of a disordered crystal: ASE keeps one atom on each.
+
+    Warns
+    -----
+    SpecimenWarning
+        Names the occupancy of one of the sites.
+    """
+    sites = (getattr(atoms, "info", None) or {}).get("occupancy")  # of a CIF: a mapping for each kind of site
+    sites = [site for site in (sites.values() if isinstance(sites, Mapping) else ()) if isinstance(site, Mapping)]
+    sites += [{"an atom": share} for share in np.unique(atoms.arrays.get("occupancy", ()))]  # of a PDB
+    for site in sites:
+        if any(isinstance(share, float) and 0 < share < 1 for share in site.values()):
+            shares = ", ".join(f"{name} {share:g}" for name, share in site.items())
+            warnings.warn(
+                f"the structure has sites that are occupied partially ({shares}), which become ordered and complete: "
+                "place atoms and vacancies at random before",
+                SpecimenWarning,
+                stacklevel=4,
+            )
+            return
 
 
 def to_atoms(

@@ -26,7 +26,7 @@ from apt_evap._common.validation import (
     digest,
     short_text,
 )
-from apt_evap.specimen import ase_atoms, lattice, posture
+from apt_evap.specimen import ase_atoms, lattice, orientation_check
 from apt_evap.specimen.alloy import check_solutes
 from apt_evap.specimen.materials import Material, as_material
 from apt_evap.specimen.phases import Arrangement, Phase, check_phases
@@ -315,12 +315,14 @@ class Tip:
         Raises
         ------
         ValueError
-            If shapes disagree, if an index has no element, or if atoms are at the same place or far away.
+            If shapes disagree, if an index has no element, if atoms are at the same place or far away, or if their
+            distances show that the positions are in another unit.
 
         Warns
         -----
         SpecimenWarning
-            If the specimen stands upside down or lies on its side.
+            If the specimen stands upside down or lies on its side, is in several bodies that do not touch, or has atoms
+            closer than 0.6 or farther than 1.6 times the nearest neighbour distance of their materials.
         """
         tip = cls.__new__(cls)
         tip._shell, tip._phase, tip._has_gaps, tip.phases = None, None, False, ()  # type: ignore[assignment]
@@ -365,7 +367,11 @@ class Tip:
                 f"{span[2]:.4g} nm: is one atom far away?"
             )
         tip.apex = float(high[2])
-        posture.warn_if_odd(tip.positions)
+        used = np.unique(tip.species).tolist()
+        expected = [elements[number].nearest_neighbour_distance for number in used]
+        orientation_check.check_spacing(distance, expected, [elements[number].name for number in used], n)
+        orientation_check.warn_of_bodies(tip.positions, max(distance, *expected))
+        orientation_check.warn_of_direction(tip.positions)
         if evaporable is None:
             evaporable = tip.positions[:, 2] >= (low[2] + high[2]) / 2
         tip.evaporable = check_array(evaporable, "evaporable", (n,), dtype=bool).copy()

@@ -190,7 +190,7 @@ def test_arrays_by_name(folder, capsys):
         (["run.h5", "map.npz", "--registration", "0,-1,0,0"], "scale must be a finite number > 0"),
         (["run.h5", "map.npz", "--temperature", "0"], "temperature must be a finite number [K] > 0"),
         (["run.h5", "map.npz", "--arrays", "counts"], "--arrays must name values, edges in x and y"),
-        (["run.h5", "ions.epos", "--unit", "mm"], "--unit is for a map in an .npz file, got 'ions.epos'"),
+        (["run.h5", "ions.epos", "--arrays", "a,b,c"], "--arrays is for a map in an .npz file, got 'ions.epos'"),
         (["run.h5", "other.h5"], "'other.h5' is a run: its ions need --perturbation"),
         (["run.h5", "ions.epos", "--perturbation", "Unperturbed"], "'ions.epos' contains measured ions"),
         (["run.h5", "none.epos"], "cannot read 'none.epos'"),

@@ -103,3 +103,28 @@ def test_measured_ions_need_ranges_for_species(folder, capsys):
     assert "--ranges" in capsys.readouterr().err
     assert main(["map", "ions.nxs", "--ranges", "a.rng", "--species", "Cr", "-o", "cr.png", "--json"]) == 0
     assert "Cr" in json.loads(capsys.readouterr().out)["maps"][0]["title"]
+
+
+def test_an_export_says_what_it_leaves_out(folder, small_tip, capsys):
+    ae.Simulation(small_tip, seed=1).run(20, progress=False).save("run.h5")
+    capsys.readouterr()
+    assert main(["export", "run.h5", "-o", "run.pos", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert {"x", "y", "outcome", "element"} <= set(told["left_out"]) and told["zeros"] == []
+    assert main(["export", "run.h5", "-o", "run.epos"]) == 0
+    line = capsys.readouterr().out
+    assert ", without " in line and "element" in line and ", with zeros for " in line and "pulse_voltage" in line
+    assert main(["export", "oxcart.h5", "-o", "oxcart.epos"]) == 0
+    out, err = capsys.readouterr()
+    assert "without the columns start_counter" in err and "with zeros for positions, mass_to_charge" in out
+
+
+def test_units_of_a_file_in_the_shell(folder, capsys):
+    ions = ae.Hits(x=[-3.0, 3.0], y=[-3.0, 3.0], voltage=[50.0, 60.0], pulse_voltage=[1.0, 2.0])
+    ae.write("cm.epos", ions)
+    assert main(["info", "cm.epos", "--unit", "cm", "--voltage-unit", "V", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)["columns"]
+    assert told["x"] == [-30, 30] and told["voltage"] == [50, 60]
+    assert main(["info", "cm.epos"]) == 0 and "--voltage-unit V reads them in V" in capsys.readouterr().err
+    for arguments, message in ((["--unit", "inch"], "--unit"), (["--format", "pos", "--unit", "cm"], "cm.epos")):
+        assert main(["info", "cm.epos", *arguments]) == 2 and message in capsys.readouterr().err

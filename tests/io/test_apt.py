@@ -89,7 +89,7 @@ def test_units_are_converted(save, name, column, unit, factor):
     assert strict(save(position_section(np.ones((3, 3)))), columns="positions").positions.max() == 1
 
 
-@pytest.mark.parametrize("unit", ["furlong", "", "ns", "MM"])
+@pytest.mark.parametrize("unit", ["furlong", "ns", "V", "Mm mm"])
 def test_a_section_of_unknown_unit_is_kept_as_it_is(save, unit):
     path = save(apt_section("XDet_mm", THREE, unit), apt_section("YDet_mm", THREE, "mm"))
     with pytest.warns(UserWarning, match=rf"a\.apt.*'XDet_mm' has the unknown unit '{unit}'.* not x"):
@@ -248,3 +248,38 @@ def test_some_columns_only(tmp_path):
     assert hits.columns == ("y", "pulse_id") and hits.y.tolist() == columns["y"].tolist()
     with pytest.raises(FileError, match=r"a\.apt.*no column 'voltage', available are time_of_flight, .*pulse_id"):
         read(path, columns=("x", "voltage"))
+
+
+def test_sections_of_ap_suite(save):
+    """Names of IVAS and AP Suite; the preferred one is the column, the others stay as they are."""
+    sections = {
+        "Mass": ("da", "mass_to_charge", 1.0),
+        "Voltage": ("V", "voltage", 1.0),
+        "Pulse Voltage": ("kV", "pulse_voltage", 1e3),
+        "Epos ToF": ("NS", "time_of_flight", 1.0),
+        "XDet_mm": ("", "x", 1.0),
+        "YDet_mm": ("Mm", "y", 1.0),
+    }
+    lower = {name.lower(): of for name, of in sections.items()} | {"mass": ("DA", "mass_to_charge", 1.0)}
+    for names in (sections, lower):
+        counts = [apt_section(name, np.array([1, 40, 0], "i2"), "") for name in ("pulseDelta", "pulse")]
+        parts = [apt_section(name, THREE, unit) for name, (unit, _, _) in names.items()]
+        hits = strict(save(*parts, *counts, apt_section("tof", 2 * THREE, "ns"), apt_section("Vap", THREE, "V")))
+        for _, column, factor in names.values():
+            np.testing.assert_allclose(getattr(hits, column), THREE * factor, rtol=1.2e-7)
+        assert hits.pulses.tolist() == [1, 40, 0] and set(hits.extra) == {"tof", "pulse", "Vap"}
+        assert strict(hits.source, columns=("voltage", "pulses")).columns == ("voltage", "pulses")
+    for names in (("Delta Pulse", "v", "tof"), ("pulsedelta", "VOLTAGE", "Time of Flight")):
+        counts = apt_section(names[0], np.array([1, 2, 3], "u4"))
+        hits = strict(save(counts, apt_section(names[1], THREE, "v"), apt_section(names[2], THREE, "s")))
+        assert hits.columns == ("time_of_flight", "voltage", "pulses") and hits.extra == {}
+        np.testing.assert_allclose(hits.time_of_flight, THREE * 1e9, rtol=1.2e-7)
+
+
+def test_a_preferred_section_that_does_not_fit_leaves_its_place_to_the_next(save):
+    path = save(apt_section("tofc", THREE, "furlong"), apt_section("tof", THREE, "ns"))
+    with pytest.warns(UserWarning, match="'tofc' has the unknown unit"):
+        hits = read(path)
+    assert hits.time_of_flight.tolist() == THREE.tolist() and set(hits.extra) == {"tofc"}
+    with pytest.raises(FileError, match=r"a\.apt': section 'pulseDelta' must be the number of pulses .* got -3"):
+        read(save(apt_section("pulseDelta", np.array([1, -3, 2], "i2"))))

@@ -9,10 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from ion_files import apt, apt_section, epos, ions_of, pyccapt_instrument, raw
 
 from apt_evap._common.files import FileError, TruncatedFile
 from apt_evap.detection.hits import Hits, Outcome
-from apt_evap.io.formats import FORMATS, chunks, read, write
+from apt_evap.io.formats import FORMATS, chunks, left_out, read, write
 from apt_evap.simulation.run import Run
 from apt_evap.simulation.simulation import Simulation
 from apt_evap.warnings import DataWarning
@@ -298,3 +299,78 @@ def test_measured_file_comes_back_to_the_byte(tmp_path):
     assert np.count_nonzero(hits.multiplicity > 1) / len(hits) == pytest.approx(0.041, abs=5e-4)
     write(tmp_path / "a.epos", hits)
     assert (tmp_path / "a.epos").read_bytes() == SILICON.read_bytes()
+
+
+@pytest.mark.parametrize("suffix", [".epos", ".raw"])
+def test_the_unit_of_detector_coordinates_can_be_given(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(epos(ions_of([1, 2])) if suffix == ".epos" else raw([1, 2, 2])[0])
+    hits = read(path)
+    for unit, factor in (("mm", 1), ("cm", 10), ("m", 1000), ("um", 1e-3)):
+        part = read(path, detector_unit=unit, columns=("x", "voltage"))
+        np.testing.assert_allclose(part.x, factor * hits.x, rtol=1.2e-7)
+        np.testing.assert_array_equal(part.voltage, hits.voltage)
+        parts = list(chunks(path, 2, detector_unit=unit))
+        np.testing.assert_allclose(np.concatenate([part.y for part in parts]), factor * hits.y, rtol=1.2e-7)
+    for function in (read, lambda path, **options: list(chunks(path, 2, **options))):
+        with pytest.raises(ValueError, match="detector_unit must be one of mm, cm, m, um, got 'inch'"):
+            function(path, detector_unit="inch")
+
+
+def test_a_detector_of_many_metres_is_warned_of_in_every_format(tmp_path):
+    ions = {"time_of_flight": [5.0, 6.0], "mass_to_charge": [20.0, 20.0], "positions": np.ones((2, 3))}
+    ions |= {"pulse_id": [0, 1], "voltage": [5e3, 5e3]}
+    wide, usual = (Hits(x=[0.0, width], y=[0.0, 1.0], **ions) for width in (501.0, 499.0))
+    (tmp_path / "a.apt").write_bytes(
+        apt(
+            [apt_section("XDet_mm", np.array([0, 501], "f4"), "mm"), apt_section("YDet_mm", np.zeros(2, "f4"), "mm")], 2
+        )
+    )
+    pyccapt_instrument(tmp_path / "a.h5", 2, x=np.array([0.0, 50.1]))
+    edges = np.linspace(0, 501, 9)
+    np.savez(tmp_path / "a.npz", counts=np.ones((8, 8), int), x_edges_mm=edges, y_edges_mm=edges)
+    for suffix, options in ((".epos", {}), (".nxs", {"elements": ["Al"]}), (".tapsim", {})):
+        write(tmp_path / f"a{suffix}", wide, **options)
+        write(tmp_path / f"usual{suffix}", usual, **options)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            read(tmp_path / f"usual{suffix}")
+    rows = raw([1, 2])[1]
+    rows["x"] = [0, 501]
+    (tmp_path / "a.raw").write_bytes(rows.tobytes())
+    for suffix in (".epos", ".nxs", ".tapsim", ".apt", ".h5", ".npz", ".raw"):
+        with pytest.warns(DataWarning, match=rf"a\{suffix}' has detector coordinates in 501 x .* are they in mm\?"):
+            read(tmp_path / f"a{suffix}")
+    for suffix in (".epos", ".apt", ".raw"):
+        with pytest.warns(DataWarning, match="are they in mm") as caught:
+            list(chunks(tmp_path / f"a{suffix}", 2))
+        assert len(caught) == 1
+
+
+LEFT_OUT = {
+    ".epos": {"Temp", "flag", "name"},
+    ".pos": {"x", "y", "voltage", "pulse_id", "multiplicity", "Temp", "flag", "name"},
+    ".tapsim": {"mass_to_charge", "pulse_id", "multiplicity", "Temp", "flag", "name"},
+    ".nxs": {"name"},
+    ".xyz": {"flag"},
+    ".vtp": {"flag"},
+    ".csv": set(),
+}
+
+
+@pytest.mark.parametrize("suffix", LEFT_OUT)
+def test_columns_without_a_place_are_named(tmp_path, suffix):
+    extra = {"Temp": [50.0, 51.0], "flag": [True, False], "name": ["a", "b"]}
+    columns = {"x": [1.0, 2.0], "y": [0.0, 1.0], "positions": np.ones((2, 3)), "mass_to_charge": [20.0, 20.0]}
+    measured = Hits(**columns, voltage=[5e3, 5e3], pulse_id=[0, 1], multiplicity=[1, 1], extra=extra)
+    options = {"elements": ["Al"]} if suffix == ".nxs" else {}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", DataWarning)
+        write(tmp_path / f"a{suffix}", measured, **options)
+    names = ", ".join(name for name in (*measured.columns, *extra) if name in LEFT_OUT[suffix])
+    expected = [f"is without the columns {names}, for which a {suffix} file has no place"] if names else []
+    assert [str(entry.message).partition("' ")[2] for entry in caught] == expected
+    assert left_out(tmp_path / f"a{suffix}", measured)[0] == tuple(names.split(", ") if names else ())
+    zeros = {".epos": ("time_of_flight", "pulse_voltage", "pulses")}
+    assert left_out("a" + suffix, measured)[1] == zeros.get(suffix, ())
+    assert all(entry.suffix in LEFT_OUT for entry in FORMATS if entry.write)

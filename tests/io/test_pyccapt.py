@@ -65,7 +65,7 @@ def test_every_column_of_a_calibration(tmp_path):
     assert hits.mass_to_charge.tolist() == [20, 21, 22, 23]
     assert (hits.voltage == 4000).all() and (hits.pulse_voltage == 800).all() and (hits.time_of_flight == 500).all()
     assert hits.pulse_id.tolist() == [0, 1, 1, 2] and hits.multiplicity.tolist() == [1, 2, 2, 1]
-    assert set(hits.extra) == {"uncalibrated_mass_to_charge", "start_counter"}
+    assert set(hits.extra) == {"uncalibrated_mass_to_charge", "start_counter", "multi"}
 
 
 def test_columns_of_steps_that_were_not_done_are_absent(tmp_path):
@@ -106,3 +106,34 @@ def test_refusals(tmp_path):
         del file["dld/x"]
         file["dld/x"] = h5py.ExternalLink("other.h5", "x")
     refused("dld/x is a link: data outside the file are not read")
+
+
+@pytest.mark.parametrize("name", ["x", "y", "t"])
+def test_raw_counts_are_refused(tmp_path, name):
+    pyccapt_instrument(tmp_path / "a.h5", **{name: np.arange(8, dtype="i4") * 300})
+    with pytest.raises(FileError, match=r"a\.h5': \w+ are integers, raw counts of the detector, expected cm and ns"):
+        read(tmp_path / "a.h5")
+    with pytest.raises(FileError, match="raw counts"):
+        read(tmp_path / "a.h5", columns="voltage")
+    pyccapt_calibrated(tmp_path / "b.h5", CALIBRATED | {"x_det (cm)": np.arange(4)})
+    with pytest.raises(FileError, match="raw counts"):
+        read(tmp_path / "b.h5")
+
+
+def test_the_multiplicity_of_a_calibration(tmp_path):
+    without = {name: values for name, values in CALIBRATED.items() if name != "start_counter"}
+    for numbers in ([1, 2, 0, 1], [1, 2, 2, 1]):  # for the first ion of a pulse, or for all
+        pyccapt_calibrated(tmp_path / "a.h5", without | {"multi": np.array(numbers), "delta_p": np.array([5, 2, 0, 1])})
+        hits = read(tmp_path / "a.h5")
+        assert hits.pulse_id.tolist() == [0, 1, 1, 2] and hits.multiplicity.tolist() == [1, 2, 2, 1]
+        assert hits.pulses.tolist() == [5, 2, 0, 1] and "multi" not in hits.extra
+    pyccapt_calibrated(tmp_path / "a.h5", without | {"multi": np.array([1, 3, 1, 1])})
+    hits = read(tmp_path / "a.h5")
+    assert hits.pulse_id is None and hits.extra["multi"].tolist() == [1, 3, 1, 1]
+
+
+def test_a_table_of_pandas_is_named(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["df/table"] = np.zeros(3, [("index", "i8"), ("values_block_0", "f8", 4)])
+    with pytest.raises(FileError, match=r"a\.h5' contains a table of pandas .*, expected format='fixed'"):
+        read(tmp_path / "a.h5")

@@ -1,14 +1,20 @@
 """Specimens from LAMMPS and ASE; those of TAPSim are in test_tapsim.py."""
 
+import bz2
+import gzip
+import lzma
 import sys
 import time
+import tracemalloc
+import warnings
 
 import numpy as np
 import pytest
-from ion_files import lammps_data, lammps_dump
+from ion_files import lammps_data, lammps_dump, tapsim_nodes
 
 import apt_evap as ae
 from apt_evap._common.files import FileError
+from apt_evap.warnings import SpecimenWarning
 
 PLACES = np.random.default_rng(2).uniform(1, 9, (12, 3))  # [Angstrom]
 TYPES = [1] * 8 + [2] * 4
@@ -82,7 +88,7 @@ def test_scaled_coordinates(save):
 @pytest.mark.parametrize("style", ["atomic", "charge", "molecular", "full"])
 def test_data(save, style):
     check(ae.read_tip(save(lammps_data(PLACES, TYPES, style)), NAMES))
-    check(ae.read_tip(save(lammps_data(PLACES, TYPES, style, more=" 0 0 -1")), NAMES))  # periodic images
+    check(ae.read_tip(save(lammps_data(PLACES, TYPES, style, more=" 0 0 0")), NAMES))  # periodic images
     text = lammps_data(PLACES, TYPES, style, comment=False)
     check(ae.read_tip(save(text), NAMES, style=style))
     if style != "atomic":
@@ -103,7 +109,7 @@ def test_type_labels_are_names(save):
 
 def test_types_without_a_name_are_refused(save):
     """ASE makes hydrogen of them."""
-    for text in (lammps_dump(PLACES, TYPES), lammps_data(PLACES, TYPES)):
+    for text in (lammps_dump(PLACES, TYPES), lammps_data(PLACES, TYPES).replace(" # Al", "")):
         with pytest.raises(
             FileError, match=r"a\.lmp' has types without a name.* types=\{1: 'Al'\}, got none for 1, 2$"
         ):
@@ -120,7 +126,7 @@ def test_types_without_a_name_are_refused(save):
         ("ITEM: BOX", "ITEM: CAR", "no line ITEM: BOX BOUNDS"),
         ("ITEM: ATOMS", "ITEM: THINGS", "no line ITEM: ATOMS"),
         ("type x y z", "type x y", "no columns x y z"),
-        ("id type x", "id kind x", "neither a column type nor a column element"),
+        ("id type x", "id kind x", "no column type, typelabel or element"),
         ("\n2 1 ", "\n2 1 red ", "expected numbers for the coordinates"),
         ("\n2 1 ", "\n2 1 nan ", "expected finite coordinates"),
     ],
@@ -189,7 +195,7 @@ def test_ase_that_is_not_installed(save, monkeypatch):
     for name in ["ase.io", *(name for name in sys.modules if name.startswith("ase."))]:
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(ImportError, match="reading this specimen needs ase, which is not installed: pip install ase"):
-        ae.read_tip(save("1\n\nAl 0 0 0\n", "a.xyz"))
+        ae.read_tip(save("data_a\n", "a.cif"))
 
 
 def test_a_coordinate_far_away(save):
@@ -213,3 +219,254 @@ def test_repeated_spaces_take_no_quadratic_time(save, before, repeated, after):
     with pytest.raises(FileError, match=r"a\.lmp"):
         ae.read_tip(path, format="lammps-data")
     assert time.process_time() - begin < 1.5  # 0.05 s; quadratic time: 3 s to a minute
+
+
+@pytest.mark.parametrize("tilted", [False, True])
+@pytest.mark.parametrize(
+    "columns", ["x y z ix iy iz", "xs ys zs ix iy iz", "x y z iy", "xu yu zu ix iy iz", "x y z xu yu zu"]
+)
+def test_atoms_in_other_periodic_images_are_unwrapped(save, columns, tilted):
+    """A needle on the edge of a periodic box is one body, not four quarters."""
+    low, (xy, xz, yz) = np.array([-1.0, 0.0, 2.0]), (3.0, -2.0, 1.0) if tilted else (0.0, 0.0, 0.0)
+    cell = np.array([[12.0, 0, 0], [xy, 20, 0], [xz, yz, 28]])
+    around = np.array([(0, 12.0), (0, 20.0), (0, 28.0)]) + low[:, None]
+    around += [(min(0, xy, xz, xy + xz), max(0, xy, xz, xy + xz)), (min(0, yz), max(0, yz)), (0, 0)]
+    bounds = [(*row, tilt) if tilted else tuple(row) for row, tilt in zip(around, (xy, xz, yz), strict=True)]
+    flags = np.random.default_rng(1).integers(-3, 4, (12, 3))
+    if columns == "x y z iy":
+        flags *= [0, 1, 0]
+    wrapped = PLACES - flags @ cell
+    values = {
+        **dict(zip(("x", "y", "z"), wrapped.T, strict=True)),
+        **dict(zip(("xs", "ys", "zs"), ((wrapped - low) @ np.linalg.inv(cell)).T, strict=True)),
+        **dict(zip(("xu", "yu", "zu"), PLACES.T, strict=True)),
+        **dict(zip(("ix", "iy", "iz"), flags.T, strict=True)),
+    }
+    rows = np.column_stack([values[name] for name in columns.split()])
+    text = lammps_dump(rows, TYPES, f"id type {columns}", bounds, tilt="xy xz yz " if tilted else "")
+    tip = ae.read_tip(save(text), NAMES)
+    np.testing.assert_allclose(tip.positions, 0.1 * PLACES, rtol=0, atol=1e-13)  # three boxes of 28 Angstrom
+
+
+@pytest.mark.parametrize("style", ["atomic", "full", "sphere"])
+def test_periodic_images_of_a_data_file(save, style):
+    cell = np.array([[10.0, 0, 0], [3, 20, 0], [-2, 1, 30]])
+    vectors = "10 0 0 avec\n3 20 0 bvec\n-2 1 30 cvec\n0 0 0 abc origin\n"
+    flags = np.random.default_rng(1).integers(-3, 4, (12, 3))
+    boxes = {"": np.diag(np.diag(cell)), "3 -2 1 xy xz yz\n": cell, vectors: cell}
+    for tilt, vectors in boxes.items():
+        before = {"atomic": "{k} {t}", "full": "{k} 1 {t} 0.5", "sphere": "{k} {t} 3.0 7.8"}[style]
+        rows = [
+            f"{before.format(k=k, t=kind)} {' '.join(map(repr, place.tolist()))} {' '.join(map(str, flag))}"
+            for k, (kind, place, flag) in enumerate(zip(TYPES, PLACES - flags @ vectors, flags, strict=True), 1)
+        ]
+        head = "12 atoms\n2 atom types\n0 10 xlo xhi\n0 20 ylo yhi # a box\n0 30 zlo zhi\n"
+        text = "\n".join([f"a specimen\n\n{head}{tilt}\nAtoms # {style}\n", *rows, ""])
+        tip = ae.read_tip(save(text), NAMES)
+        np.testing.assert_allclose(tip.positions, 0.1 * PLACES, rtol=0, atol=1e-13)
+    with pytest.raises(FileError, match="periodic images, but not the bounds of its box"):
+        ae.read_tip(save(text.replace("bvec", "dvec")), NAMES, format="lammps-data")
+    with pytest.raises(FileError, match=r"expected integers for the periodic images, got 0\.5"):
+        ae.read_tip(save(text.replace(rows[3], rows[3].rpartition(" ")[0] + " 0.5")), NAMES)
+
+
+def test_numbers_of_types_are_those_of_the_column_type(save):
+    """LAMMPS writes the element C for every atom unless it is told the names."""
+    lines = [*lammps_dump(PLACES, TYPES).splitlines()[:8], "ITEM: ATOMS id type element x y z"]
+    rows = [
+        f"{k} {kind} C {' '.join(map(repr, place.tolist()))}"
+        for k, (kind, place) in enumerate(zip(TYPES, PLACES, strict=True), 1)
+    ]
+    text = "\n".join([*lines, *rows, ""])
+    check(ae.read_tip(save(text), NAMES))
+    with pytest.raises(FileError, match=r"the element C for all atoms, as LAMMPS writes it .* types=\{1: 'Al'\}"):
+        ae.read_tip(save(text))
+    carbon = ae.Material("C", "fcc", 0.4, 60.0, 2, 12.0)
+    assert ae.read_tip(save(text), {"C": carbon}).elements == (carbon,)
+    named = text.replace(" 1 C ", " 1 Al ").replace(" 2 C ", " 2 Cu ")
+    check(ae.read_tip(save(named)))
+    strong = ae.material("Cu", evaporation_field=25.0)
+    tip = ae.read_tip(save(named), {2: strong})  # the other name is that of the file
+    assert tip.evaporation_fields.tolist() == [19.0, 25.0]
+    with pytest.raises(FileError, match="has no atoms of type '3'"):
+        ae.read_tip(save(named), {3: "Cu"})
+
+
+def test_names_of_types_in_the_file(save):
+    check(ae.read_tip(save(lammps_dump(PLACES, ["Al"] * 8 + ["Cu"] * 4, "id typelabel x y z"))))
+    masses = lammps_data(PLACES, TYPES).replace("2 63.55", "2 63.55  # (Cu) copper")
+    check(ae.read_tip(save(masses)))
+    check(ae.read_tip(save(masses), NAMES))
+    assert {each.name for each in ae.read_tip(save(masses), {2: "Ni"}).elements} == {"Al", "Ni"}
+    with pytest.raises(FileError, match=r"got none for 2$"):
+        ae.read_tip(save(lammps_data(PLACES, TYPES).replace("2 63.55", "2 63.55 # the second")))
+
+
+def test_styles_that_are_not_read_are_named(save):
+    text = lammps_data(PLACES, TYPES)
+    with pytest.raises(FileError, match="states the style 'hybrid' of its section Atoms, which is not read"):
+        ae.read_tip(save(text.replace("# atomic", "# hybrid sphere")), NAMES)
+
+
+def test_a_frame_that_was_not_finished(save):
+    path = save(lammps_dump(PLACES, TYPES, frames=2) + "ITEM: TIMESTEP\n2\n")
+    with pytest.raises(FileError, match=r"NUMBER OF in frame 2, as in a LAMMPS dump; the frame before is frame=1"):
+        ae.read_tip(path, NAMES)
+    check(ae.read_tip(path, NAMES, frame=1), PLACES + 1)
+
+
+@pytest.mark.parametrize("opener", [gzip.open, bz2.open, lzma.open])
+@pytest.mark.parametrize("text", [lammps_dump(PLACES, TYPES), lammps_data(PLACES, TYPES)])
+def test_compressed_files(tmp_path, opener, text):
+    """ASE would make hydrogen and helium of the types."""
+    path = tmp_path / "a.dump.gz"  # the first bytes decide, not the suffix
+    with opener(path, "wt") as file:
+        file.write(text)
+    check(ae.read_tip(path, NAMES))
+    data = path.read_bytes()
+    for cut in (20, len(data) // 2, len(data) - 1):
+        path.write_bytes(data[:cut])
+        with pytest.raises(FileError, match=r"a\.dump\.gz'"):
+            ae.read_tip(path, NAMES, format="lammps-dump")
+
+
+def test_compressed_files_of_ase_and_other_compressions(tmp_path):
+    ase = pytest.importorskip("ase")
+    ase.Atoms("Al8Cu4", positions=PLACES, cell=[10, 10, 10]).write(tmp_path / "a.vasp")
+    (tmp_path / "a.vasp.xz").write_bytes(lzma.compress((tmp_path / "a.vasp").read_bytes()))
+    np.testing.assert_allclose(ae.read_tip(tmp_path / "a.vasp.xz").positions, 0.1 * PLACES, rtol=0, atol=0.51e-9)
+    for name, magic in (("a.dump.zst", b"(\xb5/\xfd"), ("a.zip", b"PK\3\4")):
+        (tmp_path / name).write_bytes(magic + bytes(40))
+        with pytest.raises(FileError, match=rf"{name}' cannot be decompressed .* only gzip, bzip2, xz are supported"):
+            ae.read_tip(tmp_path / name)
+
+
+@pytest.mark.parametrize("compress", [gzip.compress, bz2.compress, lzma.compress])
+def test_a_small_file_cannot_fill_the_memory(tmp_path, compress):
+    head = lammps_dump(PLACES, TYPES).encode()
+    (tmp_path / "bomb.gz").write_bytes(compress(head + b" " * (1 << 26)))
+    tracemalloc.start()
+    with pytest.raises(FileError, match=r"bomb\.gz' has more than 16,777,216 bytes after decompression"):
+        ae.read_tip(tmp_path / "bomb.gz", NAMES)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1 << 26
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32"])
+def test_encodings_of_windows(tmp_path, encoding):
+    nodes = tapsim_nodes(PLACES * 1e-10, [10] * 8 + [20] * 4).decode()
+    for text in (lammps_dump(PLACES, TYPES), lammps_data(PLACES, TYPES), nodes):
+        (tmp_path / "a.txt").write_bytes(text.encode(encoding))
+        check(ae.read_tip(tmp_path / "a.txt", {10: "Al", 20: "Cu"} if text is nodes else NAMES))
+
+
+def xyz(types, places=PLACES, comment="", after=""):
+    rows = "".join(
+        f"{kind} {' '.join(map(repr, place.tolist()))}{after}\n" for kind, place in zip(types, places, strict=True)
+    )
+    return f"{len(types)}\n{comment}\n{rows}"
+
+
+def test_xyz_with_any_names_of_types(save):
+    """LAMMPS writes the numbers of its types there, and so does OVITO."""
+    symbols = ["Al"] * 8 + ["Cu"] * 4
+    check(ae.read_tip(save(xyz(symbols), "a.xyz")))
+    for text in (xyz(TYPES, comment="Atoms. Timestep: 0"), xyz(TYPES, comment="Properties=species:I:1:pos:R:3")):
+        check(ae.read_tip(save(text, "a.xyz"), NAMES))
+        with pytest.raises(FileError, match=r"a\.xyz' has types without a name.* got none for 1, 2$"):
+            ae.read_tip(save(text, "a.xyz"))
+    check(ae.read_tip(save(xyz(["A"] * 8 + ["B"] * 4), "a.xyz"), {"A": "Al", "B": "Cu"}))
+    check(ae.read_tip(save(xyz([13] * 8 + [29] * 4, comment='Properties="Z:I:1:pos:R:3"'), "a.extxyz")))
+    check(ae.read_tip(save(xyz(symbols) + xyz(symbols, PLACES + 2), "a.xyz"), frame=0))
+    check(ae.read_tip(save(xyz(symbols) + xyz(symbols, PLACES + 2) + "\n", "a.xyz")), PLACES + 2)
+    check(ae.read_tip(save(xyz(symbols), "a.xyz"), units="nano"), factor=1.0)
+    for text, message in (
+        (xyz(symbols) + "Al 1 2 3\n", "line 15: expected the number of atoms, got 'Al 1 2 3'"),
+        (xyz(symbols).replace("12", "13", 1), "states 13 atoms but contains 12"),
+        (xyz(symbols, comment="Properties=species:S:1:force:R:3"), "expected columns species and pos of each atom"),
+        (xyz(symbols, comment="Properties=species:S:x"), "expected Properties=species:S:1:pos:R:3"),
+        (xyz(symbols).replace("Cu", "Cu x"), "expected numbers for the coordinates"),
+    ):
+        with pytest.raises(FileError, match=rf"a\.xyz'.*{message}"):
+            ae.read_tip(save(text, "a.xyz"))
+
+
+def test_xyz_as_ase_writes_it(tmp_path):
+    ase = pytest.importorskip("ase")
+    from ase.io import write
+
+    atoms = ase.Atoms("Al8Cu4", positions=PLACES, cell=[10, 10, 10], pbc=True)
+    atoms.new_array("evaporable", np.arange(12) > 3)
+    atoms.new_array("forces", np.ones((12, 3)))
+    write(tmp_path / "a.xyz", [atoms, atoms], format="extxyz")
+    tip = ae.read_tip(tmp_path / "a.xyz")
+    np.testing.assert_allclose(tip.positions, 0.1 * PLACES, rtol=0, atol=0.51e-9)
+    assert tip.evaporable.tolist() == (np.arange(12) > 3).tolist()
+
+
+def test_frames_of_ase(tmp_path):
+    ase = pytest.importorskip("ase")
+    from ase.io import write
+
+    symbols = "Al8Cu4"
+    write(tmp_path / "a.traj", [ase.Atoms(symbols, positions=PLACES + shift) for shift in (0, 1, 2)])
+    check(ae.read_tip(tmp_path / "a.traj", frame=1), PLACES + 1)
+    check(ae.read_tip(tmp_path / "a.traj"), PLACES + 2)
+    with pytest.raises(FileError, match=r"a\.traj' has no frame 7"):
+        ae.read_tip(tmp_path / "a.traj", frame=7)
+    with pytest.raises(ValueError, match="frame must be an integer, got ':'"):
+        ae.read_tip(tmp_path / "a.traj", frame=":")
+
+
+def test_what_ase_cannot_read_is_said_in_a_sentence(save):
+    pytest.importorskip("ase")
+    yaml = (
+        "---\ncreator: LAMMPS\ntimestep: 0\nnatoms: 1\nkeywords: [id, type, x, y, z]\ndata:\n  - [1, 1, 0, 0, 0]\n...\n"
+    )
+    with pytest.raises(FileError, match=r"a\.yaml' is a LAMMPS dump in YAML, expected one of style custom"):
+        ae.read_tip(save(yaml, "a.yaml"), {1: "Al"})
+    pdb = "ATOM      1  Q1  MOL     1       0.000   0.000   0.000  1.00  0.00          Qq\n"
+    for text, name in (("nothing\n", "a.dat"), (pdb, "a.pdb"), ("# 1\n", "a.cfg")):
+        with pytest.raises(FileError, match=r"a\.\w+' as a specimen: expected .* says: \w+: ") as caught:
+            ae.read_tip(save(text, name))
+        assert "\n" not in str(caught.value)
+    # ASE finds a dump behind other lines, too, and takes the numbers of its types for atomic numbers
+    with pytest.raises(FileError, match="whose types ASE reads as atomic numbers"):
+        ae.read_tip(save("a comment\n" + lammps_dump(PLACES, TYPES), "a.txt"), NAMES)
+
+
+CIF = """data_a
+_cell_length_a 4
+_cell_length_b 4
+_cell_length_c 4
+_cell_angle_alpha 90
+_cell_angle_beta 90
+_cell_angle_gamma 90
+_space_group_name_H-M_alt 'P 1'
+loop_
+_atom_site_label
+_atom_site_type_symbol
+_atom_site_fract_x
+_atom_site_fract_y
+_atom_site_fract_z
+_atom_site_occupancy
+Al1 Al 0 0 0 SHARE
+Cu1 Cu 0 0 0 0.25
+Al2 Al 0.5 0.5 0.5 1
+"""
+
+
+@pytest.mark.parametrize("share", ["0.75", "0.5"])
+def test_partial_occupancy_is_warned_of(save, share):
+    pytest.importorskip("ase")
+    from ase.io import read
+
+    path = save(CIF.replace("SHARE", share), "a.cif")
+    for make in (lambda: ae.read_tip(path), lambda: ae.Tip.from_atoms(read(path))):
+        with pytest.warns(SpecimenWarning, match=rf"sites that are occupied partially \(Al {share}, Cu 0.25\)"):
+            make()
+    ordered = CIF.replace("Cu1 Cu 0 0 0 0.25\n", "").replace("SHARE", "1")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ae.read_tip(save(ordered, "b.cif"))

@@ -6,11 +6,13 @@ import warnings
 
 import numpy as np
 import pytest
+import scipy
 from scipy.spatial.transform import Rotation
 
 import apt_evap as ae
 from apt_evap.cli.main import main
-from apt_evap.specimen.posture import apex_sphere, depths, pointing, upright
+from apt_evap.specimen import orientation_check
+from apt_evap.specimen.orientation_check import apex_sphere, bodies, depths, pointing, upright
 
 
 @pytest.fixture(scope="module")
@@ -106,5 +108,44 @@ def test_info_of_a_specimen(needle, tmp_path, monkeypatch, capsys):
 
 def test_info_of_a_specimen_without_ase(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "ase.io", None)
-    (tmp_path / "tip.xyz").write_text("2\n\nNi 0 0 0\nNi 0 0 2\n")
-    assert main(["info", str(tmp_path / "tip.xyz")]) == 2 and "ase" in capsys.readouterr().err
+    (tmp_path / "tip.cif").write_text("data_tip\n")
+    assert main(["info", str(tmp_path / "tip.cif")]) == 2 and "ase" in capsys.readouterr().err
+
+
+def test_positions_in_another_unit_are_refused(needle):
+    units = ((10, "Angstrom, not in nm"), (1 / 0.052917721, "Bohr radii"), (1e3, "pm"), (0.1, "nm, not in"))
+    for factor, unit in units:
+        with pytest.raises(ValueError, match=rf"positions must be in nm, .* they fit if they are in {unit}"):
+            tip_of(factor * needle)
+
+
+def test_atoms_that_are_too_close_or_too_far_in_any_unit_are_warned_of(needle):
+    """Reduced units of LAMMPS, for example: neighbours at 1.1, read in nm or in Angstrom."""
+    for distance in (1.1, 0.11):
+        with pytest.warns(ae.warnings.SpecimenWarning, match=rf"neighbouring atoms are {distance} nm apart"):
+            tip_of(distance / 0.249 * needle)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for factor in (0.7, 1.4):  # oxides and swollen crystals
+            tip_of(factor * needle)
+
+
+def test_several_bodies_are_warned_of_with_their_atoms(needle):
+    quarters = np.bincount(2 * (needle[:, 0] < 0) + (needle[:, 1] < 0))
+    expected = ", ".join(f"{size:,}" for size in sorted(quarters, reverse=True))
+    with pytest.warns(ae.warnings.SpecimenWarning, match=f"not one body but 4 that do not touch, of {expected} atoms"):
+        tip_of(np.column_stack([needle[:, :2] % 9.0, needle[:, 2]]))  # as LAMMPS wraps it
+    aside = np.vstack([needle, [0.0, 0.0, 3.5]])  # one that has evaporated
+    with pytest.warns(ae.warnings.SpecimenWarning, match=f"but 2 that do not touch, of {len(needle):,}, 1 atoms"):
+        tip_of(aside)
+
+
+def test_bodies_are_those_of_the_complete_graph(monkeypatch):
+    """Atoms at random near the percolation threshold, in slabs of 300 atoms."""
+    monkeypatch.setattr(orientation_check, "_SLAB", 300)
+    places = np.random.default_rng(4).uniform(0, 10, (2000, 3))
+    for reach in (0.6, 0.8, 1.0):
+        near = scipy.spatial.distance.cdist(places, places) <= reach
+        n, expected = scipy.sparse.csgraph.connected_components(near)
+        pairs = set(zip(bodies(places, reach).tolist(), expected.tolist(), strict=True))
+        assert 1 < n == len(pairs)  # a one-to-one relation of both numberings
