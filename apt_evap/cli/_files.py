@@ -52,7 +52,8 @@ def _read(options):
     if options.arrays is not None:
         names = options.arrays.split(",")
         if len(names) not in (3, 4):
-            raise ValueError(f"--arrays must name values, edges in x and y, and perhaps a mask, got {options.arrays!r}")
+            expected = "values, edges in x and y, and perhaps a mask"
+            raise ValueError(f"--arrays must name {expected}, got {options.arrays!r:.80}")
         parameters |= dict(zip(("values", "x_edges", "y_edges", "mask"), names, strict=False))
     path = Path(options.file)
     is_map = (options.format or path.suffix).lower().lstrip(".") == "npz"
@@ -129,7 +130,8 @@ def _of_species(hits, names, ranges):
     known = np.unique(elements).tolist()
     for name in names:
         if name not in known:
-            raise ValueError(f"no ion is of species {name!r}{did_you_mean(name, known)}, only of {', '.join(known)}")
+            hint = did_you_mean(name, known)
+            raise ValueError(f"no ion is of species {name!r:.80}{hint}, only of {', '.join(known)}")
     return hits[np.isin(elements, names)]
 
 
@@ -183,7 +185,7 @@ def read_registration(text: str) -> Registration:
     if numbers is not None:
         return Registration(*numbers)
     if Path(text).suffix.lower() != ".json":
-        raise ValueError(f"--registration must be a .json file or ROTATION,SCALE,DX,DY[,mirror], got {text!r}")
+        raise ValueError(f"--registration must be a .json file or ROTATION,SCALE,DX,DY[,mirror], got {text!r:.80}")
     written = read_small_file(text, MAX_STUDY, "a registration or a study")
     try:
         content = json.loads(written)

@@ -109,7 +109,7 @@ class _Parser(argparse.ArgumentParser):
         if action.choices is not None and value not in action.choices:
             hint = _did_you_mean(value, action.choices)
             known = ", ".join(map(str, action.choices))
-            raise argparse.ArgumentError(action, f"invalid choice: {value!r}{hint} (choose from {known})")
+            raise argparse.ArgumentError(action, f"invalid choice: {value!r:.80}{hint} (choose from {known})")
 
 
 class _Options(argparse.Action):
@@ -688,7 +688,7 @@ def _add_reading(parser: argparse.ArgumentParser) -> Any:
 def _types(text: str) -> list[tuple[str, str]]:
     pairs = [(part.partition("=")[0], part.partition("=")[2]) for part in text.split(",")]
     if not all(key and name for key, name in pairs):
-        raise argparse.ArgumentTypeError(f"must be types with their elements, such as 1=Al,2=Cu, got {text!r}")
+        raise argparse.ArgumentTypeError(f"must be types with their elements, such as 1=Al,2=Cu, got {text!r:.80}")
     return pairs
 
 
@@ -731,7 +731,7 @@ def _integer(least: int, largest: int | None = None) -> Callable[[str], int]:
             number = least - 1
         if number < least or (largest is not None and number > largest):
             bounds = f">= {least}" if largest is None else f"from {least} to {largest}"
-            raise argparse.ArgumentTypeError(f"must be an integer {bounds}, got {text!r}")
+            raise argparse.ArgumentTypeError(f"must be an integer {bounds}, got {text!r:.80}")
         return number
 
     return integer
@@ -746,7 +746,7 @@ def _number(unit: str) -> Callable[[str], float]:
         except ValueError:
             value = -1.0
         if not 0 <= value < inf:
-            raise argparse.ArgumentTypeError(f"must be a number [{unit}] >= 0, got {text!r}")
+            raise argparse.ArgumentTypeError(f"must be a number [{unit}] >= 0, got {text!r:.80}")
         return value
 
     return number
@@ -757,7 +757,7 @@ def _numbers(text: str) -> tuple[float, ...]:
     try:
         return tuple(float(part) for part in text.split(","))
     except ValueError:
-        raise argparse.ArgumentTypeError(f"must be numbers separated by commas, got {text!r}") from None
+        raise argparse.ArgumentTypeError(f"must be numbers separated by commas, got {text!r:.80}") from None
 
 
 def _mark(n: int) -> Callable[[str], tuple[Any, ...]]:
@@ -767,7 +767,7 @@ def _mark(n: int) -> Callable[[str], tuple[Any, ...]]:
         numbers = _numbers(text)
         indices = numbers[n:]
         if len(numbers) < n or len(indices) not in (0, 3, 4) or any(each != round(each) for each in indices):
-            raise argparse.ArgumentTypeError(f"must be {n} coordinates [mm], perhaps with indices, got {text!r}")
+            raise argparse.ArgumentTypeError(f"must be {n} coordinates [mm], perhaps with indices, got {text!r:.80}")
         return (*numbers[:n], tuple(int(each) for each in indices)) if indices else numbers
 
     return mark
@@ -777,7 +777,7 @@ def _option(text: str) -> tuple[str, tuple[float, ...]]:
     """Name of an option and its numbers."""
     name, equals, numbers = text.partition("=")
     if not (name and equals):
-        raise argparse.ArgumentTypeError(f"must be NAME=N,N,..., got {text!r}")
+        raise argparse.ArgumentTypeError(f"must be NAME=N,N,..., got {text!r:.80}")
     return name, _numbers(numbers)
 
 
@@ -789,7 +789,7 @@ def _bounds(text: str) -> tuple[float | None, float | None]:
         if not ordered or not all(bound is None or isfinite(bound) for bound in (low, high)):
             raise ValueError
     except ValueError:
-        raise argparse.ArgumentTypeError(f"must be two increasing numbers, such as 27,29.5, got {text!r}") from None
+        raise argparse.ArgumentTypeError(f"must be two increasing numbers, such as 27,29.5, got {text!r:.80}") from None
     return low, high
 
 
@@ -800,7 +800,7 @@ def _circle(text: str) -> tuple[float, tuple[float, ...]]:
         if radius <= 0 or len(centre) not in (0, 2) or not all(map(isfinite, (radius, *centre))):
             raise ValueError
     except ValueError:
-        raise argparse.ArgumentTypeError(f"must be a radius, or R,X,Y, such as 15,0,-2 [mm], got {text!r}") from None
+        raise argparse.ArgumentTypeError(f"must be a radius or R,X,Y such as 15,0,-2 [mm], got {text!r:.80}") from None
     return radius, tuple(centre) or (0.0, 0.0)
 
 
@@ -811,5 +811,5 @@ def _box(text: str) -> tuple[float, ...]:
         if not (left < right and lower < upper and all(map(isfinite, (left, right, lower, upper)))):
             raise ValueError
     except ValueError:
-        raise argparse.ArgumentTypeError(f"must be X0,X1,Y0,Y1, such as -5,5,0,8 [mm], got {text!r}") from None
+        raise argparse.ArgumentTypeError(f"must be X0,X1,Y0,Y1, such as -5,5,0,8 [mm], got {text!r:.80}") from None
     return left, right, lower, upper

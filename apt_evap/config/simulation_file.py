@@ -5,7 +5,6 @@ import inspect
 import json
 import math
 import re
-import tomllib
 from collections.abc import Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -18,6 +17,7 @@ from apt_evap._common.validation import check_count, check_kind, check_number, c
 from apt_evap.config.lens_text import read_lens
 from apt_evap.config.map_panels import MapSettings
 from apt_evap.config.tables import check_keys, check_table
+from apt_evap.config.toml_text import check_levels, read_toml
 from apt_evap.detection.detector import Detector
 from apt_evap.emission.perturbations import Perturbation
 from apt_evap.evaporation.law import Extremal, Law, check_law
@@ -269,10 +269,10 @@ def read_document(path: str | Path) -> dict[str, Any]:
         raise FileError(f"{str(path)!r} is a run: see apt-evap info")
     content = read_small_file(path, _MAX_BYTES, "a TOML file")
     try:
-        return tomllib.loads(content.decode())
+        return read_toml(content.decode("utf-8-sig"))
     except UnicodeDecodeError as error:
         raise FileError(f"{str(path)!r} is not a TOML file: it is not text in UTF-8") from error
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+    except ValueError as error:
         raise FileError(f"{str(path)!r} is not a TOML file: {error}") from error
 
 
@@ -314,6 +314,7 @@ def config_of(document: dict[str, Any], path: Path) -> Config:
         check_keys(document, ("output", "phases", *tables), ("tip", "simulation"))
         for name in tables:
             check_table(document.get(name, {}), f"[{name}]")
+        check_levels(document)
         key = key_of(document)
         output = document.get("output")
         if output is not None and not (isinstance(output, str) and output):

@@ -204,7 +204,7 @@ class PairEnergies:
     def _number(self, given, known, name, what):
         values = known if given is None else {**known, **given}
         if name not in values:
-            raise ValueError(f"{what} must have a value for {name}, got {', '.join(values)}")
+            raise ValueError(f"{what} must have a value for {name}, got {short_text(list(values))}")
         return values[name]
 
     def pair_energy(self, tip: Tip, first: int, second: int) -> float:

@@ -155,10 +155,10 @@ class Arrhenius:
             return np.full(len(names), float(self.sensitivity))
         for name in self.sensitivity:
             if name not in names:
-                raise ValueError(f"sensitivity must be of the elements {', '.join(names)}, got {name!r}")
+                raise ValueError(f"sensitivity must be of the elements {', '.join(names)}, got {short_text(name)}")
         missing = [name for name in names if name not in self.sensitivity]
         if missing:
-            raise ValueError(f"sensitivity must have a value for {missing[0]}, got {self.sensitivity!r}")
+            raise ValueError(f"sensitivity must have a value for {missing[0]}, got {short_text(self.sensitivity)}")
         return np.array([float(self.sensitivity[name]) for name in names])
 
     def default_control(self) -> VoltageControl:

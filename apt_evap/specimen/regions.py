@@ -191,7 +191,7 @@ class Union:
 
     regions: tuple = checked(
         "At least one region or function of points.",
-        "regions",
+        "sequence of regions",
         lambda regions, name: tuple(check_region(region, name) for region in regions),
         read=lambda plain, name: [region_of(each, name) for each in check_sequence(plain, name, "regions")],
     )
@@ -204,7 +204,7 @@ class Union:
     @classmethod
     def _from_fields(cls, regions):
         """Union of a sequence of regions, as a file contains it."""
-        return cls(*regions)
+        return cls(*check_sequence(regions, "regions", "regions"))
 
     def __repr__(self) -> str:
         return f"Union({', '.join(map(repr, self.regions))})"
