@@ -33,7 +33,12 @@ def execute(options: argparse.Namespace) -> int:
 
     explorer, view = explorer_and_view(options)
     server, url = serve(
-        explorer, view, port=options.port, registration_of=read_registration, with_file=partial(_with_file, options)
+        explorer,
+        view,
+        port=options.port,
+        registration_of=read_registration,
+        with_file=partial(_with_file, options),
+        origins=options.allow_origin,
     )
     put(url)
     say("note", "open this address in a browser on this machine; Ctrl-C ends the explorer")

@@ -612,6 +612,14 @@ def _add_explore(commands: Any) -> None:
     command.add_argument("--simulated", type=_bounds, metavar="FIRST,LAST", help="ions of the run; default: all")
     command.add_argument("--port", type=_integer(0, 65535), default=0, metavar="N", help="default: a free one")
     command.add_argument("--no-browser", dest="browser", action="store_false", help="only print the address")
+    command.add_argument(
+        "--allow-origin",
+        type=_origin,
+        action="append",
+        default=[],
+        metavar="HOST:PORT",
+        help="address under which the browser sees the page, if it is another one, as behind a proxy; repeatable",
+    )
     _add_real_units(command)
     _add_reading(command)
 
@@ -758,6 +766,14 @@ def _numbers(text: str) -> tuple[float, ...]:
         return tuple(float(part) for part in text.split(","))
     except ValueError:
         raise argparse.ArgumentTypeError(f"must be numbers separated by commas, got {text!r:.80}") from None
+
+
+def _origin(text):
+    """Host and port of an address; a browser leaves the usual port of the protocol out, and Bokeh then takes 80."""
+    match = re.fullmatch(r"([A-Za-z0-9._-]+)(:\d{1,5})?", text)
+    if match is None or int((match[2] or ":80")[1:]) > 65535:
+        raise argparse.ArgumentTypeError(f"must be HOST or HOST:PORT, such as hub.example.org, got {text!r:.80}")
+    return text.lower()
 
 
 def _mark(n: int) -> Callable[[str], tuple[Any, ...]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations  # help() then shows ArrayLike instead of its ten types
 
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -42,7 +43,7 @@ _BINS = 384  # bins of a map of simulated hits
 def _score(given, name):
     """A number that may be NaN; in files NaN is None."""
     unknown = given is None or (isinstance(given, float) and given != given)
-    return float("nan") if unknown else check_number(given, name)
+    return math.nan if unknown else check_number(given, name)
 
 
 def _method(given, name):
