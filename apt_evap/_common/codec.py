@@ -372,6 +372,11 @@ def from_plain(plain: Any, *kinds: type, what: str = "settings") -> Any:
     return make(**values)
 
 
+def is_plain(thing: Any) -> bool:
+    """Whether an object is of the plain types, and not one that has been made already."""
+    return thing is None or isinstance(thing, bool | int | float | str | list | tuple | Mapping)
+
+
 def changed(thing: U, values: Mapping[str, Any]) -> U:
     """Settings with other values of some fields; ValueError for an unknown field."""
     known = declared(type(thing))

@@ -188,6 +188,10 @@ class ConstantPotential:
         )
 
 
+RULES = (Robin, ConstantPotential)
+"""The built-in charging rules, the default first."""
+
+
 def check_rule(rule: object) -> None:
     """Raise a ValueError if `rule` is not a charging rule."""
     methods = {name for name in ("kernel", "solve", "solve_patch") if callable(getattr(rule, name, None))}

@@ -13,6 +13,7 @@ from apt_evap._core.elementary import logarithm
 from apt_evap._core.law import BARRIERS, LawKernel, ThermalRate, WeightedField
 from apt_evap.detection.timing import Cooling
 from apt_evap.evaporation.bonds import BondField, bond_table, bonds_field
+from apt_evap.evaporation.law import Extremal
 from apt_evap.evaporation.voltage import VoltageControl
 from apt_evap.specimen.tip import Tip
 from apt_evap.units import BOLTZMANN
@@ -239,3 +240,7 @@ class Arrhenius:
         reach, _ = self.working_point(float(sensitivities[0]), control or self.default_control())
         frequency = float(logarithm(self.attempt_frequency))
         return ThermalRate(weight, np.ascontiguousarray(stiffness), frequency, self.barrier, reach, *more)
+
+
+LAWS = (Extremal, Arrhenius)
+"""The built-in laws, the default first."""
