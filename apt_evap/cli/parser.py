@@ -624,11 +624,6 @@ def _add_explore(commands: Any) -> None:
     _add_reading(command)
 
 
-# ---- arguments of several commands -----------------------------------------------------------------------------------
-
-_FILE_HELP = "a run (.h5), measured ions (.epos, ...) or a map (.npz)"
-
-
 def _add_visible(commands: Any) -> None:
     command = commands.add_parser(
         "visible",
@@ -665,6 +660,11 @@ def _add_dataset(commands: Any) -> None:
         "--without-failed", action="store_true", help="leave out runs that have failed, instead of an error"
     )
     _add_speech(command)
+
+
+# ---- arguments of several commands -----------------------------------------------------------------------------------
+
+_FILE_HELP = "a run (.h5), measured ions (.epos, ...) or a map (.npz)"
 
 
 def _add_reading(parser: argparse.ArgumentParser) -> Any:
