@@ -1,6 +1,7 @@
 """Files of the commands: reading by the options; writing that never replaces files of other programs."""
 
 import argparse
+import io
 import json
 import os
 import tempfile
@@ -218,9 +219,11 @@ def save_picture(
 
 
 def save_figure(path: Path, figure: Any) -> None:
-    suffix = path.suffix.lower()
+    """Write a figure; it is drawn in memory, so that a kill in the second that it takes leaves no temporary file."""
+    suffix, drawn = path.suffix.lower(), io.BytesIO()
+    figure.savefig(drawn, format=suffix[1:], dpi=200, metadata={_MARK_KEYS[suffix]: _MARK})
     with replace_file(path) as file:
-        figure.savefig(file, format=suffix[1:], dpi=200, metadata={_MARK_KEYS[suffix]: _MARK})
+        file.write(drawn.getbuffer())
 
 
 def check_output(path: AnyPath, is_ours: Callable[[Path], bool], force: bool) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from apt_evap import __version__, cli, plot
@@ -774,3 +775,25 @@ def test_a_command_leaves_the_environment_as_it_is(made, monkeypatch, capsys):
     before = dict(os.environ)
     assert main(["info", str(made)]) == 0
     assert dict(os.environ) == before
+
+
+def test_a_picture_is_drawn_before_its_file_is_opened(made, folder, monkeypatch):
+    """A kill while it is drawn, which takes a second, leaves nothing behind."""
+    seen = []
+    draw = Figure.savefig
+
+    def watched(figure, *arguments, **options):
+        draw(figure, *arguments, **options)
+        seen.extend(os.listdir())
+
+    monkeypatch.setattr(Figure, "savefig", watched)
+    before = os.listdir()
+    assert main(["map", str(made), "-o", "map.png", "--quiet"]) == 0
+    assert seen == before and imread("map.png").ndim == 3
+
+
+def test_a_table_that_has_no_effect_is_told(folder, capsys):
+    text = SMALL + "responses = false\n[responses]\nwide = true\n"
+    (folder / "a.toml").write_text(text.replace("ions = 60", "ions = 5"))
+    assert main(["run", "a.toml", "--quiet"]) == 0
+    assert "[responses]" in capsys.readouterr().err
