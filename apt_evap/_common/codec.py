@@ -16,7 +16,8 @@ Conditions on several fields are in a method ``_check``. It may return a dict of
 import math
 import sys
 import textwrap
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, replace
 from typing import Any, TypeVar, dataclass_transform
 
@@ -59,9 +60,26 @@ class _Setting:
         ]
 
 
+@contextmanager
+def _converting(value: Any, name: str, kind: str) -> Iterator[None]:
+    """Name the field and its value if a value of another type stops a conversion, such as a loop over a number."""
+    try:
+        yield
+    except (TypeError, AttributeError, LookupError, OverflowError, RecursionError) as error:
+        article = "an" if kind[0] in "aeiou" else "a"
+        raise ValueError(f"{name} must be {article} {kind}, got {short_text(value)}") from error
+
+
 def _field(text, check, default, kind, *, read=None, unit="", bounds="", **options):
     def optional(value, name):
-        return None if value is None and default is None else check(value, name)
+        if value is None and default is None:
+            return None
+        with _converting(value, name, kind):
+            return check(value, name)
+
+    def converted(plain, name):
+        with _converting(plain, name, kind):
+            return read(plain, name)
 
     if isinstance(default, list | dict) or callable(default):
         factory = default if callable(default) else default.copy
@@ -69,7 +87,7 @@ def _field(text, check, default, kind, *, read=None, unit="", bounds="", **optio
         default = factory()
     else:
         options["default"] = default
-    return field(metadata={_SETTING: _Setting(text, optional, read, kind, unit, bounds)}, **options)
+    return field(metadata={_SETTING: _Setting(text, optional, read and converted, kind, unit, bounds)}, **options)
 
 
 def _bounds(above=None, at_least=None, at_most=None, below=None):
@@ -349,6 +367,11 @@ def from_plain(plain: Any, *kinds: type, what: str = "settings") -> Any:
         if key in values and setting.read is not None and values[key] is not None:
             values[key] = setting.read(values[key], key)
     return kind(**values)
+
+
+def is_plain(thing: Any) -> bool:
+    """Whether an object is of the plain types, and not one that has been made already."""
+    return thing is None or isinstance(thing, bool | int | float | str | list | tuple | Mapping)
 
 
 def changed(thing: U, values: Mapping[str, Any]) -> U:

@@ -14,6 +14,7 @@ from numpy.typing import DTypeLike, NDArray
 LARGEST_SEED = 2**64 - 1
 _LARGEST_COUNT = 2**63 - 1  # integer type of the compiled core
 _LARGEST = 1e100  # the cube of a number is still finite
+_LONGEST_NAME = 100  # characters
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 100
 
@@ -256,6 +257,13 @@ def check_kind(value: Any, name: str, kind: Any, expected: str) -> Any:
     return value
 
 
+def check_name(value: Any, name: str) -> str:
+    """Return `value` if it is a text of 1 to 100 characters: names stand in messages, titles and files."""
+    if not isinstance(value, str) or not 1 <= len(value) <= _LONGEST_NAME:
+        raise ValueError(f"{name} must be text of 1 to {_LONGEST_NAME} characters, got {short_text(value)}")
+    return value
+
+
 def check_sequence(value: Any, name: str, expected: str) -> tuple[Any, ...]:
     """Return the items of a sequence as a tuple; ValueError otherwise, also for text."""
     try:
@@ -264,6 +272,16 @@ def check_sequence(value: Any, name: str, expected: str) -> tuple[Any, ...]:
         return tuple(value)
     except TypeError as error:
         raise ValueError(f"{name} must be a sequence of {expected}, got {short_text(value)}") from error
+
+
+def check_pairs(value: Any, name: str, expected: str) -> list[tuple[Any, Any]]:
+    """Return the keys and values of a mapping, or of a list of pairs, the plain form of one whose keys are no texts."""
+    if isinstance(value, Mapping):
+        return list(value.items())
+    pairs = isinstance(value, list | tuple) and all(isinstance(pair, list | tuple) and len(pair) == 2 for pair in value)
+    if not pairs:
+        raise ValueError(f"{name} must be {expected}, or a list of pairs of these, got {short_text(value)}")
+    return [(key, content) for key, content in value]
 
 
 def did_you_mean(word: object, known: Iterable[str]) -> str:

@@ -189,7 +189,9 @@ def _of_run(run):
         "outcomes": {key: summary[key] for key in _OUTCOMES if key in summary},
         "without_neighbour_to_roll_onto": summary["without_neighbour"],
         "detached": summary["detached"],
-        "perturbations_flown": [str(each["repr"] if isinstance(each, dict) else each) for each in run.perturbations],
+        "perturbations_flown": [
+            str(each.get("repr", each) if isinstance(each, dict) else each) for each in run.perturbations
+        ],
         "responses": responses,
     }
 

@@ -1,6 +1,7 @@
 """Files of the commands: reading by the options; writing that never replaces files of other programs."""
 
 import argparse
+import io
 import json
 import os
 import tempfile
@@ -52,7 +53,8 @@ def _read(options):
     if options.arrays is not None:
         names = options.arrays.split(",")
         if len(names) not in (3, 4):
-            raise ValueError(f"--arrays must name values, edges in x and y, and perhaps a mask, got {options.arrays!r}")
+            expected = "values, edges in x and y, and perhaps a mask"
+            raise ValueError(f"--arrays must name {expected}, got {options.arrays!r:.80}")
         parameters |= dict(zip(("values", "x_edges", "y_edges", "mask"), names, strict=False))
     path = Path(options.file)
     is_map = (options.format or path.suffix).lower().lstrip(".") == "npz"
@@ -130,7 +132,8 @@ def _of_species(hits, names, ranges):
     known = np.unique(elements).tolist()
     for name in names:
         if name not in known:
-            raise ValueError(f"no ion is of species {name!r}{did_you_mean(name, known)}, only of {', '.join(known)}")
+            hint = did_you_mean(name, known)
+            raise ValueError(f"no ion is of species {name!r:.80}{hint}, only of {', '.join(known)}")
     return hits[np.isin(elements, names)]
 
 
@@ -184,7 +187,7 @@ def read_registration(text: str) -> Registration:
     if numbers is not None:
         return Registration(*numbers)
     if Path(text).suffix.lower() != ".json":
-        raise ValueError(f"--registration must be a .json file or ROTATION,SCALE,DX,DY[,mirror], got {text!r}")
+        raise ValueError(f"--registration must be a .json file or ROTATION,SCALE,DX,DY[,mirror], got {text!r:.80}")
     written = read_small_file(text, MAX_STUDY, "a registration or a study")
     try:
         content = json.loads(written)
@@ -217,9 +220,11 @@ def save_picture(
 
 
 def save_figure(path: Path, figure: Any) -> None:
-    suffix = path.suffix.lower()
+    """Write a figure; it is drawn in memory, so that a kill in the second that it takes leaves no temporary file."""
+    suffix, drawn = path.suffix.lower(), io.BytesIO()
+    figure.savefig(drawn, format=suffix[1:], dpi=200, metadata={_MARK_KEYS[suffix]: _MARK})
     with replace_file(path) as file:
-        figure.savefig(file, format=suffix[1:], dpi=200, metadata={_MARK_KEYS[suffix]: _MARK})
+        file.write(drawn.getbuffer())
 
 
 def check_output(path: AnyPath, is_ours: Callable[[Path], bool], force: bool) -> None:

@@ -109,7 +109,7 @@ def integer_type(least: int, largest: int | None = None) -> Callable[[str], int]
             number = least - 1
         if number < least or (largest is not None and number > largest):
             bounds = f">= {least}" if largest is None else f"from {least} to {largest}"
-            raise argparse.ArgumentTypeError(f"must be an integer {bounds}, got {text!r}")
+            raise argparse.ArgumentTypeError(f"must be an integer {bounds}, got {text!r:.80}")
         return number
 
     return integer
@@ -124,7 +124,7 @@ def number_type(unit: str) -> Callable[[str], float]:
         except ValueError:
             value = -1.0
         if not 0 <= value < inf:
-            raise argparse.ArgumentTypeError(f"must be a number [{unit}] >= 0, got {text!r}")
+            raise argparse.ArgumentTypeError(f"must be a number [{unit}] >= 0, got {text!r:.80}")
         return value
 
     return number
@@ -135,7 +135,7 @@ def numbers_type(text: str) -> tuple[float, ...]:
     try:
         return tuple(float(part) for part in text.split(","))
     except ValueError:
-        raise argparse.ArgumentTypeError(f"must be numbers separated by commas, got {text!r}") from None
+        raise argparse.ArgumentTypeError(f"must be numbers separated by commas, got {text!r:.80}") from None
 
 
 def bounds_type(text: str) -> tuple[float | None, float | None]:
@@ -146,7 +146,7 @@ def bounds_type(text: str) -> tuple[float | None, float | None]:
         if not ordered or not all(bound is None or isfinite(bound) for bound in (low, high)):
             raise ValueError
     except ValueError:
-        raise argparse.ArgumentTypeError(f"must be two increasing numbers, such as 27,29.5, got {text!r}") from None
+        raise argparse.ArgumentTypeError(f"must be two increasing numbers, such as 27,29.5, got {text!r:.80}") from None
     return low, high
 
 
@@ -157,7 +157,7 @@ def _circle(text: str) -> tuple[float, tuple[float, ...]]:
         if radius <= 0 or len(centre) not in (0, 2) or not all(map(isfinite, (radius, *centre))):
             raise ValueError
     except ValueError:
-        raise argparse.ArgumentTypeError(f"must be a radius, or R,X,Y, such as 15,0,-2 [mm], got {text!r}") from None
+        raise argparse.ArgumentTypeError(f"must be a radius or R,X,Y such as 15,0,-2 [mm], got {text!r:.80}") from None
     return radius, tuple(centre) or (0.0, 0.0)
 
 
@@ -168,7 +168,7 @@ def _box(text: str) -> tuple[float, ...]:
         if not (left < right and lower < upper and all(map(isfinite, (left, right, lower, upper)))):
             raise ValueError
     except ValueError:
-        raise argparse.ArgumentTypeError(f"must be X0,X1,Y0,Y1, such as -5,5,0,8 [mm], got {text!r}") from None
+        raise argparse.ArgumentTypeError(f"must be X0,X1,Y0,Y1, such as -5,5,0,8 [mm], got {text!r:.80}") from None
     return left, right, lower, upper
 
 
@@ -179,7 +179,7 @@ def _mark(n: int) -> Callable[[str], tuple[Any, ...]]:
         numbers = numbers_type(text)
         indices = numbers[n:]
         if len(numbers) < n or len(indices) not in (0, 3, 4) or any(each != round(each) for each in indices):
-            raise argparse.ArgumentTypeError(f"must be {n} coordinates [mm], perhaps with indices, got {text!r}")
+            raise argparse.ArgumentTypeError(f"must be {n} coordinates [mm], perhaps with indices, got {text!r:.80}")
         return (*numbers[:n], tuple(int(each) for each in indices)) if indices else numbers
 
     return mark

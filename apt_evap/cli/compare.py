@@ -130,7 +130,7 @@ def _option(text: str) -> tuple[str, tuple[float, ...]]:
     """Name of an option and its numbers."""
     name, equals, numbers = text.partition("=")
     if not (name and equals):
-        raise argparse.ArgumentTypeError(f"must be NAME=N,N,..., got {text!r}")
+        raise argparse.ArgumentTypeError(f"must be NAME=N,N,..., got {text!r:.80}")
     return name, numbers_type(numbers)
 
 

@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import os
+import re
 import sys
 import tempfile
 import webbrowser
@@ -54,8 +55,24 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--simulated", type=bounds_type, metavar="FIRST,LAST", help="ions of the run; default: all")
     parser.add_argument("--port", type=integer_type(0, 65535), default=0, metavar="N", help="default: a free one")
     parser.add_argument("--no-browser", dest="browser", action="store_false", help="only print the address")
+    parser.add_argument(
+        "--allow-origin",
+        type=_origin,
+        action="append",
+        default=[],
+        metavar="HOST:PORT",
+        help="address under which the browser sees the page, if it is another one, as behind a proxy; repeatable",
+    )
     add_real_units(parser)
     add_reading(parser)
+
+
+def _origin(text):
+    """Host and port of an address; a browser leaves the usual port of the protocol out, and Bokeh then takes 80."""
+    match = re.fullmatch(r"([A-Za-z0-9._-]+)(:\d{1,5})?", text)
+    if match is None or int((match[2] or ":80")[1:]) > 65535:
+        raise argparse.ArgumentTypeError(f"must be HOST or HOST:PORT, such as hub.example.org, got {text!r:.80}")
+    return text.lower()
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -68,7 +85,12 @@ def execute(options: argparse.Namespace) -> int:
 
     explorer, view = explorer_and_view(options)
     server, url = serve(
-        explorer, view, port=options.port, registration_of=read_registration, with_file=partial(_with_file, options)
+        explorer,
+        view,
+        port=options.port,
+        registration_of=read_registration,
+        with_file=partial(_with_file, options),
+        origins=options.allow_origin,
     )
     put(url)
     say("note", "open this address in a browser on this machine; Ctrl-C ends the explorer")

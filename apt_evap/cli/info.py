@@ -43,7 +43,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def _types(text: str) -> list[tuple[str, str]]:
     pairs = [(part.partition("=")[0], part.partition("=")[2]) for part in text.split(",")]
     if not all(key and name for key, name in pairs):
-        raise argparse.ArgumentTypeError(f"must be types with their elements, such as 1=Al,2=Cu, got {text!r}")
+        raise argparse.ArgumentTypeError(f"must be types with their elements, such as 1=Al,2=Cu, got {text!r:.80}")
     return pairs
 
 

@@ -1,5 +1,6 @@
 """Entry point of `apt-evap`: signals, warnings, errors and exit codes."""
 
+import os
 import signal
 import sys
 import threading
@@ -33,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit code, see `apt_evap.cli.parser.EXIT_CODES`.
     """
     open_missing_streams()
-    with warnings.catch_warnings(), _terminated_like_interrupted() as terminated:
+    with warnings.catch_warnings(), _drawing_into_files(), _terminated_like_interrupted() as terminated:
         warnings.showwarning = lambda message, *_, **__: say("warning", message)
         try:
             code = _execute(arguments)
@@ -69,6 +70,23 @@ def _execute(arguments):
     except SystemExit as stop:  # --help and --version
         return stop.code or 0
     return import_module(f"apt_evap.cli.{options.command}").execute(options)
+
+
+@contextmanager
+def _drawing_into_files() -> Iterator[None]:
+    """Let matplotlib, in this process and those that it starts, draw without a screen, whatever the user's backend.
+
+    The backend of a notebook, for example, is inherited by its terminals, and cannot be imported in every environment.
+    """
+    before = os.environ.get("MPLBACKEND")
+    os.environ["MPLBACKEND"] = "agg"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["MPLBACKEND"]
+        else:
+            os.environ["MPLBACKEND"] = before
 
 
 @contextmanager

@@ -219,7 +219,13 @@ def summaries(maps: Any, titles: Sequence[str]) -> list[dict[str, Any]]:
 
 def _map_settings(run, options):
     """Settings of the maps of a run: from the options, else those of the run, else the defaults."""
-    settings = from_plain(run.provenance.get("maps", {}), MapSettings, what="maps")
+    stored = run.provenance.get("maps", {})
+    if options.perturbation:
+        stored = {name: value for name, value in stored.items() if name != "panels"}
+    try:
+        settings = from_plain(stored, MapSettings, what="maps")
+    except ValueError as error:  # of a class of the user's own
+        raise ValueError(f"the maps of {options.file!r} are not drawn again: {error}; use --perturbation") from error
     if options.perturbation:
         panels = tuple(Panel(read_perturbation(text)) for text in options.perturbation)
         settings = replace(settings, panels=panels)

@@ -199,7 +199,7 @@ def _element(name):
         return material(name)
     except ValueError as error:
         raise ValueError(
-            f"--element must be one of {', '.join(MATERIALS)}, got {name!r}: for other elements use "
+            f"--element must be one of {', '.join(MATERIALS)}, got {name!r:.80}: for other elements use "
             "--atomic-volume [nm^3] and --evaporation-field [V/nm]"
         ) from error
 
@@ -211,5 +211,5 @@ def _radius(text):
     try:
         radius = float(text)
     except ValueError:
-        raise ValueError(f"--radius must be voltage, shank or a number [nm], got {text!r}") from None
+        raise ValueError(f"--radius must be voltage, shank or a number [nm], got {text!r:.80}") from None
     return check_number(radius, "--radius", above=0, unit="nm")

@@ -66,7 +66,9 @@ def execute(options: argparse.Namespace) -> int:
     document["simulation"] = document.get("simulation", {}) | {
         name: value for name, value in own.items() if value is not None
     }
-    config = config_of(document, Path(options.config))
+    config = config_of(document, Path(options.config), own_classes=True)
+    if "responses" in document and not config.responses:
+        say("note", "the table [responses] is not used: [simulation] has responses = false")
     output = check_path(options.output or config.output or f"{config.path.stem}.h5")
     if output.suffix.lower() != ".h5":
         raise FileError(f"a run is saved in an HDF5 file with the suffix .h5, got {str(output)!r}")

@@ -1,11 +1,11 @@
 """Lenses from a table or from text such as local-electrode:shank_angle=7."""
 
-import tomllib
 from collections.abc import Mapping
 from typing import Any
 
 from apt_evap._common.codec import from_plain
-from apt_evap._common.validation import short_text
+from apt_evap._common.validation import check_kind, short_text
+from apt_evap.config.toml_text import read_toml
 from apt_evap.microscope.local_electrode import PRESETS, LocalElectrode
 
 
@@ -36,8 +36,9 @@ def read_lens(settings: str | Mapping[str, Any]) -> LocalElectrode:
         try:
             return read_lens(_table(settings))
         except ValueError as error:
-            raise ValueError(f"lens {settings!r}: {error}; an example is local-electrode:shank_angle=5") from error
-    table = dict(settings)
+            example = "an example is local-electrode:shank_angle=5"
+            raise ValueError(f"lens {short_text(settings)}: {error}; {example}") from error
+    table = dict(check_kind(settings, "lens", Mapping, "a text or a table"))
     if "preset" in table:
         name = table.pop("preset")
         known = {each.replace(" ", "-"): each for each in PRESETS}
@@ -51,7 +52,8 @@ def _table(text):
     """Table of a lens from text."""
     name, _, fields = text.partition(":")
     try:
-        changes = tomllib.loads(fields.replace(",", "\n"))
-    except tomllib.TOMLDecodeError:
-        raise ValueError(f"expected fields such as shank_angle=7 after the colon, got {fields!r}") from None
+        changes = read_toml(fields.replace(",", "\n"))
+    except ValueError:
+        expected = "expected fields such as shank_angle=7 after the colon"
+        raise ValueError(f"{expected}, got {short_text(fields)}") from None
     return {"preset": name, **changes}

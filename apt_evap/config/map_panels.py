@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from apt_evap._common.codec import checked, count, from_plain, number, settings
+from apt_evap._common.codec import checked, count, from_plain, is_plain, number, settings
 from apt_evap._common.validation import check_kind, check_number, check_sequence, short_text
 from apt_evap.config.perturbation_text import read_perturbation, title_of
 from apt_evap.detection.binning import MAX_BINS
@@ -45,7 +45,10 @@ class Panel:
     """One map in a picture."""
 
     perturbation: Any = checked(
-        "Perturbation of the ions.", "perturbation", _launches, read=lambda plain, name: read_perturbation(plain)
+        "Perturbation of the ions.",
+        "perturbation",
+        _launches,
+        read=lambda plain, name: read_perturbation(plain) if is_plain(plain) else plain,
     )
     title: str = checked("Title above the map; by default from the perturbation.", "str", _title, default=None)
 

@@ -1,12 +1,11 @@
 """Perturbations from a table or from text such as RollUp:0.155,0.155."""
 
-import tomllib
 from collections.abc import Mapping
 from typing import Any
 
 from apt_evap._common.codec import declared, is_settings, to_plain, to_python
 from apt_evap._common.validation import short_text
-from apt_evap.config.toml_text import inline
+from apt_evap.config.toml_text import inline, read_toml
 from apt_evap.emission.energies import Thermal, TruncatedNormal
 from apt_evap.emission.perturbations import Perturbation, perturbation_of
 
@@ -35,25 +34,31 @@ def read_perturbation(settings: str | Mapping[str, Any]) -> Perturbation:
         try:
             return read_perturbation(_perturbation_table(settings))
         except ValueError as error:
-            raise ValueError(f"perturbation {settings!r}: {error}; an example is RollUp:0.155,0.155") from error
+            example = "an example is RollUp:0.155,0.155"
+            raise ValueError(f"perturbation {short_text(settings)}: {error}; {example}") from error
     return perturbation_of(settings)
 
 
 def _perturbation_table(text):
     """Table of a perturbation from text."""
     if text.lstrip().startswith("{"):
-        return tomllib.loads(f"perturbation = {text}")["perturbation"]
+        table, *further = read_toml(f"perturbation = {text}").values()
+        if further:
+            raise ValueError("expected one table in one line")
+        return table
     name, colon, numbers = text.partition(":")
     if not colon:
         return {"name": name}
     try:
         values = [float(number) for number in numbers.split(",")]
     except ValueError:
-        raise ValueError(f"expected numbers separated by commas after the colon, got {numbers!r}") from None
+        expected = "expected numbers separated by commas after the colon"
+        raise ValueError(f"{expected}, got {short_text(numbers)}") from None
     fraction = {"rollup_fraction": values.pop()} if name == "Combined" else {}
     if len(values) not in (1, 2):
         expected = "1 or 2 numbers (an energy, or mean and standard deviation)"
-        raise ValueError(f"{name} takes {expected}{' and the roll-up fraction' if fraction else ''}, got {numbers!r}")
+        expected += " and the roll-up fraction" if fraction else ""
+        raise ValueError(f"{short_text(name)} takes {expected}, got {short_text(numbers)}")
     normal = dict(zip(("name", "mean", "standard_deviation"), ("TruncatedNormal", *values), strict=False))
     return {"name": name, "energy": values[0] if len(values) == 1 else normal, **fraction}
 

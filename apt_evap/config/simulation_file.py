@@ -5,25 +5,26 @@ import inspect
 import json
 import math
 import re
-import tomllib
 from collections.abc import Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from apt_evap._common.codec import from_plain, to_plain
+from apt_evap._common.codec import from_plain, is_plain, to_plain
 from apt_evap._common.files import FileError, check_path, read_small_file, sha256_of
 from apt_evap._common.validation import check_count, check_kind, check_number, check_seed, check_switch, short_text
 from apt_evap.config.lens_text import read_lens
 from apt_evap.config.map_panels import MapSettings
+from apt_evap.config.own_classes import with_own_objects
 from apt_evap.config.tables import check_keys, check_table
+from apt_evap.config.toml_text import check_levels, read_toml
 from apt_evap.detection.detector import Detector
 from apt_evap.emission.perturbations import Perturbation
-from apt_evap.evaporation.law import Extremal, Law, check_law
-from apt_evap.evaporation.rule import CompiledRule, ConstantPotential, Robin, Rule, check_rule
+from apt_evap.evaporation.law import Law, check_law
+from apt_evap.evaporation.rule import RULES, CompiledRule, Rule, check_rule
 from apt_evap.evaporation.settings import ChargeSettings
-from apt_evap.evaporation.thermal import Arrhenius
+from apt_evap.evaporation.thermal import LAWS
 from apt_evap.evaporation.voltage import VoltageControl, check_voltage
 from apt_evap.flight.crew import WHOLE_DETECTOR, FlightSettings
 from apt_evap.flight.response import ResponseSettings
@@ -145,7 +146,11 @@ class Config:
     @property
     def emissions(self) -> tuple[Perturbation, ...]:
         """Perturbations with their own flights: none, or without responses those of the maps."""
-        return () if self.responses else tuple(dict.fromkeys(panel.perturbation for panel in self.maps.panels))
+        perturbations: list[Perturbation] = []  # one of a user may have no hash
+        for panel in () if self.responses else self.maps.panels:
+            if panel.perturbation not in perturbations:
+                perturbations.append(panel.perturbation)
+        return tuple(perturbations)
 
     def specimen(self) -> Tip:
         """Build the specimen, or read it from its file.
@@ -242,8 +247,9 @@ def read_config(path: str | Path) -> Config:
     ``[[phases]]`` (fields of `Phase`; instead of a material in ``[tip]``), ``[law]`` and ``[rule]`` (a name and the
     fields of that class), ``[control]`` (`VoltageControl`), ``[real_units]`` (fields of `OperatingPoint`),
     ``[microscope]`` (fields of `LocalElectrode`, or a ``preset``)
-    and ``[maps]`` (fields of `MapSettings`). Only ``[tip]`` with a material and an apex_radius, or with a file,
-    and the ions in ``[simulation]``, are required.
+    and ``[maps]`` (fields of `MapSettings`). A law, a rule, bonds, a perturbation, a distribution of energies or a
+    region may also be of a class of one's own, by the name ``"module:Class"`` (:doc:`/extending`). Only ``[tip]`` with
+    a material and an apex_radius, or with a file, and the ions in ``[simulation]``, are required.
 
     Parameters
     ----------
@@ -259,7 +265,7 @@ def read_config(path: str | Path) -> Config:
     FileError
         If the file cannot be read or is not TOML, or a table, key or value is wrong; the message names it.
     """
-    return config_of(read_document(path), Path(path))
+    return config_of(read_document(path), Path(path), own_classes=True)
 
 
 def read_document(path: str | Path) -> dict[str, Any]:
@@ -269,14 +275,14 @@ def read_document(path: str | Path) -> dict[str, Any]:
         raise FileError(f"{str(path)!r} is a run: see apt-evap info")
     content = read_small_file(path, _MAX_BYTES, "a TOML file")
     try:
-        return tomllib.loads(content.decode())
+        return read_toml(content.decode("utf-8-sig"))
     except UnicodeDecodeError as error:
         raise FileError(f"{str(path)!r} is not a TOML file: it is not text in UTF-8") from error
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+    except ValueError as error:
         raise FileError(f"{str(path)!r} is not a TOML file: {error}") from error
 
 
-def config_of(document: dict[str, Any], path: Path) -> Config:
+def config_of(document: dict[str, Any], path: Path, *, own_classes: bool = False) -> Config:
     """Settings of a simulation from the content of a TOML file.
 
     Parameters
@@ -285,6 +291,8 @@ def config_of(document: dict[str, Any], path: Path) -> Config:
         The tables, as in `read_config`.
     path : Path
         Name of the file, for messages.
+    own_classes : bool
+        Whether the user has given this file, so that modules with classes of the user's own are imported.
 
     Returns
     -------
@@ -314,7 +322,9 @@ def config_of(document: dict[str, Any], path: Path) -> Config:
         check_keys(document, ("output", "phases", *tables), ("tip", "simulation"))
         for name in tables:
             check_table(document.get(name, {}), f"[{name}]")
+        check_levels(document)
         key = key_of(document)
+        document = with_own_objects(document, path.parent if own_classes else None)
         output = document.get("output")
         if output is not None and not (isinstance(output, str) and output):
             raise ValueError(f"output must be a file name such as 'run.h5', got {short_text(output)}")
@@ -341,14 +351,20 @@ def config_of(document: dict[str, Any], path: Path) -> Config:
         ("charges", ChargeSettings),
         ("flights", FlightSettings),
         ("monitor", Monitor),
-        ("law", Extremal, Arrhenius),
-        ("rule", Robin, ConstantPotential),
+        ("law", *LAWS),
+        ("rule", *RULES),
         ("control", VoltageControl),
     ):
         with _located(path, name):
-            table = document.get(name)
-            sections.append(from_plain(table, *kinds, what=name) if table else kinds[0]())
+            table = document.get(name, {})
+            if is_plain(table):
+                table = from_plain(table, *kinds, what=name) if table else kinds[0]()
+            sections.append(table)
     detector, charges, flights, monitor, law, rule, control = sections
+    with _located(path, "law"):
+        check_law(law)
+    with _located(path, "rule"):
+        check_rule(rule)
     with _located(path, "responses"):
         response_settings = ResponseSettings.of_table(document.get("responses", {}))
     with _located(path, "real_units"):

@@ -1,12 +1,49 @@
-"""Writing of settings as TOML; the standard library only reads it."""
+"""Settings as TOML: reading with a limit on nested tables, and writing, which the standard library does not do."""
 
 import json
 import math
 import re
+import tomllib
 from collections.abc import Mapping
 from typing import Any
 
+from apt_evap._common.validation import short_text
+
+MOST_LEVELS = 64
+"""Levels of tables and lists in settings: each of them is read by a few nested calls."""
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
+
+
+def read_toml(text: str) -> dict[str, Any]:
+    """Content of a text in TOML, dict; ValueError if it is not TOML, or has too many levels."""
+    try:
+        document = tomllib.loads(text)
+    except RecursionError:
+        raise ValueError(_TOO_DEEP) from None
+    except tomllib.TOMLDecodeError:
+        raise
+    except ValueError:
+        raise ValueError("integers must not have thousands of digits") from None
+    check_levels(document)
+    return document
+
+
+def check_levels(document: Any) -> None:
+    """Raise a ValueError if tables and lists have more than `MOST_LEVELS` levels."""
+    level = [document]
+    for _ in range(MOST_LEVELS + 1):
+        level = [
+            inner
+            for outer in level
+            for inner in (outer.values() if isinstance(outer, Mapping) else outer)
+            if isinstance(inner, Mapping | list)
+        ]
+        if not level:
+            return
+    raise ValueError(_TOO_DEEP)
+
+
+_TOO_DEEP = f"settings must have at most {MOST_LEVELS} levels of tables and lists"
 
 
 def toml_text(document: Mapping[str, Any]) -> str:
@@ -60,4 +97,4 @@ def inline(value: Any) -> str:
             return "[" + ", ".join(map(inline, value)) + "]"
         case Mapping():
             return "{" + ", ".join(f"{_key(key)} = {inline(each)}" for key, each in value.items()) + "}"
-    raise ValueError(f"settings must be texts, numbers, booleans, lists and tables, got {value!r:.80}")
+    raise ValueError(f"settings must be texts, numbers, booleans, lists and tables, got {short_text(value)}")

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from apt_evap._common.codec import checked, choice, count, from_plain, settings, vector
-from apt_evap._common.validation import check_choice, did_you_mean, short_text
+from apt_evap._common.validation import check_choice, check_kind, did_you_mean, short_text
 from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.dataset.fields import CHOICES
 from apt_evap.detection.instrument import PRESETS, Instrument
@@ -24,7 +24,9 @@ def read_instrument(table: str | Mapping[str, Any]) -> Instrument:
     ValueError
         If the preset or a field is unknown, or a field is outside its range.
     """
-    table = {"preset": table} if isinstance(table, str) else dict(table)
+    if isinstance(table, str):
+        table = {"preset": table}
+    table = dict(check_kind(table, "instrument", Mapping, "a table or the name of a preset"))
     preset = PRESETS[check_choice(table.pop("preset"), "preset", PRESETS)] if "preset" in table else {}
     return from_plain({**preset, **table}, Instrument, what="instrument")
 

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from apt_evap._common.codec import checked, from_plain, number, settings
+from apt_evap._common.codec import checked, from_plain, is_plain, number, settings
 from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_count, check_number, short_text
 from apt_evap.specimen.lattice import SECOND_SHELL_FACTORS
@@ -204,7 +204,7 @@ class PairEnergies:
     def _number(self, given, known, name, what):
         values = known if given is None else {**known, **given}
         if name not in values:
-            raise ValueError(f"{what} must have a value for {name}, got {', '.join(values)}")
+            raise ValueError(f"{what} must have a value for {name}, got {short_text(list(values))}")
         return values[name]
 
     def pair_energy(self, tip: Tip, first: int, second: int) -> float:
@@ -237,6 +237,10 @@ class PairEnergies:
         return element.evaporation_field * ratio * ratio
 
 
+BONDS = (CoordinationTable, PairEnergies)
+"""The built-in evaporation fields by bonds."""
+
+
 def _bonds(bonds, name):
     complete = all(hasattr(bonds, each) for each in ("fields", "by_species", "second_shell"))
     if not complete or isinstance(bonds, type | Mapping) or not callable(bonds.fields):
@@ -253,7 +257,7 @@ def bonds_field() -> Any:
     def read(plain, name):
         if plain == "TUNGSTEN_TABLE":
             return TUNGSTEN_TABLE
-        return from_plain(plain, CoordinationTable, PairEnergies, what=name)
+        return from_plain(plain, *BONDS, what=name) if is_plain(plain) else plain
 
     text = "Evaporation field by the bonds of an atom; by default that of its species."
     return checked(text, "BondField", _bonds, default=None, read=read)

@@ -8,6 +8,7 @@ import numpy as np
 
 from apt_evap._common.codec import part, settings
 from apt_evap._common.types import Floats, Integers
+from apt_evap._common.validation import short_text
 from apt_evap._core.law import LawKernel, PythonLaw, WeightedField
 from apt_evap.emission.roll_probability import AT_REST, BY_CHARGE, Migration
 from apt_evap.evaporation.bonds import COORDINATION, BondField, bond_table, bonds_field
@@ -113,7 +114,8 @@ class Extremal:
 def check_law(law: object) -> None:
     """Raise a ValueError if `law` is not an evaporation law."""
     if isinstance(law, type | Mapping) or not any(callable(getattr(law, name, None)) for name in ("kernel", "keys")):
-        raise ValueError(f"law must be an evaporation law with a method keys, such as Extremal(), got {law!r:.80}")
+        expected = "an evaporation law with a method keys, such as Extremal()"
+        raise ValueError(f"law must be {expected}, got {short_text(law)}")
 
 
 def has_temperature(law: Any) -> TypeGuard[ThermalLaw]:

@@ -7,6 +7,7 @@ import apt_evap._core.constant_potential as constant_potential
 import apt_evap._core.robin as robin
 from apt_evap._common.codec import choice, count, number, settings
 from apt_evap._common.types import Floats
+from apt_evap._common.validation import short_text
 from apt_evap._core.rule import ChargingRule, PythonRule
 from apt_evap.specimen.tip import Tip
 
@@ -187,13 +188,16 @@ class ConstantPotential:
         )
 
 
+RULES = (Robin, ConstantPotential)
+"""The built-in charging rules, the default first."""
+
+
 def check_rule(rule: object) -> None:
     """Raise a ValueError if `rule` is not a charging rule."""
     methods = {name for name in ("kernel", "solve", "solve_patch") if callable(getattr(rule, name, None))}
     if isinstance(rule, type) or not ("kernel" in methods or {"solve", "solve_patch"} <= methods):
-        raise ValueError(
-            f"rule must be a charging rule such as Robin(), or an object with solve and solve_patch, got {rule!r:.80}"
-        )
+        expected = "a charging rule such as Robin(), or an object with solve and solve_patch"
+        raise ValueError(f"rule must be {expected}, got {short_text(rule)}")
 
 
 def relaxation_tolerance_of(rule: Rule | CompiledRule) -> float:

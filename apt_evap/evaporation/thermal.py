@@ -13,6 +13,7 @@ from apt_evap._core.elementary import logarithm
 from apt_evap._core.law import BARRIERS, LawKernel, ThermalRate, WeightedField
 from apt_evap.detection.timing import Cooling
 from apt_evap.evaporation.bonds import BondField, bond_table, bonds_field
+from apt_evap.evaporation.law import Extremal
 from apt_evap.evaporation.voltage import VoltageControl
 from apt_evap.specimen.tip import Tip
 from apt_evap.units import BOLTZMANN
@@ -155,10 +156,10 @@ class Arrhenius:
             return np.full(len(names), float(self.sensitivity))
         for name in self.sensitivity:
             if name not in names:
-                raise ValueError(f"sensitivity must be of the elements {', '.join(names)}, got {name!r}")
+                raise ValueError(f"sensitivity must be of the elements {', '.join(names)}, got {short_text(name)}")
         missing = [name for name in names if name not in self.sensitivity]
         if missing:
-            raise ValueError(f"sensitivity must have a value for {missing[0]}, got {self.sensitivity!r}")
+            raise ValueError(f"sensitivity must have a value for {missing[0]}, got {short_text(self.sensitivity)}")
         return np.array([float(self.sensitivity[name]) for name in names])
 
     def default_control(self) -> VoltageControl:
@@ -239,3 +240,7 @@ class Arrhenius:
         reach, _ = self.working_point(float(sensitivities[0]), control or self.default_control())
         frequency = float(logarithm(self.attempt_frequency))
         return ThermalRate(weight, np.ascontiguousarray(stiffness), frequency, self.barrier, reach, *more)
+
+
+LAWS = (Extremal, Arrhenius)
+"""The built-in laws, the default first."""

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from apt_evap.config.simulation_file import read_config
+from apt_evap.explore.search_process import sentence_of
 from apt_evap.simulation.checkpoint import Checkpoint
 from apt_evap.simulation.stop_reason import StopReason
 
@@ -105,7 +106,7 @@ def _simulate(settings, output, pipe):
         ended = why if run.ended else ""
         if run.ended == StopReason.INTERRUPTED:
             ended = f"stopped with {len(run):,} of {config.n_ions:,} ions; start it again to continue"
-    except (ValueError, OSError, MemoryError) as error:
-        ended = str(error) or type(error).__name__
+    except Exception as error:
+        ended = sentence_of(error)
     with contextlib.suppress(OSError):  # the other process has died
         pipe.send(ended)

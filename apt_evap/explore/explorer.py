@@ -273,7 +273,7 @@ class Explorer:
             Called at the start and after each emission, with the number of those that are done, and of all. An error
             that it raises ends the search.
         apply : callable, optional
-            Calls a function with a tuple of arguments, such as ``multiprocessing.Pool.apply``.
+            Calls a function with a tuple of arguments, such as `SearchProcess.call`.
 
         Returns
         -------

@@ -2,8 +2,6 @@
 
 import cmath
 import math
-import multiprocessing
-import threading
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -30,6 +28,7 @@ from apt_evap.detection.hits import Hits
 from apt_evap.detection.projection import Projection
 from apt_evap.explore.latest import Latest
 from apt_evap.explore.marks import Marks, overlay
+from apt_evap.explore.search_process import SearchProcess, guarded, start_thread
 from apt_evap.explore.widgets import LEFT
 from apt_evap.fit.fit_energies import measured_map
 from apt_evap.indexing.index import Indexing, index
@@ -84,7 +83,7 @@ class IndexPanel:
         put_code: Callable[[str], None],
     ) -> None:
         self._measured, self._later, self._put_code = measured, later, put_code
-        self.latest = Latest(lambda wish: wish())
+        self.latest = Latest(lambda wish: wish())  # wishes tell their errors
         self.candidates: list[tuple[Orientation, Projection, str]] = []
         self._found: Indexing | None = None  # of the search that gave the candidates
         self._asked: Any = None  # the fit or search whose candidates are to be shown, unless others come first
@@ -222,7 +221,7 @@ class IndexPanel:
             "mirror": bool(self.options.active),
         }
         self._asked = wish = marks, options
-        self.latest.ask(partial(self._fit, wish))
+        self.latest.ask(guarded(partial(self._fit, wish), partial(self._later_put, wish, [])))
 
     def _search(self, button, start=None):
         """Search over all orientations by `index`, or refine one, in another process; marks narrow it."""
@@ -251,15 +250,11 @@ class IndexPanel:
                 self._put_searched(found, text)
 
         def work():
-            try:
-                with multiprocessing.get_context("spawn").Pool(1) as pool:
-                    found = pool.apply(index, arguments, options)
-            except ValueError as error:
-                self._later(partial(put, None, str(error)), 0)
-            else:
-                self._later(partial(put, found, f"{found.verdict}: {found.reason}"), 0)
+            with SearchProcess() as process:
+                found = process.call(index, arguments, options)
+            self._later(partial(put, found, f"{found.verdict}: {found.reason}"), 0)
 
-        threading.Thread(target=work, daemon=True).start()
+        start_thread(work, lambda sentence: self._later(partial(put, None, sentence), 0))
 
     def _put_searched(self, found, text):
         rows = [] if found is None else [
@@ -291,15 +286,12 @@ class IndexPanel:
 
     def _fit(self, wish):
         marks, options = wish
-        rows, hint = [], ""
-        try:
-            found = marks.fits(**options)
-        except ValueError as error:
-            hint = str(error)
-        else:
-            rows = [(each.orientation, each.projection, f"RMS {each.rms:.2f} mm") for each in found]
-            if len(marks.poles) == 2 and not marks.lines and options["scale"] is None:
-                hint = "two poles fit exactly: a third one decides"
+        rows = [(fit.orientation, fit.projection, f"RMS {fit.rms:.2f} mm") for fit in marks.fits(**options)]
+        exact = len(marks.poles) == 2 and not marks.lines and options["scale"] is None
+        self._later_put(wish, rows, "two poles fit exactly: a third one decides" if exact else "")
+
+    def _later_put(self, wish, rows, hint):
+        """Show the candidates of a fit, in the thread of the page."""
 
         def put():
             if self._asked is wish:  # the marks are still these

@@ -1,10 +1,9 @@
 """The page of the explorer. The numbers of this room need no Bokeh: see explorer."""
 
 import math
-import multiprocessing
-import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from html import escape
 from pathlib import Path
@@ -47,6 +46,7 @@ from apt_evap.explore.index_panel import IndexPanel
 from apt_evap.explore.latest import Latest
 from apt_evap.explore.marks import plain
 from apt_evap.explore.run_panel import RunPanel, Workbench
+from apt_evap.explore.search_process import SearchProcess, guarded, start_thread
 from apt_evap.explore.specimen_surface import COLORED_BY, surface_atoms
 from apt_evap.explore.specimen_view import SIDES, SpecimenView
 from apt_evap.explore.style import STYLES, VEIL, WIDGETS, page_styles, theme
@@ -164,7 +164,7 @@ class Page:
         self.root = root
         document.add_root(root)
         if explorer is not None:
-            self.latest.ask(partial(self._judge, self.shown))
+            self.latest.ask(guarded(partial(self._judge, self.shown), self._note_later))
             if self.both and not explorer.registered and later is None:
                 self._call_later(partial(self._register, None), FIRST_MAP)
 
@@ -444,7 +444,11 @@ class Page:
 
     def ask(self, preview: bool) -> None:
         """Ask for the maps of the current view; they come later."""
-        self.latest.ask(partial(self._compute, self.view(), preview))
+        self.latest.ask(guarded(partial(self._compute, self.view(), preview), self._note_later))
+
+    def _note_later(self, sentence):
+        """Show an error, from any thread."""
+        self._later(partial(self._put_notes, [sentence]), 0)
 
     def _call_later(self, function, delay):
         if delay:
@@ -454,11 +458,7 @@ class Page:
 
     def _compute(self, view, preview):
         """Compute a view in the worker thread; what is overtaken is not put on the page."""
-        try:
-            shown = self.explorer.show(view, preview)
-        except ValueError as error:
-            self._later(partial(self._put_notes, [str(error)]), 0)
-            return
+        shown = self.explorer.show(view, preview)
         self._later(partial(self.put, shown), 0)
         if not preview:
             self._judge(shown)
@@ -557,11 +557,7 @@ class Page:
         self._put_notes([f"reading {path}"])
 
         def work():
-            try:
-                again = self._opened(path, self.document)
-            except (ValueError, OSError) as error:
-                self._later(partial(self._put_notes, [str(error)]), 0)
-                return
+            again = self._opened(path, self.document)
 
             def show():
                 self.close()
@@ -569,12 +565,12 @@ class Page:
 
             self._later(show, 0)
 
-        threading.Thread(target=work, daemon=True).start()
+        start_thread(work, self._note_later)
 
     def _stop_search(self):
         self._searches += 1
         if self._search is not None:
-            self._search.terminate()
+            self._search.end()
             self._search = None
         self._progress = None
 
@@ -590,16 +586,13 @@ class Page:
             self._later(partial(self._put_progress, search, started, done, number), 0)
 
         def work():
-            try:
-                with multiprocessing.get_context("spawn").Pool(1) as self._search:
-                    self.explorer.register(perturbations, progress, self._search.apply)
-            except _Overtaken:
-                return
-            except ValueError as error:
-                self._later(partial(self._put_notes, [str(error)]), 0)
+            with SearchProcess() as process:
+                self._search = process
+                with suppress(_Overtaken):
+                    self.explorer.register(perturbations, progress, process.call)
             self._later(partial(self._search_ended, search), 0)
 
-        threading.Thread(target=work, daemon=True).start()
+        start_thread(work, lambda sentence: self._later(partial(self._search_ended, search, sentence), 0))
 
     def _put_progress(self, search, started, done, number):
         if search != self._searches:
@@ -614,9 +607,14 @@ class Page:
             self._progress_text = "half a minute each"
         self._put_chip(None)
 
-    def _search_ended(self, search):
-        if search == self._searches:
-            self._progress = None
+    def _search_ended(self, search, sentence=""):
+        if search != self._searches:  # it was stopped
+            return
+        self._progress = None
+        if sentence:
+            self._put_chip(None)
+            self._put_notes([sentence])
+        else:
             self.ask(preview=False)
 
     def _registration_typed(self):

@@ -1,6 +1,6 @@
 """Group of the page that writes the settings of a simulation of the measured specimen, and runs it."""
 
-import threading
+import os
 from collections.abc import Callable
 from functools import partial
 from html import escape
@@ -10,8 +10,11 @@ from typing import Any
 from bokeh.layouts import column, row
 from bokeh.models import Button, Div, NumericInput, TextInput
 
+from apt_evap._common.files import check_path
 from apt_evap._common.threads import thread_count
+from apt_evap._common.validation import short_text
 from apt_evap.explore.background_run import BackgroundRun
+from apt_evap.explore.search_process import guarded, start_thread
 from apt_evap.explore.widgets import LEFT
 from apt_evap.twin.start import Start
 
@@ -79,8 +82,14 @@ class RunPanel:
 
     @property
     def path(self) -> Path:
-        """Settings file."""
-        return Path(self.file.value.strip() or "specimen.toml").expanduser().absolute()
+        """Settings file; ValueError if no file can have this name."""
+        name = self.file.value.strip() or "specimen.toml"
+        try:
+            path = Path(name).expanduser().absolute()
+            os.fsencode(path)
+        except (RuntimeError, ValueError) as error:  # no such user, no such character
+            raise ValueError(f"the settings file must have the name of a file, got {short_text(name)}") from error
+        return check_path(path)
 
     def _ask_nothing(self):
         self._confirmed = ""
@@ -90,9 +99,12 @@ class RunPanel:
         self.text.text = escape(text)
 
     def _write(self):
+        guarded(self._write_settings, self._say)()
+
+    def _write_settings(self):
         path = self.path
         if path.suffix.lower() != ".toml":
-            self._say(f"a settings file ends in .toml, got {path.name}")
+            self._say(f"a settings file ends in .toml, got {short_text(self.file.value)}")
             return
         if path.exists() and self._confirmed != str(path):
             self._confirmed, self.write.label = str(path), f"replace {path.name}"
@@ -104,24 +116,23 @@ class RunPanel:
         minutes = self.minutes.value or 10.0
 
         def work():
-            try:
-                made = self._settings(minutes, thread_count())
-                made.save(path)
-            except (ValueError, OSError) as error:
-                self._later(partial(self._written, None, str(error)), 0)
-            else:
-                self._later(partial(self._written, made, f"wrote {path}: {made.foresight}"), 0)
+            made = self._settings(minutes, thread_count())
+            made.save(path)
+            self._later(partial(self._written, f"wrote {path}: {made.foresight}", made, path), 0)
 
-        threading.Thread(target=work, daemon=True).start()
+        start_thread(work, lambda sentence: self._later(partial(self._written, sentence), 0))
 
-    def _written(self, made, text):
+    def _written(self, text, made=None, path=None):
         self.write.disabled = False
         self._say(text)
         if made is not None:
-            self.bench.near[str(self.path.with_suffix(".h5"))] = made.near
+            self.bench.near[str(path.with_suffix(".h5"))] = made.near
             self._put_code(made.text)
 
     def _start_or_stop(self):
+        guarded(self._start_or_stop_run, self._say)()
+
+    def _start_or_stop_run(self):
         run = self.bench.run
         if run is not None and run.active:
             run.stop()

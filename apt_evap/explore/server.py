@@ -3,7 +3,7 @@
 import logging
 import secrets
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from bokeh.application import Application
 from bokeh.application.handlers import FunctionHandler
@@ -26,7 +26,23 @@ class _WithoutStrangers(logging.Filter):
         return not record.getMessage().startswith("Uncaught exception GET /ws ")
 
 
-_WITHOUT_STRANGERS = _WithoutStrangers()  # one object: a logger takes it once
+class _NamesTheOption(logging.Filter):
+    """Names the option of ``apt-evap explore`` for a page under another address, instead of one of Bokeh's own."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        if "--allow-websocket-origin" in str(record.msg) and len(record.args or ()) == 4:
+            origin, host, *_ = record.args  # type: ignore[misc]
+            record.msg, record.args = "a page under %s is refused; --allow-origin %s permits it", (origin, host)
+        return True
+
+
+# one object each: a logger takes it once
+_WITHOUT_STRANGERS, _NAMES_THE_OPTION = _WithoutStrangers(), _NamesTheOption()
+# scripts and styles relative to the address of the page: behind a proxy, it is not at the root of the server
+_RELATIVE = """
+{% block css_resources %}{{ bokeh_css | replace('"/static/', '"static/') }}{% endblock %}
+{% block js_resources %}{{ bokeh_js | replace('"/static/', '"static/') }}{% endblock %}
+"""
 
 
 def serve(
@@ -36,6 +52,7 @@ def serve(
     port: int = 0,
     registration_of: Callable[[str], Registration] | None = None,
     with_file: Callable[[str], tuple[Explorer | None, View | None]] | None = None,
+    origins: Sequence[str] = (),
 ) -> tuple[Server, str]:
     """Make the server of a page that only the holder of its address can open, from this machine.
 
@@ -51,6 +68,8 @@ def serve(
         As for `Page`.
     with_file : callable, optional
         Reads one more file, from its path, and returns the explorer and the view that show it.
+    origins : sequence of str
+        Further addresses ``"HOST:PORT"`` under which a browser opens the page, as behind a proxy.
 
     Returns
     -------
@@ -72,6 +91,7 @@ def serve(
     shown = explorer, view  # also after the page is loaded again
 
     def make(document: Document) -> None:
+        document.template = _RELATIVE
         page = Page(shown[0], document, shown[1], registration_of, None if with_file is None else opened, bench=bench)
         document.on_session_destroyed(lambda _: page.close())
 
@@ -90,6 +110,7 @@ def serve(
         return again
 
     logging.getLogger("tornado.application").addFilter(_WITHOUT_STRANGERS)
+    logging.getLogger("bokeh.server.views.ws").addFilter(_NAMES_THE_OPTION)
     key = secrets.token_bytes(32)  # other users of this machine reach 127.0.0.1, too
     server = Server(
         {"/": Application(FunctionHandler(make))},
@@ -98,7 +119,7 @@ def serve(
         secret_key=key,
         sign_sessions=True,
         generate_session_ids=False,
-        allow_websocket_origin=[f"{_ADDRESS}:{port}", f"localhost:{port}"],
+        allow_websocket_origin=[f"{_ADDRESS}:{port}", f"localhost:{port}", *origins],
     )
     server.start()
     return server, f"http://{_ADDRESS}:{port}/?bokeh-session-id={generate_session_id(key, signed=True)}"

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from apt_evap._common.codec import checked, settings
 from apt_evap._common.types import Floats, Integers
-from apt_evap._common.validation import check_array, check_choice, check_kind
+from apt_evap._common.validation import check_array, check_choice, check_kind, short_text
 from apt_evap.emission.energies import TruncatedNormal
 from apt_evap.emission.perturbations import Combined, LateralVelocity, Perturbation, RollUp
 
@@ -38,21 +38,21 @@ def _increasing(values, name):
     """Increasing numbers."""
     axis = check_array(values, name, ("n",))
     if not (len(axis) and (np.diff(axis) > 0).all()):
-        raise ValueError(f"{name} must be increasing numbers, got {axis.tolist()}")
+        raise ValueError(f"{name} must be increasing numbers, got {short_text(axis.tolist())}")
     return tuple(axis.tolist())
 
 
 def _positive(values, name):
     axis = _increasing(values, name)
     if not axis[0] > 0:
-        raise ValueError(f"{name} must be increasing numbers > 0, got {list(axis)}")
+        raise ValueError(f"{name} must be increasing numbers > 0, got {short_text(list(axis))}")
     return axis
 
 
 def _fractions(values, name):
     axis = _increasing(values, name)
     if not 0 <= axis[0] <= axis[-1] <= 1:
-        raise ValueError(f"{name} must be increasing numbers from 0 to 1, got {list(axis)}")
+        raise ValueError(f"{name} must be increasing numbers from 0 to 1, got {short_text(list(axis))}")
     return axis
 
 
@@ -61,7 +61,7 @@ def _options(options, name):
     for option, values in check_kind(options, name, Mapping, "a mapping of names to numbers").items():
         check_kind(option, f"a name in {name}", str, "text")
         if option in _RESERVED:
-            raise ValueError(f"{name} must not contain {option!r}: it has its own argument")
+            raise ValueError(f"{name} must not contain {short_text(option)}: it has its own argument")
         axes[option] = _increasing(values, f"option {option}")
     return axes
 

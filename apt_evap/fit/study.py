@@ -63,7 +63,7 @@ class Optimum:
         Similarity with the measured map.
     intervals : dict
         Bounds of 95 %, for each of these five numbers and for each option by name. They contain the noise of the ions
-        and the error of the model, and follow the ridge of equal true means (`energy_fit.intervals`). Empty without
+        and the error of the model, and follow the ridge of equal true means (``fit/intervals.py``). Empty without
         resamples.
     at_edge : tuple of str
         "mean", "relative_spread" and options that are at an end of the grid: the best value may then be beyond it.

@@ -151,9 +151,9 @@ class _Survey:
 
     def __init__(self, voltage_unit: str | None, detector_unit: str) -> None:
         self.detector_unit = check_choice(detector_unit, "detector_unit (--unit)", MM)
-        self._unit = (
-            voltage_unit if voltage_unit is None else check_choice(voltage_unit, "voltage_unit (--voltage-unit)", _UNITS)
-        )
+        if voltage_unit is not None:
+            check_choice(voltage_unit, "voltage_unit (--voltage-unit)", _UNITS)
+        self._unit = voltage_unit
         self.present = set()
         self.highest = {}
         self.pulses = PulseCheck()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -49,11 +50,23 @@ _BINS = 384  # bins of a map of simulated hits
 
 def _score(given, name):
     """A number that may be NaN; in files NaN is None."""
-    return float("nan") if given is None else float(given)
+    unknown = given is None or (isinstance(given, float) and given != given)
+    return math.nan if unknown else check_number(given, name)
 
 
-def _ties(plain, name):
-    return [from_plain(each, Registration, what=name) for each in plain]
+def _method(given, name):
+    return check_kind(given, name, str, "a text")
+
+
+def _ties(given, name):
+    return tuple(check_kind(tie, name, Registration, "Registrations") for tie in check_sequence(given, name, _TIES))
+
+
+def _read_ties(plain, name):
+    return [from_plain(tie, Registration, what=name) for tie in check_sequence(plain, name, _TIES)]
+
+
+_TIES = "Registrations"
 
 
 @settings
@@ -104,15 +117,15 @@ class Registration:
     method: str = checked(
         'Origin of the transform: "search", "start", "pole", "points", or "" if given by the user.',
         "str",
-        lambda method, name: str(method),
+        _method,
         default="",
     )
     ties: tuple = checked(
         "Other transforms that are equally good within the noise, usually by the symmetry of the crystal.",
         "tuple of Registration",
-        lambda ties, name: tuple(ties),
+        _ties,
         default=(),
-        read=_ties,
+        read=_read_ties,
     )
     distortion: Distortion | None = part(
         "Polynomial terms, applied last: the distortion of an instrument with a reflectron.", Distortion, default=None

@@ -51,17 +51,17 @@ class Column(NamedTuple):
     """Shape of a row."""
     unit: str | None = None
     """Unit of the numbers."""
-    derived: bool = False
-    """Whether it follows from the other columns, so that the fingerprint does not contain it."""
+    hashed: bool = True
+    """Whether the fingerprint contains it."""
 
 
 _EVENTS = {column.name: column for column in events.COLUMNS}
 
 
-def _of_events(path, derived=False):
+def _of_events(path, hashed=True):
     """A column that the events fill."""
     column = _EVENTS[path.rpartition("/")[2]]
-    return Column(path, column.dtype, column.row, column.unit, derived)
+    return Column(path, column.dtype, column.row, column.unit, hashed)
 
 
 ALWAYS = (
@@ -75,19 +75,19 @@ ALWAYS = (
     Column("species", np.int32),
     _of_events("charges"),
     _of_events("fields"),
-    _of_events("detached", derived=True),
-    Column("phase", np.int8, derived=True),
+    _of_events("detached", hashed=False),
+    Column("phase", np.int8, hashed=False),
 )
 OPTIONAL = (
     Column("emissions/rollup_distances", np.float64, (), "nm"),  # phases that differ in it
     _of_events("clock/waits"),
     Column("clock/voltages", np.float64, (), "V"),
-    Column("responses/not_flown", np.bool_, derived=True),  # with a field of view
-    Column("real/voltages", np.float64, (), "V", derived=True),
-    Column("real/instrument_voltages", np.float64, (), "V", derived=True),
-    Column("real/charges", np.int32, (), "e", derived=True),
-    Column("real/masses", np.float64, (), "Da", derived=True),
-    Column("real/pulse_ids", np.int64, derived=True),
+    Column("responses/not_flown", np.bool_, hashed=False),  # with a field of view
+    Column("real/voltages", np.float64, (), "V", hashed=False),
+    Column("real/instrument_voltages", np.float64, (), "V", hashed=False),
+    Column("real/charges", np.int32, (), "e", hashed=False),
+    Column("real/masses", np.float64, (), "Da", hashed=False),
+    Column("real/pulse_ids", np.int64, hashed=False),
 )
 
 

@@ -5,9 +5,8 @@ from dataclasses import replace
 from types import TracebackType
 from typing import Any
 
-from tqdm.auto import tqdm
-
 from apt_evap._common.files import FileError
+from apt_evap._common.progress import progress_bar
 from apt_evap._core.evaporation import EXHAUSTED, SWEEP_DUE
 from apt_evap.evaporation.emitter import Batch, Emitter
 from apt_evap.simulation.checkpoint import CheckpointWriter
@@ -99,7 +98,7 @@ class Recorder:
         self._monitor = Watch(settings, interval, n_evaporated - len(self), self._stored)
         self._ending = StopReason.COMPLETE
         self._report = progress if callable(progress) else None
-        self._bar = tqdm(
+        self._bar = progress_bar(
             total=n_ions,
             initial=len(self),
             unit=" ions",

@@ -275,7 +275,7 @@ class Run:
             and voltages of a control, flown perturbations and responses, but not the real units, which follow from
             them. By design it does not depend on the machine.
         """
-        columns = columns_of(self, (column for column in self.every_column if not column.derived))
+        columns = columns_of(self, (column for column in self.every_column if column.hashed))
         hashed = hashlib.sha256()
         for name in sorted(columns):
             values = np.array(columns[name], order="C")

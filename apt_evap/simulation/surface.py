@@ -3,7 +3,7 @@
 from apt_evap._common.codec import from_plain
 from apt_evap._common.validation import check_kind
 from apt_evap.evaporation.emitter import Emitter
-from apt_evap.evaporation.rule import ConstantPotential, Robin
+from apt_evap.evaporation.rule import RULES
 from apt_evap.evaporation.settings import ChargeSettings
 from apt_evap.simulation.run import Run
 from apt_evap.specimen.tip import Tip
@@ -33,7 +33,7 @@ def surface_after(run: Run, n_threads: int | None = None) -> Emitter:
     check_kind(run, "run", Run, "a Run")
     if run.state is None:
         raise ValueError(f"{run!r} does not contain the state of its surface")
-    rule = from_plain(run.settings["rule"], Robin, ConstantPotential, what="the charging rule")
+    rule = from_plain(run.settings["rule"], *RULES, what="the charging rule")
     emitter = Emitter(
         Tip.from_settings(run.settings["tip"]),
         run.voltage,

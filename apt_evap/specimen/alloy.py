@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from apt_evap._common.codec import checked, from_plain, number, settings
 from apt_evap._common.counter_random import GAMMA, mix, open_interval
 from apt_evap._common.types import Floats, Integers
-from apt_evap._common.validation import check_kind, check_number, check_seed
+from apt_evap._common.validation import check_kind, check_number, check_pairs, check_seed
 from apt_evap._core.elementary import exponential
 from apt_evap.specimen.materials import Material, as_material
 from apt_evap.specimen.regions import region_of, with_boundary
@@ -58,6 +58,30 @@ class Segregation:
         return self.bulk + (self.peak - self.bulk) * exponential(-0.5 * scaled * scaled)
 
 
+def by_material(values: Any, name: str) -> dict[Material, Any]:
+    """Return the values of elements by Material, dict.
+
+    Parameters
+    ----------
+    values : mapping or list
+        Values by element (Material, its name, or a table of a file), or pairs of these, as a run contains them.
+    name : str
+        Name of the argument, for the message.
+
+    Raises
+    ------
+    ValueError
+        If it is something else, an element is unknown, or an element occurs twice.
+    """
+    materials: dict[Material, Any] = {}
+    for element, value in check_pairs(values, name, "a table of an element to its atomic fraction"):
+        material = as_material(element, name)
+        if material in materials:
+            raise ValueError(f"{name} must have each element once, got {material.name} twice")
+        materials[material] = value
+    return materials
+
+
 def check_solutes(
     solutes: Mapping[Material, Any] | Mapping[str, Any] | None, *, profiles: bool = True
 ) -> dict[Material, Any]:
@@ -82,8 +106,7 @@ def check_solutes(
     fractions: dict[Material, Any] = {}
     if solutes is not None:
         check_kind(solutes, "solutes", Mapping, "a mapping of an element to its atomic fraction")
-    for element, fraction in (solutes or {}).items():
-        solute = as_material(element, "solutes")
+    for solute, fraction in by_material(solutes or {}, "solutes").items():
         if isinstance(fraction, Segregation) and profiles:
             fractions[solute] = fraction
         elif isinstance(fraction, Mapping) and profiles:  # of a file

@@ -159,12 +159,12 @@ def check_axis(structure: str, axis: Sequence[float], name: str = "axis") -> tup
         u, v, t, w = indices
         # exactly for integers; otherwise to the rounding of a few decimals
         if abs(u + v + t) > (0 if (indices == np.rint(indices)).all() else 1e-6 * np.abs(indices).max()):
-            raise ValueError(f"{name} must have u + v + t = 0 for a direction [u v t w], got {axis!r}")
+            raise ValueError(f"{name} must have u + v + t = 0 for a direction [u v t w], got {short_text(axis)}")
         indices = np.array([u - t, v - t, w])
     if not indices.any():
-        raise ValueError(f"{name} must not be zero, got {axis!r}")
+        raise ValueError(f"{name} must not be zero, got {short_text(axis)}")
     if np.abs(indices).max() > 1e6 or np.abs(indices).max() < 1e-6:
-        raise ValueError(f"{name} must have its largest number between 1e-6 and 1e6, got {axis!r}")
+        raise ValueError(f"{name} must have its largest number between 1e-6 and 1e6, got {short_text(axis)}")
     if (indices == np.rint(indices)).all():
         whole = indices.astype(np.int64)
         return tuple((whole // np.gcd.reduce(whole)).tolist())

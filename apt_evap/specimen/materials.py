@@ -6,7 +6,7 @@ from typing import Any
 
 from apt_evap._common.codec import checked, choice, count, from_plain, number, settings
 from apt_evap._common.notebook import as_table
-from apt_evap._common.validation import check_kind, check_number, did_you_mean, short_text
+from apt_evap._common.validation import check_kind, check_name, check_number, did_you_mean, short_text
 from apt_evap.specimen.lattice import BASES, nearest_neighbour_distance
 from apt_evap.units import ELEMENTARY_CHARGE
 
@@ -18,12 +18,6 @@ _SHAIKH = "Shaikh et al., arXiv 2509.13744, appendix on polarization"
 # larger than for any element: finds wrong units, such as a = 3.52 (Angstrom) or 35e9 (V/m)
 _LONGEST = 2.0
 _HIGHEST_FIELD = 1000.0
-
-
-def _name(name, what):
-    if not isinstance(name, str) or not name:
-        raise ValueError(f"{what} must be text such as 'Ni', got {short_text(name)}")
-    return name
 
 
 def _sources(given, name):
@@ -43,7 +37,7 @@ class Material:
     <Tip: 6,583 atoms of M [0 0 1], apex radius 2 nm, shank 4 nm at 1.5 degrees, rounded base>
     """
 
-    name: str = checked("Chemical symbol, or any name.", "str", _name)
+    name: str = checked("Chemical symbol, or any name.", "str", check_name)
     structure: str = choice("Crystal structure.", BASES)
     a: float = number("Lattice constant.", above=0, at_most=_LONGEST, unit="nm")
     evaporation_field: float = number(
@@ -160,7 +154,9 @@ def material(name: str, **changes: Any) -> Material:
     known = [item.name for item in fields(Material) if item.name not in ("name", "sources")]
     for change in changes:
         if change not in known:
-            raise ValueError(f"a material has no {change!r}{did_you_mean(change, known)}; it has {', '.join(known)}")
+            raise ValueError(
+                f"a material has no {short_text(change)}{did_you_mean(change, known)}; it has {', '.join(known)}"
+            )
     if not isinstance(name, str) or name not in MATERIALS:
         known = f"known are {', '.join(MATERIALS)}, define others as Material(...)"
         symbol = _WORDS.get(name.strip().lower()) if isinstance(name, str) else None

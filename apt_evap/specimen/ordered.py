@@ -8,6 +8,7 @@ import numpy as np
 from apt_evap._common.codec import checked, choice, from_plain, settings
 from apt_evap._common.types import Integers
 from apt_evap._common.validation import check_count, check_number, check_sequence, short_text
+from apt_evap.specimen.alloy import by_material
 from apt_evap.specimen.lattice import BASES
 from apt_evap.specimen.materials import Material, as_material
 
@@ -40,8 +41,8 @@ def _occupant(value, name):
     if not isinstance(value, Mapping):
         return ((as_material(value, name), 1.0),)
     fractions = tuple(
-        (as_material(element, name), check_number(fraction, f"fraction of {short_text(element)}", above=0, at_most=1))
-        for element, fraction in value.items()
+        (element, check_number(fraction, f"fraction of {element.name}", above=0, at_most=1))
+        for element, fraction in by_material(value, name).items()
     )
     total = sum(fraction for _, fraction in fractions)
     if not abs(total - 1) < 1e-9:
@@ -61,7 +62,7 @@ def _of_file(plain, name):
     if plain in ("", None):  # TOML has no None
         return None
     if isinstance(plain, list):
-        return {as_material(element, name): fraction for element, fraction in plain}
+        return by_material(plain, name)
     return as_material(plain, name) if isinstance(plain, Mapping) and "structure" in plain else plain
 
 

@@ -10,9 +10,18 @@ from numpy.typing import NDArray
 from apt_evap._common.codec import checked, number, settings
 from apt_evap._common.small_matrices import matrix_product
 from apt_evap._common.types import Floats, Integers
-from apt_evap._common.validation import check_choice, check_kind, check_number, check_sequence, short_text
+from apt_evap._common.validation import check_choice, check_kind, check_name, check_number, check_sequence
 from apt_evap.specimen import lattice
-from apt_evap.specimen.alloy import SOLUTE, SUBLATTICE, VACANCY, Segregation, check_solutes, choose, site_numbers
+from apt_evap.specimen.alloy import (
+    SOLUTE,
+    SUBLATTICE,
+    VACANCY,
+    Segregation,
+    by_material,
+    check_solutes,
+    choose,
+    site_numbers,
+)
 from apt_evap.specimen.materials import Material, as_material
 from apt_evap.specimen.ordered import check_order, order_of, sublattice
 from apt_evap.specimen.regions import boundary_distance, check_region, contains, region_of
@@ -20,12 +29,6 @@ from apt_evap.specimen.surface_criterion import SurfaceCriterion
 
 _MOST_PHASES = 127  # int8 per atom
 _HIGHEST_FIELD = 1000.0  # [V/nm]: as for a Material
-
-
-def _name(name, what):
-    if not isinstance(name, str) or not name:
-        raise ValueError(f"{what} must be text such as 'matrix', got {short_text(name)}")
-    return name
 
 
 def _field(given, name):
@@ -42,16 +45,11 @@ def _solutes(given, name):
     return check_solutes(given)
 
 
-def _pairs(plain, name):
-    """Pairs of an element and its fraction from a table, or from the list that a run contains."""
-    return plain if isinstance(plain, list) else check_kind(plain, name, Mapping, "a table").items()
-
-
 @settings
 class Phase:
     """A part of a specimen: a crystal in a region."""
 
-    name: str = checked('Any name, such as "matrix".', "str", _name)
+    name: str = checked('Any name, such as "matrix".', "str", check_name)
     material: Any = checked(
         "The crystal, and its main element. A precipitate that is coherent with the matrix has the lattice constant of "
         'the matrix: ``ae.material("Cu", a=aluminium.a)``.',
@@ -87,7 +85,7 @@ class Phase:
         "mapping",
         _solutes,
         default={},
-        read=lambda plain, name: {as_material(key, name): each for key, each in _pairs(plain, name)},
+        read=by_material,
         hash=False,
     )
     evaporation_field: float | Mapping[str, float] | None = checked(

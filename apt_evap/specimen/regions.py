@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from apt_evap._common.codec import checked, from_plain, number, settings, vector
+from apt_evap._common.codec import checked, from_plain, is_plain, number, settings, vector
 from apt_evap._common.small_matrices import lengths, products
 from apt_evap._common.types import Booleans, Floats
 from apt_evap._common.validation import check_array, check_kind, check_number, check_sequence, short_text
@@ -279,5 +279,5 @@ def boundary_distance(region: Any, points: Floats) -> Floats:
 
 
 def region_of(plain: Any, name: str = "region") -> Any:
-    """Region from its plain form; ValueError if it was a function or a class of the user, which no file contains."""
-    return from_plain(plain, *REGIONS, what=name)
+    """Region from its plain form; ValueError if it was a function or a class of the user, which no run contains."""
+    return from_plain(plain, *REGIONS, what=name) if is_plain(plain) else plain

@@ -184,6 +184,71 @@ def test_a_plain_form_that_does_not_fit_is_refused(plain):
         from_plain(plain, Pulse)
 
 
+DEEP: list = []
+for _ in range(2_000):
+    DEEP = [DEEP]
+ODD = (
+    5,
+    -1.5,
+    "x",
+    "x" * 100_000,
+    True,
+    [],
+    [1, 2],
+    [[1]],
+    [[1, 2, 3]],
+    {},
+    {"a": 1},
+    [None] * 3,
+    10**400,
+    [10**400] * 3,
+)
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda example: type(example).__name__)
+def test_no_value_of_a_field_escapes_the_checks(example):
+    """A value is taken, or refused in a short sentence; whatever its type."""
+    plain = to_plain(example)
+    for name in declared(type(example)):
+        for odd in (*ODD, DEEP, {"name": name, "x": DEEP}, None):
+            try:
+                from_plain({**plain, name: odd}, type(example))
+            except ValueError as error:
+                assert 0 < len(str(error)) < 1_000 and "\n" not in str(error)
+
+
+@pytest.mark.parametrize(
+    ("kind", "plain", "field"),
+    [
+        (ae.emission.Mixture, {"perturbations": 5}, "perturbations"),
+        (ae.specimen.Phase, {"name": "m", "material": "Ni", "solutes": [1, 2]}, "solutes"),
+        (ae.specimen.Phase, {"name": "m", "material": "Ni", "solutes": [["Al"]]}, "solutes"),
+        (ae.specimen.Phase, {"name": "m", "material": "Ni", "solutes": [["Al", 0.1], ["Al", 0.2]]}, "solutes"),
+        (ae.specimen.Superlattice, {"prototype": "L1_2", "second": [0, 0, 0]}, "second"),
+        (ae.specimen.Superlattice, {"prototype": "L1_2", "second": [["Al", 0.5], ["Al", 0.5]]}, "second"),
+        (ae.specimen.Union, {"regions": None}, "regions"),
+        (ae.Registration, {"rotation": 0.0, "scale": 1.0, "shift": [0, 0], "ties": 3}, "ties"),
+        (ae.Registration, {"rotation": 0.0, "scale": 1.0, "shift": [0, 0], "ties": [3]}, "ties"),
+        (ae.Registration, {"rotation": 0.0, "scale": 1.0, "shift": [0, 0], "score": "high"}, "score"),
+        (ae.Registration, {"rotation": 0.0, "scale": 1.0, "shift": [0, 0], "score": 10**400}, "score"),
+        (ae.Registration, {"rotation": 0.0, "scale": 1.0, "shift": [0, 0], "method": 3}, "method"),
+        (ae.dataset.DatasetSettings, {"instrument": {"integer": [0, 10]}}, "instrument"),
+        (ae.dataset.DatasetSettings, {"instrument": {"uniform": [0, 10]}}, "instrument"),
+    ],
+)
+def test_the_field_is_named_also_if_its_conversion_stops(kind, plain, field):
+    with pytest.raises(ValueError, match=field):
+        from_plain(plain, kind)
+
+
+def test_an_element_occurs_once():
+    for solutes in ({"Al": 0.1, ae.material("Al"): 0.2}, {ae.material("Al"): 0.1, "Al": 0.1}):
+        with pytest.raises(ValueError, match="Al"):
+            ae.Tip(NICKEL, apex_radius=2.0, solutes=solutes)
+    again = from_plain(to_plain(ae.specimen.Phase("m", NICKEL, solutes={"Al": 0.1, "Cu": 0.2})), ae.specimen.Phase)
+    assert {element.name: fraction for element, fraction in again.solutes.items()} == {"Al": 0.1, "Cu": 0.2}
+
+
 def test_values_are_converted_defaults_are_not_shared_and_nothing_can_be_set():
     pulse = Pulse(np.float32(1.5), np.int64(3), place=[1, 2])
     assert type(pulse.width) is float and type(pulse.shots) is int and pulse.place == (1.0, 2.0)

@@ -12,6 +12,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from apt_evap import __version__, cli, plot
@@ -753,3 +754,44 @@ def test_an_output_that_is_no_regular_file_is_refused(folder, capsys, name):
     os.mkfifo(name)
     option = "-o" if name.endswith(".h5") else "--map"
     assert f"cannot write '{name}': Not a regular file" in failed(capsys, "run", "small.toml", option, name)
+
+
+@pytest.mark.parametrize("backend", ["module://matplotlib_inline.backend_inline", "nope"])
+def test_pictures_do_not_need_the_backend_of_the_shell(made, folder, backend):
+    """A terminal of a notebook sets a backend, which other environments do not have."""
+    environment = os.environ | {"MPLBACKEND": backend, "PYTHONPATH": HERE}
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", PROGRAM, "map", str(made), "-o", "map.png", "--quiet"],
+        env=environment, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert imread("map.png").ndim == 3
+
+
+def test_a_command_leaves_the_environment_as_it_is(made, monkeypatch, capsys):
+    monkeypatch.setenv("MPLBACKEND", "module://mine")
+    before = dict(os.environ)
+    assert main(["info", str(made)]) == 0
+    assert dict(os.environ) == before
+
+
+def test_a_picture_is_drawn_before_its_file_is_opened(made, folder, monkeypatch):
+    """A kill while it is drawn, which takes a second, leaves nothing behind."""
+    seen = []
+    draw = Figure.savefig
+
+    def watched(figure, *arguments, **options):
+        draw(figure, *arguments, **options)
+        seen.extend(os.listdir())
+
+    monkeypatch.setattr(Figure, "savefig", watched)
+    before = os.listdir()
+    assert main(["map", str(made), "-o", "map.png", "--quiet"]) == 0
+    assert seen == before and imread("map.png").ndim == 3
+
+
+def test_a_table_that_has_no_effect_is_told(folder, capsys):
+    text = SMALL + "responses = false\n[responses]\nwide = true\n"
+    (folder / "a.toml").write_text(text.replace("ions = 60", "ions = 5"))
+    assert main(["run", "a.toml", "--quiet"]) == 0
+    assert "[responses]" in capsys.readouterr().err

@@ -4,6 +4,7 @@ import pytest
 
 import apt_evap as ae
 from apt_evap._common.codec import to_python
+from apt_evap.config.lens_text import read_lens
 from apt_evap.config.perturbation_text import read_perturbation, title_of, write_perturbation
 
 NORMAL = ae.TruncatedNormal(0.155, 0.1)
@@ -64,3 +65,30 @@ def test_a_perturbation_of_a_user_has_no_text():
 
     with pytest.raises(ValueError, match="perturbation"):
         write_perturbation(Mine())
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{a=" + "[" * 2_000,
+        "{a" + ".a" * 1_500 + "=1}",
+        '{name="RollUp", energy=' + "1" * 5_000 + "}",
+        "RollUp:" + "1" * 5_000 + "x",
+        "X" * 100_000,
+        "X" * 100_000 + ":1,2,3",
+        '{name="Mixture", perturbations=5}',
+        '{name="Unperturbed"}\nx=1',
+    ],
+    ids=lambda text: text[:20],
+)
+def test_a_text_that_is_none_is_refused_in_a_short_sentence(text):
+    with pytest.raises(ValueError, match="perturbation") as refused:
+        read_perturbation(text)
+    assert len(str(refused.value)) < 600
+
+
+@pytest.mark.parametrize("text", ["a:b=" + "[" * 2_000, "local-electrode:" + "x" * 100_000, "x" * 100_000, 5])
+def test_a_lens_that_is_none_is_refused_in_a_short_sentence(text):
+    with pytest.raises(ValueError, match="lens") as refused:
+        read_lens(text)
+    assert len(str(refused.value)) < 600

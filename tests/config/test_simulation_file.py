@@ -14,7 +14,7 @@ from apt_evap._common.codec import from_plain, to_plain
 from apt_evap._common.files import FileError
 from apt_evap.config.map_panels import MapSettings, Panel
 from apt_evap.config.perturbation_text import read_perturbation, title_of
-from apt_evap.config.simulation_file import read_config
+from apt_evap.config.simulation_file import config_of, read_config
 from apt_evap.detection.detector import Detector
 from apt_evap.emission.energies import Thermal, TruncatedNormal
 from apt_evap.emission.perturbations import Combined, LateralVelocity, Mixture, RollUp, Unperturbed
@@ -303,12 +303,39 @@ def test_no_value_gives_anything_but_a_config_or_one_sentence(tmp_path, place, v
             config.simulation(n_threads=1)
 
 
-@pytest.mark.parametrize("content", [b"ions = = 3", b"\x89HDF\r\n\x1a\n\xff\x00", b"[tip]\n[tip]\n"])
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"ions = = 3",
+        b"\x89HDF\r\n\x1a\n\xff\x00",
+        b"[tip]\n[tip]\n",
+        b"x" + b".a" * 1_500 + b" = 1",
+        b"[x" + b".a" * 1_500 + b"]",
+        b"x = " + b"[" * 1_500 + b"]" * 1_500,
+        b"x = " + b"[" * 70 + b"]" * 70,
+        b"x = " + b"9" * 5_000,
+    ],
+)
 def test_what_is_not_toml_is_called_so(tmp_path, content):
     path = tmp_path / "a.toml"
     path.write_bytes(content)
     with pytest.raises(FileError, match=r"a\.toml' is not a TOML file: "):
         read_config(path)
+
+
+def test_deep_tables_of_python_are_refused_too():
+    deep: dict = {}
+    for _ in range(2_000):
+        deep = {"a": deep}
+    for document in ({**MINIMAL, "law": deep}, {**MINIMAL, "tip": {**MINIMAL["tip"], "solutes": deep}}):
+        with pytest.raises(FileError, match=r"made\.toml'.*levels"):
+            config_of(document, Path("made.toml"))
+
+
+def test_a_byte_order_mark_is_no_content(tmp_path):
+    plain, marked = written(tmp_path, MINIMAL), tmp_path / "marked.toml"
+    marked.write_bytes(b"\xef\xbb\xbf" + plain.read_bytes().replace(b"\n", b"\r\n"))
+    assert read_config(marked).key == read_config(plain).key
 
 
 def test_what_is_too_large_or_a_pipe_is_not_read(tmp_path):

@@ -1,5 +1,6 @@
 """The page of the explorer in a document without a browser."""
 
+import re
 import threading
 import time
 from dataclasses import replace
@@ -17,7 +18,7 @@ pytest.importorskip("bokeh")
 from bokeh.document import Document
 from bokeh.models import Slider, Spinner
 from bokeh.util.token import generate_jwt_token, generate_session_id
-from tornado.httpclient import HTTPClientError, HTTPRequest
+from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
 from tornado.websocket import websocket_connect
 
 from apt_evap.cli._files import read_registration
@@ -590,3 +591,33 @@ def test_connections_of_strangers_print_no_traceback(run, caplog):
     finally:
         server.stop()
     assert not [record for record in caplog.records if record.exc_info]
+
+
+def test_a_page_behind_a_proxy(caplog):
+    """Its scripts are relative to its address, and it is opened under the addresses that are named, and no others."""
+    server, url = serve(None, origins=["hub.example.org", "other.example:8000"])
+    base = url.split("/?")[0]
+    answers = []
+
+    async def visit():
+        client = AsyncHTTPClient()
+        text = (await client.fetch(url)).body.decode()
+        scripts = re.findall(r'src="([^"]*)"', text)
+        assert scripts and all(script.startswith("static/") for script in scripts) and '"/static' not in text
+        assert (await client.fetch(f"{base}/{scripts[0]}")).code == 200
+        token = re.search(r'"token":"([^"]+)"', text)[1]
+        for origin in ("https://hub.example.org", "http://other.example:8000", "http://other.example:8001"):
+            request = HTTPRequest(base.replace("http", "ws") + "/ws", headers={"Origin": origin})
+            try:
+                connection = await websocket_connect(request, subprotocols=["bokeh", token])
+                answers.append(await connection.read_message() is not None)
+                connection.close()
+            except HTTPClientError as error:
+                answers.append(error.code)
+
+    try:
+        server.io_loop.run_sync(visit)
+    finally:
+        server.stop()
+    assert answers == [True, True, 403]
+    assert "--allow-origin other.example:8001" in caplog.text
