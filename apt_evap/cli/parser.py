@@ -766,7 +766,8 @@ def _mark(n: int) -> Callable[[str], tuple[Any, ...]]:
     def mark(text):
         numbers = _numbers(text)
         indices = numbers[n:]
-        if len(numbers) < n or len(indices) not in (0, 3, 4) or any(each != round(each) for each in indices):
+        whole = all(index.is_integer() for index in indices)  # no infinity, no NaN
+        if len(numbers) < n or len(indices) not in (0, 3, 4) or not whole:
             raise argparse.ArgumentTypeError(f"must be {n} coordinates [mm], perhaps with indices, got {text!r}")
         return (*numbers[:n], tuple(int(each) for each in indices)) if indices else numbers
 

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from apt_evap._common.files import check_path
+from apt_evap._common.files import check_path, open_for_reading
 from apt_evap._common.threads import thread_count
 from apt_evap.cli._files import check_output, lens_of
 from apt_evap.cli._output import tell, tell_json
@@ -44,5 +44,5 @@ def summary(start: Start) -> dict[str, object]:
 
 def is_start(path: Path) -> bool:
     """Whether a file was made by this command."""
-    with open(path, "rb") as file:
+    with open_for_reading(path) as file:
         return file.read(len(MARK)) == MARK.encode()
