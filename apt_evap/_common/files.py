@@ -54,7 +54,9 @@ def check_path(path: Any) -> Path:
         os.fsencode(path)
     except UnicodeEncodeError:
         encoding = sys.getfilesystemencoding()
-        raise FileError(f"path must be a file name in {encoding}, the encoding of this locale, got {path!a:.80}") from None
+        raise FileError(
+            f"path must be a file name in {encoding}, the encoding of this locale, got {path!a:.80}"
+        ) from None
     return Path(path)
 
 

@@ -315,7 +315,7 @@ def _emission(rolled):
 
 
 def _of_metal(material):
-    """Lines of the panel with the rule of the metal, if its cohesive energy is known and its field is that of a metal."""
+    """Lines of the panel with the rule of the metal, if the material has the numbers of one."""
     if material.cohesive_energy is None:
         return []
     try:
