@@ -1,11 +1,12 @@
 """`apt-evap start`: a settings file for a simulation of a measured specimen."""
 
 import argparse
+import shlex
 from pathlib import Path
 
 from apt_evap._common.files import check_path, open_for_reading
 from apt_evap._common.threads import thread_count
-from apt_evap.cli._files import check_output, lens_of
+from apt_evap.cli._files import check_output, lens_of, path_word
 from apt_evap.cli._output import tell, tell_json
 from apt_evap.cli.index import indexed
 from apt_evap.twin.start import MARK, Start, settings_of
@@ -18,7 +19,7 @@ def execute(options: argparse.Namespace) -> int:
     start = start_of(options)
     tell(options, f"{start.indexing}")
     start.save(path)
-    tell(options, f"wrote {path}: {start.foresight}; simulate with apt-evap run {path}")
+    tell(options, f"wrote {path}: {start.foresight}; simulate with apt-evap run {shlex.quote(path_word(path))}")
     tell_json(options, {"wrote": str(path), "file": options.file, **summary(start)})
     return 0
 
