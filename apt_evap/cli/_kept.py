@@ -27,8 +27,10 @@ class KeptFiles:
     ----------
     folder : Path
         The folder; it is made with the first file.
-    made_from : mapping
-        SHA-256 of input files and values of options by name, in the types of JSON.
+    files : mapping
+        SHA-256 of the input files by name; None for an option that is not given.
+    options : mapping
+        Values of the options that change a result, in the types of JSON.
     names : sequence of str
         Names that files and folders of the command may have.
 
@@ -38,9 +40,12 @@ class KeptFiles:
         If the folder cannot be written, has files of other programs with these names, or was made from something else.
     """
 
-    def __init__(self, folder: Path, made_from: Mapping[str, Any], names: Sequence[str]) -> None:
+    def __init__(
+        self, folder: Path, files: Mapping[str, str | None], options: Mapping[str, Any], names: Sequence[str]
+    ) -> None:
         self.folder = folder
-        self._made_from = json.loads(json.dumps(made_from))
+        self._files = files
+        self._made_from = json.loads(json.dumps({**files, **options}))
         self._digests: dict[str, str] = {}
         if os.path.lexists(folder) and not folder.is_dir():
             raise FileError(f"cannot write to {str(folder)!r}: it is not a folder")
@@ -70,10 +75,13 @@ class KeptFiles:
         for name in self._made_from | made_from:
             now, then = self._made_from.get(name), made_from.get(name)
             if now != then:
-                what = f"another {name}"
-                if not name.startswith("content of "):
-                    what = f"--{name.replace('_', '-')} {short_text(then)}, not {short_text(now)}"
-                raise FileError(f"{str(self.folder)!r} was made from {what}: {_ELSEWHERE}")
+                if name in self._files:
+                    what = f"from another {name}"
+                else:
+                    option = f"--{name.replace('_', '-')}"
+                    what = f"without {option}" if then is None else f"with {option} {short_text(then)}"
+                    what += "" if now is None else f", not with {short_text(now)}"
+                raise FileError(f"{str(self.folder)!r} was made {what}: {_ELSEWHERE}")
         self._digests = digests
 
     def _refuse(self, name, why) -> NoReturn:

@@ -289,12 +289,14 @@ def _add_twin(commands: Any) -> None:
         "twin",
         help="from a measured file to a simulation of its specimen, a fit and a report",
         description="Index a measured map, simulate its specimen, register the simulated map on the measured one, fit\n"
-        "the emission, and write a report. The same command continues after an interruption.",
+        "the emission, and write a report. The same command continues after an interruption. A folder belongs\n"
+        "to one FILE and one set of options: others are refused.",
         epilog="writes to FOLDER:\n"
         "  specimen.toml, start.json   settings of the simulation, and the indexing\n"
         "  run.h5, run.png             the simulation\n"
         "  registration.json, study/   as of apt-evap compare; study/report.html has it all\n"
-        "  answer.txt                  constants of the measurement, what they depend on, and checks\n\n"
+        "  answer.txt                  constants of the measurement, what they depend on, and checks\n"
+        "  twin.json                   SHA-256 of these files and of FILE, and the options\n\n"
         "example:\n"
         "  apt-evap twin R5083.epos --element Ni --distance 90 --minutes 10\n"
         "  apt-evap twin map.npz --element Ni --pole=-9.6,-0.4,1,1,1 --pole 2.4,6.2,1,1,3 --pole=-7.5,-13.5,1,3,1",

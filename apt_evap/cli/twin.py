@@ -41,7 +41,7 @@ _REPORT = f"{STUDY}/{REPORT}"
 _FRACTIONS = "0.2,0.4,0.6,0.8,1"  # that roll up, in the fit
 # options that change no result; the threads only limit the size of the tip
 _NO_MATTER = ("command", "arguments", "output", "threads")
-_FILES = ("file", "ranges", "undistort")  # options that are files
+_FILES = ("file", "ranges", "undistort")  # their content matters
 
 
 def _text(value, name):
@@ -98,7 +98,8 @@ class _Facts:
 def execute(options: argparse.Namespace) -> int:
     """Run the command; finished steps are not repeated."""
     folder = check_path(options.output or f"{Path(options.file).stem}_twin")
-    kept = KeptFiles(folder, _made_from(options), (SETTINGS, FACTS, RUN, REGISTRATION, STUDY, ANSWER))
+    files, values = _made_from(options)
+    kept = KeptFiles(folder, files, values, (SETTINGS, FACTS, RUN, REGISTRATION, STUDY, ANSWER))
     facts = _start(options, kept)
     candidate = _candidate(facts.best, options, folder)
     code = run_command.execute(_parsed("run", folder / SETTINGS, "-o", folder / RUN, "--resume", options=options))
@@ -137,14 +138,12 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _made_from(options):
-    """Content of the input files, and all options that change a result."""
+    """SHA-256 of the input files, and all options that change a result."""
     lens = lens_of(options)
     values = {name: value for name, value in vars(options).items() if name not in (*_NO_MATTER, *_FILES)}
     values["lens"] = None if lens is None else to_plain(lens)
-    for name in _FILES:
-        path = getattr(options, name)
-        values[f"content of {'FILE' if name == 'file' else f'--{name}'}"] = None if path is None else sha256_of(path)
-    return values
+    paths = {"FILE": options.file, "file of --ranges": options.ranges, "file of --undistort": options.undistort}
+    return {name: None if path is None else sha256_of(path) for name, path in paths.items()}, values
 
 
 def _start(options, kept):
