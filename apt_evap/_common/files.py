@@ -4,6 +4,7 @@ import hashlib
 import os
 import secrets
 import stat
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -39,10 +40,17 @@ def check_path(path: Any) -> Path:
     Raises
     ------
     FileError
-        If it is not a str or a path, or contains a null character.
+        If it is not a str or a path, or contains a character that names of files cannot have, here or in this locale.
     """
     if not isinstance(path, str | os.PathLike) or "\0" in os.fspath(path):
         raise FileError(f"path must be a file name, got {path!r:.80}")
+    try:
+        os.fsencode(path)
+    except UnicodeEncodeError:
+        encoding = sys.getfilesystemencoding()
+        raise FileError(
+            f"path must be a file name in {encoding}, the encoding of this locale, got {path!a:.80}"
+        ) from None
     return Path(path)
 
 

@@ -198,6 +198,11 @@ def read_registration(text: str) -> Registration:
         raise FileError(f"{text!r} does not contain a registration: {error}") from error
 
 
+def path_word(path: str | Path) -> str:
+    """Word of a command line, a path with ./ before a dash, which would make an option of it."""
+    return f".{os.sep}{path}" if isinstance(path, Path) and str(path).startswith("-") else str(path)
+
+
 def picture_path(path: AnyPath) -> Path:
     path = check_path(path)
     if path.suffix.lower() not in _MARK_KEYS:

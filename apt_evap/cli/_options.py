@@ -178,7 +178,8 @@ def _mark(n: int) -> Callable[[str], tuple[Any, ...]]:
     def mark(text):
         numbers = numbers_type(text)
         indices = numbers[n:]
-        if len(numbers) < n or len(indices) not in (0, 3, 4) or any(each != round(each) for each in indices):
+        is_whole = all(index.is_integer() for index in indices)  # no infinity, no NaN
+        if len(numbers) < n or len(indices) not in (0, 3, 4) or not is_whole:
             raise argparse.ArgumentTypeError(f"must be {n} coordinates [mm], perhaps with indices, got {text!r:.80}")
         return (*numbers[:n], tuple(int(each) for each in indices)) if indices else numbers
 

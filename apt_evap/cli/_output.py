@@ -12,14 +12,15 @@ INTERRUPTED, TERMINATED = 130, 143  # 128 + number of SIGINT and SIGTERM, as in 
 
 
 def open_missing_streams() -> None:
-    """Open streams that the caller has closed, and let stdout escape characters that it cannot encode."""
+    """Open streams that the caller has closed, and let stdout escape what it cannot encode, in any locale."""
     for name in ("stdin", "stdout", "stderr"):
         if getattr(sys, name) is None:
             # otherwise the next file would get a free number below 3, and output for a stream would go into it
             while (number := os.open(os.devnull, os.O_RDWR)) < 3:
                 pass
             setattr(sys, name, open(number, "r" if name == "stdin" else "w"))
-    if getattr(sys.stdout, "errors", None) == "strict" and hasattr(sys.stdout, "reconfigure"):
+    # in the C locale it is "surrogateescape", which knows the bytes of file names, but no other characters
+    if getattr(sys.stdout, "errors", None) in ("strict", "surrogateescape") and hasattr(sys.stdout, "reconfigure"):
         sys.stdout.reconfigure(errors="backslashreplace")
 
 

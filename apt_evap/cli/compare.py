@@ -247,7 +247,7 @@ def _write(study, run, folder, options, messages, sections):
 
 
 def _write_table(study, path):
-    with open(path, "w", newline="") as file:
+    with open(path, "w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         matrices = [study.scores, study.errors, study.shares]
         names = [

@@ -1,11 +1,12 @@
 """`apt-evap start`: a settings file for a simulation of a measured specimen."""
 
 import argparse
+import shlex
 from pathlib import Path
 
-from apt_evap._common.files import check_path
+from apt_evap._common.files import check_path, open_for_reading
 from apt_evap._common.threads import thread_count
-from apt_evap.cli._files import check_output, lens_of
+from apt_evap.cli._files import check_output, lens_of, path_word
 from apt_evap.cli._options import add_indexing, add_reading, add_specimen, add_speech
 from apt_evap.cli._output import tell, tell_json
 from apt_evap.cli.index import indexed
@@ -39,7 +40,7 @@ def execute(options: argparse.Namespace) -> int:
     start = start_of(options)
     tell(options, f"{start.indexing}")
     start.save(path)
-    tell(options, f"wrote {path}: {start.foresight}; simulate with apt-evap run {path}")
+    tell(options, f"wrote {path}: {start.foresight}; simulate with apt-evap run {shlex.quote(path_word(path))}")
     tell_json(options, {"wrote": str(path), "file": options.file, **summary(start)})
     return 0
 
@@ -65,5 +66,5 @@ def summary(start: Start) -> dict[str, object]:
 
 def is_start(path: Path) -> bool:
     """Whether a file was made by this command."""
-    with open(path, "rb") as file:
+    with open_for_reading(path) as file:
         return file.read(len(MARK)) == MARK.encode()

@@ -76,7 +76,17 @@ def _key(key):
     return key if _BARE.fullmatch(key) else _text(key)
 
 
+def comment(text: str) -> str:
+    """Comment of one line, "# ..."; characters that cannot be printed, such as line breaks, are escaped."""
+    shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    return f"# {shown}"
+
+
 def _text(value):
+    try:
+        value.encode()
+    except UnicodeEncodeError:  # of a file name that is not in UTF-8
+        raise ValueError(f"texts of settings must be Unicode, got {value!a:.80}") from None
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")  # JSON allows this character, TOML does not
 
 

@@ -11,21 +11,23 @@ import numpy as np
 import scipy
 
 from apt_evap._common.short_repr import short_repr
-from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence
+from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence, short_text
 from apt_evap.crystallography.orientation import Orientation
 from apt_evap.crystallography.symmetry import point_group
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.projection import Projection
-from apt_evap.indexing.marks import marks_of
+from apt_evap.indexing.marks import check_places, contradictory_marks, contradictory_pair, marks_of
 from apt_evap.indexing.master_pattern import MasterPattern, master_patterns
-from apt_evap.indexing.refine import Refined, bins_of, refine, resolution
+from apt_evap.indexing.refine import NO_STRETCH, Refined, bins_of, refine, resolution
 from apt_evap.indexing.search import Start, disc_of, misorientation, search
 from apt_evap.maps.folded_map import FoldedMap, folded
 from apt_evap.specimen.materials import as_material
 
 WIDEST, NARROWEST = 45.0, 12.0
 """Half angles of the field of view between which the scale is searched, if it is not known [degrees]."""
+LARGEST_ANGLE, LEAST_ANGLE = 60.0, 5.0
+"""Half angles of the field of view that a scale may give [degrees]."""
 DIFFERENT = 6.0
 """Angle between two orientations above which they are different answers [degrees]."""
 DECIDED = 12.0
@@ -35,11 +37,15 @@ RIVAL = 0.8
 LEAST_IONS = 4_000
 """Fewest ions with which a map decides, without marks: of 11 decided maps of 1,500 to 4,300 ions 4 were wrong, all
 below 3,100 ions (articles/find_the_poles)."""
+LEAST_GAIN, LEAST_STRUCTURE = 40.0, 4.0
+"""A map has structure beyond its noise if an orientation decreases the deviance by the first number, or if it deviates
+from slow changes by more than the second one, in standard errors: 52 maps of noise reach 13 to 31 and at most 2.1,
+maps of 1,000 simulated ions 50 to 88."""
 LEAST_COMPRESSION, LARGEST_COMPRESSION = 1.2, 2.2
 """Image compressions between which the scale is searched, if only the flight length is known."""
 _STARTS, _FINAL = 12, 6  # orientations that are refined, and that are refined to the end
 _QUICK, _RIVALS = 7, 4  # steps of a first refinement; orientations of each other structure that are tried
-_BEYOND = 1.1  # refined scales may leave their bounds by this factor: the stretch changes the scale
+_BEYOND = 1.1  # refined scales may leave bounds that nobody gave by this factor: the stretch changes the scale
 _MAP_BINS = 128
 
 
@@ -196,14 +202,14 @@ def index(
     material : Material or str
         The crystal.
     scales : sequence of two float, optional
-        Bounds of the scale [mm/rad]: the flight length divided by the image compression. A lens gives them within 10 %:
-        ``L / lens.compression(radius)``. By default those of `distance`, or a half angle of the field of view between
-        12 and 45 degrees.
+        Bounds of the scale of all candidates [mm/rad]: the flight length divided by the image compression. A lens gives
+        them within 10 %: ``L / lens.compression(radius)``. By default those of `distance`, or a half angle of the field
+        of view between 12 and 45 degrees. Scales for which the half angle is not 5 to 60 degrees are left out.
     poles : sequence, optional
         Poles that you see: (x, y) [mm], or (x, y, indices) if you know which one it is.
     lines : sequence, optional
         Zone lines that you see: (x, y, x, y) of two points far from each other [mm], or with the indices of the zone
-        axis as a fifth value. They need not meet in a pole.
+        axis as a fifth value. They need not meet in a pole. Indices are at most 9.
     patterns : sequence of MasterPattern, optional
         Patterns of the crystal; by default those of the package, for several radii.
     distance : float, optional
@@ -220,7 +226,8 @@ def index(
     Raises
     ------
     ValueError
-        If there is no pattern of the structure, or an argument is outside its range.
+        If there is no pattern of the structure, an argument is outside its range, a mark is outside the map, or the map
+        has too few bins.
 
     Notes
     -----
@@ -231,7 +238,8 @@ def index(
     neighbouring residuals of the better one in units of Poisson's. So a model that leaves structure unexplained decides
     less. The map is `decided` if the margin to the next orientation that differs by more than 6 degrees is above 12,
     and without marks of a user it has 4,000 ions, no such orientation explains more than 0.8 of what the first one
-    explains, and no other crystal structure explains more.
+    explains, and no other crystal structure explains more. A map of noise has a score of 0. Marks that no orientation
+    explains, or that contradict the map, are named in the reason, and the map is not decided.
 
     The axis is that at the centre of the field of view. An orientation and its mirror image look the same in crystals
     with mirror planes: a map does not decide its handedness.
@@ -262,19 +270,20 @@ def index(
             raise ValueError(f"patterns must be of {material.structure}, got {pattern!r}")
     disc = disc_of(measured)
     marks = marks_of(material, poles, lines)
-    if start is not None and scales is distance is None:
-        scales = start[1].scale / _BEYOND, start[1].scale * _BEYOND
-    low, high = _scales(disc, scales, distance)
+    check_places(marks, measured, disc.radius)
+    (low, high), bounds = _scales(disc, scales, distance, start)
     bins = bins_of(disc)
     sigma = resolution(disc, math.sqrt(low * high))
     densities = [pattern.smoothed(sigma) for pattern in patterns]
 
     def refined(start, steps):
         number = start[0]
-        return number, refine(bins, disc, densities[number], *start[1:], marks, steps)
+        return number, refine(bins, disc, densities[number], *start[1:], marks, steps, bounds)
 
     if start is None:
         starts = search(disc, patterns, (low, high), _STARTS, marks)
+        if marks:  # which may be wrong
+            starts += search(disc, patterns, (low, high), _RIVALS)
     else:
         matrix = _matrix_at(disc.centre, *start)
         starts = [Start(matrix, start[1].scale, 0.0, 0.5, number) for number in range(len(patterns))]
@@ -287,18 +296,21 @@ def index(
         rolled = each.amplitudes[1] / max(each.amplitudes.sum(), 1e-9)
         again.append(refined((number, each.matrix, each.scale, rolled), 20))
     found = _ranked(again + found[_FINAL:])
-    within = [each for each in found if low / _BEYOND < each[1].scale < high * _BEYOND]
-    found = within or found
+    if bounds != (low, high):
+        inside = [each for each in found if bounds[0] * 1.001 < each[1].scale_at_centre < bounds[1] / 1.001]
+        found = inside or found
     different: list[tuple[int, Refined]] = []
     for number, each in found:
         if all(misorientation(each.matrix, other.matrix, proper) > DIFFERENT for _, other in different):
             different.append((number, each))
     n = check_count(candidates, "candidates", at_least=1)
-    answer = _judged(measured, disc, material, patterns, different, proper, n, bool(marks))
+    contradiction = contradictory_pair(marks, disc.centre, bounds)
+    contradiction = contradiction or contradictory_marks(marks, different[0][1].deviations)
+    answer = _judged(measured, disc, bins, material, patterns, different, proper, n, bounds, bool(marks), contradiction)
     if start is not None:
         return replace(answer, decided=False, reason="refined from a given orientation, others were not searched")
     if answer.decided and not marks:
-        rival = _rival(disc, bins, sigma, (low, high), different[0][1], answer.best.pattern)
+        rival = _rival(disc, bins, sigma, (low, high), bounds, different[0][1], answer.best.pattern)
         if rival:
             answer = replace(answer, decided=False, reason=f"a {rival} crystal explains the map better")
     return answer
@@ -314,7 +326,7 @@ def _ranked(found):
     return [found[k] for k in np.argsort(-_evidence(found), kind="stable")]
 
 
-def _rival(disc, bins, sigma, scales, best, pattern):
+def _rival(disc, bins, sigma, scales, bounds, best, pattern):
     """Another structure that explains a map better than the best orientation, "" if there is none."""
     for other in ("fcc", "bcc", "diamond", "hcp"):
         if other == pattern.structure:
@@ -322,7 +334,7 @@ def _rival(disc, bins, sigma, scales, best, pattern):
         rival = min(master_patterns(other), key=lambda each: abs(math.log(each.apex_radius / pattern.apex_radius)))
         densities = rival.smoothed(sigma)
         for start in search(disc, (rival,), scales, _RIVALS):
-            found = refine(bins, disc, densities, start.matrix, start.scale, start.rolled, steps=_QUICK)
+            found = refine(bins, disc, densities, start.matrix, start.scale, start.rolled, (), _QUICK, bounds)
             if found.gain > best.gain:
                 return other
     return ""
@@ -339,30 +351,50 @@ def _matrix_at(centre, orientation, projection):
     return scipy.spatial.transform.Rotation.from_rotvec(turn).as_matrix() @ matrix
 
 
-def _scales(disc, scales, distance):
-    """Bounds of the scale [mm/rad]."""
+def _scales(disc, scales, distance, start):
+    """Bounds of the scale for the search, and for the answer [mm/rad]."""
     if scales is not None and distance is not None:
         raise ValueError("give scales or distance, not both")
+    name, factors = "scales", (1.0, 1.0)
     if scales is not None:
         low, high = check_array(scales, "scales", (2,)).tolist()
-        return check_number(low, "scales", above=0), check_number(high, "scales", at_least=low, unit="mm/rad")
-    if distance is not None:
-        length = check_number(distance, "distance", above=0, unit="mm")
-        return length / LARGEST_COMPRESSION, length / LEAST_COMPRESSION
-    return disc.radius / math.radians(WIDEST), disc.radius / math.radians(NARROWEST)
+        got = [check_number(low, name, above=0), check_number(high, name, at_least=low, unit="mm/rad")]
+    elif distance is not None:
+        name, factors = "distance", (LEAST_COMPRESSION, LARGEST_COMPRESSION)
+        length = got = check_number(distance, name, above=0, unit="mm")
+        low, high = length / LARGEST_COMPRESSION, length / LEAST_COMPRESSION
+    elif start is not None:
+        name, got = "the scale of start", start[1].scale
+        low, high = got / _BEYOND**2, got * _BEYOND**2
+    else:
+        low, high = disc.radius / math.radians(WIDEST), disc.radius / math.radians(NARROWEST)
+        return (low, high), (low / _BEYOND, high * _BEYOND)
+    least, largest = disc.radius / math.radians(LARGEST_ANGLE), disc.radius / math.radians(LEAST_ANGLE)
+    if high < least or low > largest:
+        unit = "mm" if name == "distance" else "mm/rad"
+        raise ValueError(
+            f"{name} must be from {least * factors[0]:.3g} to {largest * factors[1]:.3g} {unit} for this map (half "
+            f"angles of {LEAST_ANGLE:g} to {LARGEST_ANGLE:g} degrees for its radius of {disc.radius:.3g} mm), got "
+            f"{short_text(got)}"
+        )
+    bounds = max(low, least), min(high, largest)
+    return bounds, bounds
 
 
-def _judged(measured, disc, material, patterns, found, proper, n, marked):
+def _judged(measured, disc, bins, material, patterns, found, proper, n, bounds, marked, contradiction):
     evidence = _evidence(found)
+    structured = bins.structure > LEAST_STRUCTURE * bins.structure_error
+    structured = structured or max(each.gain for _, each in found) >= LEAST_GAIN
+    scores = [float(np.clip(each.explained, 0, 1)) if structured else 0.0 for _, each in found]
     weights = np.exp(0.5 * (evidence - evidence[0]))
     candidates = []
-    for (number, each), weight in zip(found[:n], weights / weights.sum(), strict=False):
+    for (number, each), weight, score in zip(found[:n], weights / weights.sum(), scores, strict=False):
         contrast = float(each.amplitudes.sum())
         candidates.append(
             Candidate(
                 orientation=_orientation(material, each.matrix, proper),
-                projection=_projection(disc, each),
-                score=float(np.clip(each.explained, 0, 1)),
+                projection=_projection(disc, each, bounds),
+                score=score,
                 confidence=float(weight),
                 rolled=float(each.amplitudes[1] / max(contrast, 1e-9)),
                 contrast=contrast,
@@ -370,15 +402,19 @@ def _judged(measured, disc, material, patterns, found, proper, n, marked):
                 pattern=patterns[number],
             )
         )
-    margin, best = math.inf, float(np.clip(found[0][1].explained, 0, 1))
+    margin, best = math.inf, scores[0]
     if len(found) > 1:
         margin = float(evidence[0] - evidence[1])
-    next_best = max((float(np.clip(each.explained, 0, 1)) for _, each in found[1:]), default=0.0)
+    next_best = max(scores[1:], default=0.0)
     decided = margin > DECIDED and (marked or next_best < RIVAL * best)
     numbers = f"{best:.2f} of the structure instead of {next_best:.2f} (margin {margin:.0f}; {DECIDED:g} is needed)"
-    if not marked and measured.is_counts and measured.ions < LEAST_IONS:
+    if not structured:
+        decided, reason = False, "the map has no structure beyond its noise"
+    elif contradiction:
+        decided, reason = False, contradiction
+    elif not marked and measured.is_counts and measured.ions < LEAST_IONS:
         decided, reason = False, f"{measured.ions:,} ions are too few to decide: {LEAST_IONS:,} are needed; {numbers}"
-    elif decided and best < next_best:
+    elif decided and best <= next_best:
         reason = f"only it fits the marks and the map (margin {margin:.0f}; {DECIDED:g} is needed)"
     elif decided:
         reason = f"it explains more than any other orientation, {numbers}"
@@ -399,10 +435,10 @@ def _orientation(material, matrix, proper):
     return Orientation.from_matrix(material, matrix @ member.T)
 
 
-def _projection(disc, refined):
+def _projection(disc, refined, bounds):
     """The projection whose radius has the same first two terms: equidistant, or compressed for a negative stretch."""
     stretch = refined.stretch
-    if stretch > -0.01:
-        return Projection(refined.scale, disc.centre)
-    scale = refined.scale / (1 - stretch)
+    scale = float(np.clip(refined.scale_at_centre, *bounds))  # by rounding
+    if stretch > NO_STRETCH:
+        return Projection(scale, disc.centre)
     return Projection(scale, disc.centre, compression=math.sqrt(-(1 - stretch) / (3 * stretch)) * disc.radius / scale)

@@ -6,6 +6,7 @@ of degree four: the efficiency of the detector, the decrease of the density towa
 slow. The amplitudes a are at least 0, their sum is at most 1.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -25,8 +26,12 @@ BINS = 56
 _STEPS = 15  # iterations at most
 _FINE = 0.3  # change of the deviance that ends the iteration: far below one standard error
 _DIFFERENCE = 2e-3  # [rad] of the numerical derivatives: a quarter of a pixel of the patterns
+_LONGEST = 3.0  # radii; a square has 1.4
+_FEWEST = 100  # bins, for 15 slow polynomials and 7 numbers of an orientation
 _LEAST = 0.05  # expected counts of a bin at least, where residuals are divided by their error
 _REACH = 5  # bins: residuals farther apart count as independent
+NO_STRETCH = -0.01
+"""Radial stretch above which the projection of the answer is equidistant."""
 _STRETCH = 0.05  # standard deviation of the prior of the radial stretch at the rim
 
 
@@ -57,6 +62,11 @@ class Bins(NamedTuple):
         """Sum of the squared deviations from this fit, beyond that of noise."""
         return pearson(self.counts, self.mu) - len(self.counts) + self.slow.shape[1]
 
+    @property
+    def structure_error(self) -> float:
+        """Standard deviation of `structure` by noise."""
+        return math.sqrt((2 + 1 / np.maximum(self.mu, _LEAST)).sum())
+
 
 @dataclass(frozen=True)
 class Refined:
@@ -78,8 +88,20 @@ class Refined:
     """Variance of the sum of neighbouring counts about the model, relative to that of Poisson's distribution."""
     misfit: float
     """Sum of the squared deviations of the marks in standard errors, and of their penalties."""
+    deviations: np.ndarray
+    """Deviation of each mark from what it may be [standard errors], shape (n_marks,)."""
     covariance: np.ndarray
     """Of the rotation vector [rad] and the logarithm of the scale, shape (4, 4)."""
+
+    @property
+    def scale_at_centre(self) -> float:
+        """Scale of the projection [mm/rad]."""
+        return self.scale / _widened(self.stretch)
+
+
+def _widened(stretch):
+    """Ratio of the scale from the centre to the rim to that at the centre, as in the projection of the answer."""
+    return 1.0 - stretch if stretch <= NO_STRETCH else 1.0
 
 
 def resolution(disc: Disc, scale: float) -> float:
@@ -105,6 +127,14 @@ def bins_of(disc: Disc) -> Bins:
     places = np.column_stack([combined(each)[inside] / factor**2 for each in (x, y)])
     places = (places - disc.centre) / disc.radius
     counts = combined(values)[inside]
+    if len(counts) < _FEWEST:
+        raise ValueError(
+            f"the map must have at least {_FEWEST} bins in its field of view, got {len(counts)} in {map!r}"
+        )
+    if (longest := float(np.hypot(*places.T).max())) > _LONGEST:
+        raise ValueError(
+            f"the field of view must reach at most {_LONGEST:g} radii of its circle, got {longest:.1f} in {map!r}"
+        )
     # well-conditioned polynomials
     terms = [places[:, 0] ** i * places[:, 1] ** j for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)]
     slow = np.linalg.qr(np.column_stack(terms))[0] * np.sqrt(len(places))
@@ -154,6 +184,7 @@ def refine(
     rolled: float,
     marks: Sequence[Mark] = (),
     steps: int = _STEPS,
+    bounds: tuple[float, float] | None = None,
 ) -> Refined:
     """Maximise the likelihood near a start.
 
@@ -171,6 +202,8 @@ def refine(
         Marks of a user.
     steps : int
         Largest number of iterations.
+    bounds : tuple of float, optional
+        Bounds of the scale at the centre [mm/rad].
 
     Returns
     -------
@@ -183,7 +216,13 @@ def refine(
         rotation = scipy.spatial.transform.Rotation.from_rotvec(turn).as_matrix() @ matrix
         return sampled(densities, directions @ rotation) - 1.0
 
+    def limits(stretch):
+        """Bounds of the logarithm of the scale from the centre to the rim."""
+        low, high = (-math.inf, math.inf) if bounds is None else np.log(bounds)
+        return np.array([low, high]) + math.log(_widened(stretch))
+
     geometry = np.array([0.0, 0.0, 0.0, np.log(scale), 0.0])
+    geometry[3] = np.clip(geometry[3], *limits(0.0))
     amplitudes = 0.5 * np.array([1 - rolled, rolled])
     fit = bins.fit
 
@@ -199,13 +238,15 @@ def refine(
         scale, stretch = float(np.exp(geometry[3])), geometry[4]
         return [directions_of(spot, disc.radius, scale, stretch) @ rotation for spot in spots]
 
-    # each mark keeps the target that it has at the start
-    targets = [mark.misfit(each)[1] for mark, each in zip(marks, of_marks(geometry), strict=True)]
+    # each mark keeps the target that it has at the start; one that is far from all of them does not count
+    targets = [mark.nearest(each) for mark, each in zip(marks, of_marks(geometry), strict=True)]
 
     def deviations(geometry):
         """Of the marks from their targets, and of the stretch from 0, in standard errors."""
         parts = [
-            mark.signed(each, target) for mark, each, target in zip(marks, of_marks(geometry), targets, strict=True)
+            mark.signed(each, target)
+            for mark, each, target in zip(marks, of_marks(geometry), targets, strict=True)
+            if target is not None
         ]
         return np.concatenate([*parts, [geometry[4] / _STRETCH]])
 
@@ -239,14 +280,22 @@ def refine(
             )
             normal[-5:, -5:] += slopes.T @ slopes
             right[-5:] -= slopes.T @ now
+        solved = normal
+        low, high = limits(geometry[4])
+        if moving and ((geometry[3] <= low and right[-2] < 0) or (geometry[3] >= high and right[-2] > 0)):
+            solved = normal.copy()  # the scale stays at its bound
+            solved[-2, :], solved[:, -2], right[-2] = 0.0, 0.0, 0.0
+            solved[-2, -2] = normal[-2, -2]
         improved = False
         for _ in range(6):
-            damped = normal + np.diag(damping * np.diag(normal) + 1e-12 * np.trace(normal))
+            damped = solved + np.diag(damping * np.diag(solved) + 1e-12 * np.trace(solved))
             change = np.linalg.solve(damped, right)
             new_fit = fit + np.clip(change[:n_slow], -1, 1)
             new_amplitudes = np.maximum(amplitudes + np.clip(change[n_slow : n_slow + 2], -0.3, 0.3), 0)
             new_amplitudes /= max(1.0, new_amplitudes.sum())
             new_geometry = geometry + (np.clip(change[n_slow + 2 :], -0.05, 0.05) if moving else 0.0)
+            if bounds is not None:
+                new_geometry[3] = np.clip(new_geometry[3], *limits(new_geometry[4]))
             new_contrasts = contrast(new_geometry[:3], *new_geometry[3:]) if moving else contrasts
             new_value = deviance(bins.counts, model(new_fit, new_amplitudes, new_contrasts)[0]) + penalty(new_geometry)
             if new_value <= value:
@@ -274,9 +323,10 @@ def refine(
         float(geometry[4]),
         amplitudes,
         bins.deviance - deviance(bins.counts, mu),
-        1 - (pearson(bins.counts, mu) - freedom) / max(bins.structure, 1e-9),
+        1 - (pearson(bins.counts, mu) - freedom) / bins.structure if bins.structure > bins.structure_error else 0.0,
         dispersion * _correlated(bins, mu),
         sum(mark.misfit(each)[0] for mark, each in zip(marks, of_marks(geometry), strict=True)),
+        np.array([mark.deviation(each) for mark, each in zip(marks, of_marks(geometry), strict=True)]),
         covariance,
     )
 

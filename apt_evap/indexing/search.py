@@ -68,6 +68,8 @@ class Start(NamedTuple):
 
 def disc_of(map: DetectorMap) -> Disc:
     """Find the field of view of a map, without its rim and corners of low density, and the largest circle inside it."""
+    if not map.values[map.mask].sum() > 0:
+        raise ValueError(f"the map must have hits, got {map!r}")
     values = map.values if map.is_counts else map.values * (20 / map.values[map.mask].mean())
     mask = map.mask & field_of_view(np.where(map.mask, values, 0))
     width, height = map.bin_size

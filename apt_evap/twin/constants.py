@@ -23,7 +23,7 @@ from apt_evap.microscope.local_electrode import LocalElectrode
 from apt_evap.reconstruction.reconstruct import reconstruct
 from apt_evap.reconstruction.shank import fit_shank
 from apt_evap.specimen.lattice import atom_density
-from apt_evap.twin.start import FIELD_FACTOR, voltages_of
+from apt_evap.twin.start import FIELD_FACTOR, has_voltage, voltages_of
 
 _ENDS = 1000  # ions at the beginning and at the end, for the voltages there
 _IONS = 20_000  # that are reconstructed for the angle of the shank
@@ -266,7 +266,7 @@ def _shank(hits, disc, scale, volume, efficiency, field, lens, factor, length):
     name = "angle of the shank [degrees]"
     if hits.x is None or hits.y is None:
         return Constant(name, math.nan, math.nan, "the ions have no places")
-    placed = replace(hits.within_circle(disc.radius, disc.centre), extent=None)
+    placed = replace(hits[has_voltage(hits)].within_circle(disc.radius, disc.centre), extent=None)
     placed = replace(placed, x=placed.x - disc.centre[0], y=placed.y - disc.centre[1])
     if lens is not None and length is not None:
         if lens.profile is not None:
@@ -356,13 +356,9 @@ def _sequence(hits, voltages):
 def _charges(hits, material, ranges):
     """Charge states of the element: their change, and the field that they give."""
     try:
-        course = course_of_charges(np.where(hits.detected, ion_charges(hits, material.name, ranges), 0), material.name)
-        course = course_of_charges(
-            np.where(hits.detected, ion_charges(hits, material.name, ranges), 0),
-            material.name,
-            course.charge,
-            sections=2,
-        )
+        charges = np.where(hits.detected, ion_charges(hits, material.name, ranges), 0)
+        course = course_of_charges(charges, material.name)
+        course = course_of_charges(charges, material.name, course.charge, sections=2)
     except ValueError:  # other elements, or one charge
         return []
     if (course.lower + course.upper).min() < LEAST:

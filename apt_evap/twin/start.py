@@ -11,14 +11,16 @@ from typing import Any
 
 import numpy as np
 
+from apt_evap._common.codec import to_plain
 from apt_evap._common.files import replace_file
 from apt_evap._common.short_repr import short_repr
-from apt_evap._common.types import AnyPath, Floats
+from apt_evap._common.types import AnyPath, Booleans, Floats
 from apt_evap._common.validation import check_count, check_kind, check_number
 from apt_evap._version import __version__
 from apt_evap.config.cost_estimate import CostEstimate, estimate_cost
 from apt_evap.config.perturbation_text import write_perturbation
 from apt_evap.config.simulation_file import config_of
+from apt_evap.config.toml_text import comment, inline
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.perturbations import RollUp
 from apt_evap.indexing.index import Indexing
@@ -26,6 +28,7 @@ from apt_evap.indexing.search import disc_of
 from apt_evap.microscope.local_electrode import LocalElectrode
 from apt_evap.registration.register import Registration
 from apt_evap.specimen.lattice import atom_density
+from apt_evap.specimen.materials import MATERIALS
 
 MARK = "# Settings of a simulation, made from a measured map by apt_evap"
 """Beginning of the first line of the text."""
@@ -189,9 +192,18 @@ def voltages_of(hits: Hits | None) -> Floats | None:
     """Standing voltage plus pulse of the ions that have one [V], None if there is none."""
     if hits is None or hits.voltage is None:
         return None
-    voltages = hits.voltage if hits.pulse_voltage is None else hits.voltage + hits.pulse_voltage
-    voltages = voltages[np.isfinite(voltages) & (voltages > 0)]
+    voltages = _voltages(hits)[has_voltage(hits)]
     return voltages.astype(float) if len(voltages) else None
+
+
+def has_voltage(hits: Hits) -> Booleans:
+    """Whether the voltage of an ion is known: finite and above 0; bool (n,)."""
+    voltages = _voltages(hits)
+    return np.isfinite(voltages) & (voltages > 0)
+
+
+def _voltages(hits):
+    return hits.voltage if hits.pulse_voltage is None else hits.voltage + hits.pulse_voltage
 
 
 def _radii(hits, field, lens, factor):
@@ -233,10 +245,10 @@ def _text(indexing, radii, size, lens, factor):
     shank_why = "assumed, it hardly changes the map of the cap" if lens is None else "that of the lens"
     lines = [
         f"{MARK} {__version__}.",
-        f"# Measured: {indexing.map.source or 'a map'}",
+        comment(f"Measured: {indexing.map.source or 'a map'}"),
         "",
         "[tip]",
-        f'material = "{material.name}"',
+        f"material = {_material_text(material)}",
         f"axis = [{axis}]    # at the centre of the map, within {best.angle_error:.1f} degrees by its noise",
         f"# {sure}",
         *others,
@@ -283,6 +295,14 @@ def _text(indexing, radii, size, lens, factor):
     return "\n".join(lines)
 
 
+def _material_text(material):
+    """Value of the key material: the name of a known material, or a table of another one."""
+    if material == MATERIALS.get(material.name):
+        return inline(material.name)
+    # with its sources, so that no field is that of a known material with this name
+    return inline({name: value for name, value in to_plain(material).items() if value is not None})
+
+
 def _emission(rolled):
     """Lines of the panel with the emission that the patterns suggest."""
     why = f"# the map has {rolled:.0%} of the pattern of ions that roll up; the energy is to be fitted"
@@ -295,13 +315,17 @@ def _emission(rolled):
 
 
 def _of_metal(material):
-    """Lines of the panel with the rule of the metal, if its cohesive energy is known."""
+    """Lines of the panel with the rule of the metal, if the material has the numbers of one."""
     if material.cohesive_energy is None:
+        return []
+    try:
+        perturbation = RollUp.of_metal(material)
+    except ValueError:
         return []
     return [
         "",
         "[[maps.panels]]",
         'title = "rule of the metal"',
         "# from the cohesive energy and the evaporation field; nothing is taken from this map",
-        f"perturbation = {write_perturbation(RollUp.of_metal(material))}",
+        f"perturbation = {write_perturbation(perturbation)}",
     ]
