@@ -10,6 +10,7 @@ import platform
 import resource
 import time
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -368,7 +369,9 @@ def response_errors(radii=(20, 80), shank=2.0, events=5000, ions=200, n_threads=
 def hits_of_a_million(ions=1_000_000, n_threads=2):
     """Time of `Run.hits` for a million ions, from copies of a small run."""
     run = ae.Simulation(nickel_tip(12, 1.0), seed=1, n_threads=n_threads).run(2000, progress=False)
-    run = ae.Run.join([run] * (ions // len(run)))
+    numbers, n = run.emissions.ions, len(run)
+    copies = [replace(run, emissions=replace(run.emissions, ions=numbers + k * n)) for k in range(ions // n)]
+    run = ae.Run.join(copies)
     energy = ae.TruncatedNormal(0.155, 0.155)
     rows = []
     for perturbation in (ae.Unperturbed(), ae.LateralVelocity(energy), ae.RollUp(energy), ae.Combined(energy, 0.75)):
