@@ -13,6 +13,10 @@ class ChargesWarning(AptWarning):
     """Charges that did not converge, or that drifted from the converged ones."""
 
 
+class EmissionWarning(AptWarning):
+    """A rule of the emission outside the conditions for which it holds."""
+
+
 class ResponseWarning(AptWarning):
     """Hits from responses outside the fitted range, or where the fit is poor."""
 

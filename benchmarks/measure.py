@@ -10,6 +10,7 @@ import platform
 import resource
 import time
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -244,6 +245,48 @@ def charge_error(emitter, tolerance):
     return float(np.sqrt((error**2).mean())), float(np.abs(error).max())
 
 
+def potentials(radii=(5, 7, 10, 14, 20), events=1000, step=25, n_threads=1):
+    """Potential in the centre, and charges of the cap, against converged copies of the surface; with and without bound.
+
+    Measured every `step` events and before each relaxation. The cap is the part within 60 degrees of the axis.
+    """
+    rows = []
+    for radius in radii:
+        tip = ae.Tip(NICKEL, radius * A, axis=(1, 1, 1))
+        for rule, bound in ((ae.Robin(), 1.0), (ae.Robin(), 4e-3), (ae.ConstantPotential(), 4e-3)):
+            settings = ae.evaporation.ChargeSettings(potential_bound=bound)
+            emitter = Emitter(tip, rule=rule, settings=settings, n_threads=n_threads)
+            exact = Emitter(tip, rule=rule, n_threads=n_threads)
+            removed, n, errors = [], 0, []
+            for batch in emitter.advance(events, batch_size=step):
+                removed.append(batch.site)
+                n += len(batch)
+                exact.remove(np.concatenate(removed))
+                exact.relax(1e-7)
+                removed = []
+                order, reference = np.argsort(emitter.atoms), np.argsort(exact.atoms)
+                x, y, z = exact.positions[reference].T
+                cap = np.hypot(x, y) < np.tan(np.radians(60)) * z
+                charges, known = emitter.charges[order][cap], exact.charges[reference][cap]
+                inside, expected = (each.potential_at([tip.potential_point], 0.0)[0] for each in (emitter, exact))
+                errors.append((np.sqrt(np.mean((charges - known) ** 2)) / known.mean(), inside / expected - 1))
+            cap, inside = np.array(errors).T
+            rows.append(
+                {
+                    "R [a]": radius,
+                    "surface atoms": len(emitter),
+                    "rule": type(rule).__name__,
+                    "bound": bound,
+                    "events": n,
+                    "cap, RMS [%]": 100 * float(np.sqrt(np.mean(cap**2))),
+                    "cap, largest RMS [%]": 100 * float(cap.max()),
+                    "potential, lowest [%]": 100 * float(inside.min()),
+                    "potential, highest [%]": 100 * float(inside.max()),
+                }
+            )
+    return {"title": f"between relaxations, Ni[111], shank 2 R, {events:,} events", "rows": rows}
+
+
 def flights(radii=(20, 40, 80, 120), shank=2.0, ions=256, group=17):
     """Time and evaluations of a flight, alone and in a group with common walks through the octree; one thread."""
     rows = []
@@ -368,7 +411,9 @@ def response_errors(radii=(20, 80), shank=2.0, events=5000, ions=200, n_threads=
 def hits_of_a_million(ions=1_000_000, n_threads=2):
     """Time of `Run.hits` for a million ions, from copies of a small run."""
     run = ae.Simulation(nickel_tip(12, 1.0), seed=1, n_threads=n_threads).run(2000, progress=False)
-    run = ae.Run.join([run] * (ions // len(run)))
+    numbers, n = run.emissions.ions, len(run)
+    copies = [replace(run, emissions=replace(run.emissions, ions=numbers + k * n)) for k in range(ions // n)]
+    run = ae.Run.join(copies)
     energy = ae.TruncatedNormal(0.155, 0.155)
     rows = []
     for perturbation in (ae.Unperturbed(), ae.LateralVelocity(energy), ae.RollUp(energy), ae.Combined(energy, 0.75)):
@@ -433,6 +478,7 @@ PARTS = {
     "rates": rates,
     "flights": flights,
     "charges": charge_errors,
+    "potentials": potentials,
     "places": place_errors,
     "responses": response_errors,
     "hits": hits_of_a_million,

@@ -15,6 +15,7 @@ cdef class Evaporation:
     cdef readonly ChargingRule rule
     cdef readonly LawKernel law
     cdef readonly double potential, coulomb, field_unit, patch_radius, update_radius, opening_angle
+    cdef readonly double potential_bound
     cdef readonly object start          # start values of the last relaxation of the whole surface
     cdef readonly long n_removed, since_relaxation
     cdef readonly long n_partial        # relaxations of a part since that of the whole surface
@@ -25,6 +26,7 @@ cdef class Evaporation:
     cdef readonly Control control       # of the voltage
     cdef readonly double target_stretch # squared reach of a roll-up over that of a nearest neighbour
     cdef readonly unsigned long long seed
+    cdef readonly bint was_scaled        # whether the potential inside was restored since the last relaxation
     cdef bint has_support
     cdef int[::1] slot_of               # (n_atoms,) -1 for atoms not at the surface
     cdef double[:, ::1] normals         # (capacity, 3) by slot
@@ -52,4 +54,5 @@ cdef class Evaporation:
     cdef double hopping(self, double key, double strength, long atom) noexcept nogil
     cdef int judge(self, const int* slots, long n) except -1 nogil
     cdef int event(self, long atom, Journal journal) except -1 nogil
+    cdef int scale(self, Journal journal) except -1 nogil
     cdef int expose(self, const int* fresh, int n_fresh, int gone, Journal journal) except -1 nogil

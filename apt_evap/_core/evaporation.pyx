@@ -9,7 +9,7 @@ cost of an event does not depend on the size of the specimen.
 from functools import partial
 
 from cython.parallel cimport prange
-from libc.math cimport INFINITY
+from libc.math cimport INFINITY, fabs
 
 import numpy as np
 
@@ -83,6 +83,9 @@ cdef class Evaporation:
         [nm].
     opening_angle : float
         Opening angle of relaxations, and of fields at newly exposed atoms [rad].
+    potential_bound : float
+        Relative change of the potential inside the specimen by events, above which it is restored by a common factor of
+        all charges, and a relaxation is due. Only for rules that compute it: `Robin`.
     seed : int
         Seed of the random numbers of a stochastic law: the choice of event k depends on (seed, k) only.
     control : Control, optional
@@ -92,7 +95,7 @@ cdef class Evaporation:
     """
 
     def __init__(self, Neighbourhood atoms, ChargingRule rule, LawKernel law, double potential, double coulomb,
-                 double patch_radius, double update_radius, double opening_angle,
+                 double patch_radius, double update_radius, double opening_angle, double potential_bound,
                  unsigned long long seed=0, Control control=None, double target_stretch=1.0):
         self.atoms, self.rule, self.law = atoms, rule, law
         self.potential, self.coulomb = potential, coulomb
@@ -101,6 +104,7 @@ cdef class Evaporation:
         self.since_relaxation, self.n_partial = NOT_RELAXED, 0
         self.seed, self.target_stretch = seed, target_stretch
         self.control = Control() if control is None else control
+        self.potential_bound = potential_bound
         self.has_support = bool(np.asarray(atoms.support).any())
         self.slot_of = np.full(atoms.n_atoms, -1, np.int32)
         self.make_room(ROOM)
@@ -250,7 +254,7 @@ cdef class Evaporation:
         self.control.voltage_factor = self.control.after_relaxation(log_rate_at)
         if self.control.voltage_factor != factor:
             self.chooser = self.ranked(self.control.voltage_factor, n_threads)
-        self.since_relaxation = 0
+        self.since_relaxation, self.was_scaled = 0, False
 
     def log_rate_at(self, double voltage_factor, int n_threads=1):
         """Natural logarithm of the sum of all rates [1/s] for a voltage over that of the charges; the keys are kept.
@@ -439,9 +443,31 @@ cdef class Evaporation:
             journal.slot[at + 1 + i] = patch.slot[i]
             journal.charge[at + 1 + i] = patch.charge[i]
             self.tree.set_charge(patch.slot[i], patch.charge[i])
-        self.tree.refresh()
-        self.judge(patch.slot, patch.n)
+        if fabs(self.rule.drift) > self.potential_bound:
+            self.scale(journal)
+        else:
+            self.tree.refresh()
+            self.judge(patch.slot, patch.n)
         journal.n_events += 1
+        return 0
+
+    cdef int scale(self, Journal journal) except -1 nogil:
+        # Multiply all charges by the factor that restores the potential inside. These are then the changes by the event.
+        cdef double factor = 1.0 / (1.0 + self.rule.drift)
+        cdef long slot, at = journal.start[journal.n_events] + 1
+        journal.room(self.tree.n_slots + 1, 0)
+        for slot in range(self.tree.n_slots):
+            if self.tree.atom[slot] >= 0:
+                self.tree.set_charge(slot, factor * self.tree.q[slot])
+                journal.slot[at] = <int>slot
+                journal.charge[at] = self.tree.q[slot]
+                at += 1
+        journal.start[journal.n_events + 1] = at
+        self.tree.refresh()
+        self.rule.scaled(self.tree, factor)
+        self.was_scaled = True
+        with gil:
+            self.chooser = self.ranked(self.control.voltage_factor, 1)
         return 0
 
     cdef int expose(self, const int* fresh, int n_fresh, int gone, Journal journal) except -1 nogil:
@@ -513,7 +539,8 @@ cdef class Evaporation:
                 if self.since_relaxation < NOT_RELAXED and best < 0:
                     status = STATUS_EXHAUSTED
                     break
-                if self.since_relaxation >= sweep_interval or self.atoms.opened or self.tree.n_slots + MAX_NEAR > self.tree.x.shape[0]:
+                if (self.since_relaxation >= sweep_interval or self.was_scaled or self.atoms.opened
+                        or self.tree.n_slots + MAX_NEAR > self.tree.x.shape[0]):
                     status = STATUS_SWEEP_DUE
                     break
                 drawn = self.chooser.draws and leaving < 0

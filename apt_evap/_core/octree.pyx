@@ -238,6 +238,13 @@ cdef class Octree:
         # Recomputes moments of the nodes above changed charges, children before parents: descending preorder numbers.
         cdef long i, j
         cdef int node
+        if 4 * self.n_dirty > self.n_nodes:   # faster than sorting
+            for node in range(self.n_nodes - 1, -1, -1):
+                if self.dirty[node]:
+                    self.moments(node)
+                    self.dirty[node] = 0
+            self.n_dirty = 0
+            return
         for i in range(1, self.n_dirty):
             node = self.queue[i]
             j = i - 1

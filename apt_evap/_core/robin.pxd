@@ -12,6 +12,8 @@ cdef class Robin(FieldRule):
     cdef readonly double tolerance
     cdef readonly int window
     cdef readonly object point          # (1, 3) the point inside with the given potential [nm]
+    cdef double[3] inner                # the same at the last relaxation
+    cdef double potential               # of the specimen at the last relaxation [e/nm]
     cdef double clearance               # initial distance of this point from the surface [nm]
     cdef double far_scale               # factor of the charges far from the holes since the whole surface was solved
     cdef float[::1] matrix, residual
@@ -20,5 +22,6 @@ cdef class Robin(FieldRule):
     cdef scale_others(self, Octree tree, InteractionLists lists, ratios)
     cdef double along(self, const double[:, ::1] normals, long i) noexcept nogil
     cdef normal_field(self, Octree tree, const double[:, ::1] normals)
+    cdef double inside(self, double x, double y, double z, double charge) noexcept nogil
     cdef int grow(self, long stride) except -1 nogil
     cdef int patch_charges(self, Octree tree, double[:, ::1] normals, Patch* patch) except -1 nogil

@@ -5,14 +5,14 @@ that the total charge is conserved (Robin, 1886; Rolland et al., Microsc. Microa
 """
 
 cimport cython
-from libc.math cimport M_PI, fabsf
+from libc.math cimport M_PI, fabsf, sqrt
 
 import numpy as np
 
 from apt_evap._core import interactions
 
 from apt_evap._core.octree cimport Octree
-from apt_evap._core.rule cimport FieldRule, Patch
+from apt_evap._core.rule cimport FieldRule, Hole, Patch
 from apt_evap._core.interactions cimport InteractionLists
 
 
@@ -111,6 +111,7 @@ cdef class Robin(FieldRule):
         outcome = self.iterate(tree, normals, lists, tolerance=tolerance, max_sweeps=max_sweeps,
                                double_precision=double_precision, n_threads=n_threads)
         self.scale(tree, potential / (tree.charges / self.keep_inside(tree)).sum())
+        self.inner, self.potential, self.drift = self.point.ravel(), potential, 0.0
         if before > 0.0:
             self.far_scale *= tree.charges[others].sum() / before
         return outcome
@@ -293,6 +294,31 @@ cdef class Robin(FieldRule):
         for fraction, other in zip(right, maps[:-1]):
             charges -= fraction * (maps[-1] - other)
         return charges
+
+    cdef double inside(self, double x, double y, double z, double charge) noexcept nogil:
+        # Potential of a charge at the point inside the specimen, over that of the specimen.
+        cdef double dx = x - self.inner[0], dy = y - self.inner[1], dz = z - self.inner[2]
+        return charge / (max(sqrt(dx * dx + dy * dy + dz * dz), 1e-3 * self.clearance) * self.potential)
+
+    cdef void removed(self, Octree tree, const Hole* hole) noexcept nogil:
+        FieldRule.removed(self, tree, hole)
+        self.drift -= self.inside(hole.x, hole.y, hole.z, hole.charge)
+
+    cdef int solve_patch(self, Octree tree, double[:, ::1] normals, const Hole* hole, Patch* patch) except -1 nogil:
+        cdef long i, slot
+        FieldRule.solve_patch(self, tree, normals, hole, patch)
+        for i in range(patch.n):
+            slot = patch.slot[i]
+            self.drift += self.inside(tree.x[slot], tree.y[slot], tree.z[slot], patch.change[i])
+        return 0
+
+    cdef void scaled(self, Octree tree, double factor) noexcept nogil:
+        cdef long slot
+        cdef int axis
+        for slot in range(tree.n_slots):
+            for axis in range(3):
+                self.field[slot, axis] *= factor
+        self.drift = 0.0
 
     cdef int grow(self, long stride) except -1 nogil:
         if stride > self.residual.shape[0]:

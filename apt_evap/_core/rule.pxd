@@ -50,10 +50,12 @@ cdef void merge(Octree tree, Patch* patch) noexcept nogil
 cdef class ChargingRule:
     cdef readonly double area           # area per surface atom at the last relaxation [nm^2]
     cdef readonly double near           # distance over the radius of the patch, beyond which its changes are merged
+    cdef readonly double drift          # relative change of the potential inside the specimen by events
 
     cdef void removed(self, Octree tree, const Hole* hole) noexcept nogil
     cdef int exposed(self, Octree tree, long slot, double opening_angle) except -1 nogil
     cdef int solve_patch(self, Octree tree, double[:, ::1] normals, const Hole* hole, Patch* patch) except -1 nogil
+    cdef void scaled(self, Octree tree, double factor) noexcept nogil
     cdef double strength(self, Octree tree, long slot) noexcept nogil
 
 

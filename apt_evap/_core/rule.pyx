@@ -150,6 +150,10 @@ cdef class ChargingRule:
         with gil:
             raise NotImplementedError(f"{type(self).__name__} has no solve_patch")
 
+    cdef void scaled(self, Octree tree, double factor) noexcept nogil:
+        # All charges were multiplied by a factor that removes `drift`; only for rules that compute it.
+        pass
+
     cdef double strength(self, Octree tree, long slot) noexcept nogil:
         # Field just outside a slot, in units of `field_unit`.
         return tree.q[slot]

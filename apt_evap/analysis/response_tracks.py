@@ -11,6 +11,7 @@ from apt_evap._common.short_repr import short_repr
 from apt_evap._common.validation import check_array, check_kind
 from apt_evap.emission.emissions import TangentialLaunches
 from apt_evap.emission.surface_frame import rollup_direction
+from apt_evap.flight.response import Responses
 from apt_evap.simulation.run import Run
 from apt_evap.units import speed_from_energy
 
@@ -110,10 +111,11 @@ def _places(run, ions, velocities, rolled):
     """Positions on the detector [mm], shape (...), of launches along the surface [nm/ns] of shape (..., 2)."""
     shape = velocities.shape[:-1]
     repeats = np.repeat(ions, int(np.prod(shape[1:])))
-    chosen = run[repeats]
+    responses = run.responses
+    chosen = Responses(responses.site[repeats], responses.rolled[repeats], responses.residuals[repeats])
     first, second = velocities.reshape(-1, 2).T
     starts = np.full(len(repeats), rolled)
     launches = TangentialLaunches(starts, first, second)
-    ends = run.response_model.evaluate(chosen.responses, launches, chosen.emissions.masses)
+    ends = run.response_model.evaluate(chosen, launches, run.emissions.masses[repeats])
     x, y, *_ = run.detector.impacts(*ends)
     return x.reshape(shape), y.reshape(shape)

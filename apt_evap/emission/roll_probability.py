@@ -107,6 +107,9 @@ class Migration(_ByChargeRatio):
     tungsten: see :doc:`/results/three_metals`. Both the image of a dipole in the metal and the field between the sites
     are in it. All atoms have the same numbers: an alloy is not described.
 
+    With Robin's charges the ratios are others, and other atoms would roll: 51 instead of 11 % of iron. A run with such
+    charges then gives an ``EmissionWarning``.
+
     Examples
     --------
     The charge ratio above which atoms roll, and which part of the atoms has it on a small tip:
@@ -117,7 +120,8 @@ class Migration(_ByChargeRatio):
     >>> print(f"{nickel.threshold:.2f} {aluminium.threshold:.2f}")
     0.81 1.63
     >>> tip = ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1))
-    >>> run = ae.Simulation(tip, seed=1, response_settings=ae.ResponseSettings.wide()).run(60)
+    >>> wide, rule = ae.ResponseSettings.wide(), ae.ConstantPotential()
+    >>> run = ae.Simulation(tip, seed=1, response_settings=wide, rule=rule).run(60)
     >>> round(float(nickel.probabilities(run.emissions).mean()), 2)
     0.77
     """

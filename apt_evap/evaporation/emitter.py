@@ -20,6 +20,7 @@ from apt_evap._core.events import COLUMNS, Events
 from apt_evap._core.journal import Journal
 from apt_evap._core.neighbourhood import Neighbourhood
 from apt_evap._core.octree import Octree
+from apt_evap.emission.perturbations import warn_if_not_for
 from apt_evap.evaporation import rule as rules
 from apt_evap.evaporation.cap import Cap, measure_cap
 from apt_evap.evaporation.law import Extremal, Law, check_law, has_temperature, kernel_of
@@ -149,6 +150,7 @@ class Emitter:
         check_law(self.law)
         self.rule = rules.Robin() if rule is None else rule
         rules.check_rule(self.rule)
+        warn_if_not_for(type(self.rule).__name__, self.law, stacklevel=2)
         settings = ChargeSettings() if settings is None else settings
         check_kind(settings, "settings", ChargeSettings, "ChargeSettings")
         if settings.tolerance is None:
@@ -174,6 +176,7 @@ class Emitter:
             self.settings.patch_radius * distance,
             self.settings.update_radius * distance,
             self.settings.opening_angle,
+            self.settings.potential_bound,
             (check_seed(seed) + _SEED_STEP) % (1 << 64),
             self._rate_control,
             stretch,

@@ -70,6 +70,14 @@ class ChargeSettings:
         default=10,
         at_least=1,
     )
+    potential_bound: float = number(
+        "With Robin's rule, a relaxation is due before `sweep_interval` if events have changed the potential inside "
+        "the specimen by this fraction. The potential is then restored at once by a factor common to all charges. "
+        "Measured: needed below R = 20 a; from there on the change within an interval is smaller. 1: never.",
+        default=4e-3,
+        above=0,
+        at_most=1,
+    )
 
     def _check(self):
         check_number(self.update_radius, "update_radius", at_least=self.patch_radius, unit="d_nn")

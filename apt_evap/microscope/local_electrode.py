@@ -20,6 +20,11 @@ SMALLEST, LARGEST = 1.0, 1000.0
 _ITERATIONS = 5  # of Newton's method; the ratio of the angles changes by a few per cent only
 # cubic through the values at -1, 0, 1 and 2, in powers of the place between 0 and 1; the highest power first
 _CUBIC = np.array([[-1, 3, -3, 1], [3, -6, 3, 0], [-2, -3, 6, -1], [0, 6, 0, 0]]) / 6.0
+_MIDDLE = np.array([-1, 9, 9, -1]) / 16.0  # the same at 1/2
+_EVEN = np.array([0, 2, 4])
+# With a profile, octaves are divided until the interpolated field factor and angles agree with those in the middle.
+_FACTOR_BOUND, _ANGLE_BOUND = 5e-5, 1e-4
+_NARROWEST = 2.0**-8  # octaves: the field factor has a kink where the sphere of the apex passes one of the profile
 
 
 class LensProjection(NamedTuple):
@@ -102,8 +107,9 @@ class LocalElectrode:
     The conductors have a common axis: a spherical cap with a conical shank, and a cone with an aperture. Their charges
     follow from boundary elements (`microscope.boundary_elements`), the projection from flights of ions that start at
     rest (`microscope.lens`). Both are computed when they are first needed, for radii of 1, 2, 4, ... nm, and kept with
-    the object. Between these radii, cubic polynomials in the logarithm of the radius interpolate (measured: field
-    factors within 1e-5, angles within 1e-4).
+    the object. Between these radii, cubic polynomials in the logarithm of the radius interpolate. With a profile,
+    further radii are added until the interpolation agrees with the solution. Measured: field factors within 1e-5, for
+    shanks of 30 degrees and profiles with kinks within 1e-4; angles within 1e-4.
 
     Equations and limits: :doc:`/microscope`. Electrodes and their influence on field factor and compression: Loi et
     al., Ultramicroscopy 132, 107 (2013).
@@ -458,7 +464,8 @@ class _Table:
 
     def __init__(self, setting: LocalElectrode) -> None:
         self._setting = setting
-        self._lenses: dict[int, Lens] = {}
+        self._lenses: dict[float, Lens] = {}
+        self._cells: dict[int, list[tuple[float, float]]] = {}
         self._last: Lens | None = None
 
     def lens(self, radius: float) -> Lens:
@@ -494,10 +501,36 @@ class _Table:
             return np.empty((*radii.shape, *np.shape(quantity(self._node(5)))))
         place = np.log2(radii)
         first, last = (math.floor(each) for each in (place.min(), place.max()))
-        values = np.array([quantity(self._node(index)) for index in range(first - 1, last + 3)])
-        windows = np.stack([values[shift : shift + last - first + 1] for shift in range(4)])
+        starts, widths = np.array([cell for octave in range(first, last + 1) for cell in self._cells_of(octave)]).T
+        windows = np.array(
+            [[quantity(self._node(place)) for place in starts + shift * widths] for shift in range(-1, 3)]
+        )
         cubic = np.tensordot(_CUBIC, windows, axes=1)
-        return scipy.interpolate.PPoly(cubic, np.arange(first, last + 2, dtype=float))(place)
+        powers = widths ** np.arange(3, -1, -1)[:, None]
+        cubic /= powers.reshape(*powers.shape, *[1] * (cubic.ndim - 2))
+        return scipy.interpolate.PPoly(cubic, np.append(starts, last + 1.0))(place)
+
+    def _cells_of(self, octave):
+        """Start and width of the intervals of the interpolation from 2^octave nm on, in octaves."""
+        if octave not in self._cells:
+            whole = (float(octave), 1.0)
+            self._cells[octave] = [whole] if self._setting.profile is None else self._divided(*whole)
+        return self._cells[octave]
+
+    def _divided(self, start, width):
+        """Parts of an interval in which the interpolation agrees with the solution in the middle."""
+        middle, half = self._node(start + width / 2), width / 2
+        around = [self._node(start + shift * width) for shift in range(-1, 3)]
+        factor, coefficients = (
+            sum(weight * each for weight, each in zip(_MIDDLE, values, strict=True))
+            for values in ([lens.field_factor for lens in around], [lens.coefficients for lens in around])
+        )
+        # change of the angle and of the path of a flight with the farthest angle on the cap
+        changes = np.abs(coefficients - middle.coefficients).reshape(2, 3) @ math.radians(LAST_ANGLE) ** _EVEN
+        apart = abs(factor / middle.field_factor - 1), changes[0] / middle.coefficients[0]
+        if width <= _NARROWEST or (apart[0] <= _FACTOR_BOUND and apart[1] <= _ANGLE_BOUND):
+            return [(start, width)]
+        return [*self._divided(start, half), *self._divided(start + half, half)]
 
     def _node(self, index):
         if index not in self._lenses:

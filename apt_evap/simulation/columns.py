@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apt_evap._common.types import Floats
 from apt_evap._core import events
@@ -115,6 +116,16 @@ def response_columns(settings: ResponseSettings) -> list[Column]:
         Column("responses/rolled", np.float32, (3, rolled)),
         Column("responses/residuals", np.float32, (2,), "mm"),
     ]
+
+
+def check_sequence_of_ions(ions: NDArray[np.int64], name: str) -> None:
+    """Raise ValueError unless the ions of a run are in the sequence of evaporation, each once."""
+    wrong = np.flatnonzero(ions[1:] <= ions[:-1])
+    if len(wrong):
+        before, after = ions[wrong[0]], ions[wrong[0] + 1]
+        raise ValueError(
+            f"{name} must be in the sequence of evaporation, each once, got ion {after} after ion {before}"
+        )
 
 
 def columns_of(run: Any, every: Iterable[Column]) -> dict[str, np.ndarray]:

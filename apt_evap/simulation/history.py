@@ -9,6 +9,14 @@ from apt_evap._common.short_repr import short_repr
 from apt_evap.evaporation.cap import Cap
 
 
+def _joined(parts):
+    """Columns of the joined parts, without repeated rows."""
+    columns = [np.concatenate(pieces) for pieces in zip(*parts, strict=True)]
+    rows = np.column_stack(columns)
+    first = {row.tobytes(): number for number, row in reversed(list(enumerate(rows)))}
+    return columns if len(first) == len(rows) else [column[sorted(first.values())] for column in columns]
+
+
 class History(NamedTuple):
     """Results of each check of the monitor, for the charges and for the ions since the previous check.
 
@@ -43,8 +51,8 @@ class History(NamedTuple):
 
     @classmethod
     def join(cls, parts: "Iterable[History]") -> "History":
-        """Join the parts of a history in their order."""
-        return cls(*(np.concatenate(columns) for columns in zip(cls.empty(), *parts, strict=True)))
+        """Join the parts of a history in their order; equal rows count once, as parts of a run share its history."""
+        return cls(*_joined([cls.empty(), *parts]))
 
 
 class CapHistory(NamedTuple):
@@ -80,8 +88,8 @@ class CapHistory(NamedTuple):
 
     @classmethod
     def join(cls, parts: "Iterable[CapHistory]") -> "CapHistory":
-        """Join the parts of a history in their order."""
-        return cls(*(np.concatenate(columns) for columns in zip(cls.empty(), *parts, strict=True)))
+        """Join the parts of a history in their order; equal rows count once, as parts of a run share its history."""
+        return cls(*_joined([cls.empty(), *parts]))
 
     @classmethod
     def of(cls, ion: int, cap: Cap | None) -> "CapHistory":

@@ -19,6 +19,7 @@ from apt_evap._common.types import AnyPath, Booleans, Floats, Integers
 from apt_evap._common.validation import (
     check_kind,
     check_seed,
+    check_sequence,
     check_switch,
     short_text,
 )
@@ -28,7 +29,7 @@ from apt_evap.detection.hits import Hits, Outcome
 from apt_evap.detection.instrument import Instrument
 from apt_evap.emission.emissions import Emissions, TangentialLaunches
 from apt_evap.emission.ion_random import IonRandom
-from apt_evap.emission.perturbations import Perturbation, Unperturbed, described
+from apt_evap.emission.perturbations import Perturbation, Unperturbed, described, warn_if_not_for
 from apt_evap.evaporation.state import EmitterState
 from apt_evap.flight.field_of_view import stereographic_rim
 from apt_evap.flight.response import ResponseModel, Responses, ResponseSettings
@@ -40,6 +41,7 @@ from apt_evap.simulation.columns import (
     Clock,
     Column,
     Flown,
+    check_sequence_of_ions,
     columns_of,
     flown_columns,
     parts_of,
@@ -158,7 +160,33 @@ class Run:
         return len(self.site)
 
     def __getitem__(self, rows: Any) -> "Run":
-        """Return the run with selected ions only; takes a slice, a mask or indices."""
+        """Part of the run: only the selected ions, as if the others had not been recorded.
+
+        Parameters
+        ----------
+        rows : slice or array_like
+            A slice, a mask or indices. The rows stay in the sequence of evaporation, each at most once.
+
+        Returns
+        -------
+        Run
+            With the history of the whole run. Voltages in real units stay those of the whole run if it has them;
+            `at_evaporation_field` of the part averages over the selected ions only. `pulses` and `multiplicity` of hits
+            count the selected ions.
+
+        Raises
+        ------
+        ValueError
+            If `rows` is of another kind, or in another order.
+        IndexError
+            If a row does not exist, or a mask has another length than the run.
+        """
+        if not isinstance(rows, slice):
+            indices = np.asarray(rows)
+            if indices.ndim != 1 or (indices.size and indices.dtype.kind not in "biu"):
+                raise ValueError(f"rows must be a slice, a mask or indices such as [5], got {short_text(rows)}")
+            rows = indices if indices.size else np.empty(0, int)
+        check_sequence_of_ions(self.emissions.ions[rows], "rows")
         arrays = {path: values[rows] for path, values in columns_of(self, self.every_column).items()}
         return replace(self, **parts_of(arrays, self.emissions.nearest_neighbour_distance))
 
@@ -346,6 +374,7 @@ class Run:
 
     def _landed(self, perturbation, by_response):
         """Stereographic directions (n, 2), times of flight (n,) and ions that were not flown, for a perturbation."""
+        warn_if_not_for(dict(self.settings.get("rule") or {}).get("name"), perturbation, stacklevel=3)
         for flown_as, flown in zip(self.perturbations, self.flown, strict=True):
             known = flown_as == perturbation or flown_as == described(perturbation)  # by name and repr in a file
             # the energies of flights were those at the simulated voltage
@@ -683,8 +712,33 @@ class Run:
 
     @classmethod
     def join(cls, runs: "Sequence[Run]") -> "Run":
-        """Join the parts of one run in their order."""
-        first, parts = runs[0], [columns_of(run, run.every_column) for run in runs]
+        """Join the parts of one run.
+
+        Parameters
+        ----------
+        runs : sequence of Run
+            At least one part, in the sequence of evaporation. Ions may be missing between them.
+
+        Returns
+        -------
+        Run
+            With the state and the end of the first part.
+
+        Raises
+        ------
+        ValueError
+            If there is no part, the parts belong to different runs, or their ions do not follow one another.
+        """
+        runs = check_sequence(runs, "runs", "parts of a run")
+        if not runs:
+            raise ValueError("runs must be at least one part of a run, got none")
+        first = runs[0]
+        for number, run in enumerate(runs):
+            check_kind(run, f"runs[{number}]", Run, "a Run")
+            if name := _difference(first, run):
+                raise ValueError(f"runs must be parts of one run, got runs[{number}] whose {name} differ from runs[0]")
+        check_sequence_of_ions(np.concatenate([run.emissions.ions for run in runs]), "ions of the joined runs")
+        parts = [columns_of(run, run.every_column) for run in runs]
         arrays = {path: np.concatenate([part[path] for part in parts]) for path in parts[0]}
         return replace(
             first,
@@ -741,6 +795,21 @@ def load(path: AnyPath) -> Run:
     <Run: 100 ions of Ni at 1000 V; responses, 0 of them flagged>
     """
     return Run(**read_run(path))
+
+
+def _difference(one, other):
+    """Name of the first property that differs between two parts of one run; "" if there is none."""
+    if one is other:
+        return ""
+    pairs = {
+        "settings": (one.settings, other.settings),
+        "elements": (one.elements, other.elements),
+        "perturbations": tuple([described(each) for each in run.perturbations] for run in (one, other)),
+        "responses": (one.responses is None, other.responses is None),
+        "real units": (one.units, other.units),
+        "columns": tuple([column.path for column in run.every_column] for run in (one, other)),
+    }
+    return next((name for name, (first, second) in pairs.items() if first is not second and first != second), "")
 
 
 def _describe(perturbation):

@@ -20,6 +20,7 @@ from apt_evap.flight.response import ResponseSettings
 from apt_evap.simulation.columns import (
     ALWAYS,
     OPTIONAL,
+    check_sequence_of_ions,
     columns_of,
     flown_columns,
     parts_of,
@@ -163,8 +164,12 @@ def _read(file, n):
         arrays[column.path] = file.read(_place(column), stored, (n, *column.row)).astype(column.dtype, copy=False)
     _check_index(arrays["species"], "species", len(elements))
     _check_index(arrays["phase"], "phase", len(settings["tip"].get("phases", ())) or 1)
+    check_sequence_of_ions(arrays["emissions/ions"], "ions")
     units = None
     if "real/voltages" in arrays:
+        steps = np.diff(arrays["real/pulse_ids"])
+        if len(steps) and steps.min() < 0:
+            raise ValueError(f"pulse_ids must not decrease from ion to ion, got a step of {steps.min()}")
         units = from_plain(file.json(f"{_SIMULATION}/real/units"), RealUnits)
     state, first_event = None, 0
     if f"{_SIMULATION}/state" in file:

@@ -11,9 +11,11 @@ from apt_evap._core.evaporation import DONE, SWEEP_DUE
 from apt_evap._core.events import COLUMNS, Events
 from apt_evap.evaporation.emitter import Batch
 
+FIXED = ae.evaporation.ChargeSettings(potential_bound=1.0)  # no relaxation before an interval ends
+
 
 def test_columns_are_those_declared(small_tip):
-    emitter = ae.evaporation.Emitter(small_tip)
+    emitter = ae.evaporation.Emitter(small_tip, settings=FIXED)
     events = Events(small_tip.positions, 40)
     assert events.journal.n_events == 0 and all(len(each) == 0 for each in events.columns().values())
     assert emitter._core.evaporate(events, 30) == SWEEP_DUE
@@ -27,7 +29,7 @@ def test_columns_are_those_declared(small_tip):
 
 
 def test_a_table_is_filled_from_call_to_call(small_tip):
-    emitter, twin = ae.evaporation.Emitter(small_tip), ae.evaporation.Emitter(small_tip)
+    emitter, twin = (ae.evaporation.Emitter(small_tip, settings=FIXED) for _ in range(2))
     events = Events(small_tip.positions, 40)
     assert emitter._core.evaporate(events, 30) == SWEEP_DUE
     first = events.columns()

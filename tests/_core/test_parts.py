@@ -14,7 +14,7 @@ OFTEN = ae.evaporation.ChargeSettings(sweep_interval=40)
 
 
 def emitter_of(tip, rule, **settings):
-    settings = {"sweep_interval": 40} | settings
+    settings = {"sweep_interval": 40, "potential_bound": 1.0} | settings
     return ae.evaporation.Emitter(tip, rule=rule, settings=ae.evaporation.ChargeSettings(**settings), n_threads=1)
 
 

@@ -2,6 +2,7 @@
 
 import math
 import runpy
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from apt_evap.emission import Emissions, Migration
 from apt_evap.emission.roll_probability import AT_REST, BY_CHARGE
 from apt_evap.specimen.materials import material
 from apt_evap.units import BOLTZMANN, ELEMENTARY_CHARGE
+from apt_evap.warnings import EmissionWarning
 
 SCRIPT = Path(__file__).parents[2] / "articles" / "three_metals" / "migration.py"
 
@@ -131,3 +133,29 @@ def test_the_charge_after_a_roll_up(metal):
     assert np.std(charge - line) < 0.1
     assert abs(np.mean(charge - line)) < 0.2
     assert (field > 1.0).all()
+
+
+def test_migration_with_robins_charges_warns(tip12):
+    """Its line over the charge ratios is that of a constant potential: nickel rolls 1.5 times too often otherwise."""
+    wide, law = ae.ResponseSettings.wide(energy_limit=20.0), ae.RollUp.of_metal("Ni")
+    nested = ae.emission.Mixture(
+        (ae.RollUp(0.2), ae.emission.Mixture((ae.Combined(0.1, 0.5, Migration.of("Ni")), law)))
+    )
+    robin, constant = (
+        ae.Simulation(tip12, seed=1, n_threads=1, response_settings=wide, rule=rule).run(60, progress=False)
+        for rule in (ae.Robin(), ae.ConstantPotential())
+    )
+    for perturbation in (law, nested, ae.RollUp(0.1, Migration.of("Ni"))):
+        for each in (robin.hits, robin.places, robin.at_evaporation_field().hits):
+            with pytest.warns(EmissionWarning, match="rule=ConstantPotential") as caught:
+                each(perturbation)
+            assert [warning.filename for warning in caught] == [__file__]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        constant.hits(law), constant.hits(nested)
+        robin.hits(ae.RollUp(0.1, ae.emission.ChargeRatio(0.8)))
+        ae.evaporation.Emitter(tip12, law=ae.Extremal(hop=Migration.of("Ni")), rule=ae.ConstantPotential())
+    with pytest.warns(EmissionWarning):
+        ae.evaporation.Emitter(tip12, law=ae.Extremal(hop=Migration.of("Ni")))
+    shares = [law.probability.probabilities(run.emissions).mean() for run in (robin, constant)]
+    assert shares[0] > 1.2 * shares[1] > 0

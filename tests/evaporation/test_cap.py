@@ -187,7 +187,7 @@ def test_fields_of_a_free_sphere_of_atoms(nickel):
 
 
 def test_the_history_of_a_run_has_the_cap_after_each_relaxation(small_tip, tmp_path):
-    settings = ae.evaporation.ChargeSettings(sweep_interval=40)
+    settings = ae.evaporation.ChargeSettings(sweep_interval=40, potential_bound=1.0)
     run = ae.Simulation(small_tip, charge_settings=settings, n_threads=1).run(
         130, responses=False, progress=False, batch_size=25
     )
@@ -209,7 +209,7 @@ def test_the_cap_of_a_shrinking_specimen(tip12):
     """While the first cap rounds off, the radius changes little and the field follows it at constant voltage."""
     emitter = ae.evaporation.Emitter(tip12, n_threads=1)
     caps = [batch.cap for batch in emitter.advance(1000) if batch.cap is not None]
-    assert len(caps) == 10
+    assert len(caps) >= 10
     radii, fields = (np.array([getattr(cap, name) for cap in caps]) for name in ("radius", "field"))
     assert radii == pytest.approx(radii.mean(), rel=0.05)  # 1,000 of 19,000 evaporable atoms: 2 nm of 4.2 at most
     # F is in proportion to 1/R for a form that stays the same: what it changes is below 5 %

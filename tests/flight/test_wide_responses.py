@@ -1,7 +1,5 @@
 """Wide responses: probability, sharpness and height of the launches in post-processing, against flights."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -97,8 +95,8 @@ def test_a_run_comes_back_from_its_file(run, tmp_path):
     for perturbation in FLOWN:
         again = loaded.hits(perturbation, by_response=True)
         np.testing.assert_array_equal(again.x, run.hits(perturbation, by_response=True).x)
-    half = ae.Run.join([replace(loaded), replace(run)])
-    assert half.emissions.targets.shape == (240, 3, 3)
+    joined = ae.Run.join([loaded[:50], run[50:]])
+    np.testing.assert_array_equal(joined.emissions.targets, run.emissions.targets)
 
 
 def test_runs_without_wide_responses_say_so(tip12):

@@ -302,6 +302,17 @@ def test_times_of_inclined_flights(lens):
 # ---- shanks and electrodes -------------------------------------------------------------------------------------------
 
 
+def test_the_table_of_a_profile_with_a_kink_agrees_with_solutions():
+    """More radii where the shank changes its angle. Measured: 4e-5; with powers of 2 alone 2e-3 to 5e-3."""
+    setting = LocalElectrode(4e4, 2e4, 5.0, profile=((0.0, 10.0), (100.0, 20.0), (1000.0, 150.0)))
+    radii = np.array([17.0, 20.3, 22.7, 25.5, 30.0])
+    solved = [setting.lens(radius) for radius in radii]
+    assert setting.field_factor(radii) == pytest.approx([lens.field_factor for lens in solved], rel=1e-4)
+    assert setting.compression(radii) == pytest.approx([lens.compression for lens in solved], rel=1e-4)
+    voltages = 30.0 * radii * [lens.field_factor for lens in solved]
+    assert setting.radius(voltages, 30.0) == pytest.approx(radii, rel=1e-4)
+
+
 def test_a_profile_of_a_cone_is_a_cone():
     """A measured profile of a cone with a spherical apex of 30 nm, between 20 and 200 nm below the apex."""
     slope = math.radians(7.0)

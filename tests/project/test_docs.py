@@ -256,6 +256,23 @@ def test_command_lines_are_understood():
             make_parser().parse_args(words)
 
 
+def test_methods_of_laws_and_rules_have_the_arguments_of_the_code():
+    """``name(arguments)`` of the text: a function of the package has the same ones."""
+    text = (ROOT / "docs" / "extending_physics.rst").read_text()
+    described = {
+        (name, *re.split(r",\s+", names)) for name, names in re.findall(r"``(\w+)\((\w+(?:,\s+\w+)*)\)``", text)
+    }
+    sources = [path.read_text() for end in ("py", "pyx") for path in (ROOT / "apt_evap").rglob(f"*.{end}")]
+    written = set()
+    for source in sources:
+        for name, names in re.findall(r"def (?:[\w.]+ )*(\w+)\(([^()]*)\)", source):
+            arguments = re.sub(r"\[[^]]*\]", "", names).split(",")
+            words = [re.split(r"[:=]", argument)[0].split() for argument in arguments]
+            written.add((name, *(word[-1] for word in words if word and word[-1] != "self")))
+    assert len(described) >= 8
+    assert described - written == set()
+
+
 def test_links_lead_somewhere():
     for target in re.findall(r"\]\(([^)]+)\)", README.read_text()):
         assert target.startswith("https://") or (ROOT / target).exists(), target

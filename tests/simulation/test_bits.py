@@ -14,7 +14,7 @@ import pytest
 import apt_evap as ae
 from apt_evap.config.simulation_file import read_config
 
-FINGERPRINT = "a75c895043d43c8bee9ed34cee90c5161c3bace0fbb7e30907d8a41df69ee2b1"
+FINGERPRINT = "cf147b8e5b959b5e1d3ad025365e96ca34017d6c951664004070ddf3a9b96077"
 PROGRAM = """
 import warnings
 

@@ -7,9 +7,12 @@ import apt_evap as ae
 from apt_evap.simulation.monitor import charge_residuals
 from apt_evap.warnings import ChargesWarning, ResponseWarning, RunWarning
 
+FIXED = ae.evaporation.ChargeSettings(potential_bound=1.0)  # no relaxation before an interval ends
+
 
 def simulate(tip, n=400, responses=False, batch_size=256, n_threads=1, emissions=(), **options):
     monitor = ae.simulation.Monitor(**{"interval": 100} | options.pop("monitor", {}))
+    options = {"charge_settings": FIXED} | options
     simulation = ae.Simulation(tip, seed=3, n_threads=n_threads, monitor=monitor, **options)
     return simulation.run(n, emissions, responses=responses, progress=False, batch_size=batch_size)
 
@@ -97,14 +100,15 @@ def test_watching_changes_no_bit_and_depends_on_no_batch_or_thread(small_tip):
 
 
 def test_a_run_after_a_run_has_its_own_history(small_tip):
-    simulation = ae.Simulation(small_tip, n_threads=1, monitor=ae.simulation.Monitor(interval=100))
+    monitor = ae.simulation.Monitor(interval=100)
+    simulation = ae.Simulation(small_tip, n_threads=1, monitor=monitor, charge_settings=FIXED)
     first, second = (simulation.run(250, responses=False, progress=False) for _ in range(2))
     assert first.history.ions.tolist() == [100, 200]
     assert second.history.ions.tolist() == [400]  # the first relaxation at which 100 ions of this run have left
 
 
 def test_by_default_every_tenth_relaxation(small_tip):
-    run = ae.Simulation(small_tip, n_threads=1).run(1100, responses=False, progress=False)
+    run = ae.Simulation(small_tip, n_threads=1, charge_settings=FIXED).run(1100, responses=False, progress=False)
     assert run.history.ions.tolist() == [1000]
 
 
