@@ -269,7 +269,7 @@ def read_document(path: str | Path) -> dict[str, Any]:
         raise FileError(f"{str(path)!r} is a run: see apt-evap info")
     content = read_small_file(path, _MAX_BYTES, "a TOML file")
     try:
-        return tomllib.loads(content.decode())
+        return tomllib.loads(content.decode("utf-8-sig"))
     except UnicodeDecodeError as error:
         raise FileError(f"{str(path)!r} is not a TOML file: it is not text in UTF-8") from error
     except (tomllib.TOMLDecodeError, RecursionError) as error:
