@@ -114,7 +114,9 @@ def check_spacing(distance: float, expected: Sequence[float], names: Sequence[st
     for supposed, read in product(_UNITS, ("nm", "Angstrom", "Bohr radii")):
         corrected = distance * _UNITS[supposed] / _UNITS[read]
         if supposed != read and low / _AS_CLOSE <= corrected <= _AS_CLOSE * high:
-            raise ValueError(f"positions must be in nm, {problem}: they fit if they are in {supposed}, not in {read}")
+            raise ValueError(
+                f"positions were read in a wrong unit: {problem}, as if {supposed} had been taken for {read}"
+            )
     warnings.warn(
         f"{problem}: wrong unit (reduced units of LAMMPS?), wrong material or not a solid; voltages and fields are "
         "only right for the distances of the material",

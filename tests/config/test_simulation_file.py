@@ -14,7 +14,7 @@ from apt_evap._common.codec import from_plain, to_plain
 from apt_evap._common.files import FileError
 from apt_evap.config.map_panels import MapSettings, Panel
 from apt_evap.config.perturbation_text import read_perturbation, title_of
-from apt_evap.config.simulation_file import config_of, read_config
+from apt_evap.config.simulation_file import config_of, read_config, read_document
 from apt_evap.detection.detector import Detector
 from apt_evap.emission.energies import Thermal, TruncatedNormal
 from apt_evap.emission.perturbations import Combined, LateralVelocity, Mixture, RollUp, Unperturbed
@@ -480,3 +480,10 @@ def test_a_microscope_by_its_preset_or_its_fields(tmp_path):
         path.write_text(base + wrong)
         with pytest.raises(FileError, match=name):
             read_config(path)
+
+
+def test_a_settings_file_may_have_a_byte_order_mark(tmp_path):
+    """Editors of Windows write it."""
+    path = tmp_path / "a.toml"
+    path.write_text('[tip]\nmaterial = "Ni"\napex_radius = 2.0\n', encoding="utf-8-sig")
+    assert read_document(path)["tip"]["apex_radius"] == 2.0

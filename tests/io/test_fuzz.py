@@ -1,5 +1,6 @@
 """Whatever a file holds, a reader gives ions or says in one sentence what is wrong with which file."""
 
+import gzip
 import os
 import subprocess
 import sys
@@ -180,7 +181,11 @@ PLACES = np.random.default_rng(1).uniform(1, 9, (8, 3))
 SPECIMENS = {
     "dump": lammps_dump(PLACES, [1] * 8, frames=2).encode(),
     "scaled dump": lammps_dump(PLACES / 10, [1] * 8, "id type xs ys zs").encode(),
+    "dump with images": lammps_dump(np.hstack([PLACES, PLACES // 3]), [1] * 8, "id type x y z ix iy iz").encode(),
     "data": lammps_data(PLACES, [1] * 8, "full").encode(),
+    "data with images": lammps_data(PLACES, [1] * 8, "atomic", more=" 1 0 -1").encode(),
+    "packed dump": gzip.compress(lammps_dump(PLACES, [1] * 8).encode()),
+    "xyz": b"8\nProperties=species:S:1:pos:R:3\n" + b"".join(b"1 %.3f %.3f %.3f\n" % (*row,) for row in PLACES),
     "nodes": tapsim_nodes(PLACES * 1e-10, [10] * 7 + [0], numbers=range(8)),
     "binary nodes": tapsim_nodes(PLACES * 1e-10, [10] * 7 + [0], binary=True),
 }
@@ -196,7 +201,8 @@ def test_changed_specimens(tmp_path, name, changes, size):
     data = bytearray(SPECIMENS[name])
     for place, value in changes:
         data[int(place * len(data))] = value
-    format = "tapsim" if "nodes" in name else "lammps-dump" if "dump" in name else "lammps-data"
+    formats = {"nodes": "tapsim", "dump": "lammps-dump", "data": "lammps-data", "xyz": "xyz"}
+    format = next(format for word, format in formats.items() if word in name)
     path = save(tmp_path, data[: int(size * len(data))], ".txt")
     types = {10 if "nodes" in name else 1: "Al"}
     tip = told(lambda: ae.read_tip(path, types, format=format), path)

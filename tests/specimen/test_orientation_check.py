@@ -113,9 +113,9 @@ def test_info_of_a_specimen_without_ase(tmp_path, monkeypatch, capsys):
 
 
 def test_positions_in_another_unit_are_refused(needle):
-    units = ((10, "Angstrom, not in nm"), (1 / 0.052917721, "Bohr radii"), (1e3, "pm"), (0.1, "nm, not in"))
-    for factor, unit in units:
-        with pytest.raises(ValueError, match=rf"positions must be in nm, .* they fit if they are in {unit}"):
+    units = ((10, "Angstrom", "nm"), (1 / 0.052917721, "Bohr radii", "nm"), (1e3, "pm", "nm"), (0.1, "nm", "Angstrom"))
+    for factor, supposed, read in units:
+        with pytest.raises(ValueError, match=f"wrong unit: .*, as if {supposed} had been taken for {read}$"):
             tip_of(factor * needle)
 
 
