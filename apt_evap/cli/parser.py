@@ -816,7 +816,8 @@ def _circle(text: str) -> tuple[float, tuple[float, ...]]:
         if radius <= 0 or len(centre) not in (0, 2) or not all(map(isfinite, (radius, *centre))):
             raise ValueError
     except ValueError:
-        raise argparse.ArgumentTypeError(f"must be a radius or R,X,Y such as 15,0,-2 [mm], got {text!r:.80}") from None
+        expected = "a radius, or R,X,Y, such as 15,0,-2 [mm]"
+        raise argparse.ArgumentTypeError(f"must be {expected}, got {text!r:.80}") from None
     return radius, tuple(centre) or (0.0, 0.0)
 
 
