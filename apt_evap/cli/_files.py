@@ -227,7 +227,10 @@ def save_picture(
 def save_figure(path: Path, figure: Any) -> None:
     """Write a figure; it is drawn in memory, so that a kill in the second that it takes leaves no temporary file."""
     suffix, drawn = path.suffix.lower(), io.BytesIO()
-    figure.savefig(drawn, format=suffix[1:], dpi=200, metadata={_MARK_KEYS[suffix]: _MARK})
+    try:
+        figure.savefig(drawn, format=suffix[1:], dpi=200, metadata={_MARK_KEYS[suffix]: _MARK})
+    except OSError as error:  # such as a font that cannot be read
+        raise FileError(f"cannot write {str(path)!r}: {error.strerror or error}") from error
     with replace_file(path) as file:
         file.write(drawn.getbuffer())
 

@@ -269,8 +269,8 @@ class Counting:
     def __init__(self, read):
         self.read, self.given = read, []
 
-    def __call__(self, *arguments):
-        self.given.append(Noting(self.read(*arguments)))
+    def __call__(self, *arguments, **options):
+        self.given.append(Noting(self.read(*arguments, **options)))
         return self.given[-1]
 
 
