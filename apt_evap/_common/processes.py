@@ -11,6 +11,7 @@ from pathlib import Path
 
 _PR_SET_PDEATHSIG = 1  # of linux/prctl.h
 _POLLING = 1.0  # seconds
+_SYNCHRONIZE = 0x00100000  # of winnt.h
 
 
 def machine() -> str:
@@ -38,6 +39,8 @@ def birth(pid: int) -> str | None:
     except OSError:
         if Path("/proc/self/stat").exists():
             return None
+        if os.name == "nt":
+            return ""  # there os.kill(pid, 0) would be Ctrl-C
         try:
             os.kill(pid, 0)
         except ProcessLookupError:
@@ -49,7 +52,7 @@ def birth(pid: int) -> str | None:
 
 
 def die_with(parent: int) -> None:
-    """End this process by SIGKILL when its parent ends, also if the parent is killed.
+    """End this process when its parent ends, also if the parent is killed.
 
     Without it, a computation would outlive its killed worker and write on while another worker repeats it.
 
@@ -63,10 +66,18 @@ def die_with(parent: int) -> None:
     else:
         threading.Thread(target=_watch, args=(parent,), daemon=True).start()
     if os.getppid() != parent:
-        os.kill(os.getpid(), signal.SIGKILL)
+        _end()
+
+
+def _end():
+    os.kill(os.getpid(), getattr(signal, "SIGKILL", signal.SIGTERM))  # on Windows both end it at once
 
 
 def _watch(parent):
-    while os.getppid() == parent:
-        time.sleep(_POLLING)
-    os.kill(os.getpid(), signal.SIGKILL)
+    if sys.platform == "win32":  # where getppid does not change
+        kernel = ctypes.windll.kernel32
+        kernel.WaitForSingleObject(kernel.OpenProcess(_SYNCHRONIZE, False, parent), -1)
+    else:
+        while os.getppid() == parent:
+            time.sleep(_POLLING)
+    _end()

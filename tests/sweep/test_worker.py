@@ -124,7 +124,7 @@ def test_interrupted_work_saves_its_ions_and_continues_with_the_same_bits(tmp_pa
     (key,) = sweep.keys
     folder = sweep.folder_of(key)
     process = worker(sweep)
-    until(lambda: (folder / "run.h5.unfinished" / "lock").exists())
+    until(lambda: (folder / "run.h5.lock").exists())
     time.sleep(0.3)  # so that some ions have evaporated; with none it is the same test
     process.send_signal(signal.SIGTERM)
     assert process.wait(60) == 143
@@ -143,7 +143,7 @@ def test_a_run_ends_with_its_killed_worker(tmp_path):
     sweep = planned(tmp_path, 'base = "base.toml"\n[[points]]\n"tip.offset_seed" = 1\n', LONG)
     (key,) = sweep.keys
     process = worker(sweep)
-    until(lambda: (sweep.folder_of(key) / "run.h5.unfinished" / "lock").exists())
+    until(lambda: (sweep.folder_of(key) / "run.h5.lock").exists())
     (child,) = living_children(process.pid)
     process.kill()
     process.wait()
