@@ -157,7 +157,7 @@ def datasets(path):
     found = {}
 
     def note(name, item):
-        if isinstance(item, h5py.Dataset) and name != "entry1/start_time":
+        if isinstance(item, h5py.Dataset) and name not in ("entry1/start_time", "entry1/simulation/provenance"):
             found[name] = np.asarray(item[()])
 
     with h5py.File(path) as file:
