@@ -9,10 +9,11 @@ import time
 
 _PR_SET_PDEATHSIG = 1  # of linux/prctl.h
 _POLLING = 1.0  # seconds
+_SYNCHRONIZE = 0x00100000  # of winnt.h
 
 
 def die_with(parent: int) -> None:
-    """End this process by SIGKILL when its parent ends, also if the parent is killed.
+    """End this process when its parent ends, also if the parent is killed.
 
     Without it, a computation would outlive its killed parent and write on while another process repeats it.
 
@@ -26,10 +27,18 @@ def die_with(parent: int) -> None:
     else:
         threading.Thread(target=_watch, args=(parent,), daemon=True).start()
     if os.getppid() != parent:
-        os.kill(os.getpid(), signal.SIGKILL)
+        _end()
+
+
+def _end():
+    os.kill(os.getpid(), getattr(signal, "SIGKILL", signal.SIGTERM))  # on Windows both end it at once
 
 
 def _watch(parent):
-    while os.getppid() == parent:
-        time.sleep(_POLLING)
-    os.kill(os.getpid(), signal.SIGKILL)
+    if sys.platform == "win32":  # where getppid does not change
+        kernel = ctypes.windll.kernel32
+        kernel.WaitForSingleObject(kernel.OpenProcess(_SYNCHRONIZE, False, parent), -1)
+    else:
+        while os.getppid() == parent:
+            time.sleep(_POLLING)
+    _end()

@@ -1,1 +1,1 @@
-"""Storage: HDF5 files with a digest of all bytes, and the groups that NeXus requires of them."""
+"""Storage: HDF5 files with checksums, the groups that NeXus requires of them, and locks."""

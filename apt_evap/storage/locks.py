@@ -5,6 +5,7 @@ import socket
 import warnings
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from apt_evap._common.files import FileError, check_regular
 from apt_evap.warnings import RunWarning
@@ -37,7 +38,8 @@ class FileLock:
     """
 
     def __init__(self, path: Path, of: str) -> None:
-        self._path, self._of, self._file = path, of, None
+        self._path, self._of = path, of
+        self._file: Any = None
         try:
             while self._file is None:  # again if its owner has just removed it
                 file = open(path, "r+", encoding="utf-8", errors="replace", opener=_opened)
