@@ -6,7 +6,6 @@ All sections with one fixed record per ion are read; the others are named in a w
 
 import math
 import os
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ from apt_evap.detection.hits import Hits
 from apt_evap.io._apt_sections import read_sections
 from apt_evap.io._pulses import PulseCheck, first_from_every, pulses_from_first, whole_pulses
 from apt_evap.io._records import check_columns, fill
-from apt_evap.warnings import DataWarning
+from apt_evap.warnings import DataWarning, warn
 
 # sections, in lower case, that are columns of Hits: name, number of values per ion, unit
 _KNOWN = {
@@ -172,10 +171,9 @@ def _assign(sections, path):
         elif columns and section.dtype.kind not in ("iu" if columns[0][0] == "multiplicity" else "iuf"):
             problem = f"values of type {section.dtype}"
         if problem:
-            warnings.warn(
+            warn(
                 f"{str(path)!r}: section {section.name!r} has {problem}, so it is stored in extra, not {columns[0][0]}",
                 DataWarning,
-                stacklevel=5,
             )
         if problem or not columns or targets & {target for target, _, _ in columns}:
             assigned.append(_Column(section, None))
@@ -205,11 +203,10 @@ def _ions(file, path, grouping, n):
         return numbers.astype(np.uint32)
     ions = first_from_every(numbers)
     if ions is None:
-        warnings.warn(
+        warn(
             f"{str(path)!r}: pulses unknown, so its Multiplicity is stored in extra: it does not contain the number of "
             f"ions of each pulse, neither for all ions nor for the first ion only ({problem})",
             DataWarning,
-            stacklevel=4,
         )
     return ions
 

@@ -6,7 +6,6 @@ separator may be a comma.
 """
 
 import re
-import warnings
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from apt_evap._common.files import FileError
 from apt_evap._common.types import AnyPath
 from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.io._texts import formula, number, read_text
-from apt_evap.warnings import DataWarning
+from apt_evap.warnings import DataWarning, warn
 
 
 def read_rrng(path: AnyPath) -> Ranges:
@@ -50,8 +49,9 @@ def read_rrng(path: AnyPath) -> Ranges:
         raise FileError(f"{str(path)!r} has no lines Range1=... in a section [Ranges], expected at least one")
     numbers = [value for section, _, key, value in lines if section == "ranges" and key == "number"]
     if numbers and numbers[0] != str(len(parts)):
-        warnings.warn(
-            f"{str(path)!r} states {numbers[0]:.20} ranges but contains {len(parts)}", DataWarning, stacklevel=2
+        warn(
+            f"{str(path)!r} states {numbers[0]:.20} ranges but contains {len(parts)}",
+            DataWarning,
         )
     names, low, high, volume, colour, composition = zip(*parts, strict=True)
     return Ranges(names, np.array(low), np.array(high), np.array(volume), colour, composition, source=str(path))

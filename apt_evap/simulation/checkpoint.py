@@ -15,7 +15,6 @@ import shutil
 import socket
 import stat
 import time
-import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -30,7 +29,7 @@ from apt_evap.evaporation.state import EmitterState
 from apt_evap.simulation.run import PART_NAME, Run, load, part_paths
 from apt_evap.simulation.run_hdf5 import count_ions, is_run, read_state, write_state
 from apt_evap.simulation.stop_reason import StopReason
-from apt_evap.warnings import DataWarning, RunWarning
+from apt_evap.warnings import DataWarning, RunWarning, warn
 
 try:
     import fcntl
@@ -200,10 +199,9 @@ class Keeper:
                 raise FileError(
                     f"{str(self._checkpoint.path)!r} is being written by {owner}; wait for it or choose another file"
                 ) from None
-            warnings.warn(
+            warn(
                 f"cannot lock {str(self._folder)!r} ({error.strerror}): make sure that no other process writes to it",
                 RunWarning,
-                stacklevel=6,
             )
 
     @uninterrupted()
@@ -314,7 +312,7 @@ class Keeper:
                 last = load(part_paths(self._folder)[-1])
                 state, first_event = last.state, last.first_event
         except FileError as error:
-            warnings.warn(f"{error}: all events are recomputed", DataWarning, stacklevel=7)
+            warn(f"{error}: all events are recomputed", DataWarning)
             state, first_event = None, 0
         return replace(run, state=state, first_event=first_event)
 
@@ -365,7 +363,7 @@ class Keeper:
             if len(state.sites) <= first_event + self._written_to:  # otherwise its ions are not on the disk yet
                 write_state(self._folder / STATE_NAME, state, first_event)
         except FileError as error:
-            warnings.warn(f"no checkpoint: {error}; the run continues and will try again", RunWarning, stacklevel=4)
+            warn(f"no checkpoint: {error}; the run continues and will try again", RunWarning)
         return on_disk
 
     def _write_part(self, part):

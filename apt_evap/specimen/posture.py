@@ -1,13 +1,11 @@
 """How a specimen from positions stands: upright, upside down, on its side or leaning; the sphere of its apex."""
 
-import warnings
-
 import numpy as np
 import scipy
 
 from apt_evap._common.sphere import fit_sphere
 from apt_evap._common.types import Floats
-from apt_evap.warnings import SpecimenWarning
+from apt_evap.warnings import SpecimenWarning, warn
 
 _LEAST = 200  # atoms: fewer have no shape
 _END = 0.1  # fraction of the height at either end whose widths are compared
@@ -55,11 +53,10 @@ def warn_if_odd(positions: Floats) -> None:
         seen = f"lies on its side, along {'xyz'[np.argmax(np.abs(axis))]}"
     else:
         seen = "stands upside down"
-    warnings.warn(
+    warn(
         f"the specimen {seen}: its narrow end points along ({axis[0]:.2f}, {axis[1]:.2f}, {axis[2]:.2f}), "
         f"{angle:.0f} degrees from z; its axis must be +z, with the apex on top, at the largest z",
         SpecimenWarning,
-        stacklevel=3,
     )
 
 
