@@ -1,5 +1,11 @@
 """Classes of warnings, by subject. Filter them by class: the texts may change."""
 
+import sys
+import warnings
+
+_PACKAGE = __name__.partition(".")[0]
+_BETWEEN = ("contextlib", "functools")  # modules with frames between two functions of the package
+
 
 class AptWarning(UserWarning):
     """Base of all warnings of this package."""
@@ -39,3 +45,24 @@ class SpecimenWarning(AptWarning):
 
 class RunWarning(AptWarning):
     """A run that ends early, or that cannot be saved as requested."""
+
+
+def warn(message: str, category: type[AptWarning]) -> None:
+    """Issue a warning for the line outside the package that has called it.
+
+    Parameters
+    ----------
+    message : str
+        Text.
+    category : type
+        One of these classes.
+    """
+    level, frame = 2, sys._getframe(1)
+    while frame.f_back is not None and _is_inside(frame):
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, category, stacklevel=level)
+
+
+def _is_inside(frame):
+    module = frame.f_globals.get("__name__") or ""
+    return module.partition(".")[0] == _PACKAGE or module in _BETWEEN

@@ -33,7 +33,7 @@ from apt_evap.simulation.run import load
 from apt_evap.specimen.materials import material
 from apt_evap.twin.constants import constants_of
 from apt_evap.twin.start import ENERGY, HEIGHT, ROLLS, SHARPNESS, near
-from apt_evap.warnings import RegistrationWarning
+from apt_evap.warnings import RegistrationWarning, warn
 
 SETTINGS, FACTS, RUN, REGISTRATION, STUDY, ANSWER = (
     "specimen.toml", "start.json", "run.h5", "registration.json", "study", "answer.txt",
@@ -209,7 +209,7 @@ def _registered(hits, measured_map, bounds):
                     "that of the indexing is kept")  # fmt: skip
         return register(hits, measured_map, **(bounds | {"scales": 1.0}))
     for each in caught:
-        warnings.warn(str(each.message), RegistrationWarning, stacklevel=2)
+        warn(str(each.message), RegistrationWarning)
     return found
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
@@ -16,7 +15,7 @@ from apt_evap._common.optional_imports import optional_import
 from apt_evap._common.types import Booleans, Floats, Integers
 from apt_evap._common.validation import check_array, check_kind, check_number, check_seed, check_switch
 from apt_evap.detection.binning import bin_edges, count, field_of_view, find_quantisations
-from apt_evap.warnings import MapWarning
+from apt_evap.warnings import MapWarning, warn
 
 if TYPE_CHECKING:
     import xarray
@@ -165,11 +164,10 @@ class DetectorMap:
         if like is not None:
             x_edges, y_edges, mask = like.x_edges, like.y_edges, like.mask if mask is None else mask
             if quantisations is not None and dither_seed is None and not _fits(like, quantisations):
-                warnings.warn(
+                warn(
                     "the bins of the other map are not multiples of the quantisation step of these hits: stripes are "
                     "possible; dither_seed prevents them",
                     MapWarning,
-                    stacklevel=2,
                 )
         else:
             extent = hits.extent if extent is None else extent

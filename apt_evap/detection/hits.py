@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
@@ -27,7 +26,7 @@ from apt_evap.detection.binning import find_quantisations
 from apt_evap.detection.dataframe import to_dataframe
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.distortion import DistortionGrid
-from apt_evap.warnings import DataWarning
+from apt_evap.warnings import DataWarning, warn
 
 if TYPE_CHECKING:
     import pandas
@@ -317,11 +316,10 @@ class Hits:
         if outside and outside == np.count_nonzero(detected):
             raise ValueError(f"grid must contain the ions, got all {outside:,} of them outside {grid!r}")
         if outside:
-            warnings.warn(
+            warn(
                 f"{outside:,} of {np.count_nonzero(detected):,} ions are outside the calibration grid: they have no "
                 "undistorted place",
                 DataWarning,
-                stacklevel=2,
             )
         return replace(self, x=x, y=y, extent=None)
 

@@ -1,6 +1,5 @@
 """Ranges of the mass-to-charge ratio, which assign species to measured ions."""
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 from apt_evap._common.types import Integers
 from apt_evap._common.validation import check_array, check_kind, check_sequence, did_you_mean, short_text
 from apt_evap.detection.hits import Hits
-from apt_evap.warnings import DataWarning
+from apt_evap.warnings import DataWarning, warn
 
 _MANY = 1 / 3  # of the ions outside every range; measured: 7 % of an oxide on silicon with its own ranges
 
@@ -208,11 +207,10 @@ class Ranges:
     def _warn_of_others(self, species):
         outside = int(np.count_nonzero(species < 0))
         if outside > _MANY * len(species):
-            warnings.warn(
+            warn(
                 f"{outside:,} of {len(species):,} ions ({outside / len(species):.0%}) are outside every range of "
                 f"{self.source or 'these ranges'}: do the ranges belong to these ions?",
                 DataWarning,
-                stacklevel=3,
             )
 
     def _warn_of_overlap(self):
@@ -223,11 +221,10 @@ class Ranges:
             at = pairs[0]
             owner = order[: at + 1][self.high[order][: at + 1] == reach[at]][0]
             first, second = sorted((int(owner), int(order[at + 1])))
-            warnings.warn(
+            warn(
                 f"{self.source or 'Ranges'}: {len(pairs)} ranges overlap another one, the first in the file is used: "
                 f"{self._text(first)} over {self._text(second)}" + (", ..." if len(pairs) > 1 else ""),
                 DataWarning,
-                stacklevel=4,
             )
 
     def _text(self, i):

@@ -8,7 +8,6 @@ probability of a roll-up, the sharpness of the target and the launch height are 
 
 from __future__ import annotations  # `RollUp.of_metal` returns one
 
-import warnings
 from collections.abc import Mapping, Sequence
 from copy import copy
 from typing import Any, Protocol
@@ -38,7 +37,7 @@ from apt_evap.emission.surface_frame import (
 )
 from apt_evap.specimen.materials import Material
 from apt_evap.units import speed_from_energy
-from apt_evap.warnings import EmissionWarning
+from apt_evap.warnings import EmissionWarning, warn
 
 __all__ = [
     "Combined",
@@ -440,7 +439,7 @@ def perturbation_of(perturbation: Any) -> Any:
     return from_plain(perturbation, *PERTURBATIONS, what="perturbation")
 
 
-def warn_if_not_for(rule: str | None, perturbation: Any, stacklevel: int) -> None:
+def warn_if_not_for(rule: str | None, perturbation: Any) -> None:
     """Warn if a perturbation, or one of a mixture, has a `Migration`, and the charges are those of Robin's rule.
 
     Parameters
@@ -449,8 +448,6 @@ def warn_if_not_for(rule: str | None, perturbation: Any, stacklevel: int) -> Non
         Name of the charging rule, if it is known.
     perturbation : perturbation or Extremal
         A `Migration` is its `probability` or its `hop`.
-    stacklevel : int
-        Of the warning, seen from the caller.
     """
     if rule != "Robin":
         return
@@ -459,9 +456,8 @@ def warn_if_not_for(rule: str | None, perturbation: Any, stacklevel: int) -> Non
         members += getattr(member, "perturbations", ())
     laws = [getattr(member, name, None) for member in members for name in ("probability", "hop")]
     if any(isinstance(law, Migration) for law in laws):
-        warnings.warn(
+        warn(
             "Migration holds for charges at a constant potential, but those of this run follow from Robin's rule, with "
             "which other atoms roll up: run with rule=ConstantPotential(), or [rule] in a settings file",
             EmissionWarning,
-            stacklevel=stacklevel + 1,
         )

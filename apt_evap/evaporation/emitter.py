@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
@@ -31,7 +30,7 @@ from apt_evap.specimen.ase_atoms import to_atoms
 from apt_evap.specimen.lattice import BOND_FACTORS, SECOND_SHELL_FACTORS
 from apt_evap.specimen.tip import Tip
 from apt_evap.units import COULOMB
-from apt_evap.warnings import ChargesWarning
+from apt_evap.warnings import ChargesWarning, warn
 
 RECORD = 16_384  # events after which a batch contains a tree in any case, so that journals need not be kept
 BATCH = 256  # events per batch; results do not depend on it
@@ -150,7 +149,7 @@ class Emitter:
         check_law(self.law)
         self.rule = rules.Robin() if rule is None else rule
         rules.check_rule(self.rule)
-        warn_if_not_for(type(self.rule).__name__, self.law, stacklevel=2)
+        warn_if_not_for(type(self.rule).__name__, self.law)
         settings = ChargeSettings() if settings is None else settings
         check_kind(settings, "settings", ChargeSettings, "ChargeSettings")
         if settings.tolerance is None:
@@ -414,11 +413,10 @@ class Emitter:
     def _converged(self, outcome, tolerance):
         self._recorded, self._is_new = RECORD, True
         if not outcome[1] < tolerance:
-            warnings.warn(
+            warn(
                 f"charges did not converge in {outcome[0]} sweeps: largest relative change {outcome[1]:.1g} "
                 f"(tolerance {tolerance:.1g})",
                 ChargesWarning,
-                stacklevel=4,
             )
         return outcome
 

@@ -27,7 +27,7 @@ from apt_evap.maps.similarity import WINDOW
 from apt_evap.registration.register import Registration
 from apt_evap.simulation.real_units import RealUnits
 from apt_evap.simulation.run import Run
-from apt_evap.warnings import MapWarning, RegistrationWarning, ResponseWarning, StructureWarning
+from apt_evap.warnings import MapWarning, RegistrationWarning, ResponseWarning, StructureWarning, warn
 
 BINS = 128
 DRAWN = 10
@@ -159,20 +159,18 @@ def fit_energies(
         structure = _structure_scores(measure, search, structures, maps, cells[0])
     registration.warn_if_doubtful()
     if structure is not None and structure.lost:
-        warnings.warn(
+        warn(
             f"the best map by {settings.score_name} has lost the zone lines of the measured map: contrasts "
             f"{_contrasts(structure.optimum)} in the rings about a pole, measured {_contrasts(structure.measured)}; "
             "see Study.structure",
             StructureWarning,
-            stacklevel=2,
         )
     density = maps["unperturbed"].ions / search.comparison.mask.sum()
     if density < FEWEST_IONS:
-        warnings.warn(
+        warn(
             f"the run has {density:.2g} ions per compared bin, but a map needs at least {FEWEST_IONS:g}: "
             f"use fewer bins than {max(measured.values.shape)}, or simulate more ions",
             MapWarning,
-            stacklevel=2,
         )
     resampled = values[1:]
     wins = np.ravel_multi_index(cells[1:].T, grid.shape)

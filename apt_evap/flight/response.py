@@ -12,7 +12,6 @@ the detector.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -40,7 +39,7 @@ from apt_evap.flight.designs import (
 )
 from apt_evap.flight.landing import Ends, land
 from apt_evap.units import FLIGHT_TIME
-from apt_evap.warnings import ResponseWarning
+from apt_evap.warnings import ResponseWarning, warn
 
 
 @settings
@@ -328,12 +327,11 @@ class ResponseModel:
         limit = self.settings.energy_limit / energy_scale
         faster = int(np.count_nonzero(squared_lengths(velocities) > 1.0001))
         if faster:
-            warnings.warn(
+            warn(
                 f"{faster:,} of {len(velocities):,} ions launch above the energy limit of the responses "
                 f"({limit:.3g} eV): their hits are extrapolated; run with a larger energy_limit (ResponseSettings, or "
                 "[responses] in a settings file)",
                 ResponseWarning,
-                stacklevel=4,
             )
         values = np.empty((len(velocities), 3))
         starts = (~launches.rolled, launches.rolled)

@@ -2,7 +2,6 @@
 
 import os
 import struct
-import warnings
 from dataclasses import dataclass, replace
 from typing import BinaryIO
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from apt_evap._common.files import FileError, TruncatedFile
 from apt_evap._common.types import AnyPath
-from apt_evap.warnings import DataWarning
+from apt_evap.warnings import DataWarning, warn
 
 SIGNATURE = b"APT\0"
 _SECTION = b"SEC\0"
@@ -72,7 +71,7 @@ def read_sections(file: BinaryIO, path: AnyPath, partial: bool) -> tuple[int, li
     if header_size < _HEADER_SIZE:
         raise FileError(f"{str(path)!r} has a header size of {header_size}, expected >= {_HEADER_SIZE}")
     if version != 2:
-        warnings.warn(f"{str(path)!r} has version {version} of .apt, read as version 2", DataWarning, stacklevel=6)
+        warn(f"{str(path)!r} has version {version} of .apt, read as version 2", DataWarning)
     if n == 0:
         raise FileError(f"{str(path)!r} has 0 ions according to its header, expected >= 1")
 
@@ -93,7 +92,7 @@ def read_sections(file: BinaryIO, path: AnyPath, partial: bool) -> tuple[int, li
                 raise TruncatedFile(
                     f"{problem}; partial=True (--partial) reads the {len(sections)} complete sections before it"
                 )
-            warnings.warn(f"{problem}; only the {len(sections)} sections before it are read", DataWarning, stacklevel=6)
+            warn(f"{problem}; only the {len(sections)} sections before it are read", DataWarning)
             break
         if section:
             sections.append(section)
@@ -130,7 +129,7 @@ def _section(head, at, n, size, path):
     else:
         dtype, values = np.dtype(f"<{_KINDS[kind]}{bits // 8}"), record_size // (bits // 8)
     if problem:
-        warnings.warn(f"{where} skipped, because it has {problem}", DataWarning, stacklevel=7)
+        warn(f"{where} skipped, because it has {problem}", DataWarning)
         return None, end
     if records != n:
         raise FileError(f"{where} has {records} records, expected one for each of the {n} ions")
@@ -166,8 +165,9 @@ def _distinct(sections, path):
             count += 1
             name = f"{section.name} ({count})"
         if count > 1:
-            warnings.warn(
-                f"{str(path)!r}: another section {section.name!r} is called {name!r}", DataWarning, stacklevel=7
+            warn(
+                f"{str(path)!r}: another section {section.name!r} is called {name!r}",
+                DataWarning,
             )
         names.add(name)
         distinct.append(replace(section, name=name))

@@ -1,7 +1,6 @@
 """Ions as points with data, for the formats of visualisation programs."""
 
 import re
-import warnings
 from collections.abc import Iterable
 from typing import Any
 
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 
 from apt_evap._common.types import AnyPath, Booleans, Floats
 from apt_evap.detection.hits import Hits
-from apt_evap.warnings import DataWarning
+from apt_evap.warnings import DataWarning, warn
 
 _NAMES = {"x": "detector_x", "y": "detector_y"}
 
@@ -49,7 +48,7 @@ def points_and_data(path: AnyPath, hits: Hits) -> tuple[Booleans | slice, Floats
     if n_omitted == len(hits):
         raise ValueError(f"no ion to write to {str(path)!r}: {reason}")
     if n_omitted:
-        warnings.warn(f"ions left out of {str(path)!r}: {reason}", DataWarning, stacklevel=4)
+        warn(f"ions left out of {str(path)!r}: {reason}", DataWarning)
     chosen = finite if n_omitted else slice(None)
     data = {_NAMES.get(name, name): getattr(hits, name) for name in hits.columns if name != "positions"}
     for name, values in hits.extra.items():

@@ -1,7 +1,6 @@
 """Headerless files with rows of 4-byte words: common functions of .pos, .epos and .raw."""
 
 import os
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, BinaryIO
@@ -13,7 +12,7 @@ from apt_evap._common.files import FileError, TruncatedFile, open_for_reading, r
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_choice, check_switch, short_text
 from apt_evap.detection.hits import Hits, Outcome
-from apt_evap.warnings import DataWarning
+from apt_evap.warnings import DataWarning, warn
 
 MM = {"mm": 1.0, "cm": 10.0, "m": 1e3, "um": 1e-3}
 """Units of lengths on a detector [mm]."""
@@ -287,8 +286,9 @@ def choose(path: AnyPath, hits: Hits, columns: Any) -> Any:
         raise ValueError(f"no ion to write to {str(path)!r}: {what}")
     if n_omitted == 0:
         return slice(None)
-    warnings.warn(
-        f"{n_omitted:,} of {len(hits):,} ions left out of {str(path)!r}: {reasons}", DataWarning, stacklevel=4
+    warn(
+        f"{n_omitted:,} of {len(hits):,} ions left out of {str(path)!r}: {reasons}",
+        DataWarning,
     )
     return hit & finite
 

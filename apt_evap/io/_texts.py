@@ -7,7 +7,6 @@ import io
 import lzma
 import math
 import re
-import warnings
 import zlib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
@@ -18,7 +17,7 @@ import numpy as np
 
 from apt_evap._common.files import FileError, check_path, open_for_reading, read_small_file
 from apt_evap._common.types import AnyPath, Floats
-from apt_evap.warnings import DataWarning
+from apt_evap.warnings import DataWarning, warn
 
 _MAX_BYTES = 1 << 22
 SYMBOLS = tuple(
@@ -254,9 +253,7 @@ def species_name(word: str, known: Collection[str], where: str) -> str:
     symbol = word.capitalize()
     name = word if atoms_of(word) or symbol not in ELEMENTS else symbol
     if similar:
-        warnings.warn(
-            f"{where}: {word!r} may be any of {', '.join(similar)}, it is read as {name}", DataWarning, stacklevel=4
-        )
+        warn(f"{where}: {word!r} may be any of {', '.join(similar)}, it is read as {name}", DataWarning)
     return name
 
 

@@ -6,7 +6,6 @@ All sections with one fixed record per ion are read; the others are named in a w
 
 import math
 import os
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ from apt_evap.detection.hits import Hits
 from apt_evap.io._apt_sections import read_sections
 from apt_evap.io._pulses import ions_per_pulse, pulses_from_first, whole_pulses
 from apt_evap.io._records import check_columns, fill
-from apt_evap.warnings import DataWarning
+from apt_evap.warnings import DataWarning, warn
 
 # columns of Hits: number of values per ion, unit, and names of their sections in lower case, the preferred one first
 _COLUMNS: dict[str, tuple[int, str | None, tuple[str, ...]]] = {
@@ -188,10 +187,9 @@ def _fits(section, target, values, unit, path):
     elif section.dtype.kind not in ("iu" if target in _COUNTS else "iuf"):
         problem = f"values of type {section.dtype}"
     if problem:
-        warnings.warn(
+        warn(
             f"{str(path)!r}: section {section.name!r} has {problem}, so it is stored in extra, not {target}",
             DataWarning,
-            stacklevel=6,
         )
     return not problem
 
@@ -209,11 +207,10 @@ def _ions(file, path, grouping, n):
     """Ions per pulse for the first ion of each pulse and 0 for the others; None, with a warning, if inconsistent."""
     ions, problem = ions_per_pulse(_values(file, path, grouping.section, 0, n))
     if ions is None:
-        warnings.warn(
+        warn(
             f"{str(path)!r}: pulses unknown, so its Multiplicity is stored in extra: it does not contain the number of "
             f"ions of each pulse, neither for all ions nor for the first ion only ({problem})",
             DataWarning,
-            stacklevel=4,
         )
     return ions
 

@@ -4,7 +4,6 @@ Larson et al., Local Electrode Atom Probe Tomography (Springer, 2013), appendix 
 detector coordinates in mm, in contrast to the units printed there.
 """
 
-import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -15,7 +14,7 @@ from apt_evap._common.validation import check_choice
 from apt_evap.detection.hits import Hits
 from apt_evap.io._pulses import PulseCheck, first_from_equal, pulses_from_first, whole_pulses
 from apt_evap.io._records import MM, check_any, choose, choose_fields, in_mm, open_words, write_words
-from apt_evap.warnings import DataWarning
+from apt_evap.warnings import DataWarning, warn
 
 _ROW = 44
 _FIELDS = {
@@ -180,10 +179,9 @@ class _Survey:
         highest = self.highest.get(decisive, np.nan)
         self.kilovolts = self._unit == "kV" or (self._unit is None and bool(highest < _LEAST))
         if self.kilovolts and self._unit is None and decisive in self.present:
-            warnings.warn(
+            warn(
                 f"{str(path)!r}: voltages of at most {highest:.4g} are taken for kV; voltage_unit='V' reads them in V",
                 DataWarning,
-                stacklevel=5,
             )
         if "voltage" in self.present:
             self.present.add("pulse_voltage")
@@ -192,11 +190,10 @@ class _Survey:
             problem = self.pulses.problem(cut)
             self.grouped = not problem
             if problem:
-                warnings.warn(
+                warn(
                     f"{str(path)!r}: pulses unknown, so pulse_id and multiplicity are None: the column of ions per "
                     f"pulse is inconsistent, {problem}",
                     DataWarning,
-                    stacklevel=5,
                 )
 
 
@@ -257,11 +254,10 @@ def write_epos(path: AnyPath, hits: Hits) -> None:
         (v[chosen].max() for v in (hits.voltage, hits.pulse_voltage) if v is not None and v[chosen].any()), np.nan
     )
     if highest < _LEAST:
-        warnings.warn(
+        warn(
             f"{str(path)!r}: voltages of at most {highest:.4g} V can be taken for kV: the format does not contain "
             f"their unit; voltage_unit='V' reads them in V",
             DataWarning,
-            stacklevel=3,
         )
     ions = np.zeros(len(hits), np.uint32)
     if hits.pulse_id is not None:

@@ -4,7 +4,6 @@ A new format needs one module with a reader, a writer or both, and one line in `
 """
 
 import inspect
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -37,7 +36,7 @@ from apt_evap.io.tapsim import WRITTEN as TAPSIM_COLUMNS
 from apt_evap.io.tapsim import read_tapsim, write_tapsim
 from apt_evap.io.vtp import write_vtp
 from apt_evap.io.xyz import write_xyz
-from apt_evap.warnings import DataWarning
+from apt_evap.warnings import DataWarning, warn
 
 __all__ = ["FORMATS", "RANGE_FORMATS", "FileError", "Format", "TruncatedFile", "chunks", "read", "read_ranges", "write"]
 
@@ -213,11 +212,10 @@ def _warn_of_size(path, content):
     else:
         return False
     if max(size) > _WIDEST:
-        warnings.warn(
+        warn(
             f"{str(path)!r} has detector coordinates in {size[0]:.4g} x {size[1]:.4g} mm, no detector is wider than "
             f"{_WIDEST:g} mm: are they in mm?",
             DataWarning,
-            stacklevel=3,
         )
     return max(size) > _WIDEST
 
@@ -266,10 +264,9 @@ def write(path: AnyPath, hits: Hits, *, format: str | None = None, **options: An
     chosen.write(path, hits, **options)
     lost, _ = left_out(path, hits, format=format)
     if lost and hits.outcome is None and hits.ion is None:
-        warnings.warn(
+        warn(
             f"{str(path)!r} is without the columns {', '.join(lost)}, for which a {chosen.suffix} file has no place",
             DataWarning,
-            stacklevel=2,
         )
 
 

@@ -4,7 +4,6 @@ Little-endian, no header: base, pulse and reflectron voltage [V], detector x, y 
 float32, then an epoch (int32) and the number of the pulse (uint32).
 """
 
-import warnings
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -13,7 +12,7 @@ from apt_evap._common.types import AnyPath
 from apt_evap.detection.hits import Hits
 from apt_evap.io._pulses import first_from_equal, pulses_from_first
 from apt_evap.io._records import check_any, choose_fields, in_mm, open_words
-from apt_evap.warnings import DataWarning
+from apt_evap.warnings import DataWarning, warn
 
 _ROW = 32
 _FIELDS = {
@@ -141,7 +140,7 @@ def _grouped(blocks, path):
         )
     else:
         return True
-    warnings.warn(f"{str(path)!r}: {problem}", DataWarning, stacklevel=4)
+    warn(f"{str(path)!r}: {problem}", DataWarning)
     return bool(has_numbers)
 
 

@@ -4,15 +4,13 @@ Miller, Atom Probe Tomography (Kluwer, 2000), and Larson et al., Local Electrode
 appendix A. A second table, the polyatomic extension, may give molecular ions names and colours.
 """
 
-import warnings
-
 import numpy as np
 
 from apt_evap._common.files import FileError
 from apt_evap._common.types import AnyPath
 from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.io._texts import atoms_in, colour, count, formula, number, read_text, species_name
-from apt_evap.warnings import DataWarning
+from apt_evap.warnings import DataWarning, warn
 
 
 def read_rng(path: AnyPath) -> Ranges:
@@ -55,7 +53,7 @@ def read_rng(path: AnyPath) -> Ranges:
     if not rows:
         raise FileError(f"{str(path)!r} has no range with a species, expected at least one")
     if n_empty:
-        warnings.warn(f"{str(path)!r}: {n_empty} ranges have no species and are left out", DataWarning, stacklevel=2)
+        warn(f"{str(path)!r}: {n_empty} ranges have no species and are left out", DataWarning)
     named = [names.get(bounds, ("", "")) for bounds, _ in rows]
     species = [formula(atoms) for _, atoms in rows]
     return Ranges(
@@ -104,7 +102,7 @@ def _table(lines, path):
         if line not in rows:  # `Ranges` ignores a repeated one
             rows[line] = _row(line.split()[1:], columns, f"{where}, line {at}")
     if n_rows != n_ranges:
-        warnings.warn(f"{where} states {n_ranges} ranges but contains {n_rows}", DataWarning, stacklevel=3)
+        warn(f"{where} states {n_ranges} ranges but contains {n_rows}", DataWarning)
     return list(rows.values()), colours
 
 

@@ -6,7 +6,6 @@ Volume and colour may be missing, and the decimal separator may be a comma.
 """
 
 import re
-import warnings
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from apt_evap._common.types import AnyPath
 from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.io._texts import atoms_in, atoms_of, formula, number, read_text, species_name
 from apt_evap.specimen.isotopes import ISOTOPES
-from apt_evap.warnings import DataWarning
+from apt_evap.warnings import DataWarning, warn
 
 
 def read_rrng(path: AnyPath) -> Ranges:
@@ -52,8 +51,9 @@ def read_rrng(path: AnyPath) -> Ranges:
         raise FileError(f"{str(path)!r} has no lines Range1=... in a section [Ranges], expected at least one")
     numbers = [value for section, _, key, value in lines if section == "ranges" and key == "number"]
     if numbers and numbers[0] != str(len(parts)):
-        warnings.warn(
-            f"{str(path)!r} states {numbers[0]:.20} ranges but contains {len(parts)}", DataWarning, stacklevel=2
+        warn(
+            f"{str(path)!r} states {numbers[0]:.20} ranges but contains {len(parts)}",
+            DataWarning,
         )
     names, low, high, volume, colour, composition, species = zip(*parts, strict=True)
     _warn_of_charges(path, low, high, species)
@@ -122,10 +122,9 @@ def _warn_of_charges(path, low, high, species):
         for n, first, last in ranges:
             others = [0.5 * (start + end) for m, start, end in ranges if m != n]
             if n > 1 and any(first <= mass <= last for mass in masses + others):
-                warnings.warn(
+                warn(
                     f"{str(path)!r}: {name}:{n} from {first / n:g} to {last / n:g} Da has the mass of {name} with "
                     f"{n} charges, but is read as {n} atoms: the number must be that of the atoms",
                     DataWarning,
-                    stacklevel=3,
                 )
                 return

@@ -5,7 +5,6 @@ have 102 bytes in the byte order of the machine, here little-endian.
 """
 
 import re
-import warnings
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_switch
 from apt_evap.detection.hits import Hits
 from apt_evap.io._texts import read_bytes
-from apt_evap.warnings import DataWarning
+from apt_evap.warnings import DataWarning, warn
 
 SIGNATURE = b"TAPSIM RESULTS DATA"
 _MAX_BYTES = 1 << 36
@@ -215,7 +214,7 @@ def write_tapsim(path: AnyPath, hits: Hits, *, binary: bool = False) -> None:
                 rows["stop"][:, k] = values / _MM_PER_M
     if hits.site is not None:
         if hits.site.max(initial=0) > np.iinfo("u4").max:
-            warnings.warn(f"{str(path)!r}: node numbers beyond 32 bits are written as 0", DataWarning, stacklevel=3)
+            warn(f"{str(path)!r}: node numbers beyond 32 bits are written as 0", DataWarning)
         rows["number"] = np.where((hits.site >= 0) & (hits.site <= np.iinfo("u4").max), hits.site, 0)
     with replace_file(path) as file:
         file.write(_header(binary).encode())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -39,7 +38,7 @@ from apt_evap.registration.correlation_search import (
 from apt_evap.registration.patches import patch_displacements
 from apt_evap.registration.polynomial import LARGEST_DEGREE, Distortion, fit_polynomial
 from apt_evap.registration.transform import SimilarityTransform
-from apt_evap.warnings import RegistrationWarning
+from apt_evap.warnings import RegistrationWarning, warn
 
 DOUBTFUL = 0.5
 """Limit of score times square root of the overlap. Wrong transforms reach 0.25 on noise, 0.5 on maps of other poles."""
@@ -217,12 +216,11 @@ class Registration:
     def warn_if_doubtful(self) -> None:
         """Warn if the registration is `doubtful`."""
         if self.doubtful:
-            warnings.warn(
+            warn(
                 f"the registration is doubtful: the correlation of the maps is only {self.score:.2f} in their common "
                 f"area ({self.overlap:.0%} of the measured one), as for unrelated maps; plot the overlay, check the "
                 "axis of the simulated specimen, and give known values of rotation, scale and shift",
                 RegistrationWarning,
-                stacklevel=3,
             )
 
     def to_text(self) -> str:
@@ -368,11 +366,10 @@ def register(
     best.warn_if_doubtful()
     at = _bounds_reached(fits[0].transform, *bounds)
     if at:
-        warnings.warn(
+        warn(
             f"the registration is at a bound of its search: {', '.join(at)}; widen it, or check the maps and the axis "
             "of the simulated specimen",
             RegistrationWarning,
-            stacklevel=2,
         )
     return best
 
@@ -555,12 +552,11 @@ def register_points(
     if degree != 0:
         return _polynomial_registration(best, fit, "points")
     if fit.degree:
-        warnings.warn(
+        warn(
             f"the residual of the points, {best.residual:.2f} mm, has a systematic part: terms of degree {fit.degree} "
             f"reduce it to {fit.residual:.2f} mm; for an instrument with a reflectron use Hits.undistorted, or "
             "degree=None",
             RegistrationWarning,
-            stacklevel=2,
         )
     return best
 

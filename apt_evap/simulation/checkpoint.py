@@ -8,7 +8,6 @@ locked by the process that writes them.
 import math
 import os
 import time
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from apt_evap.simulation.run import Run, load
 from apt_evap.simulation.run_hdf5 import count_ions, is_run
 from apt_evap.simulation.stop_reason import StopReason
 from apt_evap.storage.locks import FileLock
-from apt_evap.warnings import RunWarning
+from apt_evap.warnings import RunWarning, warn
 
 _RATIO = 50  # least ratio of the time between two checkpoints to the time that one takes, unless `minutes` is 0
 
@@ -227,7 +226,7 @@ class CheckpointWriter:
             run.ended_by(StopReason.UNFINISHED).save(self._checkpoint.unfinished)
             self._n_written = len(run)
         except FileError as error:
-            warnings.warn(f"no checkpoint: {error}; the run continues and will try again", RunWarning, stacklevel=4)
+            warn(f"no checkpoint: {error}; the run continues and will try again", RunWarning)
         ended, pause = time.monotonic(), 60 * self._checkpoint.minutes
         self._due_at = ended + (max(pause, _RATIO * (ended - began)) if pause else 0)
 

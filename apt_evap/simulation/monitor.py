@@ -1,6 +1,5 @@
 """The monitor of a run: convergence of the charges, and fractions of ions with problems."""
 
-import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +10,7 @@ from apt_evap._common.types import Floats
 from apt_evap.detection.hits import Outcome
 from apt_evap.evaporation.emitter import Emitter
 from apt_evap.simulation.history import History
-from apt_evap.warnings import ChargesWarning, ResponseWarning, RunWarning
+from apt_evap.warnings import ChargesWarning, ResponseWarning, RunWarning, warn
 
 if TYPE_CHECKING:
     from apt_evap.simulation.run import Run
@@ -163,7 +162,7 @@ class Watch:
     def _warn(self, kind, what, message):
         if what not in self._warned:  # once per run, not at every check
             self._warned.add(what)
-            warnings.warn(message, kind, stacklevel=6)
+            warn(message, kind)
 
     def take(self) -> History:
         """Return and clear the history of the checks since the last call."""

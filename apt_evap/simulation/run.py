@@ -3,7 +3,6 @@
 import hashlib
 import json
 import math
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -52,7 +51,7 @@ from apt_evap.simulation.history import CapHistory, History
 from apt_evap.simulation.provenance import joined, provenance_now
 from apt_evap.simulation.real_units import OperatingPoint, RealColumns, RealUnits, in_real_units, random_of
 from apt_evap.simulation.run_hdf5 import read_run, write_run
-from apt_evap.warnings import RunWarning
+from apt_evap.warnings import RunWarning, warn
 
 _RIM_SAMPLES = 16  # ions, and azimuths, for which the rim of the field of view is followed to a detector
 
@@ -374,7 +373,7 @@ class Run:
 
     def _landed(self, perturbation, by_response):
         """Stereographic directions (n, 2), times of flight (n,) and ions that were not flown, for a perturbation."""
-        warn_if_not_for(dict(self.settings.get("rule") or {}).get("name"), perturbation, stacklevel=3)
+        warn_if_not_for(dict(self.settings.get("rule") or {}).get("name"), perturbation)
         for flown_as, flown in zip(self.perturbations, self.flown, strict=True):
             known = flown_as == perturbation or flown_as == described(perturbation)  # by name and repr in a file
             # the energies of flights were those at the simulated voltage
@@ -451,11 +450,10 @@ class Run:
     def _warn_if_beyond(self, seen, what):
         """Warn if there are directions within those of a device that are outside the field of view of the flights."""
         if seen:
-            warnings.warn(
+            warn(
                 f"the {what} sees ions outside the field of view of the flights ({self.field_of_view:.4g} degrees), "
                 "which are missing: run with a larger field_of_view (FlightSettings, or [flights] in a settings file)",
                 RunWarning,
-                stacklevel=3,
             )
 
     def _seen(self, directions, times):

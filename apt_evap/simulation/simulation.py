@@ -6,7 +6,6 @@ threads and any size of a batch.
 """
 
 import threading
-import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 
@@ -39,7 +38,7 @@ from apt_evap.simulation.monitor import Monitor
 from apt_evap.simulation.recorder import Recorder
 from apt_evap.simulation.run import Run
 from apt_evap.specimen.tip import Tip
-from apt_evap.warnings import RunWarning
+from apt_evap.warnings import RunWarning, warn
 
 BACKLOG = 4  # batches whose flights may be pending during further events
 
@@ -374,11 +373,10 @@ class Simulation:
         """Warn if there are fewer evaporable atoms than requested ions."""
         available = self.tip.max_ions - self.emitter.counts["events"]
         if n_ions > available:
-            warnings.warn(
+            warn(
                 f"n_ions is {n_ions:,} but only about {max(available, 0):,} atoms can evaporate: the run will be "
                 "shorter",
                 RunWarning,
-                stacklevel=3,
             )
 
     def _settings_of(self, tip):

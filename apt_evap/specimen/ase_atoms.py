@@ -1,6 +1,5 @@
 """Conversion of specimens to and from Atoms objects of ASE, an optional package."""
 
-import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from apt_evap._common.optional_imports import optional_import
 from apt_evap._common.types import Floats
 from apt_evap.specimen.materials import Material, as_material
-from apt_evap.warnings import SpecimenWarning
+from apt_evap.warnings import SpecimenWarning, warn
 
 if TYPE_CHECKING:
     import ase
@@ -78,11 +77,10 @@ def warn_of_occupancy(atoms: "ase.Atoms") -> None:
     for site in sites:
         if any(isinstance(share, float) and 0 < share < 1 for share in site.values()):
             shares = ", ".join(f"{name} {share:g}" for name, share in site.items())
-            warnings.warn(
+            warn(
                 f"the structure has sites that are occupied partially ({shares}), which become ordered and complete: "
                 "place atoms and vacancies at random before",
                 SpecimenWarning,
-                stacklevel=4,
             )
             return
 

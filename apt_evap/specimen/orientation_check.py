@@ -1,6 +1,5 @@
 """Checks of a specimen from positions: direction of its axis, distance of its atoms, number of bodies; its apex."""
 
-import warnings
 from collections.abc import Sequence
 from itertools import product
 
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 
 from apt_evap._common.sphere import fit_sphere
 from apt_evap._common.types import Floats
-from apt_evap.warnings import SpecimenWarning
+from apt_evap.warnings import SpecimenWarning, warn
 
 _LEAST = 200  # atoms: fewer have no shape
 _CROWD = 50  # atoms: fewer have no typical distance
@@ -64,11 +63,10 @@ def warn_of_direction(positions: Floats) -> None:
         seen = f"lies on its side, along {'xyz'[np.argmax(np.abs(axis))]}"
     else:
         seen = "stands upside down"
-    warnings.warn(
+    warn(
         f"the specimen {seen}: its narrow end points along ({axis[0]:.2f}, {axis[1]:.2f}, {axis[2]:.2f}), "
         f"{angle:.0f} degrees from z; its axis must be +z, with the apex on top, at the largest z",
         SpecimenWarning,
-        stacklevel=3,
     )
 
 
@@ -117,11 +115,10 @@ def check_spacing(distance: float, expected: Sequence[float], names: Sequence[st
             raise ValueError(
                 f"positions were read in a wrong unit: {problem}, as if {supposed} had been taken for {read}"
             )
-    warnings.warn(
+    warn(
         f"{problem}: wrong unit (reduced units of LAMMPS?), wrong material or not a solid; voltages and fields are "
         "only right for the distances of the material",
         SpecimenWarning,
-        stacklevel=3,
     )
 
 
@@ -145,11 +142,10 @@ def warn_of_bodies(positions: Floats, distance: float) -> None:
     sizes = np.sort(np.bincount(bodies(positions, _BOND * distance)))[::-1]
     if len(sizes) > 1:
         largest = ", ".join(f"{size:,}" for size in sizes[:4]) + (", ..." if len(sizes) > 4 else "")
-        warnings.warn(
+        warn(
             f"the specimen is not one body but {len(sizes):,} that do not touch, of {largest} atoms: was it cut by the "
             "borders of a periodic box, or are atoms around it?",
             SpecimenWarning,
-            stacklevel=3,
         )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -33,7 +32,7 @@ from apt_evap.specimen.phases import Arrangement, Phase, check_phases
 from apt_evap.specimen.shape import TaperedCap
 from apt_evap.specimen.shell import Shell
 from apt_evap.specimen.surface_criterion import SurfaceCriterion
-from apt_evap.warnings import DataWarning
+from apt_evap.warnings import DataWarning, warn
 
 _ROUNDING = 1e-6  # [d_nn]: sites on the surface are all included, in spite of rounding
 _LAYER = 0.74  # thickness of the layer of surface atoms [d_nn]: for fcc, 0.48 a^2 of the surface per atom
@@ -256,11 +255,10 @@ class Tip:
         for number, phase in enumerate(self.phases if len(self.phases) > 1 else ()):
             is_void = phase.vacancies == 1
             if not (arrangement.has_sites[number] if is_void else (self._phase == number).any()):
-                warnings.warn(
+                warn(
                     f"phase {phase.name} has no {'sites' if is_void else 'atoms'}: its region is outside the specimen, "
                     "covered by later phases, or too small",
                     DataWarning,
-                    stacklevel=3,
                 )
 
     def _without_overlap(self, positions, phases):

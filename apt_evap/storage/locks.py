@@ -2,13 +2,12 @@
 
 import os
 import socket
-import warnings
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from apt_evap._common.files import FileError, check_regular
-from apt_evap.warnings import RunWarning
+from apt_evap.warnings import RunWarning, warn
 
 try:
     import fcntl
@@ -67,10 +66,9 @@ class FileLock:
             owner = file.read(100) or "another process"
             raise FileError(f"{self._of!r} is being written by {owner}; wait for it or choose another file") from None
         except OSError as error:
-            warnings.warn(
+            warn(
                 f"cannot lock {self._of!r} ({error.strerror}): make sure that no other process writes it",
                 RunWarning,
-                stacklevel=6,
             )
 
     def _sign(self, file):

@@ -104,7 +104,7 @@ def test_the_ions_are_those_that_the_instrument_records(made):
 def test_examples_of_a_run_differ(made):
     examples = [each for each in ae.dataset.load(made[1]) if each.about["run"] == made[0].sweep.keys[0]]
     assert [each.about["emission"]["name"] for each in examples] == ["Unperturbed", "RollUp", "RollUp"]
-    energies = [each.about["emission"]["energy"]["energy"] for each in examples[1:]]
+    energies = [each.about["emission"]["energy"] for each in examples[1:]]
     assert energies[0] != energies[1] and all(0.005 <= energy <= 0.01 for energy in energies)
     assert len({each.about["seed"] for each in examples}) == 3
 
