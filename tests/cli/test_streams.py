@@ -76,7 +76,7 @@ def test_a_terminal_that_knows_ascii_alone(folder):
 def test_a_locale_without_degree_signs(folder):
     """The C locale without its mode of UTF-8: ASCII, and another handler of errors than other locales have."""
     locale = {"LC_ALL": "C", "PYTHONUTF8": "0"}
-    print_one = "import apt_evap.cli._output as o; o.open_missing_streams(); o.put('20\u00b0 \u00b1 1 caf\udce9')"
+    print_one = r"import apt_evap.cli._output as o; o.open_missing_streams(); o.put('20\u00b0 \u00b1 1 caf\udce9')"
     done = subprocess.run(
         [sys.executable, "-c", print_one],
         capture_output=True,

@@ -261,7 +261,7 @@ def test_bounds_of_the_scale_hold_for_all_candidates():
 ])  # fmt: skip
 def test_half_angles_that_no_instrument_has_are_refused(options):
     _, map = made("fcc", (0.30, 0.54, 0.79), ions=2_000)
-    with pytest.raises(ValueError, match=f"{next(iter(options))} must be .* half angles"):
+    with pytest.raises(ValueError, match=f"{next(iter(options))} must be .* for this map"):
         ae.index(map, "Ni", **options)
 
 

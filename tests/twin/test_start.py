@@ -113,10 +113,14 @@ def test_commands_from_a_file_to_settings(found, tmp_path, monkeypatch, capsys):
     assert "--pole" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", [
-    'a.epos\n[tip]\nmaterial = "W"', 'a\noutput = "\\u002ftmp\\u002fevil.h5"\n#', "bell\x07", "x\ry", "caf\udce9", "\x7f",
-    "\u2028", "tab\t", "\ud800",
-])  # fmt: skip
+NAMES = [
+    'a.epos\n[tip]\nmaterial = "W"',
+    'a\noutput = "\\u002ftmp\\u002fevil.h5"\n#',
+    *("bell\x07", "x\ry", "caf\udce9", "\x7f", "\u2028", "tab\t", "\ud800"),
+]
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_names_of_files_do_not_become_settings(found, tmp_path, name):
     _, indexing = found
     usual = tomllib.loads(ae.twin.settings_of(indexing, minutes=5).text)
