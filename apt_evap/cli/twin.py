@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import os
 import shlex
 import warnings
 from pathlib import Path
@@ -30,6 +31,7 @@ from apt_evap.registration.register import at_bound, register
 from apt_evap.report.measurement import measurement_section
 from apt_evap.report.page import Page
 from apt_evap.simulation.run import load
+from apt_evap.simulation.run_hdf5 import is_run
 from apt_evap.specimen.materials import material
 from apt_evap.twin.constants import constants_of
 from apt_evap.twin.start import ENERGY, HEIGHT, ROLLS, SHARPNESS, near
@@ -134,6 +136,8 @@ def execute(options: argparse.Namespace) -> int:
     kept = KeptFiles(folder, files, values, (SETTINGS, FACTS, RUN, REGISTRATION, STUDY, ANSWER))
     facts = _start(options, kept)
     candidate = _candidate(facts.best, options, folder)
+    if os.path.lexists(folder / RUN) and not is_run(folder / RUN):
+        raise FileError(f"{str(folder / RUN)!r} is not a run: remove it, or give another folder with -o")
     code = run_command.execute(_parsed("run", folder / SETTINGS, "-o", folder / RUN, "--resume", options=options))
     if code:
         return code

@@ -73,6 +73,25 @@ def test_a_terminal_that_knows_ascii_alone(folder):
     assert (code, out, err) == (0, "wrote \\xc5_map.png\n", "")
 
 
+def test_a_locale_without_degree_signs(folder):
+    """The C locale without its mode of UTF-8: ASCII, and another handler of errors than other locales have."""
+    locale = {"LC_ALL": "C", "PYTHONUTF8": "0"}
+    print_one = r"import apt_evap.cli._output as o; o.open_missing_streams(); o.put('20\u00b0 \u00b1 1 caf\udce9')"
+    done = subprocess.run(
+        [sys.executable, "-c", print_one],
+        capture_output=True,
+        env=os.environ | {"PYTHONPATH": HERE} | locale,
+        timeout=120,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, b"20\\xb0 \\xb1 1 caf\\udce9\n", b"")
+    os.rename(folder / "ions.epos", folder / "Å.epos")
+    assert shell(folder, "", "map", "Å.epos", **locale)[::2] == (0, "")
+    # a name in a settings file that this locale cannot write
+    (folder / "small.toml").write_text(f'output = "Å.h5"\n{SMALL}', encoding="utf-8")
+    code, _, err = shell(folder, "", "run", "small.toml", **locale)
+    assert code == 2 and "path must be a file name in" in err
+
+
 def test_ctrl_c_while_libraries_are_loaded(folder):
     """A library in place of h5py presses it as it is imported."""
     (folder / "h5py.py").write_text("import os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\ntime.sleep(60)\n")

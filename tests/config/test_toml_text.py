@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from apt_evap.config.toml_text import toml_text
+from apt_evap.config.toml_text import comment, toml_text
 
 TEXT = st.text(st.characters(codec="utf-8"))
 NUMBERS = st.booleans() | st.integers(-(2**63), 2**63 - 1) | st.floats(allow_nan=False)
@@ -33,3 +33,14 @@ def test_nan():
 def test_other_types_are_refused():
     with pytest.raises(ValueError, match=r"texts, numbers, booleans, lists and tables, got datetime.date"):
         toml_text({"day": datetime.date(2026, 1, 1)})
+
+
+@given(st.text())
+def test_a_comment_is_one_line_without_content(text):
+    written = f"{comment(text)}\nx = 1\n"
+    assert tomllib.loads(written.encode().decode()) == {"x": 1} and written.count("\n") == 2
+
+
+def test_text_that_is_not_unicode_is_refused():
+    with pytest.raises(ValueError, match="Unicode"):
+        toml_text({"output": "caf\udce9.h5"})

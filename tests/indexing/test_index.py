@@ -244,3 +244,84 @@ def test_the_picture_of_an_answer_shows_its_candidates():
     axes = ae.plot.indexing(found, candidates=2)
     assert len(axes) == 3 and f"{found.best}" in axes[1].get_title()
     assert DECIDED > 0
+
+
+def test_bounds_of_the_scale_hold_for_all_candidates():
+    _, map = made("fcc", (0.30, 0.54, 0.79), 20.0)  # its scale is outside of all of these
+    for scales in ((48.0, 54.0), (66.0, 72.0), (50.0, 50.0)):
+        for each in quickly(map, "Ni", scales=scales).candidates:
+            assert scales[0] <= each.projection.scale <= scales[1]
+    for each in ae.index(map, "Ni", patterns=master_patterns("fcc")[:1], distance=60.0).candidates:
+        assert 60 / 2.2 <= each.projection.scale <= 60 / 1.2
+
+
+@pytest.mark.parametrize("options", [
+    {"distance": 1e-9}, {"distance": 0.1}, {"distance": 1e12}, {"scales": (1e-9, 1e-8)}, {"scales": (22.0, 30.0)},
+    {"scales": (1e5, 1e6)},
+])  # fmt: skip
+def test_half_angles_that_no_instrument_has_are_refused(options):
+    _, map = made("fcc", (0.30, 0.54, 0.79), ions=2_000)
+    with pytest.raises(ValueError, match=f"{next(iter(options))} must be .* for this map"):
+        ae.index(map, "Ni", **options)
+
+
+@pytest.mark.parametrize("mean", [0.5, 3.0])
+@pytest.mark.parametrize("shape", ["flat", "gradient", "half"])
+def test_noise_has_no_score(mean, shape):
+    _, map = made("bcc", (0.1, 0.60, 0.80), ions=2_000)
+    x = map.centres[0][None, :] / 35
+    expected = {"flat": 1 + 0 * x, "gradient": 1 + 0.6 * x, "half": 1.0 * (x > 0)}[shape] * mean
+    counts = np.random.default_rng(4).poisson(np.broadcast_to(expected, map.values.shape))
+    found = quickly(ae.DetectorMap.from_array(counts, map.x_edges, map.y_edges, map.mask, is_counts=True), "W")
+    assert not found.decided and "no structure" in found.reason
+    assert [each.score for each in found.candidates] == [0.0] * len(found.candidates)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("kind", ["zeros", "one hot bin", "row", "thin", "few bins"])
+def test_maps_that_are_none_are_refused(kind):
+    counts = np.random.default_rng(1).poisson(3.0, (128, 128))
+    if kind == "zeros":
+        counts *= 0
+    elif kind == "one hot bin":
+        counts = np.where(np.arange(128 * 128).reshape(128, 128) == 8000, 5000, 0)
+    elif kind == "row":
+        counts[:62], counts[66:] = 0, 0
+    elif kind == "thin":
+        counts = counts[:4]
+    else:
+        counts = counts[:5, :5]
+    edges = [np.arange(size + 1.0) - size / 2 for size in counts.shape]
+    with pytest.raises(ValueError, match=r"hits|bins|field of view"):
+        ae.index(ae.DetectorMap.from_array(counts, edges[1], edges[0], is_counts=True), "W")
+
+
+def test_marks_outside_the_map_and_of_no_pole_are_refused():
+    _, map = made("fcc", (0.30, 0.54, 0.79), ions=2_000)
+    for poles in (
+        [(1e9, 1e9)],
+        [(34.0, 34.0)],
+        [(1.0, 1.0, (99999, 1, 1))],
+        [(1.0, 1.0, (1.5, 1, 1))],
+        [(1.0, 1.0, 7)],
+    ):
+        with pytest.raises(ValueError, match="poles"):
+            quickly(map, "Ni", poles=poles)
+    with pytest.raises(ValueError, match="lines"):
+        quickly(map, "Ni", lines=[(0.0, 0.0, 0.0, 90.0)])
+
+
+def test_marks_that_contradict_each_other_or_the_map_are_named():
+    orientation, map = made("fcc", (0.42, 0.50, 0.76), 20.0)
+    projection = ae.detection.Projection(SCALE)
+    first, second, third = projection.places(orientation.directions(np.array([[1.0, 0, 1], [0, -1, -1], [1, 1, 1]])) * [
+        [1], [-1], [1]]).tolist()  # fmt: skip
+    good = quickly(map, "Ni", poles=[(*first, (0, 2, 2)), (*second, (0, 2, 2)), (*third, (1, 1, 1))])
+    assert good.decided
+    # 60 degrees apart, as 311 and another 311 are within 3 degrees, but 311 is not there
+    wrong = quickly(map, "Ni", poles=[(*first, (3, 1, 1)), (*second, (3, 1, 1))])
+    assert not wrong.decided and wrong.reason.count("called 311") == 2
+    assert off(wrong.best, orientation) < 1.0
+    # no scale makes two poles 111 as near as these
+    near = quickly(map, "Ni", poles=[(*third, (1, 1, 1)), (third[0] + 15.0, third[1], (1, 1, 1))])
+    assert not near.decided and "contradict each other" in near.reason and near.reason.count("called 111") == 2

@@ -1,6 +1,9 @@
 """Settings of a simulation from a measured map, and the commands that go from a file to an answer."""
 
 import json
+import os
+import tomllib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -108,6 +111,47 @@ def test_commands_from_a_file_to_settings(found, tmp_path, monkeypatch, capsys):
     assert main(arguments) == 2 and "mine.toml" in capsys.readouterr().err
     assert main(["index", "measured.npz", "--element", "Ni", "--pole=-1,x"]) == 2
     assert "--pole" in capsys.readouterr().err
+
+
+NAMES = [
+    'a.epos\n[tip]\nmaterial = "W"',
+    'a\noutput = "\\u002ftmp\\u002fevil.h5"\n#',
+    *("bell\x07", "x\ry", "caf\udce9", "\x7f", "\u2028", "tab\t", "\ud800"),
+]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_names_of_files_do_not_become_settings(found, tmp_path, name):
+    _, indexing = found
+    usual = tomllib.loads(ae.twin.settings_of(indexing, minutes=5).text)
+    start = ae.twin.settings_of(replace(indexing, map=replace(indexing.map, source=name)), minutes=5)
+    start.save(tmp_path / "mine.toml")
+    assert tomllib.loads((tmp_path / "mine.toml").read_text(encoding="utf-8")) == usual
+
+
+@pytest.mark.parametrize("name", ["Ni", 'My "alloy"\n[tip]', "Ünobtainium"])
+def test_a_material_of_a_user_is_that_of_the_run(found, tmp_path, name):
+    _, indexing = found
+    mine = ae.Material(
+        name, structure="fcc", a=0.40, evaporation_field=20.0, charge_state=2, mass=61.7, sources={"a": "x\n[tip]"}
+    )
+    best = replace(indexing.best, orientation=replace(indexing.best.orientation, material=mine))
+    start = ae.twin.settings_of(replace(indexing, candidates=(best,)), minutes=5)
+    start.save(tmp_path / "mine.toml")
+    config = ae.config.read_config(tmp_path / "mine.toml")
+    assert config.tip["material"] == mine and config.tip["material"].polarizability is None
+    assert config.tip["apex_radius"] == pytest.approx(start.simulated_radius)
+
+
+def test_a_pipe_in_the_place_of_the_settings_is_refused(found, tmp_path, monkeypatch, capsys):
+    from apt_evap.cli.start import is_start
+
+    os.mkfifo(tmp_path / "pipe.toml")
+    with pytest.raises(ae.FileError, match="regular file"):
+        is_start(tmp_path / "pipe.toml")
+    for mark in ("1,2,1e400,0,0", "1,2,nan,0,0", "1,2,0.5,0,0"):
+        assert main(["index", "none.npz", "--element", "W", "--pole", mark]) == 2
+        assert "--pole" in capsys.readouterr().err
 
 
 @pytest.mark.slow
