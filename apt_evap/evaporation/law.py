@@ -66,7 +66,7 @@ class Extremal:
     >>> tip = ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1))
     >>> run = ae.Simulation(tip, law=ae.Extremal()).run(3)
     >>> run.site  # index of each atom, in the sequence of evaporation
-    array([8101, 7922, 8099])
+    array([8101, 8099, 7922])
     """
 
     bonds: BondField | None = bonds_field()

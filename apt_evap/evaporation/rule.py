@@ -101,7 +101,7 @@ class Robin:
     >>> tip = ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1))
     >>> run = ae.Simulation(tip, voltage=1000.0, rule=ae.Robin(tolerance=1e-6)).run(100)
     >>> print(f"{np.median(run.charges):.2f} e")
-    1.98 e
+    2.02 e
     """
 
     RELAXATION_TOLERANCE: ClassVar[float] = 3e-3

@@ -163,9 +163,9 @@ def folded(
     >>> maps = [run.hits(each).map(bins=60) for each in (ae.Unperturbed(), ae.RollUp(0.2))]
     >>> first, second = (ae.maps.folded(each, projection, *pole, reach=30) for each in maps)
     >>> print(first)
-    <FoldedMap of 359 ions: 2mm, up to 30 degrees, ceiling of a correlation 0.71>
+    <FoldedMap of 362 ions: 2mm, up to 30 degrees, ceiling of a correlation 0.84>
     >>> print(f"{first.correlation(second):.2f}")
-    0.17
+    0.18
     """
     symmetry = check_choice(symmetry, "symmetry", SYMMETRIES)
     reach = check_number(reach, "reach", at_least=1, at_most=90, unit="degrees")

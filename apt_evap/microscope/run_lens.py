@@ -80,7 +80,7 @@ class RunLens:
     >>> run = ae.Simulation(ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1)), seed=1).run(100)
     >>> real = run.at_evaporation_field(ae.microscope.LocalElectrode.preset("local electrode"))
     >>> real.lens.radii([0, 99]).round(1)  # nm
-    array([1.7, 1.7])
+    array([1.7, 1.3])
     """
 
     lens: LocalElectrode = part("The lens of the instrument.", LocalElectrode)

@@ -13,6 +13,9 @@ ENERGY = ae.TruncatedNormal(0.155, 0.155)
 FLOWN = (ae.RollUp(0.2), ae.LateralVelocity(ENERGY))
 
 
+FIXED = ae.evaporation.ChargeSettings(potential_bound=1.0)  # no relaxation before an interval ends
+
+
 def columns(run):
     named = columns_of(run, run.every_column)
     for perturbation in (ae.Unperturbed(), ae.RollUp(ENERGY)):
@@ -204,7 +207,7 @@ def test_ctrl_c_keeps_what_is_done(small_tip):
             return ae.Unperturbed().launch(emissions, random)
 
     before = signal.getsignal(signal.SIGINT)
-    run = ae.Simulation(small_tip).run(80, [Interrupting()], progress=False, batch_size=10)
+    run = ae.Simulation(small_tip, charge_settings=FIXED).run(80, [Interrupting()], progress=False, batch_size=10)
     assert run.ended == "interrupted"
     assert len(run) == 30  # the batch under way is kept
     assert signal.getsignal(signal.SIGINT) is before
@@ -226,7 +229,7 @@ class Half:
         (lambda s: s.run(10.5), "n_ions must be an integer"),
         (lambda s: s.run(10, batch_size=0), "batch_size must be an integer"),
         (lambda s: s.run(10, [3]), "emissions must be perturbations with a method launch, got 3"),
-        (lambda s: s.run(10, [Half()]), "must launch 10 ions, one per emission, got 5"),
+        (lambda s: s.run(10, [Half()]), r"must launch \d+ ions, one per emission, got \d"),
         (
             lambda s: ae.Simulation(s.tip, voltage=-1.0),
             r"voltage must be .* \[V\] > 0 and <= 1e\+06, got -1.0",
@@ -339,7 +342,7 @@ def test_every_ion_of_the_large_run_is_accounted_for(run20):
 def test_flights_follow_an_emitter_that_was_driven_by_hand(nickel):
     tip = ae.Tip(nickel, apex_radius=6 * nickel.a, axis=(1, 1, 1), shank_length=6 * nickel.a)
     by_hand, whole = ae.Simulation(tip, seed=1), ae.Simulation(tip, seed=1)
-    by_hand.emitter.evaporate(60)
+    list(by_hand.emitter.advance(60))
     later = by_hand.run(20, responses=False, progress=False).hits(ae.Unperturbed())
     run = whole.run(80, responses=False, progress=False).hits(ae.Unperturbed())
     assert np.array_equal(later.x, run.x[60:]) and np.array_equal(later.site, run.site[60:])
@@ -394,7 +397,8 @@ def test_an_exception_keeps_what_is_done(small_tip):
     with pytest.raises(
         ae.simulation.RunInterrupted, match="broken on purpose; the attribute `run` contains the 100 ions"
     ) as caught:
-        ae.Simulation(small_tip, seed=1).run(200, [Breaking()], responses=False, progress=False, batch_size=50)
+        simulation = ae.Simulation(small_tip, seed=1, charge_settings=FIXED)
+        simulation.run(200, [Breaking()], responses=False, progress=False, batch_size=50)
     assert len(caught.value.run) == 100
     assert caught.value.run.ended == "RuntimeError: broken on purpose"
     assert isinstance(caught.value.__cause__, RuntimeError)
