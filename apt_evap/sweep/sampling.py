@@ -108,15 +108,16 @@ def _bounds(content, name):
     """Two numbers in increasing order and their unit, "" if they have none."""
     if isinstance(content, list) and len(content) == 2:
         if all(isinstance(each, int | float) and not isinstance(each, bool) for each in content):
-            numbers, units = [float(each) for each in content], {""}
+            numbers, units = content, {""}
         else:
             found = [_LENGTH.fullmatch(each) if isinstance(each, str) else None for each in content]
-            try:
-                numbers, units = [float(each[1]) for each in found], {each[2] for each in found}  # type: ignore[index]
-            except (TypeError, ValueError):
-                numbers, units = [], set()
-        if len(units) == 1 and np.isfinite(numbers).all() and numbers[0] < numbers[1]:
-            return (*numbers, units.pop())
+            numbers, units = [each and each[1] for each in found], {each and each[2] for each in found}
+        try:
+            low, high = map(float, numbers)
+        except (TypeError, ValueError, OverflowError):  # no number, or an integer of hundreds of digits
+            low = high = np.nan
+        if len(units) == 1 and low < high and np.isfinite(high - low):
+            return low, high, units.pop()
     raise ValueError(
         f'{name} must be two numbers in increasing order, or two lengths such as ["20 a", "60 a"], '
         f"got {short_text(content)}"
