@@ -4,7 +4,8 @@ import argparse
 from pathlib import Path
 
 from apt_evap.cli._output import say, tell, tell_json
-from apt_evap.dataset.making import ABOUT, make, plan_set, verify
+from apt_evap.dataset.description import ABOUT, verify
+from apt_evap.dataset.making import make, plan_set
 from apt_evap.sweep.foresight import hours_text
 
 
