@@ -188,7 +188,8 @@ def read_finished(folder: Path, names: Iterable[str] | None = ()) -> dict[str, A
         raise FileError(f"{str(folder / SUMS)!r} must have one checksum of each file of the data set, see {name!r:.80}")
     for name in sorted(sums) if names is None else [ABOUT, *names]:
         check_sha256(folder / name, sums[name], f"that of {SUMS}")
-        if expected.get(name, sums[name]) != sums[name]:
+    for name, digest in expected.items():
+        if digest != sums[name]:
             raise FileError(f"{str(folder / SUMS)!r} has another checksum of {name} than {ABOUT}")
     return content
 
