@@ -300,11 +300,11 @@ def _begin(planned, folder):
 
 def _missing(shards, content, folder):
     """Shards that are not complete; FileError if a file of a complete one has changed."""
-    known = {(shard["name"], shard["key"]): shard for shard in content["shards"] if is_complete(shard)}
+    complete = {(shard["name"], shard["key"]): shard["files"] for shard in content["shards"] if is_complete(shard)}
     missing = []
     for shard in shards:
-        files = known[shard.name, shard.key]["files"] if (shard.name, shard.key) in known else {None: None}
-        if any(name is None or not os.path.lexists(folder / name) for name in files):
+        files = complete.get((shard.name, shard.key))
+        if files is None or not all(os.path.lexists(folder / name) for name in files):
             missing.append(shard)
             continue
         for name, digest in files.items():
@@ -316,24 +316,24 @@ def _run_missing(sweep, keys, workers, note):
     """Make runs that are missing, or wait for those that another process makes; states of those that are not done."""
     states = {key: sweep.state(key) for key in keys}
     passing = [key for key, state in states.items() if state.name == "failed" and _may_pass(state.message)]
-    if passing:
-        points = [k for k, key in enumerate(sweep.keys) if key in set(passing)]
-        part = [tuple(values[k] for k in points) for values in (sweep.points, sweep.foresights)]
-        retry(replace(sweep, points=part[0], foresights=part[1]))
-    waited = False
+    retry(replace(sweep, points=tuple(sweep.by_key[key] for key in passing)))
+    worked: set[str] = set()
+    is_waiting = False
     while True:
         states = {key: state for key in keys if (state := sweep.state(key)).name != "done"}
-        names = [state.name for state in states.values()]
-        if "open" in names:
+        new = [key for key, state in states.items() if state.name == "open" and key not in worked]
+        n_running = sum(state.name == "running" for state in states.values())
+        if new:
+            worked.update(new)
             note(f"{len(states):,} of {len(sweep.points):,} runs are missing")
             if workers > 1:
                 work_locally(sweep, workers)
             else:
-                work(sweep, keys)
-        elif "running" in names:
-            if not waited:
-                note(f"waiting for {names.count('running'):,} runs of another process")
-            waited = True
+                work(sweep, new)
+        elif n_running:
+            if not is_waiting:
+                note(f"waiting for {n_running:,} runs of another process")
+            is_waiting = True
             time.sleep(_WAIT)
         else:
             return states

@@ -56,8 +56,11 @@ class _Place:
 
 def _check_drawn(value, name, read):
     """Read values of all parts of the ranges, and each of a choice: a wrong one must not end the making of a set."""
-    for place in [*np.arange(_PLACES) / _PLACES, 1 - 1e-9] if has_options(value) else [0.0]:
-        read(drawn(value, _Place(place), name))
+    try:
+        for place in [*np.arange(_PLACES) / _PLACES, 1 - 1e-9] if has_options(value) else [0.0]:
+            read(drawn(value, _Place(place), name))
+    except RecursionError as error:
+        raise ValueError(f"{name} must not have hundreds of tables in each other, got {short_text(value)}") from error
 
 
 def _emissions(value, name):

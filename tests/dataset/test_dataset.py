@@ -359,6 +359,15 @@ def test_emissions_need_responses(tmp_path):
         planned(tmp_path, base=BASE + "responses = false\n", runs=False)
 
 
+def test_deep_tables_are_refused():
+    table = {"name": "RollUp"}
+    for _ in range(3000):
+        table = {"a": table}
+    for settings in ({"emissions": [table]}, {"instrument": table}):
+        with pytest.raises(ValueError, match="hundreds of tables"):
+            DatasetSettings(**settings)
+
+
 def test_settings_come_back():
     settings = DatasetSettings(emissions=["Unperturbed"], draws=4)
     assert settings.per_run == 1  # nothing is drawn
