@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import re
 import secrets
 import stat
 import sys
@@ -13,6 +14,7 @@ from typing import Any, BinaryIO
 
 from apt_evap._common.types import AnyPath
 
+_UNFINISHED = re.compile(r"\..{0,40}\.[0-9a-f]{16}\.part", re.DOTALL)  # names of temporary files
 _ABANDONED_AFTER = 3600.0  # seconds since the last byte was written
 _WAIT_FOR_NOBODY = getattr(os, "O_NONBLOCK", 0)
 
@@ -202,6 +204,11 @@ def remove_abandoned(target: Path, after: float = _ABANDONED_AFTER) -> None:
                 with suppress(OSError):
                     if time.time() - part.stat().st_mtime > after:
                         part.unlink()
+
+
+def is_unfinished(name: str) -> bool:
+    """Whether a name is that of a temporary file of `replace_file`."""
+    return _UNFINISHED.fullmatch(name) is not None
 
 
 def _before(target):

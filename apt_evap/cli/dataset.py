@@ -6,7 +6,8 @@ from pathlib import Path
 from apt_evap.cli._options import add_speech, integer_type
 from apt_evap.cli._output import say, tell, tell_json
 from apt_evap.config.cost_estimate import hours_text
-from apt_evap.dataset.making import ABOUT, make, plan_set, verify
+from apt_evap.dataset.description import ABOUT, verify
+from apt_evap.dataset.making import make, plan_set
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

@@ -1,24 +1,26 @@
 """Reading of a data set: examples one by one, or complete tables as arrays, data frames or an xarray Dataset."""
 
 import json
+import os
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apt_evap._common.files import check_path
+from apt_evap._common.files import FileError, check_path
 from apt_evap._common.optional_imports import optional_import
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_choice
+from apt_evap.dataset.description import check_sha256, read_finished
 from apt_evap.dataset.examples import Rows
 from apt_evap.dataset.fields import TEXT, chosen_tables
-from apt_evap.dataset.making import read_about
 from apt_evap.dataset.settings import SPLITS, read_instrument
-from apt_evap.dataset.shards import Schema, read_table
+from apt_evap.dataset.shards import Schema, file_names, read_table
 from apt_evap.detection.dataframe import to_dataframe
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.instrument import Instrument
@@ -27,7 +29,8 @@ if TYPE_CHECKING:
     import pandas
     import xarray
 
-_JSON = ("elements", "phases", "emission", "instrument", "settings")
+_JSON = {"elements": list, "phases": list, "emission": dict, "instrument": dict, "settings": dict}
+_KEPT = 8  # tables
 
 
 @dataclass(frozen=True, repr=False)
@@ -66,8 +69,80 @@ class Example:
         other = {"pulse_id": "pulse", "positions": "site", "ion": "number"}
         columns |= {name: self.ions[own] for name, own in other.items() if own in self.ions}
         extra = {name: self.ions[name] for name in ("species", "phase", "charge") if name in self.ions}
-        half = self.about["instrument"]["field_of_view"] / 2
+        half = self.instrument.field_of_view / 2
         return Hits(**columns, extra=extra, source=self.about["name"], extent=(-half, half, -half, half))
+
+
+class _Files:
+    """The files of a data set. Each is read only if its SHA-256 is that of ``dataset.json``.
+
+    The last tables are kept, because examples follow one another. They are given as copies.
+    """
+
+    def __init__(self, folder: Path, content: dict[str, Any]) -> None:
+        self.folder, self.content = folder, content
+        self.suffix = content["dataset"]["format"]
+        self.schema: Schema = chosen_tables(tuple(content["dataset"]["fields"]))
+        self._shards = {shard["name"]: shard for shard in content["shards"]}
+        self._compared: dict[str, tuple[int, ...]] = {}  # state of each file when its SHA-256 was compared
+        self._kept: dict[tuple[str, str], Rows] = {}
+
+    def __reduce__(self):  # without what is kept: in another process, files are compared again
+        return _Files, (self.folder, self.content)
+
+    def rows(self, name: str, table: str, rows: Any) -> Rows:
+        """Rows of a table of a shard: a slice, or the function of its columns that selects them."""
+        shard = self._shards[name]
+        self._compare(shard, table)
+        if self.suffix == "hdf5" and isinstance(rows, slice):
+            return read_table(self.folder, name, table, self.schema, self.suffix, rows)
+        key = name, table
+        if key not in self._kept:
+            columns = self._complete(shard, table)
+            while len(self._kept) >= _KEPT:
+                del self._kept[next(iter(self._kept))]
+            self._kept[key] = columns
+        columns = self._kept[key]
+        chosen = rows if isinstance(rows, slice) else rows(columns)
+        return {
+            column: values[chosen].copy() if isinstance(values, np.ndarray) else values[chosen]
+            for column, values in columns.items()
+        }
+
+    def table(self, name: str, table: str) -> Rows:
+        """Complete table of a shard."""
+        self._compare(self._shards[name], table)
+        return self._complete(self._shards[name], table)
+
+    def _complete(self, shard, table):
+        """Complete table of a shard with as many rows as its description says; they are numbered in it."""
+        columns = read_table(self.folder, shard["name"], table, self.schema, self.suffix)
+        n = len(next(iter(columns.values())))
+        good = n == shard.get(table, n)
+        if table == "examples":
+            ions = columns["ions"]
+            good = good and np.array_equal(columns["first_ion"], np.cumsum(ions) - ions) and ions.sum() == shard["ions"]
+        else:
+            number = columns["example"].astype(np.int64)
+            good = good and np.all(np.diff(number) >= 0) and np.all(number < shard["examples"])
+        if not good:
+            raise FileError(f"{str(self._path(shard, table))!r} has other rows of {table} than its description says")
+        return columns
+
+    def _path(self, shard, table):
+        return self.folder / file_names(shard["name"], self.schema, self.suffix)[table]
+
+    def _compare(self, shard, table):
+        """Compare the SHA-256 of a file, unless it is unchanged since the last time."""
+        path = self._path(shard, table)
+        try:
+            status = os.stat(path)
+        except OSError as error:
+            raise FileError(f"cannot read {str(path)!r}: {error.strerror}") from error
+        state = status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+        if self._compared.get(path.name) != state:
+            check_sha256(path, shard["files"][path.name], "that of the data set which was opened")
+            self._compared[path.name] = state
 
 
 class DataSet:
@@ -85,6 +160,7 @@ class DataSet:
 
     def __init__(self, folder: Path, content: dict[str, Any], shards: tuple[dict[str, Any], ...]) -> None:
         self.folder, self.content, self.shards = folder, content, shards
+        self._files = _Files(folder, content)
 
     def __repr__(self) -> str:
         return f"<DataSet: {len(self):,} examples of {sum(shard['runs'] for shard in self.shards):,} runs>"
@@ -92,7 +168,7 @@ class DataSet:
     @property
     def schema(self) -> Schema:
         """Fields by table, dict."""
-        return chosen_tables(tuple(self.content["dataset"]["fields"]))
+        return self._files.schema
 
     @cached_property
     def _firsts(self) -> NDArray[Any]:
@@ -109,27 +185,29 @@ class DataSet:
         index = range(len(self))[index]  # IndexError outside
         number = int(np.searchsorted(self._firsts, index, side="right")) - 1
         shard, row = self.shards[number]["name"], index - int(self._firsts[number])
-        about = {name: values[row] for name, values in self._read(shard, "examples").items()}
+        read = self._files.rows
+        about = {name: values[0] for name, values in read(shard, "examples", lambda _: slice(row, row + 1)).items()}
         about = {name: value.item() if isinstance(value, np.generic) else value for name, value in about.items()}
-        about |= {name: json.loads(about[name]) for name in _JSON}
+        about |= {name: self._decoded(shard, name, about[name]) for name in _JSON}
         first = about.pop("first_ion")
-        rows = slice(first, first + about["ions"])
-        if self.content["dataset"]["format"] == "hdf5":
-            ions = read_table(self.folder, shard, "ions", self.schema, "hdf5", rows)
-        else:
-            ions = {name: values[rows] for name, values in self._read(shard, "ions").items()}
-        tables = {"ions": ions}
+        tables = {"ions": read(shard, "ions", slice(first, first + about["ions"]))}
+        if not np.array_equal(tables["ions"]["example"], np.full(about["ions"], row)):
+            raise FileError(f"{str(self.folder)!r}: the ions of an example of {shard} must be those that it counts")
         for name in self.schema:
             if name not in ("examples", "ions"):
-                columns = self._read(shard, name)
-                own = columns["example"] == row
-                tables[name] = {each: values[own] for each, values in columns.items()}
+                tables[name] = read(shard, name, lambda columns: columns["example"] == row)
         for columns in tables.values():
             columns.pop("example")
         return Example(about, **tables)
 
-    def _read(self, shard, table):
-        return dict(_cached(self.folder, shard, table, self.content["dataset"]["format"], tuple(self.schema.items())))
+    def _decoded(self, shard, name, text):
+        """Content of a text in JSON of an example."""
+        with suppress(ValueError, RecursionError):
+            if isinstance(content := json.loads(text), _JSON[name]):
+                return content
+        raise FileError(
+            f"{str(self.folder)!r}: {name} of an example of {shard} must be a {_JSON[name].__name__} in JSON"
+        )
 
     def split(self, name: str) -> "DataSet":
         """The examples of one part.
@@ -144,7 +222,9 @@ class DataSet:
         DataSet
         """
         check_choice(name, "name", SPLITS)
-        return DataSet(self.folder, self.content, tuple(each for each in self.shards if each["split"] == name))
+        part = DataSet(self.folder, self.content, tuple(shard for shard in self.shards if shard["split"] == name))
+        part._files = self._files  # and what it has compared
+        return part
 
     def table(self, name: str = "ions") -> dict[str, Any]:
         """Complete table of all examples.
@@ -161,10 +241,7 @@ class DataSet:
             set, and ``first_ion`` that of its first ion.
         """
         fields = self.schema[check_choice(name, "name", tuple(self.schema))]
-        parts = [
-            read_table(self.folder, shard["name"], name, self.schema, self.content["dataset"]["format"])
-            for shard in self.shards
-        ]
+        parts = [self._files.table(shard["name"], name) for shard in self.shards]
         ions = np.cumsum([0, *(shard["ions"] for shard in self.shards)])
         offsets = {"example": self._firsts, "first_ion": ions}
         columns = {}
@@ -216,12 +293,6 @@ class DataSet:
         return xarray.Dataset(variables, attrs={"title": self.content["title"]})
 
 
-@lru_cache(maxsize=8)
-def _cached(folder: Path, shard: str, table: str, suffix: str, schema: Any) -> Rows:
-    """A table of a file; the last ones are kept, because examples follow one another."""
-    return read_table(folder, shard, table, dict(schema), suffix)
-
-
 def load(path: AnyPath) -> DataSet:
     """Open a finished data set.
 
@@ -237,8 +308,9 @@ def load(path: AnyPath) -> DataSet:
     Raises
     ------
     FileError
-        If it is not a data set. `verify` compares the checksums.
+        If it is not a finished data set. `verify` compares the checksums of all files, reading that of each file which
+        is used.
     """
-    folder = check_path(path)
-    content = read_about(folder)
+    folder = check_path(path).absolute()
+    content = read_finished(folder)
     return DataSet(folder, content, tuple(content["shards"]))

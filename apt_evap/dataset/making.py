@@ -1,9 +1,9 @@
 """Making of a data set from a study file: plan, runs, examples, description, checksums."""
 
-import hashlib
-import json
-import re
-from collections.abc import Callable
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,15 +13,31 @@ import numpy as np
 import scipy
 
 from apt_evap._common.codec import from_plain, to_plain
-from apt_evap._common.files import FileError, check_path, read_small_file, replace_file, sha256_of
+from apt_evap._common.files import FileError, check_path, is_unfinished, sha256_of
+from apt_evap._common.kept import check_made_from, digest_of
 from apt_evap._common.optional_imports import optional_import
 from apt_evap._common.types import AnyPath
 from apt_evap._version import __version__
-from apt_evap.dataset.datasheet import datasheet
+from apt_evap.dataset.description import (
+    ABOUT,
+    FORMAT,
+    SHEET,
+    SUMS,
+    check_sha256,
+    counts_of,
+    finish,
+    is_complete,
+    is_finished,
+    made_from,
+    read_about,
+    read_finished,
+    tables_of,
+    write_about,
+)
 from apt_evap.dataset.examples import examples_of, joined
 from apt_evap.dataset.fields import chosen_tables
-from apt_evap.dataset.settings import SPLITS, DatasetSettings, read_instrument
-from apt_evap.dataset.shards import Schema, file_names, key_in, key_of_shard, read_table, write_shard
+from apt_evap.dataset.settings import MOST_EXAMPLES, SPLITS, DatasetSettings, read_instrument
+from apt_evap.dataset.shards import Schema, file_names, write_shard
 from apt_evap.simulation.run import load
 from apt_evap.sweep.planning import Sweep, plan, status
 from apt_evap.sweep.point_folder import RUN
@@ -29,11 +45,12 @@ from apt_evap.sweep.sampling import drawn
 from apt_evap.sweep.study_file import Point, SweepStudy, read_study
 from apt_evap.sweep.working import work
 
-FORMAT = "apt_evap dataset 1"
-ABOUT, SHEET, SUMS = "dataset.json", "README.md", "SHA256SUMS"
-"""Files of a data set beside those of its examples."""
-_MAX_BYTES = 1 << 30
-_SHARD = re.compile(rf"({'|'.join(SPLITS)})-\d{{4,}}(\.h5|\.\w+\.parquet)")
+try:
+    import fcntl
+except ImportError:  # not on this system: two processes may write the same bytes
+    fcntl = None  # type: ignore[assignment]
+
+_WAIT = 2.0  # seconds between two looks at runs that another process makes
 # Measured for runs of 60 to 2,000 ions with responses: 470 to 507 bytes per ion, 56 kB for the rest
 _RUN_BYTES_PER_ION, _RUN_BYTES = 510, 6e4
 _TEXT_BYTES, _FILE_BYTES = 4000, 40_000  # measured: 2.5 kB of texts in an example, 20 kB of HDF5 in an empty file
@@ -137,6 +154,9 @@ def plan_set(path: AnyPath) -> PlannedSet:
             raise ValueError("emissions need responses = true in [simulation]")
         if settings.format == "parquet":
             optional_import("pyarrow", "a data set in Parquet")
+        examples = len(study.points) * settings.per_run
+        if examples > MOST_EXAMPLES:
+            raise ValueError(f"a data set must have at most {MOST_EXAMPLES:,} examples, got {examples:,}")
     except (ValueError, ImportError) as error:
         raise FileError(f"{str(path)!r}, [dataset]: {error}") from error
     sweep = plan(path)
@@ -145,13 +165,13 @@ def plan_set(path: AnyPath) -> PlannedSet:
 
 def _shards(points, settings):
     """Files of the data set: successive runs of a part share one, so that further points leave full files alone."""
-    content = to_plain(settings)
+    content = made_from({"dataset": to_plain(settings), "versions": {"apt_evap": __version__}})
     found = []
     for split in SPLITS:
         own = [point for point in points if split_of(point, settings) == split]
         for number, first in enumerate(range(0, len(own), settings.runs_per_file)):
             some = tuple(own[first : first + settings.runs_per_file])
-            key = key_of_shard([FORMAT, __version__, content, split, [point.key for point in some]])
+            key = digest_of([FORMAT, content, split, [point.key for point in some]])
             found.append(Shard(f"{split}-{number:04}", split, some, key))
     return tuple(found)
 
@@ -162,8 +182,7 @@ def split_of(point: Point, settings: DatasetSettings) -> str:
     Runs of one specimen are in one part, and further points do not move the earlier ones.
     """
     specimen = {name: value for name, value in point.document.items() if name in ("tip", "phases")}
-    digest = hashlib.sha256(json.dumps(specimen, sort_keys=True).encode()).digest()
-    place, end = int.from_bytes(digest[:6], "big") / (1 << 48), 0.0
+    place, end = int(digest_of(specimen)[:12], 16) / (1 << 48), 0.0
     for name, fraction in zip(SPLITS, settings.split, strict=True):
         end += fraction
         if place < end:
@@ -181,15 +200,16 @@ def make(
 ) -> dict[str, Any]:
     r"""Make a data set, or finish one that was interrupted.
 
-    Runs that are missing are made by the sweep. Files of examples that are complete are not written again. Equal
-    studies give equal bytes, also after an interruption.
+    Runs that are missing are made by the sweep, also those that a full disk or another error of the system has ended.
+    Files of examples that are complete are not written again. Equal studies give equal bytes, also after an
+    interruption, or if two processes make the set.
 
     Parameters
     ----------
     planned : PlannedSet
         The plan.
     folder : str or path-like
-        Folder of the data set; it is made if necessary.
+        Folder of the data set: new, empty, or that of a data set of the same study or of fewer points of it.
     workers : int
         Processes that run simulations.
     without_failed : bool
@@ -205,7 +225,7 @@ def make(
     Raises
     ------
     FileError
-        If a run has failed, a file is damaged, or cannot be written.
+        If the folder contains something else, a run has failed, a file is damaged, or cannot be written.
 
     Examples
     --------
@@ -223,44 +243,145 @@ def make(
     Al RollUp 3
     """
     folder, sweep = check_path(folder), planned.sweep
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileError(f"cannot write {str(folder)!r}: {error.strerror}") from error
-    if (folder / SUMS).exists():
-        _check_sums(folder, [name for shard in planned.shards for name in _files(planned, shard)])
+    with _alone(folder, note):
+        content = _begin(planned, folder)
     shards = planned.shards
-    missing = [shard for shard in shards if _key_in(planned, folder, shard) != shard.key]
-    keys = [point.key for shard in missing for point in shard.points]
-    n_waiting = sum(sweep.state(key).name in ("waiting", "running") for key in keys)
-    worked = {}
-    if n_waiting:
-        note(f"{n_waiting:,} of {len(sweep.points):,} runs are missing")
-        worked = work(sweep, keys, workers if workers > 1 else None)
-    states = {key: state for key in keys if (state := sweep.state(key)).name != "done"}
+    keys = [point.key for shard in _missing(shards, content, folder) for point in shard.points]
+    states = _run_missing(sweep, keys, workers, note)
     failed = [key for key, state in states.items() if state.name == "failed"]
     if without_failed and len(failed) == len(states):
-        points = tuple(point for point in sweep.points if point.key not in failed)
-        shards = _shards(points, planned.settings)
-        missing = [shard for shard in shards if _key_in(planned, folder, shard) != shard.key]
+        shards = _shards([point for point in sweep.points if point.key not in failed], planned.settings)
     elif states:
         key, state = next(iter(states.items()))
-        message = state.message or (worked[key].message if key in worked else "")
-        message = f", {message}" if message else ""
-        remedy = "; --without-failed leaves them out" if len(failed) == len(states) else ""
+        message = f", {state.message}" if state.message else ""
+        remedy = "; --without-failed leaves them out, apt-evap sweep work --retry tries them again"
         raise FileError(
-            f"{len(states):,} of {len(sweep.points):,} runs are not done, such as {key}: {state.name}{message}{remedy}"
+            f"{len(states):,} of {len(sweep.points):,} runs are not done, such as {key}: {state.name}{message}"
+            f"{remedy if len(failed) == len(states) else ''}"
         )
-    if missing:
-        (folder / SUMS).unlink(missing_ok=True)  # those of files that are replaced now
+    with _alone(folder, note):
+        content = _begin(planned, folder)  # again: another process may have worked on it
+        _record(planned, folder, shards, content, note)
+        return read_finished(folder)
+
+
+def _begin(planned, folder):
+    """Description of the data set in a folder, made if the folder is empty; FileError if it is not that of this study.
+
+    It names all files that may be replaced. Nothing else in the folder is.
+    """
+    try:
+        names = [name for name in os.listdir(folder) if not is_unfinished(name)]
+    except OSError as error:
+        raise FileError(f"cannot read {str(folder)!r}: {error.strerror}") from error
+    if not names:
+        content = _content(planned, [_entry(planned, shard) for shard in planned.shards])
+        write_about(folder, content)
+        return content
+    remedy = "give another folder with -o, or remove it"
+    if ABOUT not in names:
+        raise FileError(f"{str(folder)!r} contains {min(names)!r} and is not a data set: {remedy}")
+    content = read_finished(folder, (SHEET,) if SHEET in names else ()) if SUMS in names else read_about(folder)
+    check_made_from(folder, made_from(content), made_from(_content(planned)), remedy)
+    known = set(planned.sweep.keys)
+    if lost := [key for key in content["points"] if key not in known]:
+        raise FileError(
+            f"{str(folder)!r} contains {len(lost):,} runs that this study does not have, such as {lost[0]}: {remedy}"
+        )
+    listed = {ABOUT, SHEET, SUMS, *(name for shard in content["shards"] for name in shard["files"])}
+    for name in {*listed, *(name for shard in planned.shards for name in _files(planned, shard))}.intersection(names):
+        if name not in listed or (folder / name).is_symlink():
+            raise FileError(f"{str(folder / name)!r} is a link, or not a file of the data set: {remedy}")
+    return content
+
+
+def _missing(shards, content, folder):
+    """Shards that are not complete; FileError if a file of a complete one has changed."""
+    complete = {(shard["name"], shard["key"]): shard["files"] for shard in content["shards"] if is_complete(shard)}
+    missing = []
+    for shard in shards:
+        files = complete.get((shard.name, shard.key))
+        if files is None or not all(os.path.lexists(folder / name) for name in files):
+            missing.append(shard)
+            continue
+        for name, digest in files.items():
+            check_sha256(folder / name, digest, f"that of {ABOUT}")
+    return missing
+
+
+def _run_missing(sweep, keys, workers, note):
+    """Make runs that are missing, or wait for those that another process makes; states of those that are not done."""
+    worked: dict[str, Any] = {}
+    is_waiting = False
+    while True:
+        states = {key: state for key in keys if (state := sweep.state(key)).name != "done"}
+        new = [key for key, state in states.items() if state.name == "waiting" and key not in worked]
+        n_running = sum(state.name == "running" for state in states.values())
+        if new:
+            note(f"{len(states):,} of {len(sweep.points):,} runs are missing")
+            worked |= dict.fromkeys(new) | work(sweep, new, workers if workers > 1 else None)
+        elif n_running:
+            if not is_waiting:
+                note(f"waiting for {n_running:,} runs of another process")
+            is_waiting = True
+            time.sleep(_WAIT)
+        else:
+            # the message of an error of the system is that of this call
+            return {key: worked.get(key) or state for key, state in states.items()}
+
+
+@contextmanager
+def _alone(folder: Path, note: Callable[[str], object]) -> Iterator[None]:
+    """Make a folder, and wait until no other process on this machine writes into it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(folder, os.O_RDONLY) if fcntl is not None else None
+    except OSError as error:
+        raise FileError(f"cannot write {str(folder)!r}: {error.strerror}") from error
+    if descriptor is None:
+        yield
+        return
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            note(f"waiting for another process that writes {folder}")
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        except OSError:  # this file system has no locks: the other process writes the same bytes
+            pass
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _record(planned, folder, shards, content, note):
+    """Write the files of examples that are missing, the description and the checksums, unless all are there.
+
+    The description is written first, so that every file that is written after it is known as one of the data set, and
+    again after each of them, with its SHA-256.
+    """
+    missing = _missing(shards, content, folder)
+    complete = {(shard["name"], shard["key"]): shard for shard in content["shards"]}
+    entries = [_entry(planned, shard) if shard in missing else complete[shard.name, shard.key] for shard in shards]
+    included = {point.key for shard in shards for point in shard.points}
+    left_out = {point.key: str(point) for point in planned.sweep.points if point.key not in included}
+    new = _content(planned, entries, left_out)
+    if is_finished(folder) and new | {"versions": content["versions"]} == content:
+        return
+    with suppress(FileNotFoundError):
+        (folder / SUMS).unlink()  # those of files that are replaced now
+    write_about(folder, new)
     for number, shard in enumerate(missing, start=1):
         note(f"file {number:,} of {len(missing):,}: {shard.name}")
         examples = []
         for point in shard.points:
-            examples += examples_of(_run(sweep, point.key), point, planned.settings, shard.split)
+            examples += examples_of(_run(planned.sweep, point.key), point, planned.settings, shard.split)
         tables = joined(examples, planned.settings)
-        write_shard(folder, shard.name, tables, planned.schema, planned.settings.format, shard.key)
-    return _finish(planned, folder, shards)
+        write_shard(folder, shard.name, tables, planned.schema, planned.settings.format)
+        entries[shards.index(shard)] = _entry(planned, shard, folder, tables["examples"])
+        new = _content(planned, entries, left_out)
+        write_about(folder, new)
+    finish(folder, new)
 
 
 def _run(sweep, key):
@@ -275,67 +396,36 @@ def _files(planned, shard):
     return sorted(set(file_names(shard.name, planned.schema, planned.settings.format).values()))
 
 
-def _key_in(planned, folder, shard):
-    return key_in(folder, shard.name, planned.schema, planned.settings.format)
+def _entry(planned, shard, folder=None, examples=None):
+    """Description of a shard; without its folder and table of examples, of one that is not written yet."""
+    names = _files(planned, shard)
+    return {
+        "name": shard.name,
+        "split": shard.split,
+        "key": shard.key,
+        "files": {name: None if folder is None else sha256_of(folder / name) for name in names},
+        "runs": 0 if examples is None else len(dict.fromkeys(examples["run"])),
+        "examples": 0 if examples is None else len(examples["run"]),
+        "ions": 0 if examples is None else int(np.sum(examples["ions"])),
+        "bytes": 0 if folder is None else sum((folder / name).stat().st_size for name in names),
+    }
 
 
-def _finish(planned, folder, made):
-    """Write the description, the studies and the checksums; remove files of examples that are not of the set."""
+def _content(planned, shards=(), left_out=None):
+    """Content of ``dataset.json`` with these descriptions of shards, and of runs that are left out."""
     study, settings = planned.study, planned.settings
-    shards, included = [], {point.key for shard in made for point in shard.points}
-    for shard in made:
-        table = read_table(folder, shard.name, "examples", planned.schema, settings.format)
-        names = _files(planned, shard)
-        shards.append(
-            {
-                "name": shard.name,
-                "split": shard.split,
-                "files": {name: sha256_of(folder / name) for name in names},
-                "runs": len(dict.fromkeys(table["run"])),
-                "examples": len(table["run"]),
-                "ions": int(np.sum(table["ions"])),
-                "bytes": sum((folder / name).stat().st_size for name in names),
-            }
-        )
-    content = {
+    return {
         "format": FORMAT,
         "title": settings.title or study.path.stem,
         "dataset": to_plain(settings),
+        "points": list(planned.sweep.keys),
         "study": {study.path.name: study.path.read_text(), study.base.name: study.base.read_text()},
         "versions": _versions(settings),
-        "left_out": {point.key: str(point) for point in planned.sweep.points if point.key not in included},
-        "counts": {
-            split: {
-                name: sum(shard[name] for shard in shards if shard["split"] == split)
-                for name in ("runs", "examples", "ions")
-            }
-            for split in SPLITS
-        },
-        "tables": {
-            name: [
-                {
-                    "name": field.name,
-                    "type": field.kind,
-                    "shape": list(field.row),
-                    "unit": field.unit,
-                    "description": field.text,
-                }
-                for field in fields
-            ]
-            for name, fields in planned.schema.items()
-        },
-        "shards": shards,
+        "left_out": left_out or {},
+        "counts": counts_of(shards),
+        "tables": tables_of(planned.schema),
+        "shards": list(shards),
     }
-    _write(folder / ABOUT, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
-    _write(folder / SHEET, datasheet(content))
-    listed = [name for shard in shards for name in shard["files"]]
-    for path in sorted(folder.iterdir()):
-        if _SHARD.fullmatch(path.name) and path.name not in listed:
-            path.unlink()
-    sums = {name: digest for shard in shards for name, digest in shard["files"].items()}
-    sums |= {name: sha256_of(folder / name) for name in (ABOUT, SHEET)}
-    _write(folder / SUMS, "".join(f"{digest}  {name}\n" for name, digest in sorted(sums.items())))
-    return content
 
 
 def _versions(settings):
@@ -343,65 +433,3 @@ def _versions(settings):
     if settings.format == "parquet":
         return versions | {"pyarrow": optional_import("pyarrow", "a data set in Parquet").__version__}
     return versions | {"h5py": h5py.__version__, "hdf5": h5py.version.hdf5_version}
-
-
-def _write(path, text):
-    with replace_file(path) as file:
-        file.write(text.encode())
-
-
-def read_about(folder: Path) -> dict[str, Any]:
-    """Content of ``dataset.json``; FileError if it is not that of a data set."""
-    path = folder / ABOUT
-    try:
-        content = json.loads(read_small_file(path, _MAX_BYTES, "the description of a data set"))
-        if content["format"] != FORMAT:
-            raise ValueError(f"expected {FORMAT!r}, got {content['format']!r:.60}")
-    except FileError:
-        raise
-    except (ValueError, TypeError, KeyError) as error:
-        raise FileError(f"{str(path)!r} is not the description of a data set: {error}") from error
-    return content
-
-
-def _sums(folder):
-    text = read_small_file(folder / SUMS, _MAX_BYTES, "checksums").decode()
-    return {name: digest for digest, _, name in (line.partition("  ") for line in text.splitlines())}
-
-
-def _check_sums(folder, names=None):
-    """Compare the SHA-256 of files; FileError for those that are damaged. Missing files count if no names are given."""
-    sums = _sums(folder)
-    for name in sums if names is None else [name for name in names if name in sums and (folder / name).exists()]:
-        if sha256_of(folder / name) != sums[name]:
-            remedy = "remove it, and make the data set again"
-            raise FileError(f"{str(folder / name)!r} is damaged: its SHA-256 is not that of {SUMS}; {remedy}")
-    return sums
-
-
-def verify(folder: AnyPath) -> dict[str, Any]:
-    """Verify a finished data set: the checksums of all its files.
-
-    Parameters
-    ----------
-    folder : str or path-like
-        The data set.
-
-    Returns
-    -------
-    dict
-        Content of ``dataset.json``.
-
-    Raises
-    ------
-    FileError
-        If a file is missing or damaged.
-    """
-    folder = check_path(folder)
-    content = read_about(folder)
-    sums = _check_sums(folder)
-    for shard in content["shards"]:
-        for name in shard["files"]:
-            if name not in sums:
-                raise FileError(f"{str(folder / SUMS)!r} has no checksum of {name}")
-    return content

@@ -15,6 +15,11 @@ from apt_evap.sweep.sampling import drawn, has_options
 SPLITS = ("train", "validation", "test")
 """Names of the parts of a data set."""
 
+MOST_EXAMPLES = 10_000_000
+"""Largest number of examples of a data set: a larger one is a typing error."""
+
+_PLACES = 64  # entries of the longest choice of which each is checked
+
 
 def read_instrument(table: str | Mapping[str, Any]) -> Instrument:
     """Instrument from the name of a preset, or from a table of its fields, perhaps with a ``preset`` that they change.
@@ -38,10 +43,24 @@ def _text(value, name):
 
 
 def _instrument(value, name):
-    if not isinstance(value, str | Mapping):
-        raise ValueError(f"{name} must be a table or the name of a preset, got {short_text(value)}")
-    read_instrument(drawn(value, np.random.default_rng(0), name))
+    _check_drawn(value, name, read_instrument)
     return value
+
+
+class _Place:
+    """In the place of random numbers: always the same one."""
+
+    def __init__(self, place):
+        self.random = lambda n: np.full(n, place)
+
+
+def _check_drawn(value, name, read):
+    """Read values of all parts of the ranges, and each of a choice: a wrong one must not end the making of a set."""
+    try:
+        for place in [*np.arange(_PLACES) / _PLACES, 1 - 1e-9] if has_options(value) else [0.0]:
+            read(drawn(value, _Place(place), name))
+    except RecursionError as error:
+        raise ValueError(f"{name} must not have hundreds of tables in each other, got {short_text(value)}") from error
 
 
 def _emissions(value, name):
@@ -50,7 +69,7 @@ def _emissions(value, name):
     for each in value:
         if not isinstance(each, str | Mapping):
             raise ValueError(f"{name} must contain texts and tables, got {short_text(each)}")
-        read_perturbation(drawn(each, np.random.default_rng(0), name))
+        _check_drawn(each, name, read_perturbation)
     return tuple(value)
 
 
@@ -100,7 +119,9 @@ class DatasetSettings:
         _emissions,
         default=lambda: ("Unperturbed",),
     )
-    draws: int = count("Examples of each emission that has a range or choice.", default=1, at_least=1)
+    draws: int = count(
+        "Examples of each emission that has a range or choice.", default=1, at_least=1, at_most=MOST_EXAMPLES
+    )
     fields: tuple[str, ...] = checked(
         "Columns of the ions, and further tables; by default all.", "sequence of str", _fields, default=lambda: CHOICES
     )
@@ -124,4 +145,4 @@ class DatasetSettings:
     @property
     def per_run(self) -> int:
         """Number of examples of a run."""
-        return len(self.plan)
+        return sum(self.draws if has_options(emission) else 1 for emission in self.emissions)

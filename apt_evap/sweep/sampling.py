@@ -108,16 +108,16 @@ def _bounds(content, name):
     """Two numbers in increasing order and their unit, "" if they have none."""
     if isinstance(content, list) and len(content) == 2:
         if all(isinstance(bound, int | float) and not isinstance(bound, bool) for bound in content):
-            numbers, units = [float(bound) for bound in content], {""}
+            numbers, units = content, {""}
         else:
-            lengths = [_LENGTH.fullmatch(bound) if isinstance(bound, str) else None for bound in content]
-            try:
-                numbers = [float(length[1]) for length in lengths]  # type: ignore[index]
-                units = {length[2] for length in lengths}  # type: ignore[index]
-            except (TypeError, ValueError):
-                numbers, units = [], set()
-        if len(units) == 1 and np.isfinite(numbers).all() and numbers[0] < numbers[1]:
-            return (*numbers, units.pop())
+            matches = [_LENGTH.fullmatch(bound) if isinstance(bound, str) else None for bound in content]
+            numbers, units = [bound and bound[1] for bound in matches], {bound and bound[2] for bound in matches}
+        try:
+            low, high = map(float, numbers)
+        except (TypeError, ValueError, OverflowError):  # no number, or an integer of hundreds of digits
+            low = high = np.nan
+        if len(units) == 1 and low < high and np.isfinite(high - low):
+            return low, high, units.pop()
     raise ValueError(
         f'{name} must be two numbers in increasing order, or two lengths such as ["20 a", "60 a"], '
         f"got {short_text(content)}"

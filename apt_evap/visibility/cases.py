@@ -1,6 +1,6 @@
 """A specimen with a feature, for other sizes, fields, depths and radii of the apex, and its full simulation."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -9,7 +9,6 @@ import numpy as np
 from apt_evap._common.codec import to_plain
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_choice, check_kind, check_number
-from apt_evap.detection.instrument import Instrument
 from apt_evap.emission.perturbations import Perturbation, Unperturbed
 from apt_evap.simulation.run import Run
 from apt_evap.simulation.simulation import Simulation
@@ -92,6 +91,21 @@ def varied(feature: Phase, specimen: Mapping[str, Any], **values: float) -> tupl
     return replace(feature, region=region), arguments
 
 
+def values_of(feature: Phase, specimen: Mapping[str, Any], names: Iterable[str]) -> dict[str, float]:
+    """Values of `VARIABLES` that a feature and a specimen have, of some names; those of another region are left out."""
+    host = specimen["phases"][0].material
+    field = feature.material.evaporation_field if feature.evaporation_field is None else feature.evaporation_field
+    radius, size, region = specimen["apex_radius"], size_of(feature), feature.region
+    known = {"apex_radius": radius, "field_ratio": field / host.evaporation_field}
+    if np.isfinite(size):
+        known["size"] = size
+    if isinstance(region, Sphere):
+        known["cover"] = radius - region.centre[2] - region.radius
+    elif isinstance(region, Layer) and is_across(region):
+        known["cover"] = radius - (region.upper if region.normal[2] > 0 else -region.lower)
+    return {name: known[name] for name in names if name in known}
+
+
 def bottom_of(feature: Phase, radius: float) -> float:
     """Depth of the lowest point of a feature below the apex [nm]; of what reaches further, 3 nm."""
     match feature.region:
@@ -171,10 +185,6 @@ def coordinates(feature: Phase, sites: Floats, radius: float) -> tuple[Floats, F
     return places, directions
 
 
-def described(feature: Phase, specimen: Mapping[str, Any], instrument: Instrument) -> dict[str, Any]:
-    """Feature, specimen and instrument in plain types."""
-    return {
-        "feature": to_plain(feature),
-        "specimen": {**specimen, "phases": to_plain(specimen["phases"])},
-        "instrument": to_plain(instrument),
-    }
+def described(feature: Phase, specimen: Mapping[str, Any]) -> dict[str, Any]:
+    """Feature and specimen in plain types."""
+    return {"feature": to_plain(feature), "specimen": to_plain(specimen)}

@@ -12,11 +12,15 @@ from typing import Any
 import numpy as np
 import scipy
 
-from apt_evap._common.codec import from_plain
+from apt_evap._common.codec import from_plain, to_plain
+from apt_evap._common.files import FileError
+from apt_evap._common.kept import check_made_from
 from apt_evap._common.types import AnyPath, Booleans, Floats, Integers
 from apt_evap._common.validation import check_array, check_choice, check_kind, check_number, check_seed
+from apt_evap.config.tables import check_table
 from apt_evap.detection.instrument import Instrument
-from apt_evap.emission.perturbations import Perturbation
+from apt_evap.emission.perturbations import Perturbation, Unperturbed
+from apt_evap.simulation.simulation import Simulation
 from apt_evap.specimen.phases import Phase
 from apt_evap.specimen.tip import Tip
 from apt_evap.storage.checked_hdf5 import open_hdf5, put_field, put_text, write_hdf5
@@ -30,6 +34,7 @@ from apt_evap.visibility.cases import (
     simulated,
     size_of,
     specimen_of,
+    values_of,
     varied,
 )
 from apt_evap.visibility.recorded import Ions, names_of, recorded_ions
@@ -37,9 +42,12 @@ from apt_evap.visibility.recorded import Ions, names_of, recorded_ions
 _FINE = np.concatenate([np.arange(0, 2, 0.25), np.arange(2, 9)])  # edges, in sizes of the feature
 _SIGNED = np.concatenate([-_FINE[:0:-1], _FINE])
 _ACROSS = np.linspace(0, 1, 11)  # edges, in radii of the apex
+_CELLS = {(len(_SIGNED) - 1, len(edges) - 1) for edges in (_FINE, _ACROSS)}  # shapes of the tables of a group
 _CELL = 0.025  # edge of the cells of the recorded fraction, in radii of the apex
 _FEWEST = 4  # ions of a cell: with 8, most cells of small particles take their shift from others
 _KIND = "operators"
+REMEDY = "remove it, or make operators in another file"
+"""What the user can do if operators are those of something else."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +70,10 @@ class OriginOperators:
     depth : float
         Depth that evaporates [nm].
     settings : mapping
-        Feature, specimen and instrument, in plain types.
+        What they were made from, in plain types: feature, specimen, instrument, perturbation, seed, and the settings of
+        the simulations.
+    source : str
+        The file that they were read from, for messages.
     """
 
     axes: Mapping[str, Floats]
@@ -72,6 +83,50 @@ class OriginOperators:
     recorded: Floats = field(repr=False)
     depth: float
     settings: Mapping[str, Any] = field(repr=False)
+    source: str = "operators"
+
+    def check(
+        self,
+        feature: Phase,
+        specimen: Tip,
+        instrument: Instrument,
+        perturbation: Perturbation | None = None,
+        *,
+        axes: Mapping[str, Any] | None = None,
+        n_threads: int | None = None,
+        **settings: Any,
+    ) -> None:
+        """Check that these operators are those of a feature: all but the values of the axes, and the efficiency.
+
+        Parameters
+        ----------
+        feature, specimen, instrument, perturbation, n_threads, **settings
+            As for `origin_operators`.
+        axes : mapping, optional
+            Values of each variable; by default all axes that contain the feature.
+
+        Raises
+        ------
+        FileError
+            If they were made from something else; the message names the first difference.
+        """
+        arguments = specimen_of(specimen)
+        tip = made(check_feature(feature), arguments, 0, self.depth)
+        values = values_of(feature, arguments, self.axes)  # also of the feature and the specimen of these operators
+        own_feature, own_specimen = self._case()
+        kept = dict(self.settings) | {"elements": list(self.elements)}
+        kept |= described(*varied(own_feature, own_specimen, **values))
+        asked = described(*varied(feature, arguments, **values)) | {"elements": names_of(tip.elements)[0]}
+        asked["instrument"] = to_plain(check_kind(instrument, "instrument", Instrument, "an Instrument"))
+        asked["perturbation"] = to_plain(Unperturbed() if perturbation is None else perturbation)
+        asked["simulation"] = _of_simulation(Simulation(tip, n_threads=n_threads, **settings).settings)
+        for plain in (kept, asked):
+            plain["instrument"] = {**plain["instrument"], "efficiency": None}
+            plain.pop("seed", None)
+        if axes is not None:
+            asked["axes"] = to_plain(grid_of(axes))
+            kept["axes"] = {name: to_plain(self.axes.get(name)) for name in axes}
+        check_made_from(self.source, kept, asked, REMEDY)
 
     def emulate(self, seed: int, efficiency: float | None = None, **values: float) -> Ions:
         """Draw the reconstructed ions of another specimen with the feature.
@@ -145,13 +200,40 @@ class OriginOperators:
             If it is missing, damaged or has other content.
         """
         with open_hdf5(path, "origin operators") as file:
-            settings = file.json("settings")
-            axes = {name: file.read(f"axes/{name}", np.float64, (None,)) for name in settings.pop("axes")}
-            means, covariances, recorded = (
-                file.read(name, np.float64, None) for name in ("means", "covariances", "recorded")
-            )
-            elements, depth = tuple(settings.pop("elements")), settings.pop("depth")
-        return cls(axes, elements, means, covariances, recorded, depth, settings)
+            try:
+                settings = file.json("settings")
+                check_table(settings, "settings")
+                axes = {name: file.read(f"axes/{name}", np.float64, (None,)) for name in settings.pop("axes")}
+                means, covariances, recorded = (
+                    file.read(name, np.float64, None) for name in ("means", "covariances", "recorded")
+                )
+                elements, depth = tuple(settings.pop("elements")), settings.pop("depth")
+                return cls(axes, elements, means, covariances, recorded, depth, settings, str(path))._checked()
+            except FileError:
+                raise
+            except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
+                raise FileError(f"{str(path)!r} does not contain origin operators: {error}") from error
+
+    def _checked(self):
+        """These operators, if all parts fit together; ValueError, KeyError or TypeError otherwise."""
+        check_number(self.depth, "depth", above=0, unit="nm")
+        check_seed(self.settings["seed"])
+        for name in ("specimen", "instrument", "perturbation", "simulation"):
+            check_kind(self.settings[name], name, Mapping, "a table")
+        grid = grid_of(self.axes)
+        if any(not np.array_equal(grid[name], values) for name, values in self.axes.items()):
+            raise ValueError("values of the axes must be in increasing order")
+        varied(*self._case(), **{name: float(values[0]) for name, values in grid.items()})
+        lengths = tuple(len(values) for values in grid.values())
+        cells = self.means.shape[-3:-1]
+        shape = (*lengths, 2 * len(self.elements), *cells, 3)
+        if cells not in _CELLS or self.means.shape != shape or self.covariances.shape != (*shape, 3):
+            raise ValueError(f"means must have a shape such as {shape}, got {self.means.shape}")
+        if self.recorded.shape[:-2] != lengths or not self.recorded.size:
+            raise ValueError(f"recorded must have the shape {lengths} and two more axes, got {self.recorded.shape}")
+        if not all(np.isfinite(table).all() for table in (self.means, self.covariances, self.recorded)):
+            raise ValueError("means, covariances and recorded must be finite")
+        return self
 
     def _case(self):
         specimen = dict(self.settings["specimen"])
@@ -222,11 +304,11 @@ def origin_operators(
     """
     instrument = Instrument(field_of_view=160.0) if instrument is None else instrument
     check_kind(instrument, "instrument", Instrument, "an Instrument")
+    check_seed(seed)
     arguments = specimen_of(specimen)
-    size = size_of(check_feature(feature))
-    if axes is None:
-        axes = {"size": [0.5 * size, size, 2 * size]} if math.isfinite(size) else {}
-    grid = {check_choice(name, "axes", VARIABLES): np.unique(check_array(axes[name], name, ("n",))) for name in axes}
+    check_feature(feature)
+    axes = default_axes(feature) if axes is None else axes
+    grid = grid_of(axes)
     nodes = [dict(zip(grid, point, strict=True)) for point in itertools.product(*grid.values())]
     depth = depth_for(feature, arguments, nodes)
     parts: list[tuple[Floats, ...]] = []
@@ -239,8 +321,29 @@ def origin_operators(
         parts.append((*_moments(variant, ions, len(elements), chosen["apex_radius"]), arrived))
     shape = tuple(len(values) for values in grid.values())
     means, covariances, recorded = (np.reshape(each, shape + each[0].shape) for each in zip(*parts, strict=True))
-    plain = described(feature, arguments, instrument)
+    plain = described(feature, arguments) | {
+        "instrument": to_plain(instrument),
+        "perturbation": to_plain(Unperturbed() if perturbation is None else perturbation),
+        "simulation": _of_simulation(run.settings),
+        "seed": seed,
+    }
     return OriginOperators(grid, elements, means, covariances, recorded, depth, plain)
+
+
+def default_axes(feature: Phase) -> dict[str, list[float]]:
+    """Half, all and twice the size of a feature; nothing for one without a size."""
+    size = size_of(feature)
+    return {"size": [0.5 * size, size, 2 * size]} if math.isfinite(size) else {}
+
+
+def grid_of(axes: Mapping[str, Any]) -> dict[str, Floats]:
+    """Values of each variable in increasing order."""
+    return {check_choice(name, "axes", VARIABLES): np.unique(check_array(axes[name], name, ("n",))) for name in axes}
+
+
+def _of_simulation(settings):
+    """Settings of a run that are the same for all specimens of the operators, and change their ions."""
+    return {name: value for name, value in settings.items() if name not in ("tip", "seed", "monitor")}
 
 
 def displaced(

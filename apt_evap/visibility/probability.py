@@ -12,18 +12,28 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from apt_evap._common.types import Booleans, Floats, Integers
-from apt_evap._common.validation import check_array, check_choice, check_count, check_kind, check_number, check_seed
+from apt_evap._common.validation import (
+    check_array,
+    check_choice,
+    check_count,
+    check_kind,
+    check_number,
+    check_seed,
+    short_text,
+)
 from apt_evap.detection.instrument import Instrument
 from apt_evap.emission.perturbations import Perturbation
 from apt_evap.reconstruction.precipitate import ellipsoid_of
 from apt_evap.specimen.phases import Phase
 from apt_evap.specimen.regions import Layer, Sphere
 from apt_evap.specimen.tip import Tip
-from apt_evap.visibility.cases import check_feature, simulated, size_of, specimen_of, varied
+from apt_evap.visibility.cases import check_feature, simulated, size_of, specimen_of, values_of, varied
 from apt_evap.visibility.operators import OriginOperators, origin_operators
 from apt_evap.visibility.order import Estimated
 from apt_evap.visibility.recorded import Ions, recorded_ions
 
+MOST_TWINS = 1_000_000
+"""Largest number of twins: their results are in memory."""
 _RESAMPLES = 200  # of the bootstrap: 5 % of an error
 _FEWEST = 10  # ions of a feature for its second moments
 _NEAREST, _LEAST_NEAR = 0.2, 20  # fraction and least number of the twins from which a true size is inferred
@@ -222,7 +232,8 @@ def estimate(
         alphabetical order. It returns a statistic that is larger where there is more of the feature; or a dict with
         "statistic" and measured quantities, such as "size" [nm] and "composition" (a fraction).
     operators : OriginOperators, optional
-        From `origin_operators`; by default they are made for `sizes`.
+        From `origin_operators`, of the same feature, specimen, instrument, perturbation and settings; only the values
+        of its axes and the efficiency may differ. By default they are made for `sizes`.
     perturbation : perturbation, optional
         Initial conditions of the ions; by default `Unperturbed`.
     sizes : array_like, optional
@@ -232,7 +243,7 @@ def estimate(
     twins : int
         Number of twins of the feature, and of those with different sizes.
     permutations : int
-        Number of permutations of the labels for each p-value.
+        Number of permutations of the labels for each p-value, at least 1/significance - 1.
     significance : float
         A feature is found if the p-value is at most this.
     full : bool, optional
@@ -246,6 +257,11 @@ def estimate(
     Returns
     -------
     Visibility
+
+    Raises
+    ------
+    ValueError
+        If an argument is wrong, the operators are those of something else, or the analysis does not return a number.
 
     Notes
     -----
@@ -276,12 +292,17 @@ def estimate(
     check_kind(instrument, "instrument", Instrument, "an Instrument")
     if not callable(analysis):
         raise ValueError(f"analysis must be a function of positions and labels, got {analysis!r}")
-    twins = check_count(twins, "twins", at_least=1)
+    twins = check_count(twins, "twins", at_least=1, at_most=MOST_TWINS)
+    check_permutations(permutations, significance)
     check_seed(seed)
     arguments = specimen_of(specimen)
-    full = feature.order is not None or not math.isfinite(size) if full is None else full
-    if operators is None and not full:
-        axes = None if sizes is None else {"size": sizes}
+    if full and operators is not None:
+        raise ValueError("operators must be None if full is True, because they replace the simulations")
+    full = is_simulated_in_full(feature) if full is None else full
+    axes = None if sizes is None else {"size": sizes}
+    if operators is not None:
+        operators.check(feature, specimen, instrument, perturbation, axes=axes, n_threads=n_threads, **settings)
+    elif not full:
         operators = origin_operators(
             feature, specimen, instrument, perturbation, axes=axes, seed=seed + 1, n_threads=n_threads, **settings
         )
@@ -296,7 +317,7 @@ def estimate(
             run = simulated(variant, chosen, perturbation, seed=number, n_threads=n_threads, **settings)
             ions = recorded_ions(run, instrument, perturbation, number)
         else:
-            ions = operators.emulate(number, instrument.efficiency, **_at(operators, values, feature, arguments))
+            ions = operators.emulate(number, instrument.efficiency, **values_of(variant, chosen, operators.axes))
         return _judged(variant, ions, analysis, reach, permutations, significance, random)
 
     drawn = np.exp(random.uniform(math.log(low), math.log(high), twins)) if low < high else np.empty(0)
@@ -319,6 +340,23 @@ def estimate(
         else None,
         operators,
     )
+
+
+def is_simulated_in_full(feature: Phase) -> bool:
+    """Whether the twins of a feature are full simulations by default: one with an order, or without a size."""
+    return feature.order is not None or not math.isfinite(size_of(feature))
+
+
+def check_permutations(permutations: int, significance: float) -> None:
+    """Check that a feature can be found: the smallest p-value of so many permutations is significant."""
+    check_count(permutations, "permutations", at_least=1)
+    check_number(significance, "significance", above=0, below=1)
+    needed = math.ceil(1 / significance - 1 - 1e-9)
+    if permutations < needed:
+        raise ValueError(
+            f"permutations must be at least 1 / significance - 1 = {needed:,}, got {permutations}: no p-value could be "
+            f"as small as the significance {significance:g}"
+        )
 
 
 def permutation_p_value(
@@ -362,10 +400,11 @@ def permutation_p_value(
     places = check_array(positions, "positions", ("n", 3))
     kinds = check_array(labels, "labels", (len(places),), dtype=np.int64)
     random = np.random.default_rng(seed)
-    observed = _statistic(analysis(places, kinds))
+    check_count(permutations, "permutations", at_least=1)
+    observed = _results(analysis, places, kinds)["statistic"]
     k = 0
-    for m in range(1, check_count(permutations, "permutations", at_least=1) + 1):
-        k += _statistic(analysis(places, random.permutation(kinds))) >= observed
+    for m in range(1, permutations + 1):
+        k += _results(analysis, places, random.permutation(kinds))["statistic"] >= observed
         if exceedances is not None and k >= exceedances:
             return k / m
     return (k + 1) / (permutations + 1)
@@ -387,9 +426,8 @@ def _judged(feature, ions: Ions, analysis, reach, permutations, significance, ra
     if reach is not None and hasattr(feature.region, "distance"):
         near = feature.region.distance(positions) <= reach
         positions, labels = positions[near], labels[near]
-    found = analysis(positions, labels)
-    if isinstance(found, Mapping):
-        measured |= {name: float(value) for name, value in found.items() if name != "statistic"}
+    results = _results(analysis, positions, labels)
+    measured |= {name: value for name, value in results.items() if name != "statistic"}
     enough = math.floor(significance * (permutations + 1)) + 1
     p = permutation_p_value(
         analysis, positions, labels, permutations=permutations, exceedances=max(1, enough), seed=random
@@ -433,19 +471,6 @@ def _solute(ions):
     return int(np.argmax(inside / inside.sum() - outside / outside.sum()))
 
 
-def _at(operators, values, feature, arguments):
-    """Values of all variables that operators were made for."""
-    known = {"apex_radius": arguments["apex_radius"], **values}
-    if "field_ratio" in operators.axes:
-        field, host = feature.evaporation_field, arguments["phases"][0].material.evaporation_field
-        known["field_ratio"] = (feature.material.evaporation_field if field is None else field) / host
-    if "cover" in operators.axes:
-        region = feature.region
-        top = region.centre[2] + region.radius if isinstance(region, Sphere) else region.upper
-        known["cover"] = arguments["apex_radius"] - top
-    return {name: value for name, value in known.items() if name in operators.axes}
-
-
 def _columns(judged):
     """Measured and true values of all twins."""
     return tuple(
@@ -455,8 +480,21 @@ def _columns(judged):
     )
 
 
-def _statistic(found):
-    return float(found["statistic"] if isinstance(found, Mapping) else found)
+def _results(analysis, positions, labels):
+    """Numbers by name that an analysis returns; ValueError without a statistic that can be compared, such as NaN."""
+    returned = analysis(positions, labels)
+    results = returned if isinstance(returned, Mapping) else {"statistic": returned}
+    name = getattr(analysis, "__qualname__", type(analysis).__name__)
+    try:
+        numbers = {key: float(value) for key, value in results.items()}
+    except (TypeError, ValueError):
+        numbers = {}
+    if math.isnan(numbers.get("statistic", math.nan)):
+        raise ValueError(
+            f'analysis {name} must return a number, or numbers by name with a "statistic", got {short_text(returned)} '
+            f"for {len(positions):,} ions"
+        )
+    return numbers
 
 
 def _threshold(ions, found, probability):

@@ -1,20 +1,29 @@
 """Settings files of `apt-evap visible`: a specimen with a feature, an instrument and an analysis."""
 
 import importlib.util
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from apt_evap._common.codec import checked, count, from_plain, number, part, settings
+from apt_evap._common.codec import checked, count, from_plain, number, part, settings, to_plain
 from apt_evap._common.files import FileError
+from apt_evap._common.kept import check_made_from
 from apt_evap._common.validation import check_array, check_choice
 from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.config.simulation_file import config_of, read_document
+from apt_evap.config.tables import check_keys, check_table
 from apt_evap.detection.instrument import Instrument
 from apt_evap.specimen.phases import Phase
 from apt_evap.specimen.tip import Tip
-from apt_evap.visibility.operators import OriginOperators, origin_operators
-from apt_evap.visibility.probability import Visibility, estimate
+from apt_evap.visibility.operators import REMEDY, OriginOperators, default_axes, grid_of, origin_operators
+from apt_evap.visibility.probability import (
+    MOST_TWINS,
+    Visibility,
+    check_permutations,
+    estimate,
+    is_simulated_in_full,
+)
 
 
 def _analysis(value, name):
@@ -75,17 +84,31 @@ class VisibilitySettings:
         above=0,
         unit="nm",
     )
-    twins: int = count("Twins of the feature, and of those with other sizes.", default=50, at_least=1)
-    permutations: int = count("Permutations of the labels for each p-value.", default=39, at_least=1)
+    twins: int = count(
+        "Twins of the feature, and of those with other sizes.", default=50, at_least=1, at_most=MOST_TWINS
+    )
+    permutations: int = count(
+        "Permutations of the labels for each p-value, at least 1/significance - 1.", default=39, at_least=1
+    )
     significance: float = number("Largest p-value of a feature that is found.", default=0.05, above=0, below=1)
-    seed: int = count("Seed of all twins.", default=0)
+    seed: int | None = count("Seed of all twins; by default that of the table ``[tip]``, or else 0.", default=None)
+
+    def _check(self):
+        check_permutations(self.permutations, self.significance)
+
+
+_TABLES = (  # those that are used
+    *("tip", "phases", "simulation", "detector", "charges", "flights", "responses", "law", "rule", "control"),
+    "visibility",
+)
 
 
 def estimate_of_file(path: str | Path, *, n_threads: int | None = None) -> Visibility:
     """Answer of the settings file of `apt-evap visible`.
 
-    The file contains the tables of a simulation (see `read_config`; the number of ions follows from the feature) and
-    ``[visibility]``, with the fields of `VisibilitySettings`. The Python file of the analysis is run.
+    The file contains tables of a simulation (see `read_config`) and ``[visibility]``, with the fields of
+    `VisibilitySettings`. The number of ions follows from the feature, and every twin has another shift of the lattice
+    and other random numbers: what would be ignored is refused. The Python file of the analysis is run.
 
     Parameters
     ----------
@@ -106,10 +129,21 @@ def estimate_of_file(path: str | Path, *, n_threads: int | None = None) -> Visib
     document = read_document(path)
     folder = Path(path).parent
     try:
-        chosen = from_plain(document.pop("visibility", {}), VisibilitySettings, what="visibility")
+        check_keys(document, _TABLES)
+        table = document.pop("visibility", {})
+        check_table(table, "[visibility]")
+        chosen = from_plain(table, VisibilitySettings, what="[visibility]")
         analysis = _function(folder, chosen.analysis)
+        for name in ("simulation", "tip"):
+            check_table(document.get(name, {}), f"[{name}]")
+        ignored = [f"[simulation] {key}" for key in document.get("simulation", {}) if key != "voltage"]
+        ignored += [f"[tip] {key}" for key in document.get("tip", {}) if key in ("offset_seed", "depth")]
+        if chosen.seed is not None and "seed" in document.get("tip", {}):
+            ignored.append("[tip] seed (beside that of [visibility])")
+        if ignored:
+            raise ValueError(f"{ignored[0]} must not be given, because it would be ignored")
     except ValueError as error:
-        raise FileError(f"{str(path)!r}, [visibility]: {error}") from error
+        raise FileError(f"{str(path)!r}: {error}") from error
     document["simulation"] = {"ions": 1, **document.get("simulation", {})}
     config = config_of(document, Path(path))
     if "phases" not in config.tip:
@@ -117,7 +151,8 @@ def estimate_of_file(path: str | Path, *, n_threads: int | None = None) -> Visib
     phases: dict[str, Phase] = {phase.name: phase for phase in config.tip["phases"]}
     name = chosen.feature or list(phases)[-1]
     feature = phases.pop(check_choice(name, "feature", tuple(phases)))
-    specimen = Tip(**{**config.tip, "phases": tuple(phases.values()), "seed": config.tip.get("seed", 0)})
+    seed = config.tip.get("seed", 0) if chosen.seed is None else chosen.seed
+    specimen = Tip(**{**config.tip, "phases": tuple(phases.values()), "seed": seed})
     simulation: dict[str, Any] = {
         "voltage": config.voltage,
         "law": config.law,
@@ -132,12 +167,20 @@ def estimate_of_file(path: str | Path, *, n_threads: int | None = None) -> Visib
     operators = None
     if chosen.operators is not None:
         file = folder / chosen.operators
-        if file.exists():
+        if is_simulated_in_full(feature):
+            raise FileError(
+                f"{str(path)!r}, [visibility]: operators must be those of a sphere or layer without an order: "
+                f"the twins of {feature.name!r} are simulated in full"
+            )
+        axes = default_axes(feature) if chosen.sizes is None else {"size": chosen.sizes}
+        if os.path.lexists(file):
             operators = OriginOperators.load(file)
+            made_with = {"axes": operators.axes, "seed": operators.settings["seed"]}
+            asked = {"axes": {**operators.axes, **grid_of(axes)}, "seed": seed + 1}
+            check_made_from(file, to_plain(made_with), asked, REMEDY)
         else:
-            axes = None if chosen.sizes is None else {"size": chosen.sizes}
             operators = origin_operators(
-                feature, specimen, chosen.instrument, chosen.perturbation, axes=axes, seed=chosen.seed + 1, **simulation
+                feature, specimen, chosen.instrument, chosen.perturbation, axes=axes, seed=seed + 1, **simulation
             )
             operators.save(file)
     return estimate(
@@ -152,7 +195,7 @@ def estimate_of_file(path: str | Path, *, n_threads: int | None = None) -> Visib
         twins=chosen.twins,
         permutations=chosen.permutations,
         significance=chosen.significance,
-        seed=chosen.seed,
+        seed=seed,
         **simulation,
     )
 

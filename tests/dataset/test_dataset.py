@@ -1,24 +1,30 @@
 """Data sets: their truth is that of the runs, and their bytes depend on the study alone."""
 
+import errno
+import fcntl
 import filecmp
 import hashlib
 import json
 import os
+import pickle
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from sweeps import do
 
 import apt_evap as ae
-from apt_evap._common.files import FileError
+from apt_evap._common.files import FileError, sha256_of
 from apt_evap.analysis.apex import fit_caps, image_compression
 from apt_evap.cli.main import main
-from apt_evap.dataset.making import make, plan_set, split_of, verify
+from apt_evap.dataset.description import verify
+from apt_evap.dataset.making import make, plan_set, split_of
 from apt_evap.dataset.settings import DatasetSettings
 from apt_evap.simulation.run import load
 
@@ -48,6 +54,9 @@ split = [0.5, 0.25, 0.25]
 """
 
 
+RUNS = {}  # files of runs that are done, by the keys of their points
+
+
 def planned(folder, study=STUDY, base=BASE, runs=True):
     """The planned set of a study in a folder, whose runs are done if wanted."""
     folder.mkdir(exist_ok=True)
@@ -56,7 +65,12 @@ def planned(folder, study=STUDY, base=BASE, runs=True):
     plan = plan_set(folder / "study.toml")
     for key, state in [(point.key, state) for point, state in plan.sweep.states()]:
         if runs and state.name == "waiting":
-            do(plan.sweep, key)
+            path = plan.sweep.folder_of(key) / "run.h5"
+            if key in RUNS:
+                path.write_bytes(RUNS[key])
+            else:
+                do(plan.sweep, key)
+                RUNS[key] = path.read_bytes()
     return plan
 
 
@@ -145,15 +159,16 @@ def test_more_samples_after_an_interruption(made, tmp_path, monkeypatch):
     more = planned(tmp_path, STUDY.replace("sample = 4", "sample = 8"))
     assert any(shard.name == old.name and shard.key != old.key for shard in more.shards for old in few.shards)
     with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
-        patched.setattr("apt_evap.dataset.making._finish", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patched.setattr("apt_evap.dataset.making.finish", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         make(more, tmp_path / "set")
     with pytest.raises(FileError, match="SHA256SUMS"):
         verify(tmp_path / "set")
     make(more, tmp_path / "set")
     make(more, tmp_path / "other")
     check_same(tmp_path / "set", tmp_path / "other")
-    make(planned(tmp_path), tmp_path / "set")  # and fewer: files that are not of the set are removed
-    check_same(made[1], tmp_path / "set")
+    with pytest.raises(FileError, match="runs that this study does not have"):  # and fewer
+        make(planned(tmp_path), tmp_path / "set")
+    check_same(tmp_path / "set", tmp_path / "other")
 
 
 def test_runs_of_a_specimen_are_in_one_part(tmp_path):
@@ -343,9 +358,370 @@ def test_emissions_need_responses(tmp_path):
         planned(tmp_path, base=BASE + "responses = false\n", runs=False)
 
 
+def test_deep_tables_are_refused():
+    table = {"name": "RollUp"}
+    for _ in range(3000):
+        table = {"a": table}
+    for settings in ({"emissions": [table]}, {"instrument": table}):
+        with pytest.raises(ValueError, match="hundreds of tables"):
+            DatasetSettings(**settings)
+
+
 def test_settings_come_back():
     settings = DatasetSettings(emissions=["Unperturbed"], draws=4)
     assert settings.per_run == 1  # nothing is drawn
+
+
+# ---- wrong folders and files ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def other(tmp_path_factory):
+    """Another data set, of another seed, with the same names of files: its plan and folder."""
+    folder = tmp_path_factory.mktemp("other")
+    plan = planned(folder, STUDY.replace("seed = 3", "seed = 5"))
+    make(plan, folder / "set")
+    return plan, folder / "set"
+
+
+def replaced(target, source):
+    """A data set in the place of another one."""
+    shutil.rmtree(target, ignore_errors=True)
+    shutil.copytree(source, target)
+    return target
+
+
+def first(data):
+    return data[0].about["name"], data[0].ions["x"].tolist()
+
+
+def test_two_sets_with_one_relative_name_are_two(made, other, tmp_path, monkeypatch):
+    loaded = []
+    for name, source in (("a", made[1]), ("b", other[1])):
+        replaced(tmp_path / name / "set", source)
+        monkeypatch.chdir(tmp_path / name)
+        loaded.append(ae.dataset.load("set"))
+        assert first(loaded[-1]) == first(ae.dataset.load(source))
+    assert first(loaded[0]) == first(ae.dataset.load(made[1]))  # from another folder
+
+
+def test_a_set_that_is_made_again_is_not_mixed_with_the_old_one(made, other, tmp_path):
+    old = ae.dataset.load(replaced(tmp_path / "set", made[1]))
+    assert first(old) == first(ae.dataset.load(made[1]))
+    replaced(tmp_path / "set", other[1])
+    for use in (lambda: old[0], lambda: old.split(old.shards[0]["split"])[0], lambda: old.table("ions")):
+        with pytest.raises(FileError, match="the data set which was opened"):
+            use()
+    assert first(ae.dataset.load(tmp_path / "set")) == first(ae.dataset.load(other[1]))
+
+
+def test_examples_are_copies(made):
+    data = ae.dataset.load(made[1])
+    arrays = [("about", "axis"), ("about", "orientation"), ("ions", "x"), ("poles", "x"), ("cap", "radius")]
+    before = [getattr(data[0], table)[name].copy() for table, name in arrays]
+    for table, name in arrays:
+        getattr(data[0], table)[name][...] = 5
+    for (table, name), values in zip(arrays, before, strict=True):
+        np.testing.assert_array_equal(getattr(data[0], table)[name], values)
+
+
+def test_a_loaded_set_goes_to_another_process(made):
+    data = ae.dataset.load(made[1])
+    assert first(pickle.loads(pickle.dumps(data))) == first(data)
+
+
+def flipped(path, random):
+    """Flip one bit of a file."""
+    content = bytearray(path.read_bytes())
+    content[random.integers(len(content))] ^= 1 << int(random.integers(8))
+    path.write_bytes(content)
+
+
+def everything(folder):
+    """All tables, and all examples."""
+    data = ae.dataset.load(folder)
+    tables = {f"{name} {column}": values for name in data.schema for column, values in data.table(name).items()}
+    return tables | {
+        f"{k} {column}": values for k, example in enumerate(data) for column, values in example.ions.items()
+    }
+
+
+def check_equal(one, other):
+    assert one.keys() == other.keys()
+    for name, values in one.items():
+        np.testing.assert_array_equal(values, other[name])
+
+
+@pytest.mark.parametrize("suffix", ["hdf5", "parquet"])
+def test_no_flipped_bit_is_read(made, tmp_path, suffix):
+    """Of 1,000 there was no other result (measured once); here a few."""
+    if suffix == "parquet":
+        pytest.importorskip("pyarrow")
+    folder, random = tmp_path / "set", np.random.default_rng(1)
+    make(planned(tmp_path, STUDY.replace("draws", f'format = "{suffix}"\ndraws')), folder)
+    for path in sorted(folder.iterdir()) * 5:
+        content = path.read_bytes()
+        flipped(path, random)
+        with pytest.raises(FileError):
+            verify(folder)
+        if path.name not in ("README.md", "SHA256SUMS"):  # their damage changes no example
+            with pytest.raises(FileError):
+                everything(folder)
+        path.write_bytes(content)
+    check_equal(everything(folder), everything(made[1]))
+
+
+def with_right_checksums(folder):
+    """Give a data set the checksums that its files have now, as whoever has made it could."""
+    lines = (folder / "SHA256SUMS").read_text().splitlines()
+    names = [line.split("  ")[1] for line in lines]
+    (folder / "SHA256SUMS").write_text("".join(f"{sha256_of(folder / name)}  {name}\n" for name in names))
+
+
+VALUES = (None, True, -1, 3, 10**400, float("nan"), "", "../secret/x", [], {}, [[1]], {"a": 1}, 0.5, "a" * 5000)
+
+
+def mutated(content, random):
+    """A document with one part replaced, removed or renamed."""
+    content = json.loads(json.dumps(content))
+    table, depth = content, random.integers(5)
+    while True:
+        keys = list(table) if isinstance(table, dict) else range(len(table))
+        key = keys[random.integers(len(keys))]
+        if depth == 0 or not isinstance(table[key], dict | list) or not table[key]:
+            break
+        table, depth = table[key], depth - 1
+    kind = random.integers(4)
+    if kind == 0:
+        del table[key]
+    elif kind == 1 and isinstance(table, dict):
+        table["x"] = table.pop(key)
+    else:
+        table[key] = VALUES[random.integers(len(VALUES))]
+    return content
+
+
+def test_changed_descriptions_are_refused_or_change_no_ion(made, tmp_path):
+    """Also with right checksums: a description of somebody else leads to no other column, file or traceback."""
+    folder, random = replaced(tmp_path / "set", made[1]), np.random.default_rng(1)
+    content, expected = json.loads((folder / "dataset.json").read_text()), everything(made[1])
+    read = 0
+    for _ in range(60):
+        (folder / "dataset.json").write_text(json.dumps(mutated(content, random)))
+        with_right_checksums(folder)
+        try:
+            check_equal(everything(folder), expected)
+            read += 1
+        except FileError:
+            pass
+    assert 0 < read < 30  # titles, studies and names of points are free
+    for text in ("", "[]", "5", "[" * 100_000, "1" * 5000, '{"format": 1}', '{"format": "apt_evap dataset 2"}'):
+        (folder / "dataset.json").write_text(text)
+        with_right_checksums(folder)
+        with pytest.raises(FileError, match=r"dataset\.json' is not the description of a data set"):
+            ae.dataset.load(folder)
+
+
+@pytest.mark.parametrize("what", ["name", "link", "pipe"])
+def test_nothing_outside_the_folder_is_read(made, tmp_path, what):
+    folder = replaced(tmp_path / "set", made[1])
+    content = json.loads((folder / "dataset.json").read_text())
+    shard = content["shards"][0]
+    path = folder / f"{shard['name']}.h5"
+    replaced(tmp_path / "secret", made[1])
+    if what == "name":
+        shard["name"], name = f"../secret/{shard['name']}", f"{shard['name']}.h5"
+        shard["files"] = {f"../secret/{name}": shard["files"][name]}
+    elif what == "link":
+        with h5py.File(path) as old, h5py.File(tmp_path / "new.h5", "w") as new:
+            for group in old.values():
+                old.copy(group, new)
+            del new["ions/x"]
+            new["ions/x"] = h5py.ExternalLink(str(tmp_path / "secret" / path.name), "/ions/y")
+        (tmp_path / "new.h5").replace(path)
+        shard["files"] = {path.name: sha256_of(path)}
+    else:
+        path.unlink()
+        os.mkfifo(path)
+    (folder / "dataset.json").write_text(json.dumps(content))
+    if what != "pipe":
+        with_right_checksums(folder)
+        message = "names of shards" if what == "name" else "is a link"
+    else:
+        (folder / "dataset.json").write_bytes((made[1] / "dataset.json").read_bytes())
+        message = "Not a regular file"
+    for table in ("examples", "ions"):
+        with pytest.raises(FileError, match=message):
+            ae.dataset.load(folder).table("ions" if what == "link" else table)
+
+
+def test_a_link_in_a_set_is_not_written_through(tmp_path):
+    """An unfinished set of somebody else, whose next file is a link to a file of this user."""
+    plan = planned(tmp_path)
+    make(plan, tmp_path / "set")
+    path = next((tmp_path / "set").glob("train*.h5"))
+    (tmp_path / "set" / "SHA256SUMS").unlink()
+    path.unlink()
+    (tmp_path / "mine").write_text("mine")
+    path.symlink_to(tmp_path / "mine")
+    with pytest.raises(FileError, match="is a link"):
+        make(plan, tmp_path / "set")
+    assert (tmp_path / "mine").read_text() == "mine"
+
+
+def test_a_damaged_file_of_an_unfinished_set_gets_no_new_checksum(made, tmp_path):
+    plan = planned(tmp_path)
+    make(plan, tmp_path / "set")
+    (tmp_path / "set" / "SHA256SUMS").unlink()  # as if it was killed before its end
+    path = max((tmp_path / "set").glob("*.h5"))
+    flipped(path, np.random.default_rng(3))
+    with pytest.raises(FileError, match=rf"{path.name}' is damaged"):
+        make(plan, tmp_path / "set")
+    assert not (tmp_path / "set" / "SHA256SUMS").exists()
+    path.unlink()
+    make(plan, tmp_path / "set")
+    check_same(made[1], tmp_path / "set")
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize(
+    "names", [["README.md"], ["train-0000.h5"], ["dataset.json"], ["dataset.json", "train-0007.h5"]]
+)
+def test_a_folder_of_something_else_is_refused(tmp_path, names):
+    plan = planned(tmp_path, runs=False)
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    for name in names:
+        (folder / name).write_text('{"mine": 1}')
+    before = contents(folder)
+    with pytest.raises(FileError, match="mine"):
+        make(plan, folder)
+    assert contents(folder) == before
+    with pytest.raises(FileError, match="is not a data set"):
+        make(plan, tmp_path)
+
+
+def test_files_beside_those_of_a_set_are_left_alone(tmp_path):
+    make(planned(tmp_path), tmp_path / "set")
+    for name in ("notes.txt", "train-0777.h5"):
+        (tmp_path / "set" / name).write_text("mine")
+    more = planned(tmp_path, STUDY.replace("sample = 4", "sample = 6"))
+    make(more, tmp_path / "set")
+    assert [(tmp_path / "set" / name).read_text() for name in ("notes.txt", "train-0777.h5")] == ["mine", "mine"]
+    new = {f"{shard.name}.h5" for shard in more.shards} - {path.name for path in (tmp_path / "set").iterdir()}
+    assert not new
+    (tmp_path / "set" / "train-0777.h5").unlink()
+
+
+def test_a_file_in_the_place_of_a_new_one_is_not_replaced(made, tmp_path):
+    folder = replaced(tmp_path / "set", made[1])
+    more = planned(tmp_path, STUDY.replace("sample = 4", "sample = 12"), runs=False)
+    names = {f"{shard.name}.h5" for shard in more.shards}
+    (name, *_) = sorted(names - contents(folder).keys())
+    (folder / name).write_text("mine")
+    before = contents(folder)
+    with pytest.raises(FileError, match=name):
+        make(more, folder)
+    assert contents(folder) == before
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "word"),
+    [
+        ("seed = 3", "seed = 4", "runs that this study does not have"),
+        ("draws = 2", "draws = 3", "dataset.draws"),
+        ("0.01] } }]", "0.02] } }]", "dataset.emissions"),
+        ("field_of_view = 150.0", "field_of_view = 140.0", "dataset.instrument.field_of_view"),
+        ("runs_per_file = 2", "runs_per_file = 4", "dataset.runs_per_file"),
+        ("[0.5, 0.25, 0.25]", "[0.5, 0.5, 0.0]", "dataset.split"),
+        ("draws = 2", 'draws = 2\nfields = ["x"]', "dataset.fields"),
+    ],
+)
+@pytest.mark.parametrize("is_finished", [True, False])
+def test_a_set_of_another_study_is_not_replaced(made, tmp_path, old, new, word, is_finished):
+    folder = replaced(tmp_path / "set", made[1])
+    if not is_finished:
+        (folder / "SHA256SUMS").unlink()
+    before = contents(folder)
+    with pytest.raises(FileError, match=f"'{folder}' .*{word}.* another folder"):
+        make(planned(tmp_path, STUDY.replace(old, new), runs=False), folder)
+    assert contents(folder) == before
+
+
+def test_texts_of_a_set_can_change(made, tmp_path):
+    folder = replaced(tmp_path / "set", made[1])
+    times = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.h5")}
+    make(planned(tmp_path, STUDY.replace('"Aluminium"', '"Aluminium 2"'), runs=False), folder)
+    assert "# Aluminium 2" in (folder / "README.md").read_text() and verify(folder)["title"] == "Aluminium 2"
+    assert times == {path.name: path.stat().st_mtime_ns for path in folder.glob("*.h5")}
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO])
+def test_runs_that_a_disk_has_ended_are_made_again(made, tmp_path, monkeypatch, code):
+    plan = planned(tmp_path)
+    folder = plan.sweep.folder_of(plan.sweep.keys[0])
+    (folder / "run.h5").unlink()
+    real = os.replace
+    calls = []
+
+    def full(source, target, **options):
+        if Path(target).name == "run.h5" and not calls:
+            calls.append(target)
+            raise OSError(code, os.strerror(code))
+        real(source, target, **options)
+
+    with monkeypatch.context() as patch, pytest.raises(FileError, match=os.strerror(code)):
+        patch.setattr(os, "replace", full)
+        make(plan, tmp_path / "set", without_failed=True)
+    assert calls
+    content = make(plan, tmp_path / "set", without_failed=True)
+    assert not content["left_out"]
+    check_same(made[1], tmp_path / "set")
+
+
+def test_runs_of_another_process_are_waited_for(made, tmp_path, monkeypatch):
+    plan = planned(tmp_path)
+    key = plan.sweep.keys[0]
+    folder, notes = plan.sweep.folder_of(key), []
+    run = (folder / "run.h5").rename(tmp_path / "run.h5")
+    with open(folder / "lock", "w") as lock:  # as another process does
+        fcntl.flock(lock, fcntl.LOCK_EX)
+
+        def end(seconds):
+            shutil.copy(run, folder / "run.h5")
+            lock.close()
+
+        monkeypatch.setattr("apt_evap.dataset.making.time.sleep", end)
+        make(plan, tmp_path / "set", note=notes.append)
+    assert any("waiting for 1 runs of another process" in text for text in notes)
+    check_same(made[1], tmp_path / "set")
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("emissions = [{ name = 'RollUp', energy = { uniform = [0.1, 0.2] } }]\ndraws = 2000000000", "draws"),
+        ("emissions = [{ name = 'RollUp', energy = { uniform = [0.1, 0.2] } }]\ndraws = 9000000", "examples"),
+        (f"emissions = [{{ name = 'RollUp', energy = {{ uniform = [0, 1{'0' * 400}] }} }}]", "uniform"),
+        (f"emissions = [{{ name = 'RollUp', energy = {{ log_uniform = [1, 1{'0' * 400}] }} }}]", "log_uniform"),
+        (f"instrument = {{ field_of_view = {{ integer = [1, 1{'0' * 400}] }} }}", "integer"),
+        ("instrument = { efficiency = { uniform = [-1e308, 1e308] } }", "uniform"),
+        ("instrument = { integer = [0, 10] }", "instrument must be a table"),
+        ("instrument = { uniform = [0.0, 1.0] }", "instrument must be a table"),
+        ("instrument = { choice = [{ efficiency = 0.5 }, { efficiency = 5.0 }] }", "efficiency"),
+        ("emissions = [{ choice = ['RollUp:0.1', 'RollUp:-1', 'Unperturbed'] }]", "energy"),
+        ("emissions = [{ choice = ['Unperturbed', 5] }]", "perturbation"),
+    ],
+)
+def test_ranges_out_of_range_are_named_at_once(tmp_path, text, name):
+    study = 'base = "base.toml"\nsample = 2\n[sweep]\n"tip.axis" = "random"\n[dataset]\n'
+    began = time.monotonic()
+    with pytest.raises(FileError, match=name):
+        planned(tmp_path, f"{study}{text}\n", runs=False)
+    assert time.monotonic() - began < 30  # a list of 2e9 examples took longer, and the memory of the machine
 
 
 # ---- the command ---------------------------------------------------------------------------------------------------
@@ -381,6 +757,14 @@ def started(study, folder):
 def finished(process):
     _, errors = process.communicate(timeout=300)
     assert process.returncode == 0, errors.decode()
+
+
+def test_two_commands_at_once_make_one_set(made, tmp_path):
+    planned(tmp_path, runs=False)
+    processes = [started(tmp_path / "study.toml", tmp_path / "set") for _ in range(2)]
+    for process in processes:
+        finished(process)
+    check_same(made[1], tmp_path / "set")
 
 
 def test_a_killed_set_has_the_same_bytes(made, tmp_path):

@@ -124,7 +124,7 @@ def test_intervals_contain_the_true_size_of_hidden_twins(tip, operators):
     instrument = ae.Instrument(field_of_view=160.0, efficiency=0.5)
     answer = ae.visibility.estimate(
         particle(0.7), tip, instrument, lambda positions, labels: 0.0,
-        operators=operators, twins=900, permutations=1, seed=100_000,
+        operators=operators, twins=900, permutations=1, significance=0.5, seed=100_000,
     )  # fmt: skip
     random = np.random.default_rng(3)
     n, hits = 600, 0
@@ -179,6 +179,102 @@ def test_a_foreign_file_has_no_operators(tmp_path):
     path.write_bytes(b"nothing")
     with pytest.raises(ae.FileError, match=r"other\.h5"):
         ae.visibility.OriginOperators.load(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        ({"feature": particle(0.8, fraction=0.02)}, "feature.solutes"),
+        ({"feature": particle(0.8, ratio=1.1)}, "feature.evaporation_field"),
+        ({"feature": replace(particle(0.8), region=ae.specimen.Sphere((0, 0, 1.0), 0.8))}, "feature.region.centre"),
+        ({"feature": replace(particle(0.8), solutes={"Cu": 0.5})}, "feature.solutes"),
+        ({"instrument": ae.Instrument(field_of_view=150.0)}, "instrument.field_of_view"),
+        ({"instrument": ae.Instrument(field_of_view=160.0, resolution=0.5)}, "instrument.resolution"),
+        ({"perturbation": ae.RollUp(0.2)}, "perturbation"),
+        ({"law": ae.Arrhenius(50.0)}, "simulation.law"),
+        ({"rule": ae.ConstantPotential()}, "simulation.rule"),
+        ({"voltage": 900.0}, "simulation.voltage"),
+        ({"detector": ae.Detector(distance=90.0)}, "simulation.detector"),
+        ({"specimen": ae.Tip("Ni", apex_radius=RADIUS, axis=(1, 1, 1), solutes={"Al": 0.05}, seed=1)}, "specimen"),
+        ({"sizes": [0.5, 0.8]}, "axes.size"),
+    ],
+)
+def test_operators_of_something_else_are_refused(tip, operators, tmp_path, change, name):
+    """Kept in a file: what was counted for one feature, specimen and instrument is not the answer for another."""
+    operators.save(tmp_path / "operators.h5")
+    loaded = ae.visibility.OriginOperators.load(tmp_path / "operators.h5")
+    asked = {"feature": particle(0.8), "specimen": tip, "instrument": EVERYTHING} | change
+    with pytest.raises(ae.FileError, match=rf"operators\.h5' was made with {name}"):
+        ae.visibility.estimate(**asked, analysis=pairs, operators=loaded, twins=1)
+
+
+def test_axes_and_efficiency_of_operators_are_free(tip, operators):
+    operators.check(particle(0.6), tip, ae.Instrument(field_of_view=160.0, efficiency=0.3), ae.Unperturbed())
+    operators.check(particle(0.8), tip, EVERYTHING, axes={"size": (0.9, 0.5)}, law=ae.Extremal())
+    with pytest.raises(ValueError, match="size must be"):
+        ae.visibility.estimate(particle(1.0), tip, EVERYTHING, pairs, operators=operators, twins=1)
+
+
+def test_damaged_content_of_operators_is_an_error(operators, tmp_path):
+    """The file is complete, but its content is not that of operators: no traceback, and nothing is drawn."""
+    path = tmp_path / "operators.h5"
+    for change in (
+        {"axes": {"height": operators.axes["size"]}},
+        {"axes": {"size": operators.axes["size"][::-1]}},
+        {"axes": {"size": operators.axes["size"][:1]}},
+        {"elements": ("Al",)},
+        {"depth": -1.0},
+        {"means": operators.means[..., :2]},
+        {"means": np.full_like(operators.means, np.nan)},
+        {"recorded": operators.recorded[0]},
+        *({"settings": {**operators.settings, name: 5}} for name in operators.settings if name != "seed"),
+        *(
+            {"settings": {key: value for key, value in operators.settings.items() if key != name}}
+            for name in operators.settings
+        ),
+    ):
+        replace(operators, **change).save(path)
+        with pytest.raises(ae.FileError, match=r"operators\.h5' does not contain origin operators"):
+            ae.visibility.OriginOperators.load(path)
+
+
+@pytest.mark.parametrize(
+    "returned",
+    [math.nan, {"statistic": math.nan}, {"size": 1.0}, None, "many", [1.0, 2.0], {"statistic": 1.0, "size": "x"}],
+)
+def test_an_analysis_without_a_number_is_named(returned):
+    """A comparison with NaN is never true: every p-value would be 1/(m + 1)."""
+    places = np.random.default_rng(1).random((50, 3))
+
+    def of_three(positions, labels):
+        return returned
+
+    with pytest.raises(ValueError, match=r"analysis .*of_three must return a number"):
+        ae.visibility.permutation_p_value(of_three, places, np.arange(50) % 2)
+
+
+def test_permuted_labels_without_a_number_are_an_error():
+    places, labels = np.random.default_rng(1).random((50, 3)), np.arange(50) % 2
+
+    def unstable(positions, kinds):
+        return 1.0 if np.array_equal(kinds, labels) else math.nan
+
+    with pytest.raises(ValueError, match="unstable"):
+        ae.visibility.permutation_p_value(unstable, places, labels)
+
+
+@pytest.mark.parametrize(("permutations", "significance"), [(18, 0.05), (98, 0.01), (1, 0.3)])
+def test_a_significance_that_no_p_value_reaches_is_refused(tip, operators, permutations, significance):
+    def estimate(permutations):
+        return ae.visibility.estimate(
+            particle(0.8), tip, EVERYTHING, pairs, operators=operators, twins=1,
+            permutations=permutations, significance=significance,
+        )  # fmt: skip
+
+    with pytest.raises(ValueError, match=f"permutations must be at least .* = {math.ceil(1 / significance) - 1}"):
+        estimate(permutations)
+    answer = estimate(math.ceil(1 / significance) - 1)
+    assert answer.probability.value == 2 / 3  # found, because the smallest p-value is significant
 
 
 @pytest.mark.parametrize("values", [{"size": 1.5}, {"size": 0.8, "cover": 1.0}])
@@ -270,9 +366,7 @@ def test_the_analysis_can_measure(tip, operators):
 def test_features_with_an_order_are_simulated_in_full(tip):
     order = ae.specimen.Superlattice("L1_2", "Al")
     domain = ae.specimen.Phase("domain", "Ni", ae.specimen.Sphere((0, 0, 2.0), 0.5), order=order)
-    answer = ae.visibility.estimate(
-        domain, tip, EVERYTHING, lambda positions, labels: 0.0, twins=1, permutations=1, n_threads=1
-    )
+    answer = ae.visibility.estimate(domain, tip, EVERYTHING, lambda positions, labels: 0.0, twins=1, n_threads=1)
     assert answer.operators is None and len(answer.sized.ions) == 1
 
 
