@@ -75,6 +75,7 @@ def quick(tmp_path, monkeypatch):
     monkeypatch.setattr(twin.run_command, "execute", run)
     monkeypatch.setattr(twin, "compare", compare)
     monkeypatch.setattr(twin, "load", lambda path: Run())
+    monkeypatch.setattr(twin, "is_run", lambda path: path.read_text() == "a run")
     monkeypatch.setattr(twin, "start_of", index)
     monkeypatch.setattr(twin, "_registered", lambda *_: ae.Registration(1.0, 1.0, (0.0, 0.0)))
     measurement("ni.epos")
@@ -125,6 +126,9 @@ def test_files_that_this_command_did_not_write_are_refused(quick, capsys, name, 
     assert main(["twin", *first]) == 0
     assert ("index" in quick) == (name in ("specimen.toml", "start.json")) and "compare" in quick
     assert (tmp_path / "t" / name).read_bytes() == original
+    capsys.readouterr()
+    (tmp_path / "t" / "run.h5").write_bytes(b"precious")
+    assert "t/run.h5" in refused(capsys, *first)
     # without the record, nobody knows what the files were made from
     (tmp_path / "t" / RECORD).unlink()
     capsys.readouterr()
