@@ -8,4 +8,4 @@ from apt_evap._version import __version__ as __version__
 # names are imported when they are first used (SPEC 1 of Scientific Python): the list is __init__.pyi
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 __all__ += ["__version__"]
-_shown_by("apt_evap.report.notebook")
+_shown_by("apt_evap.plot.report.notebook_views")

@@ -18,8 +18,8 @@ from PIL import Image
 import apt_evap
 from apt_evap._common.codec import declared
 from apt_evap.cli.parser import EXIT_CODES, make_parser
-from apt_evap.dataset.fields import TABLES
-from apt_evap.indexing import master_pattern
+from apt_evap.maps.indexing import master_pattern
+from apt_evap.studies.dataset.fields import TABLES
 
 HERE = Path(__file__).parent
 
@@ -117,15 +117,15 @@ def atlas(path):
     for element in ("Ni", "W", "Si", "Ti"):
         material = apt_evap.material(element)
         hexagonal = material.structure == "hcp"
-        poles, zones = apt_evap.crystallography.poles(material, 7), apt_evap.crystallography.zones(material)
+        poles, zones = apt_evap.maps.poles(material, 7), apt_evap.maps.zones(material)
         views = {"[0001]": (0, 0, 0, 1), "[10-10]": (1, 0, -1, 0), "[11-20]": (1, 1, -2, 0)} if hexagonal else {
             "[001]": (0, 0, 1), "[011]": (0, 1, 1), "[111]": (1, 1, 1), "[112]": (1, 1, 2)}  # fmt: skip
-        normals = apt_evap.crystallography.direction_normals(material, list(views.values()))
+        normals = apt_evap.maps.direction_normals(material, list(views.values()))
         crystals[material.structure] = {
             "name": f"{material.structure} ({element})",
             "radii": {
                 f"{pattern.apex_radius:g}": [_png(each) for each in pattern.smoothed(0.3)]
-                for pattern in apt_evap.indexing.master_patterns(material.structure)
+                for pattern in apt_evap.maps.master_patterns(material.structure)
             },
             "poles": [
                 [*normal.round(5).tolist(), "".join(f"{abs(i)}\u0305" if i < 0 else str(i) for i in plane.tolist()),

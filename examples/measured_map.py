@@ -62,7 +62,7 @@ folder.mkdir(parents=True, exist_ok=True)
 npz = options.measured.endswith(".npz")
 measured = ae.read_map(options.measured) if npz else ae.read(options.measured).map(bins=options.bins or 128)
 planes, positions = zip(*options.pole, strict=True)
-fit = ae.crystallography.fit_orientation(options.material, planes, positions, centre=tuple(options.centre))
+fit = ae.maps.fit_orientation(options.material, planes, positions, centre=tuple(options.centre))
 axis = " ".join(f"{index:.3f}" for index in fit.orientation.axis)
 print(f"axis [{axis}], rotation {fit.orientation.rotation:.1f} degrees; residual of the poles {fit.rms:.2f} mm (RMS)")
 

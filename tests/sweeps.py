@@ -11,8 +11,8 @@ from pathlib import Path
 import apt_evap as ae
 from apt_evap.config.simulation_file import read_config
 from apt_evap.simulation.run import load
-from apt_evap.sweep.planning import plan
-from apt_evap.sweep.point_folder import run_point
+from apt_evap.studies.sweep.planning import plan_sweep
+from apt_evap.studies.sweep.point_folder import run_point
 
 BASE = """
 [tip]
@@ -41,7 +41,7 @@ def planned(folder, study=TWELVE, base=BASE):
     """The sweep of a study in this folder."""
     (folder / "base.toml").write_text(base)
     (folder / "study.toml").write_text(study)
-    return plan(folder / "study.toml")
+    return plan_sweep(folder / "study.toml")
 
 
 def do(sweep, key):

@@ -24,10 +24,10 @@ from pathlib import Path
 import numpy as np
 
 import apt_evap as ae
-from apt_evap.dataset.fields import TEXT, Field
-from apt_evap.dataset.shards import key_in, read_table, write_shard
 from apt_evap.simulation.run_hdf5 import count_ions, is_run
-from apt_evap.visibility.operators import OriginOperators
+from apt_evap.studies.dataset.fields import TEXT, Field
+from apt_evap.studies.dataset.shards import key_in, read_table, write_shard
+from apt_evap.studies.visibility.operators import OriginOperators
 
 KINDS = ("flipped bits", "zeroed range", "random range", "truncation", "insertion", "deletion")
 GOOD = ("as the original", "FileError")

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 import apt_evap as ae
-from apt_evap.indexing import MasterPattern
+from apt_evap.maps.indexing.master_pattern import MasterPattern
 
 PATTERNS = Path(__file__).parents[1] / "apt_evap" / "indexing" / "patterns"
 ENERGY, HEIGHT, SHARPNESS = 0.35, 0.1, 0.4  # eV, nm: see articles/common_rules

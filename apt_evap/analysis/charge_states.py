@@ -146,7 +146,7 @@ class ChargeStateMap(ChargeStateCounts):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ChargeStateCourse(ChargeStateCounts):
+class ChargeStateHistory(ChargeStateCounts):
     """Charge state ratios in successive sections of the ions, made by `charge_state_ratio_course`.
 
     Parameters
@@ -243,7 +243,7 @@ def charge_state_ratio_map(
     return ChargeStateMap(element, charge, lower, upper, least, grid)
 
 
-def charge_state_ratio_course(
+def charge_state_ratio_history(
     hits: Hits,
     element: str,
     charge: int | None = None,
@@ -251,7 +251,7 @@ def charge_state_ratio_course(
     ranges: Ranges | None = None,
     sections: int | None = None,
     least: int = LEAST,
-) -> ChargeStateCourse:
+) -> ChargeStateHistory:
     """Charge state ratio of an element in successive sections of the detected ions.
 
     Parameters
@@ -278,17 +278,17 @@ def charge_state_ratio_course(
     """
     check_kind(hits, "hits", Hits, "Hits")
     charges = np.where(hits.detected, ion_charges(hits, element, ranges), 0)
-    return course_of_charges(charges, element, charge, sections=sections, least=least)
+    return charge_history(charges, element, charge, sections=sections, least=least)
 
 
-def course_of_charges(
+def charge_history(
     charges: ArrayLike,
     element: str,
     charge: int | None = None,
     *,
     sections: int | None = None,
     least: int = LEAST,
-) -> ChargeStateCourse:
+) -> ChargeStateHistory:
     """Charge state ratio in successive sections, from the charge of every ion.
 
     Parameters
@@ -316,7 +316,7 @@ def course_of_charges(
     sections = min(check_count(sections, "sections", at_least=1), len(charges))
     edges = np.linspace(0, len(charges), sections + 1).astype(int)
     lower, upper = np.add.reduceat(steps, edges[:-1], axis=1, dtype=np.int64)
-    return ChargeStateCourse(element, charge, lower, upper, least, (edges[:-1] + edges[1:]) / 2)
+    return ChargeStateHistory(element, charge, lower, upper, least, (edges[:-1] + edges[1:]) / 2)
 
 
 def ion_charges(hits: Hits, element: str, ranges: Ranges | None = None) -> Integers:

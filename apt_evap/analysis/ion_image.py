@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from apt_evap._common.ion_random import IonRandom
 from apt_evap._common.types import Booleans, Floats, Integers
 from apt_evap._common.validation import (
     check_choice,
@@ -29,10 +30,9 @@ from apt_evap.detection.detector import Detector
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits, Outcome
 from apt_evap.detection.projection import polar_angles
-from apt_evap.emission.ion_random import IonRandom
 from apt_evap.evaporation.emitter import Emitter
-from apt_evap.flight.crew import FlightSettings, check_reach, fly_at_rest
-from apt_evap.flight.landing import land
+from apt_evap.simulation.flight.flight_pool import FlightSettings, check_reach, fly_at_rest
+from apt_evap.simulation.flight.landing import land
 from apt_evap.units import BOLTZMANN
 
 SUPPLIES = ("constant", "capture")

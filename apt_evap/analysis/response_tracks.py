@@ -11,7 +11,7 @@ from apt_evap._common.short_repr import short_repr
 from apt_evap._common.validation import check_array, check_kind
 from apt_evap.emission.emissions import TangentialLaunches
 from apt_evap.emission.surface_frame import rollup_direction
-from apt_evap.flight.response import Responses
+from apt_evap.simulation.flight.response import Responses
 from apt_evap.simulation.run import Run
 from apt_evap.units import speed_from_energy
 

@@ -13,7 +13,7 @@ from apt_evap._common.validation import check_array, check_count, check_kind
 from apt_evap.simulation.run import Run
 
 
-class Course(NamedTuple):
+class SmoothedHistory(NamedTuple):
     """Percentiles of a quantity in successive sections of the ions, each of shape (k,)."""
 
     ions: np.ndarray
@@ -71,7 +71,7 @@ def evaporation_voltages(run: Run) -> Floats:
     return run.voltage * fields / run.fields
 
 
-def course(values: ArrayLike, points: int = 200) -> Course:
+def smoothed_history(values: ArrayLike, points: int = 200) -> SmoothedHistory:
     """Median and 5 and 95 % percentiles of successive sections of nearly equal length.
 
     Parameters
@@ -96,4 +96,6 @@ def course(values: ArrayLike, points: int = 200) -> Course:
         raise ValueError("values must contain at least one, got none")
     edges = np.linspace(0, len(values), min(points, len(values)) + 1).astype(int)
     sections = np.split(values, edges[1:-1])
-    return Course((edges[:-1] + edges[1:]) / 2, *np.array([np.percentile(part, [5, 50, 95]) for part in sections]).T)
+    return SmoothedHistory(
+        (edges[:-1] + edges[1:]) / 2, *np.array([np.percentile(part, [5, 50, 95]) for part in sections]).T
+    )

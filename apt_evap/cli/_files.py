@@ -19,16 +19,16 @@ from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import did_you_mean
 from apt_evap._version import __version__
 from apt_evap.config.lens_text import read_lens
-from apt_evap.crystallography.orientation import Orientation
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
+from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.detection.projection import Projection
 from apt_evap.detection.timing import mass_to_charge
 from apt_evap.io.distortion_grid import read_grid
 from apt_evap.io.formats import read as read_file
 from apt_evap.io.formats import read_ranges
-from apt_evap.microscope.local_electrode import LocalElectrode
-from apt_evap.registration.register import Registration
+from apt_evap.maps.crystallography.orientation import Orientation
+from apt_evap.maps.registration.register import Registration
 from apt_evap.simulation.run import Run, load
 
 _MARK = f"apt_evap {__version__}"

@@ -23,11 +23,11 @@ from apt_evap.detection.binning import MAX_BINS
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.fit.fit_energies import fit_energies
+from apt_evap.fit.fit_settings import FitSettings
 from apt_evap.fit.grid import MEANS, MECHANISMS, ROLLUP_FRACTIONS, RSDS, EnergyGrid
-from apt_evap.fit.settings import FitSettings
 from apt_evap.fit.study import Study
-from apt_evap.report.origin import recorded_warnings
-from apt_evap.report.study import write_study
+from apt_evap.plot.report.origin import recorded_warnings
+from apt_evap.plot.report.study_report import write_study
 from apt_evap.simulation.run import Run, load
 from apt_evap.simulation.run_hdf5 import is_run
 from apt_evap.warnings import RegistrationWarning, StructureWarning

@@ -6,8 +6,8 @@ from pathlib import Path
 from apt_evap.cli._options import add_speech, integer_type
 from apt_evap.cli._output import say, tell, tell_json
 from apt_evap.config.cost_estimate import hours_text
-from apt_evap.dataset.description import ABOUT, verify
-from apt_evap.dataset.making import make, plan_set
+from apt_evap.studies.dataset.making import make_dataset, plan_dataset
+from apt_evap.studies.dataset.set_description import ABOUT, verify_dataset
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,10 +37,10 @@ def execute(options: argparse.Namespace) -> int:
     """Run the command."""
     path = Path(options.study)
     if path.is_dir() and (path / ABOUT).exists():
-        content = verify(path)
+        content = verify_dataset(path)
         tell(options, f"{path}: all files are as in its checksums")
     else:
-        planned = plan_set(path)
+        planned = plan_dataset(path)
         hours = "" if planned.hours is None else f"; about {hours_text(planned.hours)} of one worker left"
         tell(options, f"{len(planned.sweep.points):,} runs, {planned.examples:,} examples{hours}")
         tell(
@@ -61,7 +61,7 @@ def execute(options: argparse.Namespace) -> int:
             )
             return 0
         path = Path(options.output) if options.output else path.with_name(f"{path.stem}_set")
-        content = make(
+        content = make_dataset(
             planned,
             path,
             workers=options.workers,

@@ -9,7 +9,7 @@ from apt_evap.cli._options import add_indexing, add_reading, add_speech
 from apt_evap.cli._output import tell, tell_json
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
-from apt_evap.indexing.index import Indexing, index
+from apt_evap.maps.indexing.index_map import Indexing, index
 from apt_evap.simulation.run import Run
 
 

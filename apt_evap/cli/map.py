@@ -33,15 +33,15 @@ from apt_evap.cli._options import (
 from apt_evap.cli._output import say, tell, tell_json
 from apt_evap.config.map_panels import MapSettings, Panel
 from apt_evap.config.perturbation_text import read_perturbation
-from apt_evap.crystallography.orientation import Orientation
 from apt_evap.detection.binning import MAX_BINS, shown_bins
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.projection import Projection
 from apt_evap.emission.perturbations import Unperturbed
-from apt_evap.indexing.index import index
-from apt_evap.indexing.search import disc_of
-from apt_evap.plot.maps import binned, default_smoothing, specimen_title
+from apt_evap.maps.crystallography.orientation import Orientation
+from apt_evap.maps.indexing.index_map import index
+from apt_evap.maps.indexing.orientation_search import disc_of
+from apt_evap.plot.map_figures import binned, default_smoothing, specimen_title
 from apt_evap.simulation.run import Run
 from apt_evap.simulation.surface import surface_after
 

@@ -15,7 +15,7 @@ from apt_evap.cli._output import INTERRUPTED, say, tell, tell_json
 from apt_evap.cli.map import run_maps, summaries
 from apt_evap.config.cost_estimate import estimate_cost
 from apt_evap.config.simulation_file import config_of, read_document
-from apt_evap.plot.maps import specimen_title
+from apt_evap.plot.map_figures import specimen_title
 from apt_evap.simulation.checkpoint import Checkpoint
 from apt_evap.simulation.recorder import RunInterrupted
 from apt_evap.simulation.run_hdf5 import is_run

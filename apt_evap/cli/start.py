@@ -10,7 +10,7 @@ from apt_evap.cli._files import check_output, lens_of, path_word
 from apt_evap.cli._options import add_indexing, add_reading, add_specimen, add_speech
 from apt_evap.cli._output import tell, tell_json
 from apt_evap.cli.index import indexed
-from apt_evap.twin.start import MARK, Start, settings_of
+from apt_evap.fit.start_settings import MARK, Start, settings_of
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

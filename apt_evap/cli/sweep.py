@@ -10,10 +10,10 @@ from apt_evap.cli._options import SHAPE, add_speech, integer_type
 from apt_evap.cli._output import put, say, tell, tell_json
 from apt_evap.config.cost_estimate import hours_text
 from apt_evap.detection.binning import MAX_BINS
-from apt_evap.sweep.collection import collect
-from apt_evap.sweep.planning import open_sweep, plan, retry, status
-from apt_evap.sweep.point_folder import STATES, run_point
-from apt_evap.sweep.working import work, work_with_dask
+from apt_evap.studies.sweep.collection import collect_sweep
+from apt_evap.studies.sweep.planning import open_sweep, plan_sweep, retry, sweep_status
+from apt_evap.studies.sweep.point_folder import STATES, run_point
+from apt_evap.studies.sweep.working import run_sweep, run_sweep_with_dask
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,8 +38,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         return action
 
     add_speech(add("plan", "make the folder of a sweep, and estimate memory and hours; nothing is run"))
-    work = add("work", "run the points that are waiting")
-    where = work.add_mutually_exclusive_group()
+    run_sweep = add("work", "run the points that are waiting")
+    where = run_sweep.add_mutually_exclusive_group()
     where.add_argument("--workers", type=integer_type(1), default=1, metavar="N", help="processes; default: 1")
     where.add_argument(
         "--point",
@@ -48,9 +48,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         help="only this point, by its key or number from 0, in this process; may be repeated",
     )
     where.add_argument("--scheduler", choices=("dask",), help="let the workers of a Dask cluster work")
-    work.add_argument("--address", metavar="TCP", help="address of the scheduler of Dask")
-    work.add_argument("--retry", action="store_true", help="also try failed points again")
-    add_speech(work)
+    run_sweep.add_argument("--address", metavar="TCP", help="address of the scheduler of Dask")
+    run_sweep.add_argument("--retry", action="store_true", help="also try failed points again")
+    add_speech(run_sweep)
     add("status", "show the states of all points").add_argument("--json", action="store_true", help="as JSON")
     gather = add("collect", "collect the finished points: table, maps, report, and the fit to a measured map")
     gather.add_argument("--maps", metavar="MAPS.h5", help="default: maps.h5 in the folder of the sweep")
@@ -65,7 +65,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _plan(options):
-    sweep = plan(options.study)
+    sweep = plan_sweep(options.study)
     hours = [cost.hours for cost in sweep.estimates]
     memory = [cost.memory for cost in sweep.estimates if cost.memory is not None]
     content = {
@@ -96,13 +96,13 @@ def _work(options):
     if options.scheduler == "dask":
         if options.address is None:
             raise ValueError("--scheduler dask needs --address, such as tcp://10.0.0.1:8786")
-        states = work_with_dask(sweep, options.address)
+        states = run_sweep_with_dask(sweep, options.address)
     else:
-        states = work(sweep, workers=options.workers)
+        states = run_sweep(sweep, workers=options.workers)
     for key, state in states.items():
         if state.name == "waiting":
             say("note", f"point {key} will continue: {state.message}")
-    content = status(sweep)
+    content = sweep_status(sweep)
     _tell_counts(options, content)
     tell_json(options, {"folder": content["folder"], **content["counts"]})
     return 0
@@ -122,7 +122,7 @@ def _work_on_points(options, sweep):
 
 
 def _status(options):
-    content = status(open_sweep(options.study))
+    content = sweep_status(open_sweep(options.study))
     if options.json:
         put(json.dumps(content, allow_nan=False))
         return 0
@@ -151,7 +151,7 @@ def _tell_counts(options, content):
 
 def _collect(options):
     sweep = open_sweep(options.study)
-    result = collect(
+    result = collect_sweep(
         sweep,
         maps=options.maps,
         bins=options.bins,

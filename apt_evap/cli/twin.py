@@ -21,20 +21,20 @@ from apt_evap.cli.compare import REPORT, compare
 from apt_evap.cli.index import map_of
 from apt_evap.cli.parser import make_parser
 from apt_evap.cli.start import start_of, summary
-from apt_evap.crystallography.orientation import Orientation
 from apt_evap.detection.projection import Projection
 from apt_evap.emission.perturbations import LateralVelocity, RollUp
-from apt_evap.indexing.index import Candidate
-from apt_evap.indexing.master_pattern import master_patterns
+from apt_evap.fit.measured_constants import constants_of
+from apt_evap.fit.start_settings import ENERGY, HEIGHT, ROLLS, SHARPNESS, near
 from apt_evap.io.formats import read_ranges
-from apt_evap.registration.register import at_bound, register
-from apt_evap.report.measurement import measurement_section
-from apt_evap.report.page import Page
+from apt_evap.maps.crystallography.orientation import Orientation
+from apt_evap.maps.indexing.index_map import Candidate
+from apt_evap.maps.indexing.master_pattern import master_patterns
+from apt_evap.maps.registration.register import at_bound, register
+from apt_evap.plot.report.html_page import Page
+from apt_evap.plot.report.measurement_report import measurement_section
 from apt_evap.simulation.run import load
 from apt_evap.simulation.run_hdf5 import is_run
 from apt_evap.specimen.materials import material
-from apt_evap.twin.constants import constants_of
-from apt_evap.twin.start import ENERGY, HEIGHT, ROLLS, SHARPNESS, near
 from apt_evap.warnings import RegistrationWarning, warn
 
 SETTINGS, FACTS, RUN, REGISTRATION, STUDY, ANSWER = (

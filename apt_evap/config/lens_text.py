@@ -6,7 +6,7 @@ from typing import Any
 from apt_evap._common.codec import from_plain
 from apt_evap._common.validation import check_kind, short_text
 from apt_evap.config.toml_text import read_toml
-from apt_evap.microscope.local_electrode import PRESETS, LocalElectrode
+from apt_evap.detection.microscope.local_electrode import ELECTRODE_PRESETS, LocalElectrode
 
 
 def read_lens(settings: str | Mapping[str, Any]) -> LocalElectrode:
@@ -41,10 +41,10 @@ def read_lens(settings: str | Mapping[str, Any]) -> LocalElectrode:
     table = dict(check_kind(settings, "lens", Mapping, "a text or a table"))
     if "preset" in table:
         name = table.pop("preset")
-        known = {each.replace(" ", "-"): each for each in PRESETS}
+        known = {each.replace(" ", "-"): each for each in ELECTRODE_PRESETS}
         if not isinstance(name, str) or name.replace(" ", "-") not in known:
-            raise ValueError(f"preset must be {' or '.join(map(repr, PRESETS))}, got {short_text(name)}")
-        table = {**PRESETS[known[name.replace(" ", "-")]], **table}
+            raise ValueError(f"preset must be {' or '.join(map(repr, ELECTRODE_PRESETS))}, got {short_text(name)}")
+        table = {**ELECTRODE_PRESETS[known[name.replace(" ", "-")]], **table}
     return from_plain(table, LocalElectrode, what="lens")
 
 

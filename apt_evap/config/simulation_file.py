@@ -20,17 +20,17 @@ from apt_evap.config.own_classes import with_own_objects
 from apt_evap.config.tables import check_keys, check_table
 from apt_evap.config.toml_text import check_levels, read_toml
 from apt_evap.detection.detector import Detector
+from apt_evap.detection.microscope.local_electrode import LocalElectrode
+from apt_evap.detection.microscope.run_lens import field_of_view
 from apt_evap.emission.perturbations import Perturbation
+from apt_evap.evaporation.charge_settings import ChargeSettings
 from apt_evap.evaporation.law import Law, check_law
 from apt_evap.evaporation.rule import RULES, CompiledRule, Rule, check_rule
-from apt_evap.evaporation.settings import ChargeSettings
 from apt_evap.evaporation.thermal import LAWS
 from apt_evap.evaporation.voltage import VoltageControl, check_voltage
-from apt_evap.flight.crew import WHOLE_DETECTOR, FlightSettings
-from apt_evap.flight.response import ResponseSettings
 from apt_evap.io.specimens import read_tip
-from apt_evap.microscope.local_electrode import LocalElectrode
-from apt_evap.microscope.run_lens import field_of_view
+from apt_evap.simulation.flight.flight_pool import WHOLE_DETECTOR, FlightSettings
+from apt_evap.simulation.flight.response import ResponseSettings
 from apt_evap.simulation.monitor import Monitor
 from apt_evap.simulation.real_units import OperatingPoint, check_flight_charges
 from apt_evap.simulation.run import Run

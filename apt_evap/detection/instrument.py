@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from apt_evap._common.codec import checked, number, part, settings, vector
+from apt_evap._common.ion_random import IonRandom
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_choice, check_kind, check_number, check_seed
 from apt_evap._core.elementary import arctangent, normal_quantile
 from apt_evap.detection.detector import PROJECTIONS
 from apt_evap.detection.hits import Hits, Outcome
 from apt_evap.detection.timing import Timing
-from apt_evap.emission.ion_random import IonRandom
 
 _SEED_STEP = 0x3C6EF372FE94F82B  # other random numbers than those of perturbations, isotopes, charges and pulses
 _COLUMNS = 5  # random numbers per ion: efficiency, blur in x and y, energy deficit, delay
@@ -156,7 +156,7 @@ class Instrument:
         ValueError
             If the name is unknown or a parameter is outside its range.
         """
-        return cls(**{**PRESETS[check_choice(name, "name", PRESETS)], **changes})
+        return cls(**{**INSTRUMENT_PRESETS[check_choice(name, "name", INSTRUMENT_PRESETS)], **changes})
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
@@ -334,7 +334,7 @@ class Instrument:
         return dead
 
 
-PRESETS: dict[str, dict[str, Any]] = {
+INSTRUMENT_PRESETS: dict[str, dict[str, Any]] = {
     "straight, 100 mm": {"distance": 100.0, "field_of_view": 80.0, "efficiency": 0.80},
     "reflectron, 42 mm": {"distance": 42.0, "efficiency": 0.52},
 }

@@ -15,6 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from apt_evap._common.codec import checked, from_plain, is_settings, number, part, settings, to_plain, to_python
+from apt_evap._common.ion_random import IonRandom
 from apt_evap._common.validation import check_array, check_number, short_text
 from apt_evap._core.elementary import sine_and_cosine
 from apt_evap.emission.emissions import Emissions, Launches, TangentialLaunches, choose_launches
@@ -26,7 +27,6 @@ from apt_evap.emission.energies import (
     check_energy,
     draw_energies,
 )
-from apt_evap.emission.ion_random import IonRandom
 from apt_evap.emission.roll_probability import ChargeRatio, Migration, RollProbability
 from apt_evap.emission.surface_frame import (
     launch_tangentially,

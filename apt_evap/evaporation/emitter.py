@@ -22,8 +22,8 @@ from apt_evap._core.octree import Octree
 from apt_evap.emission.perturbations import warn_if_not_for
 from apt_evap.evaporation import rule as rules
 from apt_evap.evaporation.cap import Cap, measure_cap
+from apt_evap.evaporation.charge_settings import ChargeSettings, check_angle
 from apt_evap.evaporation.law import Extremal, Law, check_law, has_temperature, kernel_of
-from apt_evap.evaporation.settings import ChargeSettings, check_angle
 from apt_evap.evaporation.state import EmitterState
 from apt_evap.evaporation.voltage import RateControl, VoltageControl, check_voltage
 from apt_evap.specimen.ase_atoms import to_atoms

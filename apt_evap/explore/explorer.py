@@ -15,9 +15,6 @@ from apt_evap._common.codec import to_python
 from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence
 from apt_evap.analysis.apex import image_compression
 from apt_evap.config.perturbation_text import write_perturbation
-from apt_evap.crystallography.directions import poles
-from apt_evap.crystallography.orientation import Orientation
-from apt_evap.crystallography.symmetry import pole_symmetry
 from apt_evap.detection.binning import MAX_BINS, bins_for, field_of_view
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
@@ -26,11 +23,14 @@ from apt_evap.emission.perturbations import Perturbation, RollUp, TruncatedNorma
 from apt_evap.explore.controls import MECHANISMS, Control, controls_of, perturbation_of
 from apt_evap.explore.placement import misplaced
 from apt_evap.fit.fit_energies import BINS, measured_map
+from apt_evap.maps.crystallography.directions import poles
+from apt_evap.maps.crystallography.orientation import Orientation
+from apt_evap.maps.crystallography.symmetry import pole_symmetry
 from apt_evap.maps.profiles import Profile, Rectangle, zone_line_profile
+from apt_evap.maps.registration.register import Registration, register
+from apt_evap.maps.registration.verdict import Likeness, likeness, symmetric_places
 from apt_evap.maps.rings import Ring, ring_statistics
 from apt_evap.maps.similarity import WINDOW, Similarity, similarity, similarity_ceiling, window_fits
-from apt_evap.registration.register import Registration, register
-from apt_evap.registration.verdict import Likeness, likeness, symmetric_places
 from apt_evap.simulation.run import Run
 from apt_evap.warnings import AptWarning
 

@@ -22,7 +22,6 @@ from bokeh.models import (
 )
 
 from apt_evap._common.codec import to_python
-from apt_evap.crystallography.orientation import Orientation
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.projection import Projection
@@ -31,9 +30,10 @@ from apt_evap.explore.marks import Marks, overlay
 from apt_evap.explore.search_process import SearchProcess, guarded, start_thread
 from apt_evap.explore.widgets import LEFT
 from apt_evap.fit.fit_energies import measured_map
-from apt_evap.indexing.index import Indexing, index
+from apt_evap.fit.start_settings import Start, settings_of
+from apt_evap.maps.crystallography.orientation import Orientation
+from apt_evap.maps.indexing.index_map import Indexing, index
 from apt_evap.specimen.materials import MATERIALS
-from apt_evap.twin.start import Start, settings_of
 
 HINT = "mode “pole”: click a pole whose family you choose here; drag a mark to move it"
 MOVED = "moved by hand"

@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from apt_evap._common.types import Floats
-from apt_evap.crystallography.directions import Poles, poles, zones
-from apt_evap.crystallography.orientation import FittedOrientation, Orientation, fit_orientation
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.projection import Projection
+from apt_evap.maps.crystallography.directions import Poles, poles, zones
+from apt_evap.maps.crystallography.orientation import FittedOrientation, Orientation, fit_orientation
 from apt_evap.specimen.materials import as_material
 
 FAMILIES = 10

@@ -61,9 +61,9 @@ from apt_evap.explore.widgets import (
     show_extent,
     square,
 )
+from apt_evap.maps.registration.register import Registration
 from apt_evap.maps.zone_line import fit_zone_line
 from apt_evap.plot.limits import color_limits, common_limits
-from apt_evap.registration.register import Registration
 from apt_evap.specimen.materials import MATERIALS
 from apt_evap.warnings import AptWarning
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from apt_evap.detection.detector_map import DetectorMap
-from apt_evap.registration.correlation_search import BROAD, MEDIUM, NARROW, View, correlation
-from apt_evap.registration.register import Registration
+from apt_evap.maps.registration.correlation_search import BROAD, MEDIUM, NARROW, View, correlation
+from apt_evap.maps.registration.register import Registration
 
 _ANGLES, _SCALES = np.arange(0.0, 360.0, 3.0), (0.85, 1.0, 1.18)
 _COMMON = 0.6  # of the area that must stay common

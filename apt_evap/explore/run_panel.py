@@ -16,7 +16,7 @@ from apt_evap._common.validation import short_text
 from apt_evap.explore.background_run import BackgroundRun
 from apt_evap.explore.search_process import guarded, start_thread
 from apt_evap.explore.widgets import LEFT
-from apt_evap.twin.start import Start
+from apt_evap.fit.start_settings import Start
 
 INTERVAL = 500
 """Time between two looks at the run [ms]."""

@@ -14,7 +14,7 @@ from bokeh.util.token import generate_session_id
 from apt_evap.explore.explorer import Explorer, View
 from apt_evap.explore.page import Page
 from apt_evap.explore.run_panel import Workbench
-from apt_evap.registration.register import Registration
+from apt_evap.maps.registration.register import Registration
 
 _ADDRESS = "127.0.0.1"
 

@@ -19,8 +19,8 @@ import scipy
 
 from apt_evap._common.types import Floats, Integers
 from apt_evap.detection.detector_map import DetectorMap, check_sigma, masked_gaussian
+from apt_evap.fit.fit_settings import FitSettings
 from apt_evap.fit.resampling import NOISE
-from apt_evap.fit.settings import FitSettings
 from apt_evap.maps.similarity import WINDOW, local_moments, local_similarity, window_fits, window_mean
 
 _FEWEST_CELLS = 50

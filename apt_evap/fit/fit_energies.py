@@ -17,14 +17,14 @@ from apt_evap.detection.hits import Hits
 from apt_evap.emission.energies import Thermal
 from apt_evap.emission.perturbations import LateralVelocity, Unperturbed
 from apt_evap.fit.comparison import FoldedComparison
+from apt_evap.fit.energy_search import EnergySearch, register_repeatedly
+from apt_evap.fit.fit_settings import FitSettings
 from apt_evap.fit.grid import EnergyGrid, maxima
 from apt_evap.fit.intervals import intervals as intervals_of
-from apt_evap.fit.search import EnergySearch, register_repeatedly
-from apt_evap.fit.settings import FitSettings
 from apt_evap.fit.structure import PoleMeasure, StructureScores
 from apt_evap.fit.study import Score, Study
+from apt_evap.maps.registration.register import Registration
 from apt_evap.maps.similarity import WINDOW
-from apt_evap.registration.register import Registration
 from apt_evap.simulation.real_units import RealUnits
 from apt_evap.simulation.run import Run
 from apt_evap.warnings import MapWarning, RegistrationWarning, ResponseWarning, StructureWarning, warn

@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_count, check_kind, check_number, check_sequence
 from apt_evap.analysis.apex import image_compression
-from apt_evap.crystallography.directions import plane_normals
-from apt_evap.crystallography.orientation import Orientation
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.emission.perturbations import Perturbation
 from apt_evap.fit.structure import Structure
+from apt_evap.maps.crystallography.directions import plane_normals
+from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.pole_frame import Directions
 from apt_evap.maps.pole_profiles import pole_profile
 from apt_evap.maps.rings import RINGS, ring_statistics

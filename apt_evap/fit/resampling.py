@@ -15,7 +15,7 @@ from apt_evap._common.types import Floats
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.perturbations import Perturbation
-from apt_evap.registration.register import Registration
+from apt_evap.maps.registration.register import Registration
 from apt_evap.simulation.run import Run
 
 NOISE = 0.1

@@ -18,17 +18,17 @@ from apt_evap._common.codec import to_plain
 from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import Floats, Integers
 from apt_evap.analysis.apex import image_compression
-from apt_evap.crystallography.directions import plain_label, plane_normals, poles
-from apt_evap.crystallography.orientation import Orientation
-from apt_evap.crystallography.symmetry import pole_symmetry
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.projection import Projection
+from apt_evap.maps.crystallography.directions import plain_label, plane_normals, poles
+from apt_evap.maps.crystallography.orientation import Orientation
+from apt_evap.maps.crystallography.symmetry import pole_symmetry
 from apt_evap.maps.folded_map import FoldedMap, folded, symmetric_cells
 from apt_evap.maps.pole_frame import pole_frame
 from apt_evap.maps.pole_profiles import pole_profile
 from apt_evap.maps.profiles import Profile
+from apt_evap.maps.registration.register import Registration
 from apt_evap.maps.rings import RINGS, LineAmplitude, Ring, line_amplitude, ring_statistics
-from apt_evap.registration.register import Registration
 from apt_evap.simulation.run import Run
 
 LOST = 0.5

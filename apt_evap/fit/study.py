@@ -13,16 +13,16 @@ from apt_evap._common.files import replace_file
 from apt_evap._common.notebook import as_table
 from apt_evap._common.types import AnyPath, Floats
 from apt_evap._version import __version__
-from apt_evap.crystallography.directions import plain_label
-from apt_evap.crystallography.orientation import Orientation
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.projection import Projection
 from apt_evap.emission.perturbations import described
+from apt_evap.fit.fit_settings import FitSettings
 from apt_evap.fit.grid import EnergyGrid
-from apt_evap.fit.settings import FitSettings
 from apt_evap.fit.structure import RegisteredProjection, StructureScores
-from apt_evap.registration.register import Registration
-from apt_evap.registration.verdict import Likeness, likeness, symmetric_places
+from apt_evap.maps.crystallography.directions import plain_label
+from apt_evap.maps.crystallography.orientation import Orientation
+from apt_evap.maps.registration.register import Registration
+from apt_evap.maps.registration.verdict import Likeness, likeness, symmetric_places
 
 
 class Score(NamedTuple):

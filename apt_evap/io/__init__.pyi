@@ -1,4 +1,4 @@
-# The public names of this room: read by type checkers, and by the lazy loader in __init__.py.
+# The public names of this package: read by type checkers, and by the lazy loader in __init__.py.
 from .distortion_grid import read_grid as read_grid
 from .formats import TruncatedFile as TruncatedFile
 from .formats import chunks as chunks

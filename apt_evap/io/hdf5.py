@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 from typing import Any
 
+from apt_evap._common.checked_hdf5 import open_hdf5
 from apt_evap._common.files import FileError, check_path
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import short_text
 from apt_evap.io.nxapm import KIND, read_nxapm
 from apt_evap.io.pyccapt import is_pyccapt, read_pyccapt
-from apt_evap.storage.checked_hdf5 import open_hdf5
 
 
 def read_hdf5(path: AnyPath, *, columns: Sequence[str] | None = None) -> Any:

@@ -1,6 +1,6 @@
 """NeXus NXapm: ions in an HDF5 file with the groups and fields of this standard for atom probe data.
 
-Columns for which NXapm has no name are in the group ``entry1/ions`` (NXcollection). See `apt_evap.storage.nexus`.
+Columns for which NXapm has no name are in the group ``entry1/ions`` (NXcollection). See `apt_evap._common.nexus`.
 """
 
 import datetime
@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
+from apt_evap._common.checked_hdf5 import CheckedFile, open_hdf5, put_field, put_text, write_hdf5
 from apt_evap._common.files import FileError
+from apt_evap._common.nexus import ENTRY, HITS, IONS, MASSES, MULTIPLICITY, TIMES, put_group, put_nxapm
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_kind, check_sequence, short_text
 from apt_evap._version import __version__
 from apt_evap.detection.hits import Hits
 from apt_evap.io._records import check_columns
 from apt_evap.io._texts import ELEMENTS
-from apt_evap.storage.checked_hdf5 import CheckedFile, open_hdf5, put_field, put_text, write_hdf5
-from apt_evap.storage.nexus import ENTRY, HITS, IONS, MASSES, MULTIPLICITY, TIMES, put_group, put_nxapm
 
 KIND = "ions"
 _OWN = f"{ENTRY}/ions"

@@ -8,13 +8,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from apt_evap._common.checked_hdf5 import CheckedFile, open_hdf5
 from apt_evap._common.files import FileError
 from apt_evap._common.types import AnyPath
 from apt_evap.detection.hits import Hits
 from apt_evap.io._pulses import first_from_equal, ions_per_pulse, pulses_from_first
 from apt_evap.io._records import check_any, check_columns
 from apt_evap.io.nxapm import numbers
-from apt_evap.storage.checked_hdf5 import CheckedFile, open_hdf5
 
 _MM_PER_CM = 10.0
 _MAX_BLOCKS = 100

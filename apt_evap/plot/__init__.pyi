@@ -1,4 +1,4 @@
-# The pictures: read by type checkers, and by the lazy loader in __init__.py.
+# The public names of this package: read by type checkers, and by the lazy loader in __init__.py.
 from ._figure import add_colorbar as add_colorbar
 from ._figure import new_figure as new_figure
 from .candidates import indexing as indexing
@@ -8,24 +8,27 @@ from .histories import history as history
 from .histories import voltage_curve as voltage_curve
 from .limits import color_limits as color_limits
 from .limits import common_limits as common_limits
-from .losses import conditions as conditions
-from .maps import binned as binned
-from .maps import describe as describe
-from .maps import detector_map as detector_map
-from .maps import detector_maps as detector_maps
-from .maps import specimen_title as specimen_title
+from .loss_figures import conditions as conditions
+from .map_figures import binned as binned
+from .map_figures import describe as describe
+from .map_figures import detector_map as detector_map
+from .map_figures import detector_maps as detector_maps
+from .map_figures import specimen_title as specimen_title
 from .overlays import overlay as overlay
 from .overlays import score_surface as score_surface
 from .pole_labels import poles as poles
-from .profiles import profile as profile
-from .profiles import profile_comparison as profile_comparison
-from .profiles import rectangles as rectangles
+from .profile_figures import profile as profile
+from .profile_figures import profile_comparison as profile_comparison
+from .profile_figures import rectangles as rectangles
 from .reconstructions import reconstruction as reconstruction
+from .report.html_page import read_report as read_report
+from .report.study_report import write_study as write_study
+from .report.sweep_report import write_sweep as write_sweep
 from .responses import ion_colors as ion_colors
 from .responses import response as response
-from .specimens import cut as cut
-from .specimens import mark_atoms as mark_atoms
-from .specimens import specimen as specimen
+from .specimen_figures import cut as cut
+from .specimen_figures import mark_atoms as mark_atoms
+from .specimen_figures import specimen as specimen
 from .spectra import spectrum as spectrum
-from .study import score_matrix as score_matrix
-from .study import side_by_side as side_by_side
+from .study_figures import score_matrix as score_matrix
+from .study_figures import side_by_side as side_by_side

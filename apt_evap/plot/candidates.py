@@ -4,9 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apt_evap._common.validation import check_count, check_kind
-from apt_evap.indexing.index import Indexing
+from apt_evap.maps.indexing.index_map import Indexing
 from apt_evap.plot._figure import new_figure
-from apt_evap.plot.maps import color_limits, detector_map
+from apt_evap.plot.map_figures import color_limits, detector_map
 from apt_evap.plot.pole_labels import poles
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from apt_evap._common.validation import check_array, check_choice, check_kind
 from apt_evap.analysis.charge_states import ChargeStateMap
 from apt_evap.plot._figure import OUTSIDE, add_colorbar, ion_label, new_figure, set_caption, set_log_ticks, set_title
-from apt_evap.plot.maps import describe
+from apt_evap.plot.map_figures import describe
 
 _LEAST_RANGE = {
     "ratio": 1.5,

@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from apt_evap._common.validation import check_choice, check_count, check_kind
-from apt_evap.analysis.charge_states import LEAST, course_of_charges, ion_charges
-from apt_evap.analysis.voltage_history import course, evaporation_voltages
+from apt_evap.analysis.charge_states import LEAST, charge_history, ion_charges
+from apt_evap.analysis.voltage_history import evaporation_voltages, smoothed_history
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.plot._figure import ion_label, new_figure, set_log_ticks
@@ -137,7 +137,7 @@ def _label_ions(ax):
 
 
 def _draw_course(ax, values, points):
-    ions, low, median, high = course(values, points)
+    ions, low, median, high = smoothed_history(values, points)
     ax.fill_between(ions, low, high, color="C0", alpha=0.25, linewidth=0, label="90 % of the ions")
     ax.plot(ions, median, color="C0", linewidth=1.3, label="median")
 
@@ -210,9 +210,9 @@ def _charges(charges, element, points):
     numbers = np.bincount(charges)
     if len(numbers) < 3 or np.minimum(numbers[1:-1], numbers[2:]).max() < LEAST:
         return []
-    ratios = course_of_charges(charges, element or "")
+    ratios = charge_history(charges, element or "")
     if len(ratios.middles) > points:
-        ratios = course_of_charges(charges, element or "", sections=points)
+        ratios = charge_history(charges, element or "", sections=points)
     return [(_draw_ratio, ratios)]
 
 

@@ -7,10 +7,10 @@ from matplotlib.lines import Line2D
 from apt_evap._common.validation import check_kind
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
+from apt_evap.maps.registration.correlation_search import BROAD, View
+from apt_evap.maps.registration.register import Registration, ScoreSurface
 from apt_evap.plot._figure import OUTSIDE, DrawnAxes, add_colorbar, new_figure, set_caption, set_title
-from apt_evap.plot.maps import detector_map
-from apt_evap.registration.correlation_search import BROAD, View
-from apt_evap.registration.register import Registration, ScoreSurface
+from apt_evap.plot.map_figures import detector_map
 
 BRIGHT, DARK, RIM = "cyan", "lime", "white"
 _SMOOTHING = 0.015
@@ -119,7 +119,7 @@ def score_surface(surface: ScoreSurface, ax: Axes | None = None) -> Axes:
     Parameters
     ----------
     surface : ScoreSurface
-        Result of `registration.score_surface`, for at least two rotations and two scales.
+        Result of `maps.score_surface`, for at least two rotations and two scales.
     ax : matplotlib.axes.Axes, optional
         A new figure by default.
 
@@ -136,7 +136,7 @@ def score_surface(surface: ScoreSurface, ax: Axes | None = None) -> Axes:
     --------
     >>> run = ae.Simulation(ae.Tip("Ni", apex_radius=2.5, axis=(1, 1, 1)), seed=1).run(400)
     >>> simulated = run.hits(ae.RollUp(0.2)).map(bins=32)
-    >>> surface = ae.registration.score_surface(simulated, simulated, rotations=(-60, 60), scales=(0.9, 1.1))
+    >>> surface = ae.maps.score_surface(simulated, simulated, rotations=(-60, 60), scales=(0.9, 1.1))
     >>> ae.plot.score_surface(surface).get_title()
     'score 0.99 at 0 degrees and 1.02'
     """

@@ -9,11 +9,11 @@ from matplotlib.patheffects import withStroke
 
 from apt_evap._common.validation import check_kind
 from apt_evap.analysis.apex import image_compression
-from apt_evap.crystallography.directions import poles as poles_of
-from apt_evap.crystallography.directions import zones
-from apt_evap.crystallography.orientation import FittedOrientation, Orientation
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.projection import Projection
+from apt_evap.maps.crystallography.directions import poles as poles_of
+from apt_evap.maps.crystallography.directions import zones
+from apt_evap.maps.crystallography.orientation import FittedOrientation, Orientation
 from apt_evap.plot._figure import DrawnAxes
 from apt_evap.simulation.run import Run
 

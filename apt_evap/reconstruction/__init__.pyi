@@ -1,24 +1,12 @@
-# The public names of this room: read by type checkers, and by the lazy loader in __init__.py.
-from .calibration import DistributionMap as DistributionMap
+# The public names of this package: read by type checkers, and by the lazy loader in __init__.py.
 from .calibration import compression_from_poles as compression_from_poles
 from .calibration import distribution_map as distribution_map
-from .consistency import Check as Check
 from .consistency import checks as checks
 from .constants import run_constants as run_constants
 from .density import CapDensity as CapDensity
-from .errors import ErrorBins as ErrorBins
-from .errors import ErrorField as ErrorField
-from .errors import GroupErrors as GroupErrors
 from .errors import ReconstructionErrors as ReconstructionErrors
-from .interface import DistanceProfile as DistanceProfile
-from .interface import InterfaceProfile as InterfaceProfile
-from .interface import SegregationProfile as SegregationProfile
 from .interface import interface_profile as interface_profile
 from .interface import segregation_profile as segregation_profile
-from .origins import OriginTable as OriginTable
 from .origins import origin_table as origin_table
-from .precipitate import PrecipitateErrors as PrecipitateErrors
-from .precipitate import SemiAxes as SemiAxes
 from .precipitate import precipitate_errors as precipitate_errors
-from .shank import ShankFit as ShankFit
 from .shank import fit_shank as fit_shank

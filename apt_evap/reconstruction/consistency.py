@@ -73,7 +73,7 @@ def checks(
     >>> rng = np.random.default_rng(1)
     >>> radius, azimuth = 20 * np.sqrt(rng.random(50_000)), 2 * np.pi * rng.random(50_000)  # mm, uniform
     >>> ions = ae.Hits(x=radius * np.cos(azimuth), y=radius * np.sin(azimuth))
-    >>> lens = ae.microscope.LocalElectrode.preset("local electrode")
+    >>> lens = ae.detection.LocalElectrode.preset("local electrode")
     >>> found = ae.reconstruct(ions, atomic_volume=0.011, distance=90.0, radius=30.0, lens=lens)
     >>> for check in ae.reconstruction.checks(found):
     ...     print(check)

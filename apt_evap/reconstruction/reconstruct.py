@@ -25,9 +25,9 @@ from apt_evap._common.validation import (
     short_text,
 )
 from apt_evap.detection.hits import Hits
+from apt_evap.detection.microscope.lens import LAST_ANGLE
+from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.io.formats import write
-from apt_evap.microscope.lens import LAST_ANGLE
-from apt_evap.microscope.local_electrode import LocalElectrode
 from apt_evap.reconstruction.density import CapDensity, density_of
 from apt_evap.reconstruction.errors import (
     FREE,

@@ -10,7 +10,7 @@ import scipy
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_kind
 from apt_evap.detection.hits import Hits
-from apt_evap.microscope.local_electrode import LocalElectrode
+from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.reconstruction.reconstruct import Reconstruction, reconstruct
 
 _ANGLES = (0.5, 1.0, 2.0, 3.0, 5.0, 7.0, 10.0, 14.0, 20.0)  # degrees, between which the angle is searched
@@ -75,7 +75,7 @@ def fit_shank(hits: Hits, lens: LocalElectrode, **constants: Any) -> ShankFit:
 
     Examples
     --------
-    >>> lens = ae.microscope.LocalElectrode(40e3, 20e3, shank_angle=6.0)
+    >>> lens = ae.detection.LocalElectrode(40e3, 20e3, shank_angle=6.0)
     >>> radii = np.linspace(30.0, 40.0, 2000)  # nm, of a cap that recedes on this shank
     >>> rng = np.random.default_rng(1)
     >>> places = rng.uniform(-20, 20, (2, 2000))

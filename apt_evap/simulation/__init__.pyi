@@ -1,15 +1,10 @@
-# The public names of this room: read by type checkers, and by the lazy loader in __init__.py.
+# The public names of this package: read by type checkers, and by the lazy loader in __init__.py.
 from .checkpoint import Checkpoint as Checkpoint
-from .columns import Clock as Clock
-from .columns import Column as Column
-from .columns import Flown as Flown
-from .history import CapHistory as CapHistory
-from .history import History as History
+from .flight.launch_designs import Design as Design
+from .flight.launch_designs import WideDesign as WideDesign
 from .monitor import Monitor as Monitor
 from .monitor import charge_residuals as charge_residuals
 from .real_units import OperatingPoint as OperatingPoint
-from .real_units import RealColumns as RealColumns
-from .real_units import RealUnits as RealUnits
 from .recorder import RunInterrupted as RunInterrupted
 from .recorder import RunNotSaved as RunNotSaved
 from .stop_reason import StopReason as StopReason

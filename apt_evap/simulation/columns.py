@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from apt_evap._common.types import Floats
 from apt_evap._core import events
 from apt_evap.emission.emissions import Emissions
-from apt_evap.flight.response import Responses, ResponseSettings
+from apt_evap.simulation.flight.response import Responses, ResponseSettings
 from apt_evap.simulation.real_units import RealColumns
 
 

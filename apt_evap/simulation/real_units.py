@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apt_evap._common.codec import checked, choice, count, from_plain, number, part, settings
+from apt_evap._common.ion_random import IonRandom
 from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_count, check_seed, short_text
 from apt_evap._core.elementary import logarithm
 from apt_evap.detection.timing import Timing
-from apt_evap.emission.ion_random import IonRandom
 from apt_evap.emission.post_ionisation import FLIGHT_CHARGES, PostIonisation
 from apt_evap.evaporation.voltage import VoltageControl
 from apt_evap.simulation.history import CapHistory

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apt_evap._common.codec import changed, from_plain, to_plain
+from apt_evap._common.ion_random import IonRandom
 from apt_evap._common.notebook import as_table
 from apt_evap._common.small_matrices import squared_lengths
 from apt_evap._common.types import AnyPath, Booleans, Floats, Integers
@@ -26,14 +27,11 @@ from apt_evap.detection.detector import Detector
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits, Outcome
 from apt_evap.detection.instrument import Instrument
+from apt_evap.detection.microscope.local_electrode import LocalElectrode
+from apt_evap.detection.microscope.run_lens import Course, RunLens
 from apt_evap.emission.emissions import Emissions, TangentialLaunches
-from apt_evap.emission.ion_random import IonRandom
 from apt_evap.emission.perturbations import Perturbation, Unperturbed, described, warn_if_not_for
 from apt_evap.evaporation.state import EmitterState
-from apt_evap.flight.field_of_view import stereographic_rim
-from apt_evap.flight.response import ResponseModel, Responses, ResponseSettings
-from apt_evap.microscope.local_electrode import LocalElectrode
-from apt_evap.microscope.run_lens import Course, RunLens
 from apt_evap.simulation.columns import (
     ALWAYS,
     OPTIONAL,
@@ -47,6 +45,8 @@ from apt_evap.simulation.columns import (
     response_columns,
     target_columns,
 )
+from apt_evap.simulation.flight.field_of_view import stereographic_rim
+from apt_evap.simulation.flight.response import ResponseModel, Responses, ResponseSettings
 from apt_evap.simulation.history import CapHistory, History
 from apt_evap.simulation.provenance import joined, provenance_now
 from apt_evap.simulation.real_units import OperatingPoint, RealColumns, RealUnits, in_real_units, random_of

@@ -1,6 +1,6 @@
 """The HDF5 file of a run: layout, writing and reading.
 
-Groups and fields have the names of NeXus NXapm if it defines one; see `apt_evap.storage.nexus` and docs/formats.rst.
+Groups and fields have the names of NeXus NXapm if it defines one; see `apt_evap._common.nexus` and docs/formats.rst.
 """
 
 import json
@@ -8,15 +8,16 @@ from typing import Any
 
 import numpy as np
 
+from apt_evap._common.checked_hdf5 import label_of, open_hdf5, put_field, put_text, write_hdf5
 from apt_evap._common.codec import from_plain, to_plain
 from apt_evap._common.files import FileError
+from apt_evap._common.nexus import ENTRY, IONS, put_group, put_nxapm
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_count, check_number, check_seed
 from apt_evap.detection.detector import Detector
 from apt_evap.emission.perturbations import described, perturbation_of
 from apt_evap.evaporation.state import EmitterState
 from apt_evap.evaporation.voltage import check_voltage
-from apt_evap.flight.response import ResponseSettings
 from apt_evap.simulation.columns import (
     ALWAYS,
     OPTIONAL,
@@ -27,12 +28,11 @@ from apt_evap.simulation.columns import (
     response_columns,
     target_columns,
 )
+from apt_evap.simulation.flight.response import ResponseSettings
 from apt_evap.simulation.history import CapHistory, History
 from apt_evap.simulation.provenance import provenance_now
 from apt_evap.simulation.real_units import RealUnits
 from apt_evap.simulation.stop_reason import StopReason
-from apt_evap.storage.checked_hdf5 import label_of, open_hdf5, put_field, put_text, write_hdf5
-from apt_evap.storage.nexus import ENTRY, IONS, put_group, put_nxapm
 
 _RUN = "run"  # kind of file
 

@@ -14,25 +14,25 @@ import numpy as np
 from apt_evap._common.codec import to_plain
 from apt_evap._common.files import FileError
 from apt_evap._common.interrupts import interruptible
+from apt_evap._common.ion_random import IonRandom
 from apt_evap._common.memory import check_copies
 from apt_evap._common.threads import thread_count
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_count, check_kind, check_seed, check_sequence, check_switch
 from apt_evap.detection.detector import Detector
 from apt_evap.emission.emissions import Emissions, check_launches
-from apt_evap.emission.ion_random import IonRandom
 from apt_evap.emission.perturbations import Perturbation, Unperturbed
+from apt_evap.evaporation.charge_settings import ChargeSettings
 from apt_evap.evaporation.emitter import BATCH, Emitter
 from apt_evap.evaporation.law import Extremal, Law
 from apt_evap.evaporation.rule import CompiledRule, Rule
-from apt_evap.evaporation.settings import ChargeSettings
 from apt_evap.evaporation.voltage import VoltageControl, check_voltage
-from apt_evap.flight.crew import WHOLE_DETECTOR, FlightCrew, FlightSettings, check_reach
-from apt_evap.flight.field_of_view import scouts_of
-from apt_evap.flight.landing import land
-from apt_evap.flight.response import ResponseModel, ResponseSettings
 from apt_evap.simulation.checkpoint import Checkpoint, CheckpointWriter
 from apt_evap.simulation.columns import Clock, Flown
+from apt_evap.simulation.flight.field_of_view import scouts_of
+from apt_evap.simulation.flight.flight_pool import WHOLE_DETECTOR, FlightCrew, FlightSettings, check_reach
+from apt_evap.simulation.flight.landing import land
+from apt_evap.simulation.flight.response import ResponseModel, ResponseSettings
 from apt_evap.simulation.history import CapHistory
 from apt_evap.simulation.monitor import Monitor
 from apt_evap.simulation.recorder import Recorder

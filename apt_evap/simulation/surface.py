@@ -2,9 +2,9 @@
 
 from apt_evap._common.codec import from_plain
 from apt_evap._common.validation import check_kind
+from apt_evap.evaporation.charge_settings import ChargeSettings
 from apt_evap.evaporation.emitter import Emitter
 from apt_evap.evaporation.rule import RULES
-from apt_evap.evaporation.settings import ChargeSettings
 from apt_evap.simulation.run import Run
 from apt_evap.specimen.tip import Tip
 

@@ -1,11 +1,9 @@
-# The public names of this room: read by type checkers, and by the lazy loader in __init__.py.
+# The public names of this package: read by type checkers, and by the lazy loader in __init__.py.
 from .alloy import Segregation as Segregation
 from .isotopes import draw_isotopes as draw_isotopes
 from .lattice import atom_density as atom_density
-from .lattice import lattice_sites_in as lattice_sites_in
 from .lattice import nearest_neighbour_distance as nearest_neighbour_distance
 from .lattice import rotation_to_axis as rotation_to_axis
-from .materials import polarization_energy as polarization_energy
 from .ordered import Superlattice as Superlattice
 from .ordered import UnitCell as UnitCell
 from .phases import Phase as Phase

@@ -16,7 +16,7 @@ HERE = Path(__file__).parent
 def answer():
     """A map of nickel, and its indexing."""
     truth = ae.Orientation("Ni", axis=(0.30, 0.54, 0.79), rotation=20.0)
-    pattern = ae.indexing.master_patterns("fcc")[1]
+    pattern = ae.maps.master_patterns("fcc")[1]
     measured = pattern.map(truth, ae.detection.Projection(60.0), width=80.0, ions=80_000, rolled=0.4)
     ae.plot.indexing(ae.index(measured, "Ni"))[0].figure.savefig(HERE / "find_orientation.png", dpi=110)
 
@@ -31,7 +31,7 @@ def patterns():
     directions = np.column_stack([(2 * x).ravel(), (2 * y).ravel(), (1 - r2).ravel()])
     names = {"fcc": "fcc (Ni)", "bcc": "bcc (W)", "diamond": "diamond (Si)", "hcp": "hcp (Ti)"}
     for column, (structure, name) in enumerate(names.items()):
-        pattern = ae.indexing.master_patterns(structure)[-1]
+        pattern = ae.maps.master_patterns(structure)[-1]
         for row, values in enumerate(pattern.at(directions, sigma=0.4)):
             ax = rows[row, column]
             image = ax.imshow(

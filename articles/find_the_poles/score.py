@@ -14,7 +14,7 @@ import time
 import numpy as np
 
 import apt_evap as ae
-from apt_evap.crystallography import point_group
+from apt_evap.maps.crystallography.symmetry import point_group
 
 NEAR = 2.0  # degrees
 PLACES = np.array([[0.0, 0.0], [15.0, 0.0], [-10.0, 12.0]])  # mm
@@ -34,7 +34,7 @@ def family_of(plane):
 
 def poles_found(candidate, planes, places):
     """Number of true poles with a pole of their family within `NEAR`."""
-    known = ae.crystallography.poles(candidate.orientation, 6)
+    known = ae.maps.poles(candidate.orientation, 6)
     predicted = candidate.projection.places(candidate.orientation.directions(known.normals))
     families = [family_of(each) for each in known.planes]
     found = 0
@@ -61,7 +61,7 @@ def main():
     options = parser.parse_args()
     wrong = {"Ni": "W", "W": "Ni", "Si": "Ni", "Ti": "W"}
     rows = []
-    data = ae.dataset.load(options.set).split(options.split)
+    data = ae.studies.load_dataset(options.set).split(options.split)
     for number in range(len(data)):
         example = data[number]
         about = example.about

@@ -19,8 +19,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import apt_evap as ae
-from apt_evap.crystallography import point_group
-from apt_evap.indexing.search import disc_of
+from apt_evap.maps.crystallography.symmetry import point_group
+from apt_evap.maps.indexing.orientation_search import disc_of
 
 sys.path.append(str(Path(__file__).parents[2] / "tools"))
 from master_patterns import simulated

@@ -56,7 +56,9 @@ def run_of(number, radius, ions, folder=None, within=VARIATION):
         # to a tenth of a bin
         flight_settings=ae.FlightSettings(opening_angle=0.6, tolerance=1e-2),
         response_settings=ae.ResponseSettings(
-            site=ae.flight.Design(1, ((0.0, 1), (1.0, 4))), rolled=ae.flight.Design(2, ((0.0, 1), (1.0, 6))), bound=1.0
+            site=ae.simulation.Design(1, ((0.0, 1), (1.0, 4))),
+            rolled=ae.simulation.Design(2, ((0.0, 1), (1.0, 6))),
+            bound=1.0,
         ),
     )
     run = simulation.run(ions, progress=False)

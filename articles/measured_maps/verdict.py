@@ -45,7 +45,7 @@ def main():
     warnings.simplefilter("ignore", ae.warnings.RegistrationWarning)
     for name, measured in maps.items():
         for element, axis in SIMULATED:
-            patterns = ae.indexing.master_patterns(ae.material(element).structure)
+            patterns = ae.maps.master_patterns(ae.material(element).structure)
             patterns = sorted(patterns, key=lambda each: each.apex_radius)
             for pattern, ions in zip(patterns, (15_000, 60_000), strict=True):
                 orientation = ae.Orientation(element, axis=axis, rotation=10.0)
@@ -55,7 +55,7 @@ def main():
                 scales = (ratio * (1 - WITHIN), ratio * (1 + WITHIN)) if options.known_scale else None
                 registration = ae.register(simulated, measured, scales=scales)
                 seen = in_the_measured_frame(simulated, measured, registration)
-                found = ae.registration.likeness(seen, measured, registration)
+                found = ae.maps.likeness(seen, measured, registration)
                 print(
                     f"{name:10} {'right' if RIGHT[name] == (element, axis) else 'wrong'} {element}{axis}"
                     f" R = {pattern.apex_radius:.0f} a: correlation {registration.score:.2f},"

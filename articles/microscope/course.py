@@ -53,7 +53,7 @@ def main():
     parser.add_argument("-o", "--output", default="course.png")
     options = parser.parse_args()
     run = simulate(options.ions, options.run)
-    lens = ae.microscope.LocalElectrode.preset("local electrode", shank_angle=SHANK)
+    lens = ae.detection.LocalElectrode.preset("local electrode", shank_angle=SHANK)
     real = run.at_evaporation_field(lens).on_detector(DETECTOR)
     volume = ae.material("Ni").a ** 3 / 4
     at = np.linspace(0, len(run) - 1, 400).astype(int)

@@ -18,9 +18,9 @@ import numpy as np
 import scipy
 
 import apt_evap as ae
-from apt_evap.microscope.boundary_elements import ChargedPanels, Panels, joined, ring_potential
-from apt_evap.microscope.conductors import electrode, graded
-from apt_evap.microscope.run_lens import Course, RunLens
+from apt_evap.detection.microscope.boundary_elements import ChargedPanels, Panels, joined, ring_potential
+from apt_evap.detection.microscope.conductors import electrode, graded
+from apt_evap.detection.microscope.run_lens import Course, RunLens
 from apt_evap.units import COULOMB, FLIGHT_TIME, NM_PER_MM
 
 MASS, CHARGE, LENGTH = 58.69, 2, 90.0  # Da, e, mm
@@ -155,7 +155,7 @@ def main():
 
 def compare(radius, ions, events, cut=0.5, seed=1):
     """Directions and times by the rule and by the flights, and which ions had a lateral energy."""
-    lens = ae.microscope.LocalElectrode(distance=40e3, aperture=20e3, shank_angle=5.0)
+    lens = ae.detection.LocalElectrode(distance=40e3, aperture=20e3, shank_angle=5.0)
     begin = time.process_time()
     emitter = surface(radius, lens.shank_angle, events, seed)
     cap = emitter.cap

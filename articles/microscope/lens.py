@@ -12,7 +12,7 @@ import time
 import matplotlib.pyplot as plt
 import numpy as np
 
-from apt_evap.microscope import LocalElectrode
+from apt_evap.detection.microscope.local_electrode import LocalElectrode
 
 ANGLES = (2.0, 5.0, 10.0)
 

@@ -42,7 +42,7 @@ def tungsten(path):
     print(f"compression from the poles: {FLIGHT_LENGTH} / {SCALE:g} = {FLIGHT_LENGTH / SCALE:.2f}")
     for preset, field in product(("plane electrode", "local electrode"), (52.0, 57.0)):
         for shank in SHANKS:
-            lens = ae.microscope.LocalElectrode.preset(preset, shank_angle=shank)
+            lens = ae.detection.LocalElectrode.preset(preset, shank_angle=shank)
             radius = float(lens.radius(middle, field))
             angles = np.array([5.0, 15.0, 30.0])
             places = FLIGHT_LENGTH * np.tan(np.radians(lens.projection(radius).flight_angles(angles)))
@@ -53,7 +53,7 @@ def tungsten(path):
             )
     for potential in (-4300.0, 4300.0, 10000.0):
         for shank in (3.0, 5.0):
-            lens = ae.microscope.LocalElectrode.preset(
+            lens = ae.detection.LocalElectrode.preset(
                 "plane electrode", shank_angle=shank, detector_potential=potential
             )
             radius = float(lens.radius(middle, 57.0))
@@ -100,11 +100,11 @@ def spots(path, fit):
 
 def nickel(path):
     """Which projection fits the poles best, with a free orientation and a free scale."""
-    fit = ae.crystallography.fit_orientation("Ni", list(SEEDS), list(SEEDS.values()))
+    fit = ae.maps.fit_orientation("Ni", list(SEEDS), list(SEEDS.values()))
     for _ in range(2):  # three poles predict the others, and all of them predict better
         print(f"scale {fit.projection.scale:.2f} mm/rad, poles within {fit.rms:.2f} mm (RMS)")
         found = spots(path, fit)
-        fit = ae.crystallography.fit_orientation("Ni", [hkl for hkl, *_ in found], [place for _, place, _ in found])
+        fit = ae.maps.fit_orientation("Ni", [hkl for hkl, *_ in found], [place for _, place, _ in found])
     for hkl, centre, moved in found:
         print(f"  {hkl} at ({centre[0]:.2f}, {centre[1]:.2f}) mm, {moved:.2f} mm from its prediction")
     normals = np.array([hkl for hkl, *_ in found], float)
@@ -117,7 +117,7 @@ def nickel(path):
         "sin": np.sin,
     }
     for shank, radius in ((2.0, 50.0), (5.0, 50.0), (10.0, 50.0)):
-        lens = ae.microscope.LocalElectrode.preset("local electrode", shank_angle=shank).projection(radius)
+        lens = ae.detection.LocalElectrode.preset("local electrode", shank_angle=shank).projection(radius)
         laws[f"lens, shank {shank:g}"] = lambda angle, lens=lens: np.tan(
             np.radians(lens.flight_angles(np.clip(np.degrees(angle), 0, 50)))
         )
@@ -173,7 +173,7 @@ def silicon(path):
         return reconstruction.errors(stored[::every], fit=("shift", "rotation"))
 
     for shank in (None, 5.0, 10.0, 14.8):
-        lens = None if shank is None else ae.microscope.LocalElectrode.preset("local electrode", shank_angle=shank)
+        lens = None if shank is None else ae.detection.LocalElectrode.preset("local electrode", shank_angle=shank)
         low, high, start = (0.0, np.log(4), np.log(3.2)) if lens is None else (2.5, 5.5, np.log(40.0))
         best = scipy.optimize.least_squares(
             lambda constants, lens=lens: errors(constants, lens, 800).residuals.ravel(),

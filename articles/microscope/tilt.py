@@ -15,9 +15,10 @@ import math
 import numpy as np
 import scipy
 
-from apt_evap.microscope import Lens, LocalElectrode
-from apt_evap.microscope.boundary_elements import _FINE
-from apt_evap.microscope.conductors import straight_flank
+from apt_evap.detection.microscope.boundary_elements import _FINE
+from apt_evap.detection.microscope.conductors import straight_flank
+from apt_evap.detection.microscope.lens import Lens
+from apt_evap.detection.microscope.local_electrode import LocalElectrode
 
 POINTS = 1500  # of the field along the axis
 

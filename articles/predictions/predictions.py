@@ -21,7 +21,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import apt_evap as ae
-from apt_evap.crystallography.orientation import Orientation
+from apt_evap.maps.crystallography.orientation import Orientation
 
 TIPS = {
     "W[110]": ("W", (1, 1, 0)),

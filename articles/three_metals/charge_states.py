@@ -20,7 +20,7 @@ from scipy.optimize import brentq
 
 import apt_evap as ae
 from apt_evap._common.codec import from_plain
-from apt_evap.crystallography import poles
+from apt_evap.maps.crystallography.directions import poles
 
 HEIGHTS = (0.0, 0.2, 0.4, 0.7, 1.0)  # nm above the start
 NEAR, FIRST = 1.7, 3.0  # degrees: half the width of a strip, and where it begins

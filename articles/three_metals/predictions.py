@@ -21,7 +21,7 @@ from judge import map_of, projection_of
 from runs import prepared
 
 import apt_evap as ae
-from apt_evap.crystallography import poles
+from apt_evap.maps.crystallography.directions import poles
 
 FIELD_OF_VIEW = 28.0  # degrees, half angle
 SKIP = 120_000  # atoms that evaporate before the first ion flies, about a third of a layer

@@ -61,7 +61,7 @@ figure = ae.plot.new_figure((9.6, 4.0))
 figure.set_layout_engine("compressed")
 left, right = figure.subplots(1, 2)
 for place, (name, (ratio, perturbation)) in enumerate(CASES.items()):
-    order = ae.visibility.false_order(alloys[ratio], "Al", None, perturbation)
+    order = ae.studies.false_order(alloys[ratio], "Al", None, perturbation)
     print(name, order, order.unlike, flush=True)
     for shift, part, color in ((-0.2, "true", "C2"), (0, "shuffled", "0.5"), (0.2, "reconstructed", "C3")):
         each = getattr(order, part)
@@ -72,7 +72,7 @@ left.set(yticks=range(len(CASES)), yticklabels=list(CASES), xlabel="Warren-Cowle
 left.invert_yaxis()
 left.legend(frameon=False)
 for ratio, color in ((1.0, "C0"), (0.8, "C3")):
-    orders = [ae.visibility.false_order(alloys[ratio], "Al", None, rest, shell=shell) for shell in SHELLS]
+    orders = [ae.studies.false_order(alloys[ratio], "Al", None, rest, shell=shell) for shell in SHELLS]
     for part, style in (("true", "o:"), ("reconstructed", "o-")):
         each = [getattr(order, part) for order in orders]
         right.errorbar(

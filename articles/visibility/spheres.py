@@ -61,13 +61,13 @@ for name, (feature, analysis) in cases.items():
     start = time.process_time()
     is_sphere = name.startswith("sphere")
     axes = {"size": [0.5, 1.0, 2.0] if is_sphere else [0.2]}
-    operators = ae.visibility.origin_operators(feature, tip, INSTRUMENT, axes=axes, n_threads=1)
+    operators = ae.studies.origin_operators(feature, tip, INSTRUMENT, axes=axes, n_threads=1)
     operators.save(options.output / f"{name.replace(' ', '_').replace(',', '')}.h5")
     made = time.process_time() - start
     for r in axes["size"]:
         variant = sphere(r, float(name.split()[-1])) if is_sphere else feature
         begin = time.process_time()
-        answer = ae.visibility.estimate(
+        answer = ae.studies.estimate_visibility(
             variant, tip, INSTRUMENT, analysis, operators=operators, reach=3.0, twins=options.twins, seed=10
         )
         row = answer.to_dict() | {"seconds": time.process_time() - begin, "operators": made}

@@ -72,7 +72,7 @@ EXAMPLES = [
         ae.specimen.Superlattice("L1_2", "Al"),
         {"Cu": 0.1},
     ),
-    ae.registration.Distortion(2, (0.0, 1.0), 20.0, (1j, 0.1, 0.2 + 1j, 0.3)),
+    ae.maps.Distortion(2, (0.0, 1.0), 20.0, (1j, 0.1, 0.2 + 1j, 0.3)),
     ae.Registration(10.0, 0.5, (1.0, 2.0), True, ties=(ae.Registration(0.0, 1.0, (0, 0)),)),
 ]
 
@@ -232,8 +232,8 @@ def test_no_value_of_a_field_escapes_the_checks(example):
         (ae.Registration, {"rotation": 0.0, "scale": 1.0, "shift": [0, 0], "score": "high"}, "score"),
         (ae.Registration, {"rotation": 0.0, "scale": 1.0, "shift": [0, 0], "score": 10**400}, "score"),
         (ae.Registration, {"rotation": 0.0, "scale": 1.0, "shift": [0, 0], "method": 3}, "method"),
-        (ae.dataset.DatasetSettings, {"instrument": {"integer": [0, 10]}}, "instrument"),
-        (ae.dataset.DatasetSettings, {"instrument": {"uniform": [0, 10]}}, "instrument"),
+        (ae.studies.DatasetSettings, {"instrument": {"integer": [0, 10]}}, "instrument"),
+        (ae.studies.DatasetSettings, {"instrument": {"uniform": [0, 10]}}, "instrument"),
     ],
 )
 def test_the_field_is_named_also_if_its_conversion_stops(kind, plain, field):

@@ -4,18 +4,18 @@ import pytest
 import apt_evap as ae
 from apt_evap.analysis.apex import FittedCap, ImageCompression
 from apt_evap.analysis.response_tracks import Tracks
-from apt_evap.analysis.voltage_history import Course
-from apt_evap.crystallography.directions import Poles, Zones, poles
-from apt_evap.crystallography.orientation import FittedOrientation
+from apt_evap.analysis.voltage_history import SmoothedHistory
 from apt_evap.emission.emissions import TangentialLaunches
 from apt_evap.explore.specimen_surface import SurfaceAtoms
 from apt_evap.fit.structure import StructureScores
+from apt_evap.maps.crystallography.directions import Poles, Zones, poles
+from apt_evap.maps.crystallography.orientation import FittedOrientation
 from apt_evap.maps.profiles import Profile, ProfileComparison
 from apt_evap.reconstruction.errors import ErrorBins, GroupErrors
 from apt_evap.simulation.history import CapHistory, History
 
 WITH_ARRAYS = (
-    FittedCap, ImageCompression, Profile, ProfileComparison, Tracks, Course, FittedOrientation, Poles, Zones,
+    FittedCap, ImageCompression, Profile, ProfileComparison, Tracks, SmoothedHistory, FittedOrientation, Poles, Zones,
     TangentialLaunches, StructureScores, SurfaceAtoms, ErrorBins, GroupErrors, CapHistory, History,
 )  # fmt: skip
 
@@ -45,5 +45,5 @@ def test_the_repr_of_a_fitted_orientation_is_short(nickel):
     tilt = ae.Orientation(nickel, (2, 3, 7))
     near = tilt.directions(crystal.normals)[:, 2] > 0.7
     places = np.column_stack(tilt.directions(crystal.normals[near]).T[:2])
-    fit = ae.crystallography.fit_orientation(nickel, crystal.planes[near], places)
+    fit = ae.maps.fit_orientation(nickel, crystal.planes[near], places)
     assert is_short(repr(fit)) and "rms=" in repr(fit)

@@ -19,8 +19,12 @@ import apt_evap as ae
 from apt_evap._common import memory
 from apt_evap._common.codec import declared
 from apt_evap._common.validation import short_text
+from apt_evap.config.cost_estimate import CostEstimate
 from apt_evap.config.simulation_file import read_config
 from apt_evap.emission.perturbations import perturbation_of
+from apt_evap.emission.surface_frame import target_shares
+from apt_evap.simulation.real_units import RealUnits
+from apt_evap.specimen.materials import polarization_energy
 from apt_evap.specimen.shape import TaperedCap
 
 NAN, INF = math.nan, math.inf
@@ -291,7 +295,7 @@ CASES = [
         {"ring": [*OBJECT, None], "measured": [*OBJECT, None], "shift": COUNT, "mirror": SWITCH},
     ),
     (ae.analysis.charge_state_ratio_map, {"element": "Ni"}, {"hits": [*OBJECT, None]}),
-    (ae.analysis.charge_state_ratio_course, {"element": "Ni"}, {"hits": [*OBJECT, None]}),
+    (ae.analysis.charge_state_ratio_history, {"element": "Ni"}, {"hits": [*OBJECT, None]}),
     (
         ae.Instrument,
         {},
@@ -326,7 +330,7 @@ CASES = [
         {"site": [*OBJECT, None], "rolled": [*OBJECT, None]},
     ),
     (
-        ae.flight.Design,
+        ae.simulation.Design,
         {"degree": 1, "rings": ((0.0, 1), (1.0, 5))},
         {
             "rings": [None, 3, "x", [], [1], [(1.0,)], [(NAN, 5)], [(1.0, 0)], [(1.0, 10**9)], [(1.0, 2)], [("a", 1)]],
@@ -440,7 +444,7 @@ CASES = [
     ),
     (ae.Orientation.from_matrix, {"material": "Ni"}, {"matrix": [*VECTOR, 2 * np.eye(3), -np.eye(3)]}),
     (
-        ae.crystallography.fit_orientation,
+        ae.maps.fit_orientation,
         {"material": "Ni", "planes": [(1, 1, 1), (0, 0, 1)], "places": [(0.0, 0), (9.0, 0)]},
         {
             "material": [*OBJECT, None],
@@ -473,7 +477,7 @@ CASES = [
         {"start": [*OBJECT], "scales": ["x", NAN, -1.0, 0, INF, (2.0, 1.0), (1, 2, 3)]},
     ),
     (
-        ae.registration.register_points,
+        ae.maps.register_points,
         {"simulated_points": CORNERS, "measured_points": CORNERS},
         {"simulated_points": VECTOR, "measured_points": [*VECTOR, [(0, 0)] * 3], "mirror": SWITCH[1:]},
     ),
@@ -511,7 +515,7 @@ CASES = [
     (ranges.index, {}, {"hits": [*OBJECT, None]}),
     (ranges.labels, {"hits": hits}, {"outside": TEXT}),
     (
-        ae.specimen.polarization_energy,
+        polarization_energy,
         {"polarizability": 1e-40, "voltage": 1e3, "field_factor": 3.0, "radius": 10.0, "step": 0.3},
         {"polarizability": POSITIVE, "voltage": NUMBER, "field_factor": POSITIVE, "radius": POSITIVE, "step": NUMBER},
     ),
@@ -544,16 +548,16 @@ CASES = [
         ae.reconstruction.fit_shank,
         {
             "hits": hits,
-            "lens": ae.microscope.LocalElectrode(40e3, 20e3, 5.0),
+            "lens": ae.detection.LocalElectrode(40e3, 20e3, 5.0),
             "atomic_volume": 0.011,
             "distance": 100.0,
         },
         {"hits": [*OBJECT, None], "lens": [*OBJECT, None]},
     ),
     (
-        ae.microscope.field_of_view,
+        ae.detection.field_of_view,
         {
-            "lens": ae.microscope.LocalElectrode(40e3, 20e3, 5.0),
+            "lens": ae.detection.LocalElectrode(40e3, 20e3, 5.0),
             "tip": ae.Tip("Ni", apex_radius=2.0),
             "detector": ae.Detector(distance=90.0, width=45.0),
         },
@@ -576,7 +580,7 @@ CASES = [
         },
     ),
     (ae.detection.Cooling, {"temperature": 50.0, "temperature_rise": 100.0, "time_constant": 2.0}, {}),
-    (ae.visibility.VisibilitySettings, {"analysis": "clusters.py:pairs"}, {}),
+    (ae.studies.VisibilitySettings, {"analysis": "clusters.py:pairs"}, {}),
     (
         ae.Reconstruction.errors,
         {"self": ae.reconstruct(hits, atomic_volume=0.011, distance=100.0, radius=30.0), "truth": np.eye(3)},
@@ -619,7 +623,7 @@ CASES = [
         },
     ),
     (
-        ae.flight.WideDesign,
+        ae.simulation.WideDesign,
         {"place": 1, "velocity": 2, "height": 1, "mixed": 2},
         {
             **{name: [*COUNT, 7] for name in ("place", "velocity", "height", "mixed")},
@@ -650,7 +654,7 @@ CASES = [
     (ae.io.read_grid, {}, {"path": [None, 3, NAN, [], "a\0b", "none.csv"]}),
     (ae.read_tip, {}, {"path": [None, 3, NAN, [], "a\0b", "none.lmp"]}),
     (
-        ae.registration.score_surface,
+        ae.maps.score_surface,
         {"simulated": grid, "measured": grid, "scales": (0.9, 1.1)},
         {
             "simulated": [*OBJECT, None],
@@ -658,9 +662,9 @@ CASES = [
             "rotations": [None, "x", (2.0, 1.0)],
         },
     ),
-    (ae.registration.register_distortion, {"simulated": grid, "measured": grid}, {"registration": [*OBJECT, None]}),
+    (ae.maps.register_distortion, {"simulated": grid, "measured": grid}, {"registration": [*OBJECT, None]}),
     (
-        ae.registration.Distortion,
+        ae.maps.Distortion,
         {"degree": 1, "centre": (0.0, 0.0), "radius": 1.0, "coefficients": (1.0,)},
         {"centre": VECTOR},
     ),
@@ -694,14 +698,14 @@ CASES = [
         {"field": 44.0, "ionisation_energy": 24.6},
         {"field": POSITIVE, "ionisation_energy": POSITIVE, "work_function": POSITIVE},
     ),
-    (ae.crystallography.plane_normals, {"material": nickel, "planes": [(1, 1, 1)]}, {"planes": VECTOR}),
-    (ae.crystallography.direction_normals, {"material": nickel, "directions": [(1, 1, 1)]}, {"directions": VECTOR}),
-    (ae.crystallography.poles, {"material": nickel}, {"material": OBJECT, "families": COUNT}),
-    (ae.crystallography.zones, {"material": nickel}, {"material": OBJECT}),
-    (ae.crystallography.point_group, {"structure": "fcc"}, {"structure": WORD}),
-    (ae.crystallography.pole_symmetry, {"material": nickel, "direction": (1, 1, 1)}, {"direction": VECTOR}),
+    (ae.maps.plane_normals, {"material": nickel, "planes": [(1, 1, 1)]}, {"planes": VECTOR}),
+    (ae.maps.direction_normals, {"material": nickel, "directions": [(1, 1, 1)]}, {"directions": VECTOR}),
+    (ae.maps.poles, {"material": nickel}, {"material": OBJECT, "families": COUNT}),
+    (ae.maps.zones, {"material": nickel}, {"material": OBJECT}),
+    (ae.maps.point_group, {"structure": "fcc"}, {"structure": WORD}),
+    (ae.maps.pole_symmetry, {"material": nickel, "direction": (1, 1, 1)}, {"direction": VECTOR}),
     (
-        ae.crystallography.symmetry_about_axis,
+        ae.maps.symmetry_about_axis,
         {"material": nickel, "orientation": np.eye(3)},
         {"orientation": [None, "x", 3]},
     ),
@@ -714,12 +718,12 @@ CASES = [
         {"distance": POSITIVE, "curved": SWITCH},
     ),
     (
-        ae.microscope.LocalElectrode,
+        ae.detection.LocalElectrode,
         {"distance": 40e3, "aperture": 20e3, "shank_angle": 5.0},
         {"profile": [3, "x", [1.0], [(0.0, 20.0)], [(0.0, 20.0), (0.0, 30.0)], [(0.0, 20.0), (50.0, 10.0)]]},
     ),
-    (ae.simulation.RealUnits, {"field_reference": "cap", "operating_field": 35.0}, {}),
-    (ae.config.CostEstimate, {"ions": 10}, {}),
+    (RealUnits, {"field_reference": "cap", "operating_field": 35.0}, {}),
+    (CostEstimate, {"ions": 10}, {}),
 ]
 NEEDS_A_RUN = [
     (
@@ -791,7 +795,7 @@ NEEDS_A_RUN = [
         {"runs": [*OBJECT, None]},
     ),
     (ae.analysis.field_ion_image, {}, {"emitter": [*OBJECT, None]}),
-    (ae.emission.target_shares, {"sharpness": 0.1}, {"emissions": [*OBJECT, None]}),
+    (target_shares, {"sharpness": 0.1}, {"emissions": [*OBJECT, None]}),
     (ae.analysis.image_compression, {}, {"run": [*OBJECT, None]}),
     (ae.analysis.field_factor, {}, {"run": [*OBJECT, None]}),
     (ae.analysis.evaporation_fields, {}, {"run": [*OBJECT, None]}),

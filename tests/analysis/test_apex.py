@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.crystallography.directions import poles
+from apt_evap.maps.crystallography.directions import poles
 
 
 class Receding:

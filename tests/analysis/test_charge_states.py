@@ -10,9 +10,9 @@ from scipy import stats
 
 import apt_evap as ae
 from apt_evap.analysis.charge_states import (
-    charge_state_ratio_course,
+    charge_history,
+    charge_state_ratio_history,
     charge_state_ratio_map,
-    course_of_charges,
     field_of_counts,
     ion_charges,
     ratio_of_counts,
@@ -149,14 +149,14 @@ def test_ions_that_missed_do_not_count():
     missed = replace(hits, outcome=np.arange(4000) % 2)
     both = charge_state_ratio_map(hits[::2], "Ni", 1, bins=5), charge_state_ratio_map(missed, "Ni", 1, bins=5)
     np.testing.assert_array_equal(both[0].lower, both[1].lower)
-    course = charge_state_ratio_course(missed, "Ni", 1, sections=4)
+    course = charge_state_ratio_history(missed, "Ni", 1, sections=4)
     assert course.ions == 2000 and course.middles.tolist() == [500, 1500, 2500, 3500]
 
 
 def test_the_pair_with_most_ions_of_the_rarer_charge():
     charges = np.repeat([1, 2, 3, 4], [900, 300, 5000, 800])
-    assert course_of_charges(charges, "W").charge == 3
-    assert course_of_charges(charges, "W", 1).charge == 1
+    assert charge_history(charges, "W").charge == 3
+    assert charge_history(charges, "W", 1).charge == 1
 
 
 # ---- course --------------------------------------------------------------------------------------------------------
@@ -167,15 +167,15 @@ def test_course_of_a_rising_field():
     field = np.linspace(24.0, 25.0, n)
     rng = np.random.default_rng(6)
     charges = PostIonisation().draw(["Ni"], np.zeros(n, int), [1], field, rng.random(n))
-    result = course_of_charges(charges, "Ni")
+    result = charge_history(charges, "Ni")
     assert len(result.middles) == n // 100
     assert_normal((result.field - np.interp(result.middles, np.arange(n), field)) / result.field_error)
     assert result.lower.sum() == np.count_nonzero(charges == 1) and result.ions == n
-    sections = course_of_charges(charges, "Ni", sections=7)
+    sections = charge_history(charges, "Ni", sections=7)
     edges = np.linspace(0, n, 8).astype(int)
     ones = [np.count_nonzero(charges[low:high] == 1) for low, high in pairwise(edges)]
     assert sections.lower.tolist() == ones
-    assert np.isnan(course_of_charges(charges[:150], "Ni", sections=10).ratio).all()
+    assert np.isnan(charge_history(charges[:150], "Ni", sections=10).ratio).all()
 
 
 # ---- a run, and its files ------------------------------------------------------------------------------------------
@@ -212,7 +212,7 @@ def test_ranges_of_a_file_give_the_map_of_the_run(real, tmp_path):
     np.testing.assert_array_equal(by_ranges.upper, own.upper)
     np.testing.assert_array_equal(by_ranges.field, own.field)
     courses = [
-        charge_state_ratio_course(ions, "Ni", 1, ranges=chosen, sections=3)
+        charge_state_ratio_history(ions, "Ni", 1, ranges=chosen, sections=3)
         for ions, chosen in ((hits[hits.detected], None), (measured, ranges))
     ]
     np.testing.assert_array_equal(courses[0].ratio, courses[1].ratio)
@@ -299,7 +299,7 @@ def test_what_is_refused():
             charge_state_ratio_map(ions, element, **options)
     for options, message in (({"sections": 0}, "sections must be"), ({"least": -1}, "least must be")):
         with pytest.raises(ValueError, match=message):
-            charge_state_ratio_course(hits, "Ni", **options)
+            charge_state_ratio_history(hits, "Ni", **options)
 
 
 def test_an_element_without_a_fit_has_ratios_only():

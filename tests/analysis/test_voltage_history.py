@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.analysis.voltage_history import course, evaporation_fields, evaporation_voltages
+from apt_evap.analysis.voltage_history import evaporation_fields, evaporation_voltages, smoothed_history
 
 
 @pytest.fixture(scope="module")
@@ -49,15 +49,15 @@ def test_runs_in_files_have_their_materials(alloy, tmp_path):
 
 def test_the_course_of_a_quantity():
     values = np.random.default_rng(1).normal(size=100)
-    ions, low, median, high = course(values, 10)
+    ions, low, median, high = smoothed_history(values, 10)
     np.testing.assert_allclose(ions, 5 + 10 * np.arange(10))
     parts = values.reshape(10, 10)
     for line, percent in ((low, 5), (median, 50), (high, 95)):
         np.testing.assert_allclose(line, np.percentile(parts, percent, axis=1))
-    assert course(values[:7], 10).median.tolist() == values[:7].tolist()
+    assert smoothed_history(values[:7], 10).median.tolist() == values[:7].tolist()
     with pytest.raises(ValueError, match="points"):
-        course(values, 0)
+        smoothed_history(values, 0)
     with pytest.raises(ValueError, match="at least one, got none"):
-        course([])
+        smoothed_history([])
     with pytest.raises(ValueError, match="run must be a Run"):
         evaporation_voltages(ae.Hits(voltage=values))

@@ -97,7 +97,7 @@ def test_everything_is_written(folder, capsys, rough_layout):
     for name in FILES:
         if name.endswith(".png"):
             assert imread(f"study/{name}")[..., :3].std() > 0.05
-    report = ae.report.read("study/report.html")
+    report = ae.plot.read_report("study/report.html")
     assert report["study"] == held
     assert report["origin"]["command"] == shlex.join(
         ["apt-evap", "compare", "run.h5", "map.npz", "-o", "study", *QUICK, *HERE]
@@ -234,7 +234,7 @@ def test_a_doubtful_registration_is_told_once_and_kept(folder, capsys):
     out, err = capsys.readouterr()
     assert "registration" not in err and out.count("the registration, correlation") == 1
     assert "registration.png, --registration sets" in out
-    told = ae.report.read("noise/report.html")["origin"]["warnings"]
+    told = ae.plot.read_report("noise/report.html")["origin"]["warnings"]
     assert not any("registration" in text for text in told)  # the report has a sentence of its own
     assert Path("noise/report.html").read_text().count("The registration is doubtful") == 1
     assert json.loads(Path("noise/study.json").read_text())["registration"]["doubtful"] is True

@@ -29,7 +29,7 @@ def test_poles_of_a_run_are_its_own(drawn, small_tip, capsys):
 
 def test_poles_of_a_measured_map_are_searched_or_given(drawn, capsys):
     truth, projection = ae.Orientation("W", (0.05, 0.66, 0.74), 30.0), ae.detection.Projection(60.0)
-    pattern = ae.indexing.master_patterns("bcc")[0]
+    pattern = ae.maps.master_patterns("bcc")[0]
     simulated = pattern.map(truth, projection, width=70.0, ions=30_000, rolled=0.5, seed=1)
     np.savez("w.npz", values=simulated.values, x_edges=simulated.x_edges, y_edges=simulated.y_edges)
     command = ["map", "w.npz", "--arrays", "values,x_edges,y_edges", "--unit", "mm", "-o", "w.png"]
@@ -40,7 +40,7 @@ def test_poles_of_a_measured_map_are_searched_or_given(drawn, capsys):
     (orientation, there), (searched, where) = drawn
     assert orientation == truth and there.scale == 60.0
     # an axis and its mirror image look alike; 0.5 degrees: a bin of the map is 0.52 degrees wide
-    axes = ae.crystallography.point_group("bcc") @ truth.matrix[2]
+    axes = ae.maps.point_group("bcc") @ truth.matrix[2]
     assert np.degrees(np.arccos((axes @ searched.matrix[2]).max())) < 0.5
     assert where.scale == pytest.approx(60.0, rel=0.02)
     for wrong, name in (

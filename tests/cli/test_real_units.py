@@ -71,7 +71,7 @@ def test_a_settings_file_with_a_microscope(made, tmp_path, monkeypatch, capsys):
     Path("lens.toml").write_text(text)
     assert main(["run", "lens.toml", "-o", "lens.h5"]) == 0
     assert "lens: shank of 7 degrees, R 1" in capsys.readouterr().out
-    lens = ae.microscope.LocalElectrode.preset("local electrode", shank_angle=7.0)
+    lens = ae.detection.LocalElectrode.preset("local electrode", shank_angle=7.0)
     run, plain = ae.load("lens.h5"), ae.load(made / "cold.h5")
     assert run.lens.lens == lens and run.fingerprint() == plain.fingerprint()
     told = summary("lens.h5", capsys)["microscope"]

@@ -8,6 +8,7 @@ import pytest
 import apt_evap as ae
 from apt_evap.cli.main import main
 from apt_evap.reconstruction.constants import run_constants
+from apt_evap.reconstruction.origins import OriginTable
 
 
 @pytest.fixture
@@ -41,7 +42,7 @@ def test_measured_ions(measured, nickel, tmp_path, capsys):
     assert main(command) == 2 and "'ni_reconstructed.pos' exists: --force" in capsys.readouterr().err
     # a table without shifts changes nothing but the direction of z
     places = np.random.default_rng(1).random((500, 2)) * 2 - 1
-    ae.reconstruction.OriginTable(places, np.zeros((500, 2))).save("table.npz")
+    OriginTable(places, np.zeros((500, 2))).save("table.npz")
     corrected = ["--compression", "1.6", "--origins", "table.npz", "--frame", "specimen", "-o", "corrected.pos"]
     assert main([*command, *corrected]) == 0 and capsys.readouterr()
     assert ae.read("corrected.pos").positions == pytest.approx(expected.specimen_positions, rel=1e-6, abs=1e-5)

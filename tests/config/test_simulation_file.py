@@ -16,12 +16,12 @@ from apt_evap.config.map_panels import MapSettings, Panel
 from apt_evap.config.perturbation_text import read_perturbation, title_of
 from apt_evap.config.simulation_file import config_of, read_config, read_document
 from apt_evap.detection.detector import Detector
+from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.emission.energies import Thermal, TruncatedNormal
 from apt_evap.emission.perturbations import Combined, LateralVelocity, Mixture, RollUp, Unperturbed
-from apt_evap.evaporation.settings import ChargeSettings
-from apt_evap.flight.crew import FlightSettings
+from apt_evap.evaporation.charge_settings import ChargeSettings
 from apt_evap.io.tapsim_nodes import write_nodes
-from apt_evap.microscope.local_electrode import LocalElectrode
+from apt_evap.simulation.flight.flight_pool import FlightSettings
 from apt_evap.simulation.simulation import Simulation
 from apt_evap.specimen.materials import material
 from apt_evap.specimen.tip import Tip

@@ -36,7 +36,7 @@ def similarity(first, second):
     """Registration without polynomial terms, which the distortion calls for."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ae.warnings.RegistrationWarning)
-        return ae.registration.register_points(first, second, mirror=False)
+        return ae.maps.register_points(first, second, mirror=False)
 
 
 def test_a_distortion_is_removed(rng):
@@ -63,7 +63,7 @@ def test_crossings_stay_crossings(seed, mirror):
     rng = np.random.default_rng(seed)
     middle = places[np.hypot(*grid.T) < 0.6]
     x, y = distortion.undistorted(*middle.T)
-    assert ae.registration.register_points(grid[np.hypot(*grid.T) < 0.6], np.column_stack([x, y])).residual < 1e-12
+    assert ae.maps.register_points(grid[np.hypot(*grid.T) < 0.6], np.column_stack([x, y])).residual < 1e-12
     straight = ae.detection.DistortionGrid(similar(grid), flipped)
     some = similar(rng.uniform(-0.5, 0.5, (20, 2)))
     assert np.column_stack(straight.undistorted(*some.T)) == pytest.approx(some, abs=1e-12)

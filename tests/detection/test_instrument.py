@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import apt_evap as ae
 from apt_evap.detection.binning import find_quantisations
-from apt_evap.detection.instrument import PRESETS, Detection
+from apt_evap.detection.instrument import INSTRUMENT_PRESETS, Detection
 
 STEPS = (0.02725, 0.02602)  # mm, of a delay-line detector
 
@@ -351,7 +351,7 @@ def test_presets():
     assert (changed.distance, changed.dead_time, changed.efficiency) == (42.0, 3.0, 0.4)
     with pytest.raises(ValueError, match=r"did you mean 'straight, 100 mm'"):
         ae.Instrument.preset("straight")
-    assert all(ae.Instrument.preset(name) for name in PRESETS)
+    assert all(ae.Instrument.preset(name) for name in INSTRUMENT_PRESETS)
 
 
 # ---- invariants ------------------------------------------------------------------------------------------------------

@@ -5,8 +5,8 @@ import pytest
 from scipy import stats
 from scipy.integrate import quad
 
+from apt_evap._common.ion_random import IonRandom
 from apt_evap.detection.timing import MASS_TO_CHARGE, Timing, mass_to_charge
-from apt_evap.emission.ion_random import IonRandom
 from apt_evap.units import BOLTZMANN, FLIGHT_TIME, NM_PER_MM
 
 ALUMINIUM = 26.9815

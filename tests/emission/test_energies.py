@@ -5,8 +5,8 @@ import pytest
 from scipy import special, stats
 from scipy.integrate import quad
 
+from apt_evap._common.ion_random import IonRandom
 from apt_evap.emission.energies import Thermal, TruncatedNormal, draw_energies, normal_probability
-from apt_evap.emission.ion_random import IonRandom
 from apt_evap.emission.perturbations import RollUp
 from apt_evap.units import BOLTZMANN
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from apt_evap.emission.ion_random import IonRandom
+from apt_evap._common.ion_random import IonRandom
 
 N = 50_000
 

@@ -10,10 +10,10 @@ from scipy import stats
 
 import apt_evap as ae
 from apt_evap._common.codec import to_plain
+from apt_evap._common.ion_random import IonRandom
 from apt_evap.config.perturbation_text import read_perturbation, title_of, write_perturbation
 from apt_evap.emission.emissions import Emissions, Launches, TangentialLaunches
 from apt_evap.emission.energies import Thermal, TruncatedNormal
-from apt_evap.emission.ion_random import IonRandom
 from apt_evap.emission.perturbations import (
     Combined,
     LateralVelocity,

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from apt_evap.emission.ion_random import IonRandom
+from apt_evap._common.ion_random import IonRandom
 from apt_evap.emission.post_ionisation import (
     FLIGHT_CHARGES,
     RATIO_PARAMETERS,

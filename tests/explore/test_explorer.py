@@ -36,7 +36,7 @@ def run(small_tip, made_once):
 
 @pytest.fixture(scope="module")
 def run_in(run):
-    lens = ae.microscope.LocalElectrode.preset("local electrode")
+    lens = ae.detection.LocalElectrode.preset("local electrode")
     return {"simulated": run, "cap": run.at_evaporation_field(), "lens": run.at_evaporation_field(lens)}
 
 
@@ -341,14 +341,14 @@ def test_before_the_registration_both_maps_have_one_size(run, measured):
 def test_the_verdict_is_that_of_the_library(run, measured, explorer):
     shown = explorer.show(View(ae.RollUp(ENERGY), 24, 2.0))
     found = explorer.likeness(shown)
-    expected = ae.registration.likeness(shown.simulated, shown.measured, TURNED)
+    expected = ae.maps.likeness(shown.simulated, shown.measured, TURNED)
     assert found.verdict == expected.verdict and found.reason == expected.reason
 
 
 @pytest.mark.parametrize(("rotation", "scale"), [(0.0, 60.0), (20.0, 60.0), (120.0, 60.0), (0.0, 51.0)])
 def test_maps_that_do_not_lie_on_each_other(rotation, scale):
     """The verdict depends on the registration: rotations by the symmetry of [111], 120 degrees, are as good."""
-    pattern, name = ae.indexing.master_patterns("fcc")[0], "Ni"
+    pattern, name = ae.maps.master_patterns("fcc")[0], "Ni"
     simulated, measured = (
         pattern.map(ae.Orientation(name, axis=(1, 1, 1), rotation=turn), ae.detection.Projection(each), width=70.0,
                     ions=40_000, rolled=0.8, seed=seed)

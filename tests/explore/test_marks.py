@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.crystallography import poles, zones
 from apt_evap.explore.marks import Marks, overlay, plain
+from apt_evap.maps.crystallography.directions import poles, zones
 
 PROJECTION = ae.detection.Projection(95.0, (2.0, -3.0))
 REACH = 60.0  # mm

@@ -451,7 +451,7 @@ def test_a_fit_of_earlier_marks_is_not_shown(measured):
 
 def test_the_orientation_is_searched():
     """The search is that of the library, in another process; its settings can be copied."""
-    pattern = ae.indexing.master_patterns("fcc")[0]
+    pattern = ae.maps.master_patterns("fcc")[0]
     orientation = ae.Orientation("Ni", axis=(0.30, 0.54, 0.79), rotation=20.0)
     projection = ae.detection.Projection(60.0)
     measured = pattern.map(orientation, projection, width=70.0, ions=30_000, rolled=0.5, seed=1)
@@ -465,7 +465,7 @@ def test_the_orientation_is_searched():
     assert found.reason in index.text.text and found.verdict in index.text.text
     assert len(index.candidates) == len(found.candidates)
     assert np.array_equal(index.candidates[0][0].matrix, found.best.orientation.matrix)
-    assert index.settings(10.0, 1).text == ae.twin.settings_of(found).text
+    assert index.settings(10.0, 1).text == ae.fit.settings_of(found).text
     if len(found.candidates) > 1:
         index.choice.value = "1"
         assert np.array_equal(index.settings(10.0, 1).indexing.best.orientation.matrix, index.candidates[1][0].matrix)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from apt_evap.fit.settings import MODEL_ERROR
+from apt_evap.fit.fit_settings import MODEL_ERROR
 
 TWINS = range(100, 106)
 

@@ -15,14 +15,15 @@ import apt_evap as ae
 from apt_evap._common.codec import declared, to_plain
 from apt_evap.emission.perturbations import Combined, launch_tangentially
 from apt_evap.fit.comparison import Comparison
+from apt_evap.fit.energy_search import EnergySearch
 from apt_evap.fit.fit_energies import real_units_of
+from apt_evap.fit.fit_settings import FitSettings
 from apt_evap.fit.grid import EnergyGrid, maxima, spline_maxima
 from apt_evap.fit.intervals import intervals
 from apt_evap.fit.resampling import NOISE, Sampler
-from apt_evap.fit.search import EnergySearch
-from apt_evap.fit.settings import FitSettings
 from apt_evap.fit.structure import PoleMeasure
 from apt_evap.maps.pole_frame import pole_frame
+from apt_evap.simulation.history import CapHistory
 
 EDGES = np.linspace(-60, 60, 49)
 ROLLUP = ae.RollUp(ae.TruncatedNormal(0.155, 0.155))
@@ -610,7 +611,7 @@ def test_energies_are_reported_in_real_units_first(twin, run):
     assert f"{study.real_energies[0]:.3g}" in text.partition(" eV")[0]
     assert real_units_of(real)["real_per_study"] == 1.0
     assert real_units_of(real)["simulated_per_study"] == pytest.approx(1 / factor, rel=1e-12)
-    assert real_units_of(replace(run, cap=ae.simulation.CapHistory.empty())) is None
+    assert real_units_of(replace(run, cap=CapHistory.empty())) is None
 
 
 def test_a_study_of_a_run_in_real_units_finds_real_energies(run):
@@ -631,7 +632,7 @@ def test_a_study_of_a_run_in_real_units_finds_real_energies(run):
 
 def test_a_run_behind_a_lens_gives_the_same_energies(run):
     """The measured map is made through the lens, too; energies at the crystal do not change."""
-    real = run.at_evaporation_field(ae.microscope.LocalElectrode.preset("local electrode"))
+    real = run.at_evaporation_field(ae.detection.LocalElectrode.preset("local electrode"))
     mean = float(np.median(0.2 / real.energy_scales))
     measured = real.hits(ae.RollUp(ae.TruncatedNormal(mean, mean / 2))).map(64)
     options = {"relative_spreads": (0.5,), "registration": HERE, "replicas": 1, "resamples": 0, "progress": False}

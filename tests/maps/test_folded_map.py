@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.crystallography.orientation import Orientation
+from apt_evap.maps.crystallography.orientation import Orientation
 
 PLANE = ae.detection.Projection(100.0, compression=1.0)
 POLE = np.array([0.1, -0.05, 1.0])

@@ -16,8 +16,8 @@ from matplotlib.text import Text
 
 import apt_evap as ae
 from apt_evap import plot
-from apt_evap.analysis.charge_states import charge_state_ratio_map, course_of_charges, ion_charges
-from apt_evap.analysis.voltage_history import course, evaporation_voltages
+from apt_evap.analysis.charge_states import charge_history, charge_state_ratio_map, ion_charges
+from apt_evap.analysis.voltage_history import evaporation_voltages, smoothed_history
 from apt_evap.maps.profiles import Profile
 from apt_evap.plot._figure import set_log_ticks
 
@@ -270,7 +270,7 @@ def test_history_of_a_run(run, tmp_path):
     band = upper.collections[0].get_paths()[0].vertices
     at_first = band[np.isclose(band[:, 0], ions[0]), 1]
     assert [at_first.min(), at_first.max()] == pytest.approx(np.percentile(run.fields[:25], [5, 95]))
-    np.testing.assert_array_equal(lower.lines[0].get_ydata(), course(evaporation_voltages(run), 10).median)
+    np.testing.assert_array_equal(lower.lines[0].get_ydata(), smoothed_history(evaporation_voltages(run), 10).median)
 
 
 def test_history_of_a_measurement():
@@ -306,7 +306,7 @@ def test_voltage_curve_of_a_run(real, tmp_path):
     labels = ["voltage with pulse [V]", "field at the cap [V/nm]", "ions per pulse", "Ni$^{2{+}}$ / Ni$^{{+}}$"]
     assert labels_of(axes) == labels and axes[-1].get_xlabel() == "ions"
     voltage, cap, rate, ratio = axes
-    np.testing.assert_array_equal(voltage.lines[0].get_ydata(), course(real.voltages, 10).median)
+    np.testing.assert_array_equal(voltage.lines[0].get_ydata(), smoothed_history(real.voltages, 10).median)
     ions, fields = cap.lines[0].get_data()
     assert ions.tolist() == real.cap.ions[real.cap.ions < 250].tolist()
     np.testing.assert_allclose(fields, (real.cap.fields / 1000)[: len(ions)] * real.voltages[ions])
@@ -314,7 +314,7 @@ def test_voltage_curve_of_a_run(real, tmp_path):
     pulses = np.diff(real.real.pulse_ids[[124, 249]], prepend=0)
     np.testing.assert_allclose(rate.patches[0].get_data().values, 125 / pulses)
     assert rate.lines[0].get_ydata()[0] == 0.01
-    expected = course_of_charges(real.flight_charges, "Ni")
+    expected = charge_history(real.flight_charges, "Ni")
     np.testing.assert_array_equal(ratio.lines[0].get_ydata(), expected.ratio)
 
 
@@ -323,14 +323,14 @@ def test_voltages_of_an_instrument(run):
     axes = plot.voltage_curve(real, points=5)
     assert labels_of(axes) == ["voltage with pulse [V]", "field at the cap [V/nm]", "ions per pulse"]
     total = real.instrument_voltages
-    np.testing.assert_allclose(axes[0].lines[0].get_ydata(), course(total, 5).median)
+    np.testing.assert_allclose(axes[0].lines[0].get_ydata(), smoothed_history(total, 5).median)
 
 
 def test_voltage_curve_of_a_run_with_a_temperature(small_tip):
     run = ae.Simulation(small_tip, seed=2, law=ae.Arrhenius(50.0)).run(220, responses=False, progress=False)
     axes = plot.voltage_curve(run, points=2)
     assert labels_of(axes) == ["voltage with pulse [V]", "field at the cap [V/nm]", "ions per pulse"]
-    np.testing.assert_array_equal(axes[0].lines[0].get_ydata(), course(run.clock.voltages, 2).median)
+    np.testing.assert_array_equal(axes[0].lines[0].get_ydata(), smoothed_history(run.clock.voltages, 2).median)
     pulses = run.clock.waits.reshape(2, 110).sum(axis=1) / run.settings["pulse_length"]
     np.testing.assert_allclose(axes[2].patches[0].get_data().values, 110 / pulses)
 
@@ -339,14 +339,14 @@ def test_voltage_curve_of_ions(real):
     hits = real.hits(ae.Unperturbed())
     axes = plot.voltage_curve(hits, points=4)
     assert labels_of(axes) == ["standing voltage [V]", "ions per pulse", "ions 2+ / 1+"]
-    np.testing.assert_allclose(axes[0].lines[0].get_ydata(), course(real.voltages / 1.2, 4).median)
+    np.testing.assert_allclose(axes[0].lines[0].get_ydata(), smoothed_history(real.voltages / 1.2, 4).median)
     expected = hits.detected[125:].sum() / hits.pulses[125:].sum()
     assert axes[1].patches[0].get_data().values[-1] == pytest.approx(expected)
     ranges = ae.detection.Ranges(["Ni", "Ni"], [28.9, 57.8], [32.2, 64.4])
     measured = ae.Hits(voltage=hits.voltage, mass_to_charge=hits.mass_to_charge)
     axes = plot.voltage_curve(measured, element="Ni", ranges=ranges)
     assert labels_of(axes) == ["voltage [V]", "Ni$^{2{+}}$ / Ni$^{{+}}$"]
-    expected = course_of_charges(ion_charges(measured, "Ni", ranges), "Ni")
+    expected = charge_history(ion_charges(measured, "Ni", ranges), "Ni")
     np.testing.assert_array_equal(axes[1].lines[0].get_ydata(), expected.ratio)
 
 

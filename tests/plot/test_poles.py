@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.crystallography.directions import ZONES, poles, zones
+from apt_evap.maps.crystallography.directions import ZONES, poles, zones
 
 
 @pytest.fixture
@@ -67,7 +67,7 @@ def test_a_fit_and_a_run_know_their_orientation_and_projection(drawn, nickel):
     crystal, orientation = poles(nickel, 6), ae.Orientation(nickel, (2, 3, 7))
     near = orientation.directions(crystal.normals)[:, 2] > 0.75
     projection = ae.detection.Projection(25.0)
-    fit = ae.crystallography.fit_orientation(
+    fit = ae.maps.fit_orientation(
         nickel, crystal.planes[near], projection.places(orientation.directions(crystal.normals[near]))
     )
     ae.plot.poles(ax, fit, families=3)

@@ -122,7 +122,7 @@ def copy_of(package, target):
         ("detection/detector_map.py", "from apt_evap.detection.hits import Hits", "modules"),
         ("detection/binning.py", "def f():\n    from apt_evap.detection.detector_map import DetectorMap", "modules"),
         ("_core/octree.pyx", "from apt_evap._core.flights cimport Flights", "modules"),
-        ("detection/binning.py", "from apt_evap.crystallography.directions import Poles", "rooms"),
+        ("detection/binning.py", "from apt_evap.maps.crystallography.directions import Poles", "rooms"),
     ],
 )
 def test_an_upward_import_or_a_circle_is_found(tmp_path, module, line, what):

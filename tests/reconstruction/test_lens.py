@@ -14,7 +14,7 @@ RIM = 20.0  # mm
 
 @pytest.fixture(scope="module", params=[0.0, 4300.0], ids=["field-free drift", "potential of the detector"])
 def lens(request):
-    return ae.microscope.LocalElectrode(40e3, 20e3, SHANK, detector_potential=request.param)
+    return ae.detection.LocalElectrode(40e3, 20e3, SHANK, detector_potential=request.param)
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +85,7 @@ def test_the_protocol_of_bas_with_a_lens(lens, receding):
 
 
 def test_radii_can_be_given_with_a_lens():
-    lens = ae.microscope.LocalElectrode(40e3, 20e3, SHANK)
+    lens = ae.detection.LocalElectrode(40e3, 20e3, SHANK)
     hits = ae.Hits(x=np.array([0.0, 10.0]), y=np.zeros(2))
     known = {"atomic_volume": VOLUME, "distance": LENGTH, "detector_radius": RIM}
     found = ae.reconstruct(hits, **known, radius=[20.0, 40.0], lens=lens)
@@ -107,7 +107,7 @@ def test_radii_can_be_given_with_a_lens():
 )
 def test_what_does_not_fit_a_lens_is_refused(arguments, name):
     given = {"atomic_volume": VOLUME, "distance": LENGTH, "evaporation_field": FIELD, "detector_radius": RIM}
-    given |= {"lens": ae.microscope.LocalElectrode(40e3, 20e3, SHANK)}
+    given |= {"lens": ae.detection.LocalElectrode(40e3, 20e3, SHANK)}
     hits = ae.Hits(x=np.array([0.0, 200.0]), y=np.zeros(2), voltage=np.full(2, 3000.0))
     with pytest.raises(ValueError, match=name):
         ae.reconstruct(hits, **(given | arguments))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
+from apt_evap.reconstruction.origins import OriginTable
 
 
 def shift_of(places):
@@ -23,7 +24,7 @@ def table():
     rng = np.random.default_rng(8)
     places = 1.6 * rng.random((60_000, 2)) - 0.8
     shifts = shift_of(places) + rng.multivariate_normal([0, 0], NOISE, len(places))
-    return ae.reconstruction.OriginTable(places, shifts, neighbours=40, compression=1.1)
+    return OriginTable(places, shifts, neighbours=40, compression=1.1)
 
 
 def test_mean_and_covariance_of_a_known_field(table, rng):
@@ -53,21 +54,21 @@ def test_a_rotated_table(table):
 def test_a_table_is_saved(table, tmp_path):
     path = tmp_path / "ni.npz"
     table.save(path)
-    copy = ae.reconstruction.OriginTable.load(path)
+    copy = OriginTable.load(path)
     assert np.array_equal(copy.places, table.places) and np.array_equal(copy.shifts, table.shifts)
     assert (copy.neighbours, copy.compression, copy.symmetry) == (40, 1.1, 1)
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(ae.FileError, match="is not a table of origins"):
-        ae.reconstruction.OriginTable.load(path)
+        OriginTable.load(path)
 
 
 def test_what_a_table_does_not_cover(table):
     with pytest.raises(ValueError, match="places"):
         table.shifts_at([[1.2, 0.0]])
     with pytest.raises(ValueError, match="a table needs at least 16 ions, got 15"):
-        ae.reconstruction.OriginTable(table.places[:15], table.shifts[:15])
+        OriginTable(table.places[:15], table.shifts[:15])
     with pytest.raises(ValueError, match="places"):
-        ae.reconstruction.OriginTable(table.places[:20], table.shifts[:21])
+        OriginTable(table.places[:20], table.shifts[:21])
     with pytest.raises(ValueError, match="runs must contain at least one run"):
         ae.reconstruction.origin_table([])
 

@@ -11,7 +11,7 @@ import apt_evap as ae
 from apt_evap import Run
 
 ROLLED = ae.RollUp(0.1)
-LENS = ae.microscope.LocalElectrode.preset("local electrode")
+LENS = ae.detection.LocalElectrode.preset("local electrode")
 
 
 @pytest.fixture(scope="module")

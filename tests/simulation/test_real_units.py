@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
+from apt_evap.simulation.history import CapHistory
 from apt_evap.simulation.real_units import OperatingPoint, pulses_of, trailing_mean
+from apt_evap.specimen.materials import polarization_energy
 from apt_evap.units import FLIGHT_TIME
 
 ROLLED = ae.RollUp(ae.TruncatedNormal(0.2, 0.1))
@@ -210,7 +212,7 @@ def test_a_run_in_real_units_is_resumed_as_simulated(tip12, tmp_path):
 
 
 def test_runs_without_fields_of_the_cap_need_the_site(run):
-    old = replace(run, cap=ae.simulation.CapHistory.empty())
+    old = replace(run, cap=CapHistory.empty())
     with pytest.raises(ValueError, match="field_reference='site'"):
         old.at_evaporation_field()
     assert old.at_evaporation_field(field_reference="site").units.field_ratio is None
@@ -294,6 +296,6 @@ def test_a_field_factor_is_near_those_of_instruments(factor, tmp_path):
     with pytest.raises(ValueError, match="field_factor"):
         ae.reconstruct(hits, atomic_volume=0.011, distance=100.0, evaporation_field=35.0, field_factor=factor)
     with pytest.raises(ValueError, match="field_factor"):
-        ae.specimen.polarization_energy(1e-40, 1e3, field_factor=factor, radius=10.0, step=0.3)
+        polarization_energy(1e-40, 1e3, field_factor=factor, radius=10.0, step=0.3)
     with pytest.raises(ValueError, match="field_factor"):
         OperatingPoint(field_factor=factor)

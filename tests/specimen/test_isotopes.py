@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from apt_evap.emission.ion_random import IonRandom
+from apt_evap._common.ion_random import IonRandom
 from apt_evap.emission.post_ionisation import RATIO_PARAMETERS
 from apt_evap.specimen.isotopes import ISOTOPES, draw_isotopes, mean_mass
 from apt_evap.specimen.materials import MATERIALS

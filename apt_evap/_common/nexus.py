@@ -1,0 +1,115 @@
+"""The groups and fields that NeXus NXapm requires of a file, for runs and for ions.
+
+Written for the application definition NXapm as in the NeXus definitions v2026.01. The validator of pynxtools 0.16
+(``pynx validate``) accepts these files without a warning. Data for which NXapm has no name are in groups of the class
+NXcollection, which are not validated. Texts of NeXus have variable length, because the validator does not accept bytes.
+They are not needed to read a file. https://fairmat-nfdi.github.io/nexus_definitions/classes/applications/NXapm.html
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import h5py
+import numpy as np
+
+from apt_evap._common.checked_hdf5 import put_field
+
+DEFINITIONS = "v2026.01"
+"""Version of the NeXus definitions."""
+ENTRY = "entry1"
+ATOM_PROBE = f"{ENTRY}/atom_probe"
+IONS = f"{ATOM_PROBE}/hit_spatial_filtering/evaporation_id"
+HITS = f"{ATOM_PROBE}/hit_finding/hit_positions"
+TIMES = f"{ATOM_PROBE}/voltage_and_bowl/raw_tof"
+MASSES = f"{ATOM_PROBE}/mass_to_charge_conversion/mass_to_charge"
+MULTIPLICITY = f"{ATOM_PROBE}/hit_finding/hit_multiplicity"
+_FRAME = f"{ENTRY}/laboratory_reference_frame"
+
+
+def put_group(parent: Any, name: str, nexus_class: str) -> Any:
+    """Create a group of a NeXus class."""
+    group = parent.create_group(name)
+    group.attrs["NX_class"] = nexus_class
+    return group
+
+
+def put_nxapm(
+    file: h5py.File,
+    *,
+    ions: Any,
+    hits: Any,
+    times: Any,
+    masses: Any,
+    multiplicity: Any = None,
+    elements: Sequence[str],
+    start_time: str,
+    version: str,
+    is_simulation: bool,
+    radius: float | None = None,
+    shank_angle: float | None = None,
+) -> None:
+    """Write all that NXapm requires, and the hits.
+
+    Parameters
+    ----------
+    file : h5py.File
+        Open for writing.
+    ions : array_like of int64
+        Number of each ion in the sequence of evaporation, shape (n,).
+    hits : array_like or None
+        Positions on the detector [mm], shape (n, 2).
+    times : array_like or None
+        Times of flight [ns], shape (n,). NXapm has no units for this field.
+    masses : array_like or None
+        Mass-to-charge ratios [Da], shape (n,).
+    multiplicity : array_like of uint32, optional
+        Number of ions in the pulse of each ion, shape (n,).
+    elements : sequence of str
+        Names of the elements of the specimen.
+    start_time : str
+        Time in ISO 8601 with its offset.
+    version : str
+        Version of this package.
+    is_simulation : bool
+        Whether the ions were simulated.
+    radius : float, optional
+        Initial radius of the specimen [nm].
+    shank_angle : float, optional
+        Half the opening angle of its shank [degrees].
+    """
+    file.attrs["NX_class"] = "NXroot"
+    entry = put_group(file, ENTRY, "NXentry")
+    put_field(entry, "definition", "NXapm").attrs["version"] = DEFINITIONS
+    put_field(entry, "start_time", start_time)
+    put_field(entry, "operation_mode", "apt")
+    specimen = put_group(entry, "specimen", "NXsample")
+    put_field(specimen, "is_simulation", np.bool_(is_simulation))
+    put_field(specimen, "atom_types", ", ".join(elements))
+    for name, value, unit in (("initial_radius", radius, "nm"), ("shank_angle", shank_angle, "deg")):
+        if value is not None:
+            put_field(specimen, name, float(value), unit)
+    frame = put_group(file, _FRAME, "NXcoordinate_system")
+    put_field(frame, "type", "cartesian")
+    for name, direction in zip("xyz", np.eye(3), strict=True):
+        put_field(frame, name, direction, "mm")
+    put_group(file, ATOM_PROBE, "NXroi_process")
+    _put_process(file, HITS, version)
+    if hits is not None:
+        put_field(file, HITS, hits, "mm").attrs["depends_on"] = f"/{_FRAME}"
+    if multiplicity is not None:
+        put_field(file, MULTIPLICITY, multiplicity)
+    put_field(_put_process(file, IONS, version), "evaporation_id_offset", np.int64(0))
+    put_field(file, IONS, ions)
+    put_group(_put_process(file, TIMES, version), "config", "NXparameters")
+    if times is not None:
+        put_field(file, TIMES, times)
+    if masses is not None:  # NXapm requires them of this step
+        _put_process(file, MASSES, version)
+        put_field(file, MASSES, masses, "Da")
+
+
+def _put_process(file, field, version):
+    """The step of the analysis that contains a field, with the program that did it."""
+    group = put_group(file, field.rpartition("/")[0], "NXprocess")
+    put_field(put_group(group, "program1", "NXprogram"), "program", "apt_evap").attrs["version"] = version
+    return group

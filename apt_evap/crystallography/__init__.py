@@ -1,5 +1,0 @@
-"""Poles and zone lines on the detector, and the orientation of a specimen from them."""
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,1 @@
+"""The lens of specimen, shank and electrode: boundary elements, and a run behind the lens."""

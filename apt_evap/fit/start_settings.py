@@ -1,0 +1,331 @@
+"""Settings of a simulation from a measured map: axis, rotation, radius, detector, emission, each with its origin."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from apt_evap._common.codec import to_plain
+from apt_evap._common.files import replace_file
+from apt_evap._common.short_repr import short_repr
+from apt_evap._common.types import AnyPath, Booleans, Floats
+from apt_evap._common.validation import check_count, check_kind, check_number
+from apt_evap._version import __version__
+from apt_evap.config.cost_estimate import CostEstimate, estimate_cost
+from apt_evap.config.perturbation_text import write_perturbation
+from apt_evap.config.simulation_file import config_of
+from apt_evap.config.toml_text import comment, inline
+from apt_evap.detection.hits import Hits
+from apt_evap.detection.microscope.local_electrode import LocalElectrode
+from apt_evap.emission.perturbations import RollUp
+from apt_evap.maps.indexing.index_map import Indexing
+from apt_evap.maps.indexing.orientation_search import disc_of
+from apt_evap.maps.registration.register import Registration
+from apt_evap.specimen.lattice import atom_density
+from apt_evap.specimen.materials import MATERIALS
+
+MARK = "# Settings of a simulation, made from a measured map by apt_evap"
+"""Beginning of the first line of the text."""
+FIELD_FACTOR = 3.3
+"""Field factor if there is no lens: the middle of 2 to 8 of usual specimens (Gault et al., Atom Probe Microscopy)."""
+RADII = (80, 60, 50, 40, 32, 25, 20, 16, 12, 10)
+"""Radii of simulated tips [lattice constants], the largest one that the time allows is taken."""
+ENERGY, HEIGHT, SHARPNESS = 0.35, 0.1, 0.4
+"""Energy [eV], height of the start [nm] and sharpness of the emission, those of the master patterns."""
+ROLLS = 0.1
+"""Fraction of the roll-up pattern below which no ion rolls up."""
+_SIMULATED_COMPRESSION = 1.03  # of free tips with R = 20 to 80 a: 1.02 to 1.045, measured with the master patterns
+_MARGIN = 1.1  # of the simulated field of view beyond the measured one
+# of the registration of a run: the indexing knows rotation, scale and place better than a search
+_ROTATIONS, _SCALES, _TILT = (-5.0, 5.0), (0.92, 1.08), math.radians(3.0)
+_ENDS = 1000  # ions at the beginning and at the end of a measurement, for its radii
+_PART = 0.2  # of the volume of the cap that may evaporate: the shape stays near the sphere
+_MOST_ENERGY = 2.5  # eV; of ions by the rule of a metal, one in ten million has more
+_VOLTAGE = 1000.0  # V, of a simulation
+# eV at this voltage: the default of responses, and where they are exact: of 3,000 ions of nickel with R = 16 a none is
+# flagged with 5 eV, 1,956 with 12.7
+_LIMITS = 1.5, 5.0
+_FEWEST, _MOST = 10_000, 150_000  # ions
+
+
+def near(centre: Sequence[float], scale: float) -> dict[str, Any]:
+    """Start and bounds of the registration of a run with the settings of a `Start`, for `register`.
+
+    Parameters
+    ----------
+    centre : sequence of float
+        Place of the axis on the map [mm].
+    scale : float
+        Of the indexed map [mm/rad].
+
+    Returns
+    -------
+    dict
+        start, rotations [degrees], scales, tolerance [mm].
+    """
+    x, y = centre
+    start = Registration(0.0, 1.0, (x, y))
+    return {"start": start, "rotations": _ROTATIONS, "scales": _SCALES, "tolerance": _TILT * scale}
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Settings of a simulation of a measured specimen.
+
+    Parameters
+    ----------
+    text : str
+        Settings file (TOML), with the origin of each number as a comment.
+    indexing : Indexing
+        The indexing of the map that they are made from.
+    radii : tuple of float
+        Radius of the measured specimen at the beginning and at the end of the measurement [nm], NaN if it has no
+        voltages.
+    simulated_radius : float
+        Radius of the simulated tip [nm].
+    near : dict
+        Where the simulated map is on the measured one, for `register`, see `near`.
+    foresight : CostEstimate
+        Time and memory that the simulation needs.
+    """
+
+    text: str
+    indexing: Indexing
+    radii: tuple[float, float]
+    simulated_radius: float
+    near: dict
+    foresight: CostEstimate
+
+    def __repr__(self) -> str:
+        return short_repr(self)
+
+    def save(self, path: AnyPath) -> None:
+        """Write the settings file; it is replaced only when complete."""
+        with replace_file(path) as file:
+            file.write(self.text.encode())
+
+
+def settings_of(
+    indexing: Indexing,
+    hits: Hits | None = None,
+    *,
+    lens: LocalElectrode | None = None,
+    field_factor: float | None = None,
+    minutes: float = 10.0,
+    threads: int = 1,
+) -> Start:
+    """Make the settings of a simulation of a measured specimen.
+
+    Parameters
+    ----------
+    indexing : Indexing
+        Result of `index` for the measured map. Its first candidate is taken; if the map does not decide, the text says
+        so.
+    hits : Hits, optional
+        The measured ions, whose voltages give the radius.
+    lens : LocalElectrode, optional
+        Lens of the instrument, which gives the field factor for a radius.
+    field_factor : float, optional
+        Field factor without a lens; 3.3 by default.
+    minutes : float
+        Time that the simulation may take. Its tip is smaller than the measured one if necessary.
+    threads : int
+        Threads of the simulation.
+
+    Returns
+    -------
+    Start
+
+    Raises
+    ------
+    ValueError
+        If an argument is outside its range, or no tip is small enough for the time.
+
+    Notes
+    -----
+    The radius is R = V / (k_f F), with the evaporation field F of the material and the sum V of standing and pulse
+    voltage. Maps change slowly with the radius: poles are sqrt(2 d / R) wide.
+
+    Examples
+    --------
+    >>> truth = ae.Orientation("W", axis=(0.1, 0.6, 0.8))
+    >>> pattern = ae.maps.master_patterns("bcc")[0]
+    >>> measured = pattern.map(truth, ae.detection.Projection(60.0), width=70.0, ions=20_000, seed=1)
+    >>> start = ae.fit.settings_of(ae.index(measured, "W", scales=(58, 62)), minutes=1)
+    >>> start.save("w.toml")
+    >>> ae.config.read_config("w.toml").tip["material"].name
+    'W'
+    """
+    check_kind(indexing, "indexing", Indexing, "an Indexing, the result of index")
+    if hits is not None:
+        check_kind(hits, "hits", Hits, "Hits")
+    if lens is not None:
+        check_kind(lens, "lens", LocalElectrode, "a LocalElectrode")
+        if field_factor is not None:
+            raise ValueError("give lens or field_factor, not both")
+    factor = FIELD_FACTOR if field_factor is None else check_number(field_factor, "field_factor", above=0)
+    budget = check_number(minutes, "minutes", above=0, unit="min") * check_count(threads, "threads", at_least=1) / 60
+    best = indexing.best
+    material = best.orientation.material
+    radii = _radii(hits, material.evaporation_field, lens, factor)
+    radius = math.nan if math.isnan(radii[0]) else sum(radii) / 2
+    sizes = [size for size in RADII if not size * material.a > radius] or [RADII[-1]]
+    for size in sizes:
+        text = _text(indexing, radii, size, lens, factor)
+        needs = estimate_cost(config_of(tomllib.loads(text), Path("settings.toml")), threads)
+        if needs.hours is not None and needs.hours <= budget:
+            break
+    else:
+        raise ValueError(
+            f"minutes must be at least {60 * (needs.hours or 0.0) / threads:.1f} for the smallest tip, got {minutes:g}"
+        )
+    return Start(text, indexing, radii, size * material.a, near(best.projection.centre, best.projection.scale), needs)
+
+
+def voltages_of(hits: Hits | None) -> Floats | None:
+    """Standing voltage plus pulse of the ions that have one [V], None if there is none."""
+    if hits is None or hits.voltage is None:
+        return None
+    voltages = _voltages(hits)[has_voltage(hits)]
+    return voltages.astype(float) if len(voltages) else None
+
+
+def has_voltage(hits: Hits) -> Booleans:
+    """Whether the voltage of an ion is known: finite and above 0; bool (n,)."""
+    voltages = _voltages(hits)
+    return np.isfinite(voltages) & (voltages > 0)
+
+
+def _voltages(hits):
+    return hits.voltage if hits.pulse_voltage is None else hits.voltage + hits.pulse_voltage
+
+
+def _radii(hits, field, lens, factor):
+    """Radii at both ends of a measurement [nm]."""
+    voltages = voltages_of(hits)
+    if voltages is None:
+        return math.nan, math.nan
+    ends = [float(np.median(part)) for part in (voltages[:_ENDS], voltages[-_ENDS:])]
+    if lens is None:
+        return ends[0] / (factor * field), ends[1] / (factor * field)
+    return float(lens.radius(ends[0], field)), float(lens.radius(ends[1], field))
+
+
+def _text(indexing, radii, size, lens, factor):
+    """The settings file."""
+    best = indexing.best
+    material, projection = best.orientation.material, best.projection
+    atoms = atom_density(material.structure, material.a, material.c) * material.a**3
+    layers = 2 * math.pi * atoms * size**2  # a lattice constant of the cap
+    ions = int(min(max(layers, _FEWEST), _PART * 2 / 3 * math.pi * atoms * size**3, _MOST))
+    disc = disc_of(indexing.map)
+    x, y = np.meshgrid(*indexing.map.centres)
+    reach = np.hypot(x - disc.centre[0], y - disc.centre[1])[disc.map.mask].max()
+    axis = ", ".join(f"{each:.4f}" for each in best.orientation.axis)
+    if math.isnan(radii[0]):
+        known = "the radius of the specimen is not known: the file has no voltages"
+    else:
+        how = f"k_f = {factor:g}" if lens is None else "the lens"
+        known = f"the specimen has R = {radii[0]:.0f} to {radii[1]:.0f} nm, by V = k_f F R with {how}"
+        known += f" and F = {material.evaporation_field:g} V/nm"
+    sure = indexing.reason if indexing.decided else f"NOT DECIDED: {indexing.reason}"
+    others = [f"#   or axis = [{', '.join(f'{each:.4f}' for each in other.orientation.axis)}], "
+              f"rotation = {other.orientation.rotation:.2f}"
+              for other in indexing.candidates[1:] if not indexing.decided]  # fmt: skip
+    # V = k_f F R of a free tip, with k_f of 1.0 to 1.2
+    volts = material.evaporation_field * size * material.a
+    limit = float(np.clip(_MOST_ENERGY * _VOLTAGE / (material.charge_state * volts), *_LIMITS))
+    shank = 3.0 if lens is None else lens.shank_angle
+    shank_why = "assumed, it hardly changes the map of the cap" if lens is None else "that of the lens"
+    lines = [
+        f"{MARK} {__version__}.",
+        comment(f"Measured: {indexing.map.source or 'a map'}"),
+        "",
+        "[tip]",
+        f"material = {_material_text(material)}",
+        f"axis = [{axis}]    # at the centre of the map, within {best.angle_error:.1f} degrees by its noise",
+        f"# {sure}",
+        *others,
+        f"rotation = {best.orientation.rotation:.2f}    # of the crystal on the map; the map is not mirrored",
+        f'apex_radius = "{size:g} a"    # simulated: {size * material.a:.1f} nm',
+        f"# {known}",
+        f'shank_length = "{2 * size:g} a"',
+        f"shank_angle = {shank:g}    # degrees: {shank_why}",
+        'depth = "6 a"    # atoms deeper below the surface are not kept in memory',
+        "offset_seed = 1    # no atom on the axis",
+        "",
+        "[simulation]",
+        f"ions = {ions:_}    # some layers of the cap",
+        "",
+        "[rule]    # charges and law whose lines are where measured ones of tungsten are",
+        'name = "ConstantPotential"',
+        "",
+        "[responses]",
+        "wide = true    # for ions that roll onto a mean of their neighbours",
+        f"energy_limit = {limit:.2f}    # eV at the simulated voltage, {_VOLTAGE:g} V",
+        "",
+        "[flights]",
+        'field_of_view = "detector"    # only ions that can arrive are flown; all atoms evaporate',
+        "",
+        "[detector]    # so large and so far away that the simulated map has the size of the measured one",
+        'projection = "equidistant"    # closer to measured maps than a plane',
+        f"distance = {projection.scale * _SIMULATED_COMPRESSION:.2f}    # mm: the scale of the map, "
+        f"{projection.scale:.1f} mm/rad, times the image compression of a free tip",
+        f"width = {2 * _MARGIN * reach:.1f}    # mm: the measured field of view and a tenth more",
+        "",
+        "[real_units]    # energies are those of an experiment",
+        "",
+        "[maps]",
+        "",
+        "[[maps.panels]]",
+        'title = "unperturbed"',
+        'perturbation = "Unperturbed"',
+        "",
+        "[[maps.panels]]",
+        *_emission(best.rolled),
+        *_of_metal(material),
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _material_text(material):
+    """Value of the key material: the name of a known material, or a table of another one."""
+    if material == MATERIALS.get(material.name):
+        return inline(material.name)
+    # with its sources, so that no field is that of a known material with this name
+    return inline({name: value for name, value in to_plain(material).items() if value is not None})
+
+
+def _emission(rolled):
+    """Lines of the panel with the emission that the patterns suggest."""
+    why = f"# the map has {rolled:.0%} of the pattern of ions that roll up; the energy is to be fitted"
+    if rolled < ROLLS:
+        table = f'{{ name = "LateralVelocity", energy = {ENERGY}, height = {HEIGHT} }}'
+        return ['title = "lateral velocities"', f"perturbation = {table}    # eV", why]
+    table = f'{{ name = "RollUp", energy = {ENERGY}, height = {HEIGHT}, sharpness = {SHARPNESS}, '
+    table += f"probability = {rolled:.2f} }}"
+    return ['title = "roll-up"', f"perturbation = {table}    # eV", why]
+
+
+def _of_metal(material):
+    """Lines of the panel with the rule of the metal, if the material has the numbers of one."""
+    if material.cohesive_energy is None:
+        return []
+    try:
+        perturbation = RollUp.of_metal(material)
+    except ValueError:
+        return []
+    return [
+        "",
+        "[[maps.panels]]",
+        'title = "rule of the metal"',
+        "# from the cohesive energy and the evaporation field; nothing is taken from this map",
+        f"perturbation = {write_perturbation(perturbation)}",
+    ]

@@ -1,0 +1,1 @@
+"""Poles and zone lines, orientation of a specimen, symmetry about its axis."""

@@ -1,0 +1,1 @@
+"""Which crystal direction is where on a map: master patterns, the search, its refinement."""

@@ -1,0 +1,259 @@
+"""Search of the orientation of a map: its flattened picture against those of a master pattern in all orientations.
+
+Pictures are polar: rings about the centre of the field of view. All rotations about the axis are then one Fourier
+transform along the azimuth. Slow changes across the map, such as those of the efficiency of the detector, are removed
+from both: polynomials of degree four. The amplitudes of the two patterns, of ions that roll up and of ions that do not,
+are fitted with every orientation, and are not negative: lines may be bright or dark.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+
+from apt_evap._common.types import Floats
+from apt_evap.detection.binning import field_of_view
+from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.detection.projection import Projection
+from apt_evap.maps.crystallography.symmetry import point_group
+from apt_evap.maps.indexing.marked_poles import Mark, rotations_misfit
+from apt_evap.maps.indexing.master_pattern import MasterPattern, nearest
+
+RINGS, AZIMUTHS = 20, 96
+"""Points of a polar picture."""
+AXIS_STEP = 3.0
+"""Distance of neighbouring axes in the search [degrees]."""
+SCALE_STEP = 0.08
+"""Step of the search in the logarithm of the scale."""
+SMOOTHED = 1.5
+"""Standard deviation of the Gaussian that smooths the patterns [degrees], about the distance to the nearest axis."""
+DEGREE = 4
+"""Degree of the polynomials that are removed from maps and patterns."""
+MARK_COST = 0.02
+"""Correlation that a squared standard error of a mark costs in the search."""
+_NARROW = 1 / 40  # radii of the field of view: smoothing of the measured map
+_RIM = 0.04  # radii of the field of view: its rim, where the density rises
+_HITS = 40  # in the area of a Gaussian, 4 pi sigma^2, for a noise of 16 %
+_DARK = 0.3  # of the median density: a rim and corners that are darker are not used
+_BRIGHTEST = 2.5  # mean densities: brighter points of map and pattern are set to this
+
+
+class Disc(NamedTuple):
+    """The largest circle inside the field of view of a map."""
+
+    map: DetectorMap
+    """The map, with the field of view as its mask."""
+    centre: tuple[float, float]
+    """Centre of the circle [mm]."""
+    radius: float
+    """Radius [mm]."""
+
+
+class Start(NamedTuple):
+    """An orientation that the search found."""
+
+    matrix: np.ndarray
+    """Rotation from crystal to specimen, shape (3, 3), with z along the centre of the disc."""
+    scale: float
+    """[mm/rad]."""
+    score: float
+    """Correlation of the flattened pictures, 0 to 1."""
+    rolled: float
+    """Amplitude of the pattern of ions that roll up, as a fraction of the sum of both."""
+    pattern: int
+    """Number of the master pattern."""
+
+
+def disc_of(map: DetectorMap) -> Disc:
+    """Find the field of view of a map, without its rim and corners of low density, and the largest circle inside it."""
+    if not map.values[map.mask].sum() > 0:
+        raise ValueError(f"the map must have hits, got {map!r}")
+    values = map.values if map.is_counts else map.values * (20 / map.values[map.mask].mean())
+    mask = map.mask & field_of_view(np.where(map.mask, values, 0))
+    width, height = map.bin_size
+    size = np.sqrt(np.count_nonzero(mask) * width * height / np.pi)
+    # as many hits in a smoothed point as in `field_of_view`
+    hits = max(float(values[mask].sum()), 1.0)
+    smoothed = map.smoothed(max(_RIM, np.sqrt(_HITS / (4 * hits))) * size).values
+    # dark poles are inside
+    mask &= scipy.ndimage.binary_fill_holes(smoothed > _DARK * np.median(smoothed[mask]))
+    mask = _distance(mask, map.bin_size) > _RIM * size
+    labels, n = scipy.ndimage.label(mask)
+    if not n:
+        raise ValueError(f"the map must have a field of view of more than a rim, got {map!r}")
+    mask = labels == 1 + np.argmax(np.bincount(labels.ravel())[1:])
+    distance = _distance(mask, map.bin_size)
+    # the middle of all bins that are about as far from the rim, as in a rectangle
+    row, column = np.argwhere(distance > distance.max() - 1.5 * max(width, height)).mean(axis=0)
+    x, y = map.centres
+    centre = (float(np.interp(column, np.arange(len(x)), x)), float(np.interp(row, np.arange(len(y)), y)))
+    return Disc(replace(map, mask=mask), centre, float(distance.max()))
+
+
+def _distance(mask, bin_size):
+    """Distance of each bin from the rim of a mask [mm]."""
+    return scipy.ndimage.distance_transform_edt(np.pad(mask, 1), sampling=bin_size[::-1])[1:-1, 1:-1]
+
+
+def _polar(rings, azimuths):
+    """Radii, shape (rings,), as fractions of the rim, and azimuths [rad]."""
+    return (np.arange(rings) + 0.5) / rings, np.arange(azimuths) * (2 * np.pi / azimuths)
+
+
+def _slow(radii, azimuths):
+    """Orthonormal polynomials on the disc, with the areas of the points as weights, (n, k), and these weights (n,)."""
+    r, phi = (each.ravel() for each in np.meshgrid(radii, azimuths, indexing="ij"))
+    x, y = r * np.cos(phi), r * np.sin(phi)
+    terms = np.column_stack([x**i * y**j for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)])
+    weights = r / r.sum()
+    return np.linalg.qr(terms * np.sqrt(weights)[:, None])[0], weights
+
+
+def flattened(disc: Disc, sigma: float) -> Floats:
+    """Polar picture of a map, smoothed by `sigma` [mm], without its slow changes, times the root of the areas.
+
+    Shape (RINGS, AZIMUTHS).
+    """
+    radii, azimuths = _polar(RINGS, AZIMUTHS)
+    slow, weights = _slow(radii, azimuths)
+    smoothed = disc.map.smoothed(max(sigma, _NARROW * disc.radius))
+    values = np.where(smoothed.mask, smoothed.values, np.nan)
+    r, phi = np.meshgrid(radii * disc.radius, azimuths, indexing="ij")
+    x, y = smoothed.centres
+    width, height = smoothed.bin_size
+    index = np.stack(
+        [(disc.centre[1] + r * np.sin(phi) - y[0]) / height, (disc.centre[0] + r * np.cos(phi) - x[0]) / width]
+    )
+    picture = scipy.ndimage.map_coordinates(np.nan_to_num(values), index, order=1, mode="nearest").ravel()
+    root = np.sqrt(weights)
+    # relative to the slow changes, then without them
+    background = slow @ (slow.T @ (picture * root)) / root
+    relative = np.clip(picture / np.maximum(background, 0.05 * background.max()), 0, _BRIGHTEST) * root
+    return (relative - slow @ (slow.T @ relative)).reshape(RINGS, AZIMUTHS)
+
+
+def axes_of(structure: str, step: float) -> Floats:
+    """Directions about `step` degrees apart, one of each set that the point group makes equal, shape (n, 3)."""
+    group = point_group(structure)
+    n = int(np.ceil(4 * np.pi / np.radians(step) ** 2))
+    k = np.arange(n) + 0.5  # a spiral of equal areas
+    z, phi = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
+    points = np.column_stack([np.sqrt(1 - z**2) * np.cos(phi), np.sqrt(1 - z**2) * np.sin(phi), z])
+    # of all equal directions the one closest to a general direction
+    general = np.array([0.36, 0.12, 0.93])
+    return points[[np.all(group @ point @ general <= point @ general + 1e-12) for point in points]]
+
+
+def about_axis(axis: Floats) -> Floats:
+    """A rotation that takes an axis of the crystal to z, shape (3, 3)."""
+    first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(axis, first), axis])
+
+
+def search(
+    disc: Disc,
+    patterns: Sequence[MasterPattern],
+    scales: tuple[float, float],
+    n_max: int,
+    marks: Sequence[Mark] = (),
+) -> list[Start]:
+    """Compare a map with all orientations and scales of some master patterns.
+
+    Parameters
+    ----------
+    disc : Disc
+        The map.
+    patterns : sequence of MasterPattern
+        Patterns of one crystal structure.
+    scales : tuple of float
+        Smallest and largest scale [mm/rad].
+    n_max : int
+        Largest number of results.
+    marks : sequence of Mark
+        Marks of a user. An orientation loses `MARK_COST` of its correlation for each squared standard error.
+
+    Returns
+    -------
+    list of Start
+        The best ones, each more than two steps from a better one.
+    """
+    radii, azimuths = _polar(RINGS, AZIMUTHS)
+    slow, weights = _slow(radii, azimuths)
+    root = np.sqrt(weights)
+    group = point_group(patterns[0].structure)
+    proper = group[np.linalg.det(group) > 0]
+    # of an axis and its mirror image the pattern is the same, with the azimuth reversed
+    turns = [about_axis(axis) for axis in axes_of(patterns[0].structure, AXIS_STEP)]
+    steps = int(np.ceil(np.log(scales[1] / scales[0]) / SCALE_STEP))
+    ring, phi = (each.ravel() for each in np.meshgrid(radii, azimuths, indexing="ij"))
+    smooth = [pattern.smoothed(SMOOTHED) for pattern in patterns]
+    found = []
+    for scale in np.geomspace(*scales, steps + 1):
+        # smoothed by the same angle as the patterns
+        picture = flattened(disc, np.radians(SMOOTHED) * scale)
+        spectrum, norm = np.fft.rfft(picture, axis=1), np.linalg.norm(picture)
+        theta = ring * (disc.radius / scale)
+        local = np.column_stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
+        marked = [Projection(scale, disc.centre).directions(mark.places) for mark in marks]
+        for turn in turns:
+            cost = np.zeros((2, AZIMUTHS))
+            if marks:
+                for mirror in (False, True):
+                    cost[int(mirror)] = MARK_COST * rotations_misfit(
+                        marks, marked, _matrix(turn, mirror, 0.0), azimuths
+                    )
+            for number, smoothed in enumerate(smooth):
+                densities = np.minimum(nearest(smoothed, local @ turn), _BRIGHTEST) * root
+                densities -= (densities @ slow) @ slow.T
+                gram = densities @ densities.T
+                spectra = np.fft.rfft(densities.reshape(2, RINGS, AZIMUTHS), axis=2)
+                for mirror in (False, True):
+                    both = spectra if mirror else spectra.conj()
+                    cross = np.fft.irfft((both * spectrum).sum(axis=1), AZIMUTHS, axis=1)
+                    score, rolled = _amplitudes(cross, gram)
+                    score = score / norm - cost[int(mirror)]
+                    best = int(np.argmax(score))
+                    found.append((score[best], rolled[best], number, scale, turn, mirror, azimuths[best]))
+    found.sort(key=lambda each: -each[0])
+    starts: list[Start] = []
+    for score, rolled, number, scale, turn, mirror, angle in found:
+        matrix = _matrix(turn, mirror, angle)
+        if not any(
+            misorientation(matrix, other.matrix, proper) < 2 * AXIS_STEP
+            and abs(np.log(scale / other.scale)) < 2.5 * SCALE_STEP
+            for other in starts
+        ):
+            starts.append(Start(matrix, float(scale), float(score), float(rolled), number))
+            if len(starts) == n_max:
+                break
+    return starts
+
+
+def _matrix(turn, mirror, angle):
+    """Rotation from crystal to specimen of a result of the search."""
+    cosine, sine = np.cos(angle), np.sin(angle)
+    about = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    # the mirror image of a crystal with inversion is the crystal turned by 180 degrees about the normal of the mirror
+    return about @ (np.diag([1.0, -1.0, 1.0]) @ -turn if mirror else turn)
+
+
+def _amplitudes(cross, gram):
+    """Largest projections onto combinations of two patterns that are not negative, (m,), and shares of the second."""
+    single = cross / np.sqrt(np.maximum(np.diag(gram), 1e-30))[:, None]
+    amplitudes = np.linalg.solve(gram + 1e-9 * np.trace(gram) * np.eye(2), cross)
+    both = np.sqrt(np.maximum((amplitudes * cross).sum(axis=0), 0))
+    positive = (amplitudes >= 0).all(axis=0)
+    score = np.where(positive, both, single.max(axis=0))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rolled = np.where(positive, amplitudes[1] / amplitudes.sum(axis=0), single[1] > single[0])
+    return score, np.nan_to_num(rolled)
+
+
+def misorientation(first: Floats, second: Floats, rotations: Floats) -> float:
+    """Smallest angle between two orientations of a crystal with these rotations as its symmetry [degrees]."""
+    turn = first.T @ second
+    trace = np.einsum("ij,nji->n", turn, rotations).max()
+    return float(np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1))))

@@ -1,0 +1,104 @@
+"""Origin of a report: command, files with their checksums, warnings, versions."""
+
+import datetime
+import hashlib
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+from apt_evap._common.files import check_path, open_for_reading
+from apt_evap._common.types import AnyPath
+from apt_evap._version import __version__
+from apt_evap.plot.report.html_page import Page, collapsed, escape, heading, table, text_of
+from apt_evap.simulation.provenance import system
+
+
+def describe_file(path: AnyPath) -> dict[str, Any]:
+    """Name, size and checksum of a file.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file.
+
+    Returns
+    -------
+    dict
+        "name" without folders, "bytes" and "sha256".
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read.
+    """
+    path = check_path(path)
+    with open_for_reading(path) as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]  # an unbuffered file
+        return {"name": path.name, "bytes": file.tell(), "sha256": digest}
+
+
+@contextmanager
+def recorded_warnings(hidden: tuple[type[Warning], ...] = ()) -> Iterator[list[Any]]:
+    """Yield a list that receives every warning; those of other classes than `hidden` are also shown as before."""
+    messages: list[Any] = []
+    show = warnings.showwarning
+
+    def record(message: Any, *where: Any, **options: Any) -> None:
+        messages.append(message)
+        if not isinstance(message, hidden):
+            show(message, *where, **options)
+
+    warnings.showwarning = record
+    try:
+        yield messages
+    finally:
+        warnings.showwarning = show
+
+
+def origin(files: Sequence[AnyPath] = (), command: str = "", messages: Sequence[str] = ()) -> dict[str, Any]:
+    """Origin of a report of this process, in the types of JSON.
+
+    Parameters
+    ----------
+    files : sequence of str or path-like
+        Files that the results were computed from.
+    command : str
+        The command line.
+    messages : sequence of str
+        Warnings of the command.
+
+    Returns
+    -------
+    dict
+        "made_by", "created", "command", "files", "warnings" and "system".
+
+    Raises
+    ------
+    FileError
+        If a file cannot be read.
+    """
+    return {
+        "made_by": f"apt_evap {__version__}",
+        "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "command": command,
+        "files": [describe_file(Path(path)) for path in files],
+        "warnings": list(messages),
+        "system": {**system(), "matplotlib": matplotlib.__version__},
+    }
+
+
+def add_origin(page: Page, content: Mapping[str, Any]) -> None:
+    """Add command, files and versions to a page, and their data."""
+    page.add(heading("Command and files"))
+    if content["command"]:
+        page.add(f"<pre>{escape(content['command'])}</pre>")
+    if content["files"]:
+        rows = [(each["name"], f"{each['bytes']:,}", each["sha256"]) for each in content["files"]]
+        page.add(table(rows, ("File", "Bytes", "SHA-256")))
+    versions = {"written by": content["made_by"], "written at": content["created"], **content["system"]}
+    page.add(collapsed("Versions", table((name, text_of(value)) for name, value in versions.items())))
+    page.data("origin", content)

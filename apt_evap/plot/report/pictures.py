@@ -1,0 +1,55 @@
+"""Pictures of maps on one place, switched by a press or a key."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from apt_evap import plot
+from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.plot._figure import OUTSIDE
+from apt_evap.plot.report.html_page import Page, switched
+
+_LEFT, _RIGHT, _BELOW, _ABOVE = 0.7, 1.05, 0.55, 0.35  # margins [inch]: labels, colour bar, labels, title
+
+
+def blinking_pictures(page: Page, maps: Mapping[str, DetectorMap], width: float = 7.2) -> str:
+    """Maps on one place that are switched by a press or a key, as HTML.
+
+    Parameters
+    ----------
+    page : Page
+        Page of the pictures.
+    maps : dict
+        Maps by title, with the same bins. The region is the mask of the first one.
+    width : float
+        Width of a picture [inch].
+
+    Returns
+    -------
+    str
+    """
+    first = next(iter(maps.values()))
+    rows, columns = (np.flatnonzero(first.mask.any(axis=axis)) for axis in (1, 0))
+    (left, right), (bottom, top) = (
+        (edges[max(index[0] - 2, 0)], edges[min(index[-1] + 3, len(edges) - 1)])
+        for edges, index in ((first.x_edges, columns), (first.y_edges, rows))
+    )
+    side = width - _LEFT - _RIGHT
+    up = side * (top - bottom) / (right - left)
+    height = up + _BELOW + _ABOVE
+    pictures = []
+    for title, map in maps.items():
+        # fixed places of axes and colour bar: both pictures agree to the pixel
+        figure = Figure(figsize=(width, height))
+        ax = figure.add_axes((_LEFT / width, _BELOW / height, side / width, up / height))
+        density = map.density[map.mask]
+        low, high = np.percentile(density, [2, 99.5])  # below 2 percent may be a dark rim
+        limits = (float(low), float(high)) if high > low else (0.0, 2.0)
+        plot.detector_map(map, ax, limits=limits, colorbar=False, caption=False)
+        ax.set(xlim=(left, right), ylim=(bottom, top), facecolor=OUTSIDE)
+        ax.set_title(title, fontsize="medium", parse_math=False)
+        bar = figure.add_axes(((_LEFT + side + 0.15) / width, _BELOW / height, 0.15 / width, up / height))
+        figure.colorbar(ax.images[0], cax=bar, label="hits per area / mean")
+        pictures.append(page.picture(figure, alt=title))
+    return switched(pictures)

@@ -1,0 +1,316 @@
+"""Report of a study: maps that blink on one place, energies with intervals and doubts, similarities, settings."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+from apt_evap import plot
+from apt_evap._common.types import AnyPath
+from apt_evap._common.validation import check_kind
+from apt_evap.analysis.description import lens_text
+from apt_evap.fit.study import Score, Study
+from apt_evap.maps.crystallography.directions import plain_label
+from apt_evap.plot.report.html_page import (
+    Page,
+    collapsed,
+    color_scale,
+    escape,
+    flat,
+    heading,
+    paragraph,
+    table,
+    text_of,
+)
+from apt_evap.plot.report.origin import add_origin, origin
+from apt_evap.plot.report.pictures import blinking_pictures
+
+_COLORS = "viridis"  # of the matrix, as of `plot.score_matrix`
+_LONG = ("run", "registered", "share_above_energy_limit")  # settings in tables of their own, or only for programs
+_RARE = 0.05
+"""Largest fraction of resamples without gain, and of energies above the limit of the responses, without a doubt."""
+
+
+def write_study(
+    study: Study,
+    path: AnyPath,
+    *,
+    title: str = "",
+    figures: Mapping[str, Figure] | None = None,
+    files: Sequence[AnyPath] = (),
+    command: str = "",
+    warnings: Sequence[str] = (),
+    sections: Sequence[str] = (),
+) -> None:
+    """Write a study as one HTML file.
+
+    The file contains its pictures and needs no network. Measured and simulated map are drawn on the same place; a press
+    on the picture or the key B switches between them, so that errors of the registration are visible as motion. The
+    content of `Study.to_dict` is inside, too (`plot.read_report`).
+
+    Parameters
+    ----------
+    study : Study
+        Result of `fit_energies`.
+    path : str or path-like
+        File to write or replace.
+    title : str
+        Title of the page; by default the mechanism.
+    figures : dict, optional
+        Figures by caption, in addition to the maps; by default that of `plot.side_by_side`.
+    files : sequence of str or path-like
+        Files of the study, whose names, sizes and SHA-256 are listed.
+    command : str
+        Command line to repeat the study.
+    warnings : sequence of str
+        Warnings of the study.
+    sections : sequence of str
+        More parts of the page, as HTML, after the energies.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be written, or one of `files` cannot be read.
+    """
+    check_kind(study, "study", Study, "a Study")
+    content, made = study.to_dict(), origin(files, command, warnings)
+    page = Page(title or f"Emission energies: {study.grid.mechanism}")
+    of_registration, others = doubts(content)
+    if study.likeness.verdict == "alike":
+        page.add(paragraph(f"The maps are alike: {study.likeness.reason}."))
+    page.add(*(paragraph(text, "doubt red") for text in of_registration))
+    page.add(paragraph(f"{study.result[:1].upper()}{study.result[1:]}.", "result"))
+    page.add(_blinking(page, study))
+    page.add(*(paragraph(text, "doubt") for text in (*others, *(f"Warning: {each}" for each in made["warnings"]))))
+    page.add(*_poles(page, study), *_evidence(page, study))
+    page.add(heading("Energies"), _energies(study), *sections)
+    page.add(heading("Similarity with the measured map"), _scores(study))
+    page.add('<div class="matrices">', *_matrices(study), "</div>", _scale(study))
+    page.add(paragraph("Rows: standard deviation / mean. Columns: mean energy [eV]. Frame: the best point.", "note"))
+    if figures is None:
+        figures = {
+            "Maps as compared: flattened, smoothed, inside the common region.": plot.side_by_side(study)[0].figure
+        }
+    page.add(heading("Pictures"), *(page.picture(figure, caption) for caption, figure in figures.items()))
+    page.add(heading("Registration"), _registration(content["registration"]))
+    page.add(heading("Settings"))
+    settings = content["settings"]
+    comparison = {name: value for name, value in settings.items() if name not in _LONG}
+    for name, part in (("Comparison", comparison), ("Simulated run", settings["run"])):
+        page.add(collapsed(name, table((key, text_of(value)) for key, value in flat(part).items())))
+    add_origin(page, made)
+    page.data("study", content)
+    page.save(path)
+
+
+def doubts(content: Mapping[str, Any]) -> tuple[list[str], list[str]]:
+    """Reasons to doubt the energies of a study.
+
+    Parameters
+    ----------
+    content : dict
+        Result of `Study.to_dict`, also read from study.json.
+
+    Returns
+    -------
+    of_registration, others : list of str
+        Sentences.
+    """
+    registration, settings, edges = content["registration"], content["settings"], content["optimum"]["at_edge"]
+    of_registration, others = [], []
+    doubtful = content["likeness"]["verdict"] == "doubtful"
+    if content["likeness"]["verdict"] != "alike" and not (doubtful and registration["doubtful"]):
+        verdict = "It is doubtful that the maps are alike" if doubtful else "The maps are not alike"
+        of_registration.append(f"{verdict}: {content['likeness']['reason']}.")
+    if registration["doubtful"]:
+        of_registration.append(
+            f"The registration is doubtful: the correlation of the maps is only {registration['score']:.2f} in their "
+            f"common area ({registration['overlap']:.0%} of the measured one), as for unrelated maps. If it is wrong, "
+            "the energies have no meaning."
+        )
+    if edges:
+        names = {"mean": "the mean", "relative_spread": "standard deviation / mean"}
+        labels = " and ".join(names.get(name, name) for name in edges)
+        others.append(f"The best point is at the end of the grid in {labels}: better values may be beyond it.")
+    if not content["refined"]["intervals"]:
+        others.append("The errors are not known, because there are no resamples.")
+    elif content["gain_share"] < 1 - _RARE:
+        share = f"{content['gain_share']:.0%}"
+        others.append(f"The best map is better than the unperturbed one in only {share} of the resamples.")
+    above = np.max(settings["share_above_energy_limit"])
+    if above > _RARE:
+        others.append(
+            f"At one end of the grid, {above:.0%} of the energies are above the limit of the responses: their hit "
+            "positions are extrapolated."
+        )
+    if settings["measured_noise"] == "not known" and settings["allow_noise"]:
+        others.append(
+            "The noise of the measured densities is not known and not corrected: the best energies have slightly more "
+            "contrast than the true ones."
+        )
+    return of_registration, others
+
+
+# ---- parts of the page -----------------------------------------------------------------------------------------------
+
+
+def _energies(study):
+    best, refined, mechanism = study.optimum, study.refined, study.grid.mechanism
+    names = {"mean": "mean [eV]", "relative_spread": "standard deviation / mean"}
+    if mechanism == "combined":
+        names["rollup_fraction"] = "roll-up fraction"
+    after = {"true_mean": "mean", "true_standard_deviation": "standard deviation"}
+    varied = [(label, f"{getattr(best, name):.4g}", refined.bounded(name)) for name, label in names.items()]
+    varied += [(name, f"{value:.4g}", refined.bounded(name)) for name, value in best.options.items()]
+    following = [
+        (f"{label} after truncation [eV]", f"{getattr(best, name):.4g}", refined.bounded(name))
+        for name, label in after.items()
+    ]
+    run, real = study.provenance["run"], study.provenance.get("real_units")
+    place = f"at {run['voltage']:g} V"
+    if real is not None:
+        operating = f"at {real['operating_field']:.3g} V/nm and {real['flight_charge']}+"
+        if real["real_per_study"] == 1.0:
+            factor, place, other = real["simulated_per_study"], operating, f"{place} and {real['barrier_charge']}+"
+        else:
+            factor, other = real["real_per_study"], operating
+        for name, label in after.items():
+            values = f"{getattr(best, name) * factor:.4g}", refined.scaled(name, factor)
+            following.append((f"{label} after truncation, {other} [eV]", *values))
+    following.append((study.settings.score_name, best.score, refined.score))
+    between = "between its points" + " (interval of 95 %)" * bool(refined.intervals)
+    head = f"{mechanism}, {place}", "best on the grid", between
+    note = "Fitted energies scale with the assumed tip radius and voltage."
+    if study.provenance.get("microscope"):
+        note += f" The run is behind a {lens_text(study.provenance['microscope'])}."
+    more = collapsed("Energies after truncation, in both units", table(following, head))
+    return table(varied, head) + paragraph(note, "note") + more
+
+
+def _scores(study):
+    corrected = (
+        f"noise-corrected {study.settings.score_name}" if study.settings.allow_noise else study.settings.score_name
+    )
+    names = ("unperturbed", "thermal", "optimum")
+    scores = {**study.baselines, "optimum": study.optimum.score}
+    labels = {"thermal": f"thermal, {study.settings.temperature:g} K", "optimum": "best"}
+    rows = [(labels.get(name, name), scores[name], study.plain[name]) for name in names]
+    head = ["Map", corrected, f"uncorrected {study.settings.score_name}"]
+    if not study.settings.allow_noise:
+        rows, head = [row[:2] for row in rows], head[:2]
+    facts = f"Gain over unperturbed: {study.gain}."
+    if study.ceiling is not None:
+        facts += f" Two halves of the measured ions: {study.ceiling} (uncorrected)."
+    width, height = study.measured.bin_size
+    return table(rows, head) + paragraph(
+        f"{facts} {study.provenance['bins_compared']:,} bins of {width:.3g} × {height:.3g} mm compared, smoothed by "
+        f"{study.settings.smoothing:.3g} mm. Errors: standard deviations of {study.settings.resamples} resamples.",
+        "note",
+    )
+
+
+def _scale(study):
+    """Colours of the matrices."""
+    low, high = float(study.scores.min()), float(study.scores.max())
+    shades = [matplotlib.colors.to_hex(matplotlib.colormaps[_COLORS](part)) for part in np.linspace(0, 1, 9)]
+    return color_scale(shades, f"{low:z.3f}", f"{high:z.3f}", study.settings.score_name)
+
+
+def _poles(page, study):
+    """Both maps with the poles and zone lines of the simulated crystal."""
+    orientation, projection = study.orientation, study.projection
+    if orientation is None or projection is None:
+        return []
+    maps = {"measured": study.measured, "simulated": study.maps["optimum"]}
+    axes = plot.detector_maps([study.compared(each) for each in maps.values()], list(maps))
+    for ax in axes:
+        plot.poles(ax, orientation, projection, region=study.measured)
+    text = "Poles and zone lines of the simulated crystal, as registered, on both maps."
+    return [page.picture(axes[0].figure, text)]
+
+
+def _evidence(page, study):
+    """Folded maps, and what they say."""
+    scores = study.structure
+    if scores is None or not scores.evidence:
+        return []
+    parts = [paragraph(f"{scores.evidence[:1].upper()}{scores.evidence[1:]}.")]
+    maps = {"measured": scores.measured, "unperturbed": scores.unperturbed, "best": scores.optimum}
+    known = {title: each.folded for title, each in maps.items() if each.folded is not None}
+    if "measured" in known and len(known) > 1:
+        pole = plain_label(scores.plane)
+        parts.append(
+            page.picture(
+                plot.folded_maps(known)[0].figure,
+                f"Maps folded about the pole ({pole}) by its symmetry, {known['measured'].symmetry}, and flattened.",
+            )
+        )
+    return parts
+
+
+def _matrices(study):
+    """A table for each roll-up fraction and option."""
+    *_, rows, columns = study.grid.shape
+    values, errors, shares = (each.reshape(-1, rows, columns) for each in (study.scores, study.errors, study.shares))
+    at = study.best_cell
+    best = int(np.ravel_multi_index(at[:-2], study.grid.shape[:-2]))
+    for layer, title in enumerate(study.grid.layers):
+        yield _matrix(study, title, values[layer], errors[layer], shares[layer], at[-2:] if layer == best else None)
+
+
+def _matrix(study, title, values, errors, shares, best):
+    """Similarities for one roll-up fraction as a table; a cell shows its details under the pointer or the focus."""
+    grid = study.grid
+    colors = matplotlib.colormaps[_COLORS]
+    low, high = float(study.scores.min()), float(study.scores.max())
+    shades = colors((values - low) / (high - low) if high > low else np.zeros_like(values))
+    lines = ['<table class="matrix">']
+    if title:
+        lines.append(f"<caption>{escape(title)}</caption>")
+    for row in reversed(range(len(grid.relative_spreads))):  # as in the picture, upwards
+        cells = []
+        for column, mean in enumerate(grid.means):
+            shade = shades[row, column, :3]
+            light = np.dot(shade, (0.299, 0.587, 0.114)) > 0.5
+            score = Score(float(values[row, column]), float(errors[row, column]))
+            details = f"mean {mean:g} eV, standard deviation / mean {grid.relative_spreads[row]:.4g}: "
+            details += f"{study.settings.score_name} {score}"
+            if len(study.resampled):
+                details += f", best in {shares[row, column]:.0%} of the resamples"
+            frame = ' class="best"' if (row, column) == best else ""
+            color = matplotlib.colors.to_hex(shade)
+            cells.append(
+                f'<td{frame} tabindex="0" style="background:{color};color:{"#000" if light else "#fff"}">'
+                f"{score.value:z.3f}<span>{escape(details)}</span></td>"
+            )
+        lines.append(f"<tr><th>{grid.relative_spreads[row]:.3g}</th>{''.join(cells)}</tr>")
+    lines.append(f"<tr><th></th>{''.join(f'<th>{mean:.4g}</th>' for mean in grid.means)}</tr></table>")
+    return "\n".join(lines)
+
+
+def _registration(content):
+    scores = {"correlation": content["score"], "common area": content["overlap"], "residual [mm]": content["residual"]}
+    rows = [
+        ("mirrored", content["mirror"]),
+        ("rotation [degrees]", content["rotation"]),
+        ("scale [measured mm per simulated mm]", content["scale"]),
+        ("shift in x, y [mm]", content["shift"]),
+        *((name, value) for name, value in scores.items() if value is not None),
+        ("origin", content["method"] or "given"),
+        ("other transforms that are equally good", len(content["ties"])),
+    ]
+    return table((name, text_of(value)) for name, value in rows)
+
+
+def _blinking(page, study):
+    """The measured and the best map on one place."""
+    best = study.optimum
+    energies = f"{best.mean:g} eV, σ/mean {best.relative_spread:g}"
+    if study.grid.mechanism == "combined":
+        energies += f", roll-up fraction {best.rollup_fraction:g}"
+    maps = {"measured": study.measured, f"simulated: {study.grid.mechanism}, {energies}": study.maps["optimum"]}
+    pictures = blinking_pictures(page, {title: study.compared(map) for title, map in maps.items()})
+    note = "Both maps are flattened and smoothed as for the comparison, each with its own colour scale."
+    return pictures + paragraph(note, "note")

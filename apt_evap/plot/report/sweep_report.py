@@ -1,0 +1,228 @@
+"""Report of a sweep: one row for each point, the best one first."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from apt_evap import plot
+from apt_evap._common.codec import for_json, from_plain
+from apt_evap._common.types import AnyPath
+from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.fit.fit_settings import FitSettings
+from apt_evap.fit.study import bounded_text
+from apt_evap.plot.map_figures import default_smoothing
+from apt_evap.plot.report.html_page import Markup, Page, heading, paragraph, switched, table, text_of
+from apt_evap.plot.report.origin import add_origin, origin
+from apt_evap.plot.report.pictures import blinking_pictures
+
+_STUDY = ("mean [eV]", "standard deviation / mean", "roll-up fraction", "real energy [eV]", "doubts")
+_MOST_SETTINGS, _MOST_MAPS = 4, 12  # in the pictures
+
+
+@dataclass(frozen=True)
+class SweepRow:
+    """A point of a sweep, with its results.
+
+    Parameters
+    ----------
+    name : str
+        Name of the point.
+    settings : dict
+        Settings that differ between the points, by name, as numbers or text.
+    results : dict
+        Further results of the point, by name with the unit in brackets, such as ``{"ions": 15000}``.
+    study : dict, optional
+        Result of `Study.to_dict`, also read from study.json; None without a comparison.
+    maps : dict
+        Maps by title with the same bins, which blink on one place; the first one is the measured one.
+    panels : dict
+        Simulated maps by the title of their emission, with the same titles and bins for all points.
+    message : str
+        What is missing or failed; empty for a complete point.
+    """
+
+    name: str
+    settings: Mapping[str, Any]
+    results: Mapping[str, Any] = field(default_factory=dict)
+    study: Mapping[str, Any] | None = None
+    maps: Mapping[str, DetectorMap] = field(default_factory=dict)
+    panels: Mapping[str, DetectorMap] = field(default_factory=dict)
+    message: str = ""
+
+    @property
+    def similarity(self) -> float:
+        """Largest similarity with the measured map, -inf without a study."""
+        return -np.inf if self.study is None else float(self.study["optimum"]["score"]["value"])
+
+
+def write_sweep(
+    rows: Sequence[SweepRow],
+    path: AnyPath,
+    *,
+    title: str = "Sweep",
+    pictures: int = 3,
+    files: Sequence[AnyPath] = (),
+    command: str = "",
+    warnings: Sequence[str] = (),
+) -> None:
+    """Write a sweep as one HTML file, with a row for each point.
+
+    The points are in the order of their similarity with the measured map; points without a study follow in their own
+    order. The file needs no network. The rows are inside as data (`plot.read_report`).
+
+    Parameters
+    ----------
+    rows : sequence of SweepRow
+        The points.
+    path : str or path-like
+        File to write or replace.
+    title : str
+        Title of the page.
+    pictures : int
+        Number of points whose maps are drawn beside the measured one, from the best one.
+    files : sequence of str or path-like
+        Files of the sweep, whose names, sizes and SHA-256 are listed.
+    command : str
+        Command line to repeat the sweep.
+    warnings : sequence of str
+        Warnings of the sweep.
+
+    Raises
+    ------
+    ValueError
+        If there is no row.
+    FileError
+        If the file cannot be written, or one of `files` cannot be read.
+    """
+    if not rows:
+        raise ValueError("rows must contain a point of the sweep, got none")
+    rows = sorted(rows, key=lambda row: -row.similarity)
+    made = origin(files, command, warnings)
+    page = Page(title)
+    page.add(*(paragraph(f"Warning: {text}", "doubt") for text in made["warnings"]))
+    failed = sum(bool(row.message) for row in rows)
+    points = f"{len(rows)} point" + "s" * (len(rows) != 1)
+    page.add(paragraph(f"{points}, {failed} of them incomplete." if failed else f"{points}, all complete."))
+    compared = any(row.study for row in rows)
+    page.add(heading("Points"), _table(rows, compared))
+    if compared:
+        page.add(
+            paragraph(
+                "The best point is first. Energies are those between the points of the grid, with the interval of "
+                "95 %, in the units of each run; real energies are after the truncation. Compare similarities only for "
+                "the same bins and the same smoothing.",
+                "note",
+            )
+        )
+    if pictures:
+        page.add(*_course(page, rows), *_gallery(page, rows))
+    for row in [row for row in rows if row.maps][:pictures]:
+        page.add(heading(f"Maps of {row.name}"), blinking_pictures(page, row.maps, 5.0))
+    add_origin(page, made)
+    page.data("points", [_data(row) for row in rows])
+    page.save(path)
+
+
+def _course(page, rows):
+    """Similarity against each setting that is a number; seeds only tell specimens apart."""
+    compared = [row for row in rows if row.study]
+    varied = [name for name in _names(row.settings for row in compared) if not name.endswith("seed")]
+    values = {name: [_number(row.settings.get(name)) for row in compared] for name in varied}
+    names = [name for name in varied if len({*values[name]} - {None}) > 1][:_MOST_SETTINGS]
+    if not names:
+        return []
+    figure = plot.new_figure((3.4 * len(names) + 0.6, 3.2))
+    for ax, name in zip(figure.subplots(1, len(names), squeeze=False, sharey=True)[0], names, strict=True):
+        points = [(x, row) for x, row in zip(values[name], compared, strict=True) if x is not None]
+        errors = [row.study["optimum"]["score"]["error"] or 0.0 for _, row in points]
+        ax.errorbar([x for x, _ in points], [row.similarity for _, row in points], errors, fmt="o", markersize=4)
+        units = {text.partition(" ")[2] for _, row in points if isinstance(text := row.settings[name], str)}
+        ax.set_xlabel(f"{name} [{units.pop()}]" if len(units) == 1 else name)
+        ax.grid(alpha=0.3)
+    figure.axes[0].set_ylabel(f"largest {_score_name(compared)}")
+    return [heading("Similarity against the settings"), page.picture(figure, alt="Similarity against the settings")]
+
+
+def _score_name(compared):
+    """What the scores of the studies are: "SSIM", or "concordance" of folded maps."""
+    return from_plain({"objective": compared[0].study["settings"]["objective"]}, FitSettings).score_name
+
+
+def _number(value):
+    """Value of a setting as a number, also of a text such as "18 a"; None if it is none."""
+    if isinstance(value, str):
+        try:
+            return float(value.partition(" ")[0])
+        except ValueError:
+            return None
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+def _gallery(page, rows):
+    """Maps of the first points, one picture for each emission."""
+    shown = [row for row in rows if row.panels][:_MOST_MAPS]
+    if not shown:
+        return []
+    drawn = []
+    for title in shown[0].panels:
+        maps = [row.panels[title] for row in shown]
+        maps = [each.smoothed(default_smoothing(each, each.ions)) if each.values.any() else each for each in maps]
+        axes = plot.detector_maps(
+            maps, [_short(row) for row in shown], columns=min(math.ceil(math.sqrt(len(shown))), 3), title=title
+        )
+        drawn.append(page.picture(axes[0].figure, alt=title))
+    parts = [heading("Maps"), switched(drawn) if len(drawn) > 1 else drawn[0]]
+    left = sum(bool(row.panels) for row in rows) - len(shown)
+    return [*parts, paragraph(f"{left} more points are in the file of the maps.", "note")] if left else parts
+
+
+def _short(row):
+    """Name of a point with its first settings, for a title."""
+    values = [f"{name.rpartition('.')[2]} {text_of(value)}" for name, value in row.settings.items()]
+    return "\n".join([row.name, *values[:2]])
+
+
+def _table(rows, compared):
+    settings, results = (_names(getattr(row, part) for row in rows) for part in ("settings", "results"))
+    of_study = [_score_name([row for row in rows if row.study]), *_STUDY] if compared else []
+    lines = []
+    for row in rows:
+        cells = [text_of(row.settings.get(name)) for name in settings]
+        cells += [text_of(row.results.get(name)) for name in results]
+        cells += _study_cells(row.study) * compared
+        lines.append((row.name, *cells, row.message))
+    head = ["Point", *settings, *results, *of_study, "Message"]
+    if not any(row.message for row in rows):
+        head, lines = head[:-1], [line[:-1] for line in lines]
+    return table(lines, head, best=0 if compared else None)
+
+
+def _study_cells(content):
+    if content is None:
+        return [""] * (1 + len(_STUDY))
+    score, refined = content["optimum"]["score"], content["refined"]
+    error = f" ± {score['error']:.3f}" if score["error"] is not None else ""
+    open_ends = refined["open_ends"]
+    energies = [
+        bounded_text(refined[name], refined["intervals"].get(name), open_ends.get(name))
+        for name in ("mean", "relative_spread", "rollup_fraction")
+    ]
+    reasons = [
+        Markup('<span class="red">registration doubtful</span>') if content["registration"]["doubtful"] else "",
+        "end of the grid" if content["optimum"]["at_edge"] else "",
+    ]
+    real = content["real_energies"]
+    energies.append("" if real is None else f"{real[0]:.3g} ± {real[1]:.3g}")
+    return [f"{score['value']:.3f}{error}", *energies, Markup(", ".join(filter(None, reasons)))]
+
+
+def _names(parts):
+    """Names in the order of their first appearance."""
+    return list(dict.fromkeys(name for part in parts for name in part))
+
+
+def _data(row):
+    return for_json({name: getattr(row, name) for name in ("name", "settings", "results", "study", "message")})

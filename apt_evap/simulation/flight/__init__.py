@@ -1,0 +1,1 @@
+"""Threads that compute the flights, detector hits, and responses of the ions to their launch velocities."""

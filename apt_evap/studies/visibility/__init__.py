@@ -1,0 +1,1 @@
+"""Probability that an analysis finds a feature, origin operators and their emulator, spurious order."""

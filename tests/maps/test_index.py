@@ -1,0 +1,327 @@
+"""Indexing: known orientations are found, the map decides or not, marks of a user count."""
+
+import numpy as np
+import pytest
+
+import apt_evap as ae
+from apt_evap.maps.crystallography.symmetry import point_group
+from apt_evap.maps.indexing.index_map import DECIDED, LEAST_IONS
+from apt_evap.maps.indexing.marked_poles import marks_of
+from apt_evap.maps.indexing.master_pattern import master_patterns
+from apt_evap.maps.indexing.orientation_search import AXIS_STEP, axes_of, disc_of, flattened, misorientation, search
+from apt_evap.maps.indexing.refine import bins_of, deviance, refine
+
+SCALE, WIDTH = 60.0, 70.0
+ELEMENTS = {"fcc": "Ni", "bcc": "W", "diamond": "Si", "hcp": "Ti"}
+
+
+def proper(structure):
+    group = point_group(structure)
+    return group[np.linalg.det(group) > 0]
+
+
+def made(structure, axis, rotation=0.0, *, ions=20_000, rolled=0.5, seed=1, projection=None, pattern=0):
+    orientation = ae.Orientation(ELEMENTS[structure], axis=axis, rotation=rotation)
+    projection = ae.detection.Projection(SCALE) if projection is None else projection
+    source = master_patterns(structure)[pattern]
+    return orientation, source.map(orientation, projection, WIDTH, ions=ions, rolled=rolled, seed=seed)
+
+
+def quickly(map, material, **options):
+    """Index with one pattern and a scale that is known within 10 %, for speed."""
+    patterns = master_patterns(ae.material(material).structure)[:1]
+    return ae.index(map, material, patterns=patterns, **{"scales": (54.0, 66.0), **options})
+
+
+def off(candidate, orientation, projection=None):
+    """Largest angle between true and found directions at three places [degrees], for the best of the equal crystals.
+
+    The axis of a candidate is at the centre of its disc, which need not be that of the true projection.
+    """
+    places = np.array([[0.0, 0.0], [15.0, 0.0], [-10.0, 12.0]])
+    truth = (projection or ae.detection.Projection(SCALE)).directions(places) @ orientation.matrix
+    answer = candidate.projection.directions(places) @ candidate.orientation.matrix
+    members = proper(orientation.material.structure)
+    return min(np.degrees(np.arccos(np.clip((answer @ each * truth).sum(axis=1), -1, 1))).max() for each in members)
+
+
+@pytest.mark.parametrize(
+    ("structure", "axis", "rotation", "rolled"),
+    [
+        ("fcc", (0.30, 0.54, 0.79), 20.0, 1.0),
+        ("bcc", (0.10, 0.60, 0.80), 110.0, 0.0),
+        ("diamond", (0.35, 0.35, 0.87), -70.0, 0.6),
+        ("hcp", (2, 1, 2), 200.0, 0.3),
+    ],
+)
+def test_the_orientation_of_a_map_is_found(structure, axis, rotation, rolled):
+    orientation, map = made(structure, axis, rotation, rolled=rolled)
+    found = quickly(map, ELEMENTS[structure])
+    assert found.decided and found.verdict == "indexed"
+    best = found.best
+    # several errors by the noise of 20,000 ions, see `angle_error`
+    assert off(best, orientation) < 0.8
+    assert best.projection.scale == pytest.approx(SCALE, rel=0.02)
+    assert best.rolled == pytest.approx(rolled, abs=0.15)
+    assert 0 < best.angle_error < 0.5 and best.score > 0.7  # the pattern is smoothed, its own noise is in the map
+
+
+def test_a_rotated_map_has_a_rotated_orientation():
+    """Rotation of the map by 90 degrees, to the noise of equal counts: nothing depends on x and y."""
+    _, map = made("fcc", (0.2, 0.5, 0.84), 10.0)
+    turned = ae.DetectorMap.from_array(
+        np.rot90(map.values, -1), map.x_edges, map.y_edges, np.rot90(map.mask, -1), is_counts=True
+    )  # rows are y: anticlockwise on the detector
+    answers = [quickly(each, "Ni") for each in (map, turned)]
+    first, second = (each.best for each in answers)
+    # folded about the pole, both are the same map
+    folds = [each.folded((1, 1, 1)) for each in answers]
+    assert folds[0].symmetry == "3m" and folds[0].correlation(folds[1]) > 0.95
+    assert quickly(map, "Ni").best._plain() == first._plain()  # and the same every time
+    about = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    expected = about @ first.orientation.matrix
+    # the search grid is the same, so the results differ by the polynomial's rounding and the end of the iteration
+    assert misorientation(second.orientation.matrix, expected, proper("fcc")) < 0.1
+
+
+def test_a_compressed_and_shifted_map_is_found():
+    projection = ae.detection.Projection(SCALE, (2.0, -1.0), compression=1.5)
+    orientation, map = made("bcc", (0.1, 0.3, 0.95), 30.0, projection=projection, ions=60_000)
+    found = quickly(map, "W")
+    assert found.decided
+    assert off(found.best, orientation, projection) < 1.0
+
+
+def test_maps_without_structure_and_of_another_crystal_are_undecided():
+    _, map = made("bcc", (0.1, 0.60, 0.80), 110.0, rolled=0.0)
+    assert not quickly(map, "Ti").decided
+    flat = ae.DetectorMap.from_array(
+        np.random.default_rng(4).poisson(3.0, map.values.shape), map.x_edges, map.y_edges, map.mask, is_counts=True
+    )
+    found = quickly(flat, "W")
+    assert found.verdict == "undecided" and len(found.candidates) > 1
+    assert sum(each.confidence for each in found.candidates) <= 1.0 + 1e-9
+    assert "undecided" in str(found) and found.to_dict()["verdict"] == "undecided"
+
+
+def test_marks_decide_what_a_noisy_map_does_not():
+    orientation, map = made("fcc", (0.30, 0.54, 0.79), 20.0, ions=1_500, rolled=0.0)
+    alone = quickly(map, "Ni")
+    projection = ae.detection.Projection(SCALE)
+    places = projection.places(orientation.directions(np.array([[1.0, 1, 1], [1, 1, 3], [0, 1, 1], [1, 3, 3]])))
+    names = [(1, 1, 1), (1, 1, 3), (0, 2, 2), (1, 3, 3)]
+    poles = [(*place, name) for place, name in zip(places, names, strict=True) if np.hypot(*place) < WIDTH / 2]
+    assert len(poles) >= 3
+    named = quickly(map, "Ni", poles=poles)
+    assert off(named.best, orientation) < 1.5
+    assert not alone.decided or off(alone.best, orientation) < 3
+    pointed = quickly(map, "Ni", poles=[each[:2] for each in poles])
+    assert off(pointed.best, orientation) < 1.5
+
+
+def test_lines_decide_without_a_pole():
+    """Two zone lines of tungsten that are parallel to their zones, and miss the pole in which these meet."""
+    orientation, map = made("bcc", (0.02, 0.69, 0.72), 40.0, ions=1_500, rolled=0.0)
+    projection = ae.detection.Projection(SCALE)
+    lines = []
+    for zone in ((1.0, 1.0, -1.0), (1.0, -1.0, 1.0)):
+        normal = orientation.directions(np.array([zone]))[0]
+        normal /= np.linalg.norm(normal)
+        first = np.cross(normal, [0.0, 1.0, 0.0])
+        first /= np.linalg.norm(first)
+        second = np.cross(normal, first)
+        angles = np.radians(np.arange(0, 360, 1.0))
+        circle = np.cos(angles)[:, None] * first + np.sin(angles)[:, None] * second
+        places = projection.places(circle)
+        places = places[np.isfinite(places).all(axis=1)]
+        places = places[np.hypot(*places.T) < 30]
+        ends = places[[0, -1]] if np.hypot(*(places[0] - places[-1])) > 5 else places[[0, len(places) // 2]]
+        along = (ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0]))
+        lines.append((*(ends + 1.0 * np.array([-along[1], along[0]])).ravel(), (1, 1, 1)))
+    found = quickly(map, "W", lines=lines)
+    assert off(found.best, orientation) < 3.0  # lines and offsets: 2.5 degrees
+
+
+def test_an_axis_of_each_equal_set_is_searched():
+    for structure in ("fcc", "hcp"):
+        axes = axes_of(structure, AXIS_STEP)
+        group = point_group(structure)
+        # the area of the sphere over that of the triangle is the order of the group
+        assert len(axes) * len(group) == pytest.approx(4 * np.pi / np.radians(AXIS_STEP) ** 2, rel=0.15)
+        rng = np.random.default_rng(1)
+        for vector in rng.normal(size=(50, 3)):
+            equal = group @ (vector / np.linalg.norm(vector))
+            nearest = np.degrees(np.arccos(np.clip((axes @ equal.T).max(), -1, 1)))
+            assert nearest < AXIS_STEP
+
+
+def test_the_search_is_the_direct_correlation():
+    """Its best score against the correlation of the same pictures, computed without Fourier transforms."""
+    from apt_evap.maps.indexing import orientation_search as module
+
+    _, map = made("fcc", (0.30, 0.54, 0.79), 0.0, rolled=0.0)
+    disc = disc_of(map)
+    pattern = master_patterns("fcc")[0]
+    start = search(disc, (pattern,), (58.0, 58.0), 1)[0]
+    radii, azimuths = module._polar(module.RINGS, module.AZIMUTHS)
+    slow, weights = module._slow(radii, azimuths)
+    ring, phi = (each.ravel() for each in np.meshgrid(radii, azimuths, indexing="ij"))
+    theta = ring * disc.radius / 58.0
+    directions = np.column_stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
+    densities = np.minimum(pattern.at(directions @ start.matrix, sigma=module.SMOOTHED), 2.5) * np.sqrt(weights)
+    densities -= (densities @ slow) @ slow.T
+    picture = flattened(disc, np.radians(module.SMOOTHED) * 58.0).ravel()
+    fit = np.linalg.lstsq(densities.T, picture, rcond=None)[0]
+    direct = np.linalg.norm(densities.T @ fit) / np.linalg.norm(picture)
+    # the search takes the nearest pixel of the pattern, here it is interpolated
+    assert start.score == pytest.approx(direct, abs=0.03) and start.scale == pytest.approx(58.0)
+
+
+def test_refinement_never_lowers_the_likelihood():
+    _, map = made("fcc", (0.30, 0.54, 0.79), 20.0)
+    disc = disc_of(map)
+    bins = bins_of(disc)
+    densities = master_patterns("fcc")[0].smoothed(0.7)
+    start = search(disc, master_patterns("fcc")[:1], (50.0, 70.0), 1)[0]
+    gains = [refine(bins, disc, densities, start.matrix, start.scale, start.rolled, steps=n).gain for n in (4, 8, 20)]
+    assert gains[0] <= gains[1] + 1e-6 <= gains[2] + 2e-6
+    last = refine(bins, disc, densities, start.matrix, start.scale, start.rolled)
+    # the model of these counts is right: their deviations are Poisson's, and not correlated
+    assert last.dispersion == pytest.approx(1.0, abs=0.25) and last.explained == pytest.approx(1.0, abs=0.1)
+    assert deviance(bins.counts, bins.counts + 1e-12) == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+def test_a_given_orientation_is_refined(mirror):
+    """A start that is some degrees off, about another centre, goes to the orientation of the map."""
+    truth, measured = made("fcc", (0.30, 0.54, 0.79), 20.0)
+    away = ae.detection.Projection(58.0, (2.0, -1.0), mirror=mirror)
+    # the orientation whose directions are at the same places of this projection
+    places = np.array([[0.0, 0.0], [15.0, 0.0], [0.0, 15.0]])
+    turn = away.directions(places).T @ np.linalg.inv(ae.detection.Projection(SCALE).directions(places).T)
+    matrix = turn @ truth.matrix
+    left, _, right = np.linalg.svd(-matrix if mirror else matrix)
+    start = ae.Orientation.from_matrix("Ni", left @ right)
+    found = ae.index(measured, "Ni", start=(start, away))
+    assert off(found.best, truth) < 1.0  # noise alone: 0.1
+    assert found.best.projection.scale == pytest.approx(SCALE, rel=0.02) and not found.decided
+    assert len(found.candidates) == 1
+
+
+def test_densities_are_indexed_as_counts_are():
+    orientation, map = made("fcc", (0.30, 0.54, 0.79), 20.0, ions=60_000)
+    density = ae.DetectorMap.from_array(np.where(map.mask, map.density, np.nan), map.x_edges, map.y_edges)
+    found = ae.index(density, "Ni", distance=90.0)  # all patterns, half angles of 27 to 50 degrees
+    assert found.decided and off(found.best, orientation) < 0.5
+
+
+def test_marks_of_a_wrong_form_are_refused():
+    nickel = ae.material("Ni")
+    for name, marks in (("poles", ([(1.0,)], [])), ("lines", ([], [(1.0, 2.0)])), ("lines", ([], [(1.0, 2, 1, 2)]))):
+        with pytest.raises(ValueError, match=name.rstrip("s")):
+            marks_of(nickel, *marks)
+    _, map = made("fcc", (0.30, 0.54, 0.79), ions=2_000)
+    with pytest.raises(ValueError, match="scales"):
+        quickly(map, "Ni", scales=(50.0, 40.0))
+    with pytest.raises(ValueError, match="distance"):
+        ae.index(map, "Ni", scales=(50.0, 60.0), distance=90.0)
+    with pytest.raises(ValueError, match="patterns"):
+        ae.index(map, "Ni", patterns=master_patterns("bcc"))
+
+
+def test_few_ions_do_not_decide(monkeypatch):
+    _, map = made("fcc", (0.30, 0.54, 0.79), 20.0, ions=20_000)
+    assert quickly(map, "Ni").decided and map.ions > LEAST_IONS
+    monkeypatch.setattr("apt_evap.maps.indexing.index_map.LEAST_IONS", 30_000)
+    found = quickly(map, "Ni")
+    assert not found.decided and f"{map.ions:,}" in found.reason
+
+
+def test_the_picture_of_an_answer_shows_its_candidates():
+    _, map = made("fcc", (0.30, 0.54, 0.79), ions=20_000)
+    found = quickly(map, "Ni")
+    assert found.decided and len(ae.plot.indexing(found)) == 2
+    axes = ae.plot.indexing(found, candidates=2)
+    assert len(axes) == 3 and f"{found.best}" in axes[1].get_title()
+    assert DECIDED > 0
+
+
+def test_bounds_of_the_scale_hold_for_all_candidates():
+    _, map = made("fcc", (0.30, 0.54, 0.79), 20.0)  # its scale is outside of all of these
+    for scales in ((48.0, 54.0), (66.0, 72.0), (50.0, 50.0)):
+        for each in quickly(map, "Ni", scales=scales).candidates:
+            assert scales[0] <= each.projection.scale <= scales[1]
+    for each in ae.index(map, "Ni", patterns=master_patterns("fcc")[:1], distance=60.0).candidates:
+        assert 60 / 2.2 <= each.projection.scale <= 60 / 1.2
+
+
+@pytest.mark.parametrize("options", [
+    {"distance": 1e-9}, {"distance": 0.1}, {"distance": 1e12}, {"scales": (1e-9, 1e-8)}, {"scales": (22.0, 30.0)},
+    {"scales": (1e5, 1e6)},
+])  # fmt: skip
+def test_half_angles_that_no_instrument_has_are_refused(options):
+    _, map = made("fcc", (0.30, 0.54, 0.79), ions=2_000)
+    with pytest.raises(ValueError, match=f"{next(iter(options))} must be .* for this map"):
+        ae.index(map, "Ni", **options)
+
+
+@pytest.mark.parametrize("mean", [0.5, 3.0])
+@pytest.mark.parametrize("shape", ["flat", "gradient", "half"])
+def test_noise_has_no_score(mean, shape):
+    _, map = made("bcc", (0.1, 0.60, 0.80), ions=2_000)
+    x = map.centres[0][None, :] / 35
+    expected = {"flat": 1 + 0 * x, "gradient": 1 + 0.6 * x, "half": 1.0 * (x > 0)}[shape] * mean
+    counts = np.random.default_rng(4).poisson(np.broadcast_to(expected, map.values.shape))
+    found = quickly(ae.DetectorMap.from_array(counts, map.x_edges, map.y_edges, map.mask, is_counts=True), "W")
+    assert not found.decided and "no structure" in found.reason
+    assert [each.score for each in found.candidates] == [0.0] * len(found.candidates)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("kind", ["zeros", "one hot bin", "row", "thin", "few bins"])
+def test_maps_that_are_none_are_refused(kind):
+    counts = np.random.default_rng(1).poisson(3.0, (128, 128))
+    if kind == "zeros":
+        counts *= 0
+    elif kind == "one hot bin":
+        counts = np.where(np.arange(128 * 128).reshape(128, 128) == 8000, 5000, 0)
+    elif kind == "row":
+        counts[:62], counts[66:] = 0, 0
+    elif kind == "thin":
+        counts = counts[:4]
+    else:
+        counts = counts[:5, :5]
+    edges = [np.arange(size + 1.0) - size / 2 for size in counts.shape]
+    with pytest.raises(ValueError, match=r"hits|bins|field of view"):
+        ae.index(ae.DetectorMap.from_array(counts, edges[1], edges[0], is_counts=True), "W")
+
+
+def test_marks_outside_the_map_and_of_no_pole_are_refused():
+    _, map = made("fcc", (0.30, 0.54, 0.79), ions=2_000)
+    for poles in (
+        [(1e9, 1e9)],
+        [(34.0, 34.0)],
+        [(1.0, 1.0, (99999, 1, 1))],
+        [(1.0, 1.0, (1.5, 1, 1))],
+        [(1.0, 1.0, 7)],
+    ):
+        with pytest.raises(ValueError, match="poles"):
+            quickly(map, "Ni", poles=poles)
+    with pytest.raises(ValueError, match="lines"):
+        quickly(map, "Ni", lines=[(0.0, 0.0, 0.0, 90.0)])
+
+
+def test_marks_that_contradict_each_other_or_the_map_are_named():
+    orientation, map = made("fcc", (0.42, 0.50, 0.76), 20.0)
+    projection = ae.detection.Projection(SCALE)
+    first, second, third = projection.places(orientation.directions(np.array([[1.0, 0, 1], [0, -1, -1], [1, 1, 1]])) * [
+        [1], [-1], [1]]).tolist()  # fmt: skip
+    good = quickly(map, "Ni", poles=[(*first, (0, 2, 2)), (*second, (0, 2, 2)), (*third, (1, 1, 1))])
+    assert good.decided
+    # 60 degrees apart, as 311 and another 311 are within 3 degrees, but 311 is not there
+    wrong = quickly(map, "Ni", poles=[(*first, (3, 1, 1)), (*second, (3, 1, 1))])
+    assert not wrong.decided and wrong.reason.count("called 311") == 2
+    assert off(wrong.best, orientation) < 1.0
+    # no scale makes two poles 111 as near as these
+    near = quickly(map, "Ni", poles=[(*third, (1, 1, 1)), (third[0] + 15.0, third[1], (1, 1, 1))])
+    assert not near.decided and "contradict each other" in near.reason and near.reason.count("called 111") == 2

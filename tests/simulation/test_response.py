@@ -1,0 +1,193 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+import apt_evap as ae
+from apt_evap.detection.hits import Outcome
+from apt_evap.simulation.flight.response import Responses, directions_and_times, fit_quantities
+
+ENERGY = ae.TruncatedNormal(0.155, 0.155)
+WIDE = ae.TruncatedNormal(0.4, 0.3)  # up to the 1.5 eV of the designs and somewhat beyond
+FLOWN = (
+    ae.Unperturbed(),
+    ae.LateralVelocity(ENERGY),
+    ae.LateralVelocity(WIDE),
+    ae.RollUp(ENERGY),
+    ae.Combined(ENERGY, 0.5),
+    ae.Combined(WIDE, 0.25),
+)
+
+
+# ---- designs -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["site", "rolled"])
+def test_designs_fix_their_polynomials(name):
+    design = getattr(ae.ResponseSettings(), name)
+    matrix = design.monomials(design.launches)
+    coefficients = (design.degree + 1) * (design.degree + 2) // 2
+    assert matrix.shape == (sum(count for _, count in design.rings), coefficients)
+    assert np.linalg.matrix_rank(matrix) == coefficients
+    assert len(matrix) > coefficients  # some are left over, to tell a bad fit
+    assert np.linalg.cond(matrix) < 100  # errors of the flights are not blown up
+    assert np.hypot(*design.launches.T).max() == pytest.approx(1.0)
+
+
+def test_a_design_that_fixes_nothing_is_refused():
+    with pytest.raises(ValueError, match="must determine the 6 coefficients of degree 2"):
+        ae.simulation.Design(2, ((0.0, 1), (1.0, 4)))  # five launches for six numbers
+    with pytest.raises(ValueError, match="must determine"):
+        ae.simulation.Design(2, ((1.0, 12),))  # on a circle u^2 + v^2 = 1 adds nothing
+    ae.simulation.Design(2, ((0.0, 1), (1.0, 5)))
+
+
+@given(
+    degree=st.integers(0, 4),
+    coefficients=arrays(np.float64, (2, 3, 15), elements=st.floats(-1, 1)),
+    seed=st.integers(0, 1000),
+)
+def test_polynomials_are_found_again(degree, coefficients, seed):
+    design = ae.simulation.Design(degree, ((0.0, 1), (0.5, 11), (1.0, 13)))
+    coefficients = coefficients[:, :, : (degree + 1) * (degree + 2) // 2]
+    values = np.einsum("mc,nkc->nmk", design.monomials(design.launches), coefficients)
+    fitted, residual = design.fit(values)
+    # coefficients are kept in float32: half of 2^-23 of 1, and twice that by the 15 columns of the fit
+    assert np.abs(fitted - coefficients).max() < 2e-7
+    assert residual.max() < 1e-12
+    velocities = np.random.default_rng(seed).uniform(-1, 1, (2, 2))
+    u, v = velocities.T
+    expected = np.zeros((2, 3))
+    column = 0
+    for total in range(degree + 1):
+        for j in range(total + 1):
+            expected += coefficients[:, :, column] * (u ** (total - j) * v**j)[:, None]
+            column += 1
+    assert np.abs(design.evaluate(fitted, velocities) - expected).max() < 15 * 2e-7
+
+
+def test_the_residual_is_that_of_the_fit():
+    design = ae.simulation.Design(1, ((0.0, 1), (1.0, 8)))
+    u, v = design.launches.T
+    values = np.stack([u * u - v * v, 2 * u * v, u], axis=1)[None]  # the first two are none of 1, u, v
+    _, residual = design.fit(values)
+    assert residual[0] == pytest.approx(np.sqrt(8 / (9 - 3)))  # eight launches off by 1, nine less three free
+
+
+# ---- what is fitted ------------------------------------------------------------------------------------------------
+
+
+@given(
+    radius=arrays(np.float64, 7, elements=st.floats(0, 0.999)),
+    azimuth=arrays(np.float64, 7, elements=st.floats(0, 2 * np.pi)),
+    times=arrays(np.float64, 7, elements=st.floats(0.1, 1e6)),
+)
+def test_flattened_and_back(radius, azimuth, times):
+    directions = radius[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
+    values = fit_quantities(directions, times)
+    assert values.shape == (7, 3)
+    back, again = directions_and_times(values)
+    assert np.array_equal(back, directions)
+    assert again == pytest.approx(times, rel=1e-13)
+
+
+def test_ions_along_the_plane_never_get_there():
+    _, times = directions_and_times(np.array([[1.0, 0.0, 3.0], [2.0, 0.0, 3.0], [0.0, 0.0, 3.0]]))
+    assert np.array_equal(times, [np.inf, np.inf, 3.0])
+
+
+def test_a_straight_flight_of_one_speed_is_flat():
+    """Time to a plane goes with 1/cos of the angle; times the cosine it does not."""
+    detector = ae.Detector(100.0, 300.0)
+    angle = np.radians([0.0, 30.0, 60.0])
+    velocities = np.stack([np.sin(angle), np.zeros(3), np.cos(angle)], axis=1)
+    directions, times = detector.directions(np.zeros((3, 3)), velocities, 0.0)
+    assert directions[:, 0] == pytest.approx(np.tan(angle / 2), abs=1e-15)
+    assert fit_quantities(directions, times)[:, 2] == pytest.approx(times[0], rel=1e-14)
+    x, y, at, _ = detector.impacts(directions, times)
+    assert x == pytest.approx(100 * np.tan(angle), rel=1e-13)
+    assert np.array_equal(at, times)
+    assert not y.any()
+
+
+def test_an_equidistant_detector_keeps_angles_and_times():
+    """Places at D theta, all reached after the same time by ions of one speed: a sphere around the apex."""
+    angle, azimuth = np.radians([0.0, 30.0, 60.0, 89.0, 91.0]), np.radians([0.0, 0.0, 90.0, 200.0, 0.0])
+    velocities = np.stack([np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth), np.cos(angle)], axis=1)
+    plane = ae.Detector(100.0, 300.0)
+    sphere = replace(plane, projection="equidistant")
+    directions, times = plane.directions(np.zeros((5, 3)), velocities, 0.0)
+    x, y, at, outcome = sphere.impacts(directions, times)
+    ahead = slice(0, 4)
+    assert np.hypot(x, y)[ahead] == pytest.approx(100 * angle[ahead], rel=1e-12)
+    assert y[2] == pytest.approx(100 * angle[2], rel=1e-12)
+    assert at[ahead] == pytest.approx(times[0], rel=1e-12)
+    assert [Outcome(each).name for each in outcome] == ["HIT"] * 4 + ["MISSED"]
+    # near the axis the two are one
+    small = [[1e-4, 0.0]]
+    assert sphere.impacts(np.array(small), np.ones(1))[0] == pytest.approx(
+        plane.impacts(np.array(small), np.ones(1))[0]
+    )
+    with pytest.raises(ValueError, match="projection"):
+        ae.Detector(projection="conical")
+
+
+# ---- against flights -----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def run(tip12):
+    return ae.Simulation(tip12, seed=3).run(400, emissions=FLOWN, progress=False)
+
+
+@pytest.mark.parametrize("perturbation", FLOWN, ids=repr)
+def test_responses_say_where_ions_land(run, perturbation):
+    flown = run.hits(perturbation)
+    by_response = replace(run, perturbations=(), flown=()).hits(perturbation)
+    error = np.hypot(flown.x - by_response.x, flown.y - by_response.y)[flown.detected]
+    assert error.size > 300
+    assert (error > 0).all()  # two ways to the answer, not one
+    # asked: 0.03 mm and 0.2 mm on a flight of 100 mm; measured here 0.0004 and 0.001
+    assert np.median(error) < 0.005
+    assert np.quantile(error, 0.95) < 0.02
+    assert error.max() < run.response_settings.bound
+    times = np.abs(by_response.time_of_flight / flown.time_of_flight - 1)[flown.detected]
+    assert np.median(times) < 1e-4
+
+
+def test_higher_degree_is_better(tip12):
+    """What the polynomials leave over shrinks with their degree."""
+    perturbation = ae.Combined(WIDE, 0.25)
+    errors = []
+    for degree in (1, 2, 3):
+        design = ae.simulation.Design(degree, ((0.0, 1), (0.55, 7), (1.0, 9)))
+        settings = ae.ResponseSettings(site=design, rolled=design)
+        run = ae.Simulation(tip12, seed=3, response_settings=settings).run(100, [perturbation], progress=False)
+        flown, by_response = run.hits(perturbation), replace(run, perturbations=(), flown=()).hits(perturbation)
+        errors.append(np.nanmedian(np.hypot(flown.x - by_response.x, flown.y - by_response.y)))
+    assert errors[1] < errors[0] / 2
+    assert errors[2] < errors[1] / 2
+
+
+def test_bad_fits_are_flagged(run):
+    assert not run.flagged.any()
+    bad = run.responses.residuals.copy()
+    bad[3, 0], bad[5, 1], bad[7, 0] = 0.3, 0.3, np.nan
+    flagged = replace(run, responses=Responses(run.responses.site, run.responses.rolled, bad)).flagged
+    assert np.flatnonzero(flagged).tolist() == [3, 5, 7]
+
+
+def test_a_launch_that_never_meets_the_plane_leaves_no_infinite_time():
+    """Ions at a wide angle meet an equidistant detector though one of their launches flies away from its plane."""
+    design = ae.simulation.Design(1, ((0.0, 1), (1.0, 4)))
+    values = np.zeros((2, 5, 3))
+    values[:, :, 0] = design.launches[:, 0]
+    values[:, :, 2] = 100.0
+    values[1, 2, 2] = np.inf
+    coefficients, residual = design.fit(values)
+    assert np.isfinite(coefficients).all()
+    assert residual[0] < 1e-12 and np.isinf(residual[1])  # which flags the ion
+    assert coefficients[1, 2] == pytest.approx([100.0, 0.0, 0.0], abs=1e-4)

@@ -1,0 +1,80 @@
+"""Warren-Cowley parameter and the order that evaporation feigns."""
+
+import numpy as np
+import pytest
+
+import apt_evap as ae
+from apt_evap.specimen.lattice import lattice_sites_in
+
+A = 0.352  # nm
+
+
+@pytest.fixture(scope="module")
+def cube():
+    """Sites of an fcc cube of 8 cells, and their corner of the cell."""
+    sites, _ = lattice_sites_in(
+        "fcc", A, None, np.eye(3), np.zeros(3), lambda points: np.abs(points).max(axis=1) - 4 * A,
+        [[-4 * A] * 3, [4 * A] * 3], tolerance=1e-6,
+    )  # fmt: skip
+    return sites, np.all(np.isclose(np.mod(sites / A + 0.01, 1), 0.01, atol=1e-3), axis=1)
+
+
+def test_a_perfect_order_has_no_like_neighbours(cube):
+    sites, corners = cube
+    assert ae.studies.warren_cowley(sites, corners) == 1.0
+
+
+def test_the_parameter_is_that_of_a_double_loop(cube):
+    sites = cube[0][::3]
+    solute = np.random.default_rng(1).random(len(sites)) < 0.2
+    distances = np.linalg.norm(sites[:, None] - sites, axis=2)
+    near = (distances <= 0.4) & (distances > 0)
+    like = near[solute][:, solute].sum() / near[solute].sum()
+    assert ae.studies.warren_cowley(sites, solute, 0.4) == pytest.approx(1 - like / solute.mean(), abs=1e-12)
+
+
+@pytest.fixture(scope="module")
+def alloy():
+    nickel = ae.material("Ni")
+    phase = ae.specimen.Phase("alloy", nickel, solutes={"Al": 0.1}, evaporation_field=nickel.evaporation_field)
+    tip = ae.Tip(phases=[phase], apex_radius=3.0, axis=(1, 1, 1), shank_length=3.0, seed=1, offset_seed=1)
+    return ae.Simulation(tip, seed=1, n_threads=1).run(3000, [ae.Unperturbed()], responses=False, progress=False)
+
+
+def test_a_random_alloy_with_equal_fields_has_no_order(alloy):
+    order = ae.studies.false_order([alloy], "Al")
+    for each in (order.reconstructed, order.true):
+        assert abs(each.value) < 3.5 * each.error
+    assert abs(order.shuffled.value) < 3.5 * order.shuffled.error / np.sqrt(50)
+    # the bootstrap and the permutations agree on the error of a random alloy; both have errors of 20 %
+    assert order.true.error == pytest.approx(order.shuffled.error, rel=0.6)
+    x = order.solutes / order.ions
+    assert order.unlike.value == pytest.approx(-order.reconstructed.value * x / (1 - x))
+
+
+@pytest.mark.parametrize(
+    ("argument", "name"), [({"solute": "Cu"}, "solute"), ({"runs": []}, "runs"), ({"shell": -1.0}, "shell")]
+)
+def test_wrong_arguments_are_named(alloy, argument, name):
+    with pytest.raises(ValueError, match=name):
+        ae.studies.false_order(**{"runs": alloy, "solute": "Al"} | argument)
+
+
+@pytest.mark.slow
+def test_solutes_with_a_low_field_feign_order():
+    nickel = ae.material("Ni")
+    field = {"Al": 0.8 * nickel.evaporation_field}
+    runs = []
+    for seed in (1, 2):
+        phase = ae.specimen.Phase("alloy", nickel, solutes={"Al": 0.1}, evaporation_field=field)
+        tip = ae.Tip(
+            phases=[phase], apex_radius=20 * nickel.a, axis=(1, 1, 1), shank_length=20 * nickel.a, depth=6.0, seed=seed,
+            offset_seed=seed,
+        )  # fmt: skip
+        simulation = ae.Simulation(tip, seed=seed, n_threads=1)
+        runs.append(simulation.run(27_000, [ae.Unperturbed()], responses=False, progress=False))
+    order = ae.studies.false_order(runs, "Al")
+    # an independent measurement of one such run gave -0.177 +- 0.022
+    assert order.reconstructed.value == pytest.approx(-0.177, abs=3 * np.hypot(0.022, order.reconstructed.error))
+    assert order.reconstructed.value < -3 * order.reconstructed.error
+    assert abs(order.true.value) < 3 * order.true.error
