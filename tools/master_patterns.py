@@ -1,4 +1,4 @@
-"""Make the master patterns that come with the package, from simulations: apt_evap/indexing/patterns/*.npz.
+"""Make the master patterns that come with the package, from simulations: apt_evap/maps/indexing/patterns/*.npz.
 
     python tools/master_patterns.py RUNS              # all of them, about 70 minutes of one core
     python tools/master_patterns.py RUNS --only Ni 20
@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 
 import apt_evap as ae
-from apt_evap.maps.indexing.master_pattern import MasterPattern
 
 PATTERNS = Path(__file__).parents[1] / "apt_evap" / "indexing" / "patterns"
 ENERGY, HEIGHT, SHARPNESS = 0.35, 0.1, 0.4  # eV, nm: see articles/common_rules
@@ -73,7 +72,7 @@ def main():
         for seed, path in enumerate(paths, 1):
             if not path.exists():
                 simulated(element, radius, skip, ions, seed).save(path)
-        pattern = MasterPattern.from_runs([ae.load(path) for path in paths])
+        pattern = ae.analysis.master_pattern([ae.load(path) for path in paths])
         path = PATTERNS / f"{pattern.structure}_{radius}.npz"
         pattern.save(path)
         print(f"{path.name}: {pattern.ions:,} ions, {path.stat().st_size / 1e3:.0f} kB")

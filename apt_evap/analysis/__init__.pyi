@@ -13,6 +13,7 @@ from .ion_image import ImagingGas as ImagingGas
 from .ion_image import critical_distance as critical_distance
 from .ion_image import field_ion_image as field_ion_image
 from .ion_image import tunnel_factor as tunnel_factor
+from .pattern_of_runs import master_pattern as master_pattern
 from .response_tracks import lateral_tracks as lateral_tracks
 from .response_tracks import rollup_tracks as rollup_tracks
 from .voltage_history import evaporation_fields as evaporation_fields

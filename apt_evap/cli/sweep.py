@@ -38,8 +38,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         return action
 
     add_speech(add("plan", "make the folder of a sweep, and estimate memory and hours; nothing is run"))
-    run_sweep = add("work", "run the points that are waiting")
-    where = run_sweep.add_mutually_exclusive_group()
+    work = add("work", "run the points that are waiting")
+    where = work.add_mutually_exclusive_group()
     where.add_argument("--workers", type=integer_type(1), default=1, metavar="N", help="processes; default: 1")
     where.add_argument(
         "--point",
@@ -48,9 +48,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         help="only this point, by its key or number from 0, in this process; may be repeated",
     )
     where.add_argument("--scheduler", choices=("dask",), help="let the workers of a Dask cluster work")
-    run_sweep.add_argument("--address", metavar="TCP", help="address of the scheduler of Dask")
-    run_sweep.add_argument("--retry", action="store_true", help="also try failed points again")
-    add_speech(run_sweep)
+    work.add_argument("--address", metavar="TCP", help="address of the scheduler of Dask")
+    work.add_argument("--retry", action="store_true", help="also try failed points again")
+    add_speech(work)
     add("status", "show the states of all points").add_argument("--json", action="store_true", help="as JSON")
     gather = add("collect", "collect the finished points: table, maps, report, and the fit to a measured map")
     gather.add_argument("--maps", metavar="MAPS.h5", help="default: maps.h5 in the folder of the sweep")

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
+from apt_evap._common import ion_random
 from apt_evap._common.ion_random import IonRandom
-from apt_evap.emission import ion_random
 from apt_evap.emission.emissions import Emissions
 from apt_evap.emission.surface_frame import rollup_direction, target_shares
 
