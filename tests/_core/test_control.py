@@ -34,7 +34,7 @@ def surface(tip, control=None):
     neighbours = ae.evaporation.Emitter(tip, n_threads=1)._core.atoms
     distance = tip.nearest_neighbour_distance
     radii = emitter.settings.patch_radius * distance, emitter.settings.update_radius * distance
-    options = (voltage / COULOMB, COULOMB, *radii, emitter.settings.opening_angle)
+    options = (voltage / COULOMB, COULOMB, *radii, emitter.settings.opening_angle, 1.0)
     core = Evaporation(neighbours, ae.Robin().kernel(tip), law.kernel(tip), *options, control=control)
     core.relax(tolerance=1e-3)
     return core
