@@ -505,7 +505,7 @@ def test_parts_of_two_runs_are_not_joined(unfinished, tmp_path):
         ({"seed": 6}, [Interrupting()], "settings"),
         ({}, [ae.RollUp(0.2)], "perturbations"),
     ):
-        simulation = ae.Simulation(small().tip, n_threads=1, **{"seed": 5} | options)
+        simulation = small(**options)
         simulation.run(60, responses=False, progress=False)
         part = simulation.run(30, flown, responses=False, progress=False)
         part.save(folder / "ions-000000000060.h5")
