@@ -34,7 +34,7 @@ def surface(tip, control=None):
     neighbours = ae.evaporation.Emitter(tip, n_threads=1)._core.atoms
     distance = tip.nearest_neighbour_distance
     radii = emitter.settings.patch_radius * distance, emitter.settings.update_radius * distance
-    options = (voltage / COULOMB, COULOMB, *radii, emitter.settings.opening_angle)
+    options = (voltage / COULOMB, COULOMB, *radii, emitter.settings.opening_angle, 1.0)
     core = Evaporation(neighbours, ae.Robin().kernel(tip), law.kernel(tip), *options, control=control)
     core.relax(tolerance=1e-3)
     return core
@@ -76,7 +76,7 @@ def test_keys_have_the_voltage_that_the_control_leaves(small_tip):
 def test_an_interrupted_relaxation_does_not_change_the_voltage(small_tip):
     def voltage(interrupted):
         emitter = ae.evaporation.Emitter(small_tip, law=ae.Arrhenius(80.0), seed=1, n_threads=1)
-        assert len(emitter.evaporate(20)) == 20
+        assert sum(map(len, emitter.advance(20))) == 20
         assert emitter._core.control.rise != 0
         if interrupted:
             with pytest.raises(ValueError, match="negative"):

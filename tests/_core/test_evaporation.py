@@ -95,8 +95,8 @@ def test_hardly_a_charge_is_clipped(thousand):
 def test_small_tips_keep_their_potential(nickel, rule):
     """R = 7 a: potential in the centre and charges of the cap against converged ones, as flights see them.
 
-    Measured: 0.1 % and 0.43 % with Robin's charges, 0.05 % and 0.12 % at a constant potential. Without
-    `potential_bound`, Robin's were 3.6 % and 5.5 % wrong.
+    Measured: 0.30 % and 0.42 % with Robin's charges, 0.04 % and 0.13 % at a constant potential. Without
+    `potential_bound`, Robin's were 4.5 % and 6.0 % wrong.
     """
     tip = ae.Tip(nickel, 7 * nickel.a, axis=(1, 1, 1))
     emitter, exact = (ae.evaporation.Emitter(tip, rule=rule, n_threads=1) for _ in range(2))

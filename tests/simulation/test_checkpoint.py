@@ -57,17 +57,20 @@ def processes():
     processes.close()
 
 
+FIXED = ae.evaporation.ChargeSettings(potential_bound=1.0)  # no relaxation before an interval ends
+
+
 def simulation(**options):
     """A shell that deepens within the run, watched from its first relaxation."""
     nickel = ae.material("Ni")
     tip = ae.Tip(nickel, apex_radius=6 * nickel.a, axis=(1, 1, 1), depth=3.5 * nickel.a)
     monitor = ae.simulation.Monitor(interval=150)
-    return ae.Simulation(tip, **{"seed": 5, "n_threads": 1, "monitor": monitor} | options)
+    return ae.Simulation(tip, **{"seed": 5, "n_threads": 1, "monitor": monitor, "charge_settings": FIXED} | options)
 
 
 def small(**options):
     tip = ae.Tip("Ni", apex_radius=1.5, axis=(1, 1, 1), shank_length=1.5)
-    return ae.Simulation(tip, seed=5, n_threads=1, **options)
+    return ae.Simulation(tip, **{"seed": 5, "n_threads": 1, "charge_settings": FIXED} | options)
 
 
 def run_small(path, n_ions=90, resume=False, **options):
