@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -52,6 +53,10 @@ def runs_of(process):
         except OSError:
             pass
     return numbers
+
+
+def victims_of(process):
+    return [*runs_of(process), process.pid]
 
 
 def has_begun(sweep, *keys):
@@ -233,12 +238,11 @@ def test_twelve_points_by_processes_that_are_killed(tmp_path):
     assert len(sweep.keys) == 12
     killed, calls = [], 0
     while {state.name for _, state in sweep.states()} != {"done"}:
-        process = command(sweep, "--workers", "3")
-        calls += 1
-        with Killer(lambda process=process: [*runs_of(process), process.pid], 2.0, seed=calls) as killer:
+        process, calls = command(sweep, "--workers", "3"), calls + 1
+        with Killer(partial(victims_of, process), 5.0, most=10 - len(killed), seed=calls) as killer:
             assert process.wait(300) in (0, 2, -signal.SIGKILL)
         killed += killer.killed
-        assert calls < 100
+        assert calls <= 11
     print(f"{len(killed)} processes killed, {calls} calls")
     assert len(killed) >= 3 and run_point(sweep.folder_of(sweep.keys[0])).name == "done"
     check_bits(sweep)
