@@ -105,11 +105,11 @@ class LocalElectrode:
     Notes
     -----
     The conductors have a common axis: a spherical cap with a conical shank, and a cone with an aperture. Their charges
-    follow from boundary elements (`apt_evap.detection.microscope.boundary_elements`), the projection from flights of ions that start at
-    rest (`apt_evap.detection.microscope.lens`). Both are computed when they are first needed, for radii of 1, 2, 4, ... nm, and kept with
-    the object. Between these radii, cubic polynomials in the logarithm of the radius interpolate. With a profile,
-    further radii are added until the interpolation agrees with the solution. Measured: field factors within 1e-5, for
-    shanks of 30 degrees and profiles with kinks within 1e-4; angles within 1e-4.
+    follow from boundary elements (``boundary_elements.py``), the projection from flights of ions that start at rest
+    (``lens.py``). Both are computed when they are first needed, for radii of 1, 2, 4, ... nm, and kept with the object.
+    Between these radii, cubic polynomials in the logarithm of the radius interpolate. With a profile, further radii are
+    added until the interpolation agrees with the solution. Measured: field factors within 1e-5, for shanks of 30
+    degrees and profiles with kinks within 1e-4; angles within 1e-4.
 
     Equations and limits: :doc:`/microscope`. Electrodes and their influence on field factor and compression: Loi et
     al., Ultramicroscopy 132, 107 (2013).
