@@ -18,7 +18,7 @@ from apt_evap._version import __version__
 from apt_evap.config.cost_estimate import CostEstimate
 from apt_evap.config.simulation_file import Config, config_of, key_of
 from apt_evap.config.tables import check_table
-from apt_evap.config.toml_text import toml_text
+from apt_evap.config.toml_text import comment, toml_text
 from apt_evap.studies.sweep.compare_settings import CompareSettings
 from apt_evap.studies.sweep.point_folder import (
     SETTINGS,
@@ -152,7 +152,7 @@ def plan_sweep(path: AnyPath) -> Sweep:
             place = sweep.folder_of(point.key)
             place.mkdir(parents=True, exist_ok=True)
             settings = toml_text({key: value for key, value in point.document.items() if key != "output"})
-            write_text(place / SETTINGS, f"# made from {study.base.name}: {point}\n{settings}")
+            write_text(place / SETTINGS, f"{comment(f'made from {study.base.name}: {point}')}\n{settings}")
     except OSError as error:
         raise FileError(f"cannot write {error.filename!r}: {error.strerror}") from error
     write_text(folder / _TABLE, _table(sweep))
