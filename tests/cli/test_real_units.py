@@ -113,6 +113,7 @@ def test_a_run_says_its_real_units(tmp_path, monkeypatch, capsys):
     assert np.array_equal(longer.clock.waits[:60], first.clock.waits)
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")  # of a small specimen: below 100 V
 def test_a_map_in_real_units(made, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     command = ["map", str(made / "cold.h5"), "--perturbation", "RollUp:0.3", "--bins", "32"]
@@ -123,6 +124,7 @@ def test_a_map_in_real_units(made, tmp_path, monkeypatch, capsys):
     assert "--real-units needs a run (.h5)" in capsys.readouterr().err
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")  # of a small specimen: below 100 V
 def test_ions_are_exported_as_an_instrument_would_write_them(made, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     command = ["export", str(made / "cold.h5"), "--real-units", "-o", "ni.epos", "--perturbation", "RollUp:0.3"]

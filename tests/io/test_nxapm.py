@@ -91,6 +91,7 @@ def run():
     return simulation.run(30, [ae.RollUp(0.2)], progress=False).at_evaporation_field()
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.ResponseWarning")  # 0.2 eV are above the limit in true eV
 def test_a_run_is_as_nxapm_wants_it(run, tmp_path):
     run.save(tmp_path / "a.h5")
     check_structure(tmp_path / "a.h5", "entry1/simulation", True, "Ni, Al")

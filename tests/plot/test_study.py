@@ -54,6 +54,7 @@ def test_nothing_is_loaded(seen):
     assert policy.startswith("default-src 'none'; img-src data:;") and "http" not in policy
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.MapWarning")  # few ions
 def test_options_of_the_perturbation_are_in_the_report(small_tip, tmp_path):
     settings = {**ROUGH, "response_settings": ae.ResponseSettings.wide(bound=5.0)}
     run = ae.Simulation(small_tip, seed=1, **settings).run(400, progress=False)

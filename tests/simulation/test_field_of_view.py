@@ -250,6 +250,7 @@ def test_a_detector_that_sees_more_is_warned_about(wide_part):
     assert len(recorded) and np.isfinite(recorded.x).all()
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.ResponseWarning")  # a few energies are above the limit
 def test_a_detector_behind_a_lens(tips):
     lens = ae.detection.LocalElectrode.preset("local electrode")
     detector = ae.Detector(distance=90.0, width=40.0)

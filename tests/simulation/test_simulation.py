@@ -169,6 +169,7 @@ def few_atoms(nickel, small_tip, n):
     return ae.Tip.from_positions(small_tip.positions, small_tip.species, [nickel], evaporable=may)
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.RunWarning")  # more ions than atoms
 def test_an_exhausted_specimen_ends_the_run(nickel, small_tip):
     simulation = ae.Simulation(few_atoms(nickel, small_tip, 12))
     run = simulation.run(100, progress=False)
@@ -178,6 +179,7 @@ def test_an_exhausted_specimen_ends_the_run(nickel, small_tip):
     assert run.ended in repr(run)
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.RunWarning")  # more ions than atoms
 def test_a_run_after_the_end_is_empty(nickel, small_tip):
     simulation = ae.Simulation(few_atoms(nickel, small_tip, 12))
     simulation.run(100, progress=False)
