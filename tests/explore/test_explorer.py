@@ -530,7 +530,7 @@ def test_without_bokeh_one_sentence(run, tmp_path, monkeypatch, capsys):
         (["ions.npz", "run.h5"], "RUN must be"),
         (["run.h5", "run.h5"], "MEASURED must be measured ions or a map, 'run.h5' is a run"),
         (["run.h5", "--registration=1,1,0,0"], "--registration"),
-        (["run.h5", "--perturbation", "RollUp:1,2,3"], "RollUp takes"),
+        (["run.h5", "--perturbation", "RollUp:1,2,3"], "'RollUp' takes"),
         (["run.h5", "--simulated", "5000,"], "--simulated selects none of the ions 0 to 2000"),
         (["none.h5"], "cannot read 'none.h5'"),
     ],

@@ -301,6 +301,7 @@ def test_measured_file_comes_back_to_the_byte(tmp_path):
     assert (tmp_path / "a.epos").read_bytes() == SILICON.read_bytes()
 
 
+@pytest.mark.filterwarnings("ignore:.*are they in mm:apt_evap.warnings.DataWarning")
 @pytest.mark.parametrize("suffix", [".epos", ".raw"])
 def test_the_unit_of_detector_coordinates_can_be_given(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
@@ -313,7 +314,7 @@ def test_the_unit_of_detector_coordinates_can_be_given(tmp_path, suffix):
         parts = list(chunks(path, 2, detector_unit=unit))
         np.testing.assert_allclose(np.concatenate([part.y for part in parts]), factor * hits.y, rtol=1.2e-7)
     for function in (read, lambda path, **options: list(chunks(path, 2, **options))):
-        with pytest.raises(ValueError, match="detector_unit must be one of mm, cm, m, um, got 'inch'"):
+        with pytest.raises(ValueError, match=r"detector_unit \(--unit\) must be one of mm, cm, m, um, got 'inch'"):
             function(path, detector_unit="inch")
 
 
