@@ -150,6 +150,8 @@ class DetectorMap:
             raise ValueError(f"a map needs detected ions, got none of {len(hits)} in {hits.source or 'these hits'}")
         if not detected.all():
             x, y = x[detected], y[detected]
+
+        # quantised coordinates: move every hit at random within a step, if requested
         quantisations = find_quantisations(x, y, position_step)
         if dither_seed is not None:
             if quantisations is None:
@@ -161,6 +163,8 @@ class DetectorMap:
                 values + quantisation.spacing * (random.random(len(values)) - 0.5)
                 for values, quantisation in zip((x, y), quantisations, strict=True)
             )
+
+        # edges: those of another map, or multiples of the quantisation step
         if like is not None:
             x_edges, y_edges, mask = like.x_edges, like.y_edges, like.mask if mask is None else mask
             if quantisations is not None and dither_seed is None and not _fits(like, quantisations):
@@ -172,6 +176,8 @@ class DetectorMap:
         else:
             extent = hits.extent if extent is None else extent
             x_edges, y_edges = bin_edges(x, y, bins, extent, quantisations if dither_seed is None else None)
+
+        # counts, and the bins inside the detector or the field of view
         counts = count(x, y, x_edges, y_edges)
         if not counts.any():
             raise ValueError(
