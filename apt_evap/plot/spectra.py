@@ -68,11 +68,11 @@ def spectrum(
     if not spectra or len(labels) != len(spectra):
         raise ValueError(f"spectrum needs ions, with one label each, got {len(spectra)} and {len(labels)}")
     if elements is None:
-        names = [name for each in spectra if isinstance(each, Run) for name in each.elements]
+        names = [name for run in spectra if isinstance(run, Run) for name in run.elements]
         elements = [name for name in dict.fromkeys(names) if name in ISOTOPES]
     else:
         elements = [check_choice(name, "elements", ISOTOPES) for name in elements]
-    masses = [_masses(each) for each in spectra]
+    masses = [_masses(ions) for ions in spectra]
     bin_width = check_number(bin_width, "bin_width", above=0, unit="Da")
     low, high = _default_limits(masses) if limits is None else check_array(limits, "limits", (2,)).tolist()
     if not 0 <= low < high or (high - low) / bin_width > _MOST_BINS:
