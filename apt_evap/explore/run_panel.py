@@ -118,7 +118,7 @@ class RunPanel:
         def work():
             made = self._settings(minutes, thread_count())
             made.save(path)
-            self._later(partial(self._written, f"wrote {path}: {made.foresight}", made, path), 0)
+            self._later(partial(self._written, f"wrote {path}: {made.cost}", made, path), 0)
 
         start_thread(work, lambda sentence: self._later(partial(self._written, sentence), 0))
 

@@ -911,7 +911,14 @@ MADE = {"FileError", "TruncatedFile", "Outcome", "StopReason", "RunInterrupted",
 MADE |= {"Reconstruction", "Study", "ZoneLine", "History", "CapHistory", "Ring", "RadiusFit", "TipFit", "Distortion"}
 MADE |= {"DistortionGrid", "FittedOrientation", "Similarity", "Batch", "Lens"}
 # for extensions, which call them with arrays of the package
-ARRAYS = {"charge_probabilities", "course", "course_of_charges", "draw_isotopes", "field_of_counts", "ion_charges"}
+ARRAYS = {
+    "charge_history",
+    "charge_probabilities",
+    "draw_isotopes",
+    "smoothed_history",
+    "field_of_counts",
+    "ion_charges",
+}
 ARRAYS |= {"launch_tangentially", "ratio_of_counts", "rollup_direction", "lattice_sites_in", "BondField"}
 ARRAYS |= {"Detection", "charge_residuals", "surface_after", "roll_ups"}
 
