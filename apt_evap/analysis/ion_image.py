@@ -375,13 +375,7 @@ def field_ion_image(
     starts, local = _critical_surface(emitter, positions, normals, level, scale, barrier)
     fields = local if tunnelling == "local" else barrier / np.linalg.norm(starts - positions, axis=1)
 
-    # brightness: tunnel factor relative to that at the best image field, times the supply of gas
-    known = np.isfinite(fields)
-    brightness = np.zeros(len(atoms))
-    best = tunnel_factor(gas.field, gas.ionisation_energy)
-    brightness[known] = tunnel_factor(fields[known], gas.ionisation_energy) / best
-    if supply == "capture":
-        brightness[known] *= (local[known] / gas.field) ** 2
+    brightness = _brightness(gas, supply, fields, local)
 
     # spots on the detector, by flights of the ions from the critical surface
     flown = brightness > _FAINTEST * brightness.max()
@@ -410,6 +404,17 @@ def field_ion_image(
         detector=detector,
         settings=constants,
     )
+
+
+def _brightness(gas, supply, fields, local):
+    """Tunnel factor relative to that at the best image field, times the supply of gas; 0 where it is not known."""
+    known = np.isfinite(fields)
+    brightness = np.zeros(len(fields))
+    best = tunnel_factor(gas.field, gas.ionisation_energy)
+    brightness[known] = tunnel_factor(fields[known], gas.ionisation_energy) / best
+    if supply == "capture":
+        brightness[known] *= (local[known] / gas.field) ** 2
+    return brightness
 
 
 def _barrier(ionisation_energy, work_function):

@@ -151,18 +151,9 @@ class DetectorMap:
         if not detected.all():
             x, y = x[detected], y[detected]
 
-        # quantised coordinates: move every hit at random within a step, if requested
         quantisations = find_quantisations(x, y, position_step)
         if dither_seed is not None:
-            if quantisations is None:
-                raise ValueError(
-                    "dither_seed needs a quantisation step of the coordinates (position_step), but they are continuous"
-                )
-            random = np.random.default_rng(dither_seed)
-            x, y = (
-                values + quantisation.spacing * (random.random(len(values)) - 0.5)
-                for values, quantisation in zip((x, y), quantisations, strict=True)
-            )
+            x, y = _dithered(x, y, quantisations, dither_seed)
 
         # edges: those of another map, or multiples of the quantisation step
         if like is not None:
@@ -441,6 +432,19 @@ def _on_detector(x_edges, y_edges, extent):
     columns = (extent[0] <= x) & (x <= extent[1])
     rows = (extent[2] <= y) & (y <= extent[3])
     return rows[:, None] & columns
+
+
+def _dithered(x, y, quantisations, seed):
+    """Coordinates moved at random within one quantisation step."""
+    if quantisations is None:
+        raise ValueError(
+            "dither_seed needs a quantisation step of the coordinates (position_step), but they are continuous"
+        )
+    random = np.random.default_rng(seed)
+    return [
+        values + quantisation.spacing * (random.random(len(values)) - 0.5)
+        for values, quantisation in zip((x, y), quantisations, strict=True)
+    ]
 
 
 def _fits(like, quantisations):

@@ -230,12 +230,6 @@ def _text(indexing, radii, size, lens, factor):
     x, y = np.meshgrid(*indexing.map.centres)
     reach = np.hypot(x - disc.centre[0], y - disc.centre[1])[disc.map.mask].max()
     axis = ", ".join(f"{component:.4f}" for component in best.orientation.axis)
-    if math.isnan(radii[0]):
-        known = "the radius of the specimen is not known: the file has no voltages"
-    else:
-        how = f"k_f = {factor:g}" if lens is None else "the lens"
-        known = f"the specimen has R = {radii[0]:.0f} to {radii[1]:.0f} nm, by V = k_f F R with {how}"
-        known += f" and F = {material.evaporation_field:g} V/nm"
     sure = indexing.reason if indexing.decided else f"NOT DECIDED: {indexing.reason}"
     others = [f"#   or axis = [{', '.join(f'{component:.4f}' for component in other.orientation.axis)}], "
               f"rotation = {other.orientation.rotation:.2f}"
@@ -256,7 +250,7 @@ def _text(indexing, radii, size, lens, factor):
         *others,
         f"rotation = {best.orientation.rotation:.2f}    # of the crystal on the map; the map is not mirrored",
         f'apex_radius = "{size:g} a"    # simulated: {size * material.a:.1f} nm',
-        f"# {known}",
+        f"# {_radius_text(material, radii, lens, factor)}",
         f'shank_length = "{2 * size:g} a"',
         f"shank_angle = {shank:g}    # degrees: {shank_why}",
         'depth = "6 a"    # atoms deeper below the surface are not kept in memory',
@@ -295,6 +289,16 @@ def _text(indexing, radii, size, lens, factor):
         "",
     ]
     return "\n".join(lines)
+
+
+def _radius_text(material, radii, lens, factor):
+    if math.isnan(radii[0]):
+        return "the radius of the specimen is not known: the file has no voltages"
+    by = f"k_f = {factor:g}" if lens is None else "the lens"
+    return (
+        f"the specimen has R = {radii[0]:.0f} to {radii[1]:.0f} nm, by V = k_f F R with {by} and F = "
+        f"{material.evaporation_field:g} V/nm"
+    )
 
 
 def _material_text(material):
