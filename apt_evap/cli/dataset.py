@@ -25,7 +25,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("study", metavar="STUDY.toml", help="study file with a table [dataset], or a data set")
     parser.add_argument("-o", "--output", metavar="FOLDER", help="default: name of the study with _set")
-    parser.add_argument("--plan", action="store_true", help="only foretell time and size")
+    parser.add_argument("--plan", action="store_true", help="only estimate time and size")
     parser.add_argument("--workers", type=integer_type(1), default=1, metavar="N", help="processes; default: 1")
     parser.add_argument(
         "--without-failed", action="store_true", help="leave out runs that have failed, instead of an error"

@@ -10,7 +10,7 @@ from apt_evap.cli._files import check_output, lens_of, path_word
 from apt_evap.cli._options import add_indexing, add_reading, add_specimen, add_speech
 from apt_evap.cli._output import tell, tell_json
 from apt_evap.cli.index import indexed
-from apt_evap.fit.start_settings import MARK, Start, settings_of
+from apt_evap.fit.start_settings import MARK, StartSettings, settings_of
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -40,12 +40,12 @@ def execute(options: argparse.Namespace) -> int:
     start = start_of(options)
     tell(options, f"{start.indexing}")
     start.save(path)
-    tell(options, f"wrote {path}: {start.foresight}; simulate with apt-evap run {shlex.quote(path_word(path))}")
+    tell(options, f"wrote {path}: {start.cost}; simulate with apt-evap run {shlex.quote(path_word(path))}")
     tell_json(options, {"wrote": str(path), "file": options.file, **summary(start)})
     return 0
 
 
-def start_of(options: argparse.Namespace) -> Start:
+def start_of(options: argparse.Namespace) -> StartSettings:
     """Settings by the options of a command."""
     found, ions = indexed(options)
     return settings_of(
@@ -58,7 +58,7 @@ def start_of(options: argparse.Namespace) -> Start:
     )
 
 
-def summary(start: Start) -> dict[str, object]:
+def summary(start: StartSettings) -> dict[str, object]:
     """A start in plain types."""
     radii = [None if radius != radius else radius for radius in start.radii]
     return {"radii": radii, "simulated_radius": start.simulated_radius, **start.indexing.to_dict()}

@@ -30,7 +30,7 @@ from apt_evap.explore.marks import Marks, overlay
 from apt_evap.explore.search_process import SearchProcess, guarded, start_thread
 from apt_evap.explore.widgets import LEFT
 from apt_evap.fit.fit_energies import measured_map
-from apt_evap.fit.start_settings import Start, settings_of
+from apt_evap.fit.start_settings import StartSettings, settings_of
 from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.indexing.index_map import Indexing, index
 from apt_evap.specimen.materials import MATERIALS
@@ -263,7 +263,7 @@ class IndexPanel:
         ]  # fmt: skip
         self._put(rows, text, found)
 
-    def settings(self, minutes: float, threads: int) -> Start:
+    def settings(self, minutes: float, threads: int) -> StartSettings:
         """Settings of a simulation of the chosen candidate, as ``apt-evap start`` makes them; in any thread."""
         if not self.candidates:
             raise ValueError("index the map first: click poles, or search")

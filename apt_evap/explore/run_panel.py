@@ -16,7 +16,7 @@ from apt_evap._common.validation import short_text
 from apt_evap.explore.background_run import BackgroundRun
 from apt_evap.explore.search_process import guarded, start_thread
 from apt_evap.explore.widgets import LEFT
-from apt_evap.fit.start_settings import Start
+from apt_evap.fit.start_settings import StartSettings
 
 INTERVAL = 500
 """Time between two looks at the run [ms]."""
@@ -37,7 +37,7 @@ class RunPanel:
     Parameters
     ----------
     settings : callable
-        Returns the `Start` for minutes and threads; called in a thread.
+        Returns the `StartSettings` for minutes and threads; called in a thread.
     name : str
         Settings file that is proposed.
     bench : Workbench
@@ -52,7 +52,7 @@ class RunPanel:
 
     def __init__(
         self,
-        settings: Callable[[float, int], Start],
+        settings: Callable[[float, int], StartSettings],
         name: str,
         bench: Workbench,
         later: Callable[[Callable[[], None], int], Any],
@@ -118,7 +118,7 @@ class RunPanel:
         def work():
             made = self._settings(minutes, thread_count())
             made.save(path)
-            self._later(partial(self._written, f"wrote {path}: {made.foresight}", made, path), 0)
+            self._later(partial(self._written, f"wrote {path}: {made.cost}", made, path), 0)
 
         start_thread(work, lambda sentence: self._later(partial(self._written, sentence), 0))
 

@@ -46,7 +46,7 @@ class Format:
     """A file format: suffix (also its name), first bytes, reader, writer, reader in chunks, and what is written.
 
     `fixed` are the columns that the writer always writes, as zeros if they are missing; empty if it writes those of the
-    ions. `keeps` tells whether it writes a column, by its name and values.
+    ions. `keeps` decides whether it writes a column, by its name and values.
     """
 
     suffix: str

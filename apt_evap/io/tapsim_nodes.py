@@ -66,11 +66,11 @@ def read_nodes(path: AnyPath) -> Atoms:
     atoms = ids > max(_BOUNDARIES)
     if not atoms.any():
         raise FileError(f"{str(path)!r} has no atoms among its {n} nodes: all ids are 0 to {max(_BOUNDARIES)}")
-    return Atoms(positions[atoms] * _NM_PER_M, [str(each) for each in ids[atoms].tolist()])
+    return Atoms(positions[atoms] * _NM_PER_M, [str(number) for number in ids[atoms].tolist()])
 
 
-def _truncated(path, n, found):
-    return TruncatedFile(f"{str(path)!r} states {n} nodes but ends after {found}")
+def _truncated(path, n, complete):
+    return TruncatedFile(f"{str(path)!r} states {n} nodes but ends after {complete}")
 
 
 def _text(data, start, n, columns, path):
@@ -95,7 +95,9 @@ def _text(data, start, n, columns, path):
 
 def _binary(data, start, n, columns, path):
     kinds = [("position", "<f4", 3), ("id", "<i2")]
-    kinds += [each for each, there in zip((("number", "<u4"), ("potential", "<f4")), columns, strict=True) if there]
+    kinds += [
+        column for column, present in zip((("number", "<u4"), ("potential", "<f4")), columns, strict=True) if present
+    ]
     row = np.dtype(kinds)  # type: ignore[arg-type]
     if len(data) - start < n * row.itemsize:
         raise _truncated(path, n, (len(data) - start) // row.itemsize)

@@ -66,7 +66,7 @@ def voltage_curve(
     element: str | None = None,
     ranges: Ranges | None = None,
 ) -> NDArray[np.object_]:
-    """Draw the course of a run or of a measurement against the ions: voltage, field, rate and charges.
+    """Draw the history of a run or of a measurement against the ions: voltage, field, rate and charges.
 
     There are up to four panels, those for which there are data:
 
@@ -182,7 +182,7 @@ def _panels_of_hits(hits, points, element, ranges):
     panels = [(_draw_voltage, voltage, points, "standing\nvoltage [V]" if pulsed else "voltage [V]")]
     if hits.pulses is not None and hits.pulses.any():
         edges = _sections(len(hits), points)
-        detected, pulses = (np.add.reduceat(each, edges[:-1], dtype=float) for each in (hits.detected, hits.pulses))
+        detected, pulses = (np.add.reduceat(column, edges[:-1], dtype=float) for column in (hits.detected, hits.pulses))
         panels.append((_draw_rate, edges, detected / np.maximum(pulses, 1), "ions per pulse", None))
     if ranges is not None or "charge_state" in hits.extra:
         charges = hits.extra["charge_state"] if element is None else ion_charges(hits, element, ranges)

@@ -28,7 +28,7 @@ from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits, Outcome
 from apt_evap.detection.instrument import Instrument
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
-from apt_evap.detection.microscope.run_lens import Course, RunLens
+from apt_evap.detection.microscope.run_lens import RadiusHistory, RunLens
 from apt_evap.emission.emissions import Emissions, TangentialLaunches
 from apt_evap.emission.perturbations import Perturbation, Unperturbed, described, warn_if_not_for
 from apt_evap.evaporation.state import EmitterState
@@ -580,8 +580,8 @@ class Run:
         if lens is None:
             return self
         check_kind(lens, "lens", LocalElectrode, "a LocalElectrode")
-        course = Course(self.cap.ions, self.cap.radii, self.cap.apexes)
-        imaged = RunLens.of(lens, self.settings["tip"], course, self.emissions.nearest_neighbour_distance)
+        history = RadiusHistory(self.cap.ions, self.cap.radii, self.cap.apexes)
+        imaged = RunLens.of(lens, self.settings["tip"], history, self.emissions.nearest_neighbour_distance)
         return replace(self, settings=self.settings | {"microscope": to_plain(imaged)})
 
     def simulated(self) -> "Run":

@@ -190,7 +190,7 @@ def with_dataset(path, name, values):
         ("site", lambda values: values[:-5], r"site must have shape \(60\), got \(55,\)"),
         ("flown/0/times", lambda values: values[:-5], r"times must have shape \(60\), got \(55,\)"),
         ("history/field", lambda values: values[:-1], "field must have shape"),
-        ("state/lonely_normals", lambda values: np.zeros((0, 2)), r"lonely_normals must have shape \(any, 3\)"),
+        ("state/isolated_normals", lambda values: np.zeros((0, 2)), r"isolated_normals must have shape \(any, 3\)"),
         ("masses", lambda values: h5py.Empty("f8"), "masses must have shape"),
     ],
 )
@@ -274,8 +274,8 @@ def test_states_that_do_not_fit_are_refused(run, path):
 def test_the_state_comes_back(run, path):
     other = ae.load(path)
     state = other.state
-    assert other.first_event == 0 and state.deepened == run.state.deepened
-    for name in ("sites", "charges", "lonely", "lonely_normals"):
+    assert other.first_event == 0 and state.extensions == run.state.extensions
+    for name in ("sites", "charges", "isolated", "isolated_normals"):
         assert np.array_equal(getattr(state, name), getattr(run.state, name))
     assert np.array_equal(state.rule_state["potential_point"], run.state.rule_state["potential_point"])
 

@@ -21,7 +21,7 @@ def emitter_of(tip, law, **options):
     return ae.evaporation.Emitter(tip, law=law, **{"n_threads": 1} | options)
 
 
-def course(emitter, n, batch_size=256):
+def history_of(emitter, n, batch_size=256):
     """Columns of n events: sites, charges, waits and voltages."""
     batches = list(emitter.advance(n, batch_size))
     columns = ("site", "charges", "waits", "voltages")
@@ -182,7 +182,7 @@ def test_the_spread_of_the_order_grows_with_the_temperature(tip12):
 
 def test_at_zero_temperature_the_law_is_the_extremal_one_bit_by_bit(tip12):
     extremal, cold = emitter_of(tip12, ae.Extremal()), emitter_of(tip12, ae.Arrhenius(0.0), seed=7)
-    assert same(course(extremal, 250), course(cold, 250)) == [True] * 4
+    assert same(history_of(extremal, 250), history_of(cold, 250)) == [True] * 4
     assert cold.control is None and cold.pulse_length is None and cold.control_voltage == cold.voltage == 1000.0
     for barrier in BARRIERS:
         assert type(ae.Arrhenius(0.0, barrier=barrier).kernel(tip12)) is type(ae.Extremal().kernel(tip12))
@@ -191,10 +191,10 @@ def test_at_zero_temperature_the_law_is_the_extremal_one_bit_by_bit(tip12):
 def test_close_to_zero_temperature_the_sites_are_those_of_the_extremal_law(tip12):
     # kT/C = 1e-8 at 1e-4 K; the two largest of 6,000 fields differed by 9e-7 or more in all 250 events
     extremal, cold = emitter_of(tip12, ae.Extremal()), emitter_of(tip12, ae.Arrhenius(1e-4), seed=7)
-    sites, charges, waits, _ = course(cold, 250)
-    assert same(course(extremal, 250)[:2], (sites, charges)) == [True, True]
+    sites, charges, waits, _ = history_of(cold, 250)
+    assert same(history_of(extremal, 250)[:2], (sites, charges)) == [True, True]
     assert (waits >= 0).all() and np.isfinite(waits).all()
-    warm = course(emitter_of(tip12, ae.Arrhenius(20.0), seed=7), 250)[0]
+    warm = history_of(emitter_of(tip12, ae.Arrhenius(20.0), seed=7), 250)[0]
     assert not np.array_equal(warm, sites)
 
 
@@ -207,10 +207,10 @@ def test_only_the_ratio_of_sensitivity_and_temperature_matters(small_tip, barrie
         return emitter_of(small_tip, law, control=control, seed=3)
 
     one, two = emitter(50.0, 1.0), emitter(100.0, 2.0)
-    columns = course(one, 120)
+    columns = history_of(one, 120)
     assert one.pulse_length == two.pulse_length
-    assert same(columns, course(two, 120)) == [True] * 4
-    assert not np.array_equal(columns[0], course(emitter(100.0, 1.0), 120)[0])
+    assert same(columns, history_of(two, 120)) == [True] * 4
+    assert not np.array_equal(columns[0], history_of(emitter(100.0, 1.0), 120)[0])
 
 
 def test_a_higher_attempt_frequency_lowers_the_voltage(tip12):
@@ -260,15 +260,15 @@ def test_waits_are_exponential(tip12, memory):
 
 def test_the_seed_changes_the_sequence_and_nothing_else_does(small_tip):
     law = ae.Arrhenius(60.0)
-    columns = course(emitter_of(small_tip, law, seed=1), 120)
-    assert same(columns, course(emitter_of(small_tip, law, seed=1), 120)) == [True] * 4
-    assert same(columns, course(emitter_of(small_tip, law, seed=2), 120)) == [False] * 4
+    columns = history_of(emitter_of(small_tip, law, seed=1), 120)
+    assert same(columns, history_of(emitter_of(small_tip, law, seed=1), 120)) == [True] * 4
+    assert same(columns, history_of(emitter_of(small_tip, law, seed=2), 120)) == [False] * 4
 
 
 def test_threads_and_batches_leave_the_bits(shell):
     def columns(batch_size=256, n_threads=1):
         emitter = emitter_of(shell, ae.Arrhenius(60.0), seed=11, n_threads=n_threads)
-        events = course(emitter, 260, batch_size)
+        events = history_of(emitter, 260, batch_size)
         assert len(emitter.tip) > len(shell)  # it was deepened
         return [*events, emitter.charges, emitter.control_voltage]
 
@@ -350,7 +350,7 @@ def test_the_mean_rate_is_the_wanted_one(tip12):
     """Ions per pulse, after the control has found the voltage of the first surface."""
     control = ae.VoltageControl(rate=0.01, memory=10)
     emitter = emitter_of(tip12, ae.Arrhenius(50.0), control=control, seed=1)
-    _, _, waits, voltages = course(emitter, 1800)
+    _, _, waits, voltages = history_of(emitter, 1800)
     pulses = np.floor(np.cumsum(waits) / emitter.pulse_length)
     n = len(waits) - 300
     rate = n / (pulses[-1] - pulses[299])
@@ -363,14 +363,14 @@ def test_a_longer_memory_is_a_smoother_voltage(small_tip):
     noise = []
     for memory in (10, 50, 250):
         emitter = emitter_of(small_tip, ae.Arrhenius(50.0), control=ae.VoltageControl(memory=memory), seed=1)
-        noise.append(np.diff(np.log(course(emitter, 300)[3])).std())
+        noise.append(np.diff(np.log(history_of(emitter, 300)[3])).std())
     assert noise == sorted(noise, reverse=True)
 
 
 def test_the_voltage_does_not_depend_on_the_applied_one(tip12):
     """Charges are in proportion to the voltage, so the control finds the same one from any."""
-    one = course(ae.evaporation.Emitter(tip12, 1000.0, law=ae.Arrhenius(50.0), seed=1, n_threads=1), 100)
-    two = course(ae.evaporation.Emitter(tip12, 2000.0, law=ae.Arrhenius(50.0), seed=1, n_threads=1), 100)
+    one = history_of(ae.evaporation.Emitter(tip12, 1000.0, law=ae.Arrhenius(50.0), seed=1, n_threads=1), 100)
+    two = history_of(ae.evaporation.Emitter(tip12, 2000.0, law=ae.Arrhenius(50.0), seed=1, n_threads=1), 100)
     assert np.array_equal(one[0], two[0])
     assert two[1] == pytest.approx(2 * one[1], rel=1e-9)  # charges converge to rounding in the same steps
     assert two[3] == pytest.approx(one[3], rel=1e-9)
@@ -477,7 +477,7 @@ def test_an_even_laser_is_a_higher_temperature(tip12):
     assert heated.pulse_length == law.working_point(1.0, heated.control)[1]
     per_second = ae.VoltageControl(rate=rate / heated.pulse_length, pulse_fraction=0.0)
     warm = emitter_of(tip12, ae.Arrhenius(130.0), control=per_second, seed=3)
-    assert same(course(heated, 150), course(warm, 150)) == [True] * 4
+    assert same(history_of(heated, 150), history_of(warm, 150)) == [True] * 4
     assert emitter_of(tip12, law).control == ae.VoltageControl(pulse_fraction=0.0)  # of a laser, without a choice
 
 
@@ -485,7 +485,7 @@ def test_more_ions_come_from_the_hot_side(tip12):
     fractions = []
     for asymmetry in (0.0, 1.0):
         laser = ae.evaporation.Laser(100.0, 1.0, direction=(1.0, 1.0), asymmetry=asymmetry)
-        sites = course(emitter_of(tip12, ae.Arrhenius(30.0, laser=laser), seed=1), 700)[0]
+        sites = history_of(emitter_of(tip12, ae.Arrhenius(30.0, laser=laser), seed=1), 700)[0]
         fractions.append((tip12.positions[sites][:, :2] @ [1.0, 1.0] > 0).mean())
     # 1.9 % is a standard deviation of 700 draws; neighbouring events are correlated, so four times of it
     assert fractions[0] == pytest.approx(0.5, abs=0.076)
@@ -514,7 +514,7 @@ def test_light_on_one_side_of_a_cold_specimen(small_tip):
     """
     laser = ae.evaporation.Laser(100.0, asymmetry=1.0)
     emitter = emitter_of(small_tip, ae.Arrhenius(5.0, laser=laser), seed=1)
-    sites, _, waits, voltages = course(emitter, 100)
+    sites, _, waits, voltages = history_of(emitter, 100)
     assert np.isfinite(waits).all() and np.isfinite(voltages).all()
     assert (small_tip.positions[sites, 0] > -0.6).mean() > 0.9
 
@@ -534,16 +534,16 @@ def test_a_restored_emitter_continues_with_the_same_bits(shell):
         )
 
     first = emitter()
-    course(first, 275)  # deepened once, and 35 events after a relaxation
+    history_of(first, 275)  # deepened once, and 35 events after a relaxation
     assert len(first.tip) > len(shell)
     state = first.state()
     n = len(state.sites)
     assert 0 < 275 - n < 80 and state.voltage_factor != 1.0
-    columns = course(emitter(), 400)
+    columns = history_of(emitter(), 400)
     second, other = emitter(), emitter(seed=5)
     second.restore(state), other.restore(state)
-    assert same([values[n:] for values in columns], course(second, 400 - n)) == [True] * 4
-    assert not np.array_equal(columns[0][n:], course(other, 400 - n)[0])
+    assert same([values[n:] for values in columns], history_of(second, 400 - n)) == [True] * 4
+    assert not np.array_equal(columns[0][n:], history_of(other, 400 - n)[0])
 
 
 def simulation(**options):

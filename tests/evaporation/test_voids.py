@@ -72,7 +72,7 @@ def test_a_void_that_opens_is_the_same_in_a_deeper_shell_and_after_a_resume(tmp_
     tip = with_void(depth=1.7)
     simulation = ae.Simulation(tip, n_threads=1)
     whole = simulation.run(3500, responses=False, progress=False)
-    assert whole.state.deepened
+    assert whole.state.extensions
     checkpoint = ae.simulation.Checkpoint(tmp_path / "run.h5", resume=True)
     for ions in (1900, 3500):
         run = ae.Simulation(tip, n_threads=1).run(ions, responses=False, progress=False, checkpoint=checkpoint)

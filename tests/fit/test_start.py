@@ -70,7 +70,7 @@ def test_less_time_makes_a_smaller_tip(found):
     _, indexing = found
     large, small = (ae.fit.settings_of(indexing, minutes=minutes) for minutes in (20.0, 2.0))
     assert small.simulated_radius < large.simulated_radius
-    assert small.foresight.hours * 60 <= 2.0
+    assert small.cost.hours * 60 <= 2.0
     with pytest.raises(ValueError, match="minutes"):
         ae.fit.settings_of(indexing, minutes=1e-3)
 

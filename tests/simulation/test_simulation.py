@@ -137,7 +137,7 @@ def test_ions_that_never_leave_are_counted(small_tip):
 
 
 @pytest.fixture(scope="module")
-def lonely_tip(nickel, small_tip):
+def isolated_tip(nickel, small_tip):
     """An atom on its own over the apex, further than a nearest neighbour distance from all others."""
     d = small_tip.nearest_neighbour_distance
     top = small_tip.positions[np.argmax(small_tip.positions[:, 2])] + [0, 0, 1.5 * d]
@@ -145,22 +145,22 @@ def lonely_tip(nickel, small_tip):
     return ae.Tip.from_positions(np.concatenate([small_tip.positions, [top]]), species, [nickel])
 
 
-def test_ions_without_a_neighbour_do_not_roll_and_are_counted(lonely_tip):
+def test_ions_without_a_neighbour_do_not_roll_and_are_counted(isolated_tip):
     flown = (ae.RollUp(0.3), ae.Combined(0.3, 0.5), ae.Unperturbed())
-    run = ae.Simulation(lonely_tip, seed=2).run(40, flown, progress=False)
-    lonely = ~np.isfinite(run.emissions.neighbours).all(axis=1)
-    assert lonely[0]  # it sticks out furthest, so it goes first
-    assert run.site[0] == len(lonely_tip) - 1
-    assert run.summary()["without_neighbour"] == lonely.sum() < 40
+    run = ae.Simulation(isolated_tip, seed=2).run(40, flown, progress=False)
+    isolated = ~np.isfinite(run.emissions.neighbours).all(axis=1)
+    assert isolated[0]  # it sticks out furthest, so it goes first
+    assert run.site[0] == len(isolated_tip) - 1
+    assert run.summary()["without_neighbour"] == isolated.sum() < 40
     assert not run.flagged[0]  # a roll-up that cannot be is no bad fit
     unflown = replace(run, perturbations=(), flown=())
     still = run.hits(ae.Unperturbed())
     for source in (run, unflown):
         rolled = source.hits(ae.RollUp(0.3))
-        assert rolled.x[lonely] == pytest.approx(still.x[lonely], abs=0.01)
+        assert rolled.x[isolated] == pytest.approx(still.x[isolated], abs=0.01)
         assert np.isfinite(source.hits(ae.Combined(0.3, 0.5)).x[0])
     moved = np.hypot(rolled.x - still.x, rolled.y - still.y)
-    assert np.nanmedian(moved[~lonely]) > 1.0  # the others land elsewhere
+    assert np.nanmedian(moved[~isolated]) > 1.0  # the others land elsewhere
 
 
 def few_atoms(nickel, small_tip, n):

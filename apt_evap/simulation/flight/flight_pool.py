@@ -108,7 +108,7 @@ class _Record:
     journals: list = field(default_factory=list)
 
 
-class FlightCrew:
+class FlightPool:
     """Threads that fly the ions of successive batches, each taken from the counter of its batch.
 
     Of n threads, n - 1 fly ions while the calling thread computes events. The calling thread also flies ions while it
