@@ -50,5 +50,8 @@ from .simulation.simulation import Simulation as Simulation
 from .specimen.materials import Material as Material
 from .specimen.materials import material as material
 from .specimen.tip import Tip as Tip
+from .studies.workflows.compare_maps import compare as compare
+from .studies.workflows.simulate_file import simulate as simulate
+from .studies.workflows.twin_of_map import twin as twin
 
 __version__: str

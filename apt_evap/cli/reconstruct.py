@@ -8,13 +8,9 @@ from apt_evap._common.codec import for_json
 from apt_evap._common.files import FileError, check_path
 from apt_evap._common.validation import check_number
 from apt_evap.cli._files import (
-    check_output,
     in_real_units,
-    is_picture,
     lens_of,
-    picture_path,
     read,
-    save_figure,
     select,
     with_masses,
 )
@@ -29,6 +25,7 @@ from apt_evap.reconstruction.reconstruct import FRAMES, PROJECTIONS, PROTOCOLS, 
 from apt_evap.simulation.run import Run
 from apt_evap.specimen.lattice import atom_density
 from apt_evap.specimen.materials import MATERIALS, material
+from apt_evap.studies.workflows.written_pictures import check_output, is_picture, picture_path, save_figure
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

@@ -132,7 +132,9 @@ def test_without_a_measurement_it_is_the_map_of_the_command_line(run, tmp_path, 
     monkeypatch.chdir(tmp_path)
     explorer = Explorer(run, run_arguments=["run.h5"])
     drawn = []
-    monkeypatch.setattr("apt_evap.cli.map.save_picture", lambda path, maps, titles, *_: drawn.append(maps[0]))
+    monkeypatch.setattr(
+        "apt_evap.studies.workflows.written_pictures.save_picture", lambda path, maps, titles, *_: drawn.append(maps[0])
+    )
     for view in (explorer.start, View(ae.Combined(ENERGY, 0.4), 48, 3.5, ions=(100, 1500))):
         words = shlex.split(explorer.commands(view).shell)
         assert words[:2] == ["apt-evap", "map"]
@@ -197,7 +199,9 @@ def test_a_rectangle_selects_ions(run, measured, explorer, tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     ae.write("MEASURED.epos", measured)
     drawn = []
-    monkeypatch.setattr("apt_evap.cli.map.save_picture", lambda path, maps, titles, *_: drawn.append(maps[0]))
+    monkeypatch.setattr(
+        "apt_evap.studies.workflows.written_pictures.save_picture", lambda path, maps, titles, *_: drawn.append(maps[0])
+    )
     words = shlex.split(selection.shell.replace("MEASURED", "MEASURED.epos"))
     assert main([*words[1:], "--quiet"]) == 0
     # an .epos has float32
@@ -383,7 +387,10 @@ def test_a_measurement_alone(measured, as_map, tmp_path, monkeypatch):
         assert equal(names["measured"], shown.measured)
         assert executed(explorer.selection(view, (0.0, 9.0), (0.0, 9.0)).python)["measured"].x.min() >= 0
         drawn = []
-        monkeypatch.setattr("apt_evap.cli.map.save_picture", lambda path, maps, titles, *_: drawn.append(maps[0]))
+        monkeypatch.setattr(
+            "apt_evap.studies.workflows.written_pictures.save_picture",
+            lambda path, maps, titles, *_: drawn.append(maps[0]),
+        )
         words = shlex.split(explorer.commands(view).shell)
         assert main([*words[1:], "--quiet"]) == 0
         assert np.array_equal(drawn[0].density, shown.whole.density, equal_nan=True)
