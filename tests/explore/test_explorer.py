@@ -10,7 +10,7 @@ import pytest
 from rough import ROUGH
 
 import apt_evap as ae
-from apt_evap.cli.explore import _with_file, explorer_and_view
+from apt_evap.cli._explorer_of_files import explorer_and_view, with_file
 from apt_evap.cli.main import main
 from apt_evap.cli.parser import make_parser
 from apt_evap.explore.controls import MECHANISMS, controls_of, perturbation_of, values_of
@@ -417,11 +417,11 @@ def test_a_file_is_opened_beside_the_others(run, measured, tmp_path, monkeypatch
     run.save("run.h5")
     ae.write("ions.epos", measured)
     options = make_parser().parse_args(["explore", "--circle", "20"])
-    explorer, _ = _with_file(options, "ions.epos")
+    explorer, _ = with_file(options, "ions.epos")
     assert explorer.run is None and len(explorer.measured) == len(measured)  # the circle was of another file
     with pytest.raises(ValueError, match="none"):
-        _with_file(options, "none.epos")
-    explorer, view = _with_file(options, "run.h5")  # the file that failed is forgotten
+        with_file(options, "none.epos")
+    explorer, view = with_file(options, "run.h5")  # the file that failed is forgotten
     assert explorer.names == ("run.h5", "ions.epos") and len(explorer.show(view).pictures) == 2
 
 

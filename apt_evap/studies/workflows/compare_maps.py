@@ -20,8 +20,6 @@ from apt_evap.fit.fit_settings import FitSettings
 from apt_evap.fit.grid import EnergyGrid
 from apt_evap.fit.study import Study
 from apt_evap.maps.registration.register import Registration
-from apt_evap.plot.report.origin import recorded_warnings
-from apt_evap.plot.report.study_report import write_study
 from apt_evap.simulation.run import Run, load
 from apt_evap.simulation.run_hdf5 import is_run
 from apt_evap.studies.workflows.measured_source import MeasuredSource, source_of
@@ -102,6 +100,8 @@ def compare(
     0.2 eV
     True
     """
+    from apt_evap.plot.report.origin import recorded_warnings  # with Matplotlib
+
     with recorded_warnings() as messages:
         if folder is not None:
             folder = check_path(folder)
@@ -164,6 +164,8 @@ def _is_study(path):
 
 def _write(study: Study, run: Run, folder: Path, **parts: Any) -> None:
     """Write all files to a temporary folder, and move them when they are complete; `parts` are of the report."""
+    from apt_evap.plot.report.study_report import write_study
+
     figures = {name: draw(study, run) for name, draw in _FIGURES.items()}
     try:
         with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as temporary:

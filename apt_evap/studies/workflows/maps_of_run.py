@@ -10,7 +10,6 @@ from apt_evap.detection.binning import shown_bins
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.perturbations import Perturbation, Unperturbed
-from apt_evap.plot.map_figures import default_smoothing
 from apt_evap.simulation.run import Run
 
 
@@ -48,6 +47,8 @@ def run_maps(
     run: Run, settings: MapSettings, choose: Callable[[Hits], Hits] = lambda hits: hits
 ) -> tuple[list[DetectorMap], list[str]]:
     """Maps of the complete detector, for all ions or a selection, and their titles."""
+    from apt_evap.plot.map_figures import default_smoothing  # with Matplotlib
+
     grid = run.grid(settings.bins or shown_bins(len(run)))
     maps = [choose(run.hits(panel.perturbation)).map(like=grid, position_step=None) for panel in settings.panels]
     sigma = settings.smoothing

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from apt_evap import plot
 from apt_evap._common.files import FileError, check_path
 from apt_evap._common.notebook import as_table
 from apt_evap._common.types import AnyPath
@@ -14,7 +15,6 @@ from apt_evap.analysis.description import real_units_line
 from apt_evap.config.cost_estimate import estimate_cost
 from apt_evap.config.simulation_file import Config, config_of, read_document
 from apt_evap.detection.detector_map import DetectorMap
-from apt_evap.plot.map_figures import specimen_title
 from apt_evap.simulation.checkpoint import Checkpoint
 from apt_evap.simulation.recorder import RunInterrupted
 from apt_evap.simulation.run import Run
@@ -195,7 +195,7 @@ def simulate(
     note(f"{'replaced' if replaced and not resume else 'wrote'} {path}")
     try:
         maps, titles = run_maps(run, config.maps)
-        save_picture(picture, maps, titles, title=specimen_title(run))
+        save_picture(picture, maps, titles, title=plot.specimen_title(run))
     except ValueError as error:
         raise ValueError(f"no maps are drawn, the run is in {str(path)!r}: {error}") from error
     note(f"wrote {picture}")

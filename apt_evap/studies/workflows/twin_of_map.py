@@ -33,9 +33,6 @@ from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.indexing.index_map import Candidate, Indexing, index
 from apt_evap.maps.indexing.master_pattern import master_patterns
 from apt_evap.maps.registration.register import Registration, at_bound, register
-from apt_evap.plot.report.html_page import Page
-from apt_evap.plot.report.measurement_report import measurement_section
-from apt_evap.plot.report.origin import recorded_warnings
 from apt_evap.simulation.run import Run, load
 from apt_evap.simulation.run_hdf5 import is_run
 from apt_evap.specimen.materials import Material, as_material
@@ -327,6 +324,8 @@ class Twin:
 
     def _compared(self, run, measured, folder):
         """The study, with its files if there is a folder."""
+        from apt_evap.plot.report.origin import recorded_warnings  # with Matplotlib
+
         options = {"probability": _FRACTIONS, "sharpness": (SHARPNESS,), "height": (HEIGHT,)}
         grid = EnergyGrid("roll-up", options=options) if self._rolls else EnergyGrid("lateral", options=_HEIGHT)
         written = folder is not None
@@ -368,6 +367,9 @@ class Twin:
 
     def _section(self):
         """Part of the report: the constants, and the measured map with the poles and zone lines of the candidate."""
+        from apt_evap.plot.report.html_page import Page
+        from apt_evap.plot.report.measurement_report import measurement_section
+
         measured_map, candidate = self.measured_map, self.candidate
         shown = measured_map.smoothed(max(measured_map.bin_size)) if measured_map.is_counts else measured_map
         ax = plot.detector_map(shown, title=f"{candidate}")
