@@ -164,7 +164,7 @@ def _measured_code(options):
     if options.file.lower().endswith(".npz") or (options.format or "").lstrip(".").lower() == "npz":
         names = zip(("values", "x_edges", "y_edges", "mask"), (options.arrays or "").split(","), strict=False)
         parameters = {name: value for name, value in names if value} | ({"unit": options.unit} if options.unit else {})
-        return f"ae.read_map({_call(options.file, parameters)})"
+        return f"ae.io.read_map({_call(options.file, parameters)})"
     parameters = {
         name: value for name in ("format", "partial", "byte_order", "voltage_unit") if (value := getattr(options, name))
     } | ({"detector_unit": options.unit} if options.unit else {})
