@@ -3,32 +3,8 @@
 import argparse
 from pathlib import Path
 
-from apt_evap import plot
-from apt_evap._common.codec import for_json
-from apt_evap._common.files import FileError, check_path
-from apt_evap._common.validation import check_number
-from apt_evap.cli._files import (
-    check_output,
-    in_real_units,
-    is_picture,
-    lens_of,
-    picture_path,
-    read,
-    save_figure,
-    select,
-    with_masses,
-)
 from apt_evap.cli._options import add_reading, add_real_units, add_speech, integer_type
 from apt_evap.cli._output import tell, tell_json
-from apt_evap.config.perturbation_text import read_perturbation
-from apt_evap.detection.hits import Hits
-from apt_evap.io.formats import read_ranges
-from apt_evap.reconstruction.constants import run_constants
-from apt_evap.reconstruction.origins import OriginTable
-from apt_evap.reconstruction.reconstruct import FRAMES, PROJECTIONS, PROTOCOLS, reconstruct
-from apt_evap.simulation.run import Run
-from apt_evap.specimen.lattice import atom_density
-from apt_evap.specimen.materials import MATERIALS, material
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,7 +24,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", metavar="FILE", help="measured ions (.epos, ...) or a run (.h5)")
     parser.add_argument("-o", "--output", metavar="OUT", help="default: FILE_reconstructed.pos in this folder")
     parser.add_argument(
-        "--frame", choices=FRAMES, default="depth", help="z is the depth, or goes out of the specimen; default: depth"
+        "--frame",
+        choices=("depth", "specimen"),
+        default="depth",
+        help="z is the depth, or goes out of the specimen; default: depth",
     )
     parser.add_argument(
         "--picture",
@@ -56,9 +35,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         help="draw side view, top view, depth profile and composition; --ranges gives the species of measured ions",
     )
     constants = parser.add_argument_group("constants", "The defaults of a run are its own constants.")
-    constants.add_argument("--protocol", choices=PROTOCOLS, default="cap", help="depth increment; default: cap")
+    constants.add_argument("--protocol", choices=("cap", "bas"), default="cap", help="depth increment; default: cap")
     constants.add_argument(
-        "--projection", choices=PROJECTIONS, help="angle on the cap; default: bas, of a run compressed"
+        "--projection",
+        choices=("bas", "equidistant", "compressed"),
+        help="angle on the cap; default: bas, of a run compressed",
     )
     constants.add_argument("--distance", type=float, metavar="MM", help="flight length; default: that of the run")
     constants.add_argument(
@@ -93,6 +74,14 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
+    from apt_evap import plot
+    from apt_evap._common.codec import for_json
+    from apt_evap._common.files import FileError, check_path
+    from apt_evap.cli._files import select, with_masses
+    from apt_evap.io.formats import read_ranges
+    from apt_evap.reconstruction.reconstruct import reconstruct
+    from apt_evap.studies.workflows.written_pictures import check_output, is_picture, picture_path, save_figure
+
     output = check_path(options.output or f"{Path(options.file).stem}_reconstructed.pos")
     if output.exists() and not options.force:
         raise FileError(f"{str(output)!r} exists: --force overwrites it")
@@ -138,6 +127,12 @@ def execute(options: argparse.Namespace) -> int:
 
 def _ions(options):
     """Ions of the file, and the constants that it determines."""
+    from apt_evap.cli._files import in_real_units, read
+    from apt_evap.config.perturbation_text import read_perturbation
+    from apt_evap.detection.hits import Hits
+    from apt_evap.reconstruction.constants import run_constants
+    from apt_evap.simulation.run import Run
+
     content = read(options)
     if isinstance(content, Run):
         run = in_real_units(content, options)
@@ -173,6 +168,10 @@ _GIVEN = (
 
 def _constants(options):
     """Arguments of `reconstruct` that the options set."""
+    from apt_evap.cli._files import lens_of
+    from apt_evap.reconstruction.origins import OriginTable
+    from apt_evap.specimen.lattice import atom_density
+
     settings = {name: getattr(options, name) for name in _GIVEN if getattr(options, name) is not None}
     settings["radius"] = _radius(options.radius)
     if options.origins is not None:
@@ -195,6 +194,8 @@ def _field(options):
 
 
 def _element(name):
+    from apt_evap.specimen.materials import MATERIALS, material
+
     try:
         return material(name)
     except ValueError as error:
@@ -206,6 +207,8 @@ def _element(name):
 
 def _radius(text):
     """The words voltage or shank, or a radius [nm]."""
+    from apt_evap._common.validation import check_number
+
     if text in ("voltage", "shank"):
         return text
     try:

@@ -76,7 +76,7 @@ def evaporate(metal, name, seed):
 def measurement(metal, path):
     """Measured ions or map from a file, or the map of the twin."""
     if path:
-        return ae.read_map(path) if path.endswith(".npz") else ae.read(path)
+        return ae.io.read_map(path) if path.endswith(".npz") else ae.read(path)
     _, mechanism, mean, relative_spread = CASES[metal]
     hits = evaporate(metal, "twin", seed=2).hits(
         MECHANISMS[mechanism](ae.TruncatedNormal(mean, relative_spread * mean))

@@ -492,7 +492,7 @@ CASES = [
             "overwrite": SWITCH,
         },
     ),
-    (ae.read_map, {}, {"path": [None, 3, NAN, [], "a\0b", "none.npz"]}),
+    (ae.io.read_map, {}, {"path": [None, 3, NAN, [], "a\0b", "none.npz"]}),
     (
         ae.similarity,
         {"map_a": grid, "map_b": grid},
@@ -1063,7 +1063,7 @@ def test_everything_says_in_one_line_what_it_holds(ready, tmp_path):
         (ae.RollUp(ae.TruncatedNormal(0.3, 0.1)), ["RollUp(TruncatedNormal(0.3, 0.1))"]),
         (ae.emission.IonRandom(1, [0, 1]), ["IonRandom", "seed=1", "2 ions"]),
         (ae.evaporation.ChargeSettings(), ["ChargeSettings", "tolerance=", "opening_angle=0.4"]),
-        (ae.FlightSettings(), ["FlightSettings", "tolerance=", "max_steps=500"]),
+        (ae.simulation.FlightSettings(), ["FlightSettings", "tolerance=", "max_steps=500"]),
         (ae.ResponseSettings(), ["energy_limit=1.5", "bound=0.2", "degree=4"]),
     ]
     for thing, words in told:

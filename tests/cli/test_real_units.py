@@ -54,7 +54,7 @@ def test_a_run_at_a_temperature_is_saved_in_real_units(made, capsys):
     run = ae.load(made / "hot.h5")
     assert run.settings["law"]["temperature"] == 80.0 and run.settings["control"]["rate"] == 0.02
     assert run.units.field_reference == "site" and (run.flight_charges == 2).all()
-    assert run.units.control == ae.VoltageControl(rate=0.02)
+    assert run.units.control == ae.evaporation.VoltageControl(rate=0.02)
     told = summary(made / "hot.h5", capsys)
     assert told["real_units"]["flight_charges"] == {"Ni2+": 60} and told["real_units"]["field_reference"] == "site"
     pulses = run.clock.waits.sum() / run.settings["pulse_length"]

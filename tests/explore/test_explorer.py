@@ -10,7 +10,7 @@ import pytest
 from rough import ROUGH
 
 import apt_evap as ae
-from apt_evap.cli.explore import _with_file, explorer_and_view
+from apt_evap.cli._explorer_of_files import explorer_and_view, with_file
 from apt_evap.cli.main import main
 from apt_evap.cli.parser import make_parser
 from apt_evap.explore.controls import MECHANISMS, controls_of, perturbation_of, values_of
@@ -134,7 +134,9 @@ def test_without_a_measurement_it_is_the_map_of_the_command_line(run, tmp_path, 
     monkeypatch.chdir(tmp_path)
     explorer = Explorer(run, run_arguments=["run.h5"])
     drawn = []
-    monkeypatch.setattr("apt_evap.cli.map.save_picture", lambda path, maps, titles, *_: drawn.append(maps[0]))
+    monkeypatch.setattr(
+        "apt_evap.studies.workflows.written_pictures.save_picture", lambda path, maps, titles, *_: drawn.append(maps[0])
+    )
     for view in (explorer.start, View(ae.Combined(ENERGY, 0.4), 48, 3.5, ions=(100, 1500))):
         words = shlex.split(explorer.commands(view).shell)
         assert words[:2] == ["apt-evap", "map"]
@@ -200,7 +202,9 @@ def test_a_rectangle_selects_ions(run, measured, explorer, tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     ae.write("MEASURED.epos", measured)
     drawn = []
-    monkeypatch.setattr("apt_evap.cli.map.save_picture", lambda path, maps, titles, *_: drawn.append(maps[0]))
+    monkeypatch.setattr(
+        "apt_evap.studies.workflows.written_pictures.save_picture", lambda path, maps, titles, *_: drawn.append(maps[0])
+    )
     words = shlex.split(selection.shell.replace("MEASURED", "MEASURED.epos"))
     assert main([*words[1:], "--quiet"]) == 0
     # an .epos has float32
@@ -386,7 +390,10 @@ def test_a_measurement_alone(measured, as_map, tmp_path, monkeypatch):
         assert equal(names["measured"], shown.measured)
         assert executed(explorer.selection(view, (0.0, 9.0), (0.0, 9.0)).python)["measured"].x.min() >= 0
         drawn = []
-        monkeypatch.setattr("apt_evap.cli.map.save_picture", lambda path, maps, titles, *_: drawn.append(maps[0]))
+        monkeypatch.setattr(
+            "apt_evap.studies.workflows.written_pictures.save_picture",
+            lambda path, maps, titles, *_: drawn.append(maps[0]),
+        )
         words = shlex.split(explorer.commands(view).shell)
         assert main([*words[1:], "--quiet"]) == 0
         assert np.array_equal(drawn[0].density, shown.whole.density, equal_nan=True)
@@ -413,11 +420,11 @@ def test_a_file_is_opened_beside_the_others(run, measured, tmp_path, monkeypatch
     run.save("run.h5")
     ae.write("ions.epos", measured)
     options = make_parser().parse_args(["explore", "--circle", "20"])
-    explorer, _ = _with_file(options, "ions.epos")
+    explorer, _ = with_file(options, "ions.epos")
     assert explorer.run is None and len(explorer.measured) == len(measured)  # the circle was of another file
     with pytest.raises(ValueError, match="none"):
-        _with_file(options, "none.epos")
-    explorer, view = _with_file(options, "run.h5")  # the file that failed is forgotten
+        with_file(options, "none.epos")
+    explorer, view = with_file(options, "run.h5")  # the file that failed is forgotten
     assert explorer.names == ("run.h5", "ions.epos") and len(explorer.show(view).pictures) == 2
 
 

@@ -4,15 +4,16 @@ import hashlib
 import json
 import os
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.cli import twin
-from apt_evap.cli._kept import RECORD, KeptFiles
 from apt_evap.cli.main import main
 from apt_evap.maps.indexing.master_pattern import master_patterns
+from apt_evap.studies.workflows import kept_files, twin_of_map
+from apt_evap.studies.workflows.kept_files import RECORD, KeptFiles
 
 ARGUMENTS = ("--element", "Ni", "--scales", "56,64")
 
@@ -46,38 +47,36 @@ def quick(tmp_path, monkeypatch):
     calls = []
     made = {}
 
-    def run(options):
+    def simulate(settings, output, **_):
         calls.append("run")
-        with open(options.output, "w") as file:
-            file.write("a run")
-        return 0
+        output.write_text("a run")
+        return SimpleNamespace(interrupted=False)
 
-    def compare(options, *_):
+    def compare(run, measured, folder, *_, **__):
         calls.append("compare")
-        os.makedirs(options.output, exist_ok=True)
-        with open(os.path.join(options.output, "report.html"), "w") as file:
-            file.write("a report")
+        folder.mkdir(exist_ok=True)
+        (folder / "report.html").write_text("a report")
         return _Likeness()
 
     class Run:
         def hits(self, emission):
             return emission
 
-    def index(options):
+    def index(measured, material, **options):
         calls.append("index")
-        key = (options.file, options.element, str(options.scales))
+        key = (measured.values.tobytes(), material, repr(options))
         if key not in made:
-            made[key] = start_of(options)
+            made[key] = index_map(measured, material, **options)
         return made[key]
 
-    start_of = twin.start_of
+    index_map = twin_of_map.index
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(twin.run_command, "execute", run)
-    monkeypatch.setattr(twin, "compare", compare)
-    monkeypatch.setattr(twin, "load", lambda path: Run())
-    monkeypatch.setattr(twin, "is_run", lambda path: path.read_text() == "a run")
-    monkeypatch.setattr(twin, "start_of", index)
-    monkeypatch.setattr(twin, "_registered", lambda *_: ae.Registration(1.0, 1.0, (0.0, 0.0)))
+    monkeypatch.setattr(twin_of_map, "simulate", simulate)
+    monkeypatch.setattr(twin_of_map, "compare", compare)
+    monkeypatch.setattr(twin_of_map, "load", lambda path: Run())
+    monkeypatch.setattr(twin_of_map, "is_run", lambda path: path.read_text() == "a run")
+    monkeypatch.setattr(twin_of_map, "index", index)
+    monkeypatch.setattr(twin_of_map, "_registered", lambda *_: ae.Registration(1.0, 1.0, (0.0, 0.0)))
     measurement("ni.epos")
     return calls
 
@@ -159,9 +158,7 @@ def test_after_every_write_the_command_continues(quick, capsys, tmp_path, monkey
     """Killed after the nth file that it writes; started again, it ends with the same files."""
     first = ["ni.epos", *ARGUMENTS, "-o"]
     assert main(["twin", *first, "whole"]) == 0
-    from apt_evap.cli import _kept
-
-    replace_file = _kept.replace_file
+    replace_file = kept_files.replace_file
     for last in range(1, 10):
         written = 0
 
@@ -172,10 +169,10 @@ def test_after_every_write_the_command_continues(quick, capsys, tmp_path, monkey
                 raise KeyboardInterrupt
             return replace_file(path)
 
-        monkeypatch.setattr(_kept, "replace_file", replaced)
+        monkeypatch.setattr(kept_files, "replace_file", replaced)
         code = main(["twin", *first, f"t{last}"])
         assert code == (130 if written > last else 0)
-        monkeypatch.setattr(_kept, "replace_file", replace_file)
+        monkeypatch.setattr(kept_files, "replace_file", replace_file)
         assert main(["twin", *first, f"t{last}"]) == 0
         for name in ("specimen.toml", "start.json", "registration.json", "answer.txt"):
             assert (tmp_path / f"t{last}" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()

@@ -172,7 +172,9 @@ def test_flown_energies_are_not_taken_for_real_ones(tip12):
 @pytest.mark.filterwarnings("ignore::apt_evap.warnings.ResponseWarning")  # in true eV the limit is lower
 def test_a_run_in_real_units_is_saved_joined_and_turned_back(real, run, tmp_path):
     timed = run.at_evaporation_field(
-        field_reference="site", timing=ae.detection.Timing(temperature=30.0), control=ae.VoltageControl(rate=0.02)
+        field_reference="site",
+        timing=ae.detection.Timing(temperature=30.0),
+        control=ae.evaporation.VoltageControl(rate=0.02),
     )
     timed.save(tmp_path / "real.h5")
     loaded = ae.load(tmp_path / "real.h5")
