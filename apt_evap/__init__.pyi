@@ -31,7 +31,6 @@ from .evaporation.rule import Robin as Robin
 from .evaporation.thermal import Arrhenius as Arrhenius
 from .evaporation.voltage import VoltageControl as VoltageControl
 from .fit.fit_energies import fit_energies as fit_energies
-from .io.formats import read as read
 from .io.formats import write as write
 from .io.npz import read_map as read_map
 from .io.specimens import read_tip as read_tip
@@ -44,6 +43,7 @@ from .reconstruction.reconstruct import Reconstruction as Reconstruction
 from .reconstruction.reconstruct import reconstruct as reconstruct
 from .simulation.flight.flight_pool import FlightSettings as FlightSettings
 from .simulation.flight.response import ResponseSettings as ResponseSettings
+from .simulation.read_file import read as read
 from .simulation.run import Run as Run
 from .simulation.run import load as load
 from .simulation.simulation import Simulation as Simulation

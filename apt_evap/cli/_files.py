@@ -25,10 +25,10 @@ from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.detection.projection import Projection
 from apt_evap.detection.timing import mass_to_charge
 from apt_evap.io.distortion_grid import read_grid
-from apt_evap.io.formats import read as read_file
 from apt_evap.io.formats import read_ranges
 from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.registration.register import Registration
+from apt_evap.simulation.read_file import read as read_file
 from apt_evap.simulation.run import Run, load
 
 _MARK = f"apt_evap {__version__}"
