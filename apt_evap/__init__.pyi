@@ -30,7 +30,6 @@ from .evaporation.rule import ConstantPotential as ConstantPotential
 from .evaporation.rule import Robin as Robin
 from .evaporation.thermal import Arrhenius as Arrhenius
 from .fit.fit_energies import fit_energies as fit_energies
-from .io.formats import read as read
 from .io.formats import write as write
 from .io.specimens import read_tip as read_tip
 from .maps.crystallography.orientation import Orientation as Orientation
@@ -41,6 +40,7 @@ from .maps.similarity import similarity as similarity
 from .reconstruction.reconstruct import Reconstruction as Reconstruction
 from .reconstruction.reconstruct import reconstruct as reconstruct
 from .simulation.flight.response import ResponseSettings as ResponseSettings
+from .simulation.read_file import read as read
 from .simulation.run import Run as Run
 from .simulation.run import load as load
 from .simulation.simulation import Simulation as Simulation

@@ -9,7 +9,7 @@ from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.explore.controls import values_of
 from apt_evap.explore.explorer import Explorer, View
-from apt_evap.io.formats import read as read_file
+from apt_evap.simulation.read_file import read as read_file
 from apt_evap.simulation.run import Run, load
 
 

@@ -19,9 +19,9 @@ from apt_evap.detection.hits import Hits
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.detection.timing import mass_to_charge
 from apt_evap.io.distortion_grid import read_grid
-from apt_evap.io.formats import read as read_file
 from apt_evap.io.formats import read_ranges
 from apt_evap.maps.registration.register import Registration
+from apt_evap.simulation.read_file import read as read_file
 from apt_evap.simulation.run import Run, load
 from apt_evap.studies.workflows.compare_maps import MAX_STUDY
 from apt_evap.studies.workflows.measured_source import MeasuredSource

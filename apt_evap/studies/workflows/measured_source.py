@@ -11,7 +11,7 @@ from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import digest, short_text
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
-from apt_evap.io.formats import read
+from apt_evap.simulation.read_file import read
 
 
 @dataclass(frozen=True)
