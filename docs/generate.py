@@ -50,7 +50,7 @@ def namespaces():
 
 
 def api(folder):
-    """Write a page for the front row of names, one for each namespace, and their table of contents."""
+    """Write a page for the top-level names, one for each namespace, and their table of contents."""
     spaces = namespaces()
     front = [name for name in apt_evap.__all__ if name not in spaces and name != "__version__"]
     pages = {"apt_evap": ("The names used most. ``import apt_evap as ae``, then ``ae.Tip``.", front)}
