@@ -59,7 +59,7 @@ def make_files(folder):
         "run.h5": load_run,
         "ions.nxs": ae.read,
         "train-0000.h5": load_shard,
-        "operators.h5": lambda path: replace(ae.studies.OriginOperators.load(path), source=""),
+        "operators.h5": load_operators,
     }
 
 
@@ -80,6 +80,11 @@ def load_run(path):
     """Read a run in every way that there is."""
     is_run(path), count_ions(path)
     return ae.load(path)
+
+
+def load_operators(path):
+    """Read origin operators, without the name of their file."""
+    return replace(ae.studies.OriginOperators.load(path), source="")
 
 
 def load_shard(path):
