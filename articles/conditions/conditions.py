@@ -50,7 +50,7 @@ class Pulsed:
 
     def keys(self, tip, atoms, fields, bonds):
         left = self._next()
-        if left is not None and left not in set(atoms.tolist()):  # it is no longer there: this was its event
+        if left is not None and left not in set(atoms.tolist()):  # it has left: this was its event
             self.now = self.times.pop(left)
             self.events.append((int(tip.species[left]), self.shares[left]))
         elif len(atoms) > LOCAL:  # a relaxation: the voltage is set for the rate

@@ -2,8 +2,8 @@
 The lens beside measured maps
 =============================
 
-Compares the lens of `apt_evap.microscope` with a hit list of tungsten (voltages, one flight length), with the poles of
-a map of nickel, and with the stored positions of a file of silicon::
+Compares the lens of `apt_evap.detection.microscope` with a hit list of tungsten (voltages, one flight length), with the
+poles of a map of nickel, and with the stored positions of a file of silicon::
 
     python measured.py W_tap.raw ni111_map.npz Si.epos
 

@@ -308,8 +308,8 @@ def load_dataset(path: AnyPath) -> DataSet:
     Raises
     ------
     FileError
-        If it is not a finished data set. `verify` compares the checksums of all files, reading that of each file which
-        is used.
+        If it is not a finished data set. `verify_dataset` compares the checksums of all files. When a file is
+        read, its checksum is compared.
     """
     folder = check_path(path).absolute()
     content = read_finished(folder)

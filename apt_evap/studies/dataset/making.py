@@ -70,7 +70,7 @@ class Shard:
 
 @dataclass(frozen=True, repr=False)
 class PlannedSet:
-    """A planned data set; made by `plan_set`.
+    """A planned data set; made by `plan_dataset`.
 
     Parameters
     ----------

@@ -47,7 +47,7 @@ _MAX_BYTES = 1 << 30
 
 @dataclass(frozen=True, repr=False)
 class Sweep:
-    """A planned sweep; made by `plan` and `open_sweep`.
+    """A planned sweep; made by `plan_sweep` and `open_sweep`.
 
     Parameters
     ----------
