@@ -307,6 +307,7 @@ def charge_history(
     ValueError
         If there are no two neighbouring charges, or an argument is outside its range.
     """
+    check_kind(element, "element", str, "a chemical symbol such as 'Ni'")
     least = check_count(least, "least", at_least=1)
     charges = check_array(charges, "charges", ("n",), dtype=np.int64)
     charge = _check_charge(charges, charge, element)

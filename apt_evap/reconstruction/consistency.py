@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from apt_evap._common.validation import check_array, check_kind, check_number
+from apt_evap._common.validation import check_array, check_kind, check_number, check_pairs
 from apt_evap.reconstruction.calibration import distribution_map
 from apt_evap.reconstruction.reconstruct import Reconstruction
 
@@ -82,9 +82,10 @@ def checks(
     """
     check_kind(reconstruction, "reconstruction", Reconstruction, "a Reconstruction")
     width = check_number(radius, "radius", above=0, unit="nm")
+    known = check_pairs({} if planes is None else planes, "planes", "a mapping from names to places and spacings")
     found = [
         _planes(reconstruction, name, check_array(place, f"position of {name}", (2,)), spacing, width)
-        for name, (place, spacing) in (planes or {}).items()
+        for name, (place, spacing) in known
     ]
     limits = [_rim(reconstruction)] if "lens" in reconstruction.settings else []
     return [*found, _density(reconstruction), *limits]
