@@ -10,7 +10,7 @@ from apt_evap.cli._output import put
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.description = (
-        "Summarise a run (for an unfinished run, give the folder), a file of ions, a map, or a specimen\n"
+        "Summarise a run (RUN.h5.unfinished while it is not finished), a file of ions, a map, or a specimen\n"
         "(LAMMPS, TAPSim, ASE)."
     )
     parser.epilog = (

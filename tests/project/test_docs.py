@@ -1,5 +1,6 @@
 """The documentation: its Python runs, its commands and links are right, and every public name is described."""
 
+import argparse
 import ast
 import dataclasses
 import enum
@@ -110,6 +111,18 @@ def test_the_perturbation_of_the_extending_page(folder, monkeypatch):
     )
     above, plain = run.hits(page.FromAbove(0.3)), run.hits(ae.Unperturbed())
     assert (np.hypot(above.x - plain.x, above.y - plain.y)[plain.detected & above.detected] > 0).all()
+
+
+def test_the_command_of_the_extending_page(folder, monkeypatch, capsys):
+    run_blocks(ROOT / "docs" / "extending.rst", monkeypatch)
+    page = sys.modules["__page__"]
+    ae.Simulation(ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1))).run(20, progress=False).save("few.h5")
+    parser = argparse.ArgumentParser()
+    page.arguments(parser)
+    capsys.readouterr()
+    assert page.execute(parser.parse_args(["few.h5"])) == 0
+    assert capsys.readouterr().out == "wrote charges.png\n"
+    assert (folder / "charges.png").stat().st_size > 5_000
 
 
 TUTORIALS = sorted(path.name for path in (ROOT / "examples").glob("tutorial_*.py"))
