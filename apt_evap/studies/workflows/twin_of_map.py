@@ -26,7 +26,7 @@ from apt_evap.detection.projection import Projection
 from apt_evap.emission.perturbations import LateralVelocity, RollUp
 from apt_evap.fit.grid import EnergyGrid
 from apt_evap.fit.measured_constants import Measurement, constants_of
-from apt_evap.fit.start_settings import ENERGY, HEIGHT, ROLLS, SHARPNESS, Start, near, settings_of
+from apt_evap.fit.start_settings import ENERGY, HEIGHT, ROLLS, SHARPNESS, StartSettings, near, settings_of
 from apt_evap.fit.study import Study
 from apt_evap.io.formats import read_ranges
 from apt_evap.maps.crystallography.orientation import Orientation
@@ -302,7 +302,7 @@ class Twin:
         facts = (json.dumps(start.to_dict(), indent=1) + "\n").encode()
         kept.write({SETTINGS: start.text.encode(), FACTS: facts})
 
-    def _start(self) -> Start:
+    def _start(self) -> StartSettings:
         options = self._options
         return settings_of(
             self.indexing,
