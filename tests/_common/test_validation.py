@@ -536,7 +536,15 @@ CASES = [
             "smoothing": [*COUNT, 0],
             "initial_radius": [10.0],  # not for the voltage
             "shank_angle": [3.0],
+            "settings": [*OBJECT],
+            "element": [3, []],
+            "origins": OBJECT,
         },
+    ),
+    (
+        ae.reconstruction.ReconstructionSettings,
+        {"distance": 90.0, "atomic_volume": 0.011, "evaporation_field": 35.0},
+        {"radius": ["no such", 0.0, NAN, [1.0, NAN], [[1.0]]], "element": [3, []], "lens": OBJECT},
     ),
     (
         ae.reconstruct,
