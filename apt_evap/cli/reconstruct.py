@@ -6,6 +6,22 @@ from pathlib import Path
 from apt_evap.cli._options import add_reading, add_real_units, add_speech, integer_type
 from apt_evap.cli._output import tell, tell_json
 
+_CONSTANTS = (
+    "protocol",
+    "projection",
+    "distance",
+    "detector_radius",
+    "compression",
+    "efficiency",
+    "atomic_volume",
+    "evaporation_field",
+    "field_factor",
+    "smoothing",
+    "initial_radius",
+    "shank_angle",
+)
+"""Fields of `ReconstructionSettings` that are options."""
+
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
@@ -35,7 +51,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         help="draw side view, top view, depth profile and composition; --ranges gives the species of measured ions",
     )
     constants = parser.add_argument_group("constants", "The defaults of a run are its own constants.")
-    constants.add_argument("--protocol", choices=("cap", "bas"), default="cap", help="depth increment; default: cap")
+    constants.add_argument("--protocol", choices=("cap", "bas"), help="depth increment; default: cap")
     constants.add_argument(
         "--projection",
         choices=("bas", "equidistant", "compressed"),
@@ -51,7 +67,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     constants.add_argument(
         "--compression", type=float, metavar="XI", help="image compression; default: 1.5, of a run its own"
     )
-    constants.add_argument("--efficiency", type=float, default=1.0, metavar="ETA", help="of the detector; default: 1")
+    constants.add_argument("--efficiency", type=float, metavar="ETA", help="of the detector; default: 1")
     constants.add_argument("--element", metavar="NAME", help="material that gives the atomic volume and the field")
     constants.add_argument("--atomic-volume", type=float, metavar="NM3", help="default: that of the element")
     constants.add_argument(
@@ -60,7 +76,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     constants.add_argument("--field-factor", type=float, metavar="KF", help="default: 3.3, of a run its own")
     constants.add_argument("--evaporation-field", type=float, metavar="F", help="[V/nm]; default: that of the element")
     constants.add_argument(
-        "--smoothing", type=integer_type(1), default=1, metavar="N", help="ions in the mean of the voltage; default: 1"
+        "--smoothing", type=integer_type(1), metavar="N", help="ions in the mean of the voltage; default: 1"
     )
     constants.add_argument("--origins", metavar="TABLE.npz", help="correct lateral positions by a table of origins")
     constants.add_argument("--initial-radius", type=float, metavar="NM", help="for --radius shank")
@@ -78,7 +94,8 @@ def execute(options: argparse.Namespace) -> int:
     from apt_evap._common.codec import for_json
     from apt_evap._common.files import FileError, check_path
     from apt_evap.cli._files import select, with_masses
-    from apt_evap.io.formats import read_ranges
+    from apt_evap.io.formats import read_ranges, write
+    from apt_evap.reconstruction.origins import OriginTable
     from apt_evap.reconstruction.reconstruct import reconstruct
     from apt_evap.studies.workflows.written_pictures import check_output, is_picture, picture_path, save_figure
 
@@ -89,12 +106,8 @@ def execute(options: argparse.Namespace) -> int:
     if picture is not None:
         check_output(picture, is_picture, options.force)
     hits, known = _ions(options)
-    settings = known | _constants(options)
-    if settings["radius"] != "voltage":
-        for name in ("field_factor", "evaporation_field"):
-            if getattr(options, name) is None:
-                settings.pop(name, None)
-    if "atomic_volume" not in settings:
+    settings = _settings(options, known)
+    if not {"atomic_volume", "element"} & set(settings):
         raise ValueError("--atomic-volume [nm^3] or --element is missing")
     if "distance" not in settings:
         raise ValueError("--distance is missing: the flight length [mm] is needed for ions that are not from a run")
@@ -106,14 +119,15 @@ def execute(options: argparse.Namespace) -> int:
     ranges = read_ranges(options.ranges) if picture is not None and options.ranges is not None else None
     if ranges is not None and options.species is None:
         options.ranges = None
-    reconstruction = reconstruct(select(with_masses(hits, options), options), **settings)
-    reconstruction.write(output, frame=options.frame)
+    origins = None if options.origins is None else OriginTable.load(options.origins)
+    reconstruction = reconstruct(select(with_masses(hits, options), options), origins=origins, **settings)
+    write(output, reconstruction.to_hits(options.frame))
     tell(options, f"{reconstruction!r}")
     result = {"wrote": str(output), "file": options.file, "ions": len(reconstruction)}
     if picture is not None:
         save_figure(picture, plot.reconstruction(reconstruction, ranges)[0].figure)
         result["picture"] = str(picture)
-    result["settings"] = for_json(dict(reconstruction.settings))
+    result["settings"] = for_json(reconstruction.settings)
     if hits.outcome is not None and len(reconstruction) > 2:  # simulated: the true sites are known
         errors = reconstruction.errors()
         result["errors"] = errors.to_dict()
@@ -150,40 +164,23 @@ def _ions(options):
     return content, {}
 
 
-_GIVEN = (
-    "protocol",
-    "projection",
-    "distance",
-    "compression",
-    "efficiency",
-    "detector_radius",
-    "field_factor",
-    "smoothing",
-    "initial_radius",
-    "shank_angle",
-    "evaporation_field",
-    "atomic_volume",
-)
-
-
-def _constants(options):
-    """Arguments of `reconstruct` that the options set."""
+def _settings(options, known):
+    """Settings of `reconstruct` by name: the options, and what else is known of a run."""
     from apt_evap.cli._files import lens_of
-    from apt_evap.reconstruction.origins import OriginTable
-    from apt_evap.specimen.lattice import atom_density
 
-    settings = {name: getattr(options, name) for name in _GIVEN if getattr(options, name) is not None}
-    settings["radius"] = _radius(options.radius)
-    if options.origins is not None:
-        settings["origins"] = OriginTable.load(options.origins)
+    chosen = {name: getattr(options, name) for name in _CONSTANTS if getattr(options, name) is not None}
+    chosen["radius"] = _radius(options.radius)
     if options.lens is not None:
-        settings["lens"] = lens_of(options)
+        chosen["lens"] = lens_of(options)
+    of_run = dict(known)
     if options.element is not None:
-        element = _element(options.element)
-        settings.setdefault("atomic_volume", 1 / atom_density(element.structure, element.a, element.c))
-        if settings["radius"] == "voltage":
-            settings.setdefault("evaporation_field", element.evaporation_field)
-    return settings
+        chosen["element"] = _element(options.element)
+        for name in ("atomic_volume", "evaporation_field"):
+            of_run.pop(name, None)
+    if chosen["radius"] != "voltage":
+        for name in ("field_factor", "evaporation_field"):
+            of_run.pop(name, None)
+    return of_run | chosen
 
 
 def _field(options):

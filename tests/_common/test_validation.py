@@ -451,6 +451,12 @@ CASES = [
         initial_radius=[10.0],
     ),
     row(
+        ae.reconstruction.ReconstructionSettings,
+        {"distance": 90.0, "atomic_volume": 0.011, "evaporation_field": 35.0},
+        radius=["no such", 0.0, NAN, [1.0, NAN], [[1.0]]],
+        element=[3, []],
+    ),
+    row(
         ae.reconstruct,
         {"hits": hits, "atomic_volume": 0.011, "distance": 9.0, "radius": "shank"}
         | {"initial_radius": 30.0, "shank_angle": 5.0},
