@@ -18,6 +18,7 @@ from apt_evap.cli._output import (
     open_missing_streams,
     say,
 )
+from apt_evap.warnings import AptWarning
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -35,6 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     open_missing_streams()
     with warnings.catch_warnings(), _drawing_into_files(), _terminated_like_interrupted() as terminated:
+        warnings.simplefilter("default", AptWarning)  # lines on stderr, whatever Python does with warnings elsewhere
         warnings.showwarning = lambda message, *_, **__: say("warning", message)
         try:
             code = _execute(arguments)

@@ -180,7 +180,7 @@ class _Survey:
         self.kilovolts = self._unit == "kV" or (self._unit is None and bool(highest < _LEAST))
         if self.kilovolts and self._unit is None and decisive in self.present:
             warn(
-                f"{str(path)!r}: voltages of at most {highest:.4g} are taken for kV; voltage_unit='V' reads them in V",
+                f"{str(path)!r}: voltages of at most {highest:.4g} are taken for kV; voltage_unit='V' (--voltage-unit V) reads them in V",
                 DataWarning,
             )
         if "voltage" in self.present:
@@ -256,7 +256,7 @@ def write_epos(path: AnyPath, hits: Hits) -> None:
     if highest < _LEAST:
         warn(
             f"{str(path)!r}: voltages of at most {highest:.4g} V can be taken for kV: the format does not contain "
-            f"their unit; voltage_unit='V' reads them in V",
+            f"their unit; voltage_unit='V' (--voltage-unit V) reads them in V",
             DataWarning,
         )
     ions = np.zeros(len(hits), np.uint32)

@@ -30,7 +30,7 @@ def course(emitter, n, batch_size=256):
 
 
 def same(one, other):
-    return [np.array_equal(a, b) for a, b in zip(one, other, strict=True)]
+    return [np.array_equal(a, b, equal_nan=np.asarray(a).dtype.kind == "f") for a, b in zip(one, other, strict=True)]
 
 
 def one_by_one(emitter, n):
@@ -508,12 +508,13 @@ def test_time_of_a_laser_pulse(base, rise, decay):
 
 
 def test_light_on_one_side_of_a_cold_specimen(small_tip):
-    """The far side stays at 0 K: its atoms do not leave, those of the hot side do."""
+    """The far side stays at 5 K: more atoms leave from the hot side, until it has become flatter."""
     laser = ae.evaporation.Laser(100.0, asymmetry=1.0)
     emitter = emitter_of(small_tip, ae.Arrhenius(5.0, laser=laser), seed=1)
     sites, _, waits, voltages = course(emitter, 100)
     assert np.isfinite(waits).all() and np.isfinite(voltages).all()
-    assert (small_tip.positions[sites, 0] > 0).mean() > 0.9
+    lit = small_tip.positions[sites, 0] > 0
+    assert lit[:50].mean() > 0.75 and lit.mean() > 0.65  # without the light about half; measured: 0.84 and 0.71
 
 
 def test_a_laser_needs_a_temperature():

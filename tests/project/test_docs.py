@@ -78,6 +78,7 @@ def test_blocks_are_found():
         assert page.read_text().count("code-block:: python") == len(python_blocks(page)), page.name
 
 
+@pytest.mark.docs
 @pytest.mark.filterwarnings("ignore:.*left out of:UserWarning")
 @pytest.mark.parametrize("path", [p for p in PAGES if python_blocks(p)], ids=name_of)
 def test_python_blocks_run(path, folder, monkeypatch):
@@ -94,6 +95,7 @@ def run_blocks(path, monkeypatch):
         exec(compile(block, str(path), "exec"), page.__dict__)
 
 
+@pytest.mark.docs
 @pytest.mark.filterwarnings("ignore:.*left out of:UserWarning")
 def test_what_the_readme_makes(folder, monkeypatch):
     """Its blocks run, and the files it names are written."""
@@ -102,6 +104,7 @@ def test_what_the_readme_makes(folder, monkeypatch):
         assert (folder / name).stat().st_size > 0
 
 
+@pytest.mark.docs
 def test_the_perturbation_of_the_extending_page(folder, monkeypatch):
     run_blocks(ROOT / "docs" / "extending.rst", monkeypatch)
     page = sys.modules["__page__"]
@@ -138,6 +141,7 @@ def test_examples_run(name, folder, monkeypatch, capsys):
         assert "in 100% of the resamples" in out
 
 
+@pytest.mark.docs
 def test_a_measured_file_of_ones_own(folder, monkeypatch, capsys):
     """Not every export has voltages, nor a detector about (0, 0)."""
     held = ae.read("R5083.epos")
@@ -199,6 +203,7 @@ def test_figures_3_to_6_of_small_tips(folder, monkeypatch, capsys):
     assert "| Ni combined | " in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_figure_7_of_runs_that_are_there(folder, monkeypatch, capsys, run20):
     """The script turns the crystal by 90 degrees; so is the run here, and taken for both radii."""
     first, rolled = run20.flown
@@ -222,6 +227,7 @@ def test_figure_7_evaporates_to_one_depth(folder, monkeypatch):
     assert [len(ae.load(folder / f"figure7_R{radius}a.h5")) for radius in (6, 4)] == [54, 16]
 
 
+@pytest.mark.slow
 def test_temperatures_are_compared(folder, monkeypatch, capsys):
     run_article("temperature/temperature.py", monkeypatch, "--radius", "8", "--ions", "1500", "--temperatures", "300")
     lines = capsys.readouterr().out.splitlines()
