@@ -199,6 +199,7 @@ def test_map_of_a_run(real):
     assert repr(result).startswith(text) and " of 4 x 4 bins with at least 5>" in repr(result)
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
 def test_ranges_of_a_file_give_the_map_of_the_run(real, tmp_path):
     """Written as .epos and .rrng, and read again: as measured ions, whose charges are known by their masses only."""
     hits = real.hits(ae.Unperturbed())

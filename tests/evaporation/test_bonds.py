@@ -445,6 +445,7 @@ def test_numbers_of_bonds_in_a_table_are_integers(number):
         ae.evaporation.CoordinationTable({"W": {number: 57.0}})
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.SpecimenWarning")
 def test_more_neighbours_than_can_be_counted_are_refused(nickel):
     """Two spheres, one of them compressed: with the bond length of the larger, its atoms have 18 neighbours."""
     grid = np.arange(-8, 9)

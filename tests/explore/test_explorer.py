@@ -60,7 +60,7 @@ def equal(first, second):
     return True
 
 
-@pytest.mark.filterwarnings("ignore::apt_evap.warnings.ResponseWarning")  # in true eV the energies are far lower
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.ResponseWarning")
 @pytest.mark.parametrize("units", ["simulated", "cap", "lens"])
 @pytest.mark.parametrize("perturbation", PERTURBATIONS, ids=repr)
 def test_maps_have_the_bits_of_the_library(run_in, measured, perturbation, units):
@@ -167,7 +167,8 @@ def test_python_lines_give_the_same_maps(run, measured, with_map, ions, tmp_path
         assert f"{shown.similarity.value:.4f}" in capsys.readouterr().out
 
 
-@pytest.mark.filterwarnings("ignore::apt_evap.warnings.ResponseWarning")  # in true eV the energies are far lower
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.ResponseWarning")
 def test_the_command_gives_the_same_view(run, measured, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run.save("run.h5")
@@ -370,6 +371,7 @@ def test_maps_that_do_not_lie_on_each_other(rotation, scale):
         assert ("scaled by 0.85" in why) == bool(why) == (scale != 60.0)
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
 @pytest.mark.parametrize("as_map", [False, True])
 def test_a_measurement_alone(measured, as_map, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -399,6 +401,7 @@ def test_a_measurement_alone(measured, as_map, tmp_path, monkeypatch):
         assert np.array_equal(drawn[0].density, shown.whole.density, equal_nan=True)
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
 @pytest.mark.parametrize("files", [[], ["run.h5"], ["ions.epos"], ["run.h5", "ions.epos"]])
 def test_the_command_opens_what_there_is(run, measured, tmp_path, monkeypatch, files):
     monkeypatch.chdir(tmp_path)
@@ -415,6 +418,7 @@ def test_the_command_opens_what_there_is(run, measured, tmp_path, monkeypatch, f
     assert explorer.show(view).pictures
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
 def test_a_file_is_opened_beside_the_others(run, measured, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run.save("run.h5")

@@ -271,6 +271,7 @@ def test_voltages_that_are_none(cone):
         ae.reconstruct(hits, **KNOWN, evaporation_field=FIELD)
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
 def test_files_of_a_reconstruction(cone, tmp_path):
     cone = cone[:500]
     hits = ae.Hits(x=cone.x, y=cone.y, mass_to_charge=np.full(500, 27.0), positions=np.zeros((500, 3)))
