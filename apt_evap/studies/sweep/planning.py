@@ -12,6 +12,7 @@ from typing import Any
 
 from apt_evap._common.codec import from_plain, to_plain
 from apt_evap._common.files import FileError, read_small_file
+from apt_evap._common.notebook import as_table
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import short_text
 from apt_evap._version import __version__
@@ -71,6 +72,14 @@ class Sweep:
 
     def __repr__(self) -> str:
         return f"<Sweep: {len(self.points):,} points in {str(self.folder)!r}>"
+
+    _repr_html_ = as_table
+
+    def notebook_contents(self) -> dict[str, Any]:
+        """Table that a notebook shows: settings that vary, and the number of points in each state, dict."""
+        states = [state.name for _, state in self.states()]
+        counts = {name: states.count(name) for name in STATES if name in states}
+        return {"folder": str(self.folder), "settings_that_vary": list(self.paths), "points": counts}
 
     @cached_property
     def by_key(self) -> dict[str, Point]:
