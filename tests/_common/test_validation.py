@@ -781,6 +781,7 @@ def test_every_public_name_with_arguments_is_in_the_table():
     taken |= {"write_nodes", "write_types", "describe"}  # in test_tapsim_nodes, test_main
     taken |= {"index", "indexing", "MasterPattern", "master_patterns", "master_pattern"}  # in tests/maps
     taken |= {"Measurement", "constants_of", "settings_of"}  # in tests/fit
+    taken |= {"simulate", "compare", "twin"}  # in tests/studies, tests/cli
     missing = {
         name
         for place in (ae, *SPACES)
@@ -878,7 +879,7 @@ def test_what_does_not_fit_is_refused_before_it_is_built(monkeypatch):
         ae.Tip("Ni", 1e6, depth=1.2)
     assert len(ae.Tip("Ni", 1.5)) > 0
     monkeypatch.setattr(memory, "_available_memory", lambda: 1e6)
-    with pytest.raises(ValueError, match=r"64 threads.*0\.001 GB"):
+    with pytest.raises(ValueError, match=r"n_threads=64.*0\.001 GB"):
         ae.Simulation(shell, n_threads=64)
 
 

@@ -36,6 +36,7 @@ def test_ranges(folder, capsys):
     assert json.loads(capsys.readouterr().out)["ions"] == 100
 
 
+@pytest.mark.filterwarnings("ignore:.*are they in mm:apt_evap.warnings.DataWarning")
 def test_measured_ions_in_other_formats(folder, capsys):
     assert main(["export", "oxcart.h5", "-o", "oxcart.epos"]) == 0
     here, there = ae.read("oxcart.h5"), ae.read("oxcart.epos")

@@ -88,7 +88,7 @@ def test_wrong_arguments_are_named(arguments, name):
 
 
 def test_a_picture_needs_two_axes():
-    with pytest.raises(ValueError, match="found"):
+    with pytest.raises(ValueError, match="result"):
         ae.plot.conditions(conditions({"Al": 1.0}, temperatures=50.0))
     with pytest.raises(ValueError, match="element"):
         ae.plot.conditions(conditions({"Al": 1.0}), "Cu")

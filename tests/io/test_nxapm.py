@@ -49,6 +49,9 @@ ATTRIBUTES = {
     **{name: {"version"} for name in FIELDS if name.endswith("/program")},
 }
 
+# of columns for which the format has no place
+pytestmark = pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
+
 
 def check_structure(path, own, is_simulation, elements):
     """Fail if a file is not as the validator wants it; `own` is the group that is not validated."""

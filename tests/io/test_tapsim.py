@@ -11,6 +11,8 @@ from apt_evap.io.tapsim_nodes import write_nodes, write_types
 # two roundings to float32 of numbers in metres
 SINGLE = 2.5e-7
 
+pytestmark = pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")  # places of made ions are in metres
+
 
 @pytest.mark.parametrize("binary", [False, True])
 def test_every_column_of_a_table(tmp_path, binary):

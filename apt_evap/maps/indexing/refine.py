@@ -201,7 +201,16 @@ class _Likelihood:
         Start. Each mark keeps the target that it has there; one that is far from all of them does not count.
     """
 
-    def __init__(self, bins, disc, densities, matrix, marks, bounds, geometry):
+    def __init__(
+        self,
+        bins: Bins,
+        disc: Disc,
+        densities: Floats,
+        matrix: Floats,
+        marks: Sequence[Mark],
+        bounds: tuple[float, float] | None,
+        geometry: Floats,
+    ) -> None:
         self._bins, self._disc, self._densities, self._matrix = bins, disc, densities, matrix
         self._marks = marks
         self._bounds = (-math.inf, math.inf) if bounds is None else np.log(bounds)
@@ -210,7 +219,7 @@ class _Likelihood:
         directions = self.mark_directions(geometry)
         self._targets = [mark.nearest(places) for mark, places in zip(marks, directions, strict=True)]
 
-    def rotation(self, geometry):
+    def rotation(self, geometry: Floats) -> Floats:
         """Rotation from crystal to specimen, shape (3, 3)."""
         return scipy.spatial.transform.Rotation.from_rotvec(geometry[:3]).as_matrix() @ self._matrix
 
@@ -219,24 +228,24 @@ class _Likelihood:
         scale = float(np.exp(geometry[3]))
         return directions_of(places, self._disc.radius, scale, geometry[4]) @ self.rotation(geometry)
 
-    def contrasts(self, geometry):
+    def contrasts(self, geometry: Floats) -> Floats:
         """Densities of the two patterns in each bin, minus 1, shape (2, n)."""
         return sampled(self._densities, self._crystal_directions(self._bins.places, geometry)) - 1.0
 
-    def limits(self, stretch):
+    def limits(self, stretch: float) -> Floats:
         """Bounds of the logarithm of the scale from the centre to the rim, shape (2,)."""
         return np.array(self._bounds) + math.log(_widened(stretch))
 
-    def expected(self, state):
+    def expected(self, state: _State) -> tuple[Floats, Floats]:
         """Expected counts, and the factor in them that comes from the patterns, each of shape (n,)."""
         factor = np.maximum(1 + state.amplitudes @ state.contrasts, 0.02)
         return np.exp(np.clip(self._bins.slow @ state.fit, -20, 20)) * factor, factor
 
-    def mark_directions(self, geometry):
+    def mark_directions(self, geometry: Floats) -> list[Floats]:
         """Directions in the crystal of the places of every mark."""
         return [self._crystal_directions(places, geometry) for places in self._mark_places]
 
-    def deviations(self, geometry):
+    def deviations(self, geometry: Floats) -> Floats:
         """Of the marks from their targets, and of the stretch from 0, in standard errors."""
         parts = [
             mark.signed(directions, target)
@@ -245,12 +254,12 @@ class _Likelihood:
         ]
         return np.concatenate([*parts, [geometry[4] / _STRETCH]])
 
-    def value(self, state):
+    def value(self, state: _State) -> float:
         """Deviance of the counts, and the squared deviations of the marks: what is minimised."""
         penalty = float((self.deviations(state.geometry) ** 2).sum())
         return deviance(self._bins.counts, self.expected(state)[0]) + penalty
 
-    def normal_equations(self, state, moving):
+    def normal_equations(self, state: _State, moving: bool) -> tuple[Floats, Floats]:
         """Normal matrix and right side of a Gauss-Newton step; of the geometry only if it moves."""
         mu, factor = self.expected(state)
         columns = [self._bins.slow * mu[:, None], (state.contrasts * (mu / factor)).T]
@@ -275,7 +284,7 @@ class _Likelihood:
         shifted[k] += _DIFFERENCE
         return (state.amplitudes @ (self.contrasts(shifted) - state.contrasts)) / _DIFFERENCE * mu / factor
 
-    def fixed_at_bounds(self, state, normal, right):
+    def fixed_at_bounds(self, state: _State, normal: Floats, right: Floats) -> tuple[Floats, Floats]:
         """The same equations, without a change of a scale that would leave its bounds."""
         low, high = self.limits(state.geometry[4])
         scale = state.geometry[3]
@@ -286,7 +295,7 @@ class _Likelihood:
         fixed[-2, -2] = normal[-2, -2]
         return fixed, right
 
-    def moved(self, state, change, moving):
+    def moved(self, state: _State, change: np.ndarray, moving: bool) -> _State:
         """State after a change of all parameters, limited to what a step may be."""
         n_slow = self.n_slow
         fit = state.fit + np.clip(change[:n_slow], -1, 1)
