@@ -10,7 +10,8 @@ from apt_evap.cli.parser import make_parser
 from apt_evap.detection.binning import MAX_BINS
 from apt_evap.fit.fit_settings import FitSettings
 from apt_evap.fit.grid import MEANS, MECHANISMS, ROLLUP_FRACTIONS, RSDS, EnergyGrid
-from apt_evap.reconstruction.reconstruct import FRAMES, PROJECTIONS, PROTOCOLS
+from apt_evap.reconstruction.reconstruct import FRAMES
+from apt_evap.reconstruction.reconstruction_settings import PROJECTIONS, PROTOCOLS
 
 
 @pytest.fixture(scope="module")

@@ -90,6 +90,7 @@ def compare(
 
     Examples
     --------
+    >>> from pathlib import Path
     >>> run = ae.Simulation(ae.Tip("Ni", apex_radius=2.5, axis=(1, 1, 1)), seed=1).run(600)
     >>> measured = run.hits(ae.RollUp(0.2)).map(bins=16, extent=(-60, 60, -60, 60))  # energy to be found
     >>> grid = ae.fit.EnergyGrid("roll-up", means=(0.1, 0.2, 0.3), relative_spreads=(0.5, 1.0))

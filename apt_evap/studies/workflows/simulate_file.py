@@ -142,6 +142,7 @@ def simulate(
 
     Examples
     --------
+    >>> from pathlib import Path
     >>> _ = Path("tiny.toml").write_text('''
     ... [tip]
     ... material = "Ni"

@@ -462,7 +462,7 @@ def twin(
     note: Callable[[str], None] = no_note,
     command: str = "",
 ) -> Twin:
-    """Make a twin of a measured specimen, as ``apt-evap twin`` does.
+    r"""Make a twin of a measured specimen, as ``apt-evap twin`` does.
 
     The map is indexed, its specimen is simulated, the simulated map is registered on the measured one, the emission is
     fitted, and a report is written. The same call continues after an interruption. A folder belongs to one measurement
@@ -515,6 +515,15 @@ def twin(
         If an argument is outside its range.
     KeyboardInterrupt
         If it is interrupted; what is done so far is kept.
+
+    Examples
+    --------
+    The simulation takes minutes, so that this example is not run:
+
+    >>> made = ae.twin("R5083.epos", "Ni", distance=90.0, minutes=10)  # doctest: +SKIP
+    >>> print("\n".join(made.answer))  # doctest: +SKIP
+    >>> made.report()  # doctest: +SKIP
+    PosixPath('R5083_twin/study/report.html')
     """
     source = source_of(measured)
     options = _Options(
