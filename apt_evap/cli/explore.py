@@ -21,7 +21,7 @@ from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.detection.binning import MAX_BINS
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.explore.controls import values_of
-from apt_evap.explore.explorer import Explorer, View
+from apt_evap.explore.explorer import Explorer, ExplorerSettings
 from apt_evap.io.formats import read as read_file
 from apt_evap.simulation.run import Run, load
 
@@ -120,7 +120,7 @@ def _run_in(path):
     return content if isinstance(content, Run) else None
 
 
-def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer | None, View | None]:
+def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer | None, ExplorerSettings | None]:
     """Explorer of the files of the command, and the view of its options; None without a file.
 
     Parameters
@@ -131,7 +131,7 @@ def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer | None, Vie
     Returns
     -------
     explorer : Explorer
-    view : View
+    view : ExplorerSettings
 
     Raises
     ------
@@ -169,7 +169,7 @@ def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer | None, Vie
     )
     start = explorer.start
     bins = options.bins or start.bins
-    view = View(
+    view = ExplorerSettings(
         perturbation=perturbation or start.perturbation,
         bins=bins,
         smoothing=explorer.smoothing_for(bins) if options.smooth is None else options.smooth,
