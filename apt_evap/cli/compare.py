@@ -155,8 +155,7 @@ def _compare(options, measured, messages, sections):
     registration = None if options.registration is None else read_registration(options.registration)
     measured = _measured(options) if measured is None else measured
     run = load(options.run)
-    if run.responses is None:
-        raise ValueError(f"{options.run!r} has no responses: repeat the run with responses = true in [simulation]")
+    run.require_responses(repr(options.run))
     study = fit_energies(
         run,
         measured,
