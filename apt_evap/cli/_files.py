@@ -70,7 +70,7 @@ def _read(options):
 def in_real_units(run: Run, options: argparse.Namespace) -> Run:
     """The run, in real units if the options ask for them, as a lens does; a run that already is keeps its own."""
     lens, reference = lens_of(options), options.real_units
-    if lens is None and (reference is None or (run.units is not None and run.units.field_reference == reference)):
+    if lens is None and reference in (None, run.observation.operating.field_reference):
         return run
     return run.at_evaporation_field(lens, **({} if reference is None else {"field_reference": reference}))
 

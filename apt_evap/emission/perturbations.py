@@ -8,6 +8,7 @@ probability of a roll-up, the sharpness of the target and the launch height are 
 
 from __future__ import annotations  # `RollUp.of_metal` returns one
 
+import json
 from collections.abc import Mapping, Sequence
 from copy import copy
 from typing import Any, Protocol
@@ -432,6 +433,11 @@ def described(perturbation: Any) -> dict[str, Any]:
     if is_settings(perturbation):
         return to_plain(perturbation)
     return {"name": type(perturbation).__name__, "repr": repr(perturbation)}
+
+
+def perturbation_text(perturbation: Any) -> str:
+    """Text of a perturbation, or of the description of one in a file."""
+    return perturbation.get("repr", json.dumps(perturbation)) if isinstance(perturbation, dict) else repr(perturbation)
 
 
 def perturbation_of(perturbation: Any) -> Any:

@@ -196,8 +196,8 @@ class Explorer:
     ) -> None:
         if run is None and measured is None:
             raise ValueError("the explorer needs a run, measured ions or a measured map, got none")
-        if run is not None and check_kind(run, "run", Run, "a Run").responses is None:
-            raise ValueError(f"the explorer needs a run with responses, got {run!r}")
+        if run is not None:
+            check_kind(run, "run", Run, "a Run").require_responses()
         if registration is not None:
             check_kind(registration, "registration", Registration, "a Registration")
             if measured is None or run is None:

@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +25,6 @@ from apt_evap.fit.structure import PoleMeasure, StructureScores
 from apt_evap.fit.study import Score, Study
 from apt_evap.maps.registration.register import Registration
 from apt_evap.maps.similarity import WINDOW
-from apt_evap.simulation.real_units import RealUnits
 from apt_evap.simulation.run import Run
 from apt_evap.warnings import MapWarning, RegistrationWarning, ResponseWarning, StructureWarning, warn
 
@@ -122,8 +121,7 @@ def fit_energies(
     """
     grid = check_kind(EnergyGrid() if grid is None else grid, "grid", EnergyGrid, "an EnergyGrid")
     settings = check_kind(FitSettings() if settings is None else settings, "settings", FitSettings, "FitSettings")
-    if check_kind(run, "run", Run, "a Run").responses is None:
-        raise ValueError(f"run must have responses for fit_energies, got {run!r}")
+    check_kind(run, "run", Run, "a Run").require_responses()
     if registration is not None:
         check_kind(registration, "registration", Registration, "a Registration")
     measured = measured_map(measured, settings.bins)
@@ -307,15 +305,16 @@ def real_units_of(run: Run) -> dict[str, Any] | None:
         None if the fields of the cap, which real units need, are not in the run.
     """
     try:
-        real = run if run.units is not None else run.at_evaporation_field()
+        real = run.in_real_units()
     except ValueError:
         return None
-    units = cast(RealUnits, real.units)
-    scale = float(np.median(real.energy_scales))  # simulated energy per real one
+    units = real.require_real_units("an operating point")
+    # simulated energies per real one, and per one of the study
+    scale, study_scale = (float(np.median(each.energy_scales)) for each in (real, run))
     charges, counts = np.unique(real.flight_charges, return_counts=True)
     return {
-        "real_per_study": 1.0 if run.units is not None else 1.0 / scale,
-        "simulated_per_study": scale if run.units is not None else 1.0,
+        "real_per_study": study_scale / scale,
+        "simulated_per_study": study_scale,
         "operating_field": units.operating_field,
         "field_reference": units.field_reference,
         "flight_charge": int(charges[counts.argmax()]),

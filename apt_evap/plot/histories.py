@@ -153,21 +153,19 @@ def _panels(run):
 
 def _panels_of_run(run, points, element):
     """Function that draws each panel of a run, with its arguments."""
-    if run.real is None and run.clock is None:
+    operating = run.observation.operating
+    if operating.is_constant:
         raise ValueError(
             f"the voltage of {run!r} is constant: use the run in real units, run.at_evaporation_field(), or `history`"
         )
-    total = run.instrument_voltages
-    control = run.settings.get("control") if run.units is None else vars(run.units.control)
-    pulsed = bool(control and control["pulse_fraction"] > 0)
-    panels = [(_draw_voltage, total, points, "voltage with\npulse [V]" if pulsed else "voltage [V]")]
+    label = "voltage with\npulse [V]" if operating.control.pulse_fraction > 0 else "voltage [V]"
+    panels = [(_draw_voltage, operating.instrument_voltages, points, label)]
     ions = run.emissions.ions
     known = np.isfinite(run.cap.fields) & (run.cap.ions >= ions[0]) & (run.cap.ions <= ions[-1])
     if known.any():
         at = run.cap.ions[known]
         fields = run.cap.fields[known] * np.interp(at, ions, run.voltages) / run.voltage
-        goal = run.units.operating_field if run.units is not None and run.units.field_reference == "cap" else None
-        panels.append((_draw_field, at - ions[0], fields, goal))
+        panels.append((_draw_field, at - ions[0], fields, operating.cap_field))
     panels += _rate_of_run(run, points)
     if run.real is not None:
         element = run.elements[0] if element is None else check_choice(element, "element", run.elements)

@@ -110,8 +110,7 @@ def spectrum(
 def _masses(ions):
     """Mass-to-charge ratios of the detected ions [Da]."""
     if isinstance(ions, Run):
-        if ions.real is None:
-            raise ValueError(f"a spectrum needs a run in real units, run.at_evaporation_field(), got {ions!r}")
+        ions.require_real_units("a spectrum")
         ions = ions.hits(ions.first_perturbation)
     (mass,) = check_kind(ions, "ions", Hits, "a Run or Hits").require("mass_to_charge")
     mass = mass[ions.detected & np.isfinite(mass)]

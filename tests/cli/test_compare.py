@@ -214,7 +214,7 @@ def test_measured_ions_are_selected(folder, capsys):
 
 def test_a_run_without_responses_is_refused(folder, small_tip, capsys):
     ae.Simulation(small_tip).run(50, responses=False, progress=False).save("nr.h5")
-    sentence = "'nr.h5' has no responses: repeat the run with responses = true in [simulation]"
+    sentence = "'nr.h5' must have responses, got <Run: 50 ions"
     assert sentence in failed(capsys, "nr.h5", "map.npz", *HERE)
 
 

@@ -435,7 +435,7 @@ def test_a_file_is_opened_beside_the_others(run, measured, tmp_path, monkeypatch
 def test_what_is_refused(run, measured):
     bare = replace(run, responses=None)
     for arguments, sentence in [
-        ((bare,), "needs a run with responses"),
+        ((bare,), "run must have responses"),
         ((run, None, TURNED), "registration needs"),
         ((None, measured, TURNED), "registration needs"),
         ((), "run, measured"),

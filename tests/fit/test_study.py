@@ -731,7 +731,7 @@ def test_gradients_of_the_instrument_do_not_move_the_energies(run, other):
 
 def test_studies_that_cannot_be(run, other):
     measured = seen(other, ROLLUP)
-    with pytest.raises(ValueError, match="run must have responses for fit_energies"):
+    with pytest.raises(ValueError, match="run must have responses"):
         fit_energies(replace(run, responses=None), measured, registration=HERE)
     with pytest.raises(ValueError, match="measured"):
         fit_energies(run, 3, registration=HERE)

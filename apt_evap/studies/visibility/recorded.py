@@ -67,7 +67,7 @@ def recorded_ions(
     (195, 3)
     """
     instrument = Instrument(field_of_view=160.0) if instrument is None else instrument
-    real = run if run.units is not None else run.at_evaporation_field()
+    real = run.in_real_units()
     tip = run.settings["tip"]
     if "apex_radius" not in tip:
         raise ValueError("run must be of a tip with an apex_radius, got a specimen from positions")
