@@ -109,7 +109,7 @@ def test_the_unfinished_run_of_another_point_is_not_continued(fresh, part):
             "simulation.run(20, responses=True, progress=kill, batch_size=4,\n"
             "               checkpoint=Checkpoint(sys.argv[1] + '/run.h5', 0, overwrite=True))"
         )
-        killed = subprocess.run([sys.executable, "-c", program, str(other)], capture_output=True)
+        killed = subprocess.run([sys.executable, "-P", "-c", program, str(other)], capture_output=True)
         assert killed.returncode == -signal.SIGKILL, killed.stderr
         (other / "run.h5").unlink()
         (other / part).rename(one / part)
