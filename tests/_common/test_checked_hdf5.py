@@ -44,9 +44,12 @@ def test_every_changed_bit_is_noticed(path, run):
     whole, is_read = path.read_bytes(), np.zeros(path.stat().st_size, bool)
 
     def mark(name, item):
+        if name == f"{SIMULATION}/perturbation":  # for readers of the file; `load` reads that of each set of flights
+            return
         if isinstance(item, h5py.Dataset) and item.chunks and (SIMULATION in name or name.endswith("evaporation_id")):
             chunk = item.id.get_chunk_info(0)
             is_read[chunk.byte_offset : chunk.byte_offset + chunk.size] = True
+            is_read[chunk.byte_offset + 2] = False  # five bits of the header of a stored block have no meaning
 
     with h5py.File(path) as file:
         file.visititems(mark)
