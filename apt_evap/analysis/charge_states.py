@@ -147,7 +147,7 @@ class ChargeStateMap(ChargeStateCounts):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ChargeStateHistory(ChargeStateCounts):
-    """Charge state ratios in successive sections of the ions, made by `charge_state_ratio_course`.
+    """Charge state ratios in successive sections of the ions, made by `charge_state_ratio_history`.
 
     Parameters
     ----------
@@ -296,7 +296,7 @@ def charge_history(
     charges : array_like of int
         Charge of each ion [e] in the order of evaporation, shape (n,); 0 for ions that do not count.
     element, charge, sections, least
-        As for `charge_state_ratio_course`.
+        As for `charge_state_ratio_history`.
 
     Returns
     -------
@@ -307,6 +307,7 @@ def charge_history(
     ValueError
         If there are no two neighbouring charges, or an argument is outside its range.
     """
+    check_kind(element, "element", str, "a chemical symbol such as 'Ni'")
     least = check_count(least, "least", at_least=1)
     charges = check_array(charges, "charges", ("n",), dtype=np.int64)
     charge = _check_charge(charges, charge, element)

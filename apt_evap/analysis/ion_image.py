@@ -21,6 +21,7 @@ from apt_evap._common.validation import (
     check_choice,
     check_count,
     check_kind,
+    check_name,
     check_number,
     check_seed,
     check_values,
@@ -74,6 +75,7 @@ class ImagingGas:
     field: float
 
     def __post_init__(self):
+        check_name(self.name, "name")
         check_number(self.ionisation_energy, "ionisation_energy", above=0, unit="eV")
         check_number(self.field, "field", above=0, unit="V/nm")
 

@@ -5,9 +5,6 @@ from pathlib import Path
 
 from apt_evap.cli._options import add_speech, integer_type
 from apt_evap.cli._output import say, tell, tell_json
-from apt_evap.config.cost_estimate import hours_text
-from apt_evap.studies.dataset.making import make_dataset, plan_dataset
-from apt_evap.studies.dataset.set_description import ABOUT, verify_dataset
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,6 +32,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
+    from apt_evap.config.cost_estimate import hours_text
+    from apt_evap.studies.dataset.making import make_dataset, plan_dataset
+    from apt_evap.studies.dataset.set_description import ABOUT, verify_dataset
+
     path = Path(options.study)
     if path.is_dir() and (path / ABOUT).exists():
         content = verify_dataset(path)

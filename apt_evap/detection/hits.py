@@ -146,6 +146,8 @@ class Hits:
             object.__setattr__(self, name, dict(mapping))
         self.extra.update({name: _extra(name, value) for name, value in self.extra.items()})
         check_kind(self.source, "source", str, "text")
+        if self.extent is not None:
+            check_array(self.extent, "extent", (4,))
         lengths.update((name, len(values)) for name, values in self.extra.items())
         if not lengths:
             raise ValueError("Hits needs at least one column, got none")

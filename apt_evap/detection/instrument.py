@@ -143,7 +143,7 @@ class Instrument:
         Parameters
         ----------
         name : str
-            One of `PRESETS`.
+            One of `INSTRUMENT_PRESETS`.
         **changes
             Parameters of `Instrument` that are added or changed.
 

@@ -124,6 +124,8 @@ def fit_energies(
     settings = check_kind(FitSettings() if settings is None else settings, "settings", FitSettings, "FitSettings")
     if check_kind(run, "run", Run, "a Run").responses is None:
         raise ValueError(f"run must have responses for fit_energies, got {run!r}")
+    if registration is not None:
+        check_kind(registration, "registration", Registration, "a Registration")
     measured = measured_map(measured, settings.bins)
     bin_size = max(measured.bin_size) * (0.5 if measured.is_counts else 1)
     settings = replace(

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from apt_evap._common.codec import to_plain
-from apt_evap._common.files import replace_file
+from apt_evap._common.codec import for_json, to_plain
+from apt_evap._common.files import open_for_reading, replace_file
 from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import AnyPath, Booleans, Floats
 from apt_evap._common.validation import check_count, check_kind, check_number
@@ -105,10 +105,20 @@ class StartSettings:
     def __repr__(self) -> str:
         return short_repr(self)
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return radii [nm], None if they are not known, and the indexing in plain types, dict."""
+        return for_json({"radii": self.radii, "simulated_radius": self.simulated_radius}) | self.indexing.to_dict()
+
     def save(self, path: AnyPath) -> None:
         """Write the settings file; it is replaced only when complete."""
         with replace_file(path) as file:
             file.write(self.text.encode())
+
+
+def is_start(path: AnyPath) -> bool:
+    """Whether a file is a settings file made from a measured map."""
+    with open_for_reading(path) as file:
+        return file.read(len(MARK)) == MARK.encode()
 
 
 def settings_of(

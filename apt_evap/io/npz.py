@@ -52,7 +52,7 @@ def read_map(
     --------
     >>> edges = np.linspace(-20, 20, 41)
     >>> np.savez("measured.npz", counts=np.ones((40, 40), int), x_edges_mm=edges, y_edges_mm=edges)
-    >>> ae.read_map("measured.npz")
+    >>> ae.io.read_map("measured.npz")
     <DetectorMap: 1,600 ions from 'measured.npz', 40 x 40 bins of 1 x 1 mm>
     """
     with open_for_reading(path) as file:

@@ -100,8 +100,7 @@ def pole_line_profile(
         If a direction is that of the pole, a range is empty, or there are no hits.
     """
     start = unit_vector(pole)
-    directions = np.atleast_2d(np.asarray(toward, float))
-    directions = check_array(directions, "toward", ("n", 3))
+    directions = check_array(toward, "toward", ("n", 3) if np.ndim(toward) == 2 else (3,)).reshape(-1, 3)
     inner = check_number(inner, "inner", at_least=0, unit="degrees")
     outer = check_number(outer, "outer", above=inner, at_most=90, unit="degrees")
     width = check_number(width, "width", above=0, at_most=90, unit="degrees")

@@ -73,7 +73,7 @@ class ZoneLine:
         return f"{self.kind}, {size} wide at {self.centre:+.2f} {self.unit}"
 
 
-def fit_zone_line(profile: Profile, *, exponent: float = 2.0) -> ZoneLine:
+def fit_zone_line(profile: Profile, *, exponent: float | None = 2.0) -> ZoneLine:
     r"""Fit a dip or a peak on a linear background to a profile across a zone line.
 
     Parameters

@@ -141,7 +141,7 @@ def _density(ax: Axes, result):
     ax.errorbar(
         (edges[1:] + edges[:-1]) / 2, ions / volume, np.sqrt(ions) / volume, fmt=".-", color="C0", label="near the axis"
     )
-    expected = result.settings["efficiency"] / result.settings["atomic_volume"]
+    expected = result.settings.efficiency / result.settings.atomic_volume
     ax.axhline(expected, color="0.4", linestyle="dashed", label="efficiency / atomic volume")
     ax.set(xlabel="depth of the apex [nm]", ylabel="ions per nm$^3$", ylim=(0, None))
     ax.legend(fontsize="small")

@@ -70,7 +70,8 @@ def cell_lengths(structure: str, a: float, c: float | None = None) -> Floats:
     ndarray
     """
     if check_structure(structure) == "hcp":
-        return np.array([a, math.sqrt(3) * a, c if c is not None else math.sqrt(8 / 3) * a])
+        height = math.sqrt(8 / 3) * a if c is None else check_number(c, "c", above=0, unit="nm")
+        return np.array([a, math.sqrt(3) * a, height])
     return np.array([a, a, a], dtype=np.float64)
 
 
@@ -215,6 +216,8 @@ def rotation_to_axis(material: Any, axis: Sequence[int], rotation: float = 0.0) 
     ValueError
         If the structure is unknown, or the axis is zero or not finite.
     """
+    if not isinstance(material, str) and not hasattr(material, "structure"):
+        raise ValueError(f"material must be a Material or the name of a structure, got {short_text(material)}")
     structure = check_structure(material if isinstance(material, str) else material.structure)
     a, c = (1.0, None) if isinstance(material, str) else (material.a, material.c)
     angle = math.radians(check_number(rotation, "rotation", unit="degrees"))

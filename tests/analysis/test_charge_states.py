@@ -199,13 +199,15 @@ def test_map_of_a_run(real):
     assert repr(result).startswith(text) and " of 4 x 4 bins with at least 5>" in repr(result)
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
 def test_ranges_of_a_file_give_the_map_of_the_run(real, tmp_path):
     """Written as .epos and .rrng, and read again: as measured ions, whose charges are known by their masses only."""
     hits = real.hits(ae.Unperturbed())
     own = charge_state_ratio_map(hits, "Ni", 1, bins=4, least=5)
-    ae.write(tmp_path / "ni.epos", hits[hits.detected])
+    with pytest.warns(ae.warnings.DataWarning, match="can be taken for kV"):
+        ae.write(tmp_path / "ni.epos", hits[hits.detected])
     (tmp_path / "ni.rrng").write_text(NICKEL)
-    measured, ranges = ae.read(tmp_path / "ni.epos"), ae.io.read_ranges(tmp_path / "ni.rrng")
+    measured, ranges = ae.read(tmp_path / "ni.epos", voltage_unit="V"), ae.io.read_ranges(tmp_path / "ni.rrng")
     assert "charge_state" not in measured.extra
     by_ranges = charge_state_ratio_map(measured, "Ni", 1, ranges=ranges, like=own, least=5)
     np.testing.assert_array_equal(by_ranges.lower, own.lower)

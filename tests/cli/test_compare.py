@@ -106,7 +106,7 @@ def test_everything_is_written(folder, capsys, rough_layout):
     assert [(each["name"], each["sha256"]) for each in report["origin"]["files"]] == sums
     # it is what Python gives
     study = fit_energies(
-        ae.load("run.h5"), ae.read_map("map.npz"), means=(0.1, 0.2, 0.3), relative_spreads=(0.5, 1),
+        ae.load("run.h5"), ae.io.read_map("map.npz"), means=(0.1, 0.2, 0.3), relative_spreads=(0.5, 1),
         replicas=1, resamples=4, bins=24, registration=ae.Registration(0, 1, (0, 0)), progress=False,
     )  # fmt: skip
     assert held == study.to_dict()

@@ -36,6 +36,7 @@ def test_ranges(folder, capsys):
     assert json.loads(capsys.readouterr().out)["ions"] == 100
 
 
+@pytest.mark.filterwarnings("ignore:.*are they in mm:apt_evap.warnings.DataWarning")
 def test_measured_ions_in_other_formats(folder, capsys):
     assert main(["export", "oxcart.h5", "-o", "oxcart.epos"]) == 0
     here, there = ae.read("oxcart.h5"), ae.read("oxcart.epos")
@@ -119,12 +120,13 @@ def test_an_export_says_what_it_leaves_out(folder, small_tip, capsys):
     assert "without the columns start_counter" in err and "with zeros for positions, mass_to_charge" in out
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
 def test_units_of_a_file_in_the_shell(folder, capsys):
     ions = ae.Hits(x=[-3.0, 3.0], y=[-3.0, 3.0], voltage=[50.0, 60.0], pulse_voltage=[1.0, 2.0])
     ae.write("cm.epos", ions)
     assert main(["info", "cm.epos", "--unit", "cm", "--voltage-unit", "V", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)["columns"]
     assert told["x"] == [-30, 30] and told["voltage"] == [50, 60]
-    assert main(["info", "cm.epos"]) == 0 and "--voltage-unit V reads them in V" in capsys.readouterr().err
+    assert main(["info", "cm.epos"]) == 0 and "(--voltage-unit V) reads them in V" in capsys.readouterr().err
     for arguments, message in ((["--unit", "inch"], "--unit"), (["--format", "pos", "--unit", "cm"], "cm.epos")):
         assert main(["info", "cm.epos", *arguments]) == 2 and message in capsys.readouterr().err

@@ -104,6 +104,7 @@ def test_the_rule_of_a_metal():
         ae.RollUp.of_metal(replace(material("Ni"), cohesive_energy=None))
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.EmissionWarning")
 def test_the_rule_of_a_metal_on_a_run():
     """In real units and at the simulated voltage: the same ions roll, and hit the same places."""
     tip = ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1))

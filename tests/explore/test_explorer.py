@@ -10,7 +10,7 @@ import pytest
 from rough import ROUGH
 
 import apt_evap as ae
-from apt_evap.cli.explore import _with_file, explorer_and_view
+from apt_evap.cli._explorer_of_files import explorer_and_view, with_file
 from apt_evap.cli.main import main
 from apt_evap.cli.parser import make_parser
 from apt_evap.explore.controls import MECHANISMS, controls_of, perturbation_of, values_of
@@ -44,7 +44,8 @@ def run_in(run):
 def measured(run):
     """Ions of the same run with other random numbers, turned and scaled."""
     hits = TURNED.hits(replace(run, seed=2).hits(ae.RollUp(ENERGY)))
-    return ae.Hits(x=hits.x, y=hits.y, mass_to_charge=hits.mass_to_charge).within_circle(35.0)
+    pulses = np.arange(len(hits))
+    return ae.Hits(x=hits.x, y=hits.y, mass_to_charge=hits.mass_to_charge, pulse_id=pulses).within_circle(35.0)
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +60,7 @@ def equal(first, second):
     return True
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.ResponseWarning")
 @pytest.mark.parametrize("units", ["simulated", "cap", "lens"])
 @pytest.mark.parametrize("perturbation", PERTURBATIONS, ids=repr)
 def test_maps_have_the_bits_of_the_library(run_in, measured, perturbation, units):
@@ -132,7 +134,9 @@ def test_without_a_measurement_it_is_the_map_of_the_command_line(run, tmp_path, 
     monkeypatch.chdir(tmp_path)
     explorer = Explorer(run, run_arguments=["run.h5"])
     drawn = []
-    monkeypatch.setattr("apt_evap.cli.map.save_picture", lambda path, maps, titles, *_: drawn.append(maps[0]))
+    monkeypatch.setattr(
+        "apt_evap.studies.workflows.written_pictures.save_picture", lambda path, maps, titles, *_: drawn.append(maps[0])
+    )
     for view in (explorer.start, View(ae.Combined(ENERGY, 0.4), 48, 3.5, ions=(100, 1500))):
         words = shlex.split(explorer.commands(view).shell)
         assert words[:2] == ["apt-evap", "map"]
@@ -163,6 +167,8 @@ def test_python_lines_give_the_same_maps(run, measured, with_map, ions, tmp_path
         assert f"{shown.similarity.value:.4f}" in capsys.readouterr().out
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.ResponseWarning")
 def test_the_command_gives_the_same_view(run, measured, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run.save("run.h5")
@@ -197,7 +203,9 @@ def test_a_rectangle_selects_ions(run, measured, explorer, tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     ae.write("MEASURED.epos", measured)
     drawn = []
-    monkeypatch.setattr("apt_evap.cli.map.save_picture", lambda path, maps, titles, *_: drawn.append(maps[0]))
+    monkeypatch.setattr(
+        "apt_evap.studies.workflows.written_pictures.save_picture", lambda path, maps, titles, *_: drawn.append(maps[0])
+    )
     words = shlex.split(selection.shell.replace("MEASURED", "MEASURED.epos"))
     assert main([*words[1:], "--quiet"]) == 0
     # an .epos has float32
@@ -363,6 +371,7 @@ def test_maps_that_do_not_lie_on_each_other(rotation, scale):
         assert ("scaled by 0.85" in why) == bool(why) == (scale != 60.0)
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
 @pytest.mark.parametrize("as_map", [False, True])
 def test_a_measurement_alone(measured, as_map, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -383,12 +392,16 @@ def test_a_measurement_alone(measured, as_map, tmp_path, monkeypatch):
         assert equal(names["measured"], shown.measured)
         assert executed(explorer.selection(view, (0.0, 9.0), (0.0, 9.0)).python)["measured"].x.min() >= 0
         drawn = []
-        monkeypatch.setattr("apt_evap.cli.map.save_picture", lambda path, maps, titles, *_: drawn.append(maps[0]))
+        monkeypatch.setattr(
+            "apt_evap.studies.workflows.written_pictures.save_picture",
+            lambda path, maps, titles, *_: drawn.append(maps[0]),
+        )
         words = shlex.split(explorer.commands(view).shell)
         assert main([*words[1:], "--quiet"]) == 0
         assert np.array_equal(drawn[0].density, shown.whole.density, equal_nan=True)
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
 @pytest.mark.parametrize("files", [[], ["run.h5"], ["ions.epos"], ["run.h5", "ions.epos"]])
 def test_the_command_opens_what_there_is(run, measured, tmp_path, monkeypatch, files):
     monkeypatch.chdir(tmp_path)
@@ -405,16 +418,17 @@ def test_the_command_opens_what_there_is(run, measured, tmp_path, monkeypatch, f
     assert explorer.show(view).pictures
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
 def test_a_file_is_opened_beside_the_others(run, measured, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run.save("run.h5")
     ae.write("ions.epos", measured)
     options = make_parser().parse_args(["explore", "--circle", "20"])
-    explorer, _ = _with_file(options, "ions.epos")
+    explorer, _ = with_file(options, "ions.epos")
     assert explorer.run is None and len(explorer.measured) == len(measured)  # the circle was of another file
     with pytest.raises(ValueError, match="none"):
-        _with_file(options, "none.epos")
-    explorer, view = _with_file(options, "run.h5")  # the file that failed is forgotten
+        with_file(options, "none.epos")
+    explorer, view = with_file(options, "run.h5")  # the file that failed is forgotten
     assert explorer.names == ("run.h5", "ions.epos") and len(explorer.show(view).pictures) == 2
 
 
@@ -527,7 +541,7 @@ def test_without_bokeh_one_sentence(run, tmp_path, monkeypatch, capsys):
         (["ions.npz", "run.h5"], "RUN must be"),
         (["run.h5", "run.h5"], "MEASURED must be measured ions or a map, 'run.h5' is a run"),
         (["run.h5", "--registration=1,1,0,0"], "--registration"),
-        (["run.h5", "--perturbation", "RollUp:1,2,3"], "RollUp takes"),
+        (["run.h5", "--perturbation", "RollUp:1,2,3"], "'RollUp' takes"),
         (["run.h5", "--simulated", "5000,"], "--simulated selects none of the ions 0 to 2000"),
         (["none.h5"], "cannot read 'none.h5'"),
     ],

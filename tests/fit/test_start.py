@@ -144,7 +144,7 @@ def test_a_material_of_a_user_is_that_of_the_run(found, tmp_path, name):
 
 
 def test_a_pipe_in_the_place_of_the_settings_is_refused(found, tmp_path, monkeypatch, capsys):
-    from apt_evap.cli.start import is_start
+    from apt_evap.fit.start_settings import is_start
 
     os.mkfifo(tmp_path / "pipe.toml")
     with pytest.raises(ae.FileError, match="regular file"):

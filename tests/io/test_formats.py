@@ -14,6 +14,7 @@ from ion_files import apt, apt_section, epos, ions_of, pyccapt_instrument, raw
 from apt_evap._common.files import FileError, TruncatedFile
 from apt_evap.detection.hits import Hits, Outcome
 from apt_evap.io.formats import FORMATS, chunks, left_out, read, write
+from apt_evap.simulation import read_file
 from apt_evap.simulation.run import Run
 from apt_evap.simulation.simulation import Simulation
 from apt_evap.warnings import DataWarning
@@ -170,12 +171,18 @@ def test_hdf5_is_recognised_whatever_its_name(tmp_path, small_tip):
     run = Simulation(small_tip, seed=1).run(20, responses=False, progress=False)
     run.save(tmp_path / "run.h5")
     (tmp_path / "run.h5").rename(tmp_path / "a.pos")
-    assert isinstance(read(tmp_path / "a.pos"), Run)
+    for format in (None, ".h5", "h5"):
+        assert isinstance(read_file.read(tmp_path / "a.pos", format=format), Run)
     with pytest.raises(FileError, match=r"a\.pos.*a run takes no columns, got \('x',\)"):
-        read(tmp_path / "a.pos", columns=("x",))
+        read_file.read(tmp_path / "a.pos", columns=("x",))
+    with pytest.raises(FileError, match=r"a\.pos.*takes no options, got 'partial'"):
+        read_file.read(tmp_path / "a.pos", partial=True)
+    with pytest.raises(FileError, match=r"a\.pos' is an HDF5 file of the kind 'run'"):
+        read(tmp_path / "a.pos")
     write(tmp_path / "b.nxs", run.hits(run.first_perturbation), elements=["Ni"])
     (tmp_path / "b.nxs").rename(tmp_path / "b.epos")
     assert isinstance(read(tmp_path / "b.epos"), Hits)
+    assert len(read_file.read(tmp_path / "b.epos", columns=("x", "y"))) == 20
     with pytest.raises(FileError, match=r"b\.epos.*partial"):
         read(tmp_path / "b.epos", partial=True)
     with h5py.File(tmp_path / "c.h5", "w") as file:
@@ -198,6 +205,7 @@ def hits_of(values, **columns):
 finite = st.floats(-1000, 1000, width=32).filter(lambda value: value == 0 or abs(value) > 1e-6)
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
 @given(values=arrays("f4", st.tuples(st.integers(1, 12), st.just(7)), elements=finite), data=st.data())
 def test_epos_round_trip(tmp_path, values, data):
     values[:, 4:6] += 2000  # no column of zeros, which would come back as None
@@ -281,6 +289,7 @@ def test_unwritable_places(tmp_path):
         write(tmp_path / "b.pos", hits)
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
 @pytest.mark.parametrize("suffix", [entry.suffix for entry in FORMATS if entry.write and entry.read])
 def test_every_format_that_writes_reads_back_more_ions_than_a_chunk(tmp_path, suffix):
     values = np.random.default_rng(2).uniform(1, 50, (40_000, 7)).astype("f4")
@@ -301,6 +310,7 @@ def test_measured_file_comes_back_to_the_byte(tmp_path):
     assert (tmp_path / "a.epos").read_bytes() == SILICON.read_bytes()
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
 @pytest.mark.parametrize("suffix", [".epos", ".raw"])
 def test_the_unit_of_detector_coordinates_can_be_given(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
@@ -313,7 +323,7 @@ def test_the_unit_of_detector_coordinates_can_be_given(tmp_path, suffix):
         parts = list(chunks(path, 2, detector_unit=unit))
         np.testing.assert_allclose(np.concatenate([part.y for part in parts]), factor * hits.y, rtol=1.2e-7)
     for function in (read, lambda path, **options: list(chunks(path, 2, **options))):
-        with pytest.raises(ValueError, match="detector_unit must be one of mm, cm, m, um, got 'inch'"):
+        with pytest.raises(ValueError, match=r"detector_unit \(--unit\) must be one of mm, cm, m, um, got 'inch'"):
             function(path, detector_unit="inch")
 
 
@@ -330,8 +340,10 @@ def test_a_detector_of_many_metres_is_warned_of_in_every_format(tmp_path):
     edges = np.linspace(0, 501, 9)
     np.savez(tmp_path / "a.npz", counts=np.ones((8, 8), int), x_edges_mm=edges, y_edges_mm=edges)
     for suffix, options in ((".epos", {}), (".nxs", {"elements": ["Al"]}), (".tapsim", {})):
-        write(tmp_path / f"a{suffix}", wide, **options)
-        write(tmp_path / f"usual{suffix}", usual, **options)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DataWarning)  # a .tapsim has fewer columns
+            write(tmp_path / f"a{suffix}", wide, **options)
+            write(tmp_path / f"usual{suffix}", usual, **options)
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             read(tmp_path / f"usual{suffix}")

@@ -1,5 +1,6 @@
 """The documentation: its Python runs, its commands and links are right, and every public name is described."""
 
+import argparse
 import ast
 import dataclasses
 import enum
@@ -78,7 +79,8 @@ def test_blocks_are_found():
         assert page.read_text().count("code-block:: python") == len(python_blocks(page)), page.name
 
 
-@pytest.mark.filterwarnings("ignore:.*left out of:UserWarning")
+@pytest.mark.docs
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")  # of small specimens, and ions that missed
 @pytest.mark.parametrize("path", [p for p in PAGES if python_blocks(p)], ids=name_of)
 def test_python_blocks_run(path, folder, monkeypatch):
     """All blocks of a page, one after the other, as a reader would; those of the README run below."""
@@ -94,7 +96,8 @@ def run_blocks(path, monkeypatch):
         exec(compile(block, str(path), "exec"), page.__dict__)
 
 
-@pytest.mark.filterwarnings("ignore:.*left out of:UserWarning")
+@pytest.mark.docs
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")  # of small specimens, and ions that missed
 def test_what_the_readme_makes(folder, monkeypatch):
     """Its blocks run, and the files it names are written."""
     run_blocks(README, monkeypatch)
@@ -102,6 +105,7 @@ def test_what_the_readme_makes(folder, monkeypatch):
         assert (folder / name).stat().st_size > 0
 
 
+@pytest.mark.docs
 def test_the_perturbation_of_the_extending_page(folder, monkeypatch):
     run_blocks(ROOT / "docs" / "extending.rst", monkeypatch)
     page = sys.modules["__page__"]
@@ -112,11 +116,23 @@ def test_the_perturbation_of_the_extending_page(folder, monkeypatch):
     assert (np.hypot(above.x - plain.x, above.y - plain.y)[plain.detected & above.detected] > 0).all()
 
 
+def test_the_command_of_the_extending_page(folder, monkeypatch, capsys):
+    run_blocks(ROOT / "docs" / "extending.rst", monkeypatch)
+    page = sys.modules["__page__"]
+    ae.Simulation(ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1))).run(20, progress=False).save("few.h5")
+    parser = argparse.ArgumentParser()
+    page.arguments(parser)
+    capsys.readouterr()
+    assert page.execute(parser.parse_args(["few.h5"])) == 0
+    assert capsys.readouterr().out == "wrote charges.png\n"
+    assert (folder / "charges.png").stat().st_size > 5_000
+
+
 TUTORIALS = sorted(path.name for path in (ROOT / "examples").glob("tutorial_*.py"))
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:.*left out of:UserWarning")
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")  # of small specimens, and ions that missed
 @pytest.mark.parametrize("name", TUTORIALS)
 def test_examples_run(name, folder, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", [name, "200"])
@@ -138,6 +154,7 @@ def test_examples_run(name, folder, monkeypatch, capsys):
         assert "in 100% of the resamples" in out
 
 
+@pytest.mark.docs
 def test_a_measured_file_of_ones_own(folder, monkeypatch, capsys):
     """Not every export has voltages, nor a detector about (0, 0)."""
     held = ae.read("R5083.epos")
@@ -199,6 +216,7 @@ def test_figures_3_to_6_of_small_tips(folder, monkeypatch, capsys):
     assert "| Ni combined | " in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_figure_7_of_runs_that_are_there(folder, monkeypatch, capsys, run20):
     """The script turns the crystal by 90 degrees; so is the run here, and taken for both radii."""
     first, rolled = run20.flown
@@ -222,6 +240,7 @@ def test_figure_7_evaporates_to_one_depth(folder, monkeypatch):
     assert [len(ae.load(folder / f"figure7_R{radius}a.h5")) for radius in (6, 4)] == [54, 16]
 
 
+@pytest.mark.slow
 def test_temperatures_are_compared(folder, monkeypatch, capsys):
     run_article("temperature/temperature.py", monkeypatch, "--radius", "8", "--ions", "1500", "--temperatures", "300")
     lines = capsys.readouterr().out.splitlines()

@@ -45,6 +45,7 @@ def run_examples(docstring_tests):
     return "".join(failures)
 
 
+@pytest.mark.docs
 @pytest.mark.filterwarnings("error::UserWarning")  # of the package: an example causes none
 @pytest.mark.parametrize("name", NAMES)
 def test_examples_show_what_they_print(name, tmp_path, monkeypatch):

@@ -61,7 +61,7 @@ def victims_of(process):
 
 def has_begun(sweep, *keys):
     """Whether checkpoints of all these points are on the disk."""
-    return all(any((sweep.folder_of(key) / "run.h5.unfinished").glob("*.h5")) for key in keys)
+    return all((sweep.folder_of(key) / "run.h5.unfinished").exists() for key in keys)
 
 
 def is_alive(number):

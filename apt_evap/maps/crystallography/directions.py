@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_array, check_count, short_text
+from apt_evap._common.validation import check_array, check_count, check_kind, check_sequence, short_text
 from apt_evap.specimen import lattice
 from apt_evap.specimen.materials import Material, as_material
 
@@ -130,8 +130,8 @@ def zones(material: Any, families: Sequence[Any] | None = None) -> Zones:
         If an axis is not a lattice direction.
     """
     material = _crystal(material)
-    families = ZONES[material.structure] if families is None else families
-    if not len(families):
+    families = ZONES[material.structure] if families is None else check_sequence(families, "families", "zone axes")
+    if not families:
         raise ValueError("families must contain at least one zone axis, got none")
     width = 4 if material.structure == "hcp" else 3
     axes, numbers = [], []
@@ -220,6 +220,7 @@ def plain_label(indices: Iterable[int]) -> str:
 
 def _three(material, indices, name, from_four):
     """Convert rows of three or, for hcp, four indices to three."""
+    check_kind(material, "material", Material, "a Material")
     four = material.structure == "hcp" and np.ndim(indices) == 2 and np.shape(indices)[1] == 4
     indices = check_array(indices, name, ("n", 4 if four else 3), dtype=np.int64)
     if four:

@@ -9,8 +9,9 @@ import scipy
 from numpy.typing import ArrayLike
 
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_array
+from apt_evap._common.validation import check_array, check_kind
 from apt_evap.specimen.lattice import check_structure
+from apt_evap.specimen.materials import Material
 
 _ANY = np.array([1.0, 0.3, 0.1])  # in no mirror plane; azimuths begin towards [100] where they can
 _TOLERANCE = 1e-6  # of the axis: orientations by integers are exact to rounding
@@ -76,6 +77,7 @@ def pole_symmetry(material: Any, direction: ArrayLike) -> PoleSymmetry:
     m
     1
     """
+    check_kind(material, "material", Material, "a Material")
     along = check_array(direction, "direction", (3,))
     length = np.linalg.norm(along)
     if not length > 0:
@@ -114,6 +116,7 @@ def symmetry_about_axis(material: Any, orientation: ArrayLike) -> Floats:
     ndarray
         Orthogonal matrices for (x, y), shape (n, 2, 2); 6 for fcc [111], and the identity alone for a general axis.
     """
+    check_kind(material, "material", Material, "a Material")
     turn = check_array(orientation, "orientation", (3, 3))
     turned = turn @ point_group(material.structure) @ turn.T
     keeps = np.abs(turned[:, :, 2] - (0.0, 0.0, 1.0)).max(axis=1) < _TOLERANCE

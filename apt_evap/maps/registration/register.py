@@ -20,6 +20,7 @@ from apt_evap._common.validation import (
     check_sequence,
     check_switch,
     check_values,
+    short_text,
 )
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
@@ -594,7 +595,7 @@ def _near(start, pole, tolerance, measured):
         x, y = start.back(measured.centre.real, measured.centre.imag)
         anchor, place, fraction = complex(x, y), measured.centre, 1 / 5
     elif tolerance is not None:
-        raise ValueError(f"tolerance needs a pole or a start, got {tolerance!r} alone")
+        raise ValueError(f"tolerance needs a pole or a start, got {short_text(tolerance)} alone")
     else:
         return None
     if tolerance is None:

@@ -34,6 +34,8 @@ def folded_table(data: Any) -> str:
     elif isinstance(data, Study):
         scores = {name: str(score) for name, score in data.baselines.items()}
         rows = _table({"result": data.lines(), "similarity": {"best": str(data.optimum.score)} | scores}, {})
+    elif callable(contents := getattr(data, "notebook_contents", None)):  # of a package above this one
+        rows = _table(contents(), UNITS)
     else:
         rows = _table(describe(data), UNITS)
     return f"<details><summary><code>{escape(repr(data))}</code></summary>{rows}</details>"

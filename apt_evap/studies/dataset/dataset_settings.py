@@ -52,7 +52,7 @@ def _instrument(value, name):
 class _Place:
     """In the place of random numbers: always the same one."""
 
-    def __init__(self, place):
+    def __init__(self, place: float) -> None:
         self.random = lambda n: np.full(n, place)
 
 
