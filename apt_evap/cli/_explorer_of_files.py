@@ -8,12 +8,12 @@ from apt_evap.cli._files import in_real_units, ions_of_map, lens_of, read, read_
 from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.explore.controls import values_of
-from apt_evap.explore.explorer import Explorer, View
+from apt_evap.explore.explorer import Explorer, ExplorerSettings
 from apt_evap.simulation.read_file import read as read_file
 from apt_evap.simulation.run import Run, load
 
 
-def with_file(options: argparse.Namespace, path: str) -> tuple[Explorer | None, View | None]:
+def with_file(options: argparse.Namespace, path: str) -> tuple[Explorer | None, ExplorerSettings | None]:
     """Explorer and view with one more file: a run replaces the run, anything else the measurement."""
     changes: dict[str, Any] = {"registration": None, "simulated": None}
     if _run_in(path) is not None:
@@ -34,7 +34,7 @@ def _run_in(path):
     return content if isinstance(content, Run) else None
 
 
-def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer | None, View | None]:
+def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer | None, ExplorerSettings | None]:
     """Explorer of the files of the command, and the view of its options; None without a file.
 
     Parameters
@@ -45,7 +45,7 @@ def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer | None, Vie
     Returns
     -------
     explorer : Explorer
-    view : View
+    view : ExplorerSettings
 
     Raises
     ------
@@ -83,7 +83,7 @@ def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer | None, Vie
     )
     start = explorer.start
     bins = options.bins or start.bins
-    view = View(
+    view = ExplorerSettings(
         perturbation=perturbation or start.perturbation,
         bins=bins,
         smoothing=explorer.smoothing_for(bins) if options.smooth is None else options.smooth,
