@@ -58,8 +58,7 @@ def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer | None, Exp
             raise ValueError(f"RUN must be a run, {options.run!r} contains something else")
         options.run, options.file = None, options.run
     if run is not None:
-        if run.responses is None:
-            raise ValueError(f"{options.run!r} has no responses: repeat the run with responses = true in [simulation]")
+        run.require_responses(repr(options.run))
         run = in_real_units(run, options)
     measured = None if options.file is None else _measured(options)
     registration = None

@@ -94,7 +94,7 @@ class FoldedMap:
         if np.count_nonzero(known) < _LEAST_CELLS:
             raise ValueError(f"other must share at least {_LEAST_CELLS} cells with the map, got {known.sum()}")
         pair = self.flattened[known], other.flattened[known]
-        if not all(each.std() > 0 for each in pair):
+        if not all(values.std() > 0 for values in pair):
             return float("nan")
         return float(np.corrcoef(*pair)[0, 1])
 
@@ -160,8 +160,8 @@ def folded(
     >>> run = ae.Simulation(ae.Tip("W", apex_radius=2.5, axis=(0, 1, 1)), seed=1).run(1_000)
     >>> pole = ae.Orientation.from_settings(run.settings["tip"]).nearest_pole((0, 1, 1))
     >>> projection = run.detector.seen_from_apex
-    >>> maps = [run.hits(each).map(bins=60) for each in (ae.Unperturbed(), ae.RollUp(0.2))]
-    >>> first, second = (ae.maps.folded(each, projection, *pole, reach=30) for each in maps)
+    >>> maps = [run.hits(emission).map(bins=60) for emission in (ae.Unperturbed(), ae.RollUp(0.2))]
+    >>> first, second = (ae.maps.folded(detector_map, projection, *pole, reach=30) for detector_map in maps)
     >>> print(first)
     <FoldedMap of 362 ions: 2mm, up to 30 degrees, ceiling of a correlation 0.84>
     >>> print(f"{first.correlation(second):.2f}")
@@ -184,9 +184,9 @@ def folded(
     halves = float("nan")
     if map.is_counts and seed is not None:
         half = np.random.default_rng(seed).binomial(np.rint(hits).astype(int), 0.5)
-        parts = (_folded(place, each, solid, symmetry, reach, smoothing)[0] for each in (half, hits - half))
+        parts = (_folded(place, part, solid, symmetry, reach, smoothing)[0] for part in (half, hits - half))
         unknown = float("nan")
-        first, second = (FoldedMap(each, angles, symmetry, smoothing, unknown, unknown) for each in parts)
+        first, second = (FoldedMap(part, angles, symmetry, smoothing, unknown, unknown) for part in parts)
         halves = first.correlation(second)
     number = float(hits[np.abs(place) <= reach].sum()) if frame.noise_known else float("nan")
     return FoldedMap(density, angles, symmetry, smoothing, number, halves)
@@ -224,7 +224,7 @@ def symmetric_cells(
         azimuth = np.minimum(azimuth, 2 * np.pi / order - azimuth)
     place = frame.angle * np.exp(1j * azimuth)
     labels = np.full(map.values.shape, -1)
-    column, row = (np.floor(each / size).astype(int) for each in (place.real, place.imag))
+    column, row = (np.floor(angle / size).astype(int) for angle in (place.real, place.imag))
     width = 2 * math.ceil(reach / size) + 2
     labels[map.mask] = np.where(frame.angle < reach, (row + width // 2) * width + column + width // 2, -1)
     return labels
@@ -244,17 +244,19 @@ def _folded(place, hits, solid, symmetry, reach, smoothing):
     cells = 2 * number + 1
     sums = np.zeros((2, cells, cells))
     order = int(symmetry[0]) if symmetry[0].isdigit() else 1
+    # every symmetric copy of the bins is counted into the cells
     for image in (place, place.conj()) if "m" in symmetry else (place,):
         for k in range(order):
             moved = image * np.exp(2j * np.pi * k / order)
-            column, row = (np.rint(each / STEP).astype(int) + number for each in (moved.real, moved.imag))
-            there = (np.abs(column - number) <= number) & (np.abs(row - number) <= number)
-            index = row[there] * cells + column[there]
-            for each, values in zip(sums, (hits, solid), strict=True):
-                each += np.bincount(index, values[there], cells**2).reshape(cells, cells)
-    hits, solid = (gaussian(each, [smoothing / STEP] * 2) for each in sums)
+            column, row = (np.rint(angle / STEP).astype(int) + number for angle in (moved.real, moved.imag))
+            inside = (np.abs(column - number) <= number) & (np.abs(row - number) <= number)
+            index = row[inside] * cells + column[inside]
+            for total, values in zip(sums, (hits, solid), strict=True):
+                total += np.bincount(index, values[inside], cells**2).reshape(cells, cells)
+    hits, solid = (gaussian(total, [smoothing / STEP] * 2) for total in sums)
     angles = np.arange(-number, number + 1) * STEP
     known = (np.hypot(angles, angles[:, None]) <= reach) & (solid > _COVERED * np.radians(STEP) ** 2)
+    # hits per solid angle, in the square around the reach
     density = np.full(known.shape, np.nan)
     density[known] = hits[known] / solid[known]
     inside = np.abs(angles) <= reach

@@ -129,7 +129,7 @@ def ring_statistics(
     if sectors % fold:
         raise ValueError(f"sectors must be a multiple of fold, {fold}, got {sectors}")
     _, angle, azimuth, weight, solid, noise_known = pole_frame(map, projection, pole, ions)
-    found = []
+    statistics = []
     for ring in check_sequence(rings, "rings", "pairs of radii [degrees]"):
         inner, outer = check_array(ring, "rings", (2,)).tolist()
         if not 0 <= inner < outer <= 90:
@@ -142,8 +142,8 @@ def ring_statistics(
         known = bins >= _FEWEST_BINS
         if np.count_nonzero(known) < sectors / 2 or not counts[known].any():
             raise ValueError(f"the ring {inner:g} to {outer:g} degrees has too few bins or counts on {map!r}")
-        found.append(_ring(inner, outer, counts, np.where(known, areas, np.nan), fold, noise_known))
-    return tuple(found)
+        statistics.append(_ring(inner, outer, counts, np.where(known, areas, np.nan), fold, noise_known))
+    return tuple(statistics)
 
 
 def line_amplitude(ring: Ring, measured: Ring, *, shift: int = 0, mirror: bool = False) -> LineAmplitude:
@@ -178,8 +178,8 @@ def line_amplitude(ring: Ring, measured: Ring, *, shift: int = 0, mirror: bool =
     with the profiles p and m of n sectors and the measured contrast c, from which the noise is removed. Noise of p does
     not bias A. The error is that by the noise of p.
     """
-    for name, each in (("ring", ring), ("measured", measured)):
-        check_kind(each, name, Ring, "a Ring")
+    for name, value in (("ring", ring), ("measured", measured)):
+        check_kind(value, name, Ring, "a Ring")
     shift = check_count(shift, "shift")
     check_switch(mirror, "mirror")
     if len(ring.profile) != len(measured.profile):
@@ -189,7 +189,7 @@ def line_amplitude(ring: Ring, measured: Ring, *, shift: int = 0, mirror: bool =
     if not measured.contrast > 0:
         raise ValueError(f"the measured ring must have a contrast > 0, got {measured!r}")
     turned, error = (
-        np.roll(each[::-1] if mirror else each, shift) for each in (ring.profile - 1.0, ring.profile_error)
+        np.roll(values[::-1] if mirror else values, shift) for values in (ring.profile - 1.0, ring.profile_error)
     )
     pattern = measured.profile - 1.0
     known = np.isfinite(turned) & np.isfinite(pattern)

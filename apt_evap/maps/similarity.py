@@ -163,8 +163,8 @@ def similarity(
     """
     smoothing = check_number(smoothing, "smoothing", at_least=0, unit="mm")
     data_range = check_number(data_range, "data_range", above=0)
-    for name, each in (("map_a", map_a), ("map_b", map_b)):
-        check_kind(each, name, DetectorMap, "a DetectorMap")
+    for name, value in (("map_a", map_a), ("map_b", map_b)):
+        check_kind(value, name, DetectorMap, "a DetectorMap")
     _check_bins(map_a, map_b)
     common = map_a.mask & map_b.mask
     inside = window_fits(common)
@@ -174,7 +174,8 @@ def similarity(
             f"{np.count_nonzero(common)} common bins"
         )
     densities = (
-        np.where(common, replace(each.smoothed(smoothing), mask=common).density, 1.0) for each in (map_a, map_b)
+        np.where(common, replace(smooth, mask=common).density, 1.0)
+        for smooth in (map_a.smoothed(smoothing), map_b.smoothed(smoothing))
     )
     # its window ends at 3.5 sigma, as TRUNCATE
     _, local = skimage.metrics.structural_similarity(

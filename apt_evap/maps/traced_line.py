@@ -145,17 +145,17 @@ def trace_line(map: DetectorMap, ends: ArrayLike, *, width: float) -> TracedLine
     start, low = _best_of_grid(along, across, density), max(map.bin_size) / width
     bounds = [-0.5, -np.inf, low, *[-np.inf] * 4], [0.5, np.inf, 1.0, *[np.inf] * 4]
     try:
-        found, covariance = scipy.optimize.curve_fit(model, None, density, np.clip(start, *bounds), bounds=bounds)
+        fitted, covariance = scipy.optimize.curve_fit(model, None, density, np.clip(start, *bounds), bounds=bounds)
     except RuntimeError as failure:
         raise ValueError(f"{no_line}: {failure}") from failure
-    expected = model(None, *found)
+    expected = model(None, *fitted)
     if known:
         # equal weights, as for a profile across a line; the errors are those of the counts
-        change = np.linalg.pinv(scipy.optimize.approx_fprime(found, lambda values: model(None, *values)))
+        change = np.linalg.pinv(scipy.optimize.approx_fprime(fitted, lambda values: model(None, *values)))
         variance = np.maximum(expected, 1e-3) / mean
         excess = max(1.0, float(np.mean((density - expected) ** 2 / variance)))
         covariance = (change * variance) @ change.T * excess
-    place, slope, size, height = found[:4]
+    place, slope, size, height = fitted[:4]
     height_error = math.sqrt(max(covariance[3, 3], 0.0))
     if not (_SIGNIFICANT * height_error < abs(height) and abs(place) < 0.49 and low < size < 0.99):
         raise ValueError(f"{no_line}: the fit gave a height of {height:.2g} ± {height_error:.2g}")

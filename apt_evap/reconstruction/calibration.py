@@ -197,8 +197,8 @@ def _pair_counts(across, along, lateral, reach, bins, max_pairs, seed):
         references = order[done : done + _CHUNK]
         done += len(references)
         neighbours = tree.query_ball_point(scaled[references], 1.0, p=np.inf, return_sorted=False)
-        first = np.repeat(references, [len(found) for found in neighbours])
-        second = np.concatenate([np.asarray(found, np.intp) for found in neighbours])
+        first = np.repeat(references, [len(numbers) for numbers in neighbours])
+        second = np.concatenate([np.asarray(numbers, np.intp) for numbers in neighbours])
         close = ((across[first] - across[second]) ** 2).sum(axis=1) <= lateral * lateral
         close &= first != second
         counts += np.histogram(along[second[close]] - along[first[close]], bins, (-reach, reach))[0]

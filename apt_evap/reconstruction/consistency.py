@@ -74,8 +74,8 @@ def checks(
     >>> radius, azimuth = 20 * np.sqrt(rng.random(50_000)), 2 * np.pi * rng.random(50_000)  # mm, uniform
     >>> ions = ae.Hits(x=radius * np.cos(azimuth), y=radius * np.sin(azimuth))
     >>> lens = ae.detection.LocalElectrode.preset("local electrode")
-    >>> found = ae.reconstruct(ions, atomic_volume=0.011, distance=90.0, radius=30.0, lens=lens)
-    >>> for check in ae.reconstruction.checks(found):
+    >>> reconstruction = ae.reconstruct(ions, atomic_volume=0.011, distance=90.0, radius=30.0, lens=lens)
+    >>> for check in ae.reconstruction.checks(reconstruction):
     ...     print(check)
     <Check: ions per nm^3 near the axis: 86.62, expected 90.91>
     <Check: angle on the cap at the rim [degrees]: 17.58, at most 37.48>
@@ -83,12 +83,12 @@ def checks(
     check_kind(reconstruction, "reconstruction", Reconstruction, "a Reconstruction")
     width = check_number(radius, "radius", above=0, unit="nm")
     known = check_pairs({} if planes is None else planes, "planes", "a mapping from names to places and spacings")
-    found = [
+    spacings = [
         _planes(reconstruction, name, check_array(place, f"position of {name}", (2,)), spacing, width)
         for name, (place, spacing) in known
     ]
     limits = [_rim(reconstruction)] if reconstruction.settings.lens is not None else []
-    return [*found, _density(reconstruction), *limits]
+    return [*spacings, _density(reconstruction), *limits]
 
 
 def _rim(reconstruction):
@@ -114,8 +114,8 @@ def _planes(reconstruction, name, place, spacing, width):
     value = math.nan
     if near.sum() >= 20:
         try:
-            found = distribution_map(reconstruction.positions[near], normal, reach=4 * spacing, lateral=width / 2)
-            value = found.spacing if found.amplitude >= _LEAST_AMPLITUDE else math.nan
+            distances = distribution_map(reconstruction.positions[near], normal, reach=4 * spacing, lateral=width / 2)
+            value = distances.spacing if distances.amplitude >= _LEAST_AMPLITUDE else math.nan
         except ValueError:  # no pair of ions is close enough
             pass
     meaning = "planes too far apart: the efficiency is too small, or the radius too large; too close: the reverse"

@@ -407,9 +407,9 @@ def _ranks(values, labels, counts):
     new[1:] = (groups[1:] != groups[:-1]) | (ordered[1:] != ordered[:-1])
     runs = np.cumsum(new) - 1
     means = np.bincount(runs, ranks) / np.bincount(runs) if len(values) else np.empty(0)
-    found = np.empty(len(values))
-    found[order] = means[runs]
-    return found
+    ranked = np.empty(len(values))
+    ranked[order] = means[runs]
+    return ranked
 
 
 def _squares(residuals):

@@ -266,7 +266,7 @@ def _fit(model, along, counts, reach, starts):
         return -np.log(np.where(counts, probability, 1 - probability)).sum()
 
     bounds = [(-reach, reach), (_SHARPEST * reach, 2 * reach), (0.0, 1.0), (0.0, 1.0)]
-    best = min((scipy.optimize.minimize(cost, start, bounds=bounds) for start in starts), key=lambda found: found.fun)
+    best = min((scipy.optimize.minimize(cost, start, bounds=bounds) for start in starts), key=lambda fit: fit.fun)
     # without gradients: those of a sharp step vanish between two ions
     best = scipy.optimize.minimize(cost, best.x, bounds=bounds, method="Nelder-Mead")
     values = [float(value) for value in best.x]

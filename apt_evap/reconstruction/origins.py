@@ -112,18 +112,18 @@ class OriginTable:
         Mean and covariance are those of the k nearest ions; the covariance is multiplied by 1 + 1/k. The shifts are
         averaged, not the places, so that a gradient of the density of hits gives no error of first order.
         """
-        wanted = check_array(places, "places", ("n", 2))
-        distance = float(np.hypot(*wanted.T).max(initial=0.0))
+        places = check_array(places, "places", ("n", 2))
+        distance = float(np.hypot(*places.T).max(initial=0.0))
         if distance > self.rim:
             raise ValueError(
                 f"places must be within {self.rim:.3f} R of the axis, which the origins cover, got {distance:.3f} R: "
                 "reduce detector_radius or compression"
             )
-        means, covariances = np.empty_like(wanted), np.empty((len(wanted), 2, 2))
+        means, covariances = np.empty_like(places), np.empty((len(places), 2, 2))
         k = self.neighbours
-        for first in range(0, len(wanted), _CHUNK):
+        for first in range(0, len(places), _CHUNK):
             part = slice(first, first + _CHUNK)
-            _, nearest = self._tree.query(wanted[part], k=k)  # type: ignore[attr-defined]
+            _, nearest = self._tree.query(places[part], k=k)  # type: ignore[attr-defined]
             shifts = self.shifts[nearest]
             means[part] = shifts.mean(axis=1)
             deviations = shifts - means[part, None]

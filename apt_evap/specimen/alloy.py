@@ -113,7 +113,7 @@ def check_solutes(
             fractions[solute] = from_plain(fraction, Segregation, what=f"solute {solute.name}")
         else:
             fractions[solute] = check_number(fraction, f"fraction of {solute.name}", above=0, at_most=1)
-    total = sum(each.largest if isinstance(each, Segregation) else each for each in fractions.values())
+    total = sum(part.largest if isinstance(part, Segregation) else part for part in fractions.values())
     if total > 1:
         raise ValueError(f"solutes must have fractions with a sum <= 1, got {total:g}")
     return fractions

@@ -20,8 +20,8 @@ _LONGEST = 2.0
 _HIGHEST_FIELD = 1000.0
 
 
-def _sources(given, name):
-    return dict(check_kind(given, name, Mapping, "a mapping of a field to its source"))
+def _sources(value, name):
+    return dict(check_kind(value, name, Mapping, "a mapping of a field to its source"))
 
 
 @settings

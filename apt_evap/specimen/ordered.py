@@ -66,10 +66,10 @@ def _of_file(plain, name):
     return as_material(plain, name) if isinstance(plain, Mapping) and "structure" in plain else plain
 
 
-def _second(given, name):
-    if given is None:
+def _second(value, name):
+    if value is None:
         raise ValueError(f"{name} must be an element or a mapping of elements to fractions, got None")
-    return _with_materials(_occupant(given, name))
+    return _with_materials(_occupant(value, name))
 
 
 @settings
@@ -108,15 +108,15 @@ class Superlattice:
         return [occupant if (cell, site) in second else () for cell in cells for site in range(len(BASES[structure]))]
 
 
-def _sites(given, name):
-    sites = check_sequence(given, name, "elements")
+def _sites(value, name):
+    sites = check_sequence(value, name, "elements")
     return tuple(_with_materials(_occupant(site, name)) for site in sites)
 
 
-def _cells(given, name):
-    cells = check_sequence(given, name, "three integers")
+def _cells(value, name):
+    cells = check_sequence(value, name, "three integers")
     if len(cells) != 3:
-        raise ValueError(f"{name} must be three integers, got {short_text(given)}")
+        raise ValueError(f"{name} must be three integers, got {short_text(value)}")
     return tuple(check_count(n, name, at_least=1, at_most=100) for n in cells)
 
 

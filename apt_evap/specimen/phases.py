@@ -31,18 +31,18 @@ _MOST_PHASES = 127  # int8 per atom
 _HIGHEST_FIELD = 1000.0  # [V/nm]: as for a Material
 
 
-def _field(given, name):
+def _field(value, name):
     """Evaporation field of a phase, a number or by element."""
-    if not isinstance(given, Mapping):
-        return check_number(given, name, above=0, at_most=_HIGHEST_FIELD, unit="V/nm")
+    if not isinstance(value, Mapping):
+        return check_number(value, name, above=0, at_most=_HIGHEST_FIELD, unit="V/nm")
     return {
-        str(element): check_number(each, f"{name} of {element}", above=0, at_most=_HIGHEST_FIELD, unit="V/nm")
-        for element, each in given.items()
+        str(element): check_number(field, f"{name} of {element}", above=0, at_most=_HIGHEST_FIELD, unit="V/nm")
+        for element, field in value.items()
     }
 
 
-def _solutes(given, name):
-    return check_solutes(given)
+def _solutes(value, name):
+    return check_solutes(value)
 
 
 @settings
@@ -128,7 +128,7 @@ class Phase:
     def is_random(self) -> bool:
         """Whether the atoms of the phase depend on random numbers."""
         occupants = self.order.occupants() if self.order else []
-        return bool(self.solutes) or 0 < self.vacancies < 1 or any(len(each) > 1 for each in occupants)
+        return bool(self.solutes) or 0 < self.vacancies < 1 or any(len(occupant) > 1 for occupant in occupants)
 
 
 def check_phases(phases: Any) -> tuple[Phase, ...]:
@@ -225,10 +225,11 @@ class Arrangement:
             if offset is not None:
                 lengths = lattice.cell_lengths(host.structure, host.a, host.c)
                 shift = origin + matrix_product(turned, offset * lengths)
-            each = Lattice(host.structure, host.a, host.c, tuple(map(tuple, turned.tolist())), tuple(shift.tolist()))
-            if each not in self.lattices:
-                self.lattices.append(each)
-            self._lattice_of.append(self.lattices.index(each))
+            cell = Lattice(host.structure, host.a, host.c, tuple(map(tuple, turned.tolist())), tuple(shift.tolist()))
+            if cell not in self.lattices:
+                self.lattices.append(cell)
+            self._lattice_of.append(self.lattices.index(cell))
+            # numbers of the species, in the order in which they first occur
             numbers = []
             for element in phase._materials():
                 element = phase.of_phase(element)
@@ -251,8 +252,8 @@ class Arrangement:
     def phase_of(self, points: Floats) -> NDArray[np.int8]:
         """Index of the phase at points (n, 3) [nm], int8 (n,)."""
         phase = np.zeros(len(points), dtype=np.int8)
-        for index, each in enumerate(self._phases[1:], 1):
-            phase[contains(each.region, points)] = index
+        for index, later in enumerate(self._phases[1:], 1):
+            phase[contains(later.region, points)] = index
         return phase
 
     def labels(self, number: int, points: Floats, cells: Integers, site: int) -> NDArray[np.int32]:
@@ -298,18 +299,18 @@ class Arrangement:
             n_sites = len(lattice.BASES[phase.material.structure])
             where = sublattice(phase.order, cells, site, n_sites)
             for place, occupant in enumerate(occupants):
-                there = np.flatnonzero(where == place) if occupant else ()
-                if len(there) and len(occupant) == 1:
-                    species[there] = known[first]
-                elif len(there):
-                    numbers = site_numbers(self._seed, number, cells[:, there], site, SUBLATTICE)
+                rows = np.flatnonzero(where == place) if occupant else ()
+                if len(rows) and len(occupant) == 1:
+                    species[rows] = known[first]
+                elif len(rows):
+                    numbers = site_numbers(self._seed, number, cells[:, rows], site, SUBLATTICE)
                     chosen = choose(numbers, [fraction for _, fraction in occupant])
                     # the last one also if the sum of the fractions is rounded to less than 1
-                    species[there] = np.array(known[first : first + len(occupant)])[chosen]
+                    species[rows] = np.array(known[first : first + len(occupant)])[chosen]
                 first += len(occupant)
         if phase.solutes:
             numbers = site_numbers(self._seed, number, cells, site, SOLUTE)
-            fractions = [self._fraction(index, each, points) for each in phase.solutes.values()]
+            fractions = [self._fraction(index, fraction, points) for fraction in phase.solutes.values()]
             chosen = choose(numbers, fractions)
             solute = chosen >= 0
             species[solute] = np.array(known[first:])[chosen[solute]]

@@ -200,7 +200,7 @@ class Union:
         "At least one region or function of points.",
         "regions",
         _check_regions,
-        read=lambda plain, name: [region_of(each, name) for each in check_sequence(plain, name, "regions")],
+        read=lambda plain, name: [region_of(region, name) for region in check_sequence(plain, name, "regions")],
     )
 
     def contains(self, points: Floats) -> Booleans:

@@ -128,7 +128,7 @@ def test_a_comparison_of_data_in_memory_writes_nothing_unless_it_is_asked_to(fol
         ae.compare(run, measured, "mine", GRID, QUICK, registration=HERE, progress=False)
     ae.compare(run, measured, "mine", GRID, QUICK, registration=HERE, progress=False, overwrite=True)
     assert Path("mine/report.html").exists() and Path("mine/maps.png").read_bytes() != b"precious"
-    with pytest.raises(ValueError, match="run has no responses"):
+    with pytest.raises(ValueError, match="run must have responses"):
         ae.compare(replace(run, responses=None), measured, "other")
     assert not Path("other").exists()
 

@@ -162,7 +162,7 @@ class Orientation:
         normals = poles(self.material).normals
         normals = normals[self.directions(normals)[:, 2] > math.cos(math.radians(within))]
         directions = self.directions(normals)
-        orders = np.array([pole_symmetry(self.material, each).order for each in normals], int)
+        orders = np.array([pole_symmetry(self.material, normal).order for normal in normals], int)
         order = np.lexsort((-directions[:, 2], -orders))
         return directions[order[orders[order] > 1]]
 
@@ -316,11 +316,11 @@ def _fit(normals, places, lines, projection, free, mirror):
         fitted_scale = scale * math.exp(fit.x[3]) if free else scale
         candidates.append((fit.cost, fitted_scale, rotation, fit))
     reach = np.linalg.norm(places - projection.centre, axis=1).max()
-    candidates = [each for each in candidates if reach <= Projection(each[1]).rim] or candidates
+    candidates = [fitted for fitted in candidates if reach <= Projection(fitted[1]).rim] or candidates
     # two poles may fit exactly in two ways: the one with the smaller angles is selected
-    least = min(each[0] for each in candidates)
+    least = min(cost for cost, *_ in candidates)
     _, scale, rotation, fit = max(
-        (each for each in candidates if each[0] <= 1.001 * least + 1e-12), key=lambda each: each[1]
+        (fitted for fitted in candidates if fitted[0] <= 1.001 * least + 1e-12), key=lambda fitted: fitted[1]
     )
     matrix = (scipy.spatial.transform.Rotation.from_rotvec(fit.x[:3]) * rotation).as_matrix()
     surplus = len(fit.fun) - len(fit.x) - len(places)  # two of the three offsets of a pole are independent

@@ -92,11 +92,11 @@ def pole_symmetry(material: Any, direction: ArrayLike) -> PoleSymmetry:
     mirrored = bool((~rotations).any())
     if mirrored:
         # the normal of a mirror plane is its eigenvector of -1
-        normals = [np.linalg.eigh(each)[1][:, 0] for each in keeps[~rotations]]
+        normals = [np.linalg.eigh(mirror)[1][:, 0] for mirror in keeps[~rotations]]
         inside = [sign * np.cross(normal, pole) for normal in normals for sign in (1, -1)]
     else:
         inside = [np.cross(pole, np.eye(3)[np.abs(pole).argmin()])]
-    toward = max(inside, key=lambda each: float(each @ _ANY))
+    toward = max(inside, key=lambda direction: float(direction @ _ANY))
     name = (f"{order}mm" if order % 2 == 0 else f"{order}m" if order > 1 else "m") if mirrored else str(order)
     return PoleSymmetry(name, order, to_first.T @ toward / np.linalg.norm(toward))
 

@@ -29,7 +29,7 @@ WIDEST, NARROWEST = 45.0, 12.0
 LARGEST_ANGLE, LEAST_ANGLE = 60.0, 5.0
 """Half angles of the field of view that a scale may give [degrees]."""
 DIFFERENT = 6.0
-"""Angle between two orientations above which they are different answers [degrees]."""
+"""Angle between two orientations above which they are different results [degrees]."""
 DECIDED = 12.0
 """Margin to the next different orientation above which a map decides, see the notes of `index`."""
 RIVAL = 0.8
@@ -89,7 +89,7 @@ class Candidate:
     def _plain(self):
         projection = self.projection
         return {
-            "axis": [round(each, 4) for each in self.orientation.axis],
+            "axis": [round(index, 4) for index in self.orientation.axis],
             "rotation": round(self.orientation.rotation, 2),
             "scale": projection.scale,
             "centre": list(projection.centre),
@@ -103,13 +103,13 @@ class Candidate:
         }
 
     def __str__(self):
-        axis = " ".join(f"{each:.2f}" for each in self.orientation.axis)
+        axis = " ".join(f"{index:.2f}" for index in self.orientation.axis)
         return f"[{axis}], rotation {self.orientation.rotation:.1f}°, {self.projection.scale:.1f} mm/rad"
 
 
 @dataclass(frozen=True, eq=False)
 class Indexing:
-    """Orientations that a map may show, and whether it decides; the answer of `index`.
+    """Orientations that a map may show, and whether it decides; the result of `index`.
 
     Parameters
     ----------
@@ -158,7 +158,7 @@ class Indexing:
         return folded(self.map, chosen.projection, *chosen.orientation.nearest_pole(plane), **options)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the answer in plain types, without the map.
+        """Return the result in plain types, without the map.
 
         Returns
         -------
@@ -169,7 +169,7 @@ class Indexing:
         return {
             "verdict": self.verdict,
             "reason": self.reason,
-            "candidates": [each._plain() for each in self.candidates],
+            "candidates": [candidate._plain() for candidate in self.candidates],
         }
 
     def __repr__(self) -> str:
@@ -177,7 +177,9 @@ class Indexing:
 
     def __str__(self):
         rows = [f"{self.verdict}: {self.reason}"]
-        rows += [f"{each.confidence:5.0%}  score {each.score:.2f}  {each}" for each in self.candidates]
+        rows += [
+            f"{candidate.confidence:5.0%}  score {candidate.score:.2f}  {candidate}" for candidate in self.candidates
+        ]
         return "\n".join(rows)
 
 
@@ -215,9 +217,9 @@ def index(
     distance : float, optional
         Flight length [mm], for a scale between 1/2.2 and 1/1.2 of it.
     candidates : int
-        Largest number of candidates in the answer.
+        Largest number of candidates in the result.
     start : tuple of Orientation and Projection, optional
-        Refine this orientation, such as one of `fit_orientation`, instead of a search. The answer is then undecided.
+        Refine this orientation, such as one of `fit_orientation`, instead of a search. The result is then undecided.
 
     Returns
     -------
@@ -289,41 +291,42 @@ def index(
         starts = [Start(matrix, start[1].scale, 0.0, 0.5, number) for number in range(len(patterns))]
     group = point_group(material.structure)
     proper = group[np.linalg.det(group) > 0]
-    found = [refined((each.pattern, each.matrix, each.scale, each.rolled), _QUICK) for each in starts]
-    found = _ranked(found)
+    fits = [refined((first.pattern, first.matrix, first.scale, first.rolled), _QUICK) for first in starts]
+    fits = _ranked(fits)
     again = []
-    for number, each in found[:_FINAL]:
-        rolled = each.amplitudes[1] / max(each.amplitudes.sum(), 1e-9)
-        again.append(refined((number, each.matrix, each.scale, rolled), 20))
-    found = _ranked(again + found[_FINAL:])
+    for number, fit in fits[:_FINAL]:  # of the best ones with more iterations
+        rolled = fit.amplitudes[1] / max(fit.amplitudes.sum(), 1e-9)
+        again.append(refined((number, fit.matrix, fit.scale, rolled), 20))
+    fits = _ranked(again + fits[_FINAL:])
     if bounds != (low, high):
-        inside = [each for each in found if bounds[0] * 1.001 < each[1].scale_at_centre < bounds[1] / 1.001]
-        found = inside or found
+        inside = [fit for fit in fits if bounds[0] * 1.001 < fit[1].scale_at_centre < bounds[1] / 1.001]
+        fits = inside or fits
     different: list[tuple[int, Refined]] = []
-    for number, each in found:
-        if all(misorientation(each.matrix, other.matrix, proper) > DIFFERENT for _, other in different):
-            different.append((number, each))
+    for number, fit in fits:
+        if all(misorientation(fit.matrix, other.matrix, proper) > DIFFERENT for _, other in different):
+            different.append((number, fit))
     n = check_count(candidates, "candidates", at_least=1)
     contradiction = contradictory_pair(marks, disc.centre, bounds)
     contradiction = contradiction or contradictory_marks(marks, different[0][1].deviations)
-    answer = _judged(measured, disc, bins, material, patterns, different, proper, n, bounds, bool(marks), contradiction)
+    result = _judged(measured, disc, bins, material, patterns, different, proper, n, bounds, bool(marks), contradiction)
     if start is not None:
-        return replace(answer, decided=False, reason="refined from a given orientation, others were not searched")
-    if answer.decided and not marks:
-        rival = _rival(disc, bins, sigma, (low, high), bounds, different[0][1], answer.best.pattern)
+        return replace(result, decided=False, reason="refined from a given orientation, others were not searched")
+    if result.decided and not marks:
+        rival = _rival(disc, bins, sigma, (low, high), bounds, different[0][1], result.best.pattern)
         if rival:
-            answer = replace(answer, decided=False, reason=f"a {rival} crystal explains the map better")
-    return answer
+            result = replace(result, decided=False, reason=f"a {rival} crystal explains the map better")
+    return result
 
 
-def _evidence(found):
+def _evidence(fits):
     """Twice the logarithm of the likelihood, in units of the noise about the model of the largest gain, shape (n,)."""
-    dispersion = max(found, key=lambda each: each[1].gain)[1].dispersion
-    return np.array([each.gain / dispersion - each.misfit for _, each in found])
+    dispersion = max((fit for _, fit in fits), key=lambda fit: fit.gain).dispersion
+    return np.array([fit.gain / dispersion - fit.misfit for _, fit in fits])
 
 
-def _ranked(found):
-    return [found[k] for k in np.argsort(-_evidence(found), kind="stable")]
+def _ranked(fits):
+    """Fits with the largest evidence first."""
+    return [fits[k] for k in np.argsort(-_evidence(fits), kind="stable")]
 
 
 def _rival(disc, bins, sigma, scales, bounds, best, pattern):
@@ -331,11 +334,11 @@ def _rival(disc, bins, sigma, scales, bounds, best, pattern):
     for other in ("fcc", "bcc", "diamond", "hcp"):
         if other == pattern.structure:
             continue
-        rival = min(master_patterns(other), key=lambda each: abs(math.log(each.apex_radius / pattern.apex_radius)))
+        rival = min(master_patterns(other), key=lambda known: abs(math.log(known.apex_radius / pattern.apex_radius)))
         densities = rival.smoothed(sigma)
         for start in search(disc, (rival,), scales, _RIVALS):
-            found = refine(bins, disc, densities, start.matrix, start.scale, start.rolled, (), _QUICK, bounds)
-            if found.gain > best.gain:
+            fit = refine(bins, disc, densities, start.matrix, start.scale, start.rolled, (), _QUICK, bounds)
+            if fit.gain > best.gain:
                 return other
     return ""
 
@@ -352,7 +355,7 @@ def _matrix_at(centre, orientation, projection):
 
 
 def _scales(disc, scales, distance, start):
-    """Bounds of the scale for the search, and for the answer [mm/rad]."""
+    """Bounds of the scale for the search, and for the result [mm/rad]."""
     if scales is not None and distance is not None:
         raise ValueError("give scales or distance, not both")
     name, factors = "scales", (1.0, 1.0)
@@ -381,29 +384,30 @@ def _scales(disc, scales, distance, start):
     return bounds, bounds
 
 
-def _judged(measured, disc, bins, material, patterns, found, proper, n, bounds, marked, contradiction):
-    evidence = _evidence(found)
+def _judged(measured, disc, bins, material, patterns, fits, proper, n, bounds, marked, contradiction):
+    """Candidates of the best fits, and whether they decide."""
+    evidence = _evidence(fits)
     structured = bins.structure > LEAST_STRUCTURE * bins.structure_error
-    structured = structured or max(each.gain for _, each in found) >= LEAST_GAIN
-    scores = [float(np.clip(each.explained, 0, 1)) if structured else 0.0 for _, each in found]
+    structured = structured or max(fit.gain for _, fit in fits) >= LEAST_GAIN
+    scores = [float(np.clip(fit.explained, 0, 1)) if structured else 0.0 for _, fit in fits]
     weights = np.exp(0.5 * (evidence - evidence[0]))
     candidates = []
-    for (number, each), weight, score in zip(found[:n], weights / weights.sum(), scores, strict=False):
-        contrast = float(each.amplitudes.sum())
+    for (number, fit), weight, score in zip(fits[:n], weights / weights.sum(), scores, strict=False):
+        contrast = float(fit.amplitudes.sum())
         candidates.append(
             Candidate(
-                orientation=_orientation(material, each.matrix, proper),
-                projection=_projection(disc, each, bounds),
+                orientation=_orientation(material, fit.matrix, proper),
+                projection=_projection(disc, fit, bounds),
                 score=score,
                 confidence=float(weight),
-                rolled=float(each.amplitudes[1] / max(contrast, 1e-9)),
+                rolled=float(fit.amplitudes[1] / max(contrast, 1e-9)),
                 contrast=contrast,
-                angle_error=float(np.degrees(np.sqrt(np.trace(each.covariance[:3, :3]) * each.dispersion))),
+                angle_error=float(np.degrees(np.sqrt(np.trace(fit.covariance[:3, :3]) * fit.dispersion))),
                 pattern=patterns[number],
             )
         )
     margin, best = math.inf, scores[0]
-    if len(found) > 1:
+    if len(fits) > 1:
         margin = float(evidence[0] - evidence[1])
     next_best = max(scores[1:], default=0.0)
     decided = margin > DECIDED and (marked or next_best < RIVAL * best)

@@ -72,9 +72,9 @@ class Mark(NamedTuple):
 
     def misfit(self, directions: Floats) -> tuple[float, int]:
         """Smallest sum of squared deviations and penalty, and its target."""
-        each = (self.residuals(directions) ** 2).sum(axis=1) + self.penalties
-        best = int(each.argmin())
-        return float(each[best]), best
+        misfits = (self.residuals(directions) ** 2).sum(axis=1) + self.penalties
+        best = int(misfits.argmin())
+        return float(misfits[best]), best
 
     def nearest(self, directions: Floats) -> int | None:
         """Number of the target that the mark may be, None if all are farther away than `_FARTHEST`."""
@@ -101,8 +101,8 @@ def marks_of(material: Material, marked_poles: Sequence[Any], marked_lines: Sequ
     marks = []
     known = poles(material, _FAMILIES)
     spacings = np.unique(-known.spacings.round(9))
-    for each in check_sequence(marked_poles, "poles", "positions"):
-        place, indices = _split(each, 2, "poles", "(x, y) or (x, y, indices)")
+    for pole in check_sequence(marked_poles, "poles", "positions"):
+        place, indices = _split(pole, 2, "poles", "(x, y) or (x, y, indices)")
         if indices is None:
             targets, penalties = known.normals, 2.0 * np.searchsorted(spacings, -known.spacings.round(9))
         else:
@@ -111,13 +111,13 @@ def marks_of(material: Material, marked_poles: Sequence[Any], marked_lines: Sequ
         marks.append(Mark(place.reshape(1, 2), targets, penalties, False, _text_of("pole", place, indices)))
     cubic = material.structure != "hcp"
     families = ZONES[material.structure] + (_MORE if cubic else ())
-    for each in check_sequence(marked_lines, "lines", "pairs of ends"):
-        ends, indices = _split(each, 4, "lines", "(x, y, x, y) or (x, y, x, y, indices)")
+    for line in check_sequence(marked_lines, "lines", "pairs of ends"):
+        ends, indices = _split(line, 4, "lines", "(x, y, x, y) or (x, y, x, y, indices)")
         if np.ptp(ends.reshape(2, 2), axis=0).max() == 0:
-            raise ValueError(f"the ends of a line must differ, got {short_text(each)}")
-        found = zones(material, families if indices is None else [indices])
+            raise ValueError(f"the ends of a line must differ, got {short_text(line)}")
+        axes = zones(material, families if indices is None else [indices])
         text = _text_of("line", ends, indices)
-        marks.append(Mark(ends.reshape(2, 2), found.directions, 2.0 * found.families, True, text))
+        marks.append(Mark(ends.reshape(2, 2), axes.directions, 2.0 * axes.families, True, text))
     return tuple(marks)
 
 
@@ -212,14 +212,14 @@ def rotations_misfit(marks: Sequence[Mark], directions: Sequence[Floats], turn: 
     """
     total = np.zeros(len(angles))
     cosine, sine = np.cos(angles), np.sin(angles)
-    for mark, each in zip(marks, directions, strict=True):
+    for mark, places in zip(marks, directions, strict=True):
         # targets in the specimen before the rotation; the marks are turned back
         targets = mark.targets @ turn.T
         turned = np.stack(
             [
-                each[:, :1] * cosine + each[:, 1:2] * sine,
-                each[:, 1:2] * cosine - each[:, :1] * sine,
-                np.broadcast_to(each[:, 2:], (len(each), len(angles))),
+                places[:, :1] * cosine + places[:, 1:2] * sine,
+                places[:, 1:2] * cosine - places[:, :1] * sine,
+                np.broadcast_to(places[:, 2:], (len(places), len(angles))),
             ],
             axis=-1,
         )  # (places, m, 3)

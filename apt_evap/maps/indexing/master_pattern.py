@@ -143,7 +143,7 @@ class MasterPattern:
         rolled = check_number(rolled, "rolled", at_least=0, at_most=1)
         edges = np.linspace(-half, half, check_count(bins, "bins", at_least=2) + 1)
         middle = (edges[:-1] + edges[1:]) / 2
-        x, y = (each.ravel() for each in np.meshgrid(middle, middle))
+        x, y = (values.ravel() for values in np.meshgrid(middle, middle))
         directions = projection.directions(np.column_stack([x, y])) @ orientation.matrix
         density = np.array([1 - rolled, rolled]) @ self.at(directions)
         mask = np.hypot(x, y) < half
@@ -174,7 +174,7 @@ class MasterPattern:
 def sampled(densities: Floats, directions: Floats) -> Floats:
     """Densities on the disc, shape (k, n, n), at unit vectors of shape (m, 3), by linear interpolation, (k, m)."""
     pixels = _disc(directions)
-    return np.stack([scipy.ndimage.map_coordinates(each, pixels, order=1, mode="nearest") for each in densities])
+    return np.stack([scipy.ndimage.map_coordinates(density, pixels, order=1, mode="nearest") for density in densities])
 
 
 def nearest(densities: Floats, directions: Floats) -> Floats:
@@ -204,4 +204,4 @@ def master_patterns(structure: str) -> tuple[MasterPattern, ...]:
     files = sorted((Path(__file__).parent / "patterns").glob(f"{check_structure(structure)}_*.npz"))
     if not files:
         raise ValueError(f"master patterns come for fcc, bcc, diamond and hcp, got {structure}")
-    return tuple(sorted((MasterPattern.load(each) for each in files), key=lambda each: each.apex_radius))
+    return tuple(sorted((MasterPattern.load(file) for file in files), key=lambda pattern: pattern.apex_radius))

@@ -104,7 +104,7 @@ def _polar(rings, azimuths):
 
 def _slow(radii, azimuths):
     """Orthonormal polynomials on the disc, with the areas of the points as weights, (n, k), and these weights (n,)."""
-    r, phi = (each.ravel() for each in np.meshgrid(radii, azimuths, indexing="ij"))
+    r, phi = (values.ravel() for values in np.meshgrid(radii, azimuths, indexing="ij"))
     x, y = r * np.cos(phi), r * np.sin(phi)
     terms = np.column_stack([x**i * y**j for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)])
     weights = r / r.sum()
@@ -188,9 +188,9 @@ def search(
     # of an axis and its mirror image the pattern is the same, with the azimuth reversed
     turns = [about_axis(axis) for axis in axes_of(patterns[0].structure, AXIS_STEP)]
     steps = int(np.ceil(np.log(scales[1] / scales[0]) / SCALE_STEP))
-    ring, phi = (each.ravel() for each in np.meshgrid(radii, azimuths, indexing="ij"))
+    ring, phi = (values.ravel() for values in np.meshgrid(radii, azimuths, indexing="ij"))
     smooth = [pattern.smoothed(SMOOTHED) for pattern in patterns]
-    found = []
+    scored = []
     for scale in np.geomspace(*scales, steps + 1):
         # smoothed by the same angle as the patterns
         picture = flattened(disc, np.radians(SMOOTHED) * scale)
@@ -216,10 +216,10 @@ def search(
                     score, rolled = _amplitudes(cross, gram)
                     score = score / norm - cost[int(mirror)]
                     best = int(np.argmax(score))
-                    found.append((score[best], rolled[best], number, scale, turn, mirror, azimuths[best]))
-    found.sort(key=lambda each: -each[0])
+                    scored.append((score[best], rolled[best], number, scale, turn, mirror, azimuths[best]))
+    scored.sort(key=lambda entry: -entry[0])
     starts: list[Start] = []
-    for score, rolled, number, scale, turn, mirror, angle in found:
+    for score, rolled, number, scale, turn, mirror, angle in scored:
         matrix = _matrix(turn, mirror, angle)
         if not any(
             misorientation(matrix, other.matrix, proper) < 2 * AXIS_STEP

@@ -51,7 +51,7 @@ def patch_displacements(
     shifts = np.arange(-reach, reach + 1) * pixel
     number = int(measured.reach / (half * pixel))
     places = np.arange(-number, number + 1) * half * pixel
-    found = []
+    patches = []
     for centre in (measured.centre + places + 1j * places[:, None]).ravel():
         points = centre + patch
         x, y = back(points.real, points.imag)
@@ -59,6 +59,7 @@ def patch_displacements(
         values, inside = moving.sample(np.where(known, x + 1j * y, 1e9))
         if np.count_nonzero(inside) < _FILLED * inside.size:
             continue
+        # correlation of the patch for every shift
         scores = np.full((len(shifts), len(shifts)), -1.0)
         for row, dy in enumerate(shifts):
             for column, dx in enumerate(shifts):
@@ -67,17 +68,18 @@ def patch_displacements(
                 if np.count_nonzero(common) >= _FILLED * inside.size:
                     scores[row, column] = correlation(values[common], other[common])
         row, column = np.unravel_index(scores.argmax(), scores.shape)
+        # the largest one, to a fraction of a pixel
         around = scores[row - 1 : row + 2, column - 1 : column + 2]
         if scores[row, column] < _LEAST or around.shape != (3, 3) or around.min() <= -1:
             continue
         move = complex(shifts[column] + pixel * _vertex(around[1]), shifts[row] + pixel * _vertex(around[:, 1]))
         r2 = min(float(scores[row, column]) ** 2, 0.999)
-        found.append((centre, centre + move, r2 / (1 - r2)))
-    if len(found) < _FEWEST:
+        patches.append((centre, centre + move, r2 / (1 - r2)))
+    if len(patches) < _FEWEST:
         raise ValueError(
-            f"a distortion needs at least {_FEWEST} patches of both maps with a clear correlation, got {len(found)}"
+            f"a distortion needs at least {_FEWEST} patches of both maps with a clear correlation, got {len(patches)}"
         )
-    centres, targets, weights = (np.array(column) for column in zip(*found, strict=True))
+    centres, targets, weights = (np.array(column) for column in zip(*patches, strict=True))
     return centres, targets, weights
 
 

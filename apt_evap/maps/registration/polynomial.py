@@ -32,13 +32,13 @@ def terms_of(degree: int) -> tuple[tuple[int, int], ...]:
 
 def _complex(numbers, name):
     """Complex numbers; in files they are pairs."""
-    pairs = [complex(*each) if isinstance(each, list) else each for each in numbers]
+    pairs = [complex(*number) if isinstance(number, list) else number for number in numbers]
     return tuple(np.asarray(pairs, complex).tolist())
 
 
 def _errors(errors, name):
     """Errors; unknown ones are NaN, in files None."""
-    return tuple(np.asarray([np.nan if each is None else each for each in errors], float).tolist())
+    return tuple(np.asarray([np.nan if error is None else error for error in errors], float).tolist())
 
 
 @settings
@@ -81,12 +81,12 @@ class Distortion:
 
     def back(self, points: Any) -> Any:
         """Points that `forth` moves to these, by fixed point iteration; NaN where it does not converge."""
-        found = np.asarray(points, complex)
+        origins = np.asarray(points, complex)
         with np.errstate(over="ignore", invalid="ignore"):
             for _ in range(_ITERATIONS):
-                found = points - self.shift(found)
-            wrong = ~(np.abs(self.forth(found) - points) <= 1e-6 * self.radius)
-        return np.where(wrong, np.nan, found)
+                origins = points - self.shift(origins)
+            wrong = ~(np.abs(self.forth(origins) - points) <= 1e-6 * self.radius)
+        return np.where(wrong, np.nan, origins)
 
 
 class PolynomialFit(NamedTuple):

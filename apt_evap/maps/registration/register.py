@@ -48,18 +48,18 @@ _AT_BOUND = 0.01  # part of the range of a search within which a result is at it
 _BINS = 384  # bins of a map of simulated hits
 
 
-def _score(given, name):
+def _score(value, name):
     """A number that may be NaN; in files NaN is None."""
-    unknown = given is None or (isinstance(given, float) and given != given)
-    return math.nan if unknown else check_number(given, name)
+    unknown = value is None or (isinstance(value, float) and value != value)
+    return math.nan if unknown else check_number(value, name)
 
 
-def _method(given, name):
-    return check_kind(given, name, str, "a text")
+def _method(value, name):
+    return check_kind(value, name, str, "a text")
 
 
-def _ties(given, name):
-    return tuple(check_kind(tie, name, Registration, "Registrations") for tie in check_sequence(given, name, _TIES))
+def _ties(value, name):
+    return tuple(check_kind(tie, name, Registration, "Registrations") for tie in check_sequence(value, name, _TIES))
 
 
 def _read_ties(plain, name):
@@ -376,7 +376,7 @@ def register(
 
 
 class ScoreSurface(NamedTuple):
-    """Best correlation of two maps for every rotation and scale, over all shifts: the answer of `score_surface`."""
+    """Best correlation of two maps for every rotation and scale, over all shifts: the result of `score_surface`."""
 
     rotations: Floats
     """[degrees], shape (n,)."""
@@ -609,20 +609,22 @@ def at_bound(value: float, ends: tuple[float, float]) -> bool:
 
 
 def _bounds_reached(transform, rotations, scales, near):
-    """What of a transform is within 1 % of a bound of the search, in words."""
-    found = []
+    """Descriptions of the numbers of a transform that are within 1 % of a bound of the search."""
+    reached = []
     for name, value, ends in (("rotation", transform.rotation, rotations), ("scale", transform.scale, scales)):
         if ends is not None and ends[1] > ends[0]:
             low, high = ends
             if name == "rotation":
                 value = low + (value - low + 180.0) % 360.0 - 180.0 if value < low or value > high else value
             if at_bound(value, ends):
-                found.append(f"{name} {value:.4g} of {low:.4g} to {high:.4g}")
+                reached.append(f"{name} {value:.4g} of {low:.4g} to {high:.4g}")
     if near is not None and near.tolerance > 0:
         away = transform.forth(near.anchor) - near.place
         if max(abs(away.real), abs(away.imag)) > (1 - 2 * _AT_BOUND) * near.tolerance:
-            found.append(f"shift ({away.real:.2g}, {away.imag:.2g}) mm of at most {near.tolerance:.2g} mm (tolerance)")
-    return found
+            reached.append(
+                f"shift ({away.real:.2g}, {away.imag:.2g}) mm of at most {near.tolerance:.2g} mm (tolerance)"
+            )
+    return reached
 
 
 def _view(value, name):

@@ -87,21 +87,20 @@ def likeness(
     ValueError
         If the bins differ.
     """
-    for name, each in (("simulated", simulated), ("measured", measured)):
-        check_kind(each, name, DetectorMap, "a DetectorMap")
+    for name, detector_map in (("simulated", simulated), ("measured", measured)):
+        check_kind(detector_map, name, DetectorMap, "a DetectorMap")
     if simulated.values.shape != measured.values.shape:
         raise ValueError(f"simulated must have the bins of the measured map, got {simulated!r} and {measured!r}")
     check_kind(registration, "registration", Registration, "a Registration")
-    places = [check_array(each, "about", (2,)) for each in check_sequence(about, "about", "places [mm]")]
+    places = [check_array(place, "about", (2,)) for place in check_sequence(about, "about", "places [mm]")]
     if not places:
         raise ValueError("about must contain at least one place, got none")
     common = simulated.mask & measured.mask
-    maps = [replace(each, mask=common) for each in (simulated, measured)]
+    maps = [replace(detector_map, mask=common) for detector_map in (simulated, measured)]
     for place in places:
         x, y = registration.points(*place)
         centre = complex(float(x), float(y))
-        own, other = (_symmetry(each, centre) for each in maps)
-        agreement = _agreement(own, other)
+        agreement = _agreement(*(_symmetry(detector_map, centre) for detector_map in maps))
         if np.isfinite(agreement):
             break
     halves = float("nan")

@@ -110,9 +110,7 @@ def compare(
         source = source_of(measured)
         content = source.read()
         simulated = run if isinstance(run, Run) else load(run)
-        if simulated.responses is None:
-            name = "run" if isinstance(run, Run) else repr(str(run))
-            raise ValueError(f"{name} has no responses: repeat the run with responses = true in [simulation]")
+        simulated.require_responses("run" if isinstance(run, Run) else repr(str(run)))
         study = fit_energies(
             simulated,
             content,
