@@ -180,7 +180,8 @@ class _Survey:
         self.kilovolts = self._unit == "kV" or (self._unit is None and bool(highest < _LEAST))
         if self.kilovolts and self._unit is None and decisive in self.present:
             warn(
-                f"{str(path)!r}: voltages of at most {highest:.4g} are taken for kV; voltage_unit='V' (--voltage-unit V) reads them in V",
+                f"{str(path)!r}: voltages of at most {highest:.4g} are taken for kV; voltage_unit='V' "
+                "(--voltage-unit V) reads them in V",
                 DataWarning,
             )
         if "voltage" in self.present:
