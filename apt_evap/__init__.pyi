@@ -29,11 +29,8 @@ from .evaporation.law import Extremal as Extremal
 from .evaporation.rule import ConstantPotential as ConstantPotential
 from .evaporation.rule import Robin as Robin
 from .evaporation.thermal import Arrhenius as Arrhenius
-from .evaporation.voltage import VoltageControl as VoltageControl
 from .fit.fit_energies import fit_energies as fit_energies
-from .io.formats import read as read
 from .io.formats import write as write
-from .io.npz import read_map as read_map
 from .io.specimens import read_tip as read_tip
 from .maps.crystallography.orientation import Orientation as Orientation
 from .maps.indexing.index_map import index as index
@@ -42,13 +39,16 @@ from .maps.registration.register import register as register
 from .maps.similarity import similarity as similarity
 from .reconstruction.reconstruct import Reconstruction as Reconstruction
 from .reconstruction.reconstruct import reconstruct as reconstruct
-from .simulation.flight.flight_pool import FlightSettings as FlightSettings
 from .simulation.flight.response import ResponseSettings as ResponseSettings
+from .simulation.read_file import read as read
 from .simulation.run import Run as Run
 from .simulation.run import load as load
 from .simulation.simulation import Simulation as Simulation
 from .specimen.materials import Material as Material
 from .specimen.materials import material as material
 from .specimen.tip import Tip as Tip
+from .studies.workflows.compare_maps import compare as compare
+from .studies.workflows.simulate_file import simulate as simulate
+from .studies.workflows.twin_of_map import twin as twin
 
 __version__: str

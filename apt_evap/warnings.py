@@ -47,6 +47,10 @@ class RunWarning(AptWarning):
     """A run that ends early, or that cannot be saved as requested."""
 
 
+class WorkflowWarning(AptWarning):
+    """What to know about the result of a workflow: ions that miss the detector, an interrupt, an assumption."""
+
+
 def warn(message: str, category: type[AptWarning]) -> None:
     """Issue a warning for the line outside the package that has called it.
 

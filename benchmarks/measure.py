@@ -293,7 +293,7 @@ def flights(radii=(20, 40, 80, 120), shank=2.0, ions=256, group=17):
     for radius in radii:
         emitter = Emitter(nickel_tip(radius, shank))
         batch = emitter.evaporate(min(ions, emitter.sweep_interval))
-        tip, settings = emitter.tip, ae.FlightSettings()
+        tip, settings = emitter.tip, ae.simulation.FlightSettings()
         speed = np.sqrt(2 * 0.5)  # 0.5 eV, charge state 1
         for launches in (1, group):
             flier = flier_over(batch.tree, tip, settings)
@@ -361,7 +361,7 @@ def place_errors(radius=40, shank=1.0, events=5000, ions=200, n_threads=2):
         )
         potential = COULOMB * tree.potentials(tip.potential_point[None], 0.0)[0]
         tree.charges = tree.charges * (simulation.voltage / potential)
-        flier = flier_over(tree, tip, ae.FlightSettings(opening_angle=0.0, tolerance=1e-6))
+        flier = flier_over(tree, tip, ae.simulation.FlightSettings(opening_angle=0.0, tolerance=1e-6))
         end, _ = fly(flier, Journal(tip.positions, 1), [-1], 1, run.emissions.positions, np.zeros((1, 3)))
         x, y, *_ = detector.impacts(*detector.directions(end[:, :3], end[:, 3:6], tip.apex))
         hits = run.hits(ae.Unperturbed())
@@ -443,7 +443,7 @@ def bases(radius=20, shanks=(0.5, 1.0, 2.0, 3.0, 5.0, 8.0), ions=200, n_threads=
         # the same launches for all specimens: one flight from each site, before the first event
         batch = emitter.evaporate(1)
         starts = np.ascontiguousarray(sites[:: max(1, len(sites) // ions)])
-        flier = flier_over(batch.tree, tip, ae.FlightSettings())
+        flier = flier_over(batch.tree, tip, ae.simulation.FlightSettings())
         end, _ = fly(flier, batch.journal, np.full(len(starts), -1), 1, starts, np.zeros_like(starts))
         directions, remaining = simulation.detector.directions(end[:, :3], end[:, 3:6], tip.apex)
         results[base, shank] = fields, rim, np.stack(simulation.detector.impacts(directions, remaining)[:2], axis=1)

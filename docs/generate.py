@@ -1,6 +1,7 @@
 """Pages that are made from the package: the API, the commands with their options, and the keys of a settings file."""
 
 import argparse
+import ast
 import base64
 import importlib
 import inspect
@@ -50,23 +51,38 @@ def namespaces():
 
 
 def api(folder):
-    """Write a page for the front row of names, one for each namespace, and their table of contents."""
+    """Write a page for the top-level names, one for each namespace, and their table of contents."""
     spaces = namespaces()
     front = [name for name in apt_evap.__all__ if name not in spaces and name != "__version__"]
-    pages = {"apt_evap": ("The names used most. ``import apt_evap as ae``, then ``ae.Tip``.", front)}
+    pages = {"apt_evap": ("The names used most. ``import apt_evap as ae``, then ``ae.Tip``.", {"": front})}
     for name, module in spaces.items():
         guides = ", ".join(f":doc:`/{page}`" for page in _GUIDES.get(name, "").split())
         text = f"{_sentence(inspect.getdoc(module).splitlines()[0])} {f'See {guides}.' if guides else ''}".strip()
-        public = [f"{name}.{each}" for each in getattr(module, "__all__", [])]
-        pages[f"apt_evap.{name}"] = (text, public or [name])
+        pages[f"apt_evap.{name}"] = (text, _by_subject(name, module))
     contents = [".. toctree::", "   :maxdepth: 1", ""]
-    for title, (text, names) in pages.items():
+    for title, (text, subjects) in pages.items():
         lines = [title, "=" * len(title), "", text, "", ".. currentmodule:: apt_evap", ""]
-        lines += [".. autosummary::", "   :toctree: ..", "", *(f"   {each}" for each in names)]
+        for subject, names in subjects.items():
+            lines += [f".. rubric:: {subject}", ""] if subject else []
+            lines += [".. autosummary::", "   :toctree: ..", "", *(f"   {public}" for public in names), ""]
         page = title.replace(".", "_")
         _write(folder / f"{page}.rst", lines)
         contents.append(f"   generated/api/{page}")
     _write(folder / "pages.inc", contents)
+
+
+def _by_subject(name, module):
+    """Public names of a namespace by their subject: those of its modules, then those of each package inside it."""
+    subjects = {"": []}
+    stub = Path(module.__file__).with_suffix(".pyi")
+    if not stub.exists():  # a single module, described as a whole
+        return {"": [name]}
+    for node in ast.parse(stub.read_text()).body:
+        inner = f"{module.__name__}.{node.module.split('.')[0]}"
+        inside = (stub.parent / inner.rpartition(".")[2]).is_dir()
+        subject = inspect.getdoc(importlib.import_module(inner)).splitlines()[0].rstrip(".") if inside else ""
+        subjects.setdefault(subject, []).extend(f"{name}.{item.name}" for item in node.names)
+    return {subject: sorted(names) for subject, names in subjects.items() if names}
 
 
 def commands(path):

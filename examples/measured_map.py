@@ -60,7 +60,7 @@ folder.mkdir(parents=True, exist_ok=True)
 # Orientation: the rotation, and the scale in mm per radian, that fit the positions of the indexed poles best.
 
 npz = options.measured.endswith(".npz")
-measured = ae.read_map(options.measured) if npz else ae.read(options.measured).map(bins=options.bins or 128)
+measured = ae.io.read_map(options.measured) if npz else ae.read(options.measured).map(bins=options.bins or 128)
 planes, positions = zip(*options.pole, strict=True)
 fit = ae.maps.fit_orientation(options.material, planes, positions, centre=tuple(options.centre))
 axis = " ".join(f"{index:.3f}" for index in fit.orientation.axis)

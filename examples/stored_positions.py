@@ -10,7 +10,7 @@ detector coordinates. In a third step the radii are those of the spheres on whic
 
     python stored_positions.py R5083.epos --element Si
 
-The flight length is not in the file. It can hardly be told apart from the image compression, so it is given by
+The flight length is not in the file. The data hardly distinguish it from the image compression, so it is given by
 ``--distance``. The script prints the constants and the RMS distances for each protocol and projection, and the mean
 distance in rings and depths of the best one. One million ions take a minute.
 """

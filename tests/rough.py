@@ -4,7 +4,7 @@ import apt_evap as ae
 
 # both maps are made of the same flights: a tenth of a bin, 0.1 mm, will do; a fourth of the time of the defaults
 ROUGH = {
-    "flight_settings": ae.FlightSettings(opening_angle=0.6, tolerance=1e-2),
+    "flight_settings": ae.simulation.FlightSettings(opening_angle=0.6, tolerance=1e-2),
     "response_settings": ae.ResponseSettings(
         site=ae.simulation.Design(2, ((0.0, 1), (1.0, 6))),
         rolled=ae.simulation.Design(2, ((0.0, 1), (1.0, 6))),

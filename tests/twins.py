@@ -69,7 +69,7 @@ def moments(atoms, charges):
 
 
 class Surface:
-    """Surface atoms by the centre of mass of their neighbours, worked out anew by a k-d tree at every question."""
+    """Surface atoms by the centre of mass of their neighbours, computed by a k-d tree at every question."""
 
     def __init__(self, positions, radius, threshold, support):
         self.positions, self.radius, self.threshold, self.support = positions, radius, threshold, support

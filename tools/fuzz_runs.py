@@ -17,7 +17,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from itertools import chain
 from pathlib import Path
 
@@ -26,8 +26,7 @@ import numpy as np
 import apt_evap as ae
 from apt_evap.simulation.run_hdf5 import count_ions, is_run
 from apt_evap.studies.dataset.fields import TEXT, Field
-from apt_evap.studies.dataset.shards import key_in, read_table, write_shard
-from apt_evap.studies.visibility.operators import OriginOperators
+from apt_evap.studies.dataset.shards import read_table, write_shard
 
 KINDS = ("flipped bits", "zeroed range", "random range", "truncation", "insertion", "deletion")
 GOOD = ("as the original", "FileError")
@@ -51,15 +50,16 @@ def make_files(folder):
         "examples": {"ions": np.array([500, 300]), "settings": ["one " * 300, "other"]},
         "ions": {"example": np.repeat([0, 1], [500, 300]).astype("u4"), "position": random.random((800, 3), "f4")},
     }
-    write_shard(folder, "train-0000", tables, SCHEMA, "hdf5", "0123456789abcdef")
-    shapes = (1, 2, 4, 5, 3), (1, 2, 4, 5, 3, 3), (1, 8, 8)
-    arrays = (random.random(shape) for shape in shapes)
-    OriginOperators({"size": np.array([1.0])}, ("Al", "Ni"), *arrays, 3.0, {"a": "b"}).save(folder / "operators.h5")
+    write_shard(folder, "train-0000", tables, SCHEMA, "hdf5")
+    layer = ae.specimen.Phase("layer", "Ni", ae.specimen.Layer(1.0, 1.4), solutes={"Al": 0.5})
+    specimen = ae.Tip("Ni", apex_radius=1.8, axis=(1, 1, 1), shank_length=3.6)
+    operators = ae.studies.origin_operators(layer, specimen, ae.Instrument(), axes={"size": [0.4]}, n_threads=1)
+    operators.save(folder / "operators.h5")
     return {
         "run.h5": load_run,
         "ions.nxs": ae.read,
         "train-0000.h5": load_shard,
-        "operators.h5": OriginOperators.load,
+        "operators.h5": load_operators,
     }
 
 
@@ -82,11 +82,16 @@ def load_run(path):
     return ae.load(path)
 
 
+def load_operators(path):
+    """Read origin operators, without the name of their file."""
+    return replace(ae.studies.OriginOperators.load(path), source="")
+
+
 def load_shard(path):
     """Read the tables of a file of a data set, the ions also in part."""
     folder, name = path.parent, path.stem
     tables = [read_table(folder, name, table, SCHEMA, "hdf5") for table in SCHEMA]
-    return key_in(folder, name, SCHEMA, "hdf5"), tables, read_table(folder, name, "ions", SCHEMA, "hdf5", slice(9, 70))
+    return tables, read_table(folder, name, "ions", SCHEMA, "hdf5", slice(9, 70))
 
 
 def mutant(content, random):

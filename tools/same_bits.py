@@ -58,7 +58,7 @@ def simulation(name):
         matrix = Phase("matrix", nickel, solutes={"Al": 0.1})
         phases = [matrix, Phase("core", nickel, core, evaporation_field=30.0)]
         tip = ae.Tip(phases=phases, apex_radius=12 * a, axis=(0, 0, 1), seed=4)
-        control = ae.VoltageControl(rate=0.02, memory=100)
+        control = ae.evaporation.VoltageControl(rate=0.02, memory=100)
         return ae.Simulation(tip, seed=4, law=ae.Arrhenius(60.0), control=control), 2000, ()
     if name == "potential":
         tip = ae.Tip(nickel, apex_radius=12 * a, axis=(1, 1, 1))

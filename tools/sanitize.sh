@@ -13,7 +13,8 @@ cd "$(dirname "$0")/.."
 kind=${1:?"must be address, bounds, thread or valgrind"}
 shift
 tests=("$@")
-core=(tests/_core tests/flight)
+core=(tests/_core tests/simulation/test_flights.py tests/simulation/test_response.py
+      tests/simulation/test_wide_responses.py tests/simulation/test_field_of_view.py)
 build=$PWD/build/$kind
 log=$build/findings
 mkdir -p "$build"

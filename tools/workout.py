@@ -20,7 +20,7 @@ settings = ae.evaporation.ChargeSettings(sweep_interval=max(2, ions // 4))
 simulation = ae.Simulation(tip, seed=1, n_threads=n_threads, charge_settings=settings)
 run = simulation.run(ions, (ae.RollUp(ae.TruncatedNormal(0.155, 0.155)),), progress=False, batch_size=max(2, ions // 3))
 emitter = simulation.emitter
-emitter.deepen()
+emitter.extend_shell()
 emitter.relax(tolerance=1e-7)  # in double precision
 batch = emitter.evaporate(3)
 

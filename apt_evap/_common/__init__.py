@@ -1,1 +1,1 @@
-"""Validation of user input, files, memory, threads and types, shared by all rooms."""
+"""Validation of user input, files, memory, threads and types, shared by all packages."""

@@ -30,14 +30,14 @@ _READ_ERRORS = (KeyError, IndexError, RuntimeError, TypeError, ValueError, Attri
 
 
 class Label(NamedTuple):
-    """What the first header of a file tells of its content."""
+    """Label of the content of a file, in its first header."""
 
     kind: str
     """Kind of content, such as "run"."""
     rows: int
-    """Number of its rows."""
+    """Number of rows."""
     note: str
-    """What the writer noted of it, such as the key of its settings."""
+    """Note of the writer, such as the key of the settings."""
 
 
 # ---- writing -------------------------------------------------------------------------------------------------------
@@ -250,7 +250,7 @@ class CheckedFile:
         dtype : dtype or None
             Expected type; None for any numbers and texts of fixed length.
         shape : tuple or None
-            Expected shape; None stands for any length, or for any shape.
+            Expected shape; None for any length, or for any shape.
         rows : slice
             Rows to read.
 
@@ -269,7 +269,7 @@ class CheckedFile:
         if not isinstance(item, h5py.Dataset):
             raise ValueError(f"{path} is not a dataset")
         with _damage(self.name):
-            stored, found, plist = item.dtype, item.shape, item.id.get_create_plist()
+            stored, dimensions, plist = item.dtype, item.shape, item.id.get_create_plist()
             chunks, layout, external = item.chunks or (), plist.get_layout(), plist.get_external_count()
             filters = {number: values for number, _, values, _ in map(plist.get_filter, range(plist.get_nfilters()))}
             n_bytes = item.id.get_storage_size()
@@ -277,21 +277,21 @@ class CheckedFile:
             raise ValueError(f"{path} must contain {np.dtype(dtype)}, got {stored}")
         if stored.hasobject:
             raise ValueError(f"{path} must contain numbers or texts of fixed length, got {stored}")
-        expected = (None,) * len(found or ()) if shape is None else shape
-        fits = found is not None and len(found) == len(expected)
-        if not fits or any(a != b for a, b in zip(found, expected, strict=True) if b is not None):
+        expected = (None,) * len(dimensions or ()) if shape is None else shape
+        fits = dimensions is not None and len(dimensions) == len(expected)
+        if not fits or any(a != b for a, b in zip(dimensions, expected, strict=True) if b is not None):
             lengths = ", ".join("any" if length is None else str(length) for length in expected)
-            raise ValueError(f"{path} must have shape ({lengths}), got {found}")
+            raise ValueError(f"{path} must have shape ({lengths}), got {dimensions}")
         if external or layout == h5py.h5d.VIRTUAL:
             raise ValueError(f"{path} is in another file: {_FOREIGN}")
-        if max(math.prod(found), math.prod(chunks)) * stored.itemsize > self._size:
-            raise ValueError(f"{path} has shape {found}, more than the {self._size} bytes of the file")
+        if max(math.prod(dimensions), math.prod(chunks)) * stored.itemsize > self._size:
+            raise ValueError(f"{path} has shape {dimensions}, more than the {self._size} bytes of the file")
         if filters.pop(h5py.h5z.FILTER_DEFLATE, (0,))[0] or filters.keys() - {h5py.h5z.FILTER_FLETCHER32}:
             raise ValueError(f"{path} is compressed or filtered: h5repack -f NONE writes a copy that is not")
-        if n_bytes < math.prod(found) * stored.itemsize:
+        if n_bytes < math.prod(dimensions) * stored.itemsize:
             raise ValueError(f"{path} is incomplete")
         with _damage(self.name):
-            return item[rows] if found else item[()]
+            return item[rows] if dimensions else item[()]
 
     def _names(self, item):
         """Names in a group; HDF5 takes a name that it cannot look up for one that is missing."""

@@ -137,7 +137,7 @@ def vector(
     def check_all(value, name):
         numbers = tuple(check_array(value, name, (length,)).tolist())
         if bounds:
-            numbers = tuple(check_number(each, name, unit=unit, **bounds) for each in numbers)
+            numbers = tuple(check_number(value, name, unit=unit, **bounds) for value in numbers)
         return numbers if check is None else check(numbers, name)
 
     kind = f"sequence of float, shape ({length},)"
@@ -276,8 +276,8 @@ def to_plain(thing: Any, *, short: bool = False) -> Any:
         `from_plain` rebuilds settings from it.
     """
 
-    def plain(each):
-        return to_plain(each, short=short)
+    def plain(item):
+        return to_plain(item, short=short)
 
     if thing is None or isinstance(thing, bool | int | float | str):
         return thing
@@ -287,28 +287,30 @@ def to_plain(thing: Any, *, short: bool = False) -> Any:
         return plain(thing.tolist())
     if isinstance(thing, Mapping):
         if all(isinstance(key, str | int | np.integer) for key in thing):
-            return {str(key): plain(each) for key, each in thing.items()}
-        return [[plain(key), plain(each)] for key, each in thing.items()]
+            return {str(key): plain(item) for key, item in thing.items()}
+        return [[plain(key), plain(item)] for key, item in thing.items()]
     if isinstance(thing, tuple) and hasattr(thing, "_fields"):
-        return {name: plain(each) for name, each in zip(thing._fields, thing, strict=True)}
+        return {name: plain(item) for name, item in zip(thing._fields, thing, strict=True)}
     if isinstance(thing, list | tuple | set | frozenset):
-        return [plain(each) for each in thing]
+        return [plain(item) for item in thing]
     if callable(thing) and hasattr(thing, "__qualname__"):
         return f"{thing.__module__}.{thing.__qualname__}"
     return {"name": type(thing).__name__} | {
-        name: plain(each)
-        for name, (each, default) in _parameters(thing).items()
-        if not (short and _same(each, default))
+        name: plain(value)
+        for name, (value, default) in _parameters(thing).items()
+        if not (short and _same(value, default))
     }
 
 
 def _parameters(thing):
     """Values and defaults of the parameters of an object by name."""
     if callable(getattr(thing, "settings", None)):
-        return {name: (each, MISSING) for name, each in thing.settings().items()}
+        return {name: (value, MISSING) for name, value in thing.settings().items()}
     if is_dataclass(thing):
         return {item.name: (getattr(thing, item.name), _default(item)) for item in fields(thing) if item.init}
-    return {name: (each, MISSING) for name, each in getattr(thing, "__dict__", {}).items() if not name.startswith("_")}
+    return {
+        name: (value, MISSING) for name, value in getattr(thing, "__dict__", {}).items() if not name.startswith("_")
+    }
 
 
 def _same(content, default):
@@ -321,8 +323,8 @@ def for_json(thing: Any) -> Any:
     if isinstance(plain, float):
         return plain if math.isfinite(plain) else None
     if isinstance(plain, dict):
-        return {name: for_json(each) for name, each in plain.items()}
-    return [for_json(each) for each in plain] if isinstance(plain, list) else plain
+        return {name: for_json(item) for name, item in plain.items()}
+    return [for_json(item) for item in plain] if isinstance(plain, list) else plain
 
 
 def from_plain(plain: Any, *kinds: type, what: str = "settings") -> Any:
@@ -397,8 +399,8 @@ def to_python(thing: Any, package: str = "ae.") -> str:
 
 def _python(thing, package=""):
     if not declared(type(thing)):
-        if isinstance(thing, tuple | list) and any(declared(type(each)) for each in thing):
-            inner = ", ".join(_python(each, package) for each in thing)
+        if isinstance(thing, tuple | list) and any(declared(type(item)) for item in thing):
+            inner = ", ".join(_python(item, package) for item in thing)
             return f"({inner},)" if len(thing) == 1 else f"({inner})"
         return repr(thing)
     parts, by_name = [], False
@@ -416,7 +418,7 @@ def _python(thing, package=""):
 
 def _name(kind, package):
     """Name of a class in a Python expression."""
-    package_name, *room = kind.__module__.split(".")[:2]
+    package_name, *folders = kind.__module__.split(".")[:2]
     if package and package_name == "apt_evap" and kind.__name__ not in sys.modules[package_name].__all__:
-        return f"{package}{room[0]}.{kind.__name__}"
+        return f"{package}{folders[0]}.{kind.__name__}"
     return f"{package}{kind.__name__}"

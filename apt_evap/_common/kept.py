@@ -1,4 +1,4 @@
-"""What is kept from an earlier call is used again only if it was made from the same input with the same options.
+"""Check that kept results were made from the same input with the same options, before they are used again.
 
 A data set, operators of a feature or the steps of a workflow are found again by the name of a file or folder, which
 says nothing of their origin. They therefore store what they were made from, in plain types: settings as of `to_plain`,

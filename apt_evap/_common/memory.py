@@ -51,7 +51,7 @@ def check_copies(surface_atoms: float, n_threads: int) -> None:
     """Check that the copies of the surface, one per thread, fit into the free memory (ValueError)."""
     _check(
         copied_memory(surface_atoms, n_threads),
-        f"{n_threads} threads, each with a copy of {surface_atoms:.2g} surface atoms,",
+        f"n_threads={n_threads} (--threads), each with a copy of {surface_atoms:.2g} surface atoms,",
         "use fewer threads",
     )
 

@@ -1,4 +1,4 @@
-"""Views of data in a notebook: a module above those of the data makes them when a notebook asks."""
+"""Views of data in a notebook, made by a module above those of the data when a notebook requests them."""
 
 from importlib import import_module
 from typing import Any

@@ -1,4 +1,4 @@
-"""Optional packages."""
+"""Import of optional packages."""
 
 from importlib import import_module
 from typing import Any

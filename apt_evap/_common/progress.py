@@ -1,4 +1,4 @@
-"""Progress bars."""
+"""Progress bars of long computations."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""One line for results that contain arrays: the shape and range of each array instead of its numbers."""
+"""Short representation of results with arrays: shape and range of each array instead of the numbers."""
 
 from typing import Any
 

@@ -20,7 +20,7 @@ if hasattr(os, "register_at_fork"):
 def usable_threads(n_threads: int) -> int:
     """Return the number of threads that OpenMP can use: 1 in a process that was forked after its parent used several.
 
-    The threads of the parent do not exist in the child, and OpenMP of GCC would wait for them for ever. The results
+    The threads of the parent do not exist in the child, and OpenMP of GCC would wait for them forever. The results
     do not depend on the number of threads.
     """
     _state["several"] |= n_threads > 1

@@ -77,7 +77,7 @@ def check_array(
     name : str
         Name of the argument, for the message.
     shape : tuple
-        Expected shape; a str stands for any length, equal strings for equal lengths: ``("n", 3)``.
+        Expected shape; a str for any length, equal strings for equal lengths: ``("n", 3)``.
     dtype : dtype
         Type of the result; a conversion that loses a fraction or a sign is an error.
     finite : bool
@@ -258,7 +258,7 @@ def check_kind(value: Any, name: str, kind: Any, expected: str) -> Any:
 
 
 def check_name(value: Any, name: str) -> str:
-    """Return `value` if it is a text of 1 to 100 characters: names stand in messages, titles and files."""
+    """Return `value` if it is a text of 1 to 100 characters: names are used in messages, titles and files."""
     if not isinstance(value, str) or not 1 <= len(value) <= _LONGEST_NAME:
         raise ValueError(f"{name} must be text of 1 to {_LONGEST_NAME} characters, got {short_text(value)}")
     return value
@@ -275,7 +275,7 @@ def check_sequence(value: Any, name: str, expected: str) -> tuple[Any, ...]:
 
 
 def check_pairs(value: Any, name: str, expected: str) -> list[tuple[Any, Any]]:
-    """Return the keys and values of a mapping, or of a list of pairs, the plain form of one whose keys are no texts."""
+    """Return the keys and values of a mapping, or of a list of pairs, its plain form if keys are not texts."""
     if isinstance(value, Mapping):
         return list(value.items())
     pairs = isinstance(value, list | tuple) and all(isinstance(pair, list | tuple) and len(pair) == 2 for pair in value)

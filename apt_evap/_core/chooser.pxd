@@ -26,5 +26,5 @@ cdef class RateSum(Chooser):
     cdef int[::1] rising                # (capacity,) nodes whose sum is recomputed
     cdef long leaves
 
-    cdef void weigh(self, int slot) noexcept nogil
+    cdef void set_rate(self, int slot) noexcept nogil
     cdef void add(self, long node) noexcept nogil

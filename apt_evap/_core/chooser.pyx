@@ -41,7 +41,7 @@ cdef class Chooser:
 
     def chosen(self, u=0.5):
         """The slots that evaporate next for random numbers; -1 if none can evaporate. In the shape of `u`."""
-        return np.array([self.choose(each) for each in np.ravel(u)]).reshape(np.shape(u))[()]
+        return np.array([self.choose(number) for number in np.ravel(u)]).reshape(np.shape(u))[()]
 
     @property
     def rate(self):
@@ -109,8 +109,8 @@ cdef class Largest(Chooser):
 cdef class RateSum(Chooser):
     """Chooser of a slot with a probability proportional to its rate (residence-time algorithm), by a tree of sums.
 
-    Every sum is recomputed from its two parts, never corrected by a difference: rounding errors do not accumulate. Rates
-    are kept as value 2^exponent: there is no overflow, even if they differ by thousands of orders of magnitude.
+    Every sum is recomputed from its two parts, never corrected by a difference: rounding errors do not accumulate.
+    Rates are kept as value 2^exponent: there is no overflow, even if they differ by thousands of orders of magnitude.
 
     Parameters
     ----------
@@ -131,11 +131,11 @@ cdef class RateSum(Chooser):
         self.rising = np.empty(key.shape[0], np.int32)
         with nogil:
             for slot in range(<int>key.shape[0]):
-                self.weigh(slot)
+                self.set_rate(slot)
             for node in range(self.leaves - 1, 0, -1):
                 self.add(node)
 
-    cdef void weigh(self, int slot) noexcept nogil:
+    cdef void set_rate(self, int slot) noexcept nogil:
         # The rate of a slot from its key.
         cdef long leaf = self.leaves + slot
         if self.key[slot] >= -1e15:
@@ -190,7 +190,7 @@ cdef class RateSum(Chooser):
         cdef int node
         for i in range(n):
             self.rising[i] = <int>self.leaves + slots[i]
-            self.weigh(slots[i])
+            self.set_rate(slots[i])
         while n and self.rising[0] > 1:
             left = 0
             for i in range(n):

@@ -1,9 +1,9 @@
 """Charges of the surface atoms of a conductor: every atom has the same potential.
 
-sum_{j != i} q_j u(r_ij) + S q_i = V / k_e for every surface atom i. Point charges have u(r) = 1/r; Gaussian charges, as in
-the molecular dynamics of electrodes (Siepmann and Sprik, J. Chem. Phys. 102, 511, 1995), have u(r) = erf(eta r/sqrt 2)/r
-with eta = S sqrt(pi/2). S is the self term: the potential of an atom by its own charge. The matrix is symmetric and, for
-S large enough, positive definite: the charges are solved by conjugate gradients.
+sum_{j != i} q_j u(r_ij) + S q_i = V / k_e for every surface atom i. Point charges have u(r) = 1/r; Gaussian charges, as
+in the molecular dynamics of electrodes (Siepmann and Sprik, J. Chem. Phys. 102, 511, 1995), have
+u(r) = erf(eta r/sqrt 2)/r with eta = S sqrt(pi/2). S is the self term: the potential of an atom by its own charge. The
+matrix is symmetric and, for S large enough, positive definite: the charges are solved by conjugate gradients.
 
 The potential of n neighbouring charges increases with sqrt(n), so the eigenvalues of smooth charges are large. The
 preconditioner of the whole surface takes the means over blocks of 4, 16, 64 ... successive slots of the tree, which are
@@ -42,11 +42,12 @@ cdef extern from "kernels.h":
 
 
 LATTICE_SUM = 3.92
-"""Self term times the square root of the area per atom, at which a flat lattice has its electrical surface at the nuclei.
+"""Self term times the square root of the area per atom, for a flat lattice with its electrical surface at the nuclei.
 
 The potential of a plane lattice of charges q, area s per charge, outside of it is that of a sheet. At a lattice site,
-that of all other charges is lower by 3.92 q/sqrt(s) for a triangular lattice, 3.90 for a square lattice: lim [2 sqrt(pi N)
-- sum_{j<N} sqrt(s)/r_j] (Bonsall and Maradudin, Phys. Rev. B 15, 1959, 1977, give 3.921034 and 3.900265).
+that of all other charges is lower by 3.92 q/sqrt(s) for a triangular lattice, 3.90 for a square lattice:
+lim [2 sqrt(pi N) - sum_{j<N} sqrt(s)/r_j] (Bonsall and Maradudin, Phys. Rev. B 15, 1959, 1977, give 3.921034 and
+3.900265).
 """
 
 ROUGH_ANGLE = 1.2
@@ -109,7 +110,8 @@ cdef class ConstantPotential(FieldRule):
     """
 
     def __init__(self, double self_term, bint gaussian, bint sees_others, double tolerance):
-        self.given, self.gaussian, self.sees_others, self.tolerance = self_term, gaussian, sees_others, tolerance
+        self.requested_self_term, self.tolerance = self_term, tolerance
+        self.gaussian, self.sees_others = gaussian, sees_others
         self.area, self.self_term, self.n_iterations = 1.0, 0.0, 0
         self.near = 1.6   # the potential of merged changes is less accurate than their field
         self.robin = Robin(tolerance, 8)
@@ -139,7 +141,11 @@ cdef class ConstantPotential(FieldRule):
         self.potential, self.normals = potential, normals
         if first:
             self.robin.iterate(tree, normals, lists, tolerance=1e-2, max_sweeps=max_sweeps, n_threads=n_threads)
-            self.self_term = self.given if self.given > 0.0 else LATTICE_SUM / sqrt(self.robin.area)
+            self.self_term = self.requested_self_term
+            if not self.self_term > 0.0:
+                self.self_term = LATTICE_SUM / sqrt(self.robin.area)
+
+        # potentials A q: accurate ones for the residuals, rough ones for the change that removes these
         shape = gaussian_table(self.self_term * sqrt(M_PI / 2.0)) if self.gaussian else ()
         self.sums = Potentials(lists, *shape)
         angle = max(ROUGH_ANGLE, lists.opening_angle)
@@ -150,6 +156,8 @@ cdef class ConstantPotential(FieldRule):
             multiple = potential * charges.sum() / dot(charges[chosen], image)   # the one with the smallest error
             charges *= multiple
             image *= multiple
+
+        # refinement: solve A change = V - A q by rough potentials, until the change is below the tolerance
         residuals = potential - image
         while True:
             change = np.zeros(len(chosen))
@@ -159,6 +167,8 @@ cdef class ConstantPotential(FieldRule):
             if residual < tolerance or sweeps >= max_sweeps:
                 break
             residuals = potential - self.multiply(self.sums, charges, double_precision, n_threads)
+
+        # potential of each atom at the end, and for a law that sees them the fields of all other charges
         tree.charges = charges
         if lists.disturbed is None:
             self.value = np.zeros(tree.x.shape[0])
@@ -209,6 +219,8 @@ cdef class ConstantPotential(FieldRule):
         cdef double[::1] coarse, result, lead
         cdef long n = fine.shape[0], i, k, block, first, last
         cdef double total
+
+        # means over blocks of 1, 4, 16, ... slots
         means, sizes = [residuals], [1]
         while means[len(means) - 1].shape[0] > 1:
             fine = means[len(means) - 1]
@@ -222,6 +234,8 @@ cdef class ConstantPotential(FieldRule):
                 coarse[k] = total / min(4 * block, n - k * 4 * block)
             means.append(np.asarray(coarse))
             sizes.append(4 * block)
+
+        # from the largest blocks down: add the difference from the mean of the block around, over S max(1, sqrt(n)/2)
         lead = np.zeros(1)
         coarse = np.zeros(1)
         for mean, size in zip(means[::-1], sizes[::-1]):
@@ -277,35 +291,35 @@ cdef class ConstantPotential(FieldRule):
 
         Notes
         -----
-        With the deviation d = V - phi of an atom and its mean over the four nearest atoms: the difference of the two over
-        S times the mean charge, plus the mean over V. A deviation of one atom changes its charge by d / S; one that is
-        common to many atoms changes all charges by the fraction d / V.
+        With the deviation d = V - phi of an atom and its mean over the four nearest atoms: the difference of the two
+        over S times the mean charge, plus the mean over V. A deviation of one atom changes its charge by d / S; one
+        that is common to many atoms changes all charges by the fraction d / V.
         """
         cdef const double[:, ::1] atoms = np.ascontiguousarray(positions)
         cdef const double[::1] q = np.ascontiguousarray(charges)
         cdef double[:, ::1] missing = np.empty((len(chosen), 5))
         cdef double[::1] squares = np.empty(len(positions))
         cdef double total
-        cdef long i, j, k, own
+        cdef long i, j, k, atom
         for i in range(missing.shape[0]):
             self.squared_distances(atoms, chosen[i], squares)
-            for j, own in enumerate(np.argsort(squares, kind="stable")[:5]):
-                self.squared_distances(atoms, own, squares)
-                total = self.self_term * q[own]
+            for j, atom in enumerate(np.argsort(squares, kind="stable")[:5]):
+                self.squared_distances(atoms, atom, squares)
+                total = self.self_term * q[atom]
                 for k in range(q.shape[0]):
                     if squares[k] > SAME_PLACE:
                         total += q[k] / sqrt(squares[k])
                         if squares[k] < self.sums.reach_squared:
                             total += q[k] * self.sums.difference(squares[k])
                 missing[i, j] = self.potential - total
-        own_part, near = np.asarray(missing)[:, 0], np.asarray(missing)[:, 1:].mean(axis=1)
-        return (own_part - near) / (self.self_term * charges.mean()) + near / self.potential
+        at_atom, near = np.asarray(missing)[:, 0], np.asarray(missing)[:, 1:].mean(axis=1)
+        return (at_atom - near) / (self.self_term * charges.mean()) + near / self.potential
 
-    cdef void squared_distances(self, const double[:, ::1] atoms, long own, double[::1] squares) noexcept nogil:
+    cdef void squared_distances(self, const double[:, ::1] atoms, long atom, double[::1] squares) noexcept nogil:
         cdef long k
         for k in range(atoms.shape[0]):
-            squares[k] = ((atoms[k, 0] - atoms[own, 0]) ** 2 + (atoms[k, 1] - atoms[own, 1]) ** 2
-                          + (atoms[k, 2] - atoms[own, 2]) ** 2)
+            squares[k] = ((atoms[k, 0] - atoms[atom, 0]) ** 2 + (atoms[k, 1] - atoms[atom, 1]) ** 2
+                          + (atoms[k, 2] - atoms[atom, 2]) ** 2)
 
     # ---- events ----------------------------------------------------------------------------------------------------
 
@@ -377,18 +391,18 @@ cdef class ConstantPotential(FieldRule):
         return total
 
     cdef int solve_patch(self, Octree tree, double[:, ::1] normals, const Hole* hole, Patch* patch) except -1 nogil:
-        cdef long i, room = (hole.n + GROUP - 1) // GROUP * GROUP
-        cdef long near = min((hole.n_near + GROUP - 1) // GROUP * GROUP, room)
+        cdef long i, padded = (hole.n + GROUP - 1) // GROUP * GROUP
+        cdef long near = min((hole.n_near + GROUP - 1) // GROUP * GROUP, padded)
         cdef int slot
-        if 4 * room > self.spreads.shape[0]:
+        if 4 * padded > self.spreads.shape[0]:
             with gil:
-                self.spreads = np.empty(8 * room, np.float32)
+                self.spreads = np.empty(8 * padded, np.float32)
         self.patch_charges(tree, normals, patch)
         merge(tree, patch)
-        for i in range(4 * room):
+        for i in range(4 * padded):
             self.spreads[i] = 0.0
-        self.act_on(hole, 0, near, room, patch.stride, patch.x, patch.y, patch.z, patch.change)
-        self.act_on(hole, near, room - near, room, patch.n_merged, patch.merged_x, patch.merged_y,
+        self.act_on(hole, 0, near, padded, patch.stride, patch.x, patch.y, patch.z, patch.change)
+        self.act_on(hole, near, padded - near, padded, patch.n_merged, patch.merged_x, patch.merged_y,
                     patch.merged_z, patch.merged_change)
         if self.gaussian:
             self.correct_spread(hole, patch)
@@ -399,18 +413,18 @@ cdef class ConstantPotential(FieldRule):
         if self.sees_others:
             for i in range(hole.n):
                 slot = hole.slot[i]
-                self.field[slot, 0] += self.spreads[room + i]
-                self.field[slot, 1] += self.spreads[2 * room + i]
-                self.field[slot, 2] += self.spreads[3 * room + i]
+                self.field[slot, 0] += self.spreads[padded + i]
+                self.field[slot, 1] += self.spreads[2 * padded + i]
+                self.field[slot, 2] += self.spreads[3 * padded + i]
         return 0
 
-    cdef void act_on(self, const Hole* hole, long first, long m, long room, long n, const float* x,
+    cdef void act_on(self, const Hole* hole, long first, long m, long padded, long n, const float* x,
                      const float* y, const float* z, const float* change) noexcept nogil:
         # Potentials, and fields if a law sees them, of n changes at m slots around the hole.
         cdef float* at = &self.spreads[first]
         if self.sees_others:
             patch_potential_and_field(m, hole.near_x + first, hole.near_y + first, hole.near_z + first, n, x, y, z,
-                                      change, at, at + room, at + 2 * room, at + 3 * room)
+                                      change, at, at + padded, at + 2 * padded, at + 3 * padded)
         else:
             patch_potential(m, hole.near_x + first, hole.near_y + first, hole.near_z + first, n, x, y, z, change, at)
 
@@ -439,12 +453,14 @@ cdef class ConstantPotential(FieldRule):
         cdef double mean = 0.0
         cdef float largest = 0.0, square, before, curvature, step, bound, s, most = <float>self.sums.reach_squared
         cdef long i, k, n = patch.n, stride = patch.stride
-        cdef int iteration
+        cdef int _iteration
         self.grow(stride)
         cdef float* residual = &self.residual[0]
         cdef float* direction = &self.direction[0]
         cdef float* image = &self.image[0]
         cdef float* row
+
+        # matrix A_ik = u(r_ik), A_ii = S, and residuals V - phi of the old charges; padding has no residual
         for i in range(n):
             mean += tree.q[patch.slot[i]] / n
             row = &self.matrix[i * stride]
@@ -462,9 +478,11 @@ cdef class ConstantPotential(FieldRule):
         for i in range(stride):
             direction[i] = residual[i]
             image[i] = 0.0
+
+        # conjugate gradients: step along a direction d by r.r / d.A d, next direction r + d (r.r) / (previous r.r)
         bound = <float>(self.tolerance * self.self_term * mean)
         square = patch_dot(stride, residual, residual)
-        for iteration in range(100):
+        for _iteration in range(100):
             largest = 0.0
             for i in range(n):
                 largest = max(largest, fabsf(residual[i]))
@@ -484,7 +502,7 @@ cdef class ConstantPotential(FieldRule):
             square = patch_dot(stride, residual, residual)
             for i in range(n):
                 direction[i] = residual[i] + square / before * direction[i]
-        self.n_iterations += iteration
+            self.n_iterations += 1
         for i in range(n):
             patch.charge[i] = tree.q[patch.slot[i]] + patch.change[i]
         patch.unsettled = largest > bound

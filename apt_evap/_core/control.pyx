@@ -30,7 +30,7 @@ cdef class Control:
 
     cdef double wait(self, double u, double log_rate) noexcept nogil:
         # Time to the next event [s], from a random number u in (0, 1) and the natural logarithm of the sum of the rates
-        # [1/s] without `rise`; `rise` becomes that at the event.
+        # [1/s] without `rise`; `rise` is then the value at the event.
         return 0.0
 
     cdef void evaporated(self) noexcept nogil:
@@ -39,7 +39,7 @@ cdef class Control:
 
 
 cdef class SteadyRate(Control):
-    """Control to a constant mean rate.
+    """Control that keeps the mean rate constant.
 
     While no event happens, the logarithm of all rates rises by 1 / memory in the mean time between events. Every event
     lowers it by 1 / memory.
@@ -47,7 +47,7 @@ cdef class SteadyRate(Control):
     Parameters
     ----------
     rate : float
-        Wanted sum of the rates [1/s].
+        Requested sum of the rates [1/s].
     memory : float
         Number of events over which the rate is averaged.
     """

@@ -24,7 +24,7 @@ def sine_and_cosine(angles):
     return np.asarray(sine).reshape(shape)[()], np.asarray(cosine).reshape(shape)[()]
 
 
-cdef each(double (*function)(double) noexcept nogil, numbers):
+cdef apply(double (*function)(double) noexcept nogil, numbers):
     # A function of each of the numbers, in their shape.
     cdef long i
     cdef const double[::1] values = np.ascontiguousarray(numbers, np.float64).reshape(-1)
@@ -36,23 +36,23 @@ cdef each(double (*function)(double) noexcept nogil, numbers):
 
 
 def arctangent(numbers):
-    """Arcus tangens [rad] of numbers of any shape; relative errors below 1e-15."""
-    return each(arc_tangent, numbers)
+    """Arctangent [rad] of numbers of any shape; relative errors below 1e-15."""
+    return apply(arc_tangent, numbers)
 
 
 def logarithm(numbers):
     """Natural logarithm of positive numbers of any shape; relative errors below 5e-16."""
-    return each(natural_logarithm, numbers)
+    return apply(natural_logarithm, numbers)
 
 
 def exponential(numbers):
     """e^x of numbers of any shape; relative errors below 4e-16, 0 or inf outside the range of float64."""
-    return each(exponential_of, numbers)
+    return apply(exponential_of, numbers)
 
 
 def seventh_root_of_reciprocal(numbers):
     """x^(-1/7) of positive numbers of any shape, for the steps of flights; relative errors below 2e-15."""
-    return each(inverse_seventh_root, numbers)
+    return apply(inverse_seventh_root, numbers)
 
 
 def normal_quantile(probabilities):
@@ -60,4 +60,4 @@ def normal_quantile(probabilities):
 
     Relative errors are below 2e-15 (Wichura, Applied Statistics 37, 477, 1988, algorithm AS 241).
     """
-    return each(quantile_of_normal, probabilities)
+    return apply(quantile_of_normal, probabilities)

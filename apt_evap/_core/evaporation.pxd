@@ -20,39 +20,39 @@ cdef class Evaporation:
     cdef readonly long n_removed, since_relaxation
     cdef readonly long n_partial        # relaxations of a part since that of the whole surface
     cdef long n_slots_before            # slots of the tree after the last relaxation
-    cdef readonly signed char[::1] disturbed   # (capacity,) 1 for slots near holes since the last relaxation
+    cdef readonly signed char[::1] disturbed  # (capacity,) 1 for slots near holes since the last relaxation
     cdef public long n_clipped          # negative charges that were set to 0
     cdef public long n_unsettled        # patches that did not converge
     cdef readonly Control control       # of the voltage
-    cdef readonly double target_stretch # squared reach of a roll-up over that of a nearest neighbour
+    cdef readonly double target_stretch  # squared reach of a roll-up over that of a nearest neighbour
     cdef readonly unsigned long long seed
-    cdef readonly bint was_scaled        # whether the potential inside was restored since the last relaxation
+    cdef readonly bint was_scaled       # whether the potential inside was restored since the last relaxation
     cdef bint has_support
     cdef int[::1] slot_of               # (n_atoms,) -1 for atoms not at the surface
     cdef double[:, ::1] normals         # (capacity, 3) by slot
     cdef readonly Chooser chooser       # selects the slot that evaporates next
     cdef Hole hole                      # surroundings of an evaporating atom; its memory follows
     cdef int[::1] hole_slot
-    cdef float[:, ::1] hole_float       # (3, room)
+    cdef float[:, ::1] hole_float       # (3, capacity)
     cdef Patch patch                    # slots whose charges are solved; its memory follows
     cdef int[::1] patch_slot
     cdef double[::1] patch_charge
-    cdef float[:, ::1] patch_float      # (8, room)
-    cdef int[::1] far_slot              # (room,)
-    cdef double[::1] strength, key      # (room,) of the patch, for the law
+    cdef float[:, ::1] patch_float      # (8, capacity)
+    cdef int[::1] far_slot              # (capacity,)
+    cdef double[::1] strength, key      # (capacity,) of the patch, for the law
     cdef long long[::1] key_atom
     cdef int[::1] key_bonds
 
-    cdef void make_room(self, long room)
-    cdef rank(self, double factor, log_rate_at, int n_threads)
-    cdef Chooser ranked(self, double voltage_factor, int n_threads)
+    cdef void allocate(self, long capacity)
+    cdef update_chooser(self, double factor, log_rate_at, int n_threads)
+    cdef Chooser new_chooser(self, double voltage_factor, int n_threads)
     cdef void strongest_neighbours(self, long atom, double stretch, long long* neighbour,
                                    double* charge) noexcept nogil
-    cdef void join(self, int slot, double dx, double dy, double dz) noexcept nogil
-    cdef void near_first(self, Hole* hole) noexcept nogil
+    cdef void add_to_patch(self, int slot, double dx, double dy, double dz) noexcept nogil
+    cdef void sort_near_first(self, Hole* hole) noexcept nogil
     cdef int surroundings(self, long atom) noexcept nogil
     cdef double hopping(self, double key, double strength, long atom) noexcept nogil
-    cdef int judge(self, const int* slots, long n) except -1 nogil
+    cdef int update_keys(self, const int* slots, long n) except -1 nogil
     cdef int event(self, long atom, Journal journal) except -1 nogil
     cdef int scale(self, Journal journal) except -1 nogil
-    cdef int expose(self, const int* fresh, int n_fresh, int gone, Journal journal) except -1 nogil
+    cdef int expose(self, const int* fresh, int n_fresh, int removed_slot, Journal journal) except -1 nogil

@@ -32,7 +32,7 @@ cdef extern from "random_numbers.h":
 cdef enum:
     NOT_RELAXED = 1 << 30   # number of events since the last relaxation before the first one
     FEW = 16384             # number of surface atoms up to which one thread is faster than several
-    ROOM = 4096             # initial number of slots within the update radius; 18 d_nn of fcc contain about 1,000
+    INITIAL_CAPACITY = 4096   # slots within the update radius at first; 18 d_nn of fcc contain about 1,000
     STATUS_DONE = 0
     STATUS_SWEEP_DUE = 1
     STATUS_EXHAUSTED = 2
@@ -47,7 +47,7 @@ Measured (Ni[111], R = 20 a, first events on a perfect surface): 5e-3 leave an e
 DONE, SWEEP_DUE, EXHAUSTED, TOO_SHALLOW = STATUS_DONE, STATUS_SWEEP_DUE, STATUS_EXHAUSTED, STATUS_TOO_SHALLOW
 
 
-cdef class Start:
+cdef class RelaxationStart:
     """Start values of a relaxation, from which the same charges are recomputed bit by bit.
 
     Number of events so far, charges of the surface atoms in the order of their indices (n,) [e], atoms without
@@ -56,11 +56,11 @@ cdef class Start:
     """
 
     cdef readonly long n_removed
-    cdef readonly object charges, lonely, lonely_normals, rule_state
+    cdef readonly object charges, isolated, isolated_normals, rule_state
 
-    def __init__(self, long n_removed, charges, lonely, lonely_normals, rule_state):
+    def __init__(self, long n_removed, charges, isolated, isolated_normals, rule_state):
         self.n_removed, self.charges, self.rule_state = n_removed, charges, rule_state
-        self.lonely, self.lonely_normals = lonely, lonely_normals
+        self.isolated, self.isolated_normals = isolated, isolated_normals
 
 
 cdef class Evaporation:
@@ -107,28 +107,28 @@ cdef class Evaporation:
         self.potential_bound = potential_bound
         self.has_support = bool(np.asarray(atoms.support).any())
         self.slot_of = np.full(atoms.n_atoms, -1, np.int32)
-        self.make_room(ROOM)
+        self.allocate(INITIAL_CAPACITY)
 
-    cdef void make_room(self, long room):
+    cdef void allocate(self, long capacity):
         # Buffers for this number of slots around a hole, and for the newly exposed atoms.
-        self.hole_slot = np.empty(room + MAX_NEAR, np.int32)
-        self.hole_float = np.empty((3, room + MAX_NEAR + GROUP), np.float32)
+        self.hole_slot = np.empty(capacity + MAX_NEAR, np.int32)
+        self.hole_float = np.empty((3, capacity + MAX_NEAR + GROUP), np.float32)
         self.hole.slot = &self.hole_slot[0]
         self.hole.near_x, self.hole.near_y = &self.hole_float[0, 0], &self.hole_float[1, 0]
         self.hole.near_z = &self.hole_float[2, 0]
-        self.patch_slot = np.empty(room + MAX_NEAR, np.int32)
-        self.patch_charge = np.empty(room + MAX_NEAR)
-        self.patch_float = np.empty((8, room + MAX_NEAR), np.float32)
+        self.patch_slot = np.empty(capacity + MAX_NEAR, np.int32)
+        self.patch_charge = np.empty(capacity + MAX_NEAR)
+        self.patch_float = np.empty((8, capacity + MAX_NEAR), np.float32)
         self.patch.slot, self.patch.charge = &self.patch_slot[0], &self.patch_charge[0]
         self.patch.x, self.patch.y = &self.patch_float[0, 0], &self.patch_float[1, 0]
         self.patch.z, self.patch.change = &self.patch_float[2, 0], &self.patch_float[3, 0]
         self.patch.merged_x, self.patch.merged_y = &self.patch_float[4, 0], &self.patch_float[5, 0]
         self.patch.merged_z, self.patch.merged_change = &self.patch_float[6, 0], &self.patch_float[7, 0]
-        self.far_slot = np.empty(room + MAX_NEAR, np.int32)
-        self.strength, self.key = np.empty(room + MAX_NEAR), np.empty(room + MAX_NEAR)
-        self.key_atom, self.key_bonds = np.empty(room + MAX_NEAR, np.int64), np.empty(room + MAX_NEAR, np.int32)
+        self.far_slot = np.empty(capacity + MAX_NEAR, np.int32)
+        self.strength, self.key = np.empty(capacity + MAX_NEAR), np.empty(capacity + MAX_NEAR)
+        self.key_atom, self.key_bonds = np.empty(capacity + MAX_NEAR, np.int64), np.empty(capacity + MAX_NEAR, np.int32)
 
-    def take_over(self, Neighbourhood atoms, LawKernel law):
+    def replace_atoms(self, Neighbourhood atoms, LawKernel law):
         """Continue with additional atoms; the first ones are the previous atoms. Call `relax` next."""
         cdef int[::1] slot_of = np.full(atoms.n_atoms, -1, np.int32)
         np.asarray(slot_of)[:self.atoms.n_atoms] = self.slot_of
@@ -154,7 +154,7 @@ cdef class Evaporation:
             Opening angle of the sweeps [rad]; by default that of the events.
         n_threads : int
             Number of threads.
-        start : Start, optional
+        start : RelaxationStart, optional
             Start values; by default the current surface, or equal charges.
 
         Returns
@@ -172,30 +172,36 @@ cdef class Evaporation:
             raise ValueError("the specimen has no surface atoms")
         builders = n_threads if len(surface) > FEW else 1
         self.since_relaxation = NOT_RELAXED   # after an interruption below no atom can evaporate
+
+        # initial charges: those of the last events, or of another run, or equal ones
         log_rate_at, factor = partial(self.log_rate_at, n_threads=n_threads), self.control.voltage_factor
         if start is None:
             if self.tree is not None:
                 factor = self.control.before_relaxation(self.chooser.log_total(), log_rate_at)
-            start = self.start_here(surface, builders)
+            start = self.current_start(surface, builders)
         elif len(start.charges) != len(surface):
             raise ValueError(f"start must have the charges of {len(surface)} surface atoms, got {len(start.charges)}")
         self.start, self.n_removed, self.rule.state = start, start.n_removed, start.rule_state
+
+        # the tree orders the atoms along the Morton curve; from here on, arrays are in the order of its slots
         tree = Octree(self.atoms.positions_of(surface, builders), start.charges, surface,
                       extra=extra or len(surface) // 8 + MAX_NEAR, n_threads=builders)
-        surface = tree.atoms   # from here on in the order of the slots
+        surface = tree.atoms
         n, capacity = tree.n_slots, tree.capacity
         normals = np.zeros((capacity, 3))
         normals[:n] = self.atoms.normals_of(surface, builders)
         for slot in prange(n, nogil=True, schedule="static", num_threads=builders):
             slot_of[tree.atom[slot]] = <int>slot
-        normals[np.asarray(slot_of)[start.lonely]] = start.lonely_normals
+        normals[np.asarray(slot_of)[start.isolated]] = start.isolated_normals
+
+        # charges at the given potential, then the keys of all atoms in the resulting fields
         lists = InteractionLists(tree, opening_angle or self.opening_angle, n_threads)
         outcome = self.rule.solve(tree, normals, lists, potential=self.potential, tolerance=tolerance,
                                   max_sweeps=max_sweeps, double_precision=double_precision, n_threads=n_threads)
         self.field_unit = self.rule.field_unit(self.coulomb)
         self.tree, self.normals, self.slot_of = tree, normals, slot_of
         self.disturbed = np.zeros(capacity, np.int8)
-        self.rank(factor, log_rate_at, builders)
+        self.update_chooser(factor, log_rate_at, builders)
         self.n_partial, self.n_slots_before, self.atoms.opened = 0, tree.n_slots, False
         return outcome
 
@@ -222,14 +228,14 @@ cdef class Evaporation:
         outcome = self.rule.solve(self.tree, self.normals, lists, potential=self.potential, tolerance=tolerance,
                                   max_sweeps=max_sweeps, n_threads=n_threads)
         self.disturbed[:] = 0
-        self.rank(factor, log_rate_at, builders)
+        self.update_chooser(factor, log_rate_at, builders)
         self.n_partial += 1
         self.n_slots_before = self.tree.n_slots
         return outcome
 
     @property
     def whole_is_due(self):
-        """Whether only `relax` can continue: for a new surface, an opened void, a full tree, or a rule in Python.
+        """Whether `relax` must be called: for a new surface, an opened void, a full tree, or a rule in Python.
 
         Or for a change far from the holes above `FAR_CHANGE`, which samples do not follow well enough. A tree is full
         if its space is below twice the number of atoms that were exposed since the last relaxation.
@@ -247,13 +253,13 @@ cdef class Evaporation:
         self.n_removed += atoms.shape[0]
         self.since_relaxation = NOT_RELAXED
 
-    cdef rank(self, double factor, log_rate_at, int n_threads):
-        # The chooser after a relaxation, for a voltage over that of the charges, which the control may change.
+    cdef update_chooser(self, double factor, log_rate_at, int n_threads):
+        # New chooser after a relaxation, for a voltage over that of the charges, which the control may change.
         self.control.voltage_factor, self.control.rise = factor, 0.0
-        self.chooser = self.ranked(factor, n_threads)
+        self.chooser = self.new_chooser(factor, n_threads)
         self.control.voltage_factor = self.control.after_relaxation(log_rate_at)
         if self.control.voltage_factor != factor:
-            self.chooser = self.ranked(self.control.voltage_factor, n_threads)
+            self.chooser = self.new_chooser(self.control.voltage_factor, n_threads)
         self.since_relaxation, self.was_scaled = 0, False
 
     def log_rate_at(self, double voltage_factor, int n_threads=1):
@@ -261,11 +267,11 @@ cdef class Evaporation:
 
         -inf for a law without rates.
         """
-        cdef double total = self.ranked(voltage_factor, n_threads).log_total()
+        cdef double total = self.new_chooser(voltage_factor, n_threads).log_total()
         self.law.begin(self.field_unit * self.control.voltage_factor)
         return total
 
-    cdef Chooser ranked(self, double voltage_factor, int n_threads):
+    cdef Chooser new_chooser(self, double voltage_factor, int n_threads):
         # The chooser for recomputed keys of all slots, for a voltage over that of the charges.
         cdef long n = self.tree.n_slots, slot
         cdef int[::1] bonds = np.zeros(n, np.int32)
@@ -283,27 +289,27 @@ cdef class Evaporation:
                 key[slot] = -INFINITY
         return self.law.chooser(self.tree, key)
 
-    def start_here(self, const long long[::1] surface, int n_threads=1):
+    def current_start(self, const long long[::1] surface, int n_threads=1):
         """Start values of a relaxation of the current surface; equal charges if it has none yet."""
         cdef double[::1] charges = np.ones(len(surface))
         cdef char[::1] alone = np.zeros(len(surface), np.int8)
         cdef long i, slot
-        lonely, normals = np.empty(0, np.int64), np.empty((0, 3))
+        isolated, normals = np.empty(0, np.int64), np.empty((0, 3))
         if self.tree is not None:
             for i in prange(surface.shape[0], nogil=True, schedule="static", num_threads=n_threads):
                 slot = self.slot_of[surface[i]]
                 charges[i] = self.tree.q[slot] if slot >= 0 else 0.0
                 alone[i] = slot >= 0 and self.atoms.count[surface[i]] == 0
-            lonely = np.asarray(surface)[np.asarray(alone).view(bool)]
-            normals = np.asarray(self.normals)[np.asarray(self.slot_of)[lonely]]
-        return Start(self.n_removed, np.asarray(charges), lonely, normals, self.rule.state)
+            isolated = np.asarray(surface)[np.asarray(alone).view(bool)]
+            normals = np.asarray(self.normals)[np.asarray(self.slot_of)[isolated]]
+        return RelaxationStart(self.n_removed, np.asarray(charges), isolated, normals, self.rule.state)
 
     # ---- one event -------------------------------------------------------------------------------------------------
 
     cdef void strongest_neighbours(self, long atom, double stretch, long long* neighbour,
                                    double* charge) noexcept nogil:
-        # The TARGETS surface neighbours of an atom with the highest charges, in descending order; -1 if there are fewer.
-        # Nearest neighbours, and with a stretch above 1 also those of the second shell.
+        # The TARGETS surface neighbours of an atom with the highest charges, in descending order; -1 if there are
+        # fewer. Nearest neighbours, and with a stretch above 1 also those of the second shell.
         cdef int[MAX_NEAR] others
         cdef int n, i, k, m
         cdef long other
@@ -324,8 +330,9 @@ cdef class Evaporation:
                     neighbour[k], charge[k] = other, q
                     break
 
-    cdef void join(self, int slot, double dx, double dy, double dz) noexcept nogil:
-        # Add a slot at (dx, dy, dz) from the hole to the patch. Its normal may have changed if the hole was a neighbour.
+    cdef void add_to_patch(self, int slot, double dx, double dy, double dz) noexcept nogil:
+        # Add a slot at (dx, dy, dz) from the hole to the patch. Its normal may have changed if the hole was a
+        # neighbour.
         cdef long n = self.patch.n
         cdef double reach = 1.001 * self.atoms.radius
         self.patch.slot[n] = slot
@@ -334,7 +341,7 @@ cdef class Evaporation:
             self.atoms.normal(self.tree.atom[slot], &self.normals[slot, 0])
         self.patch.n = n + 1
 
-    cdef void near_first(self, Hole* hole) noexcept nogil:
+    cdef void sort_near_first(self, Hole* hole) noexcept nogil:
         # Order the slots around a hole: first those near the patch.
         cdef double near = self.rule.near * self.patch_radius, dx, dy, dz
         cdef long i, n_far = 0
@@ -353,7 +360,7 @@ cdef class Evaporation:
             hole.slot[hole.n_near + i] = self.far_slot[i]
 
     cdef int surroundings(self, long atom) noexcept nogil:
-        # What the law learns of the bonds of an atom: their number, or their code.
+        # Bonds of an atom for the law: their number, or their code.
         return self.atoms.bond_code[atom] if self.atoms.has_codes else self.atoms.bonds[atom]
 
     cdef double hopping(self, double key, double strength, long atom) noexcept nogil:
@@ -366,7 +373,7 @@ cdef class Evaporation:
         self.strongest_neighbours(atom, 1.0, neighbour, charge)   # for which phi was solved, whatever rolls
         return self.law.hopping(key, strength, charge[0] / self.tree.q[slot])
 
-    cdef int judge(self, const int* slots, long n) except -1 nogil:
+    cdef int update_keys(self, const int* slots, long n) except -1 nogil:
         # New keys of slots whose fields or bonds have changed.
         cdef long i
         if n == 0:
@@ -386,43 +393,47 @@ cdef class Evaporation:
 
     cdef int event(self, long atom, Journal journal) except -1 nogil:
         cdef int[MAX_NEAR] fresh
-        cdef int gone = self.slot_of[atom], n_fresh, slot
+        cdef int removed_slot = self.slot_of[atom], n_fresh, slot
         cdef double dx, dy, dz, s
         cdef Hole* hole = &self.hole
         cdef Patch* patch = &self.patch
-        cdef long room, i, at
-        hole.x, hole.y, hole.z = self.atoms.positions[atom, 0], self.atoms.positions[atom, 1], self.atoms.positions[atom, 2]
-        hole.charge = self.tree.q[gone]
+        cdef long capacity, i, at
+
+        # remove the atom from the tree, the chooser and the neighbourhoods; the removal exposes the atoms `fresh`
+        hole.x, hole.y = self.atoms.positions[atom, 0], self.atoms.positions[atom, 1]
+        hole.z = self.atoms.positions[atom, 2]
+        hole.charge = self.tree.q[removed_slot]
         self.n_removed += 1
         self.since_relaxation += 1
-        self.tree.take_out(gone)
+        self.tree.remove_atom(removed_slot)
         self.tree.refresh()
         self.slot_of[atom] = -1
-        self.chooser.key[gone] = -INFINITY
-        self.chooser.update(&gone, 1)
+        self.chooser.key[removed_slot] = -INFINITY
+        self.chooser.update(&removed_slot, 1)
         n_fresh = self.atoms.remove(atom, fresh)
 
-        # the slots around the hole, without the evaporated charge
-        room = self.hole_slot.shape[0] - MAX_NEAR - PATCH_LANES
-        hole.n = self.tree.within(hole.x, hole.y, hole.z, self.update_radius, hole.slot, room)
-        if hole.n > room:
+        # subtract the evaporated charge from the fields of the slots around the hole, and add the exposed atoms
+        capacity = self.hole_slot.shape[0] - MAX_NEAR - PATCH_LANES
+        hole.n = self.tree.within(hole.x, hole.y, hole.z, self.update_radius, hole.slot, capacity)
+        if hole.n > capacity:
             with gil:
-                self.make_room(2 * hole.n + PATCH_LANES)
+                self.allocate(2 * hole.n + PATCH_LANES)
             hole.n = self.tree.within(hole.x, hole.y, hole.z, self.update_radius, hole.slot, hole.n)
         patch.n = patch.n_clipped = 0
         patch.unsettled = False
-        self.near_first(hole)
+        self.sort_near_first(hole)
         for i in range(hole.n):
             slot = hole.slot[i]
             dx, dy, dz = self.tree.x[slot] - hole.x, self.tree.y[slot] - hole.y, self.tree.z[slot] - hole.z
             hole.near_x[i], hole.near_y[i], hole.near_z[i] = <float>dx, <float>dy, <float>dz
             s = dx * dx + dy * dy + dz * dz
             if s <= self.patch_radius * self.patch_radius:
-                self.join(slot, dx, dy, dz)
+                self.add_to_patch(slot, dx, dy, dz)
         self.rule.removed(self.tree, hole)
-        self.expose(fresh, n_fresh, gone, journal)
+        self.expose(fresh, n_fresh, removed_slot, journal)
 
-        # new charges of the patch, and changes of the fields around it
+        # solve the charges of the patch with all others fixed, and add their changes to the fields around it; padding
+        # is far away and has no charge
         patch.stride = (patch.n + PATCH_LANES - 1) // PATCH_LANES * PATCH_LANES
         for i in range(patch.n, patch.stride):
             patch.x[i] = patch.y[i] = patch.z[i] = 1e6
@@ -435,27 +446,32 @@ cdef class Evaporation:
             self.rule.solve_patch(self.tree, self.normals, hole, patch)
         self.n_clipped += patch.n_clipped
         self.n_unsettled += patch.unsettled
+
+        # record the changes for the flights, and set the new charges
         at = journal.start[journal.n_events]
-        journal.slot[at] = gone
+        journal.slot[at] = removed_slot
         journal.charge[at] = 0.0
         journal.start[journal.n_events + 1] = at + 1 + patch.n
         for i in range(patch.n):
             journal.slot[at + 1 + i] = patch.slot[i]
             journal.charge[at + 1 + i] = patch.charge[i]
             self.tree.set_charge(patch.slot[i], patch.charge[i])
+
+        # if the potential inside has changed too much, restore it; otherwise only the keys near the hole have changed
         if fabs(self.rule.drift) > self.potential_bound:
             self.scale(journal)
         else:
             self.tree.refresh()
-            self.judge(patch.slot, patch.n)
+            self.update_keys(patch.slot, patch.n)
         journal.n_events += 1
         return 0
 
     cdef int scale(self, Journal journal) except -1 nogil:
-        # Multiply all charges by the factor that restores the potential inside. These are then the changes by the event.
+        # Multiply all charges by the factor 1 / (1 + drift), which restores the potential inside. These are then the
+        # changes by the event.
         cdef double factor = 1.0 / (1.0 + self.rule.drift)
         cdef long slot, at = journal.start[journal.n_events] + 1
-        journal.room(self.tree.n_slots + 1, 0)
+        journal.reserve(self.tree.n_slots + 1, 0)
         for slot in range(self.tree.n_slots):
             if self.tree.atom[slot] >= 0:
                 self.tree.set_charge(slot, factor * self.tree.q[slot])
@@ -467,22 +483,22 @@ cdef class Evaporation:
         self.rule.scaled(self.tree, factor)
         self.was_scaled = True
         with gil:
-            self.chooser = self.ranked(self.control.voltage_factor, 1)
+            self.chooser = self.new_chooser(self.control.voltage_factor, 1)
         return 0
 
-    cdef int expose(self, const int* fresh, int n_fresh, int gone, Journal journal) except -1 nogil:
-        # The exposed atoms are added to the leaf of their nearest slot, without charge.
+    cdef int expose(self, const int* fresh, int n_fresh, int removed_slot, Journal journal) except -1 nogil:
+        # Add the exposed atoms to the leaf of their nearest slot, without charge.
         cdef double px, py, pz, s, nearest
         cdef Hole* hole = &self.hole
         cdef int slot, best
         cdef long i, k, at
-        journal.room(self.patch.n + n_fresh + 1, n_fresh)
+        journal.reserve(self.patch.n + n_fresh + 1, n_fresh)
         journal.fresh_start[journal.n_events + 1] = journal.fresh_start[journal.n_events] + n_fresh
         for k in range(n_fresh):
             px, py = self.atoms.positions[fresh[k], 0], self.atoms.positions[fresh[k], 1]
             pz = self.atoms.positions[fresh[k], 2]
             nearest = 1e30
-            best = gone
+            best = removed_slot
             for i in range(self.patch.n):
                 slot = self.patch.slot[i]
                 s = (self.tree.x[slot] - px) ** 2 + (self.tree.y[slot] - py) ** 2 + (self.tree.z[slot] - pz) ** 2
@@ -492,7 +508,7 @@ cdef class Evaporation:
             at = journal.fresh_start[journal.n_events] + k
             journal.fresh_atom[at] = fresh[k]
             journal.fresh_leaf[at] = self.tree.leaf[best]
-            slot = <int>self.tree.put_in(fresh[k], px, py, pz, self.tree.leaf[best])
+            slot = <int>self.tree.insert_atom(fresh[k], px, py, pz, self.tree.leaf[best])
             self.slot_of[fresh[k]] = slot
             self.rule.exposed(self.tree, slot, self.opening_angle)
             i, at = hole.n_near, hole.n   # the first of the distant slots becomes the last one
@@ -502,13 +518,14 @@ cdef class Evaporation:
             hole.near_x[i], hole.near_y[i] = <float>(px - hole.x), <float>(py - hole.y)
             hole.near_z[i] = <float>(pz - hole.z)
             hole.n, hole.n_near = at + 1, i + 1
-            self.join(slot, px - hole.x, py - hole.y, pz - hole.z)
+            self.add_to_patch(slot, px - hole.x, py - hole.y, pz - hole.z)
         return 0
 
     def evaporate(self, Events events, long sweep_interval):
         """Evaporate atoms until the table of events is full.
 
-        Stops early if a relaxation or deepening is needed, or no atom is left. Atoms that have lost all chains of bonds to the body leave at once, before the law selects the next atom.
+        Stops early if a relaxation or an extension of the shell is needed, or no atom is left. Atoms that have lost all
+        chains of bonds to the body leave at once, before the law selects the next atom.
 
         Parameters
         ----------

@@ -40,7 +40,7 @@ def exponents():
 
 def _basis():
     """Fields of the harmonic polynomials as coefficients of monomials, shape (harmonics, MONOMIALS, 3)."""
-    place = {tuple(each): number for number, each in enumerate(exponents().tolist())}
+    place = {tuple(powers): number for number, powers in enumerate(exponents().tolist())}
     fields = []
     for degree in range(1, ORDER + 1):
         for count, imaginary in ((degree + 1, 0), (degree, 1)):
@@ -112,7 +112,7 @@ cdef class FarField:
     centre : array_like, shape (3,)
         Centre of the ball [nm].
     radius : float
-        Its radius [nm].
+        Radius of the ball [nm].
     """
 
     def __init__(self, centre, double radius):

@@ -12,8 +12,6 @@ The scheme is the Runge-Kutta-Nystrom pair of orders 8 and 6 of Dormand, El-Mikk
 from libc.math cimport INFINITY, NAN, sqrt
 from libc.stdlib cimport free, malloc
 
-import numpy as np
-
 from apt_evap._core.far_field cimport SAMPLES, FarField
 from apt_evap._core.journal cimport Journal
 from apt_evap._core.octree cimport Octree
@@ -29,10 +27,10 @@ cdef extern from "elementary.h":
 cdef extern from *:
     """
     /* The next piece of work of several threads. */
-    static long take_next(long long *counter) { return (long)__atomic_fetch_add(counter, 1, __ATOMIC_RELAXED); }
+    static long fetch_next(long long *counter) { return (long)__atomic_fetch_add(counter, 1, __ATOMIC_RELAXED); }
     static int is_set(long long *flag) { return __atomic_load_n(flag, __ATOMIC_RELAXED) != 0; }
     """
-    long take_next(long long* counter) nogil
+    long fetch_next(long long* counter) nogil
     bint is_set(long long* flag) nogil
 
 cdef enum:
@@ -120,15 +118,15 @@ cdef class Flights:
     cdef double coulomb, length, reach, opening_angle, tolerance
     cdef double[3] centre
     cdef long max_steps, fewest
-    cdef long room
-    cdef double* work          # (STAGES + 3, room, 3): accelerations, then position, velocity, trial position
-    cdef long* flying          # (room,) flights that have not ended
+    cdef long capacity
+    cdef double* work          # (STAGES + 3, capacity, 3): accelerations, then position, velocity, trial position
+    cdef long* flying          # (capacity,) flights that have not ended
     cdef readonly long n_steps, n_evaluations, n_pairs
 
     def __cinit__(self, *args, **kwargs):
         self.work = NULL
         self.flying = NULL
-        self.room = 0
+        self.capacity = 0
         sources_init(&self.sources)
         self.near.atoms = self.near.cells = self.far.atoms = self.far.cells = NULL
 
@@ -208,7 +206,7 @@ cdef class Flights:
         cdef long ion, group, k, n = event.shape[0], n_groups = (start.shape[0] - 1) // max(1, event.shape[0])
         with nogil:
             while not is_set(&halt[0]):
-                ion = take_next(&counter[0])
+                ion = fetch_next(&counter[0])
                 if ion >= n:
                     break
                 while self.n_replayed <= event[ion]:
@@ -306,10 +304,10 @@ cdef class Flights:
         cdef double time = 0.0, dt, largest, s, length, away
         cdef long i, flying = m, steps, refused = 0
         cdef int stage, k, axis
-        if m > self.room:
+        if m > self.capacity:
             free(self.work)
             free(self.flying)
-            self.room = m
+            self.capacity = m
             self.work = <double*>malloc((STAGES + 3) * 3 * m * sizeof(double))
             self.flying = <long*>malloc(m * sizeof(long))
             if self.work == NULL or self.flying == NULL:
@@ -332,6 +330,7 @@ cdef class Flights:
             length = sqrt(v[3 * i] ** 2 + v[3 * i + 1] ** 2 + v[3 * i + 2] ** 2)
             dt = min(dt, 0.2 * self.length / (length + sqrt(0.2 * self.length * s) + 1e-30))
         for steps in range(self.max_steps):
+            # stages i of the step: positions x + dt (c_i v + dt sum_k a_ik f_k), and the accelerations f_i there
             dt = min(dt, self.time_to_reach(m, x, v, outcome))
             self.gather(m, x, v, a, outcome, dt)
             for stage in range(1, STAGES):   # the last stage of a step is the first of the next one
@@ -343,6 +342,7 @@ cdef class Flights:
                                 s += STAGE[9 * stage + k] * a[3 * (k * m + i) + axis]
                             trial[3 * i + axis] = x[3 * i + axis] + dt * (NODE[stage] * v[3 * i + axis] + dt * s)
                 self.evaluate(m, trial, a + 3 * m * stage, outcome)
+            # accept the step if the largest error is below the tolerance: v += dt sum_k b_k f_k
             largest = 0.0
             for i in range(m):
                 if outcome[i] == ION_NEVER_LEFT:
@@ -373,6 +373,7 @@ cdef class Flights:
                         end[7 * i + 6] = time
                 if flying == 0:
                     return 0
+            # next step: the error of a step of the embedded pair increases with dt^7
             if not largest < 1e30:   # a stage hit an atom
                 dt *= 0.1
                 refused += 1
@@ -380,6 +381,7 @@ cdef class Flights:
                     break
             else:
                 dt *= min(4.0, max(0.2, 0.9 * inverse_seventh_root(max(largest, 1e-12))))
+        # flights that never left: where they are after the last step
         for i in range(m):
             if outcome[i] == ION_NEVER_LEFT:
                 for axis in range(3):
@@ -388,7 +390,8 @@ cdef class Flights:
                 end[7 * i + 6] = time
         return 0
 
-    cdef double time_to_reach(self, long m, const double* x, const double* v, const signed char* outcome) noexcept nogil:
+    cdef double time_to_reach(self, long m, const double* x, const double* v,
+                              const signed char* outcome) noexcept nogil:
         # Time in which the slowest flight close to `reach` crosses it in a straight line, so that no flight ends far
         # beyond; flights that need more than the largest step are ignored.
         cdef double rr, rv, vv, dx, longest = 0.0

@@ -39,15 +39,15 @@ ctypedef fused real:
 cdef void group_field(InteractionLists lists, Octree tree, long group, double[:, ::1] field, real* work) noexcept nogil:
     # Field at one group; `work` has space for the 32 targets and their sums, relative to the centre of the group.
     cdef long first = lists.starts[group, 0], n_cells = lists.starts[group + 1, 0] - first
-    cdef long range_first = lists.starts[group, 1], n_ranges = lists.starts[group + 1, 1] - range_first, k, l
+    cdef long range_first = lists.starts[group, 1], n_ranges = lists.starts[group + 1, 1] - range_first, k, lane
     cdef const double* ball = &lists.ball[group, 0]
     cdef real* sums = work + 3 * GROUP
-    for l in range(GROUP):
-        k = lists.members[group, l]
-        work[l] = <real>(tree.x[k] - ball[0])
-        work[GROUP + l] = <real>(tree.y[k] - ball[1])
-        work[2 * GROUP + l] = <real>(tree.z[k] - ball[2])
-        sums[l] = sums[GROUP + l] = sums[2 * GROUP + l] = 0.0
+    for lane in range(GROUP):
+        k = lists.members[group, lane]
+        work[lane] = <real>(tree.x[k] - ball[0])
+        work[GROUP + lane] = <real>(tree.y[k] - ball[1])
+        work[2 * GROUP + lane] = <real>(tree.z[k] - ball[2])
+        sums[lane] = sums[GROUP + lane] = sums[2 * GROUP + lane] = 0.0
     if real is float:
         group_cells_single(n_cells, &lists.cells[0] + first, &tree.cells[0, 0], ball, work, sums)
         group_atoms_single(n_ranges, &lists.ranges[0] + 2 * range_first, &tree.x[0], &tree.y[0], &tree.z[0],
@@ -56,11 +56,11 @@ cdef void group_field(InteractionLists lists, Octree tree, long group, double[:,
         group_cells_double(n_cells, &lists.cells[0] + first, &tree.cells[0, 0], ball, work, sums)
         group_atoms_double(n_ranges, &lists.ranges[0] + 2 * range_first, &tree.x[0], &tree.y[0], &tree.z[0],
                            &tree.q[0], ball, work, sums)
-    for l in range(GROUP):   # atoms that pad a group are members of it and get the same values again
-        k = lists.members[group, l]
-        field[k, 0] = sums[l]
-        field[k, 1] = sums[GROUP + l]
-        field[k, 2] = sums[2 * GROUP + l]
+    for lane in range(GROUP):   # atoms that pad a group are members of it and get the same values again
+        k = lists.members[group, lane]
+        field[k, 0] = sums[lane]
+        field[k, 1] = sums[GROUP + lane]
+        field[k, 2] = sums[2 * GROUP + lane]
 
 
 cdef class InteractionLists:
@@ -84,11 +84,14 @@ cdef class InteractionLists:
     def __init__(self, Octree tree, double opening_angle, int n_threads=1, const signed char[::1] disturbed=None,
                  bint samples=False):
         cdef long node = 0, leaf, n = 0, group, chunk, n_chunks = 0, n_blocks = 0
-        cdef long[::1] chunk_slot = np.zeros(tree.n_nodes + 1, np.int64), chunk_group = np.zeros(tree.n_nodes + 1, np.int64)
+        cdef long[::1] chunk_slot = np.zeros(tree.n_nodes + 1, np.int64)
+        cdef long[::1] chunk_group = np.zeros(tree.n_nodes + 1, np.int64)
         cdef int[::1] slots = np.empty(tree.n_slots, np.int32), targets
         cdef long[:, ::1] blocks = np.empty((tree.n_nodes if samples else 0, 3), np.int64)
         cdef bint whole
         self.tree, self.opening_angle, self.disturbed = tree, opening_angle, disturbed
+
+        # targets: nodes of at most CHUNK atoms, whole if an atom is disturbed, otherwise the leaf in the middle
         while node < tree.n_nodes:
             if tree.last[node] - tree.first[node] <= CHUNK or tree.skip[node] == node + 1:
                 whole = disturbed is None or self.has_disturbed(tree, node)
@@ -105,6 +108,8 @@ cdef class InteractionLists:
                 node = tree.skip[node]
             else:
                 node += 1
+
+        # groups of 32 targets within these nodes
         self.blocks = np.asarray(blocks)[:n_blocks].copy()
         self.n_groups = chunk_group[n_chunks]
         self.members = np.empty((self.n_groups, GROUP), np.int32)
@@ -116,6 +121,8 @@ cdef class InteractionLists:
             if chunk_slot[chunk] < chunk_slot[chunk + 1]:
                 self.split(tree, &targets[chunk_slot[chunk]], chunk_slot[chunk + 1] - chunk_slot[chunk],
                            chunk_group[chunk])
+
+        # lists of all groups in two passes: their lengths first, then the cells and ranges themselves
         for group in prange(self.n_groups, nogil=True, schedule="dynamic", chunksize=16, num_threads=n_threads):
             self.walk(tree, group, opening_angle, NULL, NULL, &self.starts[group + 1, 0])
         starts = np.cumsum(np.asarray(self.starts), axis=0)
@@ -227,7 +234,8 @@ cdef class InteractionLists:
         self.split(tree, slots, half, group)
         self.split(tree, slots + half, n - half, group + left)
 
-    cdef void walk(self, Octree tree, long group, double opening_angle, int* cells, int* ranges, long* counts) noexcept nogil:
+    cdef void walk(self, Octree tree, long group, double opening_angle, int* cells, int* ranges,
+                   long* counts) noexcept nogil:
         # Lists of one group: accepted cells, and slots [begin, end) of the leaves whose atoms are summed one by one,
         # adjacent ranges merged; atoms added to a leaf later are ranges of one slot. Without lists it only counts
         # cells, ranges and atoms.
@@ -328,5 +336,5 @@ def direct_field(const double[:, ::1] points, const double[:, ::1] positions, co
     with nogil:
         for i in range(points.shape[0]):
             point_atoms_double(charges.shape[0], &columns[0, 0], &columns[1, 0], &columns[2, 0], &charges[0],
-                        points[i, 0], points[i, 1], points[i, 2], &field[i, 0])
+                               points[i, 0], points[i, 1], points[i, 2], &field[i, 0])
     return np.asarray(field)

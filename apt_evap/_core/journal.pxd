@@ -11,7 +11,7 @@ cdef class Journal:
     cdef long[::1] fresh_start          # (max_events + 1,)
     cdef int[::1] fresh_atom            # added atoms
     cdef int[::1] fresh_leaf            # and their leaves
-    cdef const double[:, ::1] positions # (n_atoms, 3) nm
+    cdef const double[:, ::1] positions  # (n_atoms, 3) nm
 
-    cdef int room(self, long changes, long fresh) except -1 nogil
+    cdef int reserve(self, long changes, long fresh) except -1 nogil
     cdef void replay(self, long event, Octree tree) noexcept nogil

@@ -22,7 +22,7 @@ cdef class Journal:
         self.fresh_atom = np.empty(max_events * 8, np.int32)
         self.fresh_leaf = np.empty(max_events * 8, np.int32)
 
-    cdef int room(self, long changes, long fresh) except -1 nogil:
+    cdef int reserve(self, long changes, long fresh) except -1 nogil:
         # Make space for one more event.
         if self.start[self.n_events] + changes > self.slot.shape[0]:
             with gil:
@@ -38,11 +38,11 @@ cdef class Journal:
         # The same calls in the same order as in the event.
         cdef long k
         cdef int atom
-        tree.take_out(self.slot[self.start[event]])
+        tree.remove_atom(self.slot[self.start[event]])
         for k in range(self.fresh_start[event], self.fresh_start[event + 1]):
             atom = self.fresh_atom[k]
-            tree.put_in(atom, self.positions[atom, 0], self.positions[atom, 1], self.positions[atom, 2],
-                        self.fresh_leaf[k])
+            tree.insert_atom(atom, self.positions[atom, 0], self.positions[atom, 1], self.positions[atom, 2],
+                             self.fresh_leaf[k])
         for k in range(self.start[event] + 1, self.start[event + 1]):
             tree.set_charge(self.slot[k], self.charge[k])
         tree.refresh()

@@ -207,7 +207,7 @@ APT_CLONES static void patch_potential(long m, const float *restrict targets_x, 
     }
 }
 
-/* Adds both; see patch_field. The inverse distance serves the potential and the field. */
+/* Adds both; see patch_field. The inverse distance is used for the potential and the field. */
 APT_CLONES static void patch_potential_and_field(
     long m, const float *restrict targets_x, const float *restrict targets_y, const float *restrict targets_z, long n,
     const float *restrict x, const float *restrict y, const float *restrict z, const float *restrict q,

@@ -177,18 +177,18 @@ cdef class PythonLaw(LawKernel):
     cdef int keys(self, long n, const double* strength, const long long* atom, const int* bonds,
                   double* key) except -1 nogil:
         cdef long i
-        cdef double[::1] found
+        cdef double[::1] keys
         with gil:
             atoms = np.asarray(<const long long[:n]> atom).copy()
             fields = self.field_unit * np.asarray(<const double[:n]> strength)
             bond_counts = np.asarray(<const int[:n]> bonds).copy()
-            found = np.ascontiguousarray(self.law.keys(self.tip, atoms, fields, bond_counts), np.float64)
-            if found.shape[0] != n:
+            keys = np.ascontiguousarray(self.law.keys(self.tip, atoms, fields, bond_counts), np.float64)
+            if keys.shape[0] != n:
                 raise ValueError(
-                    f"keys of {type(self.law).__name__} must return {n} values, one per atom, got {found.shape[0]}"
+                    f"keys of {type(self.law).__name__} must return {n} values, one per atom, got {keys.shape[0]}"
                 )
             for i in range(n):
-                if found[i] != found[i]:
+                if keys[i] != keys[i]:
                     raise ValueError(f"keys of {type(self.law).__name__} must be numbers, got NaN for atom {atom[i]}")
-                key[i] = found[i]
+                key[i] = keys[i]
         return 0

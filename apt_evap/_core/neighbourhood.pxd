@@ -2,9 +2,9 @@
 
 cdef enum:
     MAX_NEAR = 1024    # largest number of atoms within the radius of an atom; a dense metal has 54
-    MAX_BONDS = 64     # nearest neighbours of a removed atom that are checked for their hold; fcc has 12
+    MAX_BONDS = 64     # nearest neighbours of a removed atom that may be detached; fcc has 12
     MAX_CODED = 15     # neighbours of one kind that four bits of a code can count
-    MAX_PIECE = 2048   # atoms visited to decide which part has lost its hold; larger parts count as the body
+    MAX_PIECE = 2048   # atoms visited to decide which part is no longer attached; larger parts count as the body
 
 
 cdef class Neighbourhood:
@@ -15,20 +15,20 @@ cdef class Neighbourhood:
     cdef double[::1] reach              # (kinds,) squared radius of the neighbourhood [nm^2]
     cdef double[::1] threshold          # (kinds,) [nm]
     cdef double[:, ::1] bond            # (kinds, kinds) squared length below which atoms are nearest neighbours [nm^2]
-    cdef const double[:, ::1] positions # (n, 3) nm, array of the caller
-    cdef signed char[::1] alive                # (n,)
-    cdef const signed char[::1] support              # (n,) atoms that never become surface atoms
-    cdef const signed char[::1] anchored       # (n,) atoms that never evaporate: whatever is bonded to them has hold
-    cdef signed char[::1] exposed              # (n,) surface atoms
-    cdef signed char[::1] detached             # (n,) atoms without a chain of bonds to the body
-    cdef signed char[::1] hidden               # (n,) walls of closed voids: surface atoms when the void opens; or empty
+    cdef const double[:, ::1] positions  # (n, 3) nm, array of the caller
+    cdef signed char[::1] alive         # (n,)
+    cdef const signed char[::1] support  # (n,) atoms that never become surface atoms
+    cdef const signed char[::1] anchored  # (n,) atoms that never evaporate; bonds to them attach others
+    cdef signed char[::1] exposed       # (n,) surface atoms
+    cdef signed char[::1] detached      # (n,) atoms without a chain of bonds to the body
+    cdef signed char[::1] hidden        # (n,) walls of closed voids: surface atoms when the void opens; or empty
     cdef long n_hidden
     cdef bint opened                    # whether walls were exposed that have no slot yet
     cdef int[::1] stack                 # of a search among the hidden atoms, or among all atoms
-    cdef readonly long n_detached              # detached atoms removed so far
+    cdef readonly long n_detached       # detached atoms removed so far
     cdef int[::1] waiting               # detached atoms in the order in which they leave
     cdef long n_waiting
-    cdef int[::1] visited, piece_of, following, table   # search for parts without hold: atoms, their part, its next atom
+    cdef int[::1] visited, piece_of, following, table  # search for detached parts: atoms, their part, its next atom
     cdef int[::1] count                 # (n,) neighbours within the radius
     cdef signed char[::1] bonds         # (n,) number of nearest neighbours, closer than the bond length
     cdef const int[::1] code            # (n,) what an atom adds to the code of its nearest neighbours
@@ -47,13 +47,13 @@ cdef class Neighbourhood:
     cdef int within(self, long atom, double reach, int* others) noexcept nogil
     cdef void gather(self, long atom) noexcept nogil
     cdef int code_of(self, long atom, double s, double bond) noexcept nogil
-    cdef bint judge(self, long atom) noexcept nogil
+    cdef bint is_surface_atom(self, long atom) noexcept nogil
     cdef void normal(self, long atom, double* normal) noexcept nogil
     cdef int remove(self, long atom, int* fresh) noexcept nogil
     cdef long open_from(self, long atom) noexcept nogil
-    cdef void hold_from(self, signed char[::1] held) noexcept nogil
+    cdef void mark_attached(self, signed char[::1] attached) noexcept nogil
     cdef bint bonded(self, long first, long second, double stretch=*) noexcept nogil
-    cdef void release(self, const int* nearest, int n) noexcept nogil
+    cdef void detach_parts(self, const int* nearest, int n) noexcept nogil
     cdef long visit(self, int atom, int piece, long n, long* known) noexcept nogil
     cdef void append(self, long at, int piece, int* front, int* last) noexcept nogil
     cdef void detach(self, int atom) noexcept nogil

@@ -6,8 +6,8 @@ stays exposed until it evaporates.
 
 The walls of a closed void are in no field, and are no surface atoms before it opens.
 
-Atoms without a chain of nearest neighbour bonds to the body are detached. Only the removal of an atom can detach others,
-and each part that it cuts off contains one of its nearest neighbours: the search starts there.
+Atoms without a chain of nearest neighbour bonds to the body are detached. Only the removal of an atom can detach
+others, and each part that it cuts off contains one of its nearest neighbours: the search starts there.
 """
 
 from cython.parallel cimport prange
@@ -45,7 +45,8 @@ cdef class Neighbourhood:
     before : Neighbourhood, optional
         Neighbourhood of the first of these atoms: its removed, exposed and detached atoms remain so.
     anchored : ndarray of int8, shape (n,), optional
-        1 for atoms that never evaporate; whatever is bonded to them has hold. By default the support atoms.
+        1 for atoms that never evaporate; atoms with a chain of bonds to them are attached. By default the support
+        atoms.
     codes : (ndarray of int32, ndarray of int32, float), optional
         What an atom adds to the bond code of its nearest and of its second neighbours, each of shape (n,), and the
         distance of second neighbours [nm]. A law that depends on the species of the neighbours sees this code.
@@ -111,7 +112,7 @@ cdef class Neighbourhood:
         del flat
         for i in prange(n, nogil=True, schedule="dynamic", chunksize=1024, num_threads=n_threads):
             self.gather(i)
-            self.exposed[i] = self.alive[i] and self.judge(i)
+            self.exposed[i] = self.alive[i] and self.is_surface_atom(i)
         if before is not None:
             np.asarray(self.exposed)[:before.n_atoms] |= before.exposed
         self.n_hidden, self.opened = 0, False
@@ -123,7 +124,7 @@ cdef class Neighbourhood:
             raise ValueError(f"radius must include at most {MAX_NEAR} neighbours of each atom, got {self.radius!r} nm")
 
     def find_voids(self, const signed char[::1] outer, Neighbourhood before=None):
-        """Hide the walls of closed voids, and detach atoms without hold."""
+        """Hide the walls of closed voids, and detach atoms without bonds to an anchored atom."""
         cdef long i, n_old = 0 if before is None else before.n_atoms
         hidden = np.asarray(self.exposed).view(bool) & ~np.asarray(outer).view(bool)
         if before is not None:
@@ -137,9 +138,10 @@ cdef class Neighbourhood:
         if not np.any(self.anchored):
             return
         self.stack = np.empty(self.n_atoms, np.int32)
-        held = np.zeros(self.n_atoms, np.int8)
-        self.hold_from(held)
-        for i in np.flatnonzero(~(held | ~np.asarray(self.alive).view(bool) | np.asarray(self.detached)).view(bool)):
+        attached = np.zeros(self.n_atoms, np.int8)
+        self.mark_attached(attached)
+        left = ~np.asarray(self.alive).view(bool)
+        for i in np.flatnonzero(~(attached | left | np.asarray(self.detached)).view(bool)):
             self.detach(i)
         self.stack = np.empty(self.n_hidden, np.int32)
 
@@ -166,14 +168,14 @@ cdef class Neighbourhood:
             self.opened = True
         return n_opened
 
-    cdef void hold_from(self, signed char[::1] held) noexcept nogil:
+    cdef void mark_attached(self, signed char[::1] attached) noexcept nogil:
         # Marks all atoms with a chain of bonds to an anchored atom.
         cdef int[MAX_NEAR] others
         cdef long i, n = 0
         cdef int m, k
         for i in range(self.n_atoms):
-            if self.anchored[i] and self.alive[i] and not held[i]:
-                held[i] = 1
+            if self.anchored[i] and self.alive[i] and not attached[i]:
+                attached[i] = 1
                 self.stack[n] = <int>i
                 n += 1
         while n:
@@ -181,8 +183,8 @@ cdef class Neighbourhood:
             i = self.stack[n]
             m = self.near(i, others)
             for k in range(m):
-                if not held[others[k]] and self.bonded(i, others[k]):
-                    held[others[k]] = 1
+                if not attached[others[k]] and self.bonded(i, others[k]):
+                    attached[others[k]] = 1
                     self.stack[n] = others[k]
                     n += 1
 
@@ -219,8 +221,8 @@ cdef class Neighbourhood:
     cdef void gather(self, long atom) noexcept nogil:
         # Count, bonds and sum of offsets of the neighbours; a count of -1 means too many.
         cdef int[MAX_NEAR] others
-        cdef int own = self.kind_of(atom), n = self.within(atom, self.reach[own], others), i
-        cdef double step, s, bond = self.bond[own, own]
+        cdef int atom_kind = self.kind_of(atom), n = self.within(atom, self.reach[atom_kind], others), i
+        cdef double step, s, bond = self.bond[atom_kind, atom_kind]
         cdef int axis, n_near = 0, n_far = 0
         self.count[atom] = n
         for i in range(n):
@@ -230,7 +232,7 @@ cdef class Neighbourhood:
                 self.offset[atom, axis] += step
                 s += step * step
             if self.has_kinds:
-                bond = self.bond[own, self.kind[others[i]]]
+                bond = self.bond[atom_kind, self.kind[others[i]]]
             self.bonds[atom] += s <= bond
             n_near += s <= bond
             if self.has_codes:
@@ -245,7 +247,7 @@ cdef class Neighbourhood:
             return self.code[atom]
         return self.far_code[atom] if s <= self.second_length * self.second_length else 0
 
-    cdef bint judge(self, long atom) noexcept nogil:
+    cdef bint is_surface_atom(self, long atom) noexcept nogil:
         # Whether the atom is a surface atom by its neighbours; an isolated atom is.
         cdef double sx = self.offset[atom, 0], sy = self.offset[atom, 1], sz = self.offset[atom, 2]
         if self.support[atom]:
@@ -264,8 +266,9 @@ cdef class Neighbourhood:
         # Removes an atom and updates the normals around it; lists the newly exposed atoms and returns their number.
         cdef int[MAX_NEAR] others
         cdef int[MAX_BONDS] nearest
-        cdef int n = self.near(atom, others), i, other, n_fresh = 0, n_nearest = 0, own = self.kind_of(atom), kind
-        cdef double step, s, bond = self.bond[own, own]
+        cdef int n = self.near(atom, others), i, other, n_fresh = 0, n_nearest = 0
+        cdef int removed_kind = self.kind_of(atom), kind
+        cdef double step, s, bond = self.bond[removed_kind, removed_kind]
         cdef int axis
         self.alive[atom] = 0
         self.exposed[atom] = 0
@@ -275,7 +278,7 @@ cdef class Neighbourhood:
             s = 0.0
             if self.has_kinds:
                 kind = self.kind[other]
-                bond = self.bond[own, kind]
+                bond = self.bond[removed_kind, kind]
                 for axis in range(3):
                     step = self.positions[atom, axis] - self.positions[other, axis]
                     s += step * step
@@ -295,7 +298,7 @@ cdef class Neighbourhood:
                     if n_nearest < MAX_BONDS:
                         nearest[n_nearest] = other
                     n_nearest += 1
-            if self.judge(other) and not self.exposed[other]:
+            if self.is_surface_atom(other) and not self.exposed[other]:
                 self.exposed[other] = 1
                 if self.n_hidden and self.hidden[other]:
                     self.hidden[other] = 0
@@ -304,10 +307,10 @@ cdef class Neighbourhood:
                 fresh[n_fresh] = other
                 n_fresh += 1
         if 1 < n_nearest <= MAX_BONDS:
-            self.release(nearest, n_nearest)
+            self.detach_parts(nearest, n_nearest)
         return n_fresh
 
-    # ---- atoms without hold ----------------------------------------------------------------------------------------
+    # ---- detached atoms ----------------------------------------------------------------------------------------------
 
     cdef bint bonded(self, long first, long second, double stretch=1.0) noexcept nogil:
         # Whether two atoms are nearest neighbours; `stretch` multiplies the squared length of the bond.
@@ -318,16 +321,18 @@ cdef class Neighbourhood:
             s += step * step
         return s <= stretch * self.bond[self.kind_of(first), self.kind_of(second)]
 
-    cdef void release(self, const int* nearest, int n) noexcept nogil:
-        # Detaches the parts of the specimen that lost their hold when a common neighbour of these atoms was removed. All
-        # parts grow in turn, one atom at a time, until they meet, touch an anchored atom, or have no further atom. If no
-        # part touches an anchored atom, the last one that grows is the body.
+    cdef void detach_parts(self, const int* nearest, int n) noexcept nogil:
+        # Detaches the parts of the specimen that are no longer attached when a common neighbour of these atoms is
+        # removed. All parts grow in turn, one atom at a time, until they meet, touch an anchored atom, or have no
+        # further atom. If no part touches an anchored atom, the last one that grows is the body.
         cdef int[MAX_NEAR] others
         cdef int[MAX_BONDS] parent, front, last
-        cdef bint[MAX_BONDS] held
-        cdef int i, j, k, m, piece, other_piece, growing, n_held
+        cdef bint[MAX_BONDS] attached
+        cdef int i, j, k, m, piece, other_piece, growing, n_attached
         cdef long at, known, n_visited = 0
-        for i in range(n):   # most often they are neighbours of each other
+
+        # parts of neighbours that are bonded to each other, by union and find; most often there is only one
+        for i in range(n):
             parent[i] = i
         for i in range(n):
             for j in range(i):
@@ -338,23 +343,25 @@ cdef class Neighbourhood:
             growing += parent[i] == i
         if growing == 1:
             return
+
+        # the other parts grow from these atoms; an atom of another part joins the two
         for i in range(n):
-            held[i], front[i], last[i] = False, -1, -1
+            attached[i], front[i], last[i] = False, -1, -1
         for i in range(n):
             piece = root(parent, i)
             n_visited = self.visit(nearest[i], piece, n_visited, &known)
             self.append(n_visited - 1, piece, front, last)
-            held[piece] = held[piece] or self.anchored[nearest[i]]
+            attached[piece] = attached[piece] or self.anchored[nearest[i]]
         while True:
-            growing = n_held = 0
+            growing = n_attached = 0
             for i in range(n):
                 if parent[i] == i:
-                    n_held += held[i]
-                    growing += not held[i] and front[i] >= 0
-            if growing == 0 or (growing == 1 and n_held == 0):
+                    n_attached += attached[i]
+                    growing += not attached[i] and front[i] >= 0
+            if growing == 0 or (growing == 1 and n_attached == 0):
                 break
             for i in range(n):
-                if parent[i] != i or held[i] or front[i] < 0:
+                if parent[i] != i or attached[i] or front[i] < 0:
                     continue
                 at = front[i]
                 front[i] = self.following[at]
@@ -366,12 +373,12 @@ cdef class Neighbourhood:
                     n_visited = self.visit(others[k], piece, n_visited, &known)
                     if known < 0:
                         self.append(n_visited - 1, piece, front, last)
-                        held[piece] = held[piece] or self.anchored[others[k]]
+                        attached[piece] = attached[piece] or self.anchored[others[k]]
                     else:
                         other_piece = root(parent, self.piece_of[known])
                         if other_piece != piece:   # two parts meet
                             parent[piece] = other_piece
-                            held[other_piece] = held[other_piece] or held[piece]
+                            attached[other_piece] = attached[other_piece] or attached[piece]
                             if front[piece] >= 0:
                                 if front[other_piece] < 0:
                                     front[other_piece] = front[piece]
@@ -384,7 +391,7 @@ cdef class Neighbourhood:
                     break
             if n_visited == MAX_PIECE:
                 break
-        if growing == 0 and n_held == 0:   # all parts ended in the same round: the largest one is the body
+        if growing == 0 and n_attached == 0:   # all parts ended in the same round: the largest one is the body
             for i in range(n):
                 last[i] = 0
             for at in range(n_visited):
@@ -393,16 +400,19 @@ cdef class Neighbourhood:
             for i in range(n):
                 if last[i] > last[piece]:
                     piece = i
-            held[piece] = True
+            attached[piece] = True
+
+        # parts without an anchored atom that cannot grow any more are detached
         for at in range(n_visited):
             piece = root(parent, self.piece_of[at])
-            if not held[piece] and front[piece] < 0:
+            if not attached[piece] and front[piece] < 0:
                 self.detach(self.visited[at])
         for i in range(self.table.shape[0]):
             self.table[i] = -1
 
     cdef long visit(self, int atom, int piece, long n, long* known) noexcept nogil:
-        # Adds an atom to those visited, of which there are n; returns their new number. known: its place if it was there.
+        # Adds an atom to those visited, of which there are n; returns their new number. known: place of an atom that
+        # was visited before, or -1.
         cdef long size = self.table.shape[0], key = (<long>atom * 40503) % size
         while self.table[key] >= 0:
             if self.visited[self.table[key]] == atom:

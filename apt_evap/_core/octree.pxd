@@ -26,8 +26,8 @@ cdef class Octree:
     cdef void ball_of_box(self, long node, const double* low, const double* high) noexcept nogil
     cdef long following(self, long node, long slot) noexcept nogil
     cdef void set_charge(self, long slot, double charge) noexcept nogil
-    cdef void take_out(self, long slot) noexcept nogil
-    cdef long put_in(self, long long atom, double px, double py, double pz, int leaf) noexcept nogil
+    cdef void remove_atom(self, long slot) noexcept nogil
+    cdef long insert_atom(self, long long atom, double px, double py, double pz, int leaf) noexcept nogil
     cdef void refresh(self) noexcept nogil
     cdef void moments(self, long node) noexcept nogil
     cdef int walk(self, double cx, double cy, double cz, double radius, double opening_angle,

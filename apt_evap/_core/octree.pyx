@@ -12,7 +12,7 @@ from cython.parallel cimport prange
 from libc.math cimport sqrt
 
 from apt_evap._core.sources cimport (
-    CELL, LANES, SAME_PLACE, SingleSources, Sources, single_pad, single_room, sources_field, sources_free, sources_grow,
+    CELL, LANES, SingleSources, Sources, single_pad, single_reserve, sources_field, sources_free, sources_grow,
     sources_init, sources_potential,
 )
 
@@ -126,6 +126,8 @@ cdef class Octree:
         while k < end and not by_atoms:
             by_atoms = self.cancels[k]   # such a child has no dipole
             k = self.skip[k]
+
+        # charge Q = sum q, and sum q r
         if by_atoms:
             for leaf in range(node, end):
                 k = self.first[leaf] if self.skip[leaf] == leaf + 1 else -1
@@ -145,6 +147,8 @@ cdef class Octree:
                 cy += q * self.cells[k, 1]
                 cz += q * self.cells[k, 2]
                 k = self.skip[k]
+
+        # centre of charge c = sum q r / Q; if it is outside the ball, the charges cancel: moments about its centre
         if charge != 0.0:
             cx /= charge
             cy /= charge
@@ -155,6 +159,8 @@ cdef class Octree:
             self.cancels[node] = cx != 0.0 or cy != 0.0 or cz != 0.0
         if charge == 0.0 or self.cancels[node]:
             cx, cy, cz = ball[0], ball[1], ball[2]
+
+        # quadrupole about c, sum q (3 d d - d^2) with d = r - c; that of a child, and that of its charge at its centre
         if by_atoms:
             for leaf in range(node, end):
                 k = self.first[leaf] if self.skip[leaf] == leaf + 1 else -1
@@ -208,12 +214,12 @@ cdef class Octree:
         self.q[slot] = charge
         self.mark(self.leaf[slot])
 
-    cdef void take_out(self, long slot) noexcept nogil:
+    cdef void remove_atom(self, long slot) noexcept nogil:
         # The slot remains, without charge and without an atom.
         self.atom[slot] = -1
         self.set_charge(slot, 0.0)
 
-    cdef long put_in(self, long long atom, double px, double py, double pz, int leaf) noexcept nogil:
+    cdef long insert_atom(self, long long atom, double px, double py, double pz, int leaf) noexcept nogil:
         # Adds an atom to the leaf of a neighbouring atom; the balls above grow to contain it. -1: no space left.
         cdef long slot = self.n_slots, node = leaf
         cdef double far
@@ -314,15 +320,16 @@ cdef class Octree:
 
     cdef int collect_single(self, const double* centre, double radius, double opening_angle, double far_radius,
                             Sources* sources, SingleSources* near, SingleSources* far) except -1 nogil:
-        # Copies the sources of a walk in single precision, relative to the centre: those within a radius, and the others.
+        # Copies the sources of a walk in single precision, relative to the centre: those within a radius, and the
+        # others.
         cdef SingleSources* part
         cdef double dx, dy, dz
         cdef const double* cell
         cdef long k, at
         cdef int slot, m
         self.walk(centre[0], centre[1], centre[2], radius, opening_angle, sources)
-        single_room(near, sources.capacity, centre)
-        single_room(far, sources.capacity, centre)
+        single_reserve(near, sources.capacity, centre)
+        single_reserve(far, sources.capacity, centre)
         for k in range(sources.n_atoms):
             slot = sources.atom[k]
             dx, dy, dz = self.x[slot] - centre[0], self.y[slot] - centre[1], self.z[slot] - centre[2]

@@ -35,16 +35,16 @@ cdef void group_potential(Potentials self, InteractionLists lists, Octree tree, 
                           double* potential, real* work) noexcept nogil:
     # Potential at one group; `work` has space for the 32 targets, relative to the centre of the group, and for zeros.
     cdef long first = lists.starts[group, 0], n_cells = lists.starts[group + 1, 0] - first
-    cdef long range_first = lists.starts[group, 1], n_ranges = lists.starts[group + 1, 1] - range_first, k, l
+    cdef long range_first = lists.starts[group, 1], n_ranges = lists.starts[group + 1, 1] - range_first, k, lane
     cdef const double* ball = &lists.ball[group, 0]
     cdef double[32] sums
-    for l in range(GROUP):
-        k = lists.members[group, l]
-        work[l] = <real>(tree.x[k] - ball[0])
-        work[GROUP + l] = <real>(tree.y[k] - ball[1])
-        work[2 * GROUP + l] = <real>(tree.z[k] - ball[2])
-        work[3 * GROUP + l] = 0.0
-        sums[l] = 0.0
+    for lane in range(GROUP):
+        k = lists.members[group, lane]
+        work[lane] = <real>(tree.x[k] - ball[0])
+        work[GROUP + lane] = <real>(tree.y[k] - ball[1])
+        work[2 * GROUP + lane] = <real>(tree.z[k] - ball[2])
+        work[3 * GROUP + lane] = 0.0
+        sums[lane] = 0.0
     if real is float:
         group_cells_potential_single(n_cells, &lists.cells[0] + first, &self.cells[0, 0], ball, work,
                                      work + 3 * GROUP, sums)
@@ -57,8 +57,8 @@ cdef void group_potential(Potentials self, InteractionLists lists, Octree tree, 
                                      charges, ball, work, work + 3 * GROUP, sums)
     if self.gaussian.shape[0] > 0:
         self.correct(lists, tree, group, charges, sums)
-    for l in range(GROUP):   # atoms that pad a group are members of it and get the same values again
-        potential[lists.members[group, l]] = sums[l]
+    for lane in range(GROUP):   # atoms that pad a group are members of it and get the same values again
+        potential[lists.members[group, lane]] = sums[lane]
 
 
 cdef class Potentials:
@@ -238,18 +238,18 @@ cdef class Potentials:
                             const double* charges, double* potential) noexcept nogil:
         cdef const double* ball = &lists.ball[group, 0]
         cdef double most = self.reach_squared, reach = ball[3], dx, dy, dz, s
-        cdef long k, l, at
+        cdef long k, lane, at
         for k in range(first, last):
             dx, dy, dz = tree.x[k] - ball[0], tree.y[k] - ball[1], tree.z[k] - ball[2]
             s = dx * dx + dy * dy + dz * dz
             if s > 2.0 * (reach * reach + most):   # >= (reach + radius of the correction)^2
                 continue
-            for l in range(GROUP):
-                at = lists.members[group, l]
+            for lane in range(GROUP):
+                at = lists.members[group, lane]
                 dx, dy, dz = tree.x[k] - tree.x[at], tree.y[k] - tree.y[at], tree.z[k] - tree.z[at]
                 s = dx * dx + dy * dy + dz * dz
                 if SAME_PLACE < s < most:
-                    potential[l] += charges[k] * self.difference(s)
+                    potential[lane] += charges[k] * self.difference(s)
 
     cdef void group_single(self, InteractionLists lists, Octree tree, long group, const double* charges,
                            double* potential) noexcept nogil:

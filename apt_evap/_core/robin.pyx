@@ -81,12 +81,12 @@ cdef class Robin(FieldRule):
 
     @property
     def samples(self):
-        """True: the area per atom is common to all charges, so that those far from the holes change as well."""
+        """Whether samples are needed: True, as the area per atom is common to all charges, near and far from holes."""
         return True
 
     @property
     def far_change(self):
-        """Of the sum of the charges that are not targets."""
+        """Relative change of the sum of the charges that are not targets, since all were solved (float)."""
         return abs(self.far_scale - 1.0)
 
     @property
@@ -189,13 +189,16 @@ cdef class Robin(FieldRule):
         charges = tree.charges
         total = charges.sum()
         maps, steps = [], []   # results of the last sweeps of Robin's iteration, and their changes
-        for sweeps in range(1, max_sweeps + 1):
+        while sweeps < max_sweeps:
+            sweeps += 1
+            # fields of the targets; those of all other atoms are scaled by the ratios of the samples
             before = self.sample_fields(normals, lists)
             lists.sweep(self.field, double_precision, n_threads)
             if len(before):
                 after = self.sample_fields(normals, lists)
                 unknown = np.full(len(before), np.nan)
                 self.scale_others(tree, lists, np.divide(after, before, unknown, where=before > 0.0))
+            # Robin's equation q_i = (s/2 pi) E_i . n_i, with the area s per atom that conserves the total charge
             flux = np.maximum(self.normal_field(tree, normals), 0.0)   # a site deep in a notch has no charge
             if not flux.sum() > 0.0:
                 raise ValueError(f"the total charge of {n} surface atoms is not positive: normals must point outwards")
@@ -207,6 +210,7 @@ cdef class Robin(FieldRule):
             if residual < tolerance:
                 tree.charges = flux
                 break
+            # next charges from the last sweeps, none of them negative
             mixed = np.maximum(self.mixed(maps, steps), 0.0)
             mixed *= total / mixed.sum()
             tree.charges = mixed
@@ -230,9 +234,13 @@ cdef class Robin(FieldRule):
         cdef signed char[::1] kept = np.zeros(tree.n_slots, np.int8)
         cdef double x, y, z, scale
         cdef long i
+
+        # coordinates of the blocks from -1 to 1
         places = np.asarray(tree.ball)[np.asarray(lists.blocks)[:, 0], :3]
         lowest, highest = places.min(axis=0), places.max(axis=0)
         basis = smooth_functions((2.0 * places - lowest - highest) / np.maximum(highest - lowest, 1e-9))
+
+        # least squares of the ratios of the samples, twice: the second time without blocks that deviate
         used = np.isfinite(ratios)
         for _ in range(2):
             functions = basis[:min(len(basis), np.count_nonzero(used) // 2)]
@@ -244,6 +252,8 @@ cdef class Robin(FieldRule):
             eliminate(gram, right)
             apart = np.abs(sum(factor * one for factor, one in zip(right, functions)) - ratios)
             used &= apart <= OUTLIER * np.median(apart[used])
+
+        # scale the fields of all other atoms by the value of the function at their positions
         low, high = lowest, np.maximum(highest, lowest + 1e-9)
         c = np.concatenate([right, np.zeros(len(basis) - len(right))])
         np.asarray(kept)[lists.slots] = 1
@@ -263,7 +273,7 @@ cdef class Robin(FieldRule):
                 + self.field[i, 2] * normals[i, 2])
 
     cdef normal_field(self, Octree tree, const double[:, ::1] normals):
-        # The same for all slots; 0 where an atom was removed.
+        # Field of all other charges along the normals of all slots [e/nm^2]; 0 where an atom was removed.
         cdef double[::1] along = np.zeros(tree.n_slots)
         cdef long i
         for i in range(tree.n_slots):
@@ -333,8 +343,10 @@ cdef class Robin(FieldRule):
         cdef double c = self.area / (2.0 * M_PI), mean = 0.0
         cdef float new, largest
         cdef long i, slot
-        cdef int iteration
+        cdef int _iteration
         self.grow(patch.stride)
+
+        # residuals r_i = (s/2 pi) E_i . n_i - q_i of the old charges, and rows K_i of the matrix
         for i in range(patch.n):
             slot = patch.slot[i]
             mean += tree.q[slot] / patch.n
@@ -344,7 +356,7 @@ cdef class Robin(FieldRule):
                 normals[slot, 0] * self.field[slot, 0] + normals[slot, 1] * self.field[slot, 1]
                 + normals[slot, 2] * self.field[slot, 2]) - tree.q[slot])
             patch.change[i] = self.residual[i]
-        for iteration in range(60):
+        for _iteration in range(60):
             largest = 0.0
             for i in range(patch.n):
                 new = self.residual[i] + <float>c * patch_dot(

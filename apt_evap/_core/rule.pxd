@@ -10,8 +10,8 @@ from apt_evap._core.sources cimport Sources
 
 
 cdef struct Hole:
-    # The surroundings of an evaporated atom: slots whose fields are updated, first the near ones. Positions are relative
-    # to the hole; the arrays are padded to a multiple of GROUP with distant positions.
+    # The surroundings of an evaporated atom: slots whose fields are updated, first the near ones. Positions are
+    # relative to the hole; the arrays are padded to a multiple of GROUP with distant positions.
     double x                # position of the evaporated atom [nm]
     double y
     double z
@@ -61,7 +61,7 @@ cdef class ChargingRule:
 
 cdef class FieldRule(ChargingRule):
     cdef double[:, ::1] field           # (capacity, 3) field of all other atoms at each slot [e/nm^2]
-    cdef float[:, ::1] spread           # (3, room) change of this field by a patch
+    cdef float[:, ::1] spread           # (3, capacity) change of this field by a patch
     cdef Sources sources
 
     cdef int patch_charges(self, Octree tree, double[:, ::1] normals, Patch* patch) except -1 nogil

@@ -138,7 +138,7 @@ cdef class ChargingRule:
         return np.full(len(chosen), np.nan)
 
     cdef void removed(self, Octree tree, const Hole* hole) noexcept nogil:
-        # An atom has evaporated, with its charge: the tree does not contain it any more.
+        # An atom has evaporated, with its charge: the tree no longer contains it.
         pass
 
     cdef int exposed(self, Octree tree, long slot, double opening_angle) except -1 nogil:
@@ -188,7 +188,7 @@ cdef class FieldRule(ChargingRule):
         return 0
 
     cdef int solve_patch(self, Octree tree, double[:, ::1] normals, const Hole* hole, Patch* patch) except -1 nogil:
-        cdef long i, near, room = (hole.n + GROUP - 1) // GROUP * GROUP
+        cdef long i, near, padded = (hole.n + GROUP - 1) // GROUP * GROUP
         cdef int slot
         cdef float *field_x
         cdef float *field_y
@@ -199,17 +199,17 @@ cdef class FieldRule(ChargingRule):
                 patch.change[i] = <float>-tree.q[patch.slot[i]]
                 patch.charge[i] = 0.0
                 patch.n_clipped += 1
-        if room > self.spread.shape[1]:
+        if padded > self.spread.shape[1]:
             with gil:
-                self.spread = np.empty((3, 2 * room), np.float32)
+                self.spread = np.empty((3, 2 * padded), np.float32)
         field_x, field_y, field_z = &self.spread[0, 0], &self.spread[1, 0], &self.spread[2, 0]
-        for i in range(room):
+        for i in range(padded):
             field_x[i] = field_y[i] = field_z[i] = 0.0
-        near = min((hole.n_near + GROUP - 1) // GROUP * GROUP, room)
+        near = min((hole.n_near + GROUP - 1) // GROUP * GROUP, padded)
         patch_field(near, hole.near_x, hole.near_y, hole.near_z, patch.stride, patch.x, patch.y, patch.z, patch.change,
                     field_x, field_y, field_z)
         merge(tree, patch)
-        patch_field(room - near, hole.near_x + near, hole.near_y + near, hole.near_z + near, patch.n_merged,
+        patch_field(padded - near, hole.near_x + near, hole.near_y + near, hole.near_z + near, patch.n_merged,
                     patch.merged_x, patch.merged_y, patch.merged_z, patch.merged_change, field_x + near, field_y + near,
                     field_z + near)
         for i in range(hole.n):
@@ -266,13 +266,13 @@ cdef class PythonRule(FieldRule):
 
     @property
     def samples(self):
-        """None: the wrapped rule solves the whole surface."""
+        """None, as for every rule that solves only the whole surface."""
         return None
 
     def residuals(self, positions, normals, charges, chosen):
         """Residuals of the wrapped rule, if it has a method of this name: see `ChargingRule.residuals`."""
-        own = getattr(self.rule, "residuals", None)
-        return np.full(len(chosen), np.nan) if own is None else own(positions, normals, charges, chosen)
+        residuals = getattr(self.rule, "residuals", None)
+        return np.full(len(chosen), np.nan) if residuals is None else residuals(positions, normals, charges, chosen)
 
     cdef int patch_charges(self, Octree tree, double[:, ::1] normals, Patch* patch) except -1 nogil:
         cdef long i

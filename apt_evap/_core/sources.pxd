@@ -5,7 +5,7 @@ cdef extern from "kernels.h":
     const int LANES, SINGLE_LANES
     const double SAME_PLACE
     void point_atoms_double(long, const double*, const double*, const double*, const double*,
-                     double, double, double, double*) noexcept nogil
+                            double, double, double, double*) noexcept nogil
     void point_cells_double(long, long, const double*, double, double, double, double*) noexcept nogil
     void point_atoms_single(long, const float*, const float*, const float*, const float*,
                             float, float, float, double*) noexcept nogil
@@ -37,7 +37,7 @@ cdef int sources_init(Sources* sources) except -1 nogil
 cdef int sources_grow(Sources* sources) except -1 nogil
 cdef void sources_free(Sources* sources) noexcept nogil
 cdef void sources_field(const Sources* sources, double px, double py, double pz, double* field) noexcept nogil
-cdef int single_room(SingleSources* single, long capacity, const double* origin) except -1 nogil
+cdef int single_reserve(SingleSources* single, long capacity, const double* origin) except -1 nogil
 cdef void single_pad(SingleSources* single) noexcept nogil
 cdef void single_free(SingleSources* single) noexcept nogil
 cdef void single_field(const SingleSources* single, double px, double py, double pz, double* field) noexcept nogil

@@ -27,7 +27,7 @@ cdef void sources_free(Sources* sources) noexcept nogil:
 
 
 cdef int sources_grow(Sources* sources) except -1 nogil:
-    # Twice the room; the lists are kept, the columns are not.
+    # Double the capacity; the lists are kept, the columns are not.
     sources.capacity *= 2
     sources.atom = <int*>realloc(sources.atom, sources.capacity * sizeof(int))
     sources.cell = <int*>realloc(sources.cell, sources.capacity * sizeof(int))
@@ -71,8 +71,8 @@ cdef double sources_potential(const Sources* sources, double px, double py, doub
     return total
 
 
-cdef int single_room(SingleSources* single, long capacity, const double* origin) except -1 nogil:
-    # Removes all sources; room for this many, and for padding. The memory must be NULL at the first call.
+cdef int single_reserve(SingleSources* single, long capacity, const double* origin) except -1 nogil:
+    # Removes all sources, with space for this many and for padding. The memory must be NULL at the first call.
     cdef int axis
     if single.atoms == NULL or single.capacity < capacity + SINGLE_LANES:
         single_free(single)
@@ -111,7 +111,8 @@ cdef void single_field(const SingleSources* single, double px, double py, double
     # Field [e/nm^2] at one point, as `sources_field`.
     cdef const float* a = single.atoms
     cdef long stride = single.capacity
-    cdef float x = <float>(px - single.origin[0]), y = <float>(py - single.origin[1]), z = <float>(pz - single.origin[2])
+    cdef float x = <float>(px - single.origin[0]), y = <float>(py - single.origin[1])
+    cdef float z = <float>(pz - single.origin[2])
     field[0] = field[1] = field[2] = 0.0
     point_atoms_single(single.n_atoms, a, a + stride, a + 2 * stride, a + 3 * stride, x, y, z, field)
     point_cells_single(single.n_cells, stride, single.cells, x, y, z, field)

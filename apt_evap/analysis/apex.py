@@ -35,7 +35,7 @@ class FittedCap(NamedTuple):
     centre: np.ndarray
     """Centre [nm], shape (3,)."""
     radius: float
-    """Radius [nm]."""
+    """Radius of the sphere [nm]."""
 
     def __repr__(self) -> str:
         return short_repr(self)

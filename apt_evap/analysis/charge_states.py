@@ -1,4 +1,4 @@
-"""Charge state ratios: maps over the detector, the course during a run, and the field that follows from them."""
+"""Charge state ratios: maps over the detector, their history during a run, and the field that follows from them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from apt_evap.specimen.isotopes import ISOTOPES, mean_mass
 LEAST = 20
 """Fewest ions of both charges for a ratio: 1.5 % of the field where both are equally frequent."""
 _PER_BIN = 50  # ions per bin by default: 1 % of the field where both charges are equally frequent
-_PER_SECTION = 100  # ions per section of a course by default
+_PER_SECTION = 100  # ions per section of a history by default
 _MOST_BINS = 256  # by default, as in `DetectorMap.from_hits`
 _HIGHEST = 118  # charge [e]
 _CLOSE = 0.02  # an ion whose isotopes are this far outside its range is another one; peaks have tails of 1 %
@@ -147,7 +147,7 @@ class ChargeStateMap(ChargeStateCounts):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ChargeStateHistory(ChargeStateCounts):
-    """Charge state ratios in successive sections of the ions, made by `charge_state_ratio_course`.
+    """Charge state ratios in successive sections of the ions, made by `charge_state_ratio_history`.
 
     Parameters
     ----------
@@ -296,7 +296,7 @@ def charge_history(
     charges : array_like of int
         Charge of each ion [e] in the order of evaporation, shape (n,); 0 for ions that do not count.
     element, charge, sections, least
-        As for `charge_state_ratio_course`.
+        As for `charge_state_ratio_history`.
 
     Returns
     -------

@@ -132,9 +132,9 @@ def describe_atoms(positions: Floats, numbers: NDArray[np.integer], names: Seque
     depth = depths(turned, *sphere)
     sorted_depths = np.sort(depth[np.isfinite(depth)])
     for number, name in enumerate(names):
-        own = depth[(numbers == number) & np.isfinite(depth)]
-        if number and len(own):
-            reached = np.searchsorted(sorted_depths, np.quantile(own, [0.0, 0.1, 0.9], method="lower"))
+        depths_of_species = depth[(numbers == number) & np.isfinite(depth)]
+        if number and len(depths_of_species):
+            reached = np.searchsorted(sorted_depths, np.quantile(depths_of_species, [0.0, 0.1, 0.9], method="lower"))
             contents["atoms_above"][name] = dict(
                 zip(("its_first_atom", "a_tenth_of_them", "nine_tenths_of_them"), reached.tolist(), strict=True)
             )
@@ -190,7 +190,7 @@ def _of_run(run):
         "without_neighbour_to_roll_onto": summary["without_neighbour"],
         "detached": summary["detached"],
         "perturbations_flown": [
-            str(each.get("repr", each) if isinstance(each, dict) else each) for each in run.perturbations
+            str(plain.get("repr", plain) if isinstance(plain, dict) else plain) for plain in run.perturbations
         ],
         "responses": responses,
     }
@@ -254,7 +254,7 @@ def microscope_of(run: Run) -> dict[str, Any] | None:
 
 
 def real_units_line(run: Run) -> str:
-    """One line on a run in real units, str."""
+    """Description of a run in real units in one line, str."""
     real = _real_units(run)
     low, high = real["voltages"] or (np.nan, np.nan)
     charges = ", ".join(f"{count:,} {name}" for name, count in real["flight_charges"].items())
@@ -262,16 +262,17 @@ def real_units_line(run: Run) -> str:
         f"real units: {low:,.4g} to {high:,.4g} V for {real['operating_field']:.3g} V/nm at the "
         f"{real['field_reference']}; {charges}; 1 eV at {run.voltage:g} V is {real['energy_scale']:.3g} eV"
     )
-    found = microscope_of(run) if len(run) else None
-    return line if found is None else f"{line}; {lens_text(found)}"
+    microscope = microscope_of(run) if len(run) else None
+    return line if microscope is None else f"{line}; {lens_text(microscope)}"
 
 
-def lens_text(found: Mapping[str, Any]) -> str:
-    """One line on the result of `microscope_of`, str."""
+def lens_text(microscope: Mapping[str, Any]) -> str:
+    """Description of the result of `microscope_of` in one line, str."""
     ends = {
-        name: " to ".join(f"{value:.3g}" for value in found[name]) for name in ("radius", "field_factor", "compression")
+        name: " to ".join(f"{value:.3g}" for value in microscope[name])
+        for name in ("radius", "field_factor", "compression")
     }
-    shank = f"shank of {found['shank_angle']:g} degrees"
+    shank = f"shank of {microscope['shank_angle']:g} degrees"
     return f"lens: {shank}, R {ends['radius']} nm, k_f {ends['field_factor']}, xi {ends['compression']}"
 
 

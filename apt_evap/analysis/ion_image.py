@@ -363,24 +363,23 @@ def field_ion_image(
     check_reach(settings, emitter.tip, detector)
     scale, cap_field, radius = _scale_of(emitter, gas, image_field, voltage)
 
+    # surface atoms within the angle about the axis
     tip, positions, normals = emitter.tip, emitter.positions, emitter.normals
     centre = tip.potential_point
     chosen = tip.evaporable[emitter.atoms] & (polar_angles(positions - centre) <= angle)
     if not chosen.any():
         raise ValueError(f"half_angle must include surface atoms that can evaporate, got {half_angle:g} degrees")
     atoms, positions, normals = emitter.atoms[chosen], positions[chosen], normals[chosen]
+
+    # critical surface: potential of the specimen minus (I - phi) / e; the field of the barrier is (I - phi) / z_c
     inside = positions - _INSIDE * tip.nearest_neighbour_distance * normals
     level = scale * emitter.potential_at(inside) - barrier
     starts, local = _critical_surface(emitter, positions, normals, level, scale, barrier)
     fields = local if tunnelling == "local" else barrier / np.linalg.norm(starts - positions, axis=1)
 
-    known = np.isfinite(fields)
-    brightness = np.zeros(len(atoms))
-    brightness[known] = tunnel_factor(fields[known], gas.ionisation_energy) / tunnel_factor(
-        gas.field, gas.ionisation_energy
-    )
-    if supply == "capture":
-        brightness[known] *= (local[known] / gas.field) ** 2
+    brightness = _brightness(gas, supply, fields, local)
+
+    # spots on the detector, by flights of the ions from the critical surface
     flown = brightness > _FAINTEST * brightness.max()
     x, y = np.full((2, len(atoms)), np.nan)
     x[flown], y[flown] = _spots(emitter, starts[flown], settings, detector)
@@ -409,6 +408,17 @@ def field_ion_image(
     )
 
 
+def _brightness(gas, supply, fields, local):
+    """Tunnel factor relative to that at the best image field, times the supply of gas; 0 where it is not known."""
+    known = np.isfinite(fields)
+    brightness = np.zeros(len(fields))
+    best = tunnel_factor(gas.field, gas.ionisation_energy)
+    brightness[known] = tunnel_factor(fields[known], gas.ionisation_energy) / best
+    if supply == "capture":
+        brightness[known] *= (local[known] / gas.field) ** 2
+    return brightness
+
+
 def _barrier(ionisation_energy, work_function):
     """I - phi [eV]."""
     energy = check_number(ionisation_energy, "ionisation_energy", above=0, unit="eV")
@@ -430,8 +440,8 @@ def _scale_of(emitter, gas, image_field, voltage):
             raise ValueError(f"image_field and voltage exclude each other, got {image_field} V/nm and {voltage} V")
         scale = check_number(voltage, "voltage", above=0, unit="V") / emitter.voltage
         return scale, scale * cap.field, cap.radius
-    wanted = gas.field if image_field is None else check_number(image_field, "image_field", above=0, unit="V/nm")
-    return wanted / cap.field, wanted, cap.radius
+    field_needed = gas.field if image_field is None else check_number(image_field, "image_field", above=0, unit="V/nm")
+    return field_needed / cap.field, field_needed, cap.radius
 
 
 def _critical_surface(emitter, positions, normals, level, scale, barrier):

@@ -29,7 +29,7 @@ _DEGREE = 3  # of the decrease, in the squared sine of the polar angle
 def _grid() -> Floats:
     """Directions of all pixels, shape ((2 HALF + 1)^2, 3); beyond the equator they are on the other hemisphere."""
     steps = np.arange(-HALF, HALF + 1) * PIXEL
-    x, y = (each.ravel() for each in np.meshgrid(steps, steps))
+    x, y = (axis.ravel() for axis in np.meshgrid(steps, steps))
     z = 1 - (x * x + y * y) / 2
     stretch = np.sqrt(np.maximum((1 + z) / 2, 0))
     return np.column_stack([x * stretch, y * stretch, z])
@@ -65,20 +65,22 @@ def master_pattern(runs: Sequence[Run] | Run, emissions: Sequence[Perturbation] 
     for run in runs:
         check_kind(run, "runs", Run, "Runs")
     pairs = [run.perturbations[:2] if emissions is None else emissions for run in runs]
-    if not pairs or any(len(check_sequence(each, "emissions", "two perturbations")) != 2 for each in pairs):
+    if not pairs or any(len(check_sequence(pair, "emissions", "two perturbations")) != 2 for pair in pairs):
         raise ValueError("a master pattern needs runs with two emissions: without and with roll-up")
     orientations = [Orientation.from_settings(run.settings["tip"]) for run in runs]
     material = orientations[0].material
     sizes = [round(run.settings["tip"]["apex_radius"] / material.a, 6) for run in runs]
-    if any(each.material != material for each in orientations) or len(set(sizes)) > 1:
+    if any(orientation.material != material for orientation in orientations) or len(set(sizes)) > 1:
         raise ValueError("runs of a master pattern must be of one material and radius")
     views = []
     for run, orientation, pair in zip(runs, orientations, pairs, strict=True):
         projection = image_compression(run).projection
-        hits = [run.hits(each) for each in pair]
-        places = [np.column_stack([each.x, each.y])[each.detected] for each in hits]
-        views.append((orientation.matrix, [projection.directions(each) for each in places]))
-    densities = np.stack([_folded(material.structure, [(matrix, each[k]) for matrix, each in views]) for k in (0, 1)])
+        hits = [run.hits(perturbation) for perturbation in pair]
+        places = [np.column_stack([hits_of_one.x, hits_of_one.y])[hits_of_one.detected] for hits_of_one in hits]
+        views.append((orientation.matrix, [projection.directions(xy) for xy in places]))
+    densities = np.stack(
+        [_folded(material.structure, [(matrix, directions[k]) for matrix, directions in views]) for k in (0, 1)]
+    )
     return MasterPattern(material.structure, sizes[0], densities, sum(len(run) for run in runs))
 
 
@@ -106,8 +108,8 @@ def _folded(structure: str, views: Sequence[tuple[Floats, Floats]]) -> Floats:
     density = counts
     for _ in range(_ROUNDS):
         exposure = np.zeros(len(grid))
-        for polynomial, each in zip(decrease, cosines, strict=True):
-            for cosine in each:
+        for polynomial, cosines_of_tip in zip(decrease, cosines, strict=True):
+            for cosine in cosines_of_tip:
                 exposure += np.where(cosine > lowest, np.polynomial.polynomial.polyval(1 - cosine**2, polynomial), 0.0)
         exposure = exposure.reshape(side, side)
         density = np.divide(counts, exposure, out=np.zeros_like(counts), where=exposure > 1e-3 * exposure.max())

@@ -95,8 +95,7 @@ def rollup_tracks(run: Run, ions: ArrayLike, energies: ArrayLike) -> Tracks:
 
 
 def _check(run, ions, energies):
-    if check_kind(run, "run", Run, "a Run").responses is None:
-        raise ValueError(f"tracks need the responses of the ions, {run!r} has none: run it with responses=True")
+    check_kind(run, "run", Run, "a Run").require_responses()
     ions = check_array(ions, "ions", ("n",), dtype=np.int64)
     if len(ions) == 0 or ions.min() < 0 or ions.max() >= len(run):
         raise ValueError(f"ions must be indices from 0 to {len(run) - 1}, got {ions}")

@@ -1,4 +1,4 @@
-"""Evaporation voltage of the ions of a run, and the course of a quantity over the ions."""
+"""Evaporation voltage of the ions of a run, and the history of a quantity over the ions."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class SmoothedHistory(NamedTuple):
     low: np.ndarray
     """5th percentile, in the unit of the quantity."""
     median: np.ndarray
-    """50th percentile."""
+    """50th percentile, in this unit."""
     high: np.ndarray
-    """95th percentile."""
+    """95th percentile, in this unit."""
 
     def __repr__(self) -> str:
         return short_repr(self)
@@ -83,7 +83,7 @@ def smoothed_history(values: ArrayLike, points: int = 200) -> SmoothedHistory:
 
     Returns
     -------
-    Course
+    SmoothedHistory
 
     Raises
     ------

@@ -1,39 +1,31 @@
-"""Files of the commands: reading by the options; writing that never replaces files of other programs."""
+"""Files of the commands: reading by the options, and selection of ions."""
 
 import argparse
-import io
 import json
-import os
-import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from apt_evap import plot
 from apt_evap._common.codec import from_plain
-from apt_evap._common.files import FileError, check_path, open_for_reading, read_small_file, replace_file
-from apt_evap._common.types import AnyPath
+from apt_evap._common.files import FileError, read_small_file, sha256_of
 from apt_evap._common.validation import did_you_mean
-from apt_evap._version import __version__
 from apt_evap.config.lens_text import read_lens
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
-from apt_evap.detection.projection import Projection
 from apt_evap.detection.timing import mass_to_charge
 from apt_evap.io.distortion_grid import read_grid
-from apt_evap.io.formats import read as read_file
 from apt_evap.io.formats import read_ranges
-from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.registration.register import Registration
+from apt_evap.simulation.read_file import read as read_file
 from apt_evap.simulation.run import Run, load
-
-_MARK = f"apt_evap {__version__}"
-_MARK_RANGE = 1 << 16  # bytes: the mark is at the beginning of a .png or .svg, and at the end of a .pdf
-_MARK_KEYS = {".png": "Software", ".pdf": "Creator", ".svg": "Creator"}
+from apt_evap.studies.workflows.compare_maps import MAX_STUDY
+from apt_evap.studies.workflows.measured_source import MeasuredSource
+from apt_evap.studies.workflows.twin_of_map import path_word
 
 
 def read(options: argparse.Namespace) -> Hits | Run | DetectorMap:
@@ -78,7 +70,7 @@ def _read(options):
 def in_real_units(run: Run, options: argparse.Namespace) -> Run:
     """The run, in real units if the options ask for them, as a lens does; a run that already is keeps its own."""
     lens, reference = lens_of(options), options.real_units
-    if lens is None and (reference is None or (run.units is not None and run.units.field_reference == reference)):
+    if lens is None and reference in (None, run.observation.operating.field_reference):
         return run
     return run.at_evaporation_field(lens, **({} if reference is None else {"field_reference": reference}))
 
@@ -171,9 +163,6 @@ def ions_of_map(hits: Hits, options: argparse.Namespace) -> Hits:
     return selection
 
 
-MAX_STUDY = 1 << 28  # bytes: a study contains three numbers for each point of its grid
-
-
 def read_registration(text: str) -> Registration:
     """Registration from a file (of a registration or a study), or from numbers."""
     parts = text.split(",")
@@ -198,66 +187,30 @@ def read_registration(text: str) -> Registration:
         raise FileError(f"{text!r} does not contain a registration: {error}") from error
 
 
-def path_word(path: str | Path) -> str:
-    """Word of a command line, a path with ./ before a dash, which would make an option of it."""
-    return f".{os.sep}{path}" if isinstance(path, Path) and str(path).startswith("-") else str(path)
+def measured_of(options: argparse.Namespace) -> Hits | DetectorMap:
+    """The measured ions that the options select, or the measured map."""
+    content = read(options)
+    if isinstance(content, Run):
+        raise ValueError(f"a measured file is needed, {options.file!r} contains a run, whose orientation is known")
+    return content if isinstance(content, DetectorMap) else ions_of_map(with_masses(content, options), options)
 
 
-def picture_path(path: AnyPath) -> Path:
-    path = check_path(path)
-    if path.suffix.lower() not in _MARK_KEYS:
-        raise FileError(f"a picture is a {', '.join(_MARK_KEYS)} file, got {str(path)!r}")
-    return path
+_READING = ("format", "partial", "byte_order", "arrays", "unit", "voltage_unit")
 
 
-def save_picture(
-    path: Path,
-    maps: Sequence[DetectorMap],
-    titles: Sequence[str],
-    title: str | None = None,
-    crystal: tuple[Orientation, Projection] | None = None,
-) -> None:
-    axes = plot.detector_maps(maps, titles, limits=plot.common_limits(maps), title=title)
-    if crystal is not None:
-        for ax, each in zip(axes, maps, strict=True):
-            plot.poles(ax, *crystal, region=each, families=8)
-    save_figure(path, axes[0].figure)
-
-
-def save_figure(path: Path, figure: Any) -> None:
-    """Write a figure; it is drawn in memory, so that a kill in the second that it takes leaves no temporary file."""
-    suffix, drawn = path.suffix.lower(), io.BytesIO()
-    try:
-        figure.savefig(drawn, format=suffix[1:], dpi=200, metadata={_MARK_KEYS[suffix]: _MARK})
-    except OSError as error:  # such as a font that cannot be read
-        raise FileError(f"cannot write {str(path)!r}: {error.strerror or error}") from error
-    with replace_file(path) as file:
-        file.write(drawn.getbuffer())
-
-
-def check_output(path: AnyPath, is_ours: Callable[[Path], bool], force: bool) -> None:
-    """Check that a file can be written, and that no file of another program would be overwritten."""
-    target = Path(os.path.realpath(path))
-    try:
-        if target.is_dir():
-            raise IsADirectoryError(None, "Is a directory")
-        with tempfile.TemporaryFile(dir=target.parent):
-            pass
-        if target.exists():
-            if not target.is_file():
-                raise OSError(None, "Not a regular file")
-            if not force:
-                with open_for_reading(path):
-                    pass  # the origin of an unreadable file is not known
-                if not is_ours(target):
-                    raise FileError(f"{str(path)!r} exists and was not made by apt-evap: --force overwrites it")
-    except OSError as error:
-        raise FileError(f"cannot write {str(path)!r}: {error.strerror or error}") from error
-
-
-def is_picture(path: Path) -> bool:
-    """Whether a picture has the mark of this package, near its beginning or its end."""
-    with open_for_reading(path) as file:
-        beginning = file.read(_MARK_RANGE)
-        file.seek(max(0, path.stat().st_size - _MARK_RANGE))
-        return b"apt_evap" in beginning or b"apt_evap" in file.read(_MARK_RANGE)
+def measured_source(options: argparse.Namespace) -> MeasuredSource:
+    """The measured ions or the map, with what they are made from and the words that select the same ions."""
+    paths = {"FILE": options.file, "file of --undistort": options.undistort}
+    words = []
+    for name in ("ions", "mass", "voltage"):
+        if (bounds := getattr(options, name)) is not None:
+            words += [f"--{name}", ",".join("" if bound is None else f"{bound:.10g}" for bound in bounds)]
+    words += ["--ranges", path_word(Path(options.ranges))] if options.ranges is not None else []
+    words += [f"--species={options.species}"] if options.species is not None else []
+    return MeasuredSource(
+        partial(measured_of, options),
+        Path(options.file),
+        {name: None if path is None else sha256_of(path) for name, path in paths.items()},
+        {name: getattr(options, name) for name in (*_READING, *_SELECTING) if name != "ranges"},
+        tuple(words),
+    )

@@ -7,6 +7,8 @@ from typing import Any
 
 SHAPE: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
 """Options of every parser: texts as they are written, no abbreviations."""
+MAX_BINS = 16384
+"""That of `detection.binning`. Help must be fast, and modules of the physics import NumPy."""
 FILE_HELP = "a run (.h5), measured ions (.epos, ...) or a map (.npz)"
 """Help of an argument for any file."""
 

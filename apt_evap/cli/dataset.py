@@ -5,9 +5,6 @@ from pathlib import Path
 
 from apt_evap.cli._options import add_speech, integer_type
 from apt_evap.cli._output import say, tell, tell_json
-from apt_evap.config.cost_estimate import hours_text
-from apt_evap.studies.dataset.making import make_dataset, plan_dataset
-from apt_evap.studies.dataset.set_description import ABOUT, verify_dataset
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -25,7 +22,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("study", metavar="STUDY.toml", help="study file with a table [dataset], or a data set")
     parser.add_argument("-o", "--output", metavar="FOLDER", help="default: name of the study with _set")
-    parser.add_argument("--plan", action="store_true", help="only foretell time and size")
+    parser.add_argument("--plan", action="store_true", help="only estimate time and size")
     parser.add_argument("--workers", type=integer_type(1), default=1, metavar="N", help="processes; default: 1")
     parser.add_argument(
         "--without-failed", action="store_true", help="leave out runs that have failed, instead of an error"
@@ -35,6 +32,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
+    from apt_evap.config.cost_estimate import hours_text
+    from apt_evap.studies.dataset.making import make_dataset, plan_dataset
+    from apt_evap.studies.dataset.set_description import ABOUT, verify_dataset
+
     path = Path(options.study)
     if path.is_dir() and (path / ABOUT).exists():
         content = verify_dataset(path)

@@ -4,7 +4,6 @@ import argparse
 import ast
 from pathlib import Path
 
-from apt_evap._common.files import FileError, check_path, open_for_reading, replace_file
 from apt_evap.cli._options import add_speech
 from apt_evap.cli._output import tell, tell_json
 
@@ -25,6 +24,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
+    from apt_evap._common.files import FileError, check_path, replace_file
+
     examples = {path.name: path.read_bytes() for path in _paths()}
     titles = {name: _title(name, content.decode()) for name, content in examples.items()}
     if options.to is None:
@@ -50,6 +51,8 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _paths():
+    from apt_evap._common.files import FileError
+
     for place in _PLACES:
         paths = sorted(path for path in place.glob("*") if path.suffix in _SUFFIXES)
         if paths:
@@ -59,6 +62,8 @@ def _paths():
 
 def _check_own(path, content):
     """Check that a file that would be overwritten is an unchanged example."""
+    from apt_evap._common.files import FileError, open_for_reading
+
     if not path.exists():
         return
     with open_for_reading(path) as file:

@@ -1,18 +1,10 @@
 """`apt-evap export`: write the ions of a run or of a measurement as a file of ions."""
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 
-from apt_evap._common.files import FileError, check_path
-from apt_evap.cli._files import in_real_units, read, select
 from apt_evap.cli._options import add_reading, add_real_units, add_speech, number_type
 from apt_evap.cli._output import tell, tell_json
-from apt_evap.config.perturbation_text import read_perturbation
-from apt_evap.detection.hits import Hits
-from apt_evap.detection.timing import Timing
-from apt_evap.io.formats import left_out, write
-from apt_evap.simulation.run import Run
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -40,6 +32,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
+    from apt_evap._common.files import FileError, check_path
+    from apt_evap.cli._files import read, select
+    from apt_evap.io.formats import left_out, write
+
     output = check_path(options.output or f"{Path(options.file).stem}.epos")
     if output.exists() and not options.force:
         raise FileError(f"{str(output)!r} exists: --force overwrites it")
@@ -62,6 +58,11 @@ def execute(options: argparse.Namespace) -> int:
 
 def _ions(content, options):
     """Ions of a run for the options, or measured ones."""
+    from apt_evap.cli._files import in_real_units
+    from apt_evap.config.perturbation_text import read_perturbation
+    from apt_evap.detection.hits import Hits
+    from apt_evap.simulation.run import Run
+
     if isinstance(content, Run):
         run = in_real_units(content, options)
         if options.temperature is not None or options.jitter is not None:
@@ -80,6 +81,8 @@ def _ions(content, options):
 
 def _writing(output, content, options):
     """Options of the writer: an .nxs has the elements of the specimen."""
+    from apt_evap.simulation.run import Run
+
     if output.suffix.lower() != ".nxs":
         if options.elements is not None:
             raise ValueError(f"--elements is for an .nxs file, got {str(output)!r}")
@@ -93,6 +96,10 @@ def _writing(output, content, options):
 
 def _with_errors(run, options):
     """The run with errors of its times."""
+    from dataclasses import replace
+
+    from apt_evap.detection.timing import Timing
+
     if run.units is None:
         raise ValueError("--temperature and --jitter need a run in real units: add --real-units")
     timing = Timing(jitter=options.jitter or 0.0, temperature=options.temperature)

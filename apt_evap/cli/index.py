@@ -2,15 +2,10 @@
 
 import argparse
 from pathlib import Path
+from typing import Any
 
-from apt_evap import plot
-from apt_evap.cli._files import check_output, ions_of_map, is_picture, picture_path, read, save_figure, with_masses
 from apt_evap.cli._options import add_indexing, add_reading, add_speech
 from apt_evap.cli._output import tell, tell_json
-from apt_evap.detection.detector_map import DetectorMap
-from apt_evap.detection.hits import Hits
-from apt_evap.maps.indexing.index_map import Indexing, index
-from apt_evap.simulation.run import Run
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,36 +32,29 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
+    from apt_evap import plot
+    from apt_evap.cli._files import measured_of
+    from apt_evap.studies.workflows.written_pictures import check_output, is_picture, picture_path, save_figure
+
     picture = picture_path(options.output or f"{Path(options.file).stem}_indexed.png")
     check_output(picture, is_picture, options.force)
-    found, _ = indexed(options)
-    tell(options, f"{found}")
-    save_figure(picture, plot.indexing(found)[0].figure)
+    indexing = indexed(measured_of(options), options)
+    tell(options, f"{indexing}")
+    save_figure(picture, plot.indexing(indexing)[0].figure)
     tell(options, f"wrote {picture}")
-    tell_json(options, {"wrote": str(picture), "file": options.file, **found.to_dict()})
+    tell_json(options, {"wrote": str(picture), "file": options.file, **indexing.to_dict()})
     return 0
 
 
-def map_of(options: argparse.Namespace) -> tuple[DetectorMap, Hits | None]:
-    """The map of a command, and the selected ions if it is made of ions."""
-    content = read(options)
-    if isinstance(content, Run):
-        raise ValueError(f"a measured file is needed, {options.file!r} contains a run, whose orientation is known")
-    if isinstance(content, DetectorMap):
-        return content, None
-    ions = ions_of_map(with_masses(content, options), options)
-    return ions.map(bins=128), ions
+def indexed(measured: Any, options: argparse.Namespace) -> Any:
+    """Index measured ions or a map by the options."""
+    from apt_evap.maps.indexing.index_map import index
 
-
-def indexed(options: argparse.Namespace) -> tuple[Indexing, Hits | None]:
-    """Index the map of a command; the answer, and the ions that the map is made of."""
-    detector_map, ions = map_of(options)
-    found = index(
-        detector_map,
+    return index(
+        measured,
         options.element,
         scales=options.scales,
         distance=None if options.scales else options.distance,
         poles=options.pole or (),
         lines=options.line or (),
     )
-    return found, ions

@@ -36,8 +36,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     open_missing_streams()
     with warnings.catch_warnings(), _drawing_into_files(), _terminated_like_interrupted() as terminated:
-        warnings.simplefilter("default", AptWarning)  # lines on stderr, whatever Python does with warnings elsewhere
-        warnings.showwarning = lambda message, *_, **__: say("warning", message)
+        warnings.simplefilter("default", AptWarning)  # a command prints its warnings, whatever the filters
+        warnings.showwarning = _say_warning
         try:
             code = _execute(arguments)
             flush()
@@ -59,6 +59,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 raise
             say("error", error)
         return 2
+
+
+def _say_warning(message, category, *_, **__):
+    """Print a warning; what to know about a result is a note."""
+    from apt_evap.warnings import WorkflowWarning
+
+    say("note" if issubclass(category, WorkflowWarning) else "warning", message)
 
 
 def _execute(arguments):

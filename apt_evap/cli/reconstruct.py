@@ -3,32 +3,24 @@
 import argparse
 from pathlib import Path
 
-from apt_evap import plot
-from apt_evap._common.codec import for_json
-from apt_evap._common.files import FileError, check_path
-from apt_evap._common.validation import check_number
-from apt_evap.cli._files import (
-    check_output,
-    in_real_units,
-    is_picture,
-    lens_of,
-    picture_path,
-    read,
-    save_figure,
-    select,
-    with_masses,
-)
 from apt_evap.cli._options import add_reading, add_real_units, add_speech, integer_type
 from apt_evap.cli._output import tell, tell_json
-from apt_evap.config.perturbation_text import read_perturbation
-from apt_evap.detection.hits import Hits
-from apt_evap.io.formats import read_ranges
-from apt_evap.reconstruction.constants import run_constants
-from apt_evap.reconstruction.origins import OriginTable
-from apt_evap.reconstruction.reconstruct import FRAMES, PROJECTIONS, PROTOCOLS, reconstruct
-from apt_evap.simulation.run import Run
-from apt_evap.specimen.lattice import atom_density
-from apt_evap.specimen.materials import MATERIALS, material
+
+_CONSTANTS = (
+    "protocol",
+    "projection",
+    "distance",
+    "detector_radius",
+    "compression",
+    "efficiency",
+    "atomic_volume",
+    "evaporation_field",
+    "field_factor",
+    "smoothing",
+    "initial_radius",
+    "shank_angle",
+)
+"""Fields of `ReconstructionSettings` that are options."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,7 +40,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", metavar="FILE", help="measured ions (.epos, ...) or a run (.h5)")
     parser.add_argument("-o", "--output", metavar="OUT", help="default: FILE_reconstructed.pos in this folder")
     parser.add_argument(
-        "--frame", choices=FRAMES, default="depth", help="z is the depth, or goes out of the specimen; default: depth"
+        "--frame",
+        choices=("depth", "specimen"),
+        default="depth",
+        help="z is the depth, or goes out of the specimen; default: depth",
     )
     parser.add_argument(
         "--picture",
@@ -56,9 +51,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         help="draw side view, top view, depth profile and composition; --ranges gives the species of measured ions",
     )
     constants = parser.add_argument_group("constants", "The defaults of a run are its own constants.")
-    constants.add_argument("--protocol", choices=PROTOCOLS, default="cap", help="depth increment; default: cap")
+    constants.add_argument("--protocol", choices=("cap", "bas"), help="depth increment; default: cap")
     constants.add_argument(
-        "--projection", choices=PROJECTIONS, help="angle on the cap; default: bas, of a run compressed"
+        "--projection",
+        choices=("bas", "equidistant", "compressed"),
+        help="angle on the cap; default: bas, of a run compressed",
     )
     constants.add_argument("--distance", type=float, metavar="MM", help="flight length; default: that of the run")
     constants.add_argument(
@@ -70,7 +67,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     constants.add_argument(
         "--compression", type=float, metavar="XI", help="image compression; default: 1.5, of a run its own"
     )
-    constants.add_argument("--efficiency", type=float, default=1.0, metavar="ETA", help="of the detector; default: 1")
+    constants.add_argument("--efficiency", type=float, metavar="ETA", help="of the detector; default: 1")
     constants.add_argument("--element", metavar="NAME", help="material that gives the atomic volume and the field")
     constants.add_argument("--atomic-volume", type=float, metavar="NM3", help="default: that of the element")
     constants.add_argument(
@@ -79,7 +76,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     constants.add_argument("--field-factor", type=float, metavar="KF", help="default: 3.3, of a run its own")
     constants.add_argument("--evaporation-field", type=float, metavar="F", help="[V/nm]; default: that of the element")
     constants.add_argument(
-        "--smoothing", type=integer_type(1), default=1, metavar="N", help="ions in the mean of the voltage; default: 1"
+        "--smoothing", type=integer_type(1), metavar="N", help="ions in the mean of the voltage; default: 1"
     )
     constants.add_argument("--origins", metavar="TABLE.npz", help="correct lateral positions by a table of origins")
     constants.add_argument("--initial-radius", type=float, metavar="NM", help="for --radius shank")
@@ -93,6 +90,15 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
+    from apt_evap import plot
+    from apt_evap._common.codec import for_json
+    from apt_evap._common.files import FileError, check_path
+    from apt_evap.cli._files import select, with_masses
+    from apt_evap.io.formats import read_ranges, write
+    from apt_evap.reconstruction.origins import OriginTable
+    from apt_evap.reconstruction.reconstruct import reconstruct
+    from apt_evap.studies.workflows.written_pictures import check_output, is_picture, picture_path, save_figure
+
     output = check_path(options.output or f"{Path(options.file).stem}_reconstructed.pos")
     if output.exists() and not options.force:
         raise FileError(f"{str(output)!r} exists: --force overwrites it")
@@ -100,12 +106,8 @@ def execute(options: argparse.Namespace) -> int:
     if picture is not None:
         check_output(picture, is_picture, options.force)
     hits, known = _ions(options)
-    settings = known | _constants(options)
-    if settings["radius"] != "voltage":
-        for name in ("field_factor", "evaporation_field"):
-            if getattr(options, name) is None:
-                settings.pop(name, None)
-    if "atomic_volume" not in settings:
+    settings = _settings(options, known)
+    if not {"atomic_volume", "element"} & set(settings):
         raise ValueError("--atomic-volume [nm^3] or --element is missing")
     if "distance" not in settings:
         raise ValueError("--distance is missing: the flight length [mm] is needed for ions that are not from a run")
@@ -117,14 +119,15 @@ def execute(options: argparse.Namespace) -> int:
     ranges = read_ranges(options.ranges) if picture is not None and options.ranges is not None else None
     if ranges is not None and options.species is None:
         options.ranges = None
-    reconstruction = reconstruct(select(with_masses(hits, options), options), **settings)
-    reconstruction.write(output, frame=options.frame)
+    origins = None if options.origins is None else OriginTable.load(options.origins)
+    reconstruction = reconstruct(select(with_masses(hits, options), options), origins=origins, **settings)
+    write(output, reconstruction.to_hits(options.frame))
     tell(options, f"{reconstruction!r}")
     result = {"wrote": str(output), "file": options.file, "ions": len(reconstruction)}
     if picture is not None:
         save_figure(picture, plot.reconstruction(reconstruction, ranges)[0].figure)
         result["picture"] = str(picture)
-    result["settings"] = for_json(dict(reconstruction.settings))
+    result["settings"] = for_json(reconstruction.settings)
     if hits.outcome is not None and len(reconstruction) > 2:  # simulated: the true sites are known
         errors = reconstruction.errors()
         result["errors"] = errors.to_dict()
@@ -138,6 +141,12 @@ def execute(options: argparse.Namespace) -> int:
 
 def _ions(options):
     """Ions of the file, and the constants that it determines."""
+    from apt_evap.cli._files import in_real_units, read
+    from apt_evap.config.perturbation_text import read_perturbation
+    from apt_evap.detection.hits import Hits
+    from apt_evap.reconstruction.constants import run_constants
+    from apt_evap.simulation.run import Run
+
     content = read(options)
     if isinstance(content, Run):
         run = in_real_units(content, options)
@@ -155,36 +164,23 @@ def _ions(options):
     return content, {}
 
 
-_GIVEN = (
-    "protocol",
-    "projection",
-    "distance",
-    "compression",
-    "efficiency",
-    "detector_radius",
-    "field_factor",
-    "smoothing",
-    "initial_radius",
-    "shank_angle",
-    "evaporation_field",
-    "atomic_volume",
-)
+def _settings(options, known):
+    """Settings of `reconstruct` by name: the options, and what else is known of a run."""
+    from apt_evap.cli._files import lens_of
 
-
-def _constants(options):
-    """Arguments of `reconstruct` that the options set."""
-    settings = {name: getattr(options, name) for name in _GIVEN if getattr(options, name) is not None}
-    settings["radius"] = _radius(options.radius)
-    if options.origins is not None:
-        settings["origins"] = OriginTable.load(options.origins)
+    chosen = {name: getattr(options, name) for name in _CONSTANTS if getattr(options, name) is not None}
+    chosen["radius"] = _radius(options.radius)
     if options.lens is not None:
-        settings["lens"] = lens_of(options)
+        chosen["lens"] = lens_of(options)
+    of_run = dict(known)
     if options.element is not None:
-        element = _element(options.element)
-        settings.setdefault("atomic_volume", 1 / atom_density(element.structure, element.a, element.c))
-        if settings["radius"] == "voltage":
-            settings.setdefault("evaporation_field", element.evaporation_field)
-    return settings
+        chosen["element"] = _element(options.element)
+        for name in ("atomic_volume", "evaporation_field"):
+            of_run.pop(name, None)
+    if chosen["radius"] != "voltage":
+        for name in ("field_factor", "evaporation_field"):
+            of_run.pop(name, None)
+    return of_run | chosen
 
 
 def _field(options):
@@ -195,6 +191,8 @@ def _field(options):
 
 
 def _element(name):
+    from apt_evap.specimen.materials import MATERIALS, material
+
     try:
         return material(name)
     except ValueError as error:
@@ -206,6 +204,8 @@ def _element(name):
 
 def _radius(text):
     """The words voltage or shank, or a radius [nm]."""
+    from apt_evap._common.validation import check_number
+
     if text in ("voltage", "shank"):
         return text
     try:

@@ -4,13 +4,8 @@ import argparse
 import shlex
 from pathlib import Path
 
-from apt_evap._common.files import check_path, open_for_reading
-from apt_evap._common.threads import thread_count
-from apt_evap.cli._files import check_output, lens_of, path_word
 from apt_evap.cli._options import add_indexing, add_reading, add_specimen, add_speech
 from apt_evap.cli._output import tell, tell_json
-from apt_evap.cli.index import indexed
-from apt_evap.fit.start_settings import MARK, Start, settings_of
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,36 +30,28 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
+    from apt_evap._common.files import check_path
+    from apt_evap._common.threads import thread_count
+    from apt_evap.cli._files import lens_of, measured_of
+    from apt_evap.cli.index import indexed
+    from apt_evap.detection.hits import Hits
+    from apt_evap.fit.start_settings import is_start, settings_of
+    from apt_evap.studies.workflows.twin_of_map import path_word
+    from apt_evap.studies.workflows.written_pictures import check_output
+
     path = check_path(options.output or f"{Path(options.file).stem}.toml")
     check_output(path, is_start, options.force)
-    start = start_of(options)
-    tell(options, f"{start.indexing}")
-    start.save(path)
-    tell(options, f"wrote {path}: {start.foresight}; simulate with apt-evap run {shlex.quote(path_word(path))}")
-    tell_json(options, {"wrote": str(path), "file": options.file, **summary(start)})
-    return 0
-
-
-def start_of(options: argparse.Namespace) -> Start:
-    """Settings by the options of a command."""
-    found, ions = indexed(options)
-    return settings_of(
-        found,
-        ions,
+    measured = measured_of(options)
+    start = settings_of(
+        indexed(measured, options),
+        measured if isinstance(measured, Hits) else None,
         lens=lens_of(options),
         field_factor=options.field_factor,
         minutes=options.minutes,
         threads=thread_count(options.threads),
     )
-
-
-def summary(start: Start) -> dict[str, object]:
-    """A start in plain types."""
-    radii = [None if radius != radius else radius for radius in start.radii]
-    return {"radii": radii, "simulated_radius": start.simulated_radius, **start.indexing.to_dict()}
-
-
-def is_start(path: Path) -> bool:
-    """Whether a file was made by this command."""
-    with open_for_reading(path) as file:
-        return file.read(len(MARK)) == MARK.encode()
+    tell(options, f"{start.indexing}")
+    start.save(path)
+    tell(options, f"wrote {path}: {start.cost}; simulate with apt-evap run {shlex.quote(path_word(path))}")
+    tell_json(options, {"wrote": str(path), "file": options.file, **start.to_dict()})
+    return 0

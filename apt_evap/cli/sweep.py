@@ -4,16 +4,8 @@ import argparse
 import json
 import shlex
 
-from apt_evap._common.codec import to_plain
-from apt_evap._common.files import FileError
-from apt_evap.cli._options import SHAPE, add_speech, integer_type
+from apt_evap.cli._options import MAX_BINS, SHAPE, add_speech, integer_type
 from apt_evap.cli._output import put, say, tell, tell_json
-from apt_evap.config.cost_estimate import hours_text
-from apt_evap.detection.binning import MAX_BINS
-from apt_evap.studies.sweep.collection import collect_sweep
-from apt_evap.studies.sweep.planning import open_sweep, plan_sweep, retry, sweep_status
-from apt_evap.studies.sweep.point_folder import STATES, run_point
-from apt_evap.studies.sweep.working import run_sweep, run_sweep_with_dask
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -65,6 +57,10 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _plan(options):
+    from apt_evap._common.codec import to_plain
+    from apt_evap.config.cost_estimate import hours_text
+    from apt_evap.studies.sweep.planning import plan_sweep
+
     sweep = plan_sweep(options.study)
     hours = [cost.hours for cost in sweep.estimates]
     memory = [cost.memory for cost in sweep.estimates if cost.memory is not None]
@@ -86,6 +82,9 @@ def _plan(options):
 
 
 def _work(options):
+    from apt_evap.studies.sweep.planning import open_sweep, retry, sweep_status
+    from apt_evap.studies.sweep.working import run_sweep, run_sweep_with_dask
+
     sweep = open_sweep(options.study)
     if options.retry:
         tell(options, f"{retry(sweep):,} failed points are tried again")
@@ -110,6 +109,8 @@ def _work(options):
 
 def _work_on_points(options, sweep):
     """Run points in this process, as in a job of a batch system, which should see whether they are done."""
+    from apt_evap.studies.sweep.point_folder import run_point
+
     keys = [sweep.check_key(point) for point in options.point]
     states = {key: run_point(sweep.folder_of(key), sweep.job.threads, sweep.job.checkpoint) for key in keys}
     texts = {key: f"{key}: {state.name}{f', {state.message}' * bool(state.message)}" for key, state in states.items()}
@@ -122,6 +123,8 @@ def _work_on_points(options, sweep):
 
 
 def _status(options):
+    from apt_evap.studies.sweep.planning import open_sweep, sweep_status
+
     content = sweep_status(open_sweep(options.study))
     if options.json:
         put(json.dumps(content, allow_nan=False))
@@ -135,6 +138,9 @@ def _status(options):
 
 
 def _tell_counts(options, content):
+    from apt_evap.config.cost_estimate import hours_text
+    from apt_evap.studies.sweep.point_folder import STATES
+
     counts = content["counts"]
     shown = [name for name in STATES if counts[name] or name != "wrong"]
     text = ", ".join(f"{counts[name]:,} {name}" for name in shown)
@@ -150,6 +156,10 @@ def _tell_counts(options, content):
 
 
 def _collect(options):
+    from apt_evap._common.files import FileError
+    from apt_evap.studies.sweep.collection import collect_sweep
+    from apt_evap.studies.sweep.planning import open_sweep
+
     sweep = open_sweep(options.study)
     result = collect_sweep(
         sweep,

@@ -5,7 +5,6 @@ import math
 
 from apt_evap.cli._options import add_speech, integer_type
 from apt_evap.cli._output import tell, tell_json
-from apt_evap.studies.visibility.visibility_file import visibility_of_file
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,6 +22,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
+    from apt_evap.studies.visibility.visibility_file import visibility_of_file
+
     answer = visibility_of_file(options.config, n_threads=options.threads)
     found = answer.probability
     tell(options, f"probability to be found: {found.value:.2f} ± {found.error:.2f}")

@@ -5,7 +5,7 @@ import math
 from apt_evap._common.codec import count, number, settings
 from apt_evap._common.memory import copied_memory, needed_memory
 from apt_evap.config.simulation_file import Config
-from apt_evap.specimen.tip import foreseen_atoms
+from apt_evap.specimen.tip import estimated_atoms
 
 # Measured: resident memory of the program before a specimen is built, and after its pictures are drawn, 126 to 140 MB
 # for R = 8, 12, 20 and 30 a.
@@ -69,7 +69,7 @@ def estimate_cost(config: Config, threads: int) -> CostEstimate:
     CostEstimate
     """
     try:
-        atoms, surface = foreseen_atoms(**config.tip)
+        atoms, surface = estimated_atoms(**config.tip)
     except TypeError:  # a specimen without apex_radius
         return CostEstimate(config.n_ions, None, None, None, None)
     memory = _PROGRAM + needed_memory(atoms, surface) + copied_memory(surface, threads)

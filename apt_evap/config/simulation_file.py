@@ -68,7 +68,7 @@ class Config:
     n_ions : int
         Number of atoms to evaporate.
     responses : bool
-        Whether to compute responses; if not, the perturbations of the maps are flown instead.
+        Whether to compute responses. Perturbations of the maps that need their own flights are flown.
     voltage : float
         Applied voltage [V].
     seed : int
@@ -145,10 +145,11 @@ class Config:
 
     @property
     def emissions(self) -> tuple[Perturbation, ...]:
-        """Perturbations with their own flights: none, or without responses those of the maps."""
+        """Perturbations of the maps with their own flights: those for which the run has no responses."""
         perturbations: list[Perturbation] = []  # one of a user may have no hash
-        for panel in () if self.responses else self.maps.panels:
-            if panel.perturbation not in perturbations:
+        for panel in self.maps.panels:
+            by_response = self.responses and callable(getattr(panel.perturbation, "tangential", None))
+            if not by_response and panel.perturbation not in perturbations:
                 perturbations.append(panel.perturbation)
         return tuple(perturbations)
 

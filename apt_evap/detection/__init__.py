@@ -1,4 +1,4 @@
-"""Detection of the ions: detector, hits, detector maps, mass ranges, projections."""
+"""Detection of the ions: detector, hits, detector maps, mass ranges, projections, the lens of an instrument."""
 
 import lazy_loader
 

@@ -150,17 +150,12 @@ class DetectorMap:
             raise ValueError(f"a map needs detected ions, got none of {len(hits)} in {hits.source or 'these hits'}")
         if not detected.all():
             x, y = x[detected], y[detected]
+
         quantisations = find_quantisations(x, y, position_step)
         if dither_seed is not None:
-            if quantisations is None:
-                raise ValueError(
-                    "dither_seed needs a quantisation step of the coordinates (position_step), but they are continuous"
-                )
-            random = np.random.default_rng(dither_seed)
-            x, y = (
-                values + quantisation.spacing * (random.random(len(values)) - 0.5)
-                for values, quantisation in zip((x, y), quantisations, strict=True)
-            )
+            x, y = _dithered(x, y, quantisations, dither_seed)
+
+        # edges: those of another map, or multiples of the quantisation step
         if like is not None:
             x_edges, y_edges, mask = like.x_edges, like.y_edges, like.mask if mask is None else mask
             if quantisations is not None and dither_seed is None and not _fits(like, quantisations):
@@ -172,6 +167,8 @@ class DetectorMap:
         else:
             extent = hits.extent if extent is None else extent
             x_edges, y_edges = bin_edges(x, y, bins, extent, quantisations if dither_seed is None else None)
+
+        # counts, and the bins inside the detector or the field of view
         counts = count(x, y, x_edges, y_edges)
         if not counts.any():
             raise ValueError(
@@ -435,6 +432,19 @@ def _on_detector(x_edges, y_edges, extent):
     columns = (extent[0] <= x) & (x <= extent[1])
     rows = (extent[2] <= y) & (y <= extent[3])
     return rows[:, None] & columns
+
+
+def _dithered(x, y, quantisations, seed):
+    """Coordinates moved at random within one quantisation step."""
+    if quantisations is None:
+        raise ValueError(
+            "dither_seed needs a quantisation step of the coordinates (position_step), but they are continuous"
+        )
+    random = np.random.default_rng(seed)
+    return [
+        values + quantisation.spacing * (random.random(len(values)) - 0.5)
+        for values, quantisation in zip((x, y), quantisations, strict=True)
+    ]
 
 
 def _fits(like, quantisations):

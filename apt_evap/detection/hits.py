@@ -139,11 +139,11 @@ class Hits:
                 object.__setattr__(self, name, column)
                 lengths[name] = len(column)
         for name in ("extra", "units"):
-            given = {} if getattr(self, name) is None else getattr(self, name)
-            check_kind(given, name, Mapping, "a mapping by name of the column")
-            for key in given:
+            mapping = {} if getattr(self, name) is None else getattr(self, name)
+            check_kind(mapping, name, Mapping, "a mapping by name of the column")
+            for key in mapping:
                 check_kind(key, f"a name in {name}", str, "text")
-            object.__setattr__(self, name, dict(given))
+            object.__setattr__(self, name, dict(mapping))
         self.extra.update({name: _extra(name, value) for name, value in self.extra.items()})
         check_kind(self.source, "source", str, "text")
         if self.extent is not None:

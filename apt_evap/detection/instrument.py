@@ -21,7 +21,7 @@ _COLUMNS = 5  # random numbers per ion: efficiency, blur in x and y, energy defi
 
 
 class Detection(IntEnum):
-    """What an instrument does with an ion."""
+    """Outcome of the detection of an ion."""
 
     RECORDED = 0
     """The ion is recorded."""
@@ -44,14 +44,14 @@ class Recording(NamedTuple):
     @property
     def counts(self) -> dict[Detection, int]:
         """Number of ions with each `Detection`, dict."""
-        return {each: int(np.count_nonzero(self.detection == each)) for each in Detection}
+        return {outcome: int(np.count_nonzero(self.detection == outcome)) for outcome in Detection}
 
     def __repr__(self) -> str:
         return f"<Recording: {_counted(self)}>"
 
 
-def _projection(given, name):
-    return given if callable(given) else check_choice(given, name, PROJECTIONS)
+def _projection(projection, name):
+    return projection if callable(projection) else check_choice(projection, name, PROJECTIONS)
 
 
 @settings
@@ -143,7 +143,7 @@ class Instrument:
         Parameters
         ----------
         name : str
-            One of `PRESETS`.
+            One of `INSTRUMENT_PRESETS`.
         **changes
             Parameters of `Instrument` that are added or changed.
 
@@ -165,7 +165,7 @@ class Instrument:
         return -half, half, -half, half
 
     def record(self, hits: Hits, distance: float | None = None, *, seed: int = 0) -> Recording:
-        """Which ions are recorded, and why the others are not.
+        """Determine which ions are recorded, and why the others are not.
 
         Parameters
         ----------
@@ -348,5 +348,5 @@ mm": virtual distance of a LEAP 5000 with reflectron (transformaxes.m of Przemys
 
 def _counted(recording):
     """Number of ions of each kind, in words."""
-    counts = {each.name.lower().replace("_", " "): count for each, count in recording.counts.items()}
+    counts = {outcome.name.lower().replace("_", " "): count for outcome, count in recording.counts.items()}
     return ", ".join(f"{count:,} {name}" for name, count in counts.items())

@@ -164,8 +164,8 @@ class Ranges:
         assert self.composition is not None
         atoms: dict[str, int] = {}
         for n, composition in zip(ions.tolist(), self.composition, strict=True):
-            for element, each in composition.items():
-                atoms[element] = atoms.get(element, 0) + n * each
+            for element, number in composition.items():
+                atoms[element] = atoms.get(element, 0) + n * number
         return atoms
 
     def select(self, hits: Hits, *names: str) -> Hits:

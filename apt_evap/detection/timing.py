@@ -71,7 +71,7 @@ def mass_to_charge(
     return MASS_TO_CHARGE * voltage * time * time / (distance * distance + across)
 
 
-COURSES = ("exponential", "conduction")
+DECAYS = ("exponential", "conduction")
 _LAST = 60.0  # of the exponent of the rate over that at the peak: no ion leaves later
 _LATEST = 3e3  # delays of first order: about the time to the next pulse
 _POINTS = 4001  # of the table of delays, in proportion to the logarithm of 1 + time (measured: 1e-5 of a delay)
@@ -87,7 +87,7 @@ class Cooling:
 
     .. math:: p(t) \propto \exp\left(-\frac{Q}{k} \Big(\frac{1}{T(t)} - \frac{1}{T_\mathrm{peak}}\Big)\right) .
 
-    The rate long after the pulse is subtracted: its ions are those between the pulses. The course "exponential" is
+    The rate long after the pulse is subtracted: its ions are those between the pulses. The decay "exponential" is
     :math:`T_0 + \Delta T e^{-t/\tau}`, "conduction" :math:`T_0 + \Delta T/\sqrt{1 + t/\tau}`: the solution of the heat
     equation along a rod for a Gaussian zone with the standard deviation w, in its middle, with
     :math:`\tau = w^2/(2 D)` and the diffusivity D. Its tail is much longer. To first order both delays are exponential,
@@ -114,7 +114,7 @@ class Cooling:
         above=0,
         at_most=1000,
     )
-    course: str = choice('"exponential", or "conduction" of the heat along the shank.', COURSES, default="exponential")
+    decay: str = choice('"exponential", or "conduction" of the heat along the shank.', DECAYS, default="exponential")
 
     @classmethod
     def of_zone(
@@ -149,7 +149,7 @@ class Cooling:
     def temperatures(self, times: ArrayLike) -> Floats:
         """Temperature at times after the peak [ns], of the same shape [K]."""
         share = np.asarray(times, np.float64) / self.time_constant
-        fall = exponential(-share) if self.course == "exponential" else 1.0 / np.sqrt(1.0 + share)
+        fall = exponential(-share) if self.decay == "exponential" else 1.0 / np.sqrt(1.0 + share)
         return self.temperature + self.temperature_rise * fall
 
     def delays(self, u: ArrayLike) -> Floats:

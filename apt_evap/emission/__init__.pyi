@@ -14,6 +14,7 @@ from .post_ionisation import field_of_ratio as field_of_ratio
 from .roll_probability import ChargeRatio as ChargeRatio
 from .roll_probability import Migration as Migration
 from .roll_probability import RollProbability as RollProbability
+from .surface_frame import launch_tangentially as launch_tangentially
 from .surface_frame import roll_ups as roll_ups
 from .surface_frame import rollup_direction as rollup_direction
 from .surface_frame import tangent_frame as tangent_frame

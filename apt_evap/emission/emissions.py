@@ -138,8 +138,8 @@ class Emissions:
         return FLIGHT_TIME * np.sqrt(self.masses / self.charge_states)
 
     def __repr__(self) -> str:
-        lonely = np.count_nonzero(np.isnan(self.neighbours).any(axis=1))
-        return f"<Emissions: {len(self):,} atoms, {lonely:,} of them without a neighbour to roll onto>"
+        isolated = np.count_nonzero(np.isnan(self.neighbours).any(axis=1))
+        return f"<Emissions: {len(self):,} atoms, {isolated:,} of them without a neighbour to roll onto>"
 
 
 class TangentialLaunches(NamedTuple):
@@ -179,11 +179,11 @@ def choose_launches(launches: Sequence[TangentialLaunches], chosen: Integers) ->
     defaults = {"shares": np.tile([1.0, 0.0, 0.0], (n, 1)), "heights": np.zeros(n)}
     columns = {}
     for name in TangentialLaunches._fields:
-        given = [getattr(each, name) for each in launches]
-        if all(column is None for column in given):
+        columns_of_launches = [getattr(launch, name) for launch in launches]
+        if all(column is None for column in columns_of_launches):
             continue
-        columns[name] = result = np.array(defaults.get(name, given[0]))
-        for k, column in enumerate(given):
+        columns[name] = result = np.array(defaults.get(name, columns_of_launches[0]))
+        for k, column in enumerate(columns_of_launches):
             if column is not None:
                 rows = chosen == k
                 result[rows] = column[rows]

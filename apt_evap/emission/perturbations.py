@@ -8,6 +8,7 @@ probability of a roll-up, the sharpness of the target and the launch height are 
 
 from __future__ import annotations  # `RollUp.of_metal` returns one
 
+import json
 from collections.abc import Mapping, Sequence
 from copy import copy
 from typing import Any, Protocol
@@ -71,7 +72,7 @@ Selected, as the sharpness and the height, with maps of tungsten and nickel: par
 """
 _SHARPNESS = 1.0
 _HEIGHT_OF_ROLLED = 0.2
-"""Height above the neighbour [nm]. Ions that do not roll up start from their sites, as maps of aluminium ask for."""
+"""Height above the neighbour [nm]. Ions that do not roll up start from their sites, as maps of aluminium require."""
 _ENERGY_OF_OTHERS = 0.4
 """Mean energy of ions that do not roll up, before truncation [eV]. Selected with a map of aluminium, 0.35 to 0.5."""
 
@@ -91,7 +92,7 @@ class TangentialPerturbation(Perturbation, Protocol):
     """
 
     def tangential(self, emissions: Emissions, random: IonRandom) -> TangentialLaunches | tuple:
-        """Which ions roll up, and the velocities along t1 and t2 of `tangent_frame` [nm/ns], each of shape (n,).
+        """Compute which ions roll up, and the velocities along t1 and t2 of `tangent_frame` [nm/ns], each (n,).
 
         These three as a tuple, or with shares of targets and heights as `TangentialLaunches`.
         """
@@ -101,10 +102,10 @@ class TangentialPerturbation(Perturbation, Protocol):
 _HEIGHT = "Height of the start above the site, of a rolled ion above p_r. Above 0 it needs `ResponseSettings.wide`."
 
 
-def _probability(given, name):
+def _probability(probability, name):
     """Probability of a roll-up: a number, or an object with a method `probabilities`."""
-    own = callable(getattr(given, "probabilities", None))
-    return given if own else check_number(given, name, at_least=0, at_most=1)
+    is_function = callable(getattr(probability, "probabilities", None))
+    return probability if is_function else check_number(probability, name, at_least=0, at_most=1)
 
 
 class _Tangential:
@@ -189,9 +190,9 @@ class _Rolling(_Tangential):
         possible, first, second, shares = roll_ups(emissions, self.sharpness)
         rolled = possible.copy()
         if not certain:
-            given = self.probability
-            wanted = u[:, 2] < (given if isinstance(given, float) else given.probabilities(emissions))
-            rolled = rolled & wanted
+            probability = self.probability
+            drawn = u[:, 2] < (probability if isinstance(probability, float) else probability.probabilities(emissions))
+            rolled = rolled & drawn
         energies = draw_energies(self.energy, u[:, 0])
         fraction = getattr(self, "rollup_fraction", 1.0)
         rolling = np.where(rolled, fraction * energies, 0.0)
@@ -254,8 +255,8 @@ class RollUp(_Rolling, _Energetic):
     """Ions roll up onto a neighbour and start there, in the direction of the roll-up.
 
     They start at p_r = s + d n, with |v| = sqrt(2 E/m) along the component of p_r - p perpendicular to n. By default
-    every ion rolls up, and s is its surface nearest neighbour of highest charge, as in the paper. An ion that does not
-    roll up, as it has no neighbour or by the probability, starts from its site.
+    every ion rolls up, and s is its surface nearest neighbour of highest charge, as in Shaikh et al. (2025). An ion
+    that does not roll up, as it has no neighbour or by the probability, starts from its site.
 
     Examples
     --------
@@ -308,7 +309,7 @@ class RollUp(_Rolling, _Energetic):
         return cls(rolled, law, _SHARPNESS, _HEIGHT_OF_ROLLED, others=others, others_height=0.0)
 
     def tangential(self, emissions: Emissions, random: IonRandom) -> TangentialLaunches:
-        """Which ions roll up, and the velocities along t1 and t2 [nm/ns]: see `Combined.tangential`."""
+        """Compute which ions roll up, and the velocities along t1 and t2 [nm/ns]: see `Combined.tangential`."""
         return self._roll(emissions, random)
 
 
@@ -340,7 +341,7 @@ class Combined(_Rolling, _Divided):
     """
 
     def tangential(self, emissions: Emissions, random: IonRandom) -> TangentialLaunches:
-        """Which ions roll up, and their velocities along the surface.
+        """Compute which ions roll up, and their velocities along the surface.
 
         Parameters
         ----------
@@ -358,28 +359,28 @@ class Combined(_Rolling, _Divided):
         return self._roll(emissions, random)
 
 
-def _members(given, name):
+def _members(perturbations, name):
     """Perturbations of a mixture as a tuple."""
-    members = tuple(given) if isinstance(given, list | tuple) else ()
-    if len(members) < 2 or not all(callable(getattr(each, "tangential", None)) for each in members):
+    members = tuple(perturbations) if isinstance(perturbations, list | tuple) else ()
+    if len(members) < 2 or not all(callable(getattr(member, "tangential", None)) for member in members):
         raise ValueError(
             f"{name} must be two or more perturbations with a method `tangential`, such as (RollUp(0.2), "
-            f"LateralVelocity(0.2)), got {short_text(given)}"
+            f"LateralVelocity(0.2)), got {short_text(perturbations)}"
         )
     return members
 
 
-def _weights(given, name):
-    return tuple(check_number(each, name, above=0) for each in check_array(given, name, ("n",)).tolist())
+def _weights(weights, name):
+    return tuple(check_number(weight, name, above=0) for weight in check_array(weights, name, ("n",)).tolist())
 
 
 def _read_members(plain, name):
-    return [perturbation_of(each) if isinstance(each, Mapping) else each for each in plain]
+    return [perturbation_of(member) if isinstance(member, Mapping) else member for member in plain]
 
 
 @settings
 class Mixture(_Tangential):
-    """Each ion follows one of several perturbations, drawn by a random number of its own.
+    """Each ion follows one of several perturbations, drawn by a separate random number.
 
     Examples
     --------
@@ -413,10 +414,10 @@ class Mixture(_Tangential):
         """Launches of the perturbation that each ion follows: see `Combined.tangential`."""
         copies = [copy(random) for _ in self.perturbations]
         launches = [
-            TangentialLaunches(*each.tangential(emissions, its))
-            for each, its in zip(self.perturbations, copies, strict=True)
+            TangentialLaunches(*perturbation.tangential(emissions, stream))
+            for perturbation, stream in zip(self.perturbations, copies, strict=True)
         ]
-        u = random.uniform(max(its.n_used for its in copies) - random.n_used + 1)[:, -1]  # none of theirs
+        u = random.uniform(max(stream.n_used for stream in copies) - random.n_used + 1)[:, -1]  # none of theirs
         parts = np.cumsum(self.weights or np.ones(len(launches)))
         return choose_launches(launches, np.searchsorted(parts[:-1] / parts[-1], u, side="right"))
 
@@ -432,6 +433,11 @@ def described(perturbation: Any) -> dict[str, Any]:
     if is_settings(perturbation):
         return to_plain(perturbation)
     return {"name": type(perturbation).__name__, "repr": repr(perturbation)}
+
+
+def perturbation_text(perturbation: Any) -> str:
+    """Text of a perturbation, or of the description of one in a file."""
+    return perturbation.get("repr", json.dumps(perturbation)) if isinstance(perturbation, dict) else repr(perturbation)
 
 
 def perturbation_of(perturbation: Any) -> Any:

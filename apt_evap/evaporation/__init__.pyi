@@ -13,3 +13,4 @@ from .rule import Rule as Rule
 from .state import EmitterState as EmitterState
 from .thermal import Laser as Laser
 from .voltage import ThermalLaw as ThermalLaw
+from .voltage import VoltageControl as VoltageControl

@@ -133,7 +133,7 @@ TUNGSTEN_TABLE = CoordinationTable({"W": {n: 17.0 + 10.0 * n for n in range(1, 1
 def _by_element(energies, name):
     if not isinstance(energies, Mapping):
         raise ValueError(f"{name} must be numbers [eV] by element, got {short_text(energies)}")
-    return {key: check_number(each, f"{name} of {key}", above=0, unit="eV") for key, each in energies.items()}
+    return {key: check_number(energy, f"{name} of {key}", above=0, unit="eV") for key, energy in energies.items()}
 
 
 def _by_pair(energies, name):
@@ -143,8 +143,8 @@ def _by_pair(energies, name):
         if not isinstance(pair, str) or pair.count("-") != 1:
             raise ValueError(f"{name} must be by pair such as 'Al-Cu', got {short_text(pair)}")
     return {
-        pair: check_number(each, f"{name} of {pair}", at_least=-10, at_most=10, unit="eV")
-        for pair, each in energies.items()
+        pair: check_number(energy, f"{name} of {pair}", at_least=-10, at_most=10, unit="eV")
+        for pair, energy in energies.items()
     }
 
 
@@ -201,8 +201,8 @@ class PairEnergies:
         """Whether second neighbours are counted."""
         return self.second_weight > 0
 
-    def _number(self, given, known, name, what):
-        values = known if given is None else {**known, **given}
+    def _number(self, overrides, known, name, what):
+        values = known if overrides is None else {**known, **overrides}
         if name not in values:
             raise ValueError(f"{what} must have a value for {name}, got {short_text(list(values))}")
         return values[name]
@@ -242,7 +242,7 @@ BONDS = (CoordinationTable, PairEnergies)
 
 
 def _bonds(bonds, name):
-    complete = all(hasattr(bonds, each) for each in ("fields", "by_species", "second_shell"))
+    complete = all(hasattr(bonds, method) for method in ("fields", "by_species", "second_shell"))
     if not complete or isinstance(bonds, type | Mapping) or not callable(bonds.fields):
         raise ValueError(
             f"{name} must be an evaporation field by bonds with by_species, second_shell and a method fields, such as "
@@ -267,9 +267,9 @@ class BondCodes(NamedTuple):
     """Code of the bonds of each atom: four bits for the number of neighbours of each kind."""
 
     near: np.ndarray
-    """What an atom adds to the code of its nearest neighbours, int32 (n,)."""
+    """Contribution of each atom to the code of its nearest neighbours, int32 (n,)."""
     far: np.ndarray
-    """What it adds to that of its second neighbours, int32 (n,)."""
+    """Contribution of each atom to the code of its second neighbours, int32 (n,)."""
     second_length: float
     """Atoms closer than this are second neighbours [nm]."""
 

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from apt_evap._common.threads import thread_count, usable_threads
 from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_seed
-from apt_evap._core.evaporation import DONE, EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, Evaporation, Start
+from apt_evap._core.evaporation import DONE, EXHAUSTED, SWEEP_DUE, TOO_SHALLOW, Evaporation, RelaxationStart
 from apt_evap._core.events import COLUMNS, Events
 from apt_evap._core.journal import Journal
 from apt_evap._core.neighbourhood import Neighbourhood
@@ -180,7 +180,8 @@ class Emitter:
             self._rate_control,
             stretch,
         )
-        self._sites, self._deepened = [], []  # evaporated atoms of each batch; numbers of events before each deepening
+        self._sites: list[Integers] = []  # evaporated atoms of each batch
+        self._extensions: list[int] = []  # number of events before each extension of the shell
         if not tip.evaporable[self._core.atoms.surface].any():
             raise ValueError(f"{tip!r} has no evaporable surface atom")
         self.relax(tolerance=self.settings.start_tolerance)
@@ -434,9 +435,9 @@ class Emitter:
         return EmitterState(
             sites=sites[: start.n_removed],
             charges=start.charges,
-            lonely=start.lonely,
-            lonely_normals=start.lonely_normals,
-            deepened=tuple(self._deepened),
+            isolated=start.isolated,
+            isolated_normals=start.isolated_normals,
+            extensions=tuple(self._extensions),
             tolerance=tolerance,
             opening_angle=angle,
             clipped=clipped,
@@ -462,17 +463,20 @@ class Emitter:
         if self.counts["events"]:
             raise ValueError(f"restore needs a new emitter, got one with {self.counts['events']:,} evaporated atoms")
         first = 0
-        for event in state.deepened:
+        for event in state.extensions:
             self._core.atoms.remove_atoms(state.sites[first:event])
-            self._extend()
+            self._extend_specimen()
             first = event
         self._core.atoms.remove_atoms(state.sites[first:])
-        if not np.isin(state.lonely, self._core.atoms.surface).all() or len(state.lonely) != len(state.lonely_normals):
-            raise ValueError("lonely must be surface atoms, each with a normal: the state is of another specimen")
-        self._sites, self._deepened = [state.sites], list(state.deepened)
+        exposed = np.isin(state.isolated, self._core.atoms.surface)
+        if not exposed.all() or len(exposed) != len(state.isolated_normals):
+            raise ValueError("isolated must be surface atoms, each with a normal: the state is of another specimen")
+        self._sites, self._extensions = [state.sites], list(state.extensions)
         self._core.n_clipped, self._core.n_unsettled = state.clipped, state.unsettled
         self._core.control.voltage_factor = state.voltage_factor
-        start = Start(len(state.sites), state.charges, state.lonely, state.lonely_normals, state.rule_state)
+        start = RelaxationStart(
+            len(state.sites), state.charges, state.isolated, state.isolated_normals, state.rule_state
+        )
         self._relax(state.tolerance, state.opening_angle, start)
 
     def remove(self, sites: Integers) -> None:
@@ -488,15 +492,15 @@ class Emitter:
         self._sites.append(sites)
         self.relax()
 
-    def hand_out_tree(self) -> None:
+    def request_tree_copy(self) -> None:
         """Add a copy of the tree to the next batch, for flights that have not followed the earlier events."""
         self._recorded = RECORD
 
-    def hand_out_cap(self) -> None:
+    def request_cap(self) -> None:
         """Add the cap to the next batch, at the beginning of a run."""
         self._is_new = True
 
-    def deepen(self) -> None:
+    def extend_shell(self) -> None:
         """Extend the shell of the specimen, after `evaporate` reached its support atoms.
 
         The atoms of the previous shell keep their numbers.
@@ -506,20 +510,20 @@ class Emitter:
         ValueError
             If the specimen is not a shell, such as one made from positions.
         """
-        self._extend()
-        self._deepened.append(self._core.n_removed)
+        self._extend_specimen()
+        self._extensions.append(self._core.n_removed)
         self.relax()
 
-    def _extend(self):
+    def _extend_specimen(self):
         tip = self.tip.deepened()
         kernel = self._kernel_of(tip)
-        self._core.take_over(self._neighbourhood_of(tip, kernel, self._core.atoms), kernel)
+        self._core.replace_atoms(self._neighbourhood_of(tip, kernel, self._core.atoms), kernel)
         self.tip = tip
 
     def evaporate(self, max_events: int) -> Batch:
         """Evaporate up to `max_events` atoms.
 
-        Stops early if the surface must be relaxed, the shell deepened, or no atom is left; `advance` does this by
+        Stops early if the surface must be relaxed, the shell extended, or no atom is left; `advance` does this by
         itself.
 
         Parameters
@@ -531,7 +535,7 @@ class Emitter:
         -------
         Batch
             Its status is the reason for its end: DONE, SWEEP_DUE (call `relax_due` and continue), EXHAUSTED or
-            TOO_SHALLOW (call `deepen` and continue).
+            TOO_SHALLOW (call `extend_shell` and continue).
         """
         n = check_count(max_events, "max_events", at_least=1, at_most=_MAX_EVENTS)
         events, control = Events(self.tip.positions, n), self._rate_control
@@ -559,7 +563,7 @@ class Emitter:
         batch_size: int = BATCH,
         pause: Callable[[], AbstractContextManager[Any]] = nullcontext,
     ) -> Iterator[Batch]:
-        """Evaporate atoms batch by batch; relaxes the surface and deepens the shell between them.
+        """Evaporate atoms batch by batch; relax the surface and extend the shell between the batches.
 
         Parameters
         ----------
@@ -568,13 +572,13 @@ class Emitter:
         batch_size : int
             Events per batch; the sequence does not depend on it.
         pause : callable, optional
-            Returns a context in which the surface is relaxed or the shell deepened. Other work that needs the
+            Returns a context in which the surface is relaxed or the shell extended. Other work that needs the
             processors, or the unchanged specimen, must stop in this context.
 
         Yields
         ------
         Batch
-            May be empty. The relaxation or deepening follows when the next batch is requested, so that the surface can
+            May be empty. The relaxation or extension follows when the next batch is requested, so that the surface can
             be inspected before. The last batch is EXHAUSTED if no atom is left.
         """
         n_events = check_count(n_events, "n_events", at_least=0)
@@ -587,4 +591,4 @@ class Emitter:
                 return
             if batch.status in (SWEEP_DUE, TOO_SHALLOW):
                 with pause():
-                    self.relax_due() if batch.status == SWEEP_DUE else self.deepen()
+                    self.relax_due() if batch.status == SWEEP_DUE else self.extend_shell()

@@ -23,7 +23,7 @@ class Conditions(NamedTuple):
     elements: tuple[str, ...]
     """Names of the k elements."""
     composition: Floats
-    """True fractions, shape (k,)."""
+    """True fractions of the elements, shape (k,)."""
     temperatures: Floats
     """[K], shape (n,)."""
     pulse_fractions: Floats
@@ -45,7 +45,7 @@ class Conditions(NamedTuple):
 
     def __repr__(self) -> str:
         names = ", ".join(f"{name} {share:.3g}" for name, share in zip(self.elements, self.composition, strict=True))
-        (low_t, high_t), (low_p, high_p) = ((each.min(), each.max()) for each in self[2:4])
+        (low_t, high_t), (low_p, high_p) = ((axis.min(), axis.max()) for axis in self[2:4])
         return f"<Conditions: {names}; {low_t:g} to {high_t:g} K, pulse fractions {low_p:g} to {high_p:g}>"
 
 
@@ -105,10 +105,10 @@ def conditions(
     Examples
     --------
     >>> law = ae.Arrhenius(50.0, sensitivity={"Al": 1.0, "Cu": 0.6})
-    >>> found = ae.evaporation.conditions({"Al": 0.9, "Cu": 0.1}, temperatures=[50.0, 80.0], law=law)
-    >>> found
+    >>> losses = ae.evaporation.conditions({"Al": 0.9, "Cu": 0.1}, temperatures=[50.0, 80.0], law=law)
+    >>> losses
     <Conditions: Al 0.9, Cu 0.1; 50 to 80 K, pulse fractions 0.1 to 0.3>
-    >>> found.measured[1, :, 2].round(3)  # of Cu at 50 and 80 K, pulse fraction 0.2
+    >>> losses.measured[1, :, 2].round(3)  # of Cu at 50 and 80 K, pulse fraction 0.2
     array([0.1 , 0.09])
     """
     check_kind(composition, "composition", Mapping, "a mapping of elements to fractions")
@@ -127,6 +127,8 @@ def conditions(
     for values, name, most, unit in ((kelvins, "temperatures", 5000.0, "K"), (heights, "pulse_fractions", 1.0, "")):
         for value in values:
             check_number(float(value), name, above=0, at_most=most, unit=unit)
+
+    # ratio rho of the ions at the standing voltage to those in pulses; rho / (1 + rho) of an element are lost
     ratios = np.empty((len(elements), len(kelvins), len(heights)))
     for k, name in enumerate(elements):
         sensitivity = _sensitivity(law.sensitivity, name)
@@ -190,9 +192,9 @@ def _field_of(form, stiffness, reach):
     return max(x, _SMALLEST)
 
 
-def _sensitivity(given: Any, name: str) -> float:
-    if not isinstance(given, Mapping):
-        return float(given)
-    if name not in given:
-        raise ValueError(f"sensitivity must have a value for {name}, got {short_text(given)}")
-    return float(given[name])
+def _sensitivity(sensitivity: Any, name: str) -> float:
+    if not isinstance(sensitivity, Mapping):
+        return float(sensitivity)
+    if name not in sensitivity:
+        raise ValueError(f"sensitivity must have a value for {name}, got {short_text(sensitivity)}")
+    return float(sensitivity[name])

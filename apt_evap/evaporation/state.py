@@ -16,12 +16,12 @@ class EmitterState:
         Atoms that had evaporated by then, in their order.
     charges : ndarray, shape (m,)
         Start values of that relaxation for the surface atoms, in the order of their indices [e].
-    lonely : ndarray of int64, shape (k,)
+    isolated : ndarray of int64, shape (k,)
         Surface atoms without neighbours, which keep their last normal.
-    lonely_normals : ndarray, shape (k, 3)
+    isolated_normals : ndarray, shape (k, 3)
         Their normals.
-    deepened : tuple of int
-        Number of evaporated atoms at each deepening of the shell.
+    extensions : tuple of int
+        Number of evaporated atoms at each extension of the shell.
     tolerance : float
         Tolerance of the relaxation, as in `ChargeSettings`.
     opening_angle : float
@@ -37,9 +37,9 @@ class EmitterState:
 
     sites: np.ndarray
     charges: np.ndarray
-    lonely: np.ndarray
-    lonely_normals: np.ndarray
-    deepened: tuple
+    isolated: np.ndarray
+    isolated_normals: np.ndarray
+    extensions: tuple
     tolerance: float
     opening_angle: float
     clipped: int

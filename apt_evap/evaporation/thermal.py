@@ -71,13 +71,14 @@ class Laser:
         return base + self.temperature_rise * rise
 
 
-def _sensitivity(given, name):
+def _sensitivity(sensitivity, name):
     """One sensitivity, or sensitivities by element."""
-    if isinstance(given, Mapping):
+    if isinstance(sensitivity, Mapping):
         return {
-            key: check_number(each, f"{name} of {key}", above=0, at_most=1000, unit="eV") for key, each in given.items()
+            key: check_number(value, f"{name} of {key}", above=0, at_most=1000, unit="eV")
+            for key, value in sensitivity.items()
         }
-    return check_number(given, name, above=0, at_most=1000, unit="eV")
+    return check_number(sensitivity, name, above=0, at_most=1000, unit="eV")
 
 
 @settings

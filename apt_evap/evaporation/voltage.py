@@ -44,7 +44,7 @@ class VoltageControl:
     Examples
     --------
     >>> tip = ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1))
-    >>> control = ae.VoltageControl(rate=0.01, pulse_fraction=0.2)
+    >>> control = ae.evaporation.VoltageControl(rate=0.01, pulse_fraction=0.2)
     >>> run = ae.Simulation(tip, seed=1, control=control).run(100)
     >>> hits = run.at_evaporation_field().hits(ae.Unperturbed())
     >>> print(f"{hits.voltage[0]:.0f} V and pulses of {hits.pulse_voltage[0]:.0f} V")
@@ -102,7 +102,7 @@ class VoltageControl:
         Examples
         --------
         >>> ions = ae.Hits(voltage=np.full(50, 5000.0), pulse_voltage=np.full(50, 1000.0), pulses=np.full(50, 200))
-        >>> control = ae.VoltageControl.of_hits(ions, seen=0.5)
+        >>> control = ae.evaporation.VoltageControl.of_hits(ions, seen=0.5)
         >>> control.rate, control.pulse_fraction
         (0.01, 0.2)
         """

@@ -32,16 +32,16 @@ class BackgroundRun:
         self.settings, self.output = settings, output
         self.ions, self.n_ions = 0, 0
         self.message = "building the specimen"
-        """What it does, or why it ended."""
+        """State of the run, or why it ended."""
         self.active = True
         self.finished = False
         """Whether the file has all ions."""
         self._first: tuple[float, int] | None = None
-        self._pipe, theirs = multiprocessing.Pipe()
+        self._pipe, pipe = multiprocessing.Pipe()
         context: Any = multiprocessing.get_context("spawn")
-        self._process = context.Process(target=_simulate, args=(settings, output, theirs))
+        self._process = context.Process(target=_simulate, args=(settings, output, pipe))
         self._process.start()
-        theirs.close()  # the pipe then ends with the process
+        pipe.close()  # the pipe then ends with the process
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
         atexit.register(self.stop, wait=True)
@@ -67,13 +67,13 @@ class BackgroundRun:
         ended = "the process of the run was killed; start it again to continue"
         while True:
             try:
-                news = self._pipe.recv()
+                received = self._pipe.recv()
             except (EOFError, OSError):
                 break
-            if isinstance(news, str):
-                ended, self.finished = news, not news
+            if isinstance(received, str):
+                ended, self.finished = received, not received
                 continue
-            self.ions, self.n_ions = news
+            self.ions, self.n_ions = received
             if self._first is None:
                 self._first = time.monotonic(), self.ions
             if self.message != "stopping":

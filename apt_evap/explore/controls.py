@@ -38,7 +38,7 @@ class Control:
 
 
 CONTROLS = (
-    # the grid of the paper ends at 0.3725 eV; for the README's tip in real units that is 0.87 eV
+    # the grid of Shaikh et al. (2025) ends at 0.3725 eV; for the README's tip in real units that is 0.87 eV
     Control("mean", "mean energy [eV]", 0.0, 1.0, 0.005, 0.155),
     Control("relative_spread", "standard deviation / mean", 0.0, 3.2, 0.05, 1.0),
     Control("rollup_fraction", "roll-up fraction of the energy", 0.0, 1.0, 0.05, 0.5),
@@ -75,10 +75,12 @@ def controls_of(mechanism: str) -> tuple[Control, ...]:
         If the mechanism is unknown.
     """
     kind: Any = MECHANISMS[check_choice(mechanism, "mechanism", MECHANISMS)]
-    names = {each.name for each in fields(kind)}
+    names = {field.name for field in fields(kind)}
     if mechanism == "combined":
         names.discard(_OTHERS)  # they have the random part of the energy
-    return tuple(each for each in CONTROLS if each.name in names or (each.name in ENERGY and "energy" in names))
+    return tuple(
+        control for control in CONTROLS if control.name in names or (control.name in ENERGY and "energy" in names)
+    )
 
 
 def perturbation_of(mechanism: str, values: Mapping[str, float]) -> Perturbation:
@@ -102,7 +104,7 @@ def perturbation_of(mechanism: str, values: Mapping[str, float]) -> Perturbation
     ValueError
         If the mechanism is unknown, or a value is missing or outside its range.
     """
-    names = [each.name for each in controls_of(mechanism)]
+    names = [control.name for control in controls_of(mechanism)]
     for name in names:
         if name not in values:
             raise ValueError(f"values must contain {name!r} for the mechanism {mechanism!r}, got {short_text(values)}")
@@ -143,17 +145,17 @@ def values_of(perturbation: Perturbation) -> tuple[str, dict[str, float]]:
         raise ValueError(f"the explorer has controls for {names}, got {short_text(perturbation)}")
     mechanism = kinds[type(perturbation)]
     values = {}
-    for each in controls_of(mechanism):
-        if each.name in ENERGY:
+    for control in controls_of(mechanism):
+        if control.name in ENERGY:
             energy: Any = getattr(perturbation, "energy")  # noqa: B009  # a perturbation need not have one
             values |= dict(zip(ENERGY, _mean_and_relative_spread(energy), strict=True))
-        elif each.name == _OTHERS:
+        elif control.name == _OTHERS:
             values[_OTHERS] = _of_others(getattr(perturbation, _OTHERS), values)
         else:
-            value = getattr(perturbation, each.name)
+            value = getattr(perturbation, control.name)
             if not isinstance(value, float):
-                raise ValueError(f"the explorer has controls for a number as {each.name}, got {short_text(value)}")
-            values[each.name] = value
+                raise ValueError(f"the explorer has controls for a number as {control.name}, got {short_text(value)}")
+            values[control.name] = value
     kind: Any = type(perturbation)
     for option in fields(kind):
         value = getattr(perturbation, option.name)

@@ -35,16 +35,16 @@ from apt_evap.simulation.run import Run
 from apt_evap.warnings import AptWarning
 
 PREVIEW = 50_000
-"""Ions of a preview. Measured: 22 ms for a view with this many, `RollUp`, 256 bins and one thread of an Intel Xeon."""
+"""Ions of a preview. Measured: 22 ms for maps of this many, `RollUp`, 256 bins and one thread of an Intel Xeon."""
 REGION = RollUp(TruncatedNormal(0.155, 0.155))
-"""Second perturbation, beside none, whose map limits the common region: the energies of the paper for nickel."""
+"""Second perturbation, beside none, whose map limits the common region: energies of Shaikh et al. (2025) for nickel."""
 _PERTURBATIONS = 2  # whose positions are kept: one may be that of a preview
 _NEAR = 15.0  # degrees: a pole farther from the axis of the specimen is not that of its apex
 
 
 @dataclass(frozen=True)
-class View:
-    """What a map of the explorer shows.
+class ExplorerSettings:
+    """Settings of the maps of the explorer.
 
     Parameters
     ----------
@@ -82,13 +82,13 @@ class View:
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
-    """Maps of a view of the explorer.
+class ExplorerMaps:
+    """Maps of the explorer, and the numbers that compare them.
 
     Parameters
     ----------
-    view : View
-        The view.
+    settings : ExplorerSettings
+        Settings of the maps.
     simulated : DetectorMap or None
         Counts of the simulated ions, in the measured frame if there is a measured map; None without a run.
     measured : DetectorMap or None
@@ -104,14 +104,14 @@ class Shown:
     ions : int
         Number of simulated ions, including those outside the map.
     preview : bool
-        Whether these are only a part of the ions of the view.
+        Whether these are only a part of the ions of the settings.
     seconds : float
         Duration of the computation [s].
     notes : tuple of str
         Texts of the warnings.
     """
 
-    view: View
+    settings: ExplorerSettings
     simulated: DetectorMap | None
     measured: DetectorMap | None
     pictures: tuple[DetectorMap, ...]
@@ -122,6 +122,17 @@ class Shown:
     preview: bool
     seconds: float
     notes: tuple[str, ...]
+
+    @property
+    def width(self) -> float:
+        """Longer side of the maps [mm]."""
+        left, right, lower, upper = self.pictures[0].extent
+        return max(right - left, upper - lower)
+
+    @property
+    def bin_size(self) -> float:
+        """Longer side of a bin [mm]."""
+        return max(self.pictures[0].bin_size)
 
 
 class Pole(NamedTuple):
@@ -185,8 +196,8 @@ class Explorer:
     ) -> None:
         if run is None and measured is None:
             raise ValueError("the explorer needs a run, measured ions or a measured map, got none")
-        if run is not None and check_kind(run, "run", Run, "a Run").responses is None:
-            raise ValueError(f"the explorer needs a run with responses, got {run!r}")
+        if run is not None:
+            check_kind(run, "run", Run, "a Run").require_responses()
         if registration is not None:
             check_kind(registration, "registration", Registration, "a Registration")
             if measured is None or run is None:
@@ -205,49 +216,56 @@ class Explorer:
         self.registered = registration is not None
         """Whether the registration was found or given, not only set to show both maps in the same size."""
         self.registration = registration
-        self.near: dict[str, Any] = {}
+        self.registration_options: dict[str, Any] = {}
         """Options of `register` that say where the run is on the measurement."""
         if run is not None and measured is not None and registration is None:
             self.registration = self._same_size()
 
     @property
+    def is_comparison(self) -> bool:
+        """Whether there are a run and a measurement."""
+        return self.run is not None and self.measured is not None
+
+    @property
     def names(self) -> tuple[str, str]:
         """Files of the run and of the measurement, empty without one."""
-        first, second = (each[0] if each else "" for each in (self._run_arguments, self._measured_arguments))
+        first, second = (names[0] if names else "" for names in (self._run_arguments, self._measured_arguments))
         return first, second
 
     # ---- maps ------------------------------------------------------------------------------------------------------
 
     @property
-    def start(self) -> View:
-        """View at the start: roll-up with the energies of the paper for nickel, smoothed by one bin."""
+    def start(self) -> ExplorerSettings:
+        """Settings at the start: roll-up with the energies of Shaikh et al. (2025) for nickel, smoothed by one bin."""
         perturbation = perturbation_of("roll-up", _starting_values("roll-up"))
         if isinstance(self.measured, DetectorMap):
             bins = max(self.measured.values.shape)
         else:
             bins = bins_for(len(self.run)) if self.measured is None else BINS
-        return View(perturbation, bins, self.smoothing_for(bins))
+        return ExplorerSettings(perturbation, bins, self.smoothing_for(bins))
 
     def _same_size(self):
         """Registration by the size of both fields of view alone."""
         hits, target = self._preview_run.hits(Unperturbed()), measured_map(self.measured)
         x, y = np.meshgrid(*target.centres)
         fields = [(hits.x[hits.detected], hits.y[hits.detected]), (x[target.mask], y[target.mask])]
-        boxes = [np.percentile(each, [1, 99], axis=1) for each in fields]
-        own, other = (float(np.ptp(each, axis=0).max()) for each in boxes)
-        shift = boxes[1].mean(axis=0) - other / own * boxes[0].mean(axis=0)
-        return Registration(0.0, other / own, tuple(shift.tolist()))
+        boxes = [np.percentile(field, [1, 99], axis=1) for field in fields]
+        simulated, measured = (float(np.ptp(box, axis=0).max()) for box in boxes)
+        shift = boxes[1].mean(axis=0) - measured / simulated * boxes[0].mean(axis=0)
+        return Registration(0.0, measured / simulated, tuple(shift.tolist()))
 
     def smoothing_for(self, bins: int) -> float:
         """Smoothing by one bin, to two digits [mm]."""
         return float(f"{max(self.bins_like(bins).bin_size):.2g}")
 
     def controls(self, mechanism: str) -> tuple[Control, ...]:
-        """Controls of a mechanism that this run serves: sharpness and height need wide responses."""
-        settings, found = self.run.response_settings, controls_of(mechanism)
+        """Controls of a mechanism that this run permits: sharpness and height need wide responses."""
+        settings, controls = self.run.response_settings, controls_of(mechanism)
         if not settings.is_wide:
-            return tuple(each for each in found if each.name not in ("sharpness", "height"))
-        return tuple(replace(each, high=settings.height) if each.name == "height" else each for each in found)
+            return tuple(control for control in controls if control.name not in ("sharpness", "height"))
+        return tuple(
+            replace(control, high=settings.height) if control.name == "height" else control for control in controls
+        )
 
     @property
     def first_and_last(self) -> tuple[int, int]:
@@ -295,19 +313,19 @@ class Explorer:
         if perturbations is None:
             perturbations = [perturbation_of(name, _starting_values(name)) for name in MECHANISMS]
         best: Registration | None = None
-        found: Registration | None
+        registration: Registration | None
         failed = ValueError("perturbations must contain at least one perturbation, got none")
         progress = progress or (lambda done, number: None)
         progress(0, len(perturbations))
-        for done, each in enumerate(perturbations, 1):
-            arguments = self.run.hits(each), target, self.near
+        for done, perturbation in enumerate(perturbations, 1):
+            arguments = self.run.hits(perturbation), target, self.registration_options
             try:
-                found = _registration(*arguments) if apply is None else apply(_registration, arguments)
+                registration = _registration(*arguments) if apply is None else apply(_registration, arguments)
             except ValueError as error:  # such as a map that is too empty with this emission
-                found, failed = None, error
+                registration, failed = None, error
             progress(done, len(perturbations))
-            if found is not None and (best is None or found.score > best.score):
-                best = found
+            if registration is not None and (best is None or registration.score > best.score):
+                best = registration
                 self.set_registration(best)
         if best is None:
             raise failed
@@ -320,19 +338,19 @@ class Explorer:
         self.registered = True
         self._kept_places, self._kept_maps = [], {}
 
-    def show(self, view: View, preview: bool = False) -> Shown:
-        """Compute the maps of a view.
+    def show(self, settings: ExplorerSettings, preview: bool = False) -> ExplorerMaps:
+        """Compute maps.
 
         Parameters
         ----------
-        view : View
+        settings : ExplorerSettings
             Emission, bins, smoothing and ions.
         preview : bool
             Whether to use evenly spaced ions, at most the number of a preview. Their noise lowers the similarity.
 
         Returns
         -------
-        Shown
+        ExplorerMaps
 
         Raises
         ------
@@ -342,22 +360,22 @@ class Explorer:
         start = time.perf_counter()
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", AptWarning)
-            like = self.bins_like(view.bins)
+            like = self.bins_like(settings.bins)
             simulated = whole = alike = ceiling = None
             pictures: tuple[DetectorMap, ...] = ()
             if self.run is not None:
-                hits = self.hits(view, preview)
+                hits = self.hits(settings, preview)
                 simulated = hits.map(like=like, position_step=None)
-                flat = simulated.flattened(view.flattening)
-                pictures = (flat.smoothed(view.smoothing),)
+                flat = simulated.flattened(settings.flattening)
+                pictures = (flat.smoothed(settings.smoothing),)
             if self.measured is not None:
-                measured, picture, whole = self._measured_pictures(view)
+                measured, picture, whole = self._measured_pictures(settings)
                 pictures += (picture,)
                 if self.registered and _has_window(like):
-                    alike = similarity(flat, measured, smoothing=view.smoothing)
-                    ceiling = self._ceiling(view)
-        return Shown(
-            view=view,
+                    alike = similarity(flat, measured, smoothing=settings.smoothing)
+                    ceiling = self._ceiling(settings)
+        return ExplorerMaps(
+            settings=settings,
             simulated=simulated,
             measured=None if self.measured is None else like,
             pictures=pictures,
@@ -367,16 +385,16 @@ class Explorer:
             ions=0 if self.run is None else len(hits),
             preview=preview and self._preview_run is not self.run,
             seconds=time.perf_counter() - start,
-            notes=tuple(str(each.message) for each in caught if issubclass(each.category, AptWarning)),
+            notes=tuple(str(warning.message) for warning in caught if issubclass(warning.category, AptWarning)),
         )
 
-    def hits(self, view: View, preview: bool = False) -> Hits:
-        """Simulated ions of a view, in the measured frame if there is a measurement.
+    def hits(self, settings: ExplorerSettings, preview: bool = False) -> Hits:
+        """Simulated ions of the maps, in the measured frame if there is a measurement.
 
         Parameters
         ----------
-        view : View
-            The view.
+        settings : ExplorerSettings
+            Settings of the maps.
         preview : bool
             As for `show`.
 
@@ -387,18 +405,18 @@ class Explorer:
         """
         run: Any = self._preview_run if preview else self.run
         registration = self.registration  # may be set by another thread
-        key = view.perturbation, run is self.run, registration
+        key = settings.perturbation, run is self.run, registration
         places = next((hits for kept_key, hits in self._kept_places if kept_key == key), None)
         if places is None:
-            x, y, outcome = run.places(view.perturbation)
+            x, y, outcome = run.places(settings.perturbation)
             if registration is not None:
                 x, y = registration.points(x, y)
             places = Hits(x=x, y=y, ion=run.emissions.ions, outcome=outcome, source="simulation")
             self._kept_places = [*self._kept_places, (key, places)][-_PERTURBATIONS:]
-        return places if view.ions is None else places[slice(*np.searchsorted(run.emissions.ions, view.ions))]
+        return places if settings.ions is None else places[slice(*np.searchsorted(run.emissions.ions, settings.ions))]
 
     def bins_like(self, bins: int) -> DetectorMap:
-        """Map whose bins and mask all maps of a view have.
+        """Map whose bins and mask all maps with this number of bins have.
 
         Parameters
         ----------
@@ -446,24 +464,24 @@ class Explorer:
         ions = int(measured.values[mask].sum()) if measured.is_counts else None
         return replace(measured, mask=mask, ions=ions, detected=None)
 
-    def _measured_pictures(self, view):
-        """The measured map flattened, also smoothed, and this of the complete one; kept until a view changes them."""
-        key = view.bins, view.flattening, view.smoothing, self.registration
+    def _measured_pictures(self, settings):
+        """The measured map flattened, also smoothed, and this of the complete one; kept until settings change them."""
+        key = settings.bins, settings.flattening, settings.smoothing, self.registration
         if self._kept_picture[0] != key:
-            flat = self.bins_like(view.bins).flattened(view.flattening)
-            picture = whole = flat.smoothed(view.smoothing)
+            flat = self.bins_like(settings.bins).flattened(settings.flattening)
+            picture = whole = flat.smoothed(settings.smoothing)
             if self.run is not None:
-                whole = self._complete(view.bins).flattened(view.flattening).smoothed(view.smoothing)
+                whole = self._complete(settings.bins).flattened(settings.flattening).smoothed(settings.smoothing)
             self._kept_picture = key, (flat, picture, whole)
         return self._kept_picture[1]
 
-    def _ceiling(self, view):
-        like = self.bins_like(view.bins)
-        if not like.is_counts or view.flattening:
+    def _ceiling(self, settings):
+        like = self.bins_like(settings.bins)
+        if not like.is_counts or settings.flattening:
             return None
-        key = "ceiling", view.bins, view.smoothing, self.registration
+        key = "ceiling", settings.bins, settings.smoothing, self.registration
         if key not in self._kept_maps:
-            self._kept_maps[key] = similarity_ceiling(like, smoothing=view.smoothing)
+            self._kept_maps[key] = similarity_ceiling(like, smoothing=settings.smoothing)
         return self._kept_maps[key]
 
     # ---- what is on a map ------------------------------------------------------------------------------------------
@@ -501,12 +519,12 @@ class Explorer:
             x, y = self.registration.points(x, y)
         return Pole(text, (float(x), float(y)), fold)
 
-    def rings(self, shown: Shown) -> tuple[tuple[Ring, ...], ...]:
+    def rings(self, maps: ExplorerMaps) -> tuple[tuple[Ring, ...], ...]:
         """Statistics of rings about the pole, of the simulated and of the measured map.
 
         Parameters
         ----------
-        shown : Shown
+        maps : ExplorerMaps
             Maps, neither flattened nor smoothed for this.
 
         Returns
@@ -526,28 +544,28 @@ class Explorer:
         pole = self.pole
         scale = 1.0 if self.registration is None else self.registration.scale
         projection = Projection(self._projection.scale * scale, pole.place, compression=self._projection.compression)
-        return tuple(ring_statistics(each, projection, fold=pole.fold) for each in _maps(shown))
+        return tuple(ring_statistics(counts, projection, fold=pole.fold) for counts in _present(maps))
 
-    def likeness(self, shown: Shown) -> Likeness:
+    def likeness(self, maps: ExplorerMaps) -> Likeness:
         """Whether both maps show the same crystal along the same axis, see `likeness`, and lie on each other."""
-        assert shown.simulated is not None and shown.measured is not None and self.registration is not None
-        arguments = shown.simulated, shown.measured, self.registration
+        assert maps.simulated is not None and maps.measured is not None and self.registration is not None
+        arguments = maps.simulated, maps.measured, self.registration
         try:
             projection = self._projection
         except ValueError:  # too few ions
             projection = None
         orientation = Orientation.known(self.run.settings["tip"])
-        found = likeness(*arguments, about=symmetric_places(orientation, projection))
-        if found.verdict == "alike" and (why := misplaced(*arguments)):
-            return found._replace(verdict="doubtful", reason=f"{found.reason}, but {why}: check the registration")
-        return found
+        result = likeness(*arguments, about=symmetric_places(orientation, projection))
+        if result.verdict == "alike" and (why := misplaced(*arguments)):
+            return result._replace(verdict="doubtful", reason=f"{result.reason}, but {why}: check the registration")
+        return result
 
-    def profiles(self, shown: Shown, ends: Any, width: float) -> tuple[Rectangle, tuple[Profile, ...]]:
+    def profiles(self, maps: ExplorerMaps, ends: Any, width: float) -> tuple[Rectangle, tuple[Profile, ...]]:
         """Profiles across a line on the maps.
 
         Parameters
         ----------
-        shown : Shown
+        maps : ExplorerMaps
             The maps; counts and densities as they are, not smoothed.
         ends : array_like
             Ends of the line [mm], shape (2, 2).
@@ -569,37 +587,36 @@ class Explorer:
         (x0, y0), (x1, y1) = check_array(ends, "ends", (2, 2)).tolist()
         length = math.hypot(x1 - x0, y1 - y0)
         rectangle = Rectangle(((x0 + x1) / 2, (y0 + y1) / 2), math.degrees(math.atan2(y1 - y0, x1 - x0)), length, width)
-        maps = _maps(shown)
-        bins = max(2, int(width / max(maps[0].bin_size)))
-        return rectangle, tuple(zone_line_profile(each, rectangle, bins=bins) for each in maps)
+        bins = max(2, int(width / maps.bin_size))
+        return rectangle, tuple(zone_line_profile(counts, rectangle, bins=bins) for counts in _present(maps))
 
-    def atoms_at(self, view: View, x: float, y: float, radius: float) -> Hits:
+    def atoms_at(self, settings: ExplorerSettings, x: float, y: float, radius: float) -> Hits:
         """Atoms of the specimen whose ions land within a circle on the map.
 
         Parameters
         ----------
-        view : View
+        settings : ExplorerSettings
             Emission and ions.
         x, y : float
             Centre of the circle [mm].
         radius : float
-            Its radius [mm].
+            Radius of the circle [mm].
 
         Returns
         -------
         Hits
-            Their places on the map, `positions` in the specimen [nm], `site`, `ion`, and in `extra` the charge [e] and
+            Places on the map, `positions` in the specimen [nm], `site`, `ion`, and in `extra` the charge [e] and
             field [V/nm] at the simulated voltage.
         """
-        hits = self.hits(view)
+        hits = self.hits(settings)
         centre = check_array((x, y), "x and y", (2,))
         radius = check_number(radius, "radius", above=0, unit="mm")
-        near = hits.detected & (np.hypot(hits.x - centre[0], hits.y - centre[1]) <= radius)
-        rows = np.searchsorted(self.run.emissions.ions, hits.ion[near])  # type: ignore[index]
+        inside = hits.detected & (np.hypot(hits.x - centre[0], hits.y - centre[1]) <= radius)
+        rows = np.searchsorted(self.run.emissions.ions, hits.ion[inside])  # type: ignore[index]
         return Hits(
-            x=hits.x[near],  # type: ignore[index]
-            y=hits.y[near],  # type: ignore[index]
-            ion=hits.ion[near],  # type: ignore[index]
+            x=hits.x[inside],  # type: ignore[index]
+            y=hits.y[inside],  # type: ignore[index]
+            ion=hits.ion[inside],  # type: ignore[index]
             site=self.run.site[rows],
             positions=self.run.emissions.positions[rows],
             extra={"charge": self.run.charges[rows], "field": self.run.fields[rows]},
@@ -609,13 +626,13 @@ class Explorer:
 
     # ---- text ------------------------------------------------------------------------------------------------------
 
-    def commands(self, view: View) -> Commands:
+    def commands(self, settings: ExplorerSettings) -> Commands:
         """Command line and Python lines that give the same maps.
 
         Parameters
         ----------
-        view : View
-            The view.
+        settings : ExplorerSettings
+            Settings of the maps.
 
         Returns
         -------
@@ -623,23 +640,23 @@ class Explorer:
         """
         # a picture of `map` is neither registered nor flattened
         one = self.measured is None or self.run is None
-        command = "map" if one and not view.flattening else "explore"
+        command = "map" if one and not settings.flattening else "explore"
         # options of the run follow both files
         shell = ["apt-evap", command, *self._run_arguments[:1], *self._measured_arguments, *self._run_arguments[1:]]
-        shell += self._shell_options(view, command)
-        if view.flattening:
-            shell += ["--flatten", repr(view.flattening)]
+        shell += self._shell_options(settings, command)
+        if settings.flattening:
+            shell += ["--flatten", repr(settings.flattening)]
         if self.registered and self.registration is not None:
             shell += [f"--registration={self.registration.to_text()}"]
-        return Commands(shlex.join(shell), "\n".join([*self._python_hits(view), *self._python_maps(view)]))
+        return Commands(shlex.join(shell), "\n".join([*self._python_hits(settings), *self._python_maps(settings)]))
 
-    def selection(self, view: View, x: tuple[float, float], y: tuple[float, float]) -> Commands:
+    def selection(self, settings: ExplorerSettings, x: tuple[float, float], y: tuple[float, float]) -> Commands:
         """Command line and Python lines that select the ions within a rectangle on the map.
 
         Parameters
         ----------
-        view : View
-            The view.
+        settings : ExplorerSettings
+            Settings of the maps.
         x, y : tuple of float
             Bounds of the rectangle [mm].
 
@@ -652,40 +669,40 @@ class Explorer:
         bounds = tuple(float(f"{value:.6g}") for value in (*sorted(x), *sorted(y)))
         box = f"--box={','.join(map(repr, bounds))}"
         window = f".window(x=({bounds[0]!r}, {bounds[1]!r}), y=({bounds[2]!r}, {bounds[3]!r}))"
-        python = [*self._python_hits(view)]
+        python = [*self._python_hits(settings)]
         if self.run is not None:
             python[-1] += window
         shell = ""
         if self.measured is None:
-            shell = shlex.join(["apt-evap", "map", *self._run_arguments, *self._shell_options(view, "map"), box])
+            shell = shlex.join(["apt-evap", "map", *self._run_arguments, *self._shell_options(settings, "map"), box])
         elif isinstance(self.measured, Hits):
             shell = shlex.join(["apt-evap", "map", *self._measured_arguments, box])
             python.append(f"measured = {self.measured_code}{window}")
         return Commands(shell, "\n".join(python))
 
-    def _shell_options(self, view, command):
-        options = [] if self.run is None else ["--perturbation", write_perturbation(view.perturbation)]
-        options += ["--bins", str(view.bins), "--smooth", repr(view.smoothing)]
-        if view.ions is not None:
+    def _shell_options(self, settings, command):
+        options = [] if self.run is None else ["--perturbation", write_perturbation(settings.perturbation)]
+        options += ["--bins", str(settings.bins), "--smooth", repr(settings.smoothing)]
+        if settings.ions is not None:
             # --ions of `explore` selects measured ions
-            options += ["--ions" if command == "map" else "--simulated", "{},{}".format(*view.ions)]
+            options += ["--ions" if command == "map" else "--simulated", "{},{}".format(*settings.ions)]
         return options
 
-    def _python_hits(self, view):
+    def _python_hits(self, settings):
         if self.run is None:
             return ["import apt_evap as ae", ""]
         lines = ["import apt_evap as ae", "", f"run = {self.run_code}"]
-        hits = f"run.hits({to_python(view.perturbation)})"
+        hits = f"run.hits({to_python(settings.perturbation)})"
         if self.registration is not None:
             r = self.registration
             lines.append(f"registration = ae.Registration({r.rotation!r}, {r.scale!r}, {r.shift!r}, {r.mirror!r})")
             hits = f"registration.hits({hits})"
-        window = "" if view.ions is None else f".window(ion={view.ions!r})"
+        window = "" if settings.ions is None else f".window(ion={settings.ions!r})"
         return [*lines, f"hits = {hits}{window}"]
 
-    def _python_maps(self, view):
+    def _python_maps(self, settings):
         if self.measured is None:
-            lines = [f"simulated = hits.map(like=run.grid({view.bins}), position_step=None)"]
+            lines = [f"simulated = hits.map(like=run.grid({settings.bins}), position_step=None)"]
             names = ["simulated"]
         else:
             arguments = (
@@ -693,27 +710,27 @@ class Explorer:
             )
             lines = [
                 "from apt_evap.explore.explorer import Explorer",
-                f"measured = Explorer({arguments}).bins_like({view.bins})",
+                f"measured = Explorer({arguments}).bins_like({settings.bins})",
             ]
             names = ["measured"]
             if self.run is not None:
                 lines.append("simulated = hits.map(like=measured, position_step=None)")
                 names = ["simulated", "measured"]
-        flat = f".flattened({view.flattening!r})" if view.flattening else ""
+        flat = f".flattened({settings.flattening!r})" if settings.flattening else ""
         if len(names) > 1:
-            lines.append(f"print(ae.similarity(simulated{flat}, measured{flat}, smoothing={view.smoothing!r}))")
-        pictures = ", ".join(f"{name}{flat}.smoothed({view.smoothing!r})" for name in names)
+            lines.append(f"print(ae.similarity(simulated{flat}, measured{flat}, smoothing={settings.smoothing!r}))")
+        pictures = ", ".join(f"{name}{flat}.smoothed({settings.smoothing!r})" for name in names)
         return [*lines, f"ae.plot.detector_maps([{pictures}])[0].figure.savefig('maps.png')"]
 
 
-def _registration(simulated, measured, near):
+def _registration(simulated, measured, options):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AptWarning)  # given once, for the best one
-        return register(simulated, measured, **near)
+        return register(simulated, measured, **options)
 
 
-def _maps(shown):
-    return [each for each in (shown.simulated, shown.measured) if each is not None]
+def _present(maps):
+    return [counts for counts in (maps.simulated, maps.measured) if counts is not None]
 
 
 def _has_window(like):
@@ -722,4 +739,4 @@ def _has_window(like):
 
 
 def _starting_values(mechanism):
-    return {each.name: each.value for each in controls_of(mechanism)}
+    return {control.name: control.value for control in controls_of(mechanism)}

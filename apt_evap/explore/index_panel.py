@@ -2,7 +2,7 @@
 
 import cmath
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -25,12 +25,13 @@ from apt_evap._common.codec import to_python
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.projection import Projection
-from apt_evap.explore.latest import Latest
 from apt_evap.explore.marks import Marks, overlay
+from apt_evap.explore.mouse_tools import MouseTool
+from apt_evap.explore.newest_task import NewestTaskRunner
 from apt_evap.explore.search_process import SearchProcess, guarded, start_thread
 from apt_evap.explore.widgets import LEFT
 from apt_evap.fit.fit_energies import measured_map
-from apt_evap.fit.start_settings import Start, settings_of
+from apt_evap.fit.start_settings import StartSettings, settings_of
 from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.indexing.index_map import Indexing, index
 from apt_evap.specimen.materials import MATERIALS
@@ -48,11 +49,11 @@ y[1] += y[0] - lasty
 x.last = [x[0], y[0]]
 const square = (hx - cx) ** 2 + (hy - cy) ** 2, dx = x[1] - x[0], dy = y[1] - y[0]
 const c = (dx * (hx - cx) + dy * (hy - cy)) / square, s = (dy * (hx - cx) - dx * (hy - cy)) / square
-for (const each of [lines, poles]) {
-  const {x0, y0} = each.data
-  each.data.x = x0.map((_, k) => x[0] + c * (x0[k] - cx) - s * (y0[k] - cy))
-  each.data.y = x0.map((_, k) => y[0] + s * (x0[k] - cx) + c * (y0[k] - cy))
-  each.change.emit()
+for (const source of [lines, poles]) {
+  const {x0, y0} = source.data
+  source.data.x = x0.map((_, k) => x[0] + c * (x0[k] - cx) - s * (y0[k] - cy))
+  source.data.y = x0.map((_, k) => y[0] + s * (x0[k] - cx) + c * (y0[k] - cy))
+  source.change.emit()
 }
 """
 
@@ -62,8 +63,8 @@ class IndexPanel:
 
     Parameters
     ----------
-    fig : bokeh.plotting.figure
-        The measured map.
+    figures : sequence of bokeh.plotting.figure
+        The maps; the measured one is the last.
     measured : callable
         Returns the measured ions or map.
     material : str
@@ -76,20 +77,30 @@ class IndexPanel:
 
     def __init__(
         self,
-        fig: Any,
+        figures: Sequence[Any],
         measured: Callable[[], Hits | DetectorMap],
         material: str,
         later: Callable[[Callable[[], None], int], Any],
         put_code: Callable[[str], None],
     ) -> None:
         self._measured, self._later, self._put_code = measured, later, put_code
-        self.latest = Latest(lambda wish: wish())  # wishes tell their errors
+        self._tasks = NewestTaskRunner()
         self.candidates: list[tuple[Orientation, Projection, str]] = []
-        self._found: Indexing | None = None  # of the search that gave the candidates
-        self._asked: Any = None  # the fit or search whose candidates are to be shown, unless others come first
+        self._indexing: Indexing | None = None  # of the search that gave the candidates
+        self._awaited: Any = None  # the fit or search whose candidates will be shown, unless others come first
         self._make_widgets(material)
-        self._make_drawings(fig)
+        self._make_drawings(figures[-1])
+        number = len(figures) - 1
+        drags = [None] * number + [self.tool]
+        self.tools = {
+            name: MouseTool(drags, partial(self._clicked, number, name == "zone line"))
+            for name in ("pole", "zone line")
+        }
         self._material_changed()
+
+    def close(self) -> None:
+        """End the fits."""
+        self._tasks.close()
 
     def _make_widgets(self, material):
         half = (LEFT - 20) // 2
@@ -110,8 +121,8 @@ class IndexPanel:
         self.choice = Select(title="candidates", options=[], width=LEFT - 10, visible=False)
         self.text = Div(text=HINT, width=LEFT - 10, styles={"color": "var(--faint)"})
         self.material.on_change("value", lambda attr, old, new: self._material_changed())
-        for each in (self.scale, *self.centre):
-            each.on_change("value", lambda attr, old, new: self.fit())
+        for field in (self.scale, *self.centre):
+            field.on_change("value", lambda attr, old, new: self.fit())
         self.options.on_change("active", lambda attr, old, new: self.fit())
         self.choice.on_change("value", lambda attr, old, new: self._show_candidate())
         self.undo.on_click(self._undo)
@@ -179,6 +190,10 @@ class IndexPanel:
         new = {"x": x, "y": y, "family": self.family.value, "line": self._line if of_line else 0}
         self.marks.data = {name: [*values, new[name]] for name, values in self.marks.data.items()}
 
+    def _clicked(self, number, of_line, figure, x, y):
+        if figure == number:
+            self.add(x, y, of_line)
+
     def _undo(self):
         self.marks.data = {name: list(values)[:-1] for name, values in self.marks.data.items()}
 
@@ -217,11 +232,11 @@ class IndexPanel:
             return
         options = {
             "scale": self.scale.value,
-            "centre": tuple(each.value or 0.0 for each in self.centre),
+            "centre": tuple(field.value or 0.0 for field in self.centre),
             "mirror": bool(self.options.active),
         }
-        self._asked = wish = marks, options
-        self.latest.ask(guarded(partial(self._fit, wish), partial(self._later_put, wish, [])))
+        self._awaited = inputs = marks, options
+        self._tasks.submit(guarded(partial(self._fit, inputs), partial(self._later_put, inputs, [])))
 
     def _search(self, button, start=None):
         """Search over all orientations by `index`, or refine one, in another process; marks narrow it."""
@@ -236,75 +251,75 @@ class IndexPanel:
             options["scales"] = (0.95 * self.scale.value, 1.05 * self.scale.value)
         arguments = self._measured(), self.material.value
         label = button.label
-        for each in (self.search, self.refine):
-            each.disabled = True
+        for search_button in (self.search, self.refine):
+            search_button.disabled = True
         button.label = "searching" if start is None else "fitting"
 
-        self._asked = wish = arguments, options
+        self._awaited = inputs = arguments, options
 
-        def put(found, text):
-            for each in (self.search, self.refine):
-                each.disabled = False
+        def put(indexing, text):
+            for search_button in (self.search, self.refine):
+                search_button.disabled = False
             button.label = label
-            if self._asked is wish:  # no mark, fit or handle has changed
-                self._put_searched(found, text)
+            if self._awaited is inputs:  # no mark, fit or handle has changed
+                self._put_searched(indexing, text)
 
         def work():
             with SearchProcess() as process:
-                found = process.call(index, arguments, options)
-            self._later(partial(put, found, f"{found.verdict}: {found.reason}"), 0)
+                indexing = process.call(index, arguments, options)
+            self._later(partial(put, indexing, f"{indexing.verdict}: {indexing.reason}"), 0)
 
         start_thread(work, lambda sentence: self._later(partial(put, None, sentence), 0))
 
-    def _put_searched(self, found, text):
-        rows = [] if found is None else [
-            (each.orientation, each.projection, f"{each.confidence:.0%}, score {each.score:.2f}")
-            for each in found.candidates
+    def _put_searched(self, indexing, text):
+        rows = [] if indexing is None else [
+            (candidate.orientation, candidate.projection, f"{candidate.confidence:.0%}, score {candidate.score:.2f}")
+            for candidate in indexing.candidates
         ]  # fmt: skip
-        self._put(rows, text, found)
+        self._put(rows, text, indexing)
 
-    def settings(self, minutes: float, threads: int) -> Start:
+    def settings(self, minutes: float, threads: int) -> StartSettings:
         """Settings of a simulation of the chosen candidate, as ``apt-evap start`` makes them; in any thread."""
         if not self.candidates:
             raise ValueError("index the map first: click poles, or search")
         number, measured = int(self.choice.value or 0), self._measured()
-        found = self._found
-        if found is None:  # poles that were clicked
-            found = index(measured, self.candidates[number][0].material, start=self.candidates[number][:2])
+        indexing = self._indexing
+        if indexing is None:  # poles that were clicked
+            indexing = index(measured, self.candidates[number][0].material, start=self.candidates[number][:2])
         elif number:
-            first = found.candidates[number]
-            others = tuple(each for each in found.candidates if each is not first)
+            first = indexing.candidates[number]
+            others = tuple(candidate for candidate in indexing.candidates if candidate is not first)
             reason = "chosen by hand; another orientation explains the map better"
-            found = replace(found, candidates=(first, *others), decided=False, reason=reason)
+            indexing = replace(indexing, candidates=(first, *others), decided=False, reason=reason)
         hits = measured if isinstance(measured, Hits) else None
-        return settings_of(found, hits, minutes=minutes, threads=threads)
+        return settings_of(indexing, hits, minutes=minutes, threads=threads)
 
     def _missing(self, marks):
         if marks.poles and marks.lines:
             return "type a scale, or mark a second pole"
         return "mark a second pole, or points of a zone line through the first one" if marks.poles else HINT
 
-    def _fit(self, wish):
-        marks, options = wish
+    def _fit(self, inputs):
+        marks, options = inputs
         rows = [(fit.orientation, fit.projection, f"RMS {fit.rms:.2f} mm") for fit in marks.fits(**options)]
         exact = len(marks.poles) == 2 and not marks.lines and options["scale"] is None
-        self._later_put(wish, rows, "two poles fit exactly: a third one decides" if exact else "")
+        self._later_put(inputs, rows, "two poles fit exactly: a third one decides" if exact else "")
 
-    def _later_put(self, wish, rows, hint):
+    def _later_put(self, inputs, rows, hint):
         """Show the candidates of a fit, in the thread of the page."""
 
         def put():
-            if self._asked is wish:  # the marks are still these
+            if self._awaited is inputs:  # the marks are still these
                 self._put(rows, hint)
 
         self._later(put, 0)
 
-    def _put(self, candidates, text, found=None):
-        self.candidates, self._found, self._asked = candidates, found, None
+    def _put(self, candidates, text, indexing=None):
+        self.candidates, self._indexing, self._awaited = candidates, indexing, None
         self._hint = text
         options = []
         for number, (orientation, projection, quality) in enumerate(candidates):
-            axis = " ".join(f"{each:.2f}" for each in orientation.axis)
+            axis = " ".join(f"{component:.2f}" for component in orientation.axis)
             options.append((str(number), f"{number + 1}: [{axis}], {projection.scale:.1f} mm/rad, {quality}"))
         self.choice.update(options=options, visible=bool(options))
         self.refine.visible = bool(options)
@@ -315,18 +330,18 @@ class IndexPanel:
 
     def _show_candidate(self):
         if not self.candidates:
-            for each in (self.lines, self.poles, self.handles):
-                each.data = {name: [] for name in each.data}
+            for source in (self.lines, self.poles, self.handles):
+                source.data = {name: [] for name in source.data}
             self.text.text = self._hint
             return
         orientation, projection, quality = self.candidates[int(self.choice.value or 0)]
         drawn = overlay(orientation, projection, measured_map(self._measured()))
         gap = [[np.nan, np.nan]]
-        points = np.concatenate([each for line in drawn.lines for each in (line, gap)] or [gap])
+        points = np.concatenate([points for line in drawn.lines for points in (line, gap)] or [gap])
         self.lines.data = _twice(points)
         self.poles.data = _twice(drawn.places) | {"label": list(drawn.labels)}
         self._put_handles(projection)
-        axis = ", ".join(f"{each:.3f}" for each in orientation.axis)
+        axis = ", ".join(f"{component:.3f}" for component in orientation.axis)
         self.text.text = (
             f"<b>{quality}</b>, scale {projection.scale:.1f} mm/rad<br>axis [{axis}], rotation "
             f"{orientation.rotation:.2f}°<br>{self._hint}"
@@ -347,7 +362,7 @@ class IndexPanel:
 
     def _dragged(self):
         """Make the candidate that the handles show."""
-        places = [complex(*each) for each in zip(self.handles.data["x"], self.handles.data["y"], strict=True)]
+        places = [complex(*place) for place in zip(self.handles.data["x"], self.handles.data["y"], strict=True)]
         x, y, *end = self.handles.tags or (0.0, 0.0)
         if not self.candidates or places == [complex(x, y), complex(*end)]:
             return
@@ -364,7 +379,7 @@ class IndexPanel:
             replace(projection, scale=projection.scale * abs(ratio), centre=(places[0].real, places[0].imag)),
             MOVED,
         )
-        others = [each for k, each in enumerate(self.candidates) if k != number or quality != MOVED]
+        others = [candidate for k, candidate in enumerate(self.candidates) if k != number or quality != MOVED]
         self._put([moved, *others], "the fit starts from here")
 
 

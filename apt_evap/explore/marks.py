@@ -28,7 +28,7 @@ class Overlay(NamedTuple):
     places: Floats
     """Positions of the poles [mm], shape (n, 2)."""
     labels: tuple[str, ...]
-    """Their indices, with a minus before a negative one."""
+    """Indices of the poles, with a minus before a negative one."""
     lines: tuple[Floats, ...]
     """Points of each zone line [mm], shape (m, 2), NaN outside the map."""
 
@@ -89,22 +89,22 @@ class Marks:
         places = np.array([place for _, place in self.poles])
         if len(np.unique(np.concatenate([places, *self._points()]), axis=0)) < 2:
             raise ValueError("places of the marks must be different")
-        found: list[FittedOrientation] = []
+        fits: list[FittedOrientation] = []
         starts = sorted(self._starts(places, Projection(scale or 1.0, centre, mirror), scale is None))
         for *_, members, lines in starts[:_MOST]:
             pairs = [
                 (self._crystal.planes[member], points) for member, points in zip(lines, self._points(), strict=True)
             ]
             fit = fit_orientation(self.material, self._crystal.planes[list(members)], places, lines=pairs, **options)
-            if not any(_equal(fit, each, self._crystal) for each in found):
-                found.append(fit)
+            if not any(_equal(fit, other, self._crystal) for other in fits):
+                fits.append(fit)
         reach = float(np.linalg.norm(np.concatenate([places, *self._points()]) - centre, axis=1).max())
 
         def order(fit):
             angle = reach / fit.projection.scale
             return round(fit.rms, _DIGITS), not _LEAST <= angle <= _LARGEST, abs(math.log(angle / _LARGEST)), fit.rms
 
-        return sorted(found, key=order)[:_MOST]
+        return sorted(fits, key=order)[:_MOST]
 
     def _points(self):
         return [np.array(points) for _, points in self.lines]
@@ -122,12 +122,13 @@ class Marks:
         angles: list[float] = []
         for member in self._members[self.poles[1][0] if of_pole else self.lines[0][0]]:
             angle = math.acos(np.clip(normals[first] @ normals[member], -1, 1))
-            if not _SAME < angle < math.pi - _SAME or (simple and any(abs(angle - each) < _SAME for each in angles)):
+            if not _SAME < angle < math.pi - _SAME or (simple and any(abs(angle - other) < _SAME for other in angles)):
                 continue
             angles.append(angle)
             scales = [projection.scale]
             if free:  # distances per angle are smaller off the centre, in most directions
-                scales = [float(np.linalg.norm(places[1] - places[0])) / angle * each for each in (0.9, 1.0, 1.1, 1.2)]
+                scale = float(np.linalg.norm(places[1] - places[0])) / angle
+                scales = [factor * scale for factor in (0.9, 1.0, 1.1, 1.2)]
             tried = [self._matched(first, member, places, replace(projection, scale=scale)) for scale in scales]
             misfit, members, lines = min(tried)
             misfit = 0.0 if simple and free else round(misfit, _DIGITS)  # two poles fit exactly by some scale
@@ -142,10 +143,10 @@ class Marks:
         rotated = normals @ _frame(normals[first], normals[member]) @ _frame(directions[0], second).T
         members = [first]
         members += [
-            self._members[family][int((rotated[self._members[family]] @ each).argmax())]
-            for (family, _), each in zip(self.poles[1:], directions[1:], strict=True)
+            self._members[family][int((rotated[self._members[family]] @ direction).argmax())]
+            for (family, _), direction in zip(self.poles[1:], directions[1:], strict=True)
         ]
-        squares = [_square(rotated[k], each) for k, each in zip(members, directions, strict=True)]
+        squares = [_square(rotated[k], direction) for k, direction in zip(members, directions, strict=True)]
         lines = []
         for (family, _), points in zip(self.lines, self._points(), strict=True):
             across = np.cross(rotated[first], rotated[self._members[family]])
@@ -193,7 +194,7 @@ def overlay(orientation: Orientation, projection: Projection, like: DetectorMap,
         line = places_of(np.cos(_AZIMUTHS)[:, None] * first + np.sin(_AZIMUTHS)[:, None] * second)
         if np.isfinite(line).any():
             lines.append(line)
-    return Overlay(places[inside], tuple(plain(crystal.labels[each]) for each in inside), tuple(lines))
+    return Overlay(places[inside], tuple(plain(crystal.labels[k]) for k in inside), tuple(lines))
 
 
 def plain(label: str) -> str:
@@ -207,7 +208,7 @@ def _families(crystal: Poles) -> list[list[int]]:
     """Members of each family: its first member has the spacing and the sorted indices of all."""
     keys = [(round(spacing, 9), tuple(sorted(map(abs, plane)))) for spacing, plane in zip(
         crystal.spacings.tolist(), crystal.planes.tolist(), strict=True)]  # fmt: skip
-    return [[k for k, key in enumerate(keys) if key == each] for each in dict.fromkeys(keys)]
+    return [[k for k, key in enumerate(keys) if key == family] for family in dict.fromkeys(keys)]
 
 
 def _frame(first, second):

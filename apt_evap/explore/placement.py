@@ -34,14 +34,14 @@ def misplaced(simulated: DetectorMap, measured: DetectorMap, registration: Regis
     """
     common = simulated.mask & measured.mask
     try:
-        views = [View(replace(each, mask=common)) for each in (simulated, measured)]
+        views = [View(replace(counts, mask=common)) for counts in (simulated, measured)]
     except ValueError:  # no bin remains without the rim
         return ""
     diameter = views[1].diameter
     pixel = diameter / MEDIUM
     moving, fixed = (view.flatten(NARROW * pixel, BROAD * diameter) for view in views)
-    centre = complex(*(float(each) for each in registration.points(0.0, 0.0)))
-    x, y = (each[common] for each in np.meshgrid(*measured.centres))
+    centre = complex(*map(float, registration.points(0.0, 0.0)))
+    x, y = (coordinates[common] for coordinates in np.meshgrid(*measured.centres))
     step = max(1, round(pixel / max(measured.bin_size)) ** 2)
     points = (x + 1j * y)[::step]
     values, inside = fixed.sample(points)
@@ -49,14 +49,16 @@ def misplaced(simulated: DetectorMap, measured: DetectorMap, registration: Regis
 
     def score(angle, scale):
         turned = centre + (points - centre) * np.exp(-1j * np.radians(angle)) / scale
-        found, there = moving.sample(turned)
-        enough = there.mean() > _COMMON
-        return correlation(found[there], values[there]) * math.sqrt(there.mean()) if enough else -1.0
+        sampled, is_common = moving.sample(turned)
+        if is_common.mean() <= _COMMON:
+            return -1.0
+        return correlation(sampled[is_common], values[is_common]) * math.sqrt(is_common.mean())
 
-    here = score(0.0, 1.0)
+    registered = score(0.0, 1.0)
     best, angle, scale = max((score(angle, scale), angle, scale) for angle in _ANGLES for scale in _SCALES)
     patches = len(points) * step * math.prod(measured.bin_size) / (4 * math.pi * (NARROW * pixel) ** 2)
-    if best - here < 2 * math.sqrt(2 / patches) * (1 - best**2):
+    if best - registered < 2 * math.sqrt(2 / patches) * (1 - best**2):
         return ""
     angle = (angle + 180) % 360 - 180
-    return f"turned by {angle:.0f}° and scaled by {scale:g} they correlate better: {best:.2f} instead of {here:.2f}"
+    better = f"turned by {angle:.0f}° and scaled by {scale:g} they correlate better"
+    return f"{better}: {best:.2f} instead of {registered:.2f}"

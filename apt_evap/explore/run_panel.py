@@ -16,18 +16,19 @@ from apt_evap._common.validation import short_text
 from apt_evap.explore.background_run import BackgroundRun
 from apt_evap.explore.search_process import guarded, start_thread
 from apt_evap.explore.widgets import LEFT
-from apt_evap.fit.start_settings import Start
+from apt_evap.fit.start_settings import StartSettings
 
 INTERVAL = 500
-"""Time between two looks at the run [ms]."""
+"""Time between two updates of the state of the run [ms]."""
 
 
-class Workbench:
-    """What outlives a page that is loaded again: the run in the background, and where maps of runs are to be found."""
+class ServerState:
+    """State of all pages of a server, which outlives a page that is loaded again."""
 
     def __init__(self) -> None:
         self.run: BackgroundRun | None = None
-        self.near: dict[str, dict[str, Any]] = {}
+        """The run in the background."""
+        self.registration_options: dict[str, dict[str, Any]] = {}
         """Options of `register` for the files of runs."""
 
 
@@ -37,11 +38,11 @@ class RunPanel:
     Parameters
     ----------
     settings : callable
-        Returns the `Start` for minutes and threads; called in a thread.
+        Returns the `StartSettings` for minutes and threads; called in a thread.
     name : str
         Settings file that is proposed.
-    bench : Workbench
-        The run of all pages.
+    state : ServerState
+        Has the run of all pages.
     later : callable
         As for `Page`.
     put_code : callable
@@ -52,14 +53,14 @@ class RunPanel:
 
     def __init__(
         self,
-        settings: Callable[[float, int], Start],
+        settings: Callable[[float, int], StartSettings],
         name: str,
-        bench: Workbench,
+        state: ServerState,
         later: Callable[[Callable[[], None], int], Any],
         put_code: Callable[[str], None],
         open_run: Callable[[str], None] | None = None,
     ) -> None:
-        self._settings, self.bench, self._later = settings, bench, later
+        self._settings, self._state, self._later = settings, state, later
         self._put_code, self._open_run = put_code, open_run
         self._confirmed = ""  # the file whose replacement was asked for
         half = (LEFT - 20) // 2
@@ -68,16 +69,16 @@ class RunPanel:
         self.write = Button(label="write settings", width=half)
         self.start = Button(label="start the run", width=half)
         self.text = Div(width=LEFT - 10, text="from the chosen candidate; index the map first")
-        self.file.on_change("value", lambda attr, old, new: self._ask_nothing())
+        self.file.on_change("value", lambda attr, old, new: self._forget_confirmation())
         self.write.on_click(self._write)
         self.start.on_click(self._start_or_stop)
         self.column = column(row(self.file, self.minutes), row(self.write, self.start), self.text)
         self._closed = False
-        if bench.run is not None:
-            self._look()
+        if state.run is not None:
+            self._update()
 
     def close(self) -> None:
-        """Look at the run no more; it goes on."""
+        """Show the run no longer; it goes on."""
         self._closed = True
 
     @property
@@ -91,62 +92,62 @@ class RunPanel:
             raise ValueError(f"the settings file must have the name of a file, got {short_text(name)}") from error
         return check_path(path)
 
-    def _ask_nothing(self):
+    def _forget_confirmation(self):
         self._confirmed = ""
         self.write.label = "write settings"
 
-    def _say(self, text):
+    def _show(self, text):
         self.text.text = escape(text)
 
     def _write(self):
-        guarded(self._write_settings, self._say)()
+        guarded(self._write_settings, self._show)()
 
     def _write_settings(self):
         path = self.path
         if path.suffix.lower() != ".toml":
-            self._say(f"a settings file ends in .toml, got {short_text(self.file.value)}")
+            self._show(f"a settings file ends in .toml, got {short_text(self.file.value)}")
             return
         if path.exists() and self._confirmed != str(path):
             self._confirmed, self.write.label = str(path), f"replace {path.name}"
-            self._say(f"{path} exists: click again to replace it, or give another name")
+            self._show(f"{path} exists: click again to replace it, or give another name")
             return
-        self._ask_nothing()
+        self._forget_confirmation()
         self.write.disabled = True
-        self._say("making the settings")
+        self._show("making the settings")
         minutes = self.minutes.value or 10.0
 
         def work():
             made = self._settings(minutes, thread_count())
             made.save(path)
-            self._later(partial(self._written, f"wrote {path}: {made.foresight}", made, path), 0)
+            self._later(partial(self._written, f"wrote {path}: {made.cost}", made, path), 0)
 
         start_thread(work, lambda sentence: self._later(partial(self._written, sentence), 0))
 
     def _written(self, text, made=None, path=None):
         self.write.disabled = False
-        self._say(text)
+        self._show(text)
         if made is not None:
-            self.bench.near[str(path.with_suffix(".h5"))] = made.near
+            self._state.registration_options[str(path.with_suffix(".h5"))] = made.near
             self._put_code(made.text)
 
     def _start_or_stop(self):
-        guarded(self._start_or_stop_run, self._say)()
+        guarded(self._start_or_stop_run, self._show)()
 
     def _start_or_stop_run(self):
-        run = self.bench.run
+        run = self._state.run
         if run is not None and run.active:
             run.stop()
             return
         path = self.path
         if not path.is_file():
-            self._say(f"{path} is not there yet: write the settings first")
+            self._show(f"{path} does not exist yet: write the settings first")
             return
-        self.bench.run = BackgroundRun(path, path.with_suffix(".h5"))
-        self._look()
+        self._state.run = BackgroundRun(path, path.with_suffix(".h5"))
+        self._update()
 
-    def _look(self):
+    def _update(self):
         """Show the state of the run, again and again until it ends."""
-        run = self.bench.run
+        run = self._state.run
         if self._closed or run is None:
             return
         active = run.active  # set by another thread
@@ -158,12 +159,12 @@ class RunPanel:
                 f'<progress value="{run.ions}" max="{run.n_ions or 1}" style="width: 100%"></progress><br>'
                 f"{escape(state)}; {escape(str(run.output))}, opened here at its end"
             )
-            self._later(self._look, INTERVAL)
+            self._later(self._update, INTERVAL)
         elif not run.finished:
-            self._say(run.message)
+            self._show(run.message)
         else:
-            self.bench.run = None
-            self._say(f"{run.output} has all ions: apt-evap explore {run.output}")
+            self._state.run = None
+            self._show(f"{run.output} has all ions: apt-evap explore {run.output}")
             if self._open_run is not None:
                 self._open_run(str(run.output))
 

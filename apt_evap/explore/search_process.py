@@ -20,10 +20,10 @@ class SearchProcess:
 
     def __init__(self) -> None:
         context: Any = multiprocessing.get_context("spawn")
-        self._pipe, theirs = multiprocessing.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
+        self._pipe, pipe = multiprocessing.Pipe()
+        self._process = context.Process(target=_serve, args=(pipe,), daemon=True)
         self._process.start()
-        theirs.close()  # the pipe then ends with the process
+        pipe.close()  # the pipe then ends with the process
 
     def __enter__(self) -> "SearchProcess":
         return self
@@ -43,14 +43,14 @@ class SearchProcess:
         function : callable
             Function of a module.
         arguments : sequence
-            Its arguments.
+            Arguments of the function.
         options : mapping
-            Its keyword arguments.
+            Keyword arguments of the function.
 
         Returns
         -------
         object
-            Its result.
+            Result of the function.
 
         Raises
         ------
@@ -76,10 +76,10 @@ def _serve(pipe):
         while True:
             function, arguments, options = pipe.recv()
             try:
-                answer = function(*arguments, **options), ""
+                reply = function(*arguments, **options), ""
             except Exception as error:
-                answer = None, sentence_of(error)
-            pipe.send(answer)
+                reply = None, sentence_of(error)
+            pipe.send(reply)
 
 
 def sentence_of(error: BaseException) -> str:

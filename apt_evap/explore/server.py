@@ -11,23 +11,23 @@ from bokeh.document import Document
 from bokeh.server.server import Server
 from bokeh.util.token import generate_session_id
 
-from apt_evap.explore.explorer import Explorer, View
+from apt_evap.explore.explorer import Explorer, ExplorerSettings
 from apt_evap.explore.page import Page
-from apt_evap.explore.run_panel import Workbench
+from apt_evap.explore.run_panel import ServerState
 from apt_evap.maps.registration.register import Registration
 
 _ADDRESS = "127.0.0.1"
 
 
-class _WithoutStrangers(logging.Filter):
-    """Leaves out the tracebacks of connections that end before they belong to a session, as of other web pages."""
+class _StrangerFilter(logging.Filter):
+    """Filter that drops tracebacks of connections that end before they have a session, as of other web pages."""
 
     def filter(self, record: logging.LogRecord) -> bool:
         return not record.getMessage().startswith("Uncaught exception GET /ws ")
 
 
-class _NamesTheOption(logging.Filter):
-    """Names the option of ``apt-evap explore`` for a page under another address, instead of one of Bokeh's own."""
+class _OptionFilter(logging.Filter):
+    """Filter that names the option of ``apt-evap explore`` for a page under another address, not one of Bokeh."""
 
     def filter(self, record: logging.LogRecord) -> bool:
         if "--allow-websocket-origin" in str(record.msg) and len(record.args or ()) == 4:
@@ -36,8 +36,8 @@ class _NamesTheOption(logging.Filter):
         return True
 
 
-# one object each: a logger takes it once
-_WITHOUT_STRANGERS, _NAMES_THE_OPTION = _WithoutStrangers(), _NamesTheOption()
+# one object of each kind: a logger adds it once
+_STRANGER_FILTER, _OPTION_FILTER = _StrangerFilter(), _OptionFilter()
 # scripts and styles relative to the address of the page: behind a proxy, it is not at the root of the server
 _RELATIVE = """
 {% block css_resources %}{{ bokeh_css | replace('"/static/', '"static/') }}{% endblock %}
@@ -47,11 +47,11 @@ _RELATIVE = """
 
 def serve(
     explorer: Explorer | None,
-    view: View | None = None,
+    settings: ExplorerSettings | None = None,
     *,
     port: int = 0,
     registration_of: Callable[[str], Registration] | None = None,
-    with_file: Callable[[str], tuple[Explorer | None, View | None]] | None = None,
+    with_file: Callable[[str], tuple[Explorer | None, ExplorerSettings | None]] | None = None,
     origins: Sequence[str] = (),
 ) -> tuple[Server, str]:
     """Make the server of a page that only the holder of its address can open, from this machine.
@@ -60,14 +60,14 @@ def serve(
     ----------
     explorer : Explorer or None
         Computes all numbers; None to open files on the page.
-    view : View, optional
+    settings : ExplorerSettings, optional
         What is shown first.
     port : int
         Port on 127.0.0.1; 0 for a free one.
     registration_of : callable, optional
         As for `Page`.
     with_file : callable, optional
-        Reads one more file, from its path, and returns the explorer and the view that show it.
+        Reads one more file, from its path, and returns the explorer and the settings that show it.
     origins : sequence of str
         Further addresses ``"HOST:PORT"`` under which a browser opens the page, as behind a proxy.
 
@@ -87,12 +87,12 @@ def serve(
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         probe.bind((_ADDRESS, port))
         port = probe.getsockname()[1]
-    bench = Workbench()
-    shown = explorer, view  # also after the page is loaded again
+    state = ServerState()
+    shown = explorer, settings  # also after the page is loaded again
 
     def make(document: Document) -> None:
         document.template = _RELATIVE
-        page = Page(shown[0], document, shown[1], registration_of, None if with_file is None else opened, bench=bench)
+        page = Page(shown[0], document, shown[1], registration_of, None if with_file is None else opened, state=state)
         document.on_session_destroyed(lambda _: page.close())
 
     def opened(path: str, document: Document) -> Callable[[], None]:
@@ -101,16 +101,16 @@ def serve(
         assert with_file is not None
         shown = with_file(path)
         if shown[0] is not None:
-            shown[0].near = bench.near.get(path, {})
+            shown[0].registration_options = state.registration_options.get(path, {})
 
-        def again():
+        def make_again():
             document.clear()
             make(document)
 
-        return again
+        return make_again
 
-    logging.getLogger("tornado.application").addFilter(_WITHOUT_STRANGERS)
-    logging.getLogger("bokeh.server.views.ws").addFilter(_NAMES_THE_OPTION)
+    logging.getLogger("tornado.application").addFilter(_STRANGER_FILTER)
+    logging.getLogger("bokeh.server.views.ws").addFilter(_OPTION_FILTER)
     key = secrets.token_bytes(32)  # other users of this machine reach 127.0.0.1, too
     server = Server(
         {"/": Application(FunctionHandler(make))},

@@ -1,4 +1,4 @@
-"""The outer atoms of a specimen that leave in a run, with a quantity of each for its colour."""
+"""The outer atoms of a specimen that leave in a run, with a quantity of every atom for its colour."""
 
 from typing import NamedTuple
 
@@ -30,7 +30,7 @@ class SurfaceAtoms(NamedTuple):
     values: Floats
     """Number, field [V/nm], charge [e] or index of the phase of each atom, shape (n,)."""
     diameter: float
-    """Their nearest neighbour distance [nm]."""
+    """Nearest neighbour distance [nm]."""
 
     def __repr__(self) -> str:
         return short_repr(self)

@@ -16,10 +16,10 @@ SIDES = {"above": (0.0, 90.0), "side": (0.0, 0.0), "oblique": (30.0, 40.0)}
 PIXELS = 420
 """Width and height of the image: 700 kB, made in the browser."""
 
-# Every sphere writes its pixels where it is the nearest until now; the place within a sphere gives the shade.
+# Every sphere writes its pixels where it is the nearest so far; the place within a sphere gives the shade.
 # Right, up and towards the viewer: (x cos a - y sin a, z cos e + y' sin e, z sin e - y' cos e), y' = x sin a + y cos a.
 _DRAW = """
-const [azimuth, elevation] = points.tags.map(each => each * Math.PI / 180)
+const [azimuth, elevation] = points.tags.map(degrees => degrees * Math.PI / 180)
 const [ca, sa, ce, se] = [Math.cos(azimuth), Math.sin(azimuth), Math.cos(elevation), Math.sin(elevation)]
 const project = (x, y, z) => {
   const away = x * sa + y * ca
@@ -48,8 +48,8 @@ for (let k = 0; k < x.length; k++) {
 }
 source.change.emit()
 const places = Array.from(marked.data.px, (_, k) => project(marked.data.px[k], marked.data.py[k], marked.data.pz[k]))
-marked.data.x = places.map(each => each[0])
-marked.data.y = places.map(each => each[1])
+marked.data.x = places.map(place => place[0])
+marked.data.y = places.map(place => place[1])
 marked.change.emit()
 """
 _RADIUS = 0.6  # of a sphere, in nearest neighbour distances: few atoms behind are seen through the gaps
@@ -115,10 +115,10 @@ class SpecimenView:
         x, y, z = (positions - self.centre).T
         self.marked.data = {"x": x, "y": y, "px": x, "py": y, "pz": z}
 
-    def look_from(self, side: str) -> None:
+    def set_viewpoint(self, side: str) -> None:
         """Turn to one of `SIDES`."""
         self.points.tags = list(SIDES[side])
 
 
 # red is the lowest byte of a pixel
-_PALETTE = np.array([int(each[5:7] + each[3:5] + each[1:3], 16) for each in Viridis256], np.int32)
+_PALETTE = np.array([int(color[5:7] + color[3:5] + color[1:3], 16) for color in Viridis256], np.int32)

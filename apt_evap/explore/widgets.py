@@ -61,11 +61,11 @@ def show_extent(fig: Any, extent: Sequence[float]) -> None:
     """Show a square about an area; the page stretches it to the frame of the figure."""
     left, right, lower, upper = extent
     half = 0.52 * max(right - left, upper - lower)
-    for each, middle in ((fig.y_range, 0.5 * (lower + upper)), (fig.x_range, 0.5 * (left + right))):
+    for axis, middle in ((fig.y_range, 0.5 * (lower + upper)), (fig.x_range, 0.5 * (left + right))):
         ends = [middle - half, middle + half]
-        if each.tags != ends:
-            each.update(start=ends[0], end=ends[1])
-            each.tags = ends
+        if axis.tags != ends:
+            axis.update(start=ends[0], end=ends[1])
+            axis.tags = ends
 
 
 def color_bar(mapper: Any, title: str, **options: Any) -> ColorBar:
@@ -73,7 +73,7 @@ def color_bar(mapper: Any, title: str, **options: Any) -> ColorBar:
     return ColorBar(color_mapper=mapper, height=8, title=title, orientation="horizontal", padding=4, **options)
 
 
-def number(slider: Slider) -> Any:
+def slider_with_number(slider: Slider) -> Any:
     """Slider with a field in which its number can be typed."""
     field = Spinner(
         value=slider.value,
@@ -101,6 +101,12 @@ def number(slider: Slider) -> Any:
     slider.on_change("visible", lambda attr, old, new: both.update(visible=new))
     both.visible = slider.visible
     return both
+
+
+def request_maps_of(slider: Any, request: Callable[[bool], None]) -> None:
+    """Request maps when a slider moves or rests: `request` is called with whether a preview is enough."""
+    slider.on_change("value", lambda attr, old, new: request(True))
+    slider.on_change("value_throttled", lambda attr, old, new: request(False))
 
 
 def group(title: str, children: Sequence[Any], reset: Callable[[], None] | None = None, active: bool = True) -> Any:

@@ -1,4 +1,4 @@
-"""Fit of the emission energies to a measured map."""
+"""Fit of the emission energies to a measured map; settings of a simulation and constants from a measurement."""
 
 import lazy_loader
 

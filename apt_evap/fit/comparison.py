@@ -176,8 +176,8 @@ class FoldedComparison(Comparison):
         return self._moments(densities)[1]
 
     def _mean_similarity(self, first, second, noise=0.0):
-        (x, own), (y, other) = first, second
-        return (2 * self._weights @ (x * y) + noise) / (own + other)
+        (x, first_values), (y, other) = first, second
+        return (2 * self._weights @ (x * y) + noise) / (first_values + other)
 
 
 def _box(mask):

@@ -141,8 +141,8 @@ class EnergySearch:
                 return similarities, structure
 
             values, structures = zip(*pool.map(scores, perturbations), strict=True)
-        found = [] if measure is None else list(structures)
-        return np.stack(values, axis=1).reshape(-1, *map(len, places)), found
+        names = [] if measure is None else list(structures)
+        return np.stack(values, axis=1).reshape(-1, *map(len, places)), names
 
     def _structure(self, counts, draws, measure):
         """Structure of a simulated map of the box; several draws of an ion have the noise of one."""

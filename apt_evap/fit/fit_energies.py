@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +25,6 @@ from apt_evap.fit.structure import PoleMeasure, StructureScores
 from apt_evap.fit.study import Score, Study
 from apt_evap.maps.registration.register import Registration
 from apt_evap.maps.similarity import WINDOW
-from apt_evap.simulation.real_units import RealUnits
 from apt_evap.simulation.run import Run
 from apt_evap.warnings import MapWarning, RegistrationWarning, ResponseWarning, StructureWarning, warn
 
@@ -63,11 +62,12 @@ def fit_energies(
     measured : Hits or DetectorMap
         Measured ions, or a map of counts or of densities. The noise of densities is not known.
     grid : EnergyGrid, optional
-        Mechanism of emission and energies; by default ``EnergyGrid("roll-up")`` with the energies of the paper.
+        Mechanism of emission and energies; by default ``EnergyGrid("roll-up")`` with the energies of Shaikh et
+        al. (2025).
     settings : FitSettings, optional
         Bins, smoothing, draws and resamples.
     registration : Registration, optional
-        Carries simulated hits into the measured frame. By default found by `register` with the middle of the
+        Transform of simulated hits into the measured frame. By default determined by `register` with the middle of the
         grid, repeated with the best point until this is stable, and then refined to the largest similarity of this
         point.
     pole : sequence of int, optional
@@ -121,8 +121,7 @@ def fit_energies(
     """
     grid = check_kind(EnergyGrid() if grid is None else grid, "grid", EnergyGrid, "an EnergyGrid")
     settings = check_kind(FitSettings() if settings is None else settings, "settings", FitSettings, "FitSettings")
-    if check_kind(run, "run", Run, "a Run").responses is None:
-        raise ValueError(f"run must have responses for fit_energies, got {run!r}")
+    check_kind(run, "run", Run, "a Run").require_responses()
     if registration is not None:
         check_kind(registration, "registration", Registration, "a Registration")
     measured = measured_map(measured, settings.bins)
@@ -136,20 +135,27 @@ def fit_energies(
     with warnings.catch_warnings():
         # once per energy; the settings contain the same information
         warnings.simplefilter("ignore", ResponseWarning)
+        # the transform onto the measured map, which stays fixed from here on
         rounds: list[Any] = []
         if registration is None:
             warnings.simplefilter("ignore", RegistrationWarning)  # given once, for the last registration
             registration, rounds = register_repeatedly(search)
         search.place(registration, settings.resamples)
+
+        # scores of the maps of all energies, for all ions and for each resample
         measure, missing = _pole_measure(search, registration, pole)
         search.comparison = _comparison(search, measure, missing)
         settings = search.comparison.settings
         values, structures = search.matrix("energies", measure=measure)
+
+        # best energies: of the grid, and between its points, with their intervals
         cells = maxima(values)
         best = search.refine(values, cells)[0]
         bounds = intervals_of(grid, values, best, *settings.allowed_errors) if settings.resamples else None
         optimum = search.optimum(cells[0], bounds)
         refined = search.optimum(best, bounds)
+
+        # maps at these energies and without perturbation, for comparison
         scores, plain_scores, maps = {}, {}, {}
         for name, perturbation in (
             ("unperturbed", Unperturbed()),
@@ -160,37 +166,10 @@ def fit_energies(
         gain = scores.pop("optimum") - scores["unperturbed"]
         structure = _structure_scores(measure, search, structures, maps, cells[0])
     registration.warn_if_doubtful()
-    if structure is not None and structure.lost:
-        warn(
-            f"the best map by {settings.score_name} has lost the zone lines of the measured map: contrasts "
-            f"{_contrasts(structure.optimum)} in the rings about a pole, measured {_contrasts(structure.measured)}; "
-            "see Study.structure",
-            StructureWarning,
-        )
-    density = maps["unperturbed"].ions / search.comparison.mask.sum()
-    if density < FEWEST_IONS:
-        warn(
-            f"the run has {density:.2g} ions per compared bin, but a map needs at least {FEWEST_IONS:g}: "
-            f"use fewer bins than {max(measured.values.shape)}, or simulate more ions",
-            MapWarning,
-        )
+    _warn_of_lost_lines(structure, settings)
+    _warn_of_few_ions(maps["unperturbed"].ions / search.comparison.mask.sum(), measured)
     resampled = values[1:]
     wins = np.ravel_multi_index(cells[1:].T, grid.shape)
-    energy_limit = run.response_settings.energy_limit / np.median(run.energy_scales)  # [eV] of this run
-    provenance = {
-        "map_bins": measured.values.shape[::-1],
-        "bin_size": measured.bin_size,
-        "bins_compared": search.comparison.inside.sum(),
-        "measured": repr(measured),
-        "measured_noise": "Poisson" if measured.is_counts else "not known",
-        "registered": rounds or "given",
-        "share_above_energy_limit": grid.share_above(energy_limit),
-        "run": {"ions": len(run), "provenance": run.provenance, **run.settings},
-        "real_units": real_units_of(run),
-        "microscope": microscope_of(run),
-        "structure": missing,
-        "projection": _projection_of(run),
-    }
     return Study(
         grid=grid,
         scores=values[0],
@@ -199,8 +178,8 @@ def fit_energies(
         resampled=resampled,
         optimum=optimum,
         refined=refined,
-        baselines={name: Score.of_resamples(each) for name, each in scores.items()},
-        plain={name: Score.of_resamples(each) for name, each in plain_scores.items()},
+        baselines={name: Score.of_resamples(resamples) for name, resamples in scores.items()},
+        plain={name: Score.of_resamples(resamples) for name, resamples in plain_scores.items()},
         gain=Score.of_resamples(gain),
         gain_share=float((gain[1:] > 0).mean()) if settings.resamples else float("nan"),
         ceiling=search.ceiling(),
@@ -209,8 +188,47 @@ def fit_energies(
         maps=maps,
         structure=structure,
         settings=settings,
-        provenance=for_json(provenance),
+        provenance=_provenance(run, measured, search, rounds, missing),
     )
+
+
+def _warn_of_lost_lines(structure, settings):
+    if structure is not None and structure.lost:
+        warn(
+            f"the best map by {settings.score_name} has lost the zone lines of the measured map: contrasts "
+            f"{_contrasts(structure.optimum)} in the rings about a pole, measured {_contrasts(structure.measured)}; "
+            "see Study.structure",
+            StructureWarning,
+        )
+
+
+def _warn_of_few_ions(density, measured):
+    if density < FEWEST_IONS:
+        warn(
+            f"the run has {density:.2g} ions per compared bin, but a map needs at least {FEWEST_IONS:g}: "
+            f"use fewer bins than {max(measured.values.shape)}, or simulate more ions",
+            MapWarning,
+        )
+
+
+def _provenance(run, measured, search, rounds, missing):
+    """Origin of a study: the maps, the run and the registration, in plain types."""
+    energy_limit = run.response_settings.energy_limit / np.median(run.energy_scales)  # [eV] of this run
+    provenance = {
+        "map_bins": measured.values.shape[::-1],
+        "bin_size": measured.bin_size,
+        "bins_compared": search.comparison.inside.sum(),
+        "measured": repr(measured),
+        "measured_noise": "Poisson" if measured.is_counts else "not known",
+        "registered": rounds or "given",
+        "share_above_energy_limit": search.grid.share_above(energy_limit),
+        "run": {"ions": len(run), "provenance": run.provenance, **run.settings},
+        "real_units": real_units_of(run),
+        "microscope": microscope_of(run),
+        "structure": missing,
+        "projection": _projection_of(run),
+    }
+    return for_json(provenance)
 
 
 def _projection_of(run):
@@ -233,9 +251,9 @@ def _pole_measure(search, registration, pole):
 
 
 def _comparison(search, measure, missing):
-    """What the objective compares: by default folded maps, if there is a pole to fold about."""
-    wanted = search.settings.objective
-    if wanted == "similarity":
+    """Objective of the comparison: by default folded maps, if there is a pole to fold about."""
+    objective = search.settings.objective
+    if objective == "similarity":
         return search.comparison
     try:
         if measure is None:
@@ -243,7 +261,7 @@ def _comparison(search, measure, missing):
         settings = replace(search.comparison.settings, objective="folded")
         return FoldedComparison(search.region, settings, measure.cells(search.region))
     except ValueError as error:
-        if wanted is None:
+        if objective is None:
             return search.comparison
         raise ValueError(f"settings.objective is 'folded', but {error}") from error
 
@@ -287,15 +305,16 @@ def real_units_of(run: Run) -> dict[str, Any] | None:
         None if the fields of the cap, which real units need, are not in the run.
     """
     try:
-        real = run if run.units is not None else run.at_evaporation_field()
+        real = run.in_real_units()
     except ValueError:
         return None
-    units = cast(RealUnits, real.units)
-    scale = float(np.median(real.energy_scales))  # simulated energy per real one
+    units = real.require_real_units("an operating point")
+    # simulated energies per real one, and per one of the study
+    scale, study_scale = (float(np.median(each.energy_scales)) for each in (real, run))
     charges, counts = np.unique(real.flight_charges, return_counts=True)
     return {
-        "real_per_study": 1.0 if run.units is not None else 1.0 / scale,
-        "simulated_per_study": scale if run.units is not None else 1.0,
+        "real_per_study": study_scale / scale,
+        "simulated_per_study": study_scale,
         "operating_field": units.operating_field,
         "field_reference": units.field_reference,
         "flight_charge": int(charges[counts.argmax()]),

@@ -10,14 +10,16 @@ Measured (roll-up, Ni[111], R = 14 a, 10,000 ions, 23 twins with other origins, 
 within 20 %, each fitted by five specimens): median 0.12, 95 % below 0.24, largest 0.31. With 0.2, the intervals contain
 the hidden sigma/mean in 96 %, and the hidden true mean in 98 % of the 115 fits."""
 FOLDED_MODEL_ERROR = 0.12
-"""The same for 1 - concordance of folded maps.
+"""This difference for 1 - concordance of folded maps.
 
 Measured (50 twins as above, one specimen fitted): the intervals contain the hidden sigma/mean and true standard
 deviation in 98 and 98 %, with 0.10 in 92 and 92 %."""
 FOLDED_MODEL_ERROR_OF_MEANS = 0.08
-"""The same for the mean and the true mean, which maps see better: in 100 and 96 %, with 0.04 in 96 and 86 %."""
+"""This difference for the mean and the true mean, to which maps are more sensitive.
+
+Measured (these twins): in 100 and 96 %, with 0.04 in 96 and 86 %."""
 SAME_RADIUS_MODEL_ERROR_OF_MEANS = 0.04
-"""The same for 50 twins with radii within 5 %: 100 and 98 %, with 0.03 98 and 94 %."""
+"""This difference of means for 50 twins with radii within 5 %: 100 and 98 %, with 0.03 98 and 94 %."""
 
 
 @settings
@@ -94,7 +96,7 @@ class FitSettings:
 
     @property
     def score_name(self) -> str:
-        """What the scores are: "SSIM", or "concordance" of folded maps."""
+        """Name of the scores: "SSIM", or "concordance" of folded maps."""
         return "concordance" if self.objective == "folded" else "SSIM"
 
     @property

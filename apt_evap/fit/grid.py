@@ -16,11 +16,11 @@ from apt_evap.emission.energies import TruncatedNormal
 from apt_evap.emission.perturbations import Combined, LateralVelocity, Perturbation, RollUp
 
 MEANS = (0.01, 0.0825, 0.155, 0.2275, 0.3, 0.3725)
-"""Means of the paper's grid [eV]: from 0.01 to 0.3725 in even steps."""
+"""Means of the grid of Shaikh et al. (2025) [eV]: from 0.01 to 0.3725 in even steps."""
 RSDS = (0.01, 0.0316, 0.1, 0.316, 1.0, 3.16)
-"""Relative standard deviations of the paper's grid: from 0.01 to 3.16, two per decade."""
+"""Relative standard deviations of the grid of Shaikh et al. (2025): from 0.01 to 3.16, two per decade."""
 ROLLUP_FRACTIONS = (0.0, 0.25, 0.5, 0.75, 1.0)
-"""Roll-up fractions of the energy in the paper's grid."""
+"""Roll-up fractions of the energy in the grid of Shaikh et al. (2025)."""
 
 MECHANISMS = ("roll-up", "lateral", "combined")
 """Mechanisms of emission: `RollUp`, `LateralVelocity` or `Combined`."""
@@ -30,8 +30,8 @@ _HALVES = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
 _FINE = np.linspace(-1.0, 1.0, 41)
 
 
-def _mechanism(given, name):
-    return given if callable(given) else check_choice(given, name, MECHANISMS)
+def _mechanism(mechanism, name):
+    return mechanism if callable(mechanism) else check_choice(mechanism, name, MECHANISMS)
 
 
 def _increasing(values, name):
@@ -78,20 +78,22 @@ class EnergyGrid:
         default="roll-up",
     )
     means: Sequence[float] = checked(
-        "Means before the truncation, increasing; by default those of the paper.",
+        "Means before the truncation, increasing; by default those of Shaikh et al. (2025).",
         "sequence of float",
         _positive,
         default=MEANS,
         unit="eV",
     )
     relative_spreads: Sequence[float] = checked(
-        "Standard deviations before the truncation, relative to the means, increasing; by default those of the paper.",
+        "Standard deviations before the truncation, relative to the means, increasing; by default those of Shaikh et "
+        "al. (2025).",
         "sequence of float",
         _positive,
         default=RSDS,
     )
     rollup_fractions: Sequence[float] | None = checked(
-        'Fractions of the energy for the roll-up, increasing; only for "combined", by default those of the paper.',
+        'Fractions of the energy for the roll-up, increasing; only for "combined", by default those of Shaikh et al. '
+        "(2025).",
         "sequence of float",
         _fractions,
         default=None,

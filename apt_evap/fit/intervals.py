@@ -79,8 +79,8 @@ def intervals(
     others = _bounds(grid, places, deficit <= error_of_others * misfit + noise, best)
     chosen = {name: means if name in _MEANS else others for name in others.bounds}
     return Intervals(
-        {name: each.bounds[name] for name, each in chosen.items()},
-        {name: each.open_ends[name] for name, each in chosen.items()},
+        {name: interval.bounds[name] for name, interval in chosen.items()},
+        {name: interval.open_ends[name] for name, interval in chosen.items()},
     )
 
 

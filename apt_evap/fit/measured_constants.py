@@ -38,13 +38,13 @@ class Constant(NamedTuple):
     """A constant of a measurement."""
 
     name: str
-    """What it is, with its unit."""
+    """Name of the observable, with its unit."""
     value: float
-    """Its value; NaN if it is not determined."""
+    """Value of the constant; NaN if it is not determined."""
     error: float
     """Standard error by noise alone; NaN if it is not known."""
     depends: str
-    """What it is degenerate with, or why it is not determined."""
+    """Constants with which it is degenerate, or the reason why it is not determined."""
 
     @property
     def text(self) -> str:
@@ -58,25 +58,25 @@ class Observed(NamedTuple):
     """An observable that was not used for the constants, beside its expectation."""
 
     name: str
-    """What it is, with its unit."""
-    found: float
-    """In the measurement."""
+    """Name of the observable, with its unit."""
+    value: float
+    """Value in the measurement."""
     expected: float
-    """From the constants."""
+    """Value expected from the constants."""
     error: float
     """Standard error of the difference, by noise alone."""
     meaning: str
-    """What a deviation says."""
+    """Meaning of a deviation."""
 
     @property
     def z(self) -> float:
         """Deviation in standard errors."""
-        return (self.found - self.expected) / self.error
+        return (self.value - self.expected) / self.error
 
     @property
     def text(self) -> str:
-        """Both numbers and the deviation."""
-        return f"{self.found:.4g}, expected {self.expected:.4g} ± {self.error:.2g}: z = {self.z:+.1f}"
+        """Measured and expected value, and their deviation, as text."""
+        return f"{self.value:.4g}, expected {self.expected:.4g} ± {self.error:.2g}: z = {self.z:+.1f}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,8 +101,8 @@ class Measurement:
         return short_repr(self)
 
     def __str__(self) -> str:
-        rows = [f"{each.name}: {each.text}; {each.depends}" for each in self.constants]
-        rows += [f"check, {each.name}: {each.text}; {each.meaning}" for each in self.checks]
+        rows = [f"{constant.name}: {constant.text}; {constant.depends}" for constant in self.constants]
+        rows += [f"check, {check.name}: {check.text}; {check.meaning}" for check in self.checks]
         return "\n".join(rows)
 
 
@@ -152,11 +152,11 @@ def constants_of(
     The scale s of the map is that of the best likelihood. It fixes the image compression as :math:`\xi = L/s`, so only
     :math:`L/\xi` is measured. A voltage fixes the product :math:`k_f F R = V` of field factor, evaporation field and
     radius. A lens gives :math:`k_f` for every R, so that R follows from F. The angle of the shank follows from the
-    course of the radius along the depth as in `reconstruction.fit_shank`; the depth is that of the volume of the ions,
+    change of the radius along the depth as in `reconstruction.fit_shank`; the depth is that of the volume of the ions,
     with the angle :math:`\rho/s` at the rim of the map.
 
     Errors are those of noise. Those of F, of the efficiency, and of the geometry of the microscope are not included:
-    `Constant.depends` tells what they change.
+    `Constant.depends` describes what they change.
 
     Examples
     --------
@@ -184,16 +184,20 @@ def constants_of(
     ]
     checks: list[Observed] = []
     if length is not None:
-        compression, its_error = length / scale, length / scale * (scale_error / scale)
+        compression, error = length / scale, length / scale * (scale_error / scale)
         why = "proportional to the assumed flight length: the map fixes only their ratio"
-        constants.append(Constant("image compression", compression, its_error, why))
+        constants.append(Constant("image compression", compression, error, why))
     if hits is None or (voltages := voltages_of(check_kind(hits, "hits", Hits, "Hits"))) is None:
         return Measurement(tuple(constants), tuple(checks), {})
     field = material.evaporation_field
+
+    # constants by the voltage: field, radius and field factor; then the angle of the shank by its increase
     constants += _voltage_constants(voltages, field, lens, factor)
     volume = 1 / atom_density(material.structure, material.a, material.c)
     disc = disc_of(measured)  # a few ions are far outside the field of view
     constants.append(_shank(hits, disc, scale, volume, efficiency, field, lens, factor, length))
+
+    # observables that were not used: compression of the lens, halves of the ions, multiple hits, charges
     if lens is not None and length is not None:
         radius = float(lens.radius(float(np.median(voltages)), field))
         checks.append(
@@ -209,6 +213,8 @@ def constants_of(
     checks += _sequence(hits, voltages)
     if ranges is not None and hits.mass_to_charge is not None:
         checks += _charges(hits, material, ranges)
+
+    # arguments of `reconstruct` with these constants
     arguments: dict[str, Any] = {"atomic_volume": volume, "evaporation_field": field, "efficiency": efficiency}
     arguments["detector_radius"] = disc.radius - math.hypot(*disc.centre)
     if length is not None:
@@ -225,22 +231,22 @@ def _scale_of(measured, candidate):
     disc = disc_of(measured)
     bins, scale = bins_of(disc), candidate.projection.scale
     densities = candidate.pattern.smoothed(resolution(disc, scale))
-    found = refine(bins, disc, densities, candidate.orientation.matrix, scale, candidate.rolled, steps=20)
-    return found.scale, found.scale * math.sqrt(found.covariance[3, 3] * found.dispersion)
+    fitted = refine(bins, disc, densities, candidate.orientation.matrix, scale, candidate.rolled, steps=20)
+    return fitted.scale, fitted.scale * math.sqrt(fitted.covariance[3, 3] * fitted.dispersion)
 
 
 def _voltage_constants(voltages, field, lens, factor):
     """Voltages of both ends, and what they give."""
-    found = []
+    constants = []
     for where, part in (("first", voltages[:_ENDS]), ("last", voltages[-_ENDS:])):
         voltage = float(np.median(part))
         error = _MEDIAN * float(np.std(part)) / math.sqrt(len(part)) or math.nan  # a supply has steps
         fixed = "the product field factor x evaporation field x radius"
-        found.append(Constant(f"voltage of the {where} ions [V]", voltage, error, fixed))
+        constants.append(Constant(f"voltage of the {where} ions [V]", voltage, error, fixed))
         if lens is None:
             radius = voltage / (factor * field)
             why = f"for k_f = {factor:g} and F = {field:g} V/nm: 1 % more of either is 1 % less; k_f is 2 to 8"
-            found.append(Constant(f"radius at the {where} ions [nm]", radius, radius * error / voltage, why))
+            constants.append(Constant(f"radius at the {where} ions [nm]", radius, radius * error / voltage, why))
             continue
         radius = float(lens.radius(voltage, field))
         less = 100 * (float(lens.radius(voltage, field * (1 + _STEP))) / radius - 1)
@@ -252,17 +258,19 @@ def _voltage_constants(voltages, field, lens, factor):
                 if other is not None:
                     why += f", {100 * (float(other.radius(voltage, field)) / radius - 1):+.2f} %{text}"
         slope = math.log(float(lens.radius(voltage * (1 + _STEP), field)) / radius) / math.log(1 + _STEP)
-        found.append(Constant(f"radius at the {where} ions [nm]", radius, radius * slope * error / voltage, why))
+        constants.append(Constant(f"radius at the {where} ions [nm]", radius, radius * slope * error / voltage, why))
         of_lens = "of the lens at this radius"
-        found.append(Constant(f"field factor at the {where} ions", float(lens.field_factor(radius)), math.nan, of_lens))
-        found.append(
+        constants.append(
+            Constant(f"field factor at the {where} ions", float(lens.field_factor(radius)), math.nan, of_lens)
+        )
+        constants.append(
             Constant(f"image compression at the {where} ions", float(lens.compression(radius)), math.nan, of_lens)
         )
-    return found
+    return constants
 
 
 def _shank(hits, disc, scale, volume, efficiency, field, lens, factor, length):
-    """Angle of the shank from the course of the voltage."""
+    """Angle of the shank from the history of the voltage."""
     name = "angle of the shank [degrees]"
     if hits.x is None or hits.y is None:
         return Constant(name, math.nan, math.nan, "the ions have no places")
@@ -278,17 +286,23 @@ def _shank(hits, disc, scale, volume, efficiency, field, lens, factor, length):
         except ValueError as error:
             return Constant(name, math.nan, math.nan, str(error))
         depth, radius, angle, error = float(np.ptp(fit.depths)), float(fit.radii.mean()), fit.angle, fit.error
-        why = ", ".join(f"{change:+.2g} degrees for 1 % more {each}" for each, change in fit.per_cent.items())
+        why = ", ".join(
+            f"{change:+.2g} degrees for 1 % more {assumption}" for assumption, change in fit.per_cent.items()
+        )
     else:
+        # from R(z) of a reconstruction: dR/dz = sin a / (1 - sin a) for the angle a of the shank
         every = max(1, -(-len(placed) // _IONS))
         # with the flight length and the compression of the map their ratio alone matters
-        found = reconstruct(
+        reconstruction = reconstruct(
             placed[::every], atomic_volume=volume, distance=scale, compression=1.0,
             projection="equidistant", field_factor=factor, evaporation_field=field, efficiency=efficiency / every,
             detector_radius=disc.radius,
         )  # fmt: skip
-        parts = np.array_split(np.arange(len(found)), min(_SECTIONS, len(found)))
-        depths, radii = (np.array([each[part].mean() for part in parts]) for each in (found.depths, found.radii))
+        parts = np.array_split(np.arange(len(reconstruction)), min(_SECTIONS, len(reconstruction)))
+        depths, radii = (
+            np.array([column[part].mean() for part in parts])
+            for column in (reconstruction.depths, reconstruction.radii)
+        )
         depth, radius = float(np.ptp(depths)), float(radii.mean())
         if len(parts) < 3 or depth == 0:
             return Constant(name, math.nan, math.nan, "there are too few ions")
@@ -317,7 +331,7 @@ def _halves(measured, candidate, hits, voltages, field, lens):
     )
     expected = 1.0
     if lens is not None:
-        ends = [float(np.median(each)) for each in np.array_split(voltages, 2)]
+        ends = [float(np.median(half)) for half in np.array_split(voltages, 2)]
         before, after = (float(lens.compression(float(lens.radius(voltage, field)))) for voltage in ends)
         expected = before / after
     error = second / first * math.hypot(first_error / first, second_error / second)
@@ -327,15 +341,15 @@ def _halves(measured, candidate, hits, voltages, field, lens):
 
 def _sequence(hits, voltages):
     """Slope of the voltage and share of multiple hits, second half against the first one."""
-    found = []
+    checks = []
     if len(voltages) >= 2 * _FEWEST:
         slopes = []
         for part in np.array_split(voltages, 2):
-            sections = np.array([each.mean() for each in np.array_split(part, _SECTIONS // 2)])
+            sections = np.array([section.mean() for section in np.array_split(part, _SECTIONS // 2)])
             line = scipy.stats.linregress(np.arange(len(sections)) * len(part) / len(sections) / 1000, sections)
             slopes.append((line.slope, line.stderr))
         (first, first_error), (second, second_error) = slopes
-        found.append(
+        checks.append(
             Observed(
                 "rise of the voltage in the second half, against the first one [V per 1000 ions]",
                 float(second), float(first), float(math.hypot(first_error, second_error)),
@@ -344,38 +358,38 @@ def _sequence(hits, voltages):
         )  # fmt: skip
     if hits.multiplicity is not None and len(hits) >= 2 * _FEWEST:
         several = np.array_split(np.asarray(hits.multiplicity) > 1, 2)
-        before, after = (float(each.mean()) for each in several)
+        before, after = (float(half.mean()) for half in several)
         # ions of a pulse are not independent: at least two of each
         error = math.sqrt(2 * (before * (1 - before) / len(several[0]) + after * (1 - after) / len(several[1])))
         if error > 0:
             meaning = "the rate, and with it the field of evaporation, changes"
-            found.append(Observed("share of multiple hits, second half against first", after, before, error, meaning))
-    return found
+            checks.append(Observed("share of multiple hits, second half against first", after, before, error, meaning))
+    return checks
 
 
 def _charges(hits, material, ranges):
     """Charge states of the element: their change, and the field that they give."""
     try:
         charges = np.where(hits.detected, ion_charges(hits, material.name, ranges), 0)
-        course = charge_history(charges, material.name)
-        course = charge_history(charges, material.name, course.charge, sections=2)
+        history = charge_history(charges, material.name)
+        history = charge_history(charges, material.name, history.charge, sections=2)
     except ValueError:  # other elements, or one charge
         return []
-    if (course.lower + course.upper).min() < LEAST:
+    if (history.lower + history.upper).min() < LEAST:
         return []
-    (ratio, error), pair = ratio_of_counts(course.lower, course.upper), f"{course.charge + 1}+ / {course.charge}+"
-    found = [
+    (ratio, error), pair = ratio_of_counts(history.lower, history.upper), f"{history.charge + 1}+ / {history.charge}+"
+    constants = [
         Observed(
             f"ln of {material.name} {pair}, second half against first", float(np.log(ratio[1])),
             float(np.log(ratio[0])), float(np.hypot(*error)), "the field of evaporation changes",
         )
     ]  # fmt: skip
     if material.name in RATIO_PARAMETERS:
-        field, its_error = field_of_counts(material.name, course.charge, course.lower.sum(), course.upper.sum())
+        field, field_error = field_of_counts(material.name, history.charge, history.lower.sum(), history.upper.sum())
         meaning = "the assumed evaporation field is not on the scale of the charge states (Kingham)"
-        found.append(
+        constants.append(
             Observed(
-                f"field by {pair} [V/nm]", float(field), float(material.evaporation_field), float(its_error), meaning
+                f"field by {pair} [V/nm]", float(field), float(material.evaporation_field), float(field_error), meaning
             )
         )
-    return found
+    return constants

@@ -152,9 +152,9 @@ def fit_radius(
     settings = rings, radii, fold
     target = _structure(measured, projection, pole, *settings, ions)
     values = []
-    for run, each in zip(runs, perturbations, strict=True):
-        own = image_compression(run).projection, _direction(run, plane)
-        values.append(_structure(_map_of(run, each, draws), *own, *settings, None).values)
+    for run, perturbation in zip(runs, perturbations, strict=True):
+        projection_and_pole = image_compression(run).projection, _direction(run, plane)
+        values.append(_structure(_map_of(run, perturbation, draws), *projection_and_pole, *settings, None).values)
     return _fit(run_radii, np.array(values), target.values, np.nan_to_num(target.errors))
 
 
@@ -204,10 +204,10 @@ def _map_of(run, perturbation, draws):
     grid = run.grid(_BINS)
     by_response = draws > 1  # a flight does not depend on the seed
     hits = [replace(run, seed=run.seed + draw).hits(perturbation, by_response=by_response) for draw in range(draws)]
-    maps = [each.map(like=grid, position_step=None) for each in hits]
-    return replace(maps[0], values=np.sum([each.values for each in maps], axis=0), detected=None)
+    maps = [part.map(like=grid, position_step=None) for part in hits]
+    return replace(maps[0], values=np.sum([map.values for map in maps], axis=0), detected=None)
 
 
 def _structure(map, projection, pole, rings, radii, fold, ions):
-    found = ring_statistics(map, projection, pole, rings, fold=fold, ions=ions)
-    return Structure(found, pole_profile(map, projection, pole, radii, ions=ions))
+    statistics = ring_statistics(map, projection, pole, rings, fold=fold, ions=ions)
+    return Structure(statistics, pole_profile(map, projection, pole, radii, ions=ions))

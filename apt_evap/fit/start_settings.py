@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from apt_evap._common.codec import to_plain
-from apt_evap._common.files import replace_file
+from apt_evap._common.codec import for_json, to_plain
+from apt_evap._common.files import open_for_reading, replace_file
 from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import AnyPath, Booleans, Floats
 from apt_evap._common.validation import check_count, check_kind, check_number
@@ -42,7 +42,7 @@ ROLLS = 0.1
 """Fraction of the roll-up pattern below which no ion rolls up."""
 _SIMULATED_COMPRESSION = 1.03  # of free tips with R = 20 to 80 a: 1.02 to 1.045, measured with the master patterns
 _MARGIN = 1.1  # of the simulated field of view beyond the measured one
-# of the registration of a run: the indexing knows rotation, scale and place better than a search
+# of the registration of a run: the indexing determines rotation, scale and place better than a search
 _ROTATIONS, _SCALES, _TILT = (-5.0, 5.0), (0.92, 1.08), math.radians(3.0)
 _ENDS = 1000  # ions at the beginning and at the end of a measurement, for its radii
 _PART = 0.2  # of the volume of the cap that may evaporate: the shape stays near the sphere
@@ -55,7 +55,7 @@ _FEWEST, _MOST = 10_000, 150_000  # ions
 
 
 def near(centre: Sequence[float], scale: float) -> dict[str, Any]:
-    """Start and bounds of the registration of a run with the settings of a `Start`, for `register`.
+    """Start and bounds of the registration of a run with the settings of a `StartSettings`, for `register`.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def near(centre: Sequence[float], scale: float) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
+class StartSettings:
     """Settings of a simulation of a measured specimen.
 
     Parameters
@@ -91,7 +91,7 @@ class Start:
         Radius of the simulated tip [nm].
     near : dict
         Where the simulated map is on the measured one, for `register`, see `near`.
-    foresight : CostEstimate
+    cost : CostEstimate
         Time and memory that the simulation needs.
     """
 
@@ -100,15 +100,25 @@ class Start:
     radii: tuple[float, float]
     simulated_radius: float
     near: dict
-    foresight: CostEstimate
+    cost: CostEstimate
 
     def __repr__(self) -> str:
         return short_repr(self)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return radii [nm], None if they are not known, and the indexing in plain types, dict."""
+        return for_json({"radii": self.radii, "simulated_radius": self.simulated_radius}) | self.indexing.to_dict()
 
     def save(self, path: AnyPath) -> None:
         """Write the settings file; it is replaced only when complete."""
         with replace_file(path) as file:
             file.write(self.text.encode())
+
+
+def is_start(path: AnyPath) -> bool:
+    """Whether a file is a settings file made from a measured map."""
+    with open_for_reading(path) as file:
+        return file.read(len(MARK)) == MARK.encode()
 
 
 def settings_of(
@@ -119,7 +129,7 @@ def settings_of(
     field_factor: float | None = None,
     minutes: float = 10.0,
     threads: int = 1,
-) -> Start:
+) -> StartSettings:
     """Make the settings of a simulation of a measured specimen.
 
     Parameters
@@ -140,7 +150,7 @@ def settings_of(
 
     Returns
     -------
-    Start
+    StartSettings
 
     Raises
     ------
@@ -185,7 +195,9 @@ def settings_of(
         raise ValueError(
             f"minutes must be at least {60 * (needs.hours or 0.0) / threads:.1f} for the smallest tip, got {minutes:g}"
         )
-    return Start(text, indexing, radii, size * material.a, near(best.projection.centre, best.projection.scale), needs)
+    return StartSettings(
+        text, indexing, radii, size * material.a, near(best.projection.centre, best.projection.scale), needs
+    )
 
 
 def voltages_of(hits: Hits | None) -> Floats | None:
@@ -227,15 +239,9 @@ def _text(indexing, radii, size, lens, factor):
     disc = disc_of(indexing.map)
     x, y = np.meshgrid(*indexing.map.centres)
     reach = np.hypot(x - disc.centre[0], y - disc.centre[1])[disc.map.mask].max()
-    axis = ", ".join(f"{each:.4f}" for each in best.orientation.axis)
-    if math.isnan(radii[0]):
-        known = "the radius of the specimen is not known: the file has no voltages"
-    else:
-        how = f"k_f = {factor:g}" if lens is None else "the lens"
-        known = f"the specimen has R = {radii[0]:.0f} to {radii[1]:.0f} nm, by V = k_f F R with {how}"
-        known += f" and F = {material.evaporation_field:g} V/nm"
+    axis = ", ".join(f"{component:.4f}" for component in best.orientation.axis)
     sure = indexing.reason if indexing.decided else f"NOT DECIDED: {indexing.reason}"
-    others = [f"#   or axis = [{', '.join(f'{each:.4f}' for each in other.orientation.axis)}], "
+    others = [f"#   or axis = [{', '.join(f'{component:.4f}' for component in other.orientation.axis)}], "
               f"rotation = {other.orientation.rotation:.2f}"
               for other in indexing.candidates[1:] if not indexing.decided]  # fmt: skip
     # V = k_f F R of a free tip, with k_f of 1.0 to 1.2
@@ -254,7 +260,7 @@ def _text(indexing, radii, size, lens, factor):
         *others,
         f"rotation = {best.orientation.rotation:.2f}    # of the crystal on the map; the map is not mirrored",
         f'apex_radius = "{size:g} a"    # simulated: {size * material.a:.1f} nm',
-        f"# {known}",
+        f"# {_radius_text(material, radii, lens, factor)}",
         f'shank_length = "{2 * size:g} a"',
         f"shank_angle = {shank:g}    # degrees: {shank_why}",
         'depth = "6 a"    # atoms deeper below the surface are not kept in memory',
@@ -293,6 +299,16 @@ def _text(indexing, radii, size, lens, factor):
         "",
     ]
     return "\n".join(lines)
+
+
+def _radius_text(material, radii, lens, factor):
+    if math.isnan(radii[0]):
+        return "the radius of the specimen is not known: the file has no voltages"
+    by = f"k_f = {factor:g}" if lens is None else "the lens"
+    return (
+        f"the specimen has R = {radii[0]:.0f} to {radii[1]:.0f} nm, by V = k_f F R with {by} and F = "
+        f"{material.evaporation_field:g} V/nm"
+    )
 
 
 def _material_text(material):

@@ -83,7 +83,7 @@ class Structure(NamedTuple):
 
     @property
     def errors(self) -> Floats:
-        """Their errors, NaN for unknown noise, shape (n,)."""
+        """Standard errors of the values, NaN for unknown noise, shape (n,)."""
         return np.array([*(ring.error for ring in self.rings), *self.radial.error])
 
     def misfit(self, measured: Structure) -> tuple[float, float]:
@@ -113,11 +113,11 @@ class Structure(NamedTuple):
     def lost(self, measured: Structure) -> bool:
         """Whether all rings with a significant measured contrast have lost it."""
         pairs = [
-            (own.contrast, other.contrast)
-            for own, other in zip(self.rings, measured.rings, strict=True)
+            (ring.contrast, other.contrast)
+            for ring, other in zip(self.rings, measured.rings, strict=True)
             if other.contrast > SIGNIFICANT * np.nan_to_num(other.error) and other.contrast > 0
         ]
-        return bool(pairs) and all(own < LOST * other for own, other in pairs)
+        return bool(pairs) and all(contrast < LOST * other for contrast, other in pairs)
 
 
 class PoleMeasure:
@@ -147,8 +147,8 @@ class PoleMeasure:
         orientation = Orientation.from_settings(run.settings["tip"])
         self.projection = RegisteredProjection(image_compression(run).projection, registration)
         if plane is None:
-            found = poles(orientation.material, _FAMILIES)
-            planes, normals = found.planes, found.normals
+            families = poles(orientation.material, _FAMILIES)
+            planes, normals = families.planes, families.normals
         else:
             planes = np.atleast_2d(np.asarray(plane))
             normals = plane_normals(orientation.material, planes)
@@ -253,23 +253,23 @@ class StructureScores(NamedTuple):
         The keys are the inner and outer radii [degrees].
         """
         pairs = zip(self.optimum.rings, self.measured.rings, strict=True)
-        return {(other.inner, other.outer): line_amplitude(own, other) for own, other in pairs if other.contrast > 0}
+        return {(other.inner, other.outer): line_amplitude(ring, other) for ring, other in pairs if other.contrast > 0}
 
     @property
     def evidence(self) -> str:
-        """What the map that is best by similarity has of the measured structure about the pole, without a full stop."""
-        found = []
+        """Sentence on the structure about the pole that the map of highest similarity reproduces; no full stop."""
+        sentences = []
         correlation = float(self.correlations[self.at_optimum])
         if np.isfinite(correlation):
             ceiling = self.measured.folded.ceiling if self.measured.folded is not None else float("nan")
             most = f" (at most {ceiling:.2f} with the noise of the measurement)" if np.isfinite(ceiling) else ""
-            found.append(f"the folded maps correlate to {correlation:.2f}{most}")
-        known = {ring: each.value for ring, each in self.amplitudes.items() if np.isfinite(each.value)}
+            sentences.append(f"the folded maps correlate to {correlation:.2f}{most}")
+        known = {ring: amplitude.value for ring, amplitude in self.amplitudes.items() if np.isfinite(amplitude.value)}
         if known:
             degrees = ", ".join(f"{inner:g} to {outer:g}" for inner, outer in known)
-            values = ", ".join(f"{each:.1f}" for each in known.values())
-            found.append(f"the lines have {values} of the measured amplitude at {degrees} degrees")
-        return f"about the pole ({plain_label(self.plane)}) {', and '.join(found)}" if found else ""
+            values = ", ".join(f"{value:.1f}" for value in known.values())
+            sentences.append(f"the lines have {values} of the measured amplitude at {degrees} degrees")
+        return f"about the pole ({plain_label(self.plane)}) {', and '.join(sentences)}" if sentences else ""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the scores and the structures in plain types, without the folded maps."""

@@ -180,7 +180,7 @@ class Study:
 
     @property
     def projection(self) -> RegisteredProjection | None:
-        """From directions in the simulated specimen onto the measured map; None if the run has too few ions for it."""
+        """Projection from directions in the simulated specimen onto the measured map; None with too few ions."""
         projection = self._projection
         return None if projection is None else RegisteredProjection(projection, self.registration)
 
@@ -279,7 +279,7 @@ class Study:
 
     @property
     def result(self) -> str:
-        """The result as one sentence: who leaves how, and with what mean energy in real units, if these are known."""
+        """The result as one sentence: how the ions leave, and their mean energy in real units, if these are known."""
         refined, real = self.refined, self.provenance.get("real_units")
         factor, unit = (1.0, "eV at the simulated voltage") if real is None else (real["real_per_study"], "eV")
         material = self.provenance["run"]["tip"].get("material")
@@ -312,7 +312,8 @@ class Study:
         if scores is None:
             return ""
         contrasts, measured = (
-            " ".join(f"{ring.contrast:.2f}" for ring in each.rings) for each in (scores.optimum, scores.measured)
+            " ".join(f"{ring.contrast:.2f}" for ring in structure.rings)
+            for structure in (scores.optimum, scores.measured)
         )
         text = f"rings about ({plain_label(scores.plane)}): contrasts {contrasts}, measured {measured}, misfit "
         text += f"{scores.misfit[scores.at_optimum]:.2f} ± {scores.errors[scores.at_optimum]:.2f}"

@@ -130,7 +130,7 @@ def fit_tips(
     grid, settings : optional
         As for `fit_energies`.
     registration : Registration, optional
-        Carries the hits of all runs into the measured frame; by default found for each run.
+        Transform of the hits of all runs into the measured frame; by default determined for each run.
     **options
         Other parameters of `fit_energies`.
 
@@ -172,20 +172,20 @@ def fit_tips(
     ions = int(measured.values[region].sum()) if measured.is_counts else None
     common = replace(measured, mask=region, ions=ions, detected=None)
     studies = {
-        name: _fit(runs[name], common, grid, settings, registration=each, **options)
-        for name, each in registrations.items()
+        name: _fit(runs[name], common, grid, settings, registration=registration, **options)
+        for name, registration in registrations.items()
     }
     names = list(studies)
     # similarity of the best point of each resample, shape (runs, resamples)
     best = np.stack([study.resampled.max(axis=tuple(range(1, study.resampled.ndim))) for study in studies.values()])
     wins = np.bincount(best.argmax(axis=0), minlength=len(names)) if best.shape[1] else np.full(len(names), np.nan)
     shares = dict(zip(names, (wins / max(best.shape[1], 1)).tolist(), strict=True))
-    doubtful = tuple(name for name, each in registrations.items() if each.doubtful)
+    doubtful = tuple(name for name, registration in registrations.items() if registration.doubtful)
     return TipFit(studies, shares, doubtful, failed)
 
 
 def _fit(run, *arguments, **options):
-    """Fit of one run; a doubtful registration is expected for a wrong specimen, and told once in the result."""
+    """Fit of one run; a doubtful registration is expected for a wrong specimen, and reported once in the result."""
     run = run if isinstance(run, Run) else load(check_path(run))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RegistrationWarning)

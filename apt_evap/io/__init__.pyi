@@ -3,5 +3,6 @@ from .distortion_grid import read_grid as read_grid
 from .formats import TruncatedFile as TruncatedFile
 from .formats import chunks as chunks
 from .formats import read_ranges as read_ranges
+from .npz import read_map as read_map
 from .tapsim_nodes import write_nodes as write_nodes
 from .tapsim_nodes import write_types as write_types

@@ -74,8 +74,8 @@ def distinct(name: str, others: Iterable[str]) -> str:
     word = "_" + word if word[0].isdigit() else word
     taken = {*others, "species", "pos"}
     number = 2
-    found = word
-    while found in taken:
-        found = f"{word}_{number}"
+    unused = word
+    while unused in taken:
+        unused = f"{word}_{number}"
         number += 1
-    return found
+    return unused

@@ -312,12 +312,12 @@ def write_words(path: AnyPath, columns: Any, row_size: int, chosen: Any) -> None
     FileError
         If the file cannot be written.
     """
-    given = [(word, values[chosen], dtype) for word, values, dtype in columns if values is not None]
-    n = len(given[0][1])
+    columns_written = [(word, values[chosen], dtype) for word, values, dtype in columns if values is not None]
+    n = len(columns_written[0][1])
     with replace_file(path) as file:
         for start in range(0, n, _CHUNK):
             rows = np.zeros((min(_CHUNK, n - start), row_size // 4), ">u4")
-            for word, values, dtype in given:
+            for word, values, dtype in columns_written:
                 part = values[start : start + len(rows)].reshape(len(rows), -1)
                 rows.view(">" + dtype)[:, word : word + part.shape[1]] = part
             file.write(rows.data)

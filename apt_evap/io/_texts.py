@@ -173,8 +173,8 @@ def read_numbers(path: AnyPath, what: str, names: Sequence[str], at_most: int = 
         except ValueError:
             row = []
         if len(row) != len(names) or not all(map(math.isfinite, row)):
-            wanted = f"{len(names)} numbers ({', '.join(names)})"
-            raise FileError(f"{str(path)!r}, line {at}: expected {wanted} as in {what}, got {line.strip()!r:.60}")
+            expected = f"{len(names)} numbers ({', '.join(names)})"
+            raise FileError(f"{str(path)!r}, line {at}: expected {expected} as in {what}, got {line.strip()!r:.60}")
         rows.append(row)
     if not rows:
         raise FileError(f"{str(path)!r} has no numbers, expected {what}")

@@ -29,15 +29,16 @@ def read_grid(path: AnyPath) -> DistortionGrid:
     Raises
     ------
     FileError
-        If the file is missing or too large, a column is missing, a value is not a number, or the crossings are no grid.
+        If the file is missing or too large, a column is missing, a value is not a number, or the crossings do not
+        form a grid.
     """
     text = read_text(path, "a calibration grid", _MAX_BYTES)
     rows = [row for row in csv.reader(io.StringIO(text)) if any(cell.strip() for cell in row)]
     header = [cell.strip().lower() for cell in rows[0]] if rows else []
     missing = [name for name in _COLUMNS if name.lower() not in header]
     if missing:
-        found = ", ".join(header) or "none"
-        raise FileError(f"{str(path)!r} must have the columns {', '.join(_COLUMNS)}, it has {found}")
+        columns = ", ".join(header) or "none"
+        raise FileError(f"{str(path)!r} must have the columns {', '.join(_COLUMNS)}, it has {columns}")
     columns = [header.index(name.lower()) for name in _COLUMNS]
     values = np.empty((len(rows) - 1, 4))
     for number, row in enumerate(rows[1:]):

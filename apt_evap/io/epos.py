@@ -17,6 +17,7 @@ from apt_evap.io._records import MM, check_any, choose, choose_fields, in_mm, op
 from apt_evap.warnings import DataWarning, warn
 
 _ROW = 44
+_IN_VOLTS = "voltage_unit='V' (--voltage-unit V) reads them in V"
 _FIELDS = {
     "positions": (0, 3, "f4"),
     "mass_to_charge": (3, 1, "f4"),
@@ -180,8 +181,7 @@ class _Survey:
         self.kilovolts = self._unit == "kV" or (self._unit is None and bool(highest < _LEAST))
         if self.kilovolts and self._unit is None and decisive in self.present:
             warn(
-                f"{str(path)!r}: voltages of at most {highest:.4g} are taken for kV; voltage_unit='V' "
-                "(--voltage-unit V) reads them in V",
+                f"{str(path)!r}: voltages of at most {highest:.4g} are taken for kV; {_IN_VOLTS}",
                 DataWarning,
             )
         if "voltage" in self.present:
@@ -257,7 +257,7 @@ def write_epos(path: AnyPath, hits: Hits) -> None:
     if highest < _LEAST:
         warn(
             f"{str(path)!r}: voltages of at most {highest:.4g} V can be taken for kV: the format does not contain "
-            f"their unit; voltage_unit='V' (--voltage-unit V) reads them in V",
+            f"their unit; {_IN_VOLTS}",
             DataWarning,
         )
     ions = np.zeros(len(hits), np.uint32)

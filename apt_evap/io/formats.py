@@ -1,4 +1,4 @@
-"""Reading and writing of ions in all formats; `read` and `write` select the format.
+"""Reading of ions and maps and writing of ions in all formats; `read` and `write` select the format.
 
 A new format needs one module with a reader, a writer or both, and one line in `FORMATS`.
 """
@@ -38,7 +38,18 @@ from apt_evap.io.vtp import write_vtp
 from apt_evap.io.xyz import write_xyz
 from apt_evap.warnings import DataWarning, warn
 
-__all__ = ["FORMATS", "RANGE_FORMATS", "FileError", "Format", "TruncatedFile", "chunks", "read", "read_ranges", "write"]
+__all__ = [
+    "FORMATS",
+    "RANGE_FORMATS",
+    "FileError",
+    "Format",
+    "TruncatedFile",
+    "chunks",
+    "format_of",
+    "read",
+    "read_ranges",
+    "write",
+]
 
 
 @dataclass(frozen=True)
@@ -46,7 +57,7 @@ class Format:
     """A file format: suffix (also its name), first bytes, reader, writer, reader in chunks, and what is written.
 
     `fixed` are the columns that the writer always writes, as zeros if they are missing; empty if it writes those of the
-    ions. `keeps` tells whether it writes a column, by its name and values.
+    ions. `keeps` decides whether it writes a column, by its name and values.
     """
 
     suffix: str
@@ -109,26 +120,22 @@ _ADVICE |= {
 
 
 def read(path: AnyPath, *, format: str | None = None, columns: Sequence[str] | None = None, **options: Any) -> Any:
-    """Read a file of ions. The format is recognised by the first bytes if possible, otherwise by the suffix.
+    """Read a file of ions or a map; `simulation.read_file.read` reads runs, too.
 
     Parameters
     ----------
     path : str or path-like
-        The file: .pos, .epos, .apt, .raw, .nxs, .h5 (a run, NXapm or PyCCAPT), .npz, or a result table of TAPSim.
+        The file.
     format : str, optional
         Suffix of the format, such as ".pos", for any name of the file.
     columns : sequence of str, optional
-        Names of the columns to read; only these are kept in memory. All by default. Not for a run, an .npz and TAPSim.
+        Names of the columns to read.
     **options
-        Options of the reader of the format: ``partial=True`` reads the complete ions of a truncated file (the complete
-        sections of an .apt), ``byte_order="little"`` a .pos or .epos in the wrong byte
-        order, ``voltage_unit="V"`` an .epos with voltages below 100 V, ``detector_unit="cm"`` an .epos or .raw with
-        detector coordinates in cm; for an .npz the options of `read_map`.
+        Options of the reader of the format.
 
     Returns
     -------
-    Hits
-        The ions; for the .h5 of a simulation a `Run`, with the method `Run.hits`; for an .npz a `DetectorMap`.
+    Hits or DetectorMap
 
     Raises
     ------
@@ -136,18 +143,9 @@ def read(path: AnyPath, *, format: str | None = None, columns: Sequence[str] | N
         If the file is missing, unreadable, empty or of unknown format, or if an option or column does not exist.
     TruncatedFile
         If it ends in the middle of an ion.
-
-    Examples
-    --------
-    >>> ions = ae.Hits(positions=np.zeros((3, 3)), mass_to_charge=[29.0, 29.0, 58.0])
-    >>> ae.write("ni.pos", ions)
-    >>> hits = ae.read("ni.pos")
-    >>> hits
-    <Hits: 3 ions, 3 detected from 'ni.pos'; mass_to_charge, positions>
-    >>> hits.mass_to_charge  # Da
-    array([29., 29., 58.], dtype=float32)
     """
-    chosen = _to_read(path, format)
+    chosen = format_of(path, format)
+    assert chosen.read is not None
     content = chosen.read(path, **_options(path, chosen, chosen.read, columns, options))
     _warn_of_size(path, content)
     return content
@@ -183,7 +181,7 @@ def chunks(
         If `rows` is not an integer >= 1, or less than the number of ions of one pulse.
     """
     rows = check_count(rows, "rows", at_least=1)
-    chosen = _to_read(path, format)
+    chosen = format_of(path, format)
     if chosen.chunks is None:
         raise FileError(f"{str(path)!r} cannot be read in chunks: the format {chosen.suffix} does not support it")
     parts = chosen.chunks(path, rows, **_options(path, chosen, chosen.chunks, columns, options))
@@ -316,7 +314,23 @@ def read_ranges(path: AnyPath, *, format: str | None = None) -> Ranges:
     return RANGE_FORMATS.get(suffix, read_rrng)(path)
 
 
-def _to_read(path, format):
+def format_of(path: AnyPath, format: str | None = None) -> Format:
+    """Format of a file, by its first bytes if possible, otherwise by its suffix.
+
+    Parameters
+    ----------
+    path, format
+        As for `read`.
+
+    Returns
+    -------
+    Format
+
+    Raises
+    ------
+    FileError
+        If the file is missing or unreadable, or its format is unknown or can only be written.
+    """
     head = read_head(path, 64)
     chosen = _by_content(head) if format is None else None
     if chosen is None:

@@ -222,15 +222,15 @@ def read_data(path: AnyPath, *, units: str = "metal", style: str | None = None) 
     if style is not None:
         check_choice(style, "style", _STYLES)
     width = len(rows[0].split())
-    given = comment.split()[:1]
-    if style is None and given:
-        style = given[0] if given[0] in _STYLES else ""
+    hint = comment.split()[:1]
+    if style is None and hint:
+        style = hint[0] if hint[0] in _STYLES else ""
     if style is None and width in (5, 8):  # without or with the numbers of the periodic images
         style = "atomic"
     if not style:
         problem = "does not state the style of its section Atoms"
-        if given:
-            problem = f"states the style {given[0]!r} of its section Atoms, which is not read"
+        if hint:
+            problem = f"states the style {hint[0]!r} of its section Atoms, which is not read"
         raise FileError(f"{where} {problem} ({width} columns); style= must be one of {', '.join(_STYLES)}")
     of_type, first = _STYLES[style]
     if width not in (first + 3, first + 6):

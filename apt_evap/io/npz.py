@@ -52,7 +52,7 @@ def read_map(
     --------
     >>> edges = np.linspace(-20, 20, 41)
     >>> np.savez("measured.npz", counts=np.ones((40, 40), int), x_edges_mm=edges, y_edges_mm=edges)
-    >>> ae.read_map("measured.npz")
+    >>> ae.io.read_map("measured.npz")
     <DetectorMap: 1,600 ions from 'measured.npz', 40 x 40 bins of 1 x 1 mm>
     """
     with open_for_reading(path) as file:
@@ -84,7 +84,7 @@ def read_map(
     plane = arrays[values]
     edges = []
     for axis, name in (("x_edges", x_edges), ("y_edges", y_edges)):
-        name = choose(f"edges in {axis[0]} ({axis}_mm)", name, [each for each in arrays if each.startswith(axis)])
+        name = choose(f"edges in {axis[0]} ({axis}_mm)", name, [array for array in arrays if array.startswith(axis)])
         length = unit if unit is not None else name.rpartition("_")[2]
         if length not in MM:
             raise FileError(f"{str(path)!r}: the unit of {name} must be one of {', '.join(MM)}, got {length!r}")

@@ -72,17 +72,17 @@ def write_nxapm(path: AnyPath, hits: Hits, *, elements: Sequence[str], start_tim
             version=__version__,
             is_simulation=hits.outcome is not None or hits.site is not None,
         )
-        own = put_group(file, _OWN, "NXcollection")
-        put_text(own, "columns", json.dumps(hits.columns))
-        put_text(own, "source", hits.source or "unknown")
+        group = put_group(file, _OWN, "NXcollection")
+        put_text(group, "columns", json.dumps(hits.columns))
+        put_text(group, "source", hits.source or "unknown")
         if hits.extent is not None:
-            own.attrs["extent"] = hits.extent
+            group.attrs["extent"] = hits.extent
         for name in names:
-            put_field(own, name, getattr(hits, name), _UNITS.get(name))
+            put_field(group, name, getattr(hits, name), _UNITS.get(name))
         numeric = {name: values for name, values in hits.extra.items() if values.dtype.kind in "biuf"}
-        put_text(own, "extra", json.dumps([[name, hits.units.get(name)] for name in numeric]))
+        put_text(group, "extra", json.dumps([[name, hits.units.get(name)] for name in numeric]))
         for index, (name, values) in enumerate(numeric.items()):
-            put_field(own, f"extra_{index}", values, hits.units.get(name)).attrs["name"] = name
+            put_field(group, f"extra_{index}", values, hits.units.get(name)).attrs["name"] = name
 
 
 def _time(text):

@@ -86,22 +86,22 @@ def read_pyccapt(path: AnyPath, *, columns: Sequence[str] | None = None) -> Hits
     """
     with open_hdf5(path, "a file of PyCCAPT") as file:
         if "dld" in file:
-            found = _instrument(file)
+            columns_read = _instrument(file)
         elif "df" in file:
-            found = _calibrated(file, file.name)
+            columns_read = _calibrated(file, file.name)
         else:
             raise FileError(f"{file.name!r} is not a file of PyCCAPT: it has neither a group 'dld' nor a group 'df'")
-        return _hits(found, file.name, columns)
+        return _hits(columns_read, file.name, columns)
 
 
 def _instrument(file):
     """Columns in the group dld."""
-    found = {}
+    columns = {}
     for column, (names, factor) in _INSTRUMENT.items():
         stored = next((f"dld/{name}" for name in names if f"dld/{name}" in file), None)
         if stored is not None:
-            found[column] = _scaled(_one_column(numbers(file, stored), stored), factor)
-    return found
+            columns[column] = _scaled(_one_column(numbers(file, stored), stored), factor)
+    return columns
 
 
 def _one_column(values, name):
@@ -117,8 +117,10 @@ def _calibrated(file, path):
             f"{path!r} contains a table of pandas (format='table'), expected format='fixed', as PyCCAPT writes it: "
             "to_hdf(path, key='df', format='fixed')"
         )
-    wanted = {name: (column, factor) for column, (names, factor) in _CALIBRATED.items() for name in reversed(names)}
-    known, found = [], {}
+    known_names = {
+        name: (column, factor) for column, (names, factor) in _CALIBRATED.items() for name in reversed(names)
+    }
+    known, table = [], {}
     for index in range(_MAX_BLOCKS):
         if f"df/block{index}_items" not in file:
             break
@@ -127,18 +129,18 @@ def _calibrated(file, path):
             raise ValueError(f"df/block{index}_items must contain the names of columns")
         names = [name.decode("utf-8", "replace") for name in items.tolist()]
         known += names
-        if not any(name in wanted for name in names):
+        if not any(name in known_names for name in names):
             continue  # a block of texts or lists
         values = numbers(file, f"df/block{index}_values")
         if values.ndim != 2 or values.shape[1] != len(names):
             raise ValueError(f"df/block{index}_values must have {len(names)} columns, got shape {values.shape}")
-        found |= {name: values[:, k] for k, name in enumerate(names) if name in wanted}
+        table |= {name: values[:, k] for k, name in enumerate(names) if name in known_names}
     if "mc_low" in known:
         raise FileError(f"{path!r} contains the mass ranges of PyCCAPT, expected its ions")
     columns = {}
     for column, (names, factor) in _CALIBRATED.items():
         # the first name that is not zero for all ions: columns of steps that were not done yet are zero
-        stored = [found[name] for name in names if name in found]
+        stored = [table[name] for name in names if name in table]
         if stored:
             columns[column] = _scaled(next((values for values in stored if values.any()), stored[0]), factor)
     return columns
@@ -150,31 +152,31 @@ def _scaled(values, factor):
     return values * factor
 
 
-def _hits(found, path, columns):
-    if "x" not in found or "y" not in found:
+def _hits(table, path, columns):
+    if "x" not in table or "y" not in table:
         raise FileError(
             f"{path!r} has no detector coordinates of PyCCAPT (x and y of dld, or x_det (cm) and y_det (cm))"
         )
-    lengths = {name: len(values) for name, values in found.items()}
+    lengths = {name: len(values) for name, values in table.items()}
     if len(set(lengths.values())) > 1:
         raise FileError(f"{path!r}: columns of PyCCAPT must have equal lengths, got {lengths}")
-    counts = [name for name in _CONTINUOUS if name in found and found[name].dtype.kind in "iu"]
+    counts = [name for name in _CONTINUOUS if name in table and table[name].dtype.kind in "iu"]
     if counts:
         raise FileError(
             f"{path!r}: {', '.join(counts)} are integers, raw counts of the detector, expected cm and ns: convert them "
             "with the constants of this instrument (in PyCCAPT 78 or 80 mm for 2,450 bins, and 6.858 ps)"
         )
-    found = {name: values for name, values in found.items() if name in _KEPT or values.any()}
-    if all(name in found for name in _POSITIONS):
-        found["positions"] = np.column_stack([found.pop(name) for name in _POSITIONS])
-    found = {name: values for name, values in found.items() if name not in _POSITIONS}
-    if "start_counter" in found and len(found["x"]):
-        found["pulse_id"], found["multiplicity"] = pulses_from_first(first_from_equal(found["start_counter"]))
-    elif "multi" in found and (ions := ions_per_pulse(found["multi"])[0]) is not None:
-        found["pulse_id"], found["multiplicity"] = pulses_from_first(ions)
-        found.pop("multi")
-    chosen = check_columns(columns, tuple(found), path)
-    requested = {name: found[name] for name in chosen}
+    table = {name: values for name, values in table.items() if name in _KEPT or values.any()}
+    if all(name in table for name in _POSITIONS):
+        table["positions"] = np.column_stack([table.pop(name) for name in _POSITIONS])
+    table = {name: values for name, values in table.items() if name not in _POSITIONS}
+    if "start_counter" in table and len(table["x"]):
+        table["pulse_id"], table["multiplicity"] = pulses_from_first(first_from_equal(table["start_counter"]))
+    elif "multi" in table and (ions := ions_per_pulse(table["multi"])[0]) is not None:
+        table["pulse_id"], table["multiplicity"] = pulses_from_first(ions)
+        table.pop("multi")
+    chosen = check_columns(columns, tuple(table), path)
+    requested = {name: table[name] for name in chosen}
     check_any(requested, path)
     extra = {name: requested.pop(name) for name in _EXTRA if name in requested}
     units = {name: _EXTRA[name] for name in extra if _EXTRA[name]}

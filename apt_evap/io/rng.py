@@ -57,11 +57,11 @@ def read_rng(path: AnyPath) -> Ranges:
     named = [names.get(bounds, ("", "")) for bounds, _ in rows]
     species = [formula(atoms) for _, atoms in rows]
     return Ranges(
-        tuple(name or own for (name, _), own in zip(named, species, strict=True)),
+        tuple(name or species_name for (name, _), species_name in zip(named, species, strict=True)),
         np.array([low for (low, _), _ in rows]),
         np.array([high for (_, high), _ in rows]),
         None,
-        tuple(paint or colours.get(own, "") for (_, paint), own in zip(named, species, strict=True)),
+        tuple(paint or colours.get(species_name, "") for (_, paint), species_name in zip(named, species, strict=True)),
         tuple(atoms_in(atoms) for _, atoms in rows),
         source=str(path),
     )
@@ -77,7 +77,7 @@ def _table(lines, path):
     if len(counts) != 2:
         raise FileError(f"{where}, line {at}: expected the numbers of species and of ranges, got {first!r:.60}")
     n_species, n_ranges = (
-        count(each, "the numbers of species and of ranges", f"{where}, line {at}") for each in counts
+        count(word, "the numbers of species and of ranges", f"{where}, line {at}") for word in counts
     )
     if len(lines) < 2 * n_species + 2:
         raise FileError(f"{where}: expected {n_species} species and then a line of dashes, the file ends before it")

@@ -91,24 +91,26 @@ def read_tip(
     <Tip: 8,179 atoms of Ni from positions>
     """
     names = {str(key): value for key, value in check_kind(types or {}, "types", Mapping, "a mapping").items()}
-    given = {key: value for key, value in (("units", units), ("frame", frame), ("style", style)) if value is not None}
-    return tip_of(path, read_atoms(path, format, **given), names, **options)
+    options_given = {
+        key: value for key, value in (("units", units), ("frame", frame), ("style", style)) if value is not None
+    }
+    return tip_of(path, read_atoms(path, format, **options_given), names, **options)
 
 
-def read_atoms(path: AnyPath, format: str | None = None, **given: Any) -> Atoms:
+def read_atoms(path: AnyPath, format: str | None = None, **reader_options: Any) -> Atoms:
     """Read the atoms of a file as they are, with the options of `read_tip` for its format."""
-    name, own = str(check_path(path)), specimen_format(path)
-    kind = own if format is None else check_choice(format, "format", SPECIMEN_FORMATS)
-    if kind == "ase" != own:  # ASE makes hydrogen of types without a name
-        raise FileError(f"{name!r} is a file of the format {own}, which ASE reads without the names of its types")
-    for key in given:
+    name, detected = str(check_path(path)), specimen_format(path)
+    kind = detected if format is None else check_choice(format, "format", SPECIMEN_FORMATS)
+    if kind == "ase" != detected:  # ASE makes hydrogen of types without a name
+        raise FileError(f"{name!r} is a file of the format {detected}, which ASE reads without the names of its types")
+    for key in reader_options:
         if key not in _OPTIONS[kind]:
             takes = ", ".join(_OPTIONS[kind]) or "no such options"
             raise FileError(f"{name!r}: reading a specimen of format {kind} takes {takes}, got {key!r}")
     if kind == "ase":
-        atoms = _read_ase(path, **given)  # in Angstrom
+        atoms = _read_ase(path, **reader_options)  # in Angstrom
         return Atoms(atoms.get_positions() / 10, atoms.get_chemical_symbols(), atoms.arrays.get("evaporable"))
-    return _READERS[kind](path, **given)
+    return _READERS[kind](path, **reader_options)
 
 
 def types_of(atoms: Atoms, names: Mapping[str, Any]) -> list[str]:
@@ -133,18 +135,18 @@ def tip_of(path: AnyPath, atoms: Atoms, names: Mapping[str, Material | str], **o
             f"{name!r} has the element C for all atoms, as LAMMPS writes it without names of elements: give those of "
             "the column type, such as types={1: 'Al'}"
         )
-    unnamed = [each for each in kinds if each not in names and not each[:1].isalpha()]
+    unnamed = [kind for kind in kinds if kind not in names and not kind[:1].isalpha()]
     if unnamed:
         raise FileError(
             f"{name!r} has types without a name, expected the element of each, such as types={{{unnamed[0]}: 'Al'}}, "
             f"got none for {', '.join(unnamed)!s:.100}"
         )
-    number = {each: k for k, each in enumerate(kinds)}
+    number = {kind: k for k, kind in enumerate(kinds)}
     try:
         arguments: dict[str, Any] = {
             "positions": atoms.positions,
             "species": np.array([number[kind] for kind in types], np.int32),
-            "elements": [as_material(names.get(each, each), "types") for each in kinds],
+            "elements": [as_material(names.get(kind, kind), "types") for kind in kinds],
         }
         return Tip.from_positions(**(arguments | options))
     except ValueError as error:
@@ -164,7 +166,7 @@ def specimen_format(path: AnyPath) -> str:
 
 
 def _read_ase(path, frame=-1):
-    """Atoms of ASE, from a file of any format that it knows."""
+    """Atoms of ASE, from a file of any format that it reads."""
     head = read_head(path, 64)
     if head.startswith(b"---") and b"LAMMPS" in head:
         raise FileError(f"{str(path)!r} is a LAMMPS dump in YAML, expected one of style custom or atom, or a data file")

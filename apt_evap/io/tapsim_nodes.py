@@ -7,13 +7,13 @@ here little-endian.
 """
 
 import re
+from collections.abc import Mapping
 
 import numpy as np
 
 from apt_evap._common.files import FileError, TruncatedFile, replace_file
 from apt_evap._common.types import AnyPath
-from apt_evap._common.validation import check_kind, check_number, check_switch
-from apt_evap.evaporation.thermal import Arrhenius
+from apt_evap._common.validation import check_kind, check_number, check_switch, short_text
 from apt_evap.io._texts import read_bytes, read_head
 from apt_evap.io.lammps import Atoms
 from apt_evap.specimen.tip import Tip
@@ -66,11 +66,11 @@ def read_nodes(path: AnyPath) -> Atoms:
     atoms = ids > max(_BOUNDARIES)
     if not atoms.any():
         raise FileError(f"{str(path)!r} has no atoms among its {n} nodes: all ids are 0 to {max(_BOUNDARIES)}")
-    return Atoms(positions[atoms] * _NM_PER_M, [str(each) for each in ids[atoms].tolist()])
+    return Atoms(positions[atoms] * _NM_PER_M, [str(number) for number in ids[atoms].tolist()])
 
 
-def _truncated(path, n, found):
-    return TruncatedFile(f"{str(path)!r} states {n} nodes but ends after {found}")
+def _truncated(path, n, complete):
+    return TruncatedFile(f"{str(path)!r} states {n} nodes but ends after {complete}")
 
 
 def _text(data, start, n, columns, path):
@@ -95,7 +95,8 @@ def _text(data, start, n, columns, path):
 
 def _binary(data, start, n, columns, path):
     kinds = [("position", "<f4", 3), ("id", "<i2")]
-    kinds += [each for each, there in zip((("number", "<u4"), ("potential", "<f4")), columns, strict=True) if there]
+    optional = (("number", "<u4"), ("potential", "<f4"))
+    kinds += [column for column, is_present in zip(optional, columns, strict=True) if is_present]
     row = np.dtype(kinds)  # type: ignore[arg-type]
     if len(data) - start < n * row.itemsize:
         raise _truncated(path, n, (len(data) - start) // row.itemsize)
@@ -143,12 +144,19 @@ def write_nodes(path: AnyPath, tip: Tip, *, binary: bool = False) -> None:
                 file.write("".join([_ROW % values for values in zip(*columns, strict=True)]).encode())
 
 
-def write_types(path: AnyPath, tip: Tip, *, law: Arrhenius | None = None, voltage: float = _SPECIMEN) -> None:
+def write_types(
+    path: AnyPath,
+    tip: Tip,
+    *,
+    temperature: float = 0.0,
+    activation_energies: float | Mapping[str, float] = 1.0,
+    voltage: float = _SPECIMEN,
+) -> None:
     """Write the types of the nodes of a specimen, the configuration of TAPSim.
 
     In TAPSim the barrier is half the activation energy times (1 - field / evaporation field). The activation energies
-    written are therefore twice the sensitivities C of the law. TAPSim's field is that of its own mesh at the node, and
-    not relative to the largest one, so that probabilities of the two programs differ.
+    that correspond to `Arrhenius` are therefore twice its sensitivities C. TAPSim's field is that of its own mesh at
+    the node, and not relative to the largest one, so that probabilities of the two programs differ.
 
     Parameters
     ----------
@@ -156,8 +164,10 @@ def write_types(path: AnyPath, tip: Tip, *, law: Arrhenius | None = None, voltag
         The file; an existing one is replaced when the new one is complete.
     tip : Tip
         The specimen.
-    law : Arrhenius, optional
-        Temperature and sensitivities. By default a temperature of 0 and energies of 1 eV.
+    temperature : float
+        Temperature of the specimen [K].
+    activation_energies : float or mapping
+        Activation energy of all elements [eV], or of each by its name.
     voltage : float
         Potential of the specimen [V].
 
@@ -170,10 +180,8 @@ def write_types(path: AnyPath, tip: Tip, *, law: Arrhenius | None = None, voltag
     """
     check_kind(tip, "tip", Tip, "a Tip")
     check_number(voltage, "voltage", above=0, unit="V")
-    temperature, energies = 0.0, np.ones(len(tip.elements))
-    if law is not None:
-        check_kind(law, "law", Arrhenius, "an Arrhenius")
-        temperature, energies = law.peak_temperature, 2 * law.sensitivities(tip)
+    check_number(temperature, "temperature", at_least=0, unit="K")
+    energies = _energies(activation_energies, [element.name for element in tip.elements])
     blocks = [
         _block(
             number,
@@ -201,6 +209,19 @@ def write_types(path: AnyPath, tip: Tip, *, law: Arrhenius | None = None, voltag
         )
     with replace_file(path) as file:
         file.write("\n".join(["ASCII", "", f"TEMPERATURE = {temperature:.8g}", "", *blocks]).encode())
+
+
+def _energies(energies, names):
+    """Activation energy of each element [eV]."""
+    if not isinstance(energies, Mapping):
+        return [check_number(energies, "activation_energies", at_least=0, unit="eV")] * len(names)
+    for name in energies:
+        if name not in names:
+            raise ValueError(f"activation_energies must be of {', '.join(names)}, got {short_text(name)}")
+    for name in names:
+        if name not in energies:
+            raise ValueError(f"activation_energies must have a value for {name}, got {short_text(dict(energies))}")
+    return [check_number(energies[name], f"activation energy of {name}", at_least=0, unit="eV") for name in names]
 
 
 def _block(

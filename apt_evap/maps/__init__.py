@@ -1,4 +1,4 @@
-"""Measures of detector maps: profiles, rings about a pole, zone lines, similarity; they need no run."""
+"""Detector maps: profiles, rings about a pole, zone lines, similarity, orientation, registration, indexing."""
 
 import lazy_loader
 

@@ -35,17 +35,17 @@ def folded_maps(maps: Mapping[str, FoldedMap], *, colormap: str = "inferno") -> 
         raise ValueError("folded_maps needs at least one map, got none")
     first = next(iter(maps.values()))
     titles = [
-        title if each is first else f"{title}: correlation {each.correlation(first):.2f}"
-        for title, each in maps.items()
+        title if folded is first else f"{title}: correlation {folded.correlation(first):.2f}"
+        for title, folded in maps.items()
     ]
-    values = np.concatenate([each.flattened[np.isfinite(each.flattened)] for each in maps.values()])
+    values = np.concatenate([folded.flattened[np.isfinite(folded.flattened)] for folded in maps.values()])
     low, high = np.percentile(values, [0.5, 99.5])
     figure = new_figure((3.6 * len(maps) + 1.0, 4.0))
     axes = figure.subplots(1, len(maps), squeeze=False, sharey=True).ravel()
-    for ax, title, each in zip(axes, titles, maps.values(), strict=True):
-        end = each.angles[-1]
+    for ax, title, folded in zip(axes, titles, maps.values(), strict=True):
+        end = folded.angles[-1]
         ax.imshow(
-            each.flattened, origin="lower", extent=(-end, end, -end, end), cmap=colormap, vmin=low, vmax=high,
+            folded.flattened, origin="lower", extent=(-end, end, -end, end), cmap=colormap, vmin=low, vmax=high,
         )  # fmt: skip
         ax.set(xlabel="angle from the pole [degrees]", facecolor=OUTSIDE)
         ax.set_title(title, fontsize="medium")

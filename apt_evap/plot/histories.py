@@ -66,7 +66,7 @@ def voltage_curve(
     element: str | None = None,
     ranges: Ranges | None = None,
 ) -> NDArray[np.object_]:
-    """Draw the course of a run or of a measurement against the ions: voltage, field, rate and charges.
+    """Draw the history of a run or of a measurement against the ions: voltage, field, rate and charges.
 
     There are up to four panels, those for which there are data:
 
@@ -153,21 +153,19 @@ def _panels(run):
 
 def _panels_of_run(run, points, element):
     """Function that draws each panel of a run, with its arguments."""
-    if run.real is None and run.clock is None:
+    operating = run.observation.operating
+    if operating.is_constant:
         raise ValueError(
             f"the voltage of {run!r} is constant: use the run in real units, run.at_evaporation_field(), or `history`"
         )
-    total = run.instrument_voltages
-    control = run.settings.get("control") if run.units is None else vars(run.units.control)
-    pulsed = bool(control and control["pulse_fraction"] > 0)
-    panels = [(_draw_voltage, total, points, "voltage with\npulse [V]" if pulsed else "voltage [V]")]
+    label = "voltage with\npulse [V]" if operating.control.pulse_fraction > 0 else "voltage [V]"
+    panels = [(_draw_voltage, operating.instrument_voltages, points, label)]
     ions = run.emissions.ions
     known = np.isfinite(run.cap.fields) & (run.cap.ions >= ions[0]) & (run.cap.ions <= ions[-1])
     if known.any():
         at = run.cap.ions[known]
         fields = run.cap.fields[known] * np.interp(at, ions, run.voltages) / run.voltage
-        goal = run.units.operating_field if run.units is not None and run.units.field_reference == "cap" else None
-        panels.append((_draw_field, at - ions[0], fields, goal))
+        panels.append((_draw_field, at - ions[0], fields, operating.cap_field))
     panels += _rate_of_run(run, points)
     if run.real is not None:
         element = run.elements[0] if element is None else check_choice(element, "element", run.elements)
@@ -182,7 +180,7 @@ def _panels_of_hits(hits, points, element, ranges):
     panels = [(_draw_voltage, voltage, points, "standing\nvoltage [V]" if pulsed else "voltage [V]")]
     if hits.pulses is not None and hits.pulses.any():
         edges = _sections(len(hits), points)
-        detected, pulses = (np.add.reduceat(each, edges[:-1], dtype=float) for each in (hits.detected, hits.pulses))
+        detected, pulses = (np.add.reduceat(column, edges[:-1], dtype=float) for column in (hits.detected, hits.pulses))
         panels.append((_draw_rate, edges, detected / np.maximum(pulses, 1), "ions per pulse", None))
     if ranges is not None or "charge_state" in hits.extra:
         charges = hits.extra["charge_state"] if element is None else ion_charges(hits, element, ranges)

@@ -16,13 +16,13 @@ _LEAST_BIAS = 0.01  # of the colour scale, in units of the true fraction
 
 
 def conditions(
-    found: Conditions, element: str | None = None, axes: Sequence[Axes] | None = None
+    result: Conditions, element: str | None = None, axes: Sequence[Axes] | None = None
 ) -> NDArray[np.object_]:
     """Draw the share of an element that is lost between pulses, and the bias of its measured fraction.
 
     Parameters
     ----------
-    found : Conditions
+    result : Conditions
         Result of `evaporation.conditions`, for at least two temperatures and two pulse fractions.
     element : str, optional
         By default the one that is lost most.
@@ -41,38 +41,38 @@ def conditions(
 
     Examples
     --------
-    >>> found = ae.evaporation.conditions({"Al": 0.9, "Cu": 0.1}, law=ae.Arrhenius(50.0, {"Al": 1.0, "Cu": 0.6}))
-    >>> lost, bias = ae.plot.conditions(found)
+    >>> result = ae.evaporation.conditions({"Al": 0.9, "Cu": 0.1}, law=ae.Arrhenius(50.0, {"Al": 1.0, "Cu": 0.6}))
+    >>> lost, bias = ae.plot.conditions(result)
     >>> lost.get_title()
     'Cu that is lost between pulses'
     """
-    check_kind(found, "found", Conditions, "Conditions, such as evaporation.conditions(...)")
-    if min(len(found.temperatures), len(found.pulse_fractions)) < 2:
-        raise ValueError(f"found must have at least two temperatures and two pulse fractions, got {found}")
+    check_kind(result, "result", Conditions, "Conditions, such as evaporation.conditions(...)")
+    if min(len(result.temperatures), len(result.pulse_fractions)) < 2:
+        raise ValueError(f"result must have at least two temperatures and two pulse fractions, got {result}")
     if element is None:
-        element = found.elements[int(np.argmax(found.lost.max(axis=(1, 2))))]
-    index = found.elements.index(check_choice(element, "element", found.elements))
+        element = result.elements[int(np.argmax(result.lost.max(axis=(1, 2))))]
+    index = result.elements.index(check_choice(element, "element", result.elements))
     if axes is None:
         axes = new_figure((9.6, 3.8)).subplots(1, 2)
     lost, bias = np.asarray(axes, dtype=object).ravel()
-    horizontal, vertical = found.temperatures, found.pulse_fractions
-    shares = np.maximum(found.lost[index].T, _LEVELS[0] / 100)
+    horizontal, vertical = result.temperatures, result.pulse_fractions
+    shares = np.maximum(result.lost[index].T, _LEVELS[0] / 100)
     norm = LogNorm(_LEVELS[0] / 10, 1.0)
     drawn = lost.pcolormesh(horizontal, vertical, shares, norm=norm, cmap="magma", shading="gouraud")
     lines = lost.contour(horizontal, vertical, shares, levels=_LEVELS, colors="white", linewidths=1.0)
     lost.clabel(lines, fmt=lambda level: f"{100 * level:g} %", fontsize=9)
     lost.figure.colorbar(drawn, ax=lost, label="share that is lost", extend="min")
     lost.set_title(f"{element} that is lost between pulses")
-    relative = 100 * found.bias[index].T / found.composition[index]
+    relative = 100 * result.bias[index].T / result.composition[index]
     most = max(float(np.abs(relative).max()), 100 * _LEAST_BIAS)
     drawn = bias.pcolormesh(
         horizontal, vertical, relative, norm=TwoSlopeNorm(0.0, -most, most), cmap="RdBu_r", shading="gouraud"
     )
-    levels = [each for each in (-50, -20, -10, -5, -1, 1, 5, 10, 20, 50) if abs(each) < most]
+    levels = [percent for percent in (-50, -20, -10, -5, -1, 1, 5, 10, 20, 50) if abs(percent) < most]
     lines = bias.contour(horizontal, vertical, relative, levels=levels, colors="black", linewidths=1.0)
     bias.clabel(lines, fmt=lambda level: f"{level:+g} %", fontsize=9)
     bias.figure.colorbar(drawn, ax=bias, label="measured over true fraction, minus 1 [%]")
-    bias.set_title(f"measured {element}, {100 * found.composition[index]:.3g} % are true")
+    bias.set_title(f"measured {element}, {100 * result.composition[index]:.3g} % are true")
     for ax in (lost, bias):
         ax.set(xlabel="temperature [K]", ylabel="pulse fraction")
     return np.array([lost, bias], dtype=object)

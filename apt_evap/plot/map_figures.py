@@ -127,12 +127,12 @@ def detector_maps(
     columns = min(n, columns or (n if n <= 3 else ceil(sqrt(n))))
     rows = -(-len(drawn) // columns)
     if limits is None:
-        each = np.array([color_limits(map) for map in drawn])
-        limits = each[:, 0].min(), each[:, 1].max()
+        ranges = np.array([color_limits(map) for map in drawn])
+        limits = ranges[:, 0].min(), ranges[:, 1].max()
     figure = new_figure((4.1 * columns + 0.9, 4.3 * rows))
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    for ax, map, own in zip(axes, drawn, titles, strict=False):
-        detector_map(map, ax, title=own, limits=limits, colormap=colormap, colorbar=False)
+    for ax, map, map_title in zip(axes, drawn, titles, strict=False):
+        detector_map(map, ax, title=map_title, limits=limits, colormap=colormap, colorbar=False)
     for ax in axes[len(drawn) :]:
         ax.remove()
     axes = axes[: len(drawn)]
@@ -165,8 +165,8 @@ def specimen_title(run: Run) -> str:
     parts = [", ".join(run.elements).replace("$", r"\$")]
     if "axis" in tip:  # not of a specimen from positions
         axis = tip["axis"]
-        whole = all(each == round(each) for each in axis)
-        parts.append(f"axis [{label(axis) if whole else ' '.join(f'{each:.2f}' for each in axis)}]")
+        whole = all(index == round(index) for index in axis)
+        parts.append(f"axis [{label(axis) if whole else ' '.join(f'{index:.2f}' for index in axis)}]")
     if "apex_radius" in tip:
         parts.append(f"R = {tip['apex_radius']:.1f} nm")
     return ", ".join(parts)

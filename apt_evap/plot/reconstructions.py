@@ -1,4 +1,4 @@
-"""A reconstruction: from the side, from the tip, its course along the depth and its composition."""
+"""A reconstruction: from the side, from the tip, its radius along the depth and its composition."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ OUTSIDE = "outside every range"
 
 
 def reconstruction(
-    found: Reconstruction, ranges: Ranges | None = None, *, title: str | None = None
+    result: Reconstruction, ranges: Ranges | None = None, *, title: str | None = None
 ) -> NDArray[np.object_]:
     """Draw a reconstruction: a slice from the side, the ions per area along the axis, a depth profile, the composition.
 
@@ -35,7 +35,7 @@ def reconstruction(
 
     Parameters
     ----------
-    found : Reconstruction
+    result : Reconstruction
         Result of `reconstruct`.
     ranges : Ranges, optional
         Ranges of mass that give the species of measured ions; simulated ions have theirs.
@@ -52,39 +52,39 @@ def reconstruction(
     >>> rng = np.random.default_rng(1)
     >>> radius, azimuth = 20 * np.sqrt(rng.random(20_000)), 2 * np.pi * rng.random(20_000)  # mm, uniform
     >>> ions = ae.Hits(x=radius * np.cos(azimuth), y=radius * np.sin(azimuth))
-    >>> found = ae.reconstruct(ions, atomic_volume=0.011, distance=90.0, radius=30.0)
-    >>> axes = ae.plot.reconstruction(found)            # axes[0].figure.savefig("reconstruction.png")
+    >>> result = ae.reconstruct(ions, atomic_volume=0.011, distance=90.0, radius=30.0)
+    >>> axes = ae.plot.reconstruction(result)            # axes[0].figure.savefig("reconstruction.png")
     >>> len(axes)
     4
     """
-    check_kind(found, "found", Reconstruction, "a Reconstruction, the result of reconstruct")
-    names, species = _species(found, ranges)
+    check_kind(result, "result", Reconstruction, "a Reconstruction, the result of reconstruct")
+    names, species = _species(result, ranges)
     figure = new_figure((11.0, 8.4))
     axes = figure.subplots(2, 2).ravel()
-    _side(axes[0], found, names, species)
-    _top(axes[1], found)
+    _side(axes[0], result, names, species)
+    _top(axes[1], result)
     if len(names) > 1:
-        _fractions(axes[2], found, names, species)
+        _fractions(axes[2], result, names, species)
         _composition(axes[3], names, species)
     else:
-        _density(axes[2], found)
-        axes[3].plot(found.depths, found.radii, color="C0")
+        _density(axes[2], result)
+        axes[3].plot(result.depths, result.radii, color="C0")
         axes[3].set(xlabel="depth of the apex [nm]", ylabel="radius of the cap [nm]")
     if title is None:
-        x, y, z = np.ptp(found.positions, axis=0)
-        title = f"{len(found):,} ions, {x:.1f} × {y:.1f} × {z:.1f} nm"
+        x, y, z = np.ptp(result.positions, axis=0)
+        title = f"{len(result):,} ions, {x:.1f} × {y:.1f} × {z:.1f} nm"
     figure.suptitle(title, parse_math=False)
     return axes
 
 
-def _species(found, ranges):
+def _species(result, ranges):
     """Names of the groups of ions, the most frequent first, and the group of each ion."""
     if ranges is not None:
-        labels = check_kind(ranges, "ranges", Ranges, "Ranges, such as read_ranges(path)").labels(found.hits, OUTSIDE)
-    elif "element" in found.hits.extra:
-        labels = found.hits.extra["element"]
+        labels = check_kind(ranges, "ranges", Ranges, "Ranges, such as read_ranges(path)").labels(result.hits, OUTSIDE)
+    elif "element" in result.hits.extra:
+        labels = result.hits.extra["element"]
     else:
-        return ["ions"], np.zeros(len(found), dtype=int)
+        return ["ions"], np.zeros(len(result), dtype=int)
     names, group, number = np.unique(labels.astype(str), return_inverse=True, return_counts=True)
     order = np.argsort(-number, kind="stable")
     rank = np.empty(len(order), dtype=int)
@@ -95,8 +95,8 @@ def _species(found, ranges):
     return [*sorted_names[:_MOST], "other"], np.minimum(rank[group], _MOST)
 
 
-def _side(ax: Axes, found, names, species):
-    x, y, z = found.positions.T
+def _side(ax: Axes, result, names, species):
+    x, y, z = result.positions.T
     near = np.flatnonzero(np.abs(y - np.median(y)) < 0.05 * np.ptp(y))
     near = near[:: max(1, -(-len(near) // _DOTS))]
     size = float(np.clip(_DOTS / max(len(near), 1), 1.5, 12.0))
@@ -108,8 +108,8 @@ def _side(ax: Axes, found, names, species):
     set_title(ax, f"from the side, {0.1 * np.ptp(y):.1f} nm thick")
 
 
-def _top(ax: Axes, found):
-    shown = binned(Hits(x=found.positions[:, 0], y=found.positions[:, 1]))  # nm in place of mm
+def _top(ax: Axes, result):
+    shown = binned(Hits(x=result.positions[:, 0], y=result.positions[:, 1]))  # nm in place of mm
     low, high = color_limits(shown)
     image = ax.imshow(
         shown.density, origin="lower", extent=shown.extent, cmap="inferno", vmin=low, vmax=high, interpolation="nearest"
@@ -119,9 +119,9 @@ def _top(ax: Axes, found):
     add_colorbar([image], ax, label="ions per area / mean")
 
 
-def _core(found):
+def _core(result):
     """Ions within half the field of view, and its radius [nm]."""
-    across = np.hypot(*found.positions[:, :2].T)
+    across = np.hypot(*result.positions[:, :2].T)
     rim = _CORE * float(np.quantile(across, 0.99))
     return across < rim, rim
 
@@ -132,31 +132,31 @@ def _sections(values):
     return np.linspace(values.min(), values.max() * (1 + 1e-12) + 1e-12, n + 1)
 
 
-def _density(ax: Axes, found):
-    near, rim = _core(found)
-    depths = found.depths  # from cap to cap, so that the curvature does not matter
+def _density(ax: Axes, result):
+    near, rim = _core(result)
+    depths = result.depths  # from cap to cap, so that the curvature does not matter
     edges = _sections(depths[near])
     ions = np.histogram(depths[near], edges)[0]
     volume = np.pi * rim**2 * np.diff(edges)
     ax.errorbar(
         (edges[1:] + edges[:-1]) / 2, ions / volume, np.sqrt(ions) / volume, fmt=".-", color="C0", label="near the axis"
     )
-    expected = found.settings["efficiency"] / found.settings["atomic_volume"]
+    expected = result.settings.efficiency / result.settings.atomic_volume
     ax.axhline(expected, color="0.4", linestyle="dashed", label="efficiency / atomic volume")
     ax.set(xlabel="depth of the apex [nm]", ylabel="ions per nm$^3$", ylim=(0, None))
     ax.legend(fontsize="small")
 
 
-def _fractions(ax: Axes, found, names, species):
-    near, _ = _core(found)
-    depths = found.positions[near, 2]
+def _fractions(ax: Axes, result, names, species):
+    near, _ = _core(result)
+    depths = result.positions[near, 2]
     edges = _sections(depths)
-    number = np.stack([np.histogram(depths[species[near] == each], edges)[0] for each in range(len(names))])
+    number = np.stack([np.histogram(depths[species[near] == index], edges)[0] for index in range(len(names))])
     with np.errstate(invalid="ignore", divide="ignore"):
         fraction = number / number.sum(axis=0)
         error = np.sqrt(fraction * (1 - fraction) / number.sum(axis=0))
-    for each, _name in enumerate(names):
-        ax.errorbar((edges[1:] + edges[:-1]) / 2, fraction[each], error[each], fmt=".-", color=_COLORS[each])
+    for index, _name in enumerate(names):
+        ax.errorbar((edges[1:] + edges[:-1]) / 2, fraction[index], error[index], fmt=".-", color=_COLORS[index])
     ax.set(xlabel="depth z [nm]", ylabel="fraction of the ions near the axis", ylim=(0, None))
 
 

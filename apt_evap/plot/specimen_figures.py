@@ -191,14 +191,7 @@ def cut(
     atoms = np.flatnonzero(inside)
     if not len(atoms):
         raise ValueError(f"no atom is in the slice of {thickness:g} nm at {point.tolist()}")
-    # z upwards if the slice contains it, otherwise x to the right
-    up = np.array([0.0, 0.0, 1.0]) - across[2] * across
-    if np.linalg.norm(up) < 1e-6:
-        up = np.array([0.0, np.sign(across[2]), 0.0])
-    up = up / np.linalg.norm(up)
-    right = np.cross(across, -up) if abs(across[2]) < 1 - 1e-6 else np.array([1.0, 0.0, 0.0])
-    if right[np.argmax(np.abs(right))] < 0:
-        right = -right
+    right, up = _axes_of_slice(across)
     places = np.column_stack([tip.positions[atoms] @ right, tip.positions[atoms] @ up])
     names = tip.phase_names if color == "phase" else tuple(element.name for element in tip.elements)
     numbers = tip.phase[atoms] if color == "phase" else tip.species[atoms]
@@ -224,6 +217,16 @@ def cut(
         handles = [Line2D([], [], marker="o", linestyle="", color=palette[name], label=name) for name in shown]
         ax.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, handletextpad=0.2)
     return ax
+
+
+def _axes_of_slice(across):
+    """Unit vectors to the right and upwards: z upwards if the slice contains it, otherwise x to the right."""
+    up = np.array([0.0, 0.0, 1.0]) - across[2] * across
+    if np.linalg.norm(up) < 1e-6:
+        up = np.array([0.0, np.sign(across[2]), 0.0])
+    up = up / np.linalg.norm(up)
+    right = np.cross(across, -up) if abs(across[2]) < 1 - 1e-6 else np.array([1.0, 0.0, 0.0])
+    return (-right if right[np.argmax(np.abs(right))] < 0 else right), up
 
 
 def _direction(vector):

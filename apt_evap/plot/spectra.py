@@ -68,11 +68,11 @@ def spectrum(
     if not spectra or len(labels) != len(spectra):
         raise ValueError(f"spectrum needs ions, with one label each, got {len(spectra)} and {len(labels)}")
     if elements is None:
-        names = [name for each in spectra if isinstance(each, Run) for name in each.elements]
+        names = [name for run in spectra if isinstance(run, Run) for name in run.elements]
         elements = [name for name in dict.fromkeys(names) if name in ISOTOPES]
     else:
         elements = [check_choice(name, "elements", ISOTOPES) for name in elements]
-    masses = [_masses(each) for each in spectra]
+    masses = [_masses(ions) for ions in spectra]
     bin_width = check_number(bin_width, "bin_width", above=0, unit="Da")
     low, high = _default_limits(masses) if limits is None else check_array(limits, "limits", (2,)).tolist()
     if not 0 <= low < high or (high - low) / bin_width > _MOST_BINS:
@@ -86,19 +86,19 @@ def spectrum(
     if ax is None:
         ax = new_figure((8.0, 4.0)).subplots()
     heights = [scale * count for scale, count in zip(scales, counts, strict=True)]
-    floor = min(scales) / 2  # half an ion: the base of the lines on a logarithmic scale
+    base = min(scales) / 2  # half an ion: the base of the lines on a logarithmic scale
     for index, (height, label) in enumerate(zip(heights, labels, strict=True)):
-        values = np.maximum(height, floor)
-        ax.stairs(values, edges, baseline=floor, color=f"C{index}", linewidth=0.7, label=label, alpha=0.9, zorder=2)
+        values = np.maximum(height, base)
+        ax.stairs(values, edges, baseline=base, color=f"C{index}", linewidth=0.7, label=label, alpha=0.9, zorder=2)
         if index == 0:
-            ax.stairs(values, edges, baseline=floor, color="C0", fill=True, alpha=0.2, linewidth=0, zorder=1)
+            ax.stairs(values, edges, baseline=base, color="C0", fill=True, alpha=0.2, linewidth=0, zorder=1)
     ylabel = f"ions per {bin_width:g} Da" if len(masses) == 1 else "fraction of the ions [1/Da]"
     top = max(height.max() for height in heights)
     labelled = _label_isotopes(ax, elements, edges, counts, heights, (low, high))
     # space above the peaks for their labels, and for the legend
-    decades = np.log10(max(top / floor, 10))
+    decades = np.log10(max(top / base, 10))
     space = (0.28 if labelled else 0.06) + (0.1 if any(labels) else 0.0)
-    ax.set(yscale="log", xlim=(low, high), ylim=(floor, floor * 10 ** (decades * (1 + space))))
+    ax.set(yscale="log", xlim=(low, high), ylim=(base, base * 10 ** (decades * (1 + space))))
     ax.set(xlabel="mass-to-charge ratio [Da]", ylabel=ylabel)
     ax.grid(alpha=0.3)
     ax.set_axisbelow(True)
@@ -110,8 +110,7 @@ def spectrum(
 def _masses(ions):
     """Mass-to-charge ratios of the detected ions [Da]."""
     if isinstance(ions, Run):
-        if ions.real is None:
-            raise ValueError(f"a spectrum needs a run in real units, run.at_evaporation_field(), got {ions!r}")
+        ions.require_real_units("a spectrum")
         ions = ions.hits(ions.first_perturbation)
     (mass,) = check_kind(ions, "ions", Hits, "a Run or Hits").require("mass_to_charge")
     mass = mass[ions.detected & np.isfinite(mass)]

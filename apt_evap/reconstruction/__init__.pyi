@@ -9,4 +9,5 @@ from .interface import interface_profile as interface_profile
 from .interface import segregation_profile as segregation_profile
 from .origins import origin_table as origin_table
 from .precipitate import precipitate_errors as precipitate_errors
+from .reconstruction_settings import ReconstructionSettings as ReconstructionSettings
 from .shank import fit_shank as fit_shank

@@ -87,14 +87,14 @@ def checks(
         _planes(reconstruction, name, check_array(place, f"position of {name}", (2,)), spacing, width)
         for name, (place, spacing) in known
     ]
-    limits = [_rim(reconstruction)] if "lens" in reconstruction.settings else []
+    limits = [_rim(reconstruction)] if reconstruction.settings.lens is not None else []
     return [*found, _density(reconstruction), *limits]
 
 
 def _rim(reconstruction):
     """Angle on the cap of the outermost ions, against the largest one that passes the electrode."""
     radius = float(np.median(reconstruction.radii))
-    widest = reconstruction.settings["lens"].widest_angle(radius)
+    widest = reconstruction.settings.lens.widest_angle(radius)
     meaning = "ions from there would touch the electrode: the flight length, the shank or the aperture is wrong"
     rim = float(np.quantile(reconstruction.angles, 0.999))
     return Check("angle on the cap at the rim [degrees]", rim, widest, meaning, is_limit=True)
@@ -125,7 +125,7 @@ def _planes(reconstruction, name, place, spacing, width):
 def _density(reconstruction):
     """Ions per volume near the axis."""
     settings, positions = reconstruction.settings, reconstruction.positions
-    expected = settings["efficiency"] / settings["atomic_volume"]
+    expected = settings.efficiency / settings.atomic_volume
     across = np.hypot(positions[:, 0], positions[:, 1])
     rim = _CORE * float(np.quantile(across, 0.99))
     near = across < rim

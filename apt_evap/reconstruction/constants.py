@@ -38,9 +38,7 @@ def run_constants(run: Run, evaporation_field: float | None = None) -> dict[str,
     ValueError
         If the run is not in real units, or if too few ions of a specimen from positions are near the axis for a sphere.
     """
-    units = check_kind(run, "run", Run, "a Run").units
-    if units is None:
-        raise ValueError("run must be in real units for its field factor, see Run.at_evaporation_field")
+    units = check_kind(run, "run", Run, "a Run").require_real_units("the field factor")
     if evaporation_field is None:
         field = units.operating_field
     else:

@@ -1,6 +1,5 @@
-"""The angle of the shank from the course of the voltage."""
+"""The angle of the shank from the history of the voltage."""
 
-import math
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -12,6 +11,11 @@ from apt_evap._common.validation import check_kind
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.reconstruction.reconstruct import Reconstruction, reconstruct
+from apt_evap.reconstruction.reconstruction_settings import (
+    ReconstructionSettings,
+    resolved_settings,
+    slope_of_shank,
+)
 
 _ANGLES = (0.5, 1.0, 2.0, 3.0, 5.0, 7.0, 10.0, 14.0, 20.0)  # degrees, between which the angle is searched
 _IONS = 20_000  # that are reconstructed: the radius is a mean over many ions
@@ -40,8 +44,10 @@ class ShankFit(NamedTuple):
         return f"<ShankFit: {self.angle:.2f} +- {self.error:.2f} degrees, {radii}; {changes}>"
 
 
-def fit_shank(hits: Hits, lens: LocalElectrode, **constants: Any) -> ShankFit:
-    r"""Fit the angle of the shank to the course of the voltage.
+def fit_shank(
+    hits: Hits, lens: LocalElectrode, settings: ReconstructionSettings | None = None, **constants: Any
+) -> ShankFit:
+    r"""Fit the angle of the shank to the history of the voltage.
 
     Parameters
     ----------
@@ -49,8 +55,8 @@ def fit_shank(hits: Hits, lens: LocalElectrode, **constants: Any) -> ShankFit:
         Ions with voltages, in the sequence of evaporation.
     lens : LocalElectrode
         Lens with the geometry of the microscope; the angle of its shank is replaced. Not with a profile.
-    **constants
-        Arguments of `reconstruct`: atomic_volume, distance, evaporation_field, efficiency, detector_radius, ...
+    settings, **constants
+        As for `reconstruct`: element, distance, efficiency, detector_radius, ...
 
     Returns
     -------
@@ -89,46 +95,44 @@ def fit_shank(hits: Hits, lens: LocalElectrode, **constants: Any) -> ShankFit:
     if lens.profile is not None:
         raise ValueError("lens has a profile, which gives the angle of the shank at every radius")
     hits = hits[hits.detected]
-    every = max(1, -(-len(hits) // _IONS))
-    thinned = constants | {"efficiency": constants.get("efficiency", 1.0) / every}
+    stride = max(1, -(-len(hits) // _IONS))
+    known = resolved_settings(settings, {**constants, "lens": lens})
+    if known.mode != "voltage":
+        raise ValueError(f'radius must be "voltage" for a fit to the voltages, got {known.mode} radii')
+    thinned, known = hits[::stride], replace(known, efficiency=known.efficiency / stride)
 
     def sections(angle, changed):
-        found = reconstruct(hits[::every], lens=replace(lens, shank_angle=angle), **changed)
-        return _sections(found)
+        lens = replace(changed.lens, shank_angle=angle)
+        return _sections(reconstruct(thinned, replace(changed, lens=lens)))
 
-    def excess(angle, changed=thinned):
-        depths, radii = sections(angle, changed)
-        return _slope(depths, radii)[0] - _widening(angle)
+    def excess(angle, changed=known):
+        """Slope of the radii over the depths beyond that of a shank with this angle."""
+        return _slope(*sections(angle, changed))[0] - slope_of_shank(angle)
 
     # upwards, because the lens of a blunt shank shows less than the detector sees
     values = []
-    for each in _ANGLES:
-        values.append(excess(each))
+    for angle in _ANGLES:
+        values.append(excess(angle))
         if not values[-1] > 0:
             break
     if len(values) == 1 or values[-1] > 0:
         raise ValueError(
             f"hits must have voltages that agree with a shank of {_ANGLES[0]:g} to {_ANGLES[-1]:g} degrees, got radii "
-            f"that change by {values[0] + _widening(_ANGLES[0]):.3g} nm per nm of depth"
+            f"that change by {values[0] + slope_of_shank(_ANGLES[0]):.3g} nm per nm of depth"
         )
     angle = float(scipy.optimize.brentq(excess, *_ANGLES[len(values) - 2 : len(values)], xtol=_PRECISION))
-    depths, radii = sections(angle, thinned)
+    depths, radii = sections(angle, known)
+    # sensitivities: the change of the angle that makes up for a change of a constant
     slope = (excess(angle + 0.1) - excess(angle)) / 0.1
-    per_cent = {}
-    names = {"evaporation_field": "evaporation field", "atomic_volume": "volume per detected ion"}
-    for name, text in names.items():
-        changed = thinned | {name: thinned[name] * (1 + _STEP)}
-        per_cent[text] = float(-excess(angle, changed) / slope)
-    farther = replace(lens, distance=lens.distance * (1 + _STEP), shank_angle=angle)
-    found = _slope(*_sections(reconstruct(hits[::every], lens=farther, **thinned)))[0] - _widening(angle)
-    per_cent["distance of the electrode"] = float(-found / slope)
+    farther = replace(lens, distance=lens.distance * (1 + _STEP))
+    field, volume = known.evaporation_field, known.atomic_volume
+    larger = {
+        "evaporation field": replace(known, evaporation_field=field * (1 + _STEP)),  # type: ignore[operator]
+        "volume per detected ion": replace(known, atomic_volume=volume * (1 + _STEP)),  # type: ignore[operator]
+        "distance of the electrode": replace(known, lens=farther),
+    }
+    per_cent = {name: float(-excess(angle, changed) / slope) for name, changed in larger.items()}
     return ShankFit(angle, abs(_slope(depths, radii)[1] / slope), depths, radii, per_cent)
-
-
-def _widening(angle):
-    """dR/dz on a shank with this angle [degrees]."""
-    sine = math.sin(math.radians(angle))
-    return sine / (1 - sine)
 
 
 def _sections(reconstruction: Reconstruction) -> tuple[Floats, Floats]:

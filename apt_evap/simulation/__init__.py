@@ -1,4 +1,4 @@
-"""The simulation and its runs: monitoring, files and checkpoints."""
+"""The simulation and its runs: flights and responses, monitoring, files, checkpoints, real units."""
 
 import lazy_loader
 

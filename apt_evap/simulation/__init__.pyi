@@ -1,5 +1,6 @@
 # The public names of this package: read by type checkers, and by the lazy loader in __init__.py.
 from .checkpoint import Checkpoint as Checkpoint
+from .flight.flight_pool import FlightSettings as FlightSettings
 from .flight.launch_designs import Design as Design
 from .flight.launch_designs import WideDesign as WideDesign
 from .monitor import Monitor as Monitor

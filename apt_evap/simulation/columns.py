@@ -4,6 +4,7 @@ A column has a path, such as "site", "emissions/positions" or "flown/0/times"; a
 of ions, joining of batches, the fingerprint and the file follow from this list.
 """
 
+import hashlib
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
@@ -141,6 +142,29 @@ def columns_of(run: Any, every: Iterable[Column]) -> dict[str, np.ndarray]:
         if values is not None:
             arrays[column.path] = values
     return arrays
+
+
+def every_column_of(run: Any) -> list[Column]:
+    """The columns that a run has."""
+    columns = [*ALWAYS, *OPTIONAL, *target_columns(run.response_settings)]
+    columns += [column for number in range(len(run.flown)) for column in flown_columns(number)]
+    columns += response_columns(run.response_settings)
+    arrays = columns_of(run, columns)
+    return [column for column in columns if column.path in arrays]
+
+
+def fingerprint_of(run: Any) -> str:
+    """Hash of the columns of a run, see `Run.fingerprint`."""
+    columns = columns_of(run, (column for column in every_column_of(run) if column.hashed))
+    hashed = hashlib.sha256()
+    for name in sorted(columns):
+        values = np.array(columns[name], order="C")
+        if values.dtype.kind == "f":
+            values[np.isnan(values)] = np.nan  # NaN has many bits, which depend on the processor
+        values = values.astype(values.dtype.newbyteorder("<"), copy=False)
+        hashed.update(f"{name} {values.dtype.str} {values.shape}\n".encode())
+        hashed.update(values.data)
+    return hashed.hexdigest()
 
 
 def parts_of(arrays: Mapping[str, Any], nearest_neighbour_distance: float) -> dict[str, Any]:

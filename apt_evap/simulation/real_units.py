@@ -309,7 +309,7 @@ def isotopes_of(names: tuple[str, ...], species: Integers, masses: Floats, u: Fl
     return draw_isotopes(names, species, by_species, u)
 
 
-def in_real_units(run: Any, point: OperatingPoint) -> tuple[RealUnits, RealColumns]:
+def real_units_of(run: Any, point: OperatingPoint) -> tuple[RealUnits, RealColumns]:
     """Operating point and columns of a run in real units, see `Run.at_evaporation_field`.
 
     Parameters
@@ -369,12 +369,10 @@ def in_real_units(run: Any, point: OperatingPoint) -> tuple[RealUnits, RealColum
 
 def _instrument_voltages(run, field_factor, voltages, operating_field):
     """Voltages of an instrument with a lens or a field factor, from those of the model."""
-    if run.lens is not None:
-        if field_factor is not None:
-            raise ValueError(f"field_factor follows from the lens, got field_factor={field_factor:g} and a lens")
-        return run.lens.voltages(voltages, run.emissions.ions, operating_field)
     if field_factor is None:
-        return voltages
+        return run.observation.lens.voltages(voltages, run.emissions.ions, operating_field)
+    if run.lens is not None:
+        raise ValueError(f"field_factor follows from the lens, got field_factor={field_factor:g} and a lens")
     radius = run.settings["tip"].get("apex_radius")
     if radius is None:
         raise ValueError("field_factor needs the apex radius, which a tip made from positions does not have")

@@ -43,8 +43,8 @@ _UNITS = {"field": "V/nm", "fields": "V/nm", "radii": "nm", "apexes": "nm", "cha
 _STATE_ARRAYS = {
     "sites": (np.int64, (None,)),
     "charges": (np.float64, (None,)),
-    "lonely": (np.int64, (None,)),
-    "lonely_normals": (np.float64, (None, 3)),
+    "isolated": (np.int64, (None,)),
+    "isolated_normals": (np.float64, (None, 3)),
 }
 
 
@@ -210,7 +210,7 @@ def _read_state(file):
     numbers = file.json(f"{group}/numbers")
     state = EmitterState(
         **arrays,
-        deepened=tuple(int(event) for event in numbers["deepened"]),
+        extensions=tuple(int(event) for event in numbers["extensions"]),
         tolerance=check_number(numbers["tolerance"], "tolerance", above=0),
         opening_angle=check_number(numbers["opening_angle"], "opening_angle", at_least=0),
         clipped=check_count(numbers["clipped"], "clipped"),

@@ -30,7 +30,7 @@ from apt_evap.evaporation.voltage import VoltageControl, check_voltage
 from apt_evap.simulation.checkpoint import Checkpoint, CheckpointWriter
 from apt_evap.simulation.columns import Clock, Flown
 from apt_evap.simulation.flight.field_of_view import scouts_of
-from apt_evap.simulation.flight.flight_pool import WHOLE_DETECTOR, FlightCrew, FlightSettings, check_reach
+from apt_evap.simulation.flight.flight_pool import WHOLE_DETECTOR, FlightPool, FlightSettings, check_reach
 from apt_evap.simulation.flight.landing import land
 from apt_evap.simulation.flight.response import ResponseModel, ResponseSettings
 from apt_evap.simulation.history import CapHistory
@@ -140,7 +140,7 @@ class Simulation:
         self.settings = self._settings_of(tip)
         self.n_evaporated = 0
         self._running = threading.Lock()
-        self._crew = FlightCrew(tip, self.flight_settings, self.n_threads, self.detector)
+        self._flight_pool = FlightPool(tip, self.flight_settings, self.n_threads, self.detector)
 
     @property
     def tip(self) -> Tip:
@@ -234,16 +234,16 @@ class Simulation:
 
     def _run_alone(self, n_ions, emissions, responses, progress, batch_size, writer):
         self._catch_up(writer.previous if writer else None)
-        self.emitter.hand_out_tree()  # atoms may have evaporated without flights before
+        self.emitter.request_tree_copy()  # atoms may have evaporated without flights before
         if not (writer and writer.previous):
-            self.emitter.hand_out_cap()
+            self.emitter.request_cap()
         backlog = BACKLOG if self.n_threads > 1 else 0
         with (
-            self._crew.at_work(),
+            self._flight_pool.at_work(),
             interruptible() as interrupted,
             Recorder(self.emitter, self.monitor, n_ions, self.n_evaporated, progress, writer) as recorder,
         ):
-            for batch in self.emitter.advance(recorder.missing, batch_size, self._crew.paused):
+            for batch in self.emitter.advance(recorder.missing, batch_size, self._flight_pool.paused):
                 part = self._start_flights(batch, emissions, responses)
                 recorder.add(batch, part, self.n_evaporated, backlog)
                 if interrupted.is_set():
@@ -305,7 +305,7 @@ class Simulation:
         if responses:
             groups += model.launches(emission_batch)
             scouts = scouts_of(emission_batch, self.response_settings) if limited else None
-        flight = self._crew.start(batch, groups, scouts, len(emissions))
+        flight = self._flight_pool.start(batch, groups, scouts, len(emissions))
 
         def finish():
             (ends, every), apex = flight(), self.tip.apex

@@ -144,6 +144,7 @@ class Tip:
         material: Material | str | None = None,
         apex_radius: float | None = None,
         axis: Sequence[float] = (0, 0, 1),
+        *,
         shank_angle: float = 1.5,
         shank_length: float | None = None,
         base: str = "rounded",
@@ -155,46 +156,18 @@ class Tip:
         seed: int | None = None,
         phases: Sequence[Phase] | None = None,
     ) -> None:
-        if (material is None) == (phases is None):
-            raise ValueError(
-                f"material or phases must be given, not both, got {short_text(material)} and {short_text(phases)}"
-            )
-        self.phases: tuple[Phase, ...]
-        if phases is None:
-            fractions = check_solutes(solutes, profiles=False)
-            self.phases = (Phase("matrix", as_material(material), solutes=fractions),)  # type: ignore[arg-type]
-            if self.phases[0].material in fractions:
-                raise ValueError(f"solutes must differ from the material, got {self.phases[0].material.name}")
-        else:
-            if solutes is not None:
-                raise ValueError(f"solutes must be those of a phase if there are phases, got {short_text(solutes)}")
-            self.phases = check_phases(phases)
+        self.phases: tuple[Phase, ...] = _phases_of(material, solutes, phases)
         if seed is not None or any(phase.is_random for phase in self.phases):
             check_seed(seed, "seed (of the random sites of the solutes)")
-        host = self.phases[0].material
         d = max(phase.material.nearest_neighbour_distance for phase in self.phases)
         radius = check_number(apex_radius, "apex_radius", at_least=3 * d, unit="nm", why="3 neighbour distances")
-        length = 2 * radius if shank_length is None else shank_length
-        shape = TaperedCap(radius, length, shank_angle, base)
+        shape = TaperedCap(radius, 2 * radius if shank_length is None else shank_length, shank_angle, base)
         origin = check_array(origin, "origin", (3,))
         offset = None
         if offset_seed is not None:
             offset = np.random.default_rng(check_seed(offset_seed, "offset_seed")).random(3)
         arrangement = Arrangement(self.phases, axis, rotation, origin, offset, seed)
-        self.criteria = arrangement.criteria
-        if depth is not None:
-            depth = check_number(depth, "depth", above=self.neighbour_radius, unit="nm")
-        self._shell = Shell(shape, depth, self.neighbour_radius)
-        density = max(lattice.atom_density(each.structure, each.a, each.c) for each in arrangement.lattices)
-        check_memory(self._shell.volume() * density, shape.volume(_LAYER * d) * density)
-
-        self.positions, species, self._phase = self._atoms(arrangement)
-        self._warn_of_empty_phases(arrangement)
-        self._has_gaps = len(arrangement.lattices) > 1 or any(phase.vacancies for phase in self.phases)
-        self._set_flags()
-        self._set_elements(arrangement.elements, species)
-        self.apex = radius
-        self.potential_point = np.zeros(3)
+        self._fill(shape, depth, arrangement, d)
         whole = all(float(index).is_integer() for index in axis)
         common = {
             "apex_radius": radius,
@@ -205,17 +178,31 @@ class Tip:
             "rotation": float(rotation),
             "origin": origin.tolist(),
             "offset_seed": None if offset_seed is None else int(offset_seed),
-            "depth": depth,
+            "depth": self._shell.depth,
             "seed": None if seed is None else int(seed),
         }
         if phases is None:
-            self.settings = {"material": to_plain(host), **common, "solutes": to_plain(self.phases[0].solutes)}
+            host = self.phases[0]
+            self.settings = {"material": to_plain(host.material), **common, "solutes": to_plain(host.solutes)}
         else:
-            self.settings = {
-                **common,
-                "phases": to_plain(self.phases),
-                "elements": to_plain(self.elements),
-            }
+            self.settings = {**common, "phases": to_plain(self.phases), "elements": to_plain(self.elements)}
+
+    def _fill(self, shape, depth, arrangement, spacing):
+        """Fill the shape, or a shell of it, with the atoms of an arrangement; `spacing` is the largest d_nn [nm]."""
+        self.criteria = arrangement.criteria
+        if depth is not None:
+            depth = check_number(depth, "depth", above=self.neighbour_radius, unit="nm")
+        self._shell = Shell(shape, depth, self.neighbour_radius)
+        density = max(lattice.atom_density(cell.structure, cell.a, cell.c) for cell in arrangement.lattices)
+        check_memory(self._shell.volume() * density, shape.volume(_LAYER * spacing) * density)
+
+        self.positions, species, self._phase = self._atoms(arrangement)
+        self._warn_of_empty_phases(arrangement)
+        self._has_gaps = len(arrangement.lattices) > 1 or any(phase.vacancies for phase in self.phases)
+        self._set_flags()
+        self._set_elements(arrangement.elements, species)
+        self.apex = shape.apex_radius
+        self.potential_point = np.zeros(3)
 
     def _atoms(self, arrangement):
         """Positions, species and phases of all atoms; no phases (None) if there is one only."""
@@ -224,9 +211,9 @@ class Tip:
         # atoms below the shell can displace others in it
         margin = 0.0 if len(lattices) == 1 else self.neighbour_radius
         positions, labels = [], []
-        for number, each in enumerate(lattices):
+        for number, cell in enumerate(lattices):
             points, label = lattice.lattice_sites_in(
-                *each,
+                *cell,
                 shape.signed_distance,
                 shape.bounds,
                 depth=None if depth is None else lambda points: self._shell.depth_at(points) + margin,
@@ -239,13 +226,13 @@ class Tip:
         if len(lattices) == 1:
             places, label = positions[0], labels[0]
         else:
-            kept = self._without_overlap(positions, [each // n_species for each in labels])
-            if depth is not None:
+            kept = self._without_overlap(positions, [numbers // n_species for numbers in labels])
+            if depth is not None:  # without the margin, now that atoms in it have displaced others
                 rounding = _ROUNDING * d
                 for points, keep in zip(positions, kept, strict=True):
                     keep &= shape.signed_distance(points) >= -(self._shell.depth_at(points) + rounding)
             places = np.concatenate([points[keep] for points, keep in zip(positions, kept, strict=True)])
-            label = np.concatenate([each[keep] for each, keep in zip(labels, kept, strict=True)])
+            label = np.concatenate([numbers[keep] for numbers, keep in zip(labels, kept, strict=True)])
         if arrangement.is_pure:
             return places, np.zeros(len(places), dtype=np.int32), None
         phase = (label // n_species).astype(np.int8) if len(self.phases) > 1 else None
@@ -263,7 +250,7 @@ class Tip:
 
     def _without_overlap(self, positions, phases):
         """Which atoms of each lattice remain: without those too close to an atom of a later phase on another one."""
-        distances = np.array([each.nearest_neighbour_distance for each in self.criteria])
+        distances = np.array([criterion.nearest_neighbour_distance for criterion in self.criteria])
         trees = [scipy.spatial.cKDTree(points) for points in positions]
         kept = [np.ones(len(points), dtype=bool) for points in positions]
         for first in range(len(trees)):
@@ -340,22 +327,8 @@ class Tip:
             raise ValueError(
                 f"species must be indices from 0 to {len(elements) - 1}, got {tip.species.min()} to {tip.species.max()}"
             )
-        sample = tip.positions[:: max(1, n // _SAMPLE)]
-        neighbours = scipy.spatial.cKDTree(tip.positions)
-        nearest = neighbours.query(sample, k=2)[1]
-        distances = lengths(tip.positions[nearest[:, 1]] - tip.positions[nearest[:, 0]])
-        if not distances.min() > 0 or neighbours.query_pairs(1e-3 * float(np.median(distances))):
-            raise ValueError("positions must be distinct, got two atoms at the same place")
-        distance = float(np.median(distances))
-        criterion = SurfaceCriterion.of(tip.elements[0].structure, distance)
-        if neighbour_radius is not None:
-            radius = check_number(neighbour_radius, "neighbour_radius", above=0, at_most=_WIDEST * distance, unit="nm")
-            criterion = replace(criterion, neighbour_radius=radius)
-        if surface_threshold is not None:
-            threshold = check_number(
-                surface_threshold, "surface_threshold", above=0, at_most=criterion.neighbour_radius, unit="nm"
-            )
-            criterion = replace(criterion, surface_threshold=threshold)
+        distance = _spacing_of(tip.positions)
+        criterion = _criterion(tip.elements[0].structure, distance, neighbour_radius, surface_threshold)
         tip.criteria = (criterion,)
         low, high = tip.positions.min(axis=0), tip.positions.max(axis=0)
         span = high - low
@@ -374,7 +347,7 @@ class Tip:
             evaporable = tip.positions[:, 2] >= (low[2] + high[2]) / 2
         tip.evaporable = check_array(evaporable, "evaporable", (n,), dtype=bool).copy()
         tip.support = np.zeros(n, dtype=bool)
-        if potential_point is None:
+        if potential_point is None:  # on the mean axis, half the smallest extent below the apex
             below = min((high[0] - low[0]) / 2, (high[1] - low[1]) / 2, (high[2] - low[2]) / 2)
             potential_point = [*tip.positions[:, :2].mean(axis=0), high[2] - below]
         tip.potential_point = check_array(potential_point, "potential_point", (3,))
@@ -440,7 +413,7 @@ class Tip:
                 settings["phases"] = [from_plain(phase, Phase, what="phase") for phase in settings["phases"]]
             else:
                 settings["material"] = as_material(settings["material"])
-                settings["solutes"] = {as_material(each): fraction for each, fraction in settings["solutes"] or ()}
+                settings["solutes"] = {as_material(solute): fraction for solute, fraction in settings["solutes"] or ()}
             return cls(**settings)
         except (KeyError, TypeError) as error:
             raise ValueError(f"settings must be those of a tip, got {short_text(settings)}: {error}") from error
@@ -580,7 +553,49 @@ class Tip:
         self.masses = np.array([element.mass for element in elements])
 
 
-def foreseen_atoms(
+def _phases_of(material, solutes, phases):
+    """Phases of a tip: those of the user, or one of a material with solutes."""
+    if (material is None) == (phases is None):
+        raise ValueError(
+            f"material or phases must be given, not both, got {short_text(material)} and {short_text(phases)}"
+        )
+    if phases is not None:
+        if solutes is not None:
+            raise ValueError(f"solutes must be those of a phase if there are phases, got {short_text(solutes)}")
+        return check_phases(phases)
+    fractions = check_solutes(solutes, profiles=False)
+    matrix = Phase("matrix", as_material(material), solutes=fractions)  # type: ignore[arg-type]
+    if matrix.material in fractions:
+        raise ValueError(f"solutes must differ from the material, got {matrix.material.name}")
+    return (matrix,)
+
+
+def _spacing_of(positions):
+    """Median distance of atoms from their nearest neighbour [nm]; ValueError if two are at the same place."""
+    sample = positions[:: max(1, len(positions) // _SAMPLE)]
+    neighbours = scipy.spatial.cKDTree(positions)
+    nearest = neighbours.query(sample, k=2)[1]
+    distances = lengths(positions[nearest[:, 1]] - positions[nearest[:, 0]])
+    if not distances.min() > 0 or neighbours.query_pairs(1e-3 * float(np.median(distances))):
+        raise ValueError("positions must be distinct, got two atoms at the same place")
+    return float(np.median(distances))
+
+
+def _criterion(structure, distance, neighbour_radius, surface_threshold):
+    """Criterion for surface atoms with a measured d_nn [nm], and the distances that a user replaces [nm]."""
+    criterion = SurfaceCriterion.of(structure, distance)
+    if neighbour_radius is not None:
+        radius = check_number(neighbour_radius, "neighbour_radius", above=0, at_most=_WIDEST * distance, unit="nm")
+        criterion = replace(criterion, neighbour_radius=radius)
+    if surface_threshold is not None:
+        threshold = check_number(
+            surface_threshold, "surface_threshold", above=0, at_most=criterion.neighbour_radius, unit="nm"
+        )
+        criterion = replace(criterion, surface_threshold=threshold)
+    return criterion
+
+
+def estimated_atoms(
     *,
     apex_radius: float,
     material: Material | str | None = None,
@@ -591,7 +606,7 @@ def foreseen_atoms(
     depth: float | None = None,
     **others: Any,
 ) -> tuple[float, float]:
-    """Approximate numbers of atoms in memory and of surface atoms of a `Tip`, without building it.
+    """Estimate the numbers of atoms in memory and of surface atoms of a `Tip`, without building it.
 
     Parameters
     ----------
@@ -607,10 +622,7 @@ def foreseen_atoms(
     host = as_material(material) if phases is None else phases[0].material  # type: ignore[arg-type]
     shape = TaperedCap(apex_radius, 2 * apex_radius if shank_length is None else shank_length, shank_angle, base)
     criterion = SurfaceCriterion.of(host.structure, host.nearest_neighbour_distance)
-    return _expected_atoms(Shell(shape, depth, criterion.neighbour_radius), host)
-
-
-def _expected_atoms(shell, host):
+    shell = Shell(shape, depth, criterion.neighbour_radius)
     density = lattice.atom_density(host.structure, host.a, host.c)
-    layer = shell.shape.volume(_LAYER * host.nearest_neighbour_distance)
+    layer = shape.volume(_LAYER * host.nearest_neighbour_distance)
     return shell.volume() * density, layer * density

@@ -70,7 +70,10 @@ def main():
     parser.add_argument("--sharpness", type=float, default=0.15, help="of the target of a roll-up")
     parser.add_argument("--like", default="all, strongest neighbour", help="rule that gives the azimuth")
     options = parser.parse_args()
-    measured, place = ae.read_map(options.measured), ae.detection.Projection(options.scale, centre=tuple(options.pole))
+    measured, place = (
+        ae.io.read_map(options.measured),
+        ae.detection.Projection(options.scale, centre=tuple(options.pole)),
+    )
     target = ae.maps.ring_statistics(measured, place, rings=RINGS[options.element], fold=3)
     print(
         "measured", *(f"{ring.contrast:.2f}" for ring in target), ae.maps.pole_profile(measured, place).density.round(2)

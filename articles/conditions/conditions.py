@@ -50,7 +50,7 @@ class Pulsed:
 
     def keys(self, tip, atoms, fields, bonds):
         left = self._next()
-        if left is not None and left not in set(atoms.tolist()):  # it is no longer there: this was its event
+        if left is not None and left not in set(atoms.tolist()):  # it has left: this was its event
             self.now = self.times.pop(left)
             self.events.append((int(tip.species[left]), self.shares[left]))
         elif len(atoms) > LOCAL:  # a relaxation: the voltage is set for the rate
@@ -90,7 +90,10 @@ class Pulsed:
 
 def simulated(sensitivity, field_ratio, temperature, fraction, events, seed):
     """Share of the ions of each element that leave between pulses, with its standard error."""
-    law, control = ae.Arrhenius(temperature, sensitivity=sensitivity), ae.VoltageControl(pulse_fraction=fraction)
+    law, control = (
+        ae.Arrhenius(temperature, sensitivity=sensitivity),
+        ae.evaporation.VoltageControl(pulse_fraction=fraction),
+    )
     host = ae.material(ELEMENTS[0])
     solute = ae.Material(ELEMENTS[1], "fcc", host.a, field_ratio * host.evaporation_field, charge_state=1, mass=63.5)
     tip = ae.Tip(host, 10 * host.a, axis=(0, 0, 1), shank_length=5 * host.a, solutes={solute: SOLUTE}, seed=seed)
@@ -124,7 +127,7 @@ def main():
         (0.5, 0.8, 50.0, 0.2),
     ):
         sensitivity = dict(zip(ELEMENTS, (1.0, solute), strict=True))
-        law, control = ae.Arrhenius(temperature), ae.VoltageControl(pulse_fraction=fraction)
+        law, control = ae.Arrhenius(temperature), ae.evaporation.VoltageControl(pulse_fraction=fraction)
         ratios = [between_pulses(each, law, control)[0] for each in sensitivity.values()]
         expected = [each / (1 + each) for each in ratios]
         found = simulated(sensitivity, ratio, temperature, fraction, options.events, options.seed)

@@ -2,12 +2,12 @@
 Emission energies of aluminium and nickel
 =========================================
 
-Similarity with a measured map on the energy grid of the paper, and the maps for the best energies: lateral velocities
-for Al[012], roll-up for Ni[111], and both combined for nickel.
+Similarity with a measured map on the energy grid of Shaikh et al. (2025), and the maps for the best energies: lateral
+velocities for Al[012], roll-up for Ni[111], and both combined for nickel.
 
-This script reproduces figures 3 to 6 of Shaikh et al., arXiv 2509.13744. Their experiments are not public. Without
+This script reproduces figures 3 to 6 of this paper, arXiv 2509.13744. Its experiments are not public. Without
 arguments, a simulated twin replaces each measured map. The twin is another specimen, with other random numbers and the
-energies of the paper. Its map is rotated, scaled, shifted and limited to a circle. The figures then show the method,
+energies found there. Its map is rotated, scaled, shifted and limited to a circle. The figures then show the method,
 and how well it recovers known energies. To use measured maps, run ::
 
     python figures3to6.py --measured-al al.epos --measured-ni ni.npz
@@ -27,7 +27,7 @@ import numpy as np
 
 import apt_evap as ae
 
-# axis, mechanism and energies of the paper: mean [eV], standard deviation / mean
+# axis, mechanism and energies of Shaikh et al. (2025): mean [eV], standard deviation / mean
 CASES = {"Al": ((0, 1, 2), "lateral", 0.3, 0.316), "Ni": ((1, 1, 1), "roll-up", 0.155, 1.0)}
 MECHANISMS = {"lateral": ae.LateralVelocity, "roll-up": ae.RollUp}
 # registration of the twins on their detector, and its field of view: 30 degrees of flight directions
@@ -76,7 +76,7 @@ def evaporate(metal, name, seed):
 def measurement(metal, path):
     """Measured ions or map from a file, or the map of the twin."""
     if path:
-        return ae.read_map(path) if path.endswith(".npz") else ae.read(path)
+        return ae.io.read_map(path) if path.endswith(".npz") else ae.read(path)
     _, mechanism, mean, relative_spread = CASES[metal]
     hits = evaporate(metal, "twin", seed=2).hits(
         MECHANISMS[mechanism](ae.TruncatedNormal(mean, relative_spread * mean))

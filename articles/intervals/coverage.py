@@ -54,7 +54,7 @@ def run_of(number, radius, ions, folder=None, within=VARIATION):
         seed=number,
         n_threads=1,
         # to a tenth of a bin
-        flight_settings=ae.FlightSettings(opening_angle=0.6, tolerance=1e-2),
+        flight_settings=ae.simulation.FlightSettings(opening_angle=0.6, tolerance=1e-2),
         response_settings=ae.ResponseSettings(
             site=ae.simulation.Design(1, ((0.0, 1), (1.0, 4))),
             rolled=ae.simulation.Design(2, ((0.0, 1), (1.0, 6))),

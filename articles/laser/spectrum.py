@@ -48,7 +48,7 @@ def main():
             0.06, cooling=ae.detection.Cooling(**base, time_constant=1.8)
         ),
         "and cooling by conduction, 0.6 ns": ae.detection.Timing(
-            0.06, cooling=ae.detection.Cooling(**base, time_constant=0.6, course="conduction")
+            0.06, cooling=ae.detection.Cooling(**base, time_constant=0.6, decay="conduction")
         ),
     }
     found = {name: aligned(peak(timing, 2_000_000, 1), edges) for name, timing in curves.items()}

@@ -38,9 +38,9 @@ def main():
     parser.add_argument("nickel")
     parser.add_argument("aluminium")
     parser.add_argument("tungsten", help="ions")
-    parser.add_argument("--known-scale", action="store_true", help=f"within {WITHIN:.0%}")
+    parser.add_argument("--known-scale", action="store_true", help=f"within {WITHIN:.0%}%")
     options = parser.parse_args()
-    maps = {name: ae.read_map(getattr(options, name)) for name in ("nickel", "aluminium")}
+    maps = {name: ae.io.read_map(getattr(options, name)) for name in ("nickel", "aluminium")}
     maps["tungsten"] = ae.read(options.tungsten).map(bins=160)
     warnings.simplefilter("ignore", ae.warnings.RegistrationWarning)
     for name, measured in maps.items():

@@ -25,7 +25,7 @@ RIM = 38.0  # mm
 
 
 def simulate(ions, path):
-    """The run, from its file or the folder of an unfinished run if there is one."""
+    """The run, from its file, or that of an unfinished run."""
     for known in (path, Path(f"{path}.unfinished")):
         if known.exists():
             return ae.load(known)

@@ -20,7 +20,7 @@ import scipy
 import apt_evap as ae
 from apt_evap.detection.microscope.boundary_elements import ChargedPanels, Panels, joined, ring_potential
 from apt_evap.detection.microscope.conductors import electrode, graded
-from apt_evap.detection.microscope.run_lens import Course, RunLens
+from apt_evap.detection.microscope.run_lens import RadiusHistory, RunLens
 from apt_evap.units import COULOMB, FLIGHT_TIME, NM_PER_MM
 
 MASS, CHARGE, LENGTH = 58.69, 2, 90.0  # Da, e, mm
@@ -184,7 +184,7 @@ def compare(radius, ions, events, cut=0.5, seed=1):
     own = np.searchsorted(kept, leaving)
     scale = np.median(atoms.charges[own] / free_atoms.charges[leaving])  # of charges per volt
     spread = np.std(atoms.charges[own] / free_atoms.charges[leaving] / scale)
-    behind = RunLens.of(lens, emitter.tip.settings, course_of(cap), emitter.tip.nearest_neighbour_distance)
+    behind = RunLens.of(lens, emitter.tip.settings, history_of(cap), emitter.tip.nearest_neighbour_distance)
     expected = free_factor * lens.field_factor(cap.radius) / behind.stages[0][4]
     print(f"charges per volt within {spread:.2%}: k_f {free_factor / scale:.3f}, by the lens {expected:.3f}")
 
@@ -206,8 +206,8 @@ def compare(radius, ions, events, cut=0.5, seed=1):
     return seen, times, true_places, true_times * unit * math.sqrt(scale), kinetic > 0
 
 
-def course_of(cap):
-    return Course(np.array([0]), np.array([cap.radius]), np.array([cap.apex]))
+def history_of(cap):
+    return RadiusHistory(np.array([0]), np.array([cap.radius]), np.array([cap.apex]))
 
 
 def report(seen, times, true_places, true_times, moved):

@@ -2,8 +2,8 @@
 The lens beside measured maps
 =============================
 
-Compares the lens of `apt_evap.microscope` with a hit list of tungsten (voltages, one flight length), with the poles of
-a map of nickel, and with the stored positions of a file of silicon::
+Compares the lens of `apt_evap.detection.microscope` with a hit list of tungsten (voltages, one flight length), with the
+poles of a map of nickel, and with the stored positions of a file of silicon::
 
     python measured.py W_tap.raw ni111_map.npz Si.epos
 
@@ -63,7 +63,7 @@ def tungsten(path):
 
 def spots(path, fit):
     """Centres of dark spots at the predicted places of low-index poles [mm], and their distances from these places."""
-    measured = ae.read_map(path)
+    measured = ae.io.read_map(path)
     density = np.asarray(measured.values, float)
     x, y = ((edges[1:] + edges[:-1]) / 2 for edges in (measured.x_edges, measured.y_edges))
     families = [(1, 1, 1), (0, 0, 1), (0, 1, 1), (1, 1, 3), (0, 1, 2), (1, 3, 3), (1, 1, 2)]

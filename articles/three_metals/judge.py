@@ -51,9 +51,9 @@ def measured_of(metal, path):
     if metal == "Ni":
         # three named poles; without them the map is undecided
         orientation = ae.Orientation("Ni", axis=(0.2926, 0.5418, 0.7879), rotation=155.31)
-        return ae.read_map(path), orientation, ae.detection.Projection(26.1013, centre=(0.4029, -0.3919))
+        return ae.io.read_map(path), orientation, ae.detection.Projection(26.1013, centre=(0.4029, -0.3919))
     if metal.startswith("Al"):
-        found = ae.index(ae.read_map(path), "Al")
+        found = ae.index(ae.io.read_map(path), "Al")
         candidate = found.candidates[metal == "Al-2"]
         print(candidate)
         return found.map, candidate.orientation, candidate.projection

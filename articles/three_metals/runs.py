@@ -64,7 +64,7 @@ def prepared(tip, rule, half_angle, skip, seed=1, threads=None, law=None, shells
     common["response_settings"] = ae.ResponseSettings.wide(shells=shells)  # records the neighbours for the sharpness
     pilot = ae.Simulation(tip, **common).run(256, responses=False, progress=False)
     scale = float(np.median(pilot.at_evaporation_field().energy_scales))
-    simulation = ae.Simulation(tip, flight_settings=ae.FlightSettings(field_of_view=half_angle), **common)
+    simulation = ae.Simulation(tip, flight_settings=ae.simulation.FlightSettings(field_of_view=half_angle), **common)
     for _ in simulation.emitter.advance(skip):
         pass
     return simulation, scale

@@ -1,6 +1,6 @@
 """
-Order that evaporation alone feigns
-===================================
+Apparent short-range order of random alloys
+===========================================
 
 Random Ni[111] alloys with 10 % of a solute (Al on the sites of Ni), R = 20 lattice constants, 27,000 ions. The solute
 has 0.8 times the evaporation field of Ni, or the same. The ions are reconstructed with the constants that fit their

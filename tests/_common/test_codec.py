@@ -39,7 +39,7 @@ EXAMPLES = [
     ae.RollUp(0.2, ae.emission.Migration(4.44, 35.0, temperature=60.0)),
     ae.Combined(0.2, 0.75, sharpness=0.4),
     ae.evaporation.ChargeSettings(tolerance=1e-3, sweep_interval=50),
-    ae.FlightSettings(reach=2000.0),
+    ae.simulation.FlightSettings(reach=2000.0),
     ae.ResponseSettings(),
     ae.ResponseSettings.wide(0.15, shells=2),
     ae.simulation.Monitor(interval=20),
@@ -48,7 +48,7 @@ EXAMPLES = [
     ae.emission.PostIonisation(0.74),
     ae.Robin(window=3),
     ae.ConstantPotential(15.0, "gaussian", "others"),
-    ae.VoltageControl(0.02, memory=100),
+    ae.evaporation.VoltageControl(0.02, memory=100),
     ae.Extremal(ae.evaporation.CoordinationTable({"W": {3: 47.0, 4: 57.0}})),
     ae.Arrhenius(
         50.0,

@@ -420,7 +420,7 @@ CASES = [
         measured_points=[[(0, 0)] * 3],
     ),
     row(ae.simulation.Checkpoint, {"path": "a.h5"}, path=["a\x00b", "a.txt"], minutes=[-1.0], ions=[0]),
-    row(ae.read_map, path=["a\x00b", "none.npz"]),
+    row(ae.io.read_map, path=["a\x00b", "none.npz"]),
     row(ae.similarity, {"map_a": grid, "map_b": grid}, "data_range", map_b=[hits]),
     row(ae.maps.similarity_ceiling, {"hits": hits}),
     row(
@@ -449,6 +449,12 @@ CASES = [
         detector_radius=[0.1],
         smoothing=[0],
         initial_radius=[10.0],
+    ),
+    row(
+        ae.reconstruction.ReconstructionSettings,
+        {"distance": 90.0, "atomic_volume": 0.011, "evaporation_field": 35.0},
+        radius=["no such", 0.0, NAN, [1.0, NAN], [[1.0]]],
+        element=[3, []],
     ),
     row(
         ae.reconstruct,
@@ -753,7 +759,8 @@ MADE = {"FileError", "TruncatedFile", "Outcome", "StopReason", "RunInterrupted",
 MADE |= {"Reconstruction", "Study", "ZoneLine", "History", "CapHistory", "Ring", "RadiusFit", "TipFit", "Distortion"}
 MADE |= {"DistortionGrid", "FittedOrientation", "Similarity", "Batch", "Lens"}
 # for extensions, which call them with arrays of the package
-ARRAYS = {"charge_probabilities", "course", "course_of_charges", "draw_isotopes", "field_of_counts", "ion_charges"}
+ARRAYS = {"charge_probabilities", "draw_isotopes", "field_of_counts", "ion_charges"}
+ARRAYS |= {"smoothed_history", "charge_history"}
 ARRAYS |= {"launch_tangentially", "ratio_of_counts", "rollup_direction", "lattice_sites_in", "BondField"}
 ARRAYS |= {"Detection", "charge_residuals", "surface_after", "roll_ups"}
 
@@ -774,6 +781,7 @@ def test_every_public_name_with_arguments_is_in_the_table():
     taken |= {"write_nodes", "write_types", "describe"}  # in test_tapsim_nodes, test_main
     taken |= {"index", "indexing", "MasterPattern", "master_patterns", "master_pattern"}  # in tests/maps
     taken |= {"Measurement", "constants_of", "settings_of"}  # in tests/fit
+    taken |= {"simulate", "compare", "twin"}  # in tests/studies, tests/cli
     missing = {
         name
         for place in (ae, *SPACES)
@@ -871,7 +879,7 @@ def test_what_does_not_fit_is_refused_before_it_is_built(monkeypatch):
         ae.Tip("Ni", 1e6, depth=1.2)
     assert len(ae.Tip("Ni", 1.5)) > 0
     monkeypatch.setattr(memory, "_available_memory", lambda: 1e6)
-    with pytest.raises(ValueError, match=r"64 threads.*0\.001 GB"):
+    with pytest.raises(ValueError, match=r"n_threads=64.*0\.001 GB"):
         ae.Simulation(shell, n_threads=64)
 
 
@@ -898,7 +906,7 @@ def test_everything_says_in_one_line_what_it_holds(ready, tmp_path):
         (ae.RollUp(ae.TruncatedNormal(0.3, 0.1)), ["RollUp(TruncatedNormal(0.3, 0.1))"]),
         (ae.emission.IonRandom(1, [0, 1]), ["IonRandom", "seed=1", "2 ions"]),
         (ae.evaporation.ChargeSettings(), ["ChargeSettings", "tolerance=", "opening_angle=0.4"]),
-        (ae.FlightSettings(), ["FlightSettings", "tolerance=", "max_steps=500"]),
+        (ae.simulation.FlightSettings(), ["FlightSettings", "tolerance=", "max_steps=500"]),
         (ae.ResponseSettings(), ["energy_limit=1.5", "bound=0.2", "degree=4"]),
     ]
     for thing, words in told:

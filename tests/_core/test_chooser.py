@@ -134,7 +134,7 @@ def test_the_limit_of_a_low_temperature_is_the_largest_key(rng):
 def test_the_sum_at_the_root_does_not_drift(tip12):
     settings = ae.evaporation.ChargeSettings(sweep_interval=100_000, potential_bound=1.0)
     emitter = ae.evaporation.Emitter(tip12, law=ae.Arrhenius(50.0), settings=settings)
-    batch = emitter.evaporate(5000)  # until there is no more room for exposed atoms: no sum is ever rebuilt
+    batch = emitter.evaporate(5000)  # until there is no more space for exposed atoms: no sum is ever rebuilt
     assert batch.status == SWEEP_DUE and emitter._core.since_relaxation == len(batch) > 500
     # 240 slots change per event: 2e5 updates, of rates that differ by many orders of magnitude. 13 levels of sums,
     # each rounded to 2^-53; differences would lose the small rates next to the large ones

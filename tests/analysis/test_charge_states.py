@@ -149,8 +149,8 @@ def test_ions_that_missed_do_not_count():
     missed = replace(hits, outcome=np.arange(4000) % 2)
     both = charge_state_ratio_map(hits[::2], "Ni", 1, bins=5), charge_state_ratio_map(missed, "Ni", 1, bins=5)
     np.testing.assert_array_equal(both[0].lower, both[1].lower)
-    course = charge_state_ratio_history(missed, "Ni", 1, sections=4)
-    assert course.ions == 2000 and course.middles.tolist() == [500, 1500, 2500, 3500]
+    history = charge_state_ratio_history(missed, "Ni", 1, sections=4)
+    assert history.ions == 2000 and history.middles.tolist() == [500, 1500, 2500, 3500]
 
 
 def test_the_pair_with_most_ions_of_the_rarer_charge():
@@ -159,7 +159,7 @@ def test_the_pair_with_most_ions_of_the_rarer_charge():
     assert charge_history(charges, "W", 1).charge == 1
 
 
-# ---- course --------------------------------------------------------------------------------------------------------
+# ---- history -------------------------------------------------------------------------------------------------------
 
 
 def test_course_of_a_rising_field():
@@ -204,19 +204,20 @@ def test_ranges_of_a_file_give_the_map_of_the_run(real, tmp_path):
     """Written as .epos and .rrng, and read again: as measured ions, whose charges are known by their masses only."""
     hits = real.hits(ae.Unperturbed())
     own = charge_state_ratio_map(hits, "Ni", 1, bins=4, least=5)
-    ae.write(tmp_path / "ni.epos", hits[hits.detected])
+    with pytest.warns(ae.warnings.DataWarning, match="can be taken for kV"):
+        ae.write(tmp_path / "ni.epos", hits[hits.detected])
     (tmp_path / "ni.rrng").write_text(NICKEL)
-    measured, ranges = ae.read(tmp_path / "ni.epos"), ae.io.read_ranges(tmp_path / "ni.rrng")
+    measured, ranges = ae.read(tmp_path / "ni.epos", voltage_unit="V"), ae.io.read_ranges(tmp_path / "ni.rrng")
     assert "charge_state" not in measured.extra
     by_ranges = charge_state_ratio_map(measured, "Ni", 1, ranges=ranges, like=own, least=5)
     np.testing.assert_array_equal(by_ranges.lower, own.lower)
     np.testing.assert_array_equal(by_ranges.upper, own.upper)
     np.testing.assert_array_equal(by_ranges.field, own.field)
-    courses = [
+    histories = [
         charge_state_ratio_history(ions, "Ni", 1, ranges=chosen, sections=3)
         for ions, chosen in ((hits[hits.detected], None), (measured, ranges))
     ]
-    np.testing.assert_array_equal(courses[0].ratio, courses[1].ratio)
+    np.testing.assert_array_equal(histories[0].ratio, histories[1].ratio)
 
 
 def test_a_spectrum_with_tails_gives_nearly_the_same_ratio(real):

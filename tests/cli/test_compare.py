@@ -106,7 +106,7 @@ def test_everything_is_written(folder, capsys, rough_layout):
     assert [(each["name"], each["sha256"]) for each in report["origin"]["files"]] == sums
     # it is what Python gives
     study = fit_energies(
-        ae.load("run.h5"), ae.read_map("map.npz"), means=(0.1, 0.2, 0.3), relative_spreads=(0.5, 1),
+        ae.load("run.h5"), ae.io.read_map("map.npz"), means=(0.1, 0.2, 0.3), relative_spreads=(0.5, 1),
         replicas=1, resamples=4, bins=24, registration=ae.Registration(0, 1, (0, 0)), progress=False,
     )  # fmt: skip
     assert held == study.to_dict()
@@ -214,7 +214,7 @@ def test_measured_ions_are_selected(folder, capsys):
 
 def test_a_run_without_responses_is_refused(folder, small_tip, capsys):
     ae.Simulation(small_tip).run(50, responses=False, progress=False).save("nr.h5")
-    sentence = "'nr.h5' has no responses: repeat the run with responses = true in [simulation]"
+    sentence = "'nr.h5' must have responses, got <Run: 50 ions"
     assert sentence in failed(capsys, "nr.h5", "map.npz", *HERE)
 
 

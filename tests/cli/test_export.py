@@ -35,7 +35,8 @@ def test_ranges(folder, capsys):
     assert main(["info", "ions.nxs", "--ranges", "a.rng", "--species", "Cr", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["ions"] == 100
 
-@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
+
+@pytest.mark.filterwarnings("ignore:.*are they in mm:apt_evap.warnings.DataWarning")
 def test_measured_ions_in_other_formats(folder, capsys):
     assert main(["export", "oxcart.h5", "-o", "oxcart.epos"]) == 0
     here, there = ae.read("oxcart.h5"), ae.read("oxcart.epos")

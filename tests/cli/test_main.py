@@ -16,13 +16,14 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from apt_evap import __version__, cli, plot
-from apt_evap.cli import run as run_command
+from apt_evap.cli import _progress
 from apt_evap.cli.main import main
 from apt_evap.cli.parser import EXIT_CODES
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.perturbations import Combined, LateralVelocity, RollUp, Unperturbed
 from apt_evap.io.formats import write
 from apt_evap.simulation.run import load
+from apt_evap.studies.workflows import simulate_file
 
 HERE = str(Path(cli.__file__).parents[2])  # the package under test, installed or not
 NO_PICTURES = pytest.mark.usefixtures("blank_pictures")
@@ -128,10 +129,11 @@ def test_run_foretells_its_time_and_says_what_it_does_before_the_first_ion(folde
 
 def test_the_bar_of_a_run_fits_a_terminal(monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "80")
-    with run_command._Bar(1_000_000, 200_000) as bar:
+    with _progress.ProgressBar() as bar:
+        bar(200_000, 1_000_000)
         bar(600_000, 1_000_000)
-        bar._bar.refresh()
-        text = str(bar._bar)
+        bar.bar.refresh()
+        text = str(bar.bar)
     assert len(text) <= 80 and "60%" in text and "600000 of 1000000" in text
     assert len(text.split("|")[1]) >= 20
 
@@ -250,7 +252,7 @@ def test_a_second_run_overwrites_the_first_but_nobody_elses_files(folder, capsys
 
 
 def test_what_cannot_be_written_is_said_before_computing(folder, capsys, monkeypatch):
-    monkeypatch.setattr(run_command, "config_of", checked := Counting(run_command.config_of))
+    monkeypatch.setattr(simulate_file, "config_of", checked := Counting(simulate_file.config_of))
     assert "cannot write 'none/a.h5': No such file or directory" in failed(
         capsys, "run", "small.toml", "-o", "none/a.h5"
     )
@@ -337,10 +339,10 @@ def test_memory_and_interrupts_are_no_tracebacks_but_bugs_are(folder, capsys, mo
 
 @NO_PICTURES
 def test_progress_without_a_terminal_is_plain_lines(folder, capsys, monkeypatch):
-    monkeypatch.setattr(run_command, "SECONDS_BETWEEN_LINES", 0.0)
+    monkeypatch.setattr(_progress, "SECONDS_BETWEEN_LINES", 0.0)
     (folder / "small.toml").write_text(SMALL + "responses = false\n")
     assert main(["run", "small.toml", "--ions", "600", "--threads", "1"]) == 0
-    line = r"\d+ of 600 ions \(\d+%\), [\d.,]+ ions/s, \d+ s left\n"
+    line = r"\n3\d\d of 600 ions \(\d\d%\), [\d.,]+ ions/s, \d+ s left\n"
     assert re.search(line, capsys.readouterr().err)
     assert main(["run", "small.toml", "--ions", "600", "--threads", "1", "--quiet"]) == 0
     assert capsys.readouterr().err == ""

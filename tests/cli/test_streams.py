@@ -78,7 +78,7 @@ def test_a_locale_without_degree_signs(folder):
     locale = {"LC_ALL": "C", "PYTHONUTF8": "0"}
     print_one = r"import apt_evap.cli._output as o; o.open_missing_streams(); o.put('20\u00b0 \u00b1 1 caf\udce9')"
     done = subprocess.run(
-        [sys.executable, "-c", print_one],
+        [sys.executable, "-P", "-c", print_one],
         capture_output=True,
         env=os.environ | {"PYTHONPATH": HERE} | locale,
         timeout=120,

@@ -101,6 +101,25 @@ def read(folder, text, responses="true"):
     return ae.config.read_config(path)
 
 
+def test_a_perturbation_without_responses_is_flown(folder):
+    text = """
+[[maps.panels]]
+perturbation = { name = "mine:FromAbove", height = 0.3 }
+[[maps.panels]]
+perturbation = { name = "RollUp", energy = 0.4 }
+"""
+    (above,) = read(folder, text).emissions
+    assert above.height == 0.3
+    assert main(["run", str(folder / "a.toml"), "--quiet"]) == 0
+    run = ae.load("a.h5")
+    assert len(run.perturbations) == 1 and run.responses is not None
+    assert np.isfinite(run.hits(above).x).any() and np.isfinite(run.hits(ae.RollUp(0.4)).x).any()
+    assert main(["run", str(folder / "a.toml"), "--quiet", "--resume"]) == 0  # complete
+    (folder / "a.toml").write_text((folder / "a.toml").read_text().replace("ions = 20", "ions = 25"))
+    assert main(["run", str(folder / "a.toml"), "--quiet", "--resume"]) == 0
+    assert len(ae.load("a.h5")) == 25
+
+
 def test_a_run_with_a_law_and_perturbations_of_ones_own(folder, capsys):
     text = """
 [law]

@@ -43,7 +43,9 @@ def test_rules():
 
 
 def test_control_and_real_units():
-    assert read("pulse_fraction = 0\nrate = 2", ae.VoltageControl) == ae.VoltageControl(rate=2.0, pulse_fraction=0.0)
+    assert read("pulse_fraction = 0\nrate = 2", ae.evaporation.VoltageControl) == ae.evaporation.VoltageControl(
+        rate=2.0, pulse_fraction=0.0
+    )
     text = """
     field_reference = "site"
     operating_field = 33.0
@@ -66,7 +68,7 @@ def test_control_and_real_units():
         (LAWS, 'name = "Extremal"\ntemperature = 3', "temperature"),
         (LAWS, 'name = "Arrhenius"\ntemperature = 3\nlaser = {}', "temperature_rise"),
         (LAWS, 'name = "Extremal"\nbonds = { name = "CoordinationTable", table = { W = { few = 1.0 } } }', "few"),
-        ((ae.VoltageControl,), "rates = 1", "rate"),
+        ((ae.evaporation.VoltageControl,), "rates = 1", "rate"),
         ((OperatingPoint,), "pole = 1", "pole"),
         ((OperatingPoint,), "flight_charges = 0", "flight_charges"),
         ((OperatingPoint,), "timing = 3", "timing"),

@@ -19,7 +19,7 @@ def later(cooling, time):
 
     def rate(t):
         share = t / cooling.time_constant
-        fall = math.exp(-share) if cooling.course == "exponential" else 1 / math.sqrt(1 + share)
+        fall = math.exp(-share) if cooling.decay == "exponential" else 1 / math.sqrt(1 + share)
         hot, cold = cooling.temperature + cooling.temperature_rise * fall, cooling.temperature
         return math.exp(-cooling.barrier * (peak / hot - 1)) - math.exp(-cooling.barrier * (peak / cold - 1))
 
@@ -29,20 +29,20 @@ def later(cooling, time):
     return tail, sum(quad(rate, low, high)[0] for low, high in zip([0, *ends], ends, strict=False))
 
 
-@pytest.mark.parametrize("course", ["exponential", "conduction"])
+@pytest.mark.parametrize("decay", ["exponential", "conduction"])
 @pytest.mark.parametrize(("base", "rise", "barrier"), [(50.0, 150.0, 20.0), (80.0, 60.0, 25.0), (20.0, 400.0, 17.0)])
-def test_delays_have_the_density_of_the_rate(course, base, rise, barrier):
-    cooling = Cooling(base, rise, 3.0, barrier, course)
+def test_delays_have_the_density_of_the_rate(decay, base, rise, barrier):
+    cooling = Cooling(base, rise, 3.0, barrier, decay)
     for share, delay in zip((0.9, 0.5, 0.1, 1e-3), cooling.delays([0.9, 0.5, 0.1, 1e-3]), strict=True):
         tail, whole = later(cooling, delay)
         # the table is linear between 4,001 points
         assert tail / whole == pytest.approx(share, rel=1e-3)
 
 
-@pytest.mark.parametrize(("course", "factor"), [("exponential", 1.0), ("conduction", 2.0)])
-def test_of_the_first_order_delays_are_exponential(course, factor):
+@pytest.mark.parametrize(("decay", "factor"), [("exponential", 1.0), ("conduction", 2.0)])
+def test_of_the_first_order_delays_are_exponential(decay, factor):
     """A high barrier: ions leave before the temperature has changed much."""
-    cooling = Cooling(50.0, 150.0, 3.0, 900.0, course)
+    cooling = Cooling(50.0, 150.0, 3.0, 900.0, decay)
     delays = cooling.delays(SHARES)
     mean = factor * 3.0 * 200.0 / (900.0 * 150.0)
     assert delays.mean() == pytest.approx(mean, rel=0.01)  # the next order is 1/900 times a number of a few
@@ -57,7 +57,9 @@ def test_a_fast_cooling_delays_nothing():
 
 
 def test_the_tail_of_conduction_is_longer():
-    short, long = (Cooling(50.0, 150.0, 1.0, course=each).delays([0.5, 1e-4]) for each in ("exponential", "conduction"))
+    short, long = (
+        Cooling(50.0, 150.0, 1.0, decay=decay).delays([0.5, 1e-4]) for decay in ("exponential", "conduction")
+    )
     assert long[1] / long[0] > 1.5 * short[1] / short[0]
 
 
@@ -98,7 +100,7 @@ def test_spectra_have_the_tail(small_tip):
 def test_cooling_excludes_the_deficits_of_voltage_pulses():
     with pytest.raises(ValueError, match="temperature"):
         Timing(temperature=50.0, cooling=Cooling(50.0, 150.0, 1.0))
-    for wrong in ({"time_constant": 0.0}, {"temperature_rise": -1.0}, {"course": "linear"}):
+    for wrong in ({"time_constant": 0.0}, {"temperature_rise": -1.0}, {"decay": "linear"}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             Cooling(**{"temperature": 50.0, "temperature_rise": 150.0, "time_constant": 1.0, **wrong})
     with pytest.raises(ValueError, match="diffusivity"):

@@ -53,7 +53,7 @@ BUILT_IN = [
 MIXED = Mixture((RollUp(ENERGY, 0.4), LateralVelocity(0.1), Unperturbed()), (0.6, 0.3, 0.1))
 
 
-def emissions(n=400, seed=1, lonely=0.2):
+def emissions(n=400, seed=1, isolated=0.2):
     """Atoms on a ball, each with a neighbour at the distance D in a random direction; some have none."""
     generator = np.random.default_rng(seed)
     normals = generator.normal(size=(n, 3))
@@ -61,7 +61,7 @@ def emissions(n=400, seed=1, lonely=0.2):
     steps = generator.normal(size=(n, 3))
     steps *= D / np.linalg.norm(steps, axis=1)[:, None]
     neighbours = 7 * normals + steps
-    neighbours[generator.random(n) < lonely] = np.nan
+    neighbours[generator.random(n) < isolated] = np.nan
     masses = generator.choice([26.982, 58.693], n)
     return Emissions(7 * normals, normals, neighbours, np.ones(n), masses, np.arange(n) + 1000 * seed, D)
 
@@ -215,7 +215,7 @@ def test_combined_with_all_the_energy_in_the_rollup_is_rollup():
 
 
 def test_every_perturbation_sees_the_same_draws():
-    batch = emissions(lonely=0)
+    batch = emissions(isolated=0)
     energies = [
         kinetic_energy(one(ENERGY).launch(batch, IonRandom(11, batch.ions)), batch.masses)
         for one in (LateralVelocity, RollUp)
@@ -331,7 +331,7 @@ def test_distribution_of_a_users_own_is_checked():
 def test_launches_are_checked():
     with pytest.raises(ValueError, match="velocities"):
         Launches([[0, 0, 0]], [0, 0, 0], [True])
-    batch = emissions(3, lonely=1)
+    batch = emissions(3, isolated=1)
     with pytest.raises(ValueError, match="positions"):
         launch_tangentially(batch, np.ones(3, dtype=bool), np.zeros(3), np.zeros(3))
 
@@ -381,7 +381,7 @@ def followed(mixture, batch):
 
 
 def test_each_ion_is_launched_as_by_one_of_the_perturbations():
-    batch = emissions(20_000, lonely=0.0)
+    batch = emissions(20_000, isolated=0.0)
     mixture = Mixture((LateralVelocity(0.3), LateralVelocity(0.1), Unperturbed()), (5, 3, 2))
     counts = np.bincount(followed(mixture, batch), minlength=3)
     assert stats.chisquare(counts, len(batch) * np.array([0.5, 0.3, 0.2])).pvalue > 1e-3
@@ -391,7 +391,7 @@ def test_each_ion_is_launched_as_by_one_of_the_perturbations():
 
 def test_the_choice_does_not_depend_on_the_energy():
     """It has a random number of its own, whatever the perturbations take, also in a mixture of mixtures."""
-    batch = emissions(20_000, lonely=0.0)
+    batch = emissions(20_000, isolated=0.0)
     energy = ae.TruncatedNormal(0.2, 0.2)
     for mixture in (
         Mixture((LateralVelocity(energy), Pushed())),
@@ -412,7 +412,7 @@ def test_the_choice_does_not_depend_on_the_energy():
 
 
 def test_defaults_are_filled_in_where_one_perturbation_has_its_own():
-    batch = emissions(300, lonely=0.0)
+    batch = emissions(300, isolated=0.0)
     mixture = Mixture(THREE)
     launches = mixture.tangential(batch, IonRandom(5, batch.ions))
     assert launches.shares is None

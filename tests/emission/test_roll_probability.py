@@ -119,9 +119,9 @@ def test_the_rule_of_a_metal_on_a_run():
 
 
 def test_it_needs_the_neighbours():
-    lonely = replace(emissions_with([0.5]), targets=None, charge_ratios=None)
+    isolated = replace(emissions_with([0.5]), targets=None, charge_ratios=None)
     with pytest.raises(ValueError, match=r"Migration needs the charges .*ResponseSettings\.wide"):
-        Migration(4.44, 35.0).probabilities(lonely)
+        Migration(4.44, 35.0).probabilities(isolated)
 
 
 @pytest.mark.parametrize("metal", ["Ni", "W"])

@@ -23,7 +23,7 @@ BARRIERS = {
 @pytest.mark.parametrize(("sensitivity", "kelvin", "fraction"), [(0.6, 50.0, 0.2), (0.5, 80.0, 0.1), (1.0, 100.0, 0.3)])
 def test_losses_are_those_of_a_whole_cycle(form, sensitivity, kelvin, fraction):
     """Twin: the rate of one atom, integrated over a Gaussian pulse and over the rest of the cycle."""
-    law, control = ae.Arrhenius(kelvin, barrier=form), ae.VoltageControl(pulse_fraction=fraction)
+    law, control = ae.Arrhenius(kelvin, barrier=form), ae.evaporation.VoltageControl(pulse_fraction=fraction)
     found, x = between_pulses(sensitivity, law, control)
     reach, _ = law.working_point(sensitivity, control)
     stiffness, width = sensitivity / (BOLTZMANN * kelvin), 1e-9 * control.pulse_width
@@ -39,7 +39,7 @@ def test_losses_are_those_of_a_whole_cycle(form, sensitivity, kelvin, fraction):
 
 
 def test_the_linear_barrier_has_a_closed_form():
-    law, control = ae.Arrhenius(60.0), ae.VoltageControl(pulse_fraction=0.25, pulse_frequency=100.0)
+    law, control = ae.Arrhenius(60.0), ae.evaporation.VoltageControl(pulse_fraction=0.25, pulse_frequency=100.0)
     reach, length = law.working_point(0.7, control)
     thermal = BOLTZMANN * 60.0
     x = 1 - reach * thermal / 0.7
@@ -54,7 +54,7 @@ def test_trends():
     found = conditions({"Al": 0.5, "Cu": 0.5}, law=ae.Arrhenius(50.0, sensitivity={"Al": 1.0, "Cu": 0.5}))
     assert (np.diff(found.lost, axis=1) > 0).all() and (np.diff(found.lost, axis=2) < 0).all()
     assert (found.lost[1] >= found.lost[0]).all() and found.lost[0, 0, -1] < 1e-20
-    slow = conditions({"Al": 1.0}, temperatures=80.0, control=ae.VoltageControl(pulse_frequency=2.0))
+    slow = conditions({"Al": 1.0}, temperatures=80.0, control=ae.evaporation.VoltageControl(pulse_frequency=2.0))
     usual = conditions({"Al": 1.0}, temperatures=80.0)
     assert (slow.lost / (1 - slow.lost)) / (usual.lost / (1 - usual.lost)) == pytest.approx(100.0, rel=1e-9)
     assert found.lost_in_total == pytest.approx(found.lost.mean(axis=0))
@@ -88,7 +88,7 @@ def test_wrong_arguments_are_named(arguments, name):
 
 
 def test_a_picture_needs_two_axes():
-    with pytest.raises(ValueError, match="found"):
+    with pytest.raises(ValueError, match="result"):
         ae.plot.conditions(conditions({"Al": 1.0}, temperatures=50.0))
     with pytest.raises(ValueError, match="element"):
         ae.plot.conditions(conditions({"Al": 1.0}), "Cu")

@@ -19,7 +19,7 @@ def by_hand(emitter, n):
         if batch.status == SWEEP_DUE:
             emitter.relax_due()
         elif batch.status == TOO_SHALLOW:
-            emitter.deepen()
+            emitter.extend_shell()
         elif batch.status == EXHAUSTED:
             break
     return np.concatenate(sites)

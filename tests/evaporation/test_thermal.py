@@ -11,7 +11,7 @@ from apt_evap._core.law import BARRIERS
 from apt_evap.units import BOLTZMANN
 
 FREQUENCY = 1e13
-STEADY = ae.VoltageControl(rate=1.0, pulse_fraction=0.0)
+STEADY = ae.evaporation.VoltageControl(rate=1.0, pulse_fraction=0.0)
 # for a p-value of random numbers from a fixed seed: each test below would fail for 1 seed in 1,000
 CHANCE = 1e-3
 
@@ -21,7 +21,7 @@ def emitter_of(tip, law, **options):
     return ae.evaporation.Emitter(tip, law=law, **{"n_threads": 1} | options)
 
 
-def course(emitter, n, batch_size=256):
+def history_of(emitter, n, batch_size=256):
     """Columns of n events: sites, charges, waits and voltages."""
     batches = list(emitter.advance(n, batch_size))
     columns = ("site", "charges", "waits", "voltages")
@@ -81,7 +81,7 @@ def shell(nickel):
 def test_rates_of_the_kernel_are_those_of_the_formulas(small_tip, barrier, temperature, sensitivity):
     law = ae.Arrhenius(temperature, sensitivity, FREQUENCY, barrier)
     x = np.linspace(0.2, 2.0, 200)
-    w, _ = law.working_point(sensitivity, ae.VoltageControl())
+    w, _ = law.working_point(sensitivity, ae.evaporation.VoltageControl())
     expected = np.log(FREQUENCY) - twin(barrier, x, sensitivity / (BOLTZMANN * temperature), w)
     # a handful of roundings of terms that are at most 40 times larger than their sum
     assert log_rates(law, small_tip, x) == pytest.approx(expected, rel=1e-13, abs=1e-11)
@@ -108,7 +108,7 @@ def test_without_a_field_or_of_a_fixed_atom_there_is_no_rate(small_tip, barrier)
 )
 def test_slopes_at_the_working_point(small_tip, temperature, barrier, point, slope):
     law, h = ae.Arrhenius(temperature, barrier=barrier), 1e-5
-    w, _ = law.working_point(1.0, ae.VoltageControl())
+    w, _ = law.working_point(1.0, ae.evaporation.VoltageControl())
     thermal = BOLTZMANN * temperature
     r = w * thermal  # Q_op / C
     x = point(r)
@@ -136,7 +136,7 @@ def spread(tip, law):
 
 def probabilities(law, emitter):
     """Probability of each surface atom to evaporate next, at the voltage of the wanted rate."""
-    control = ae.VoltageControl()
+    control = ae.evaporation.VoltageControl()
     kernel, (_, length) = law.kernel(emitter.tip, control), law.working_point(1.0, control)
     fields, atoms, none = emitter.fields, emitter.atoms, np.zeros(len(emitter), np.int32)
 
@@ -182,7 +182,7 @@ def test_the_spread_of_the_order_grows_with_the_temperature(tip12):
 
 def test_at_zero_temperature_the_law_is_the_extremal_one_bit_by_bit(tip12):
     extremal, cold = emitter_of(tip12, ae.Extremal()), emitter_of(tip12, ae.Arrhenius(0.0), seed=7)
-    assert same(course(extremal, 250), course(cold, 250)) == [True] * 4
+    assert same(history_of(extremal, 250), history_of(cold, 250)) == [True] * 4
     assert cold.control is None and cold.pulse_length is None and cold.control_voltage == cold.voltage == 1000.0
     for barrier in BARRIERS:
         assert type(ae.Arrhenius(0.0, barrier=barrier).kernel(tip12)) is type(ae.Extremal().kernel(tip12))
@@ -191,10 +191,10 @@ def test_at_zero_temperature_the_law_is_the_extremal_one_bit_by_bit(tip12):
 def test_close_to_zero_temperature_the_sites_are_those_of_the_extremal_law(tip12):
     # kT/C = 1e-8 at 1e-4 K; the two largest of 6,000 fields differed by 9e-7 or more in all 250 events
     extremal, cold = emitter_of(tip12, ae.Extremal()), emitter_of(tip12, ae.Arrhenius(1e-4), seed=7)
-    sites, charges, waits, _ = course(cold, 250)
-    assert same(course(extremal, 250)[:2], (sites, charges)) == [True, True]
+    sites, charges, waits, _ = history_of(cold, 250)
+    assert same(history_of(extremal, 250)[:2], (sites, charges)) == [True, True]
     assert (waits >= 0).all() and np.isfinite(waits).all()
-    warm = course(emitter_of(tip12, ae.Arrhenius(20.0), seed=7), 250)[0]
+    warm = history_of(emitter_of(tip12, ae.Arrhenius(20.0), seed=7), 250)[0]
     assert not np.array_equal(warm, sites)
 
 
@@ -207,10 +207,10 @@ def test_only_the_ratio_of_sensitivity_and_temperature_matters(small_tip, barrie
         return emitter_of(small_tip, law, control=control, seed=3)
 
     one, two = emitter(50.0, 1.0), emitter(100.0, 2.0)
-    columns = course(one, 120)
+    columns = history_of(one, 120)
     assert one.pulse_length == two.pulse_length
-    assert same(columns, course(two, 120)) == [True] * 4
-    assert not np.array_equal(columns[0], course(emitter(100.0, 1.0), 120)[0])
+    assert same(columns, history_of(two, 120)) == [True] * 4
+    assert not np.array_equal(columns[0], history_of(emitter(100.0, 1.0), 120)[0])
 
 
 def test_a_higher_attempt_frequency_lowers_the_voltage(tip12):
@@ -245,7 +245,7 @@ def test_atoms_are_drawn_from_the_rates_of_all_atoms(tip12, rng):
 @pytest.mark.parametrize("memory", [1_000_000, 20])
 def test_waits_are_exponential(tip12, memory):
     """The rate times the wait is an Exp(1) number; with a short memory the rate rises exponentially while waiting."""
-    emitter = emitter_of(tip12, ae.Arrhenius(80.0), control=ae.VoltageControl(memory=memory), seed=5)
+    emitter = emitter_of(tip12, ae.Arrhenius(80.0), control=ae.evaporation.VoltageControl(memory=memory), seed=5)
     speed = emitter.control.rate / emitter.pulse_length / memory
     numbers, plain = [], []
     for rate, rise, *_, batch in one_by_one(emitter, 1000):
@@ -260,15 +260,15 @@ def test_waits_are_exponential(tip12, memory):
 
 def test_the_seed_changes_the_sequence_and_nothing_else_does(small_tip):
     law = ae.Arrhenius(60.0)
-    columns = course(emitter_of(small_tip, law, seed=1), 120)
-    assert same(columns, course(emitter_of(small_tip, law, seed=1), 120)) == [True] * 4
-    assert same(columns, course(emitter_of(small_tip, law, seed=2), 120)) == [False] * 4
+    columns = history_of(emitter_of(small_tip, law, seed=1), 120)
+    assert same(columns, history_of(emitter_of(small_tip, law, seed=1), 120)) == [True] * 4
+    assert same(columns, history_of(emitter_of(small_tip, law, seed=2), 120)) == [False] * 4
 
 
 def test_threads_and_batches_leave_the_bits(shell):
     def columns(batch_size=256, n_threads=1):
         emitter = emitter_of(shell, ae.Arrhenius(60.0), seed=11, n_threads=n_threads)
-        events = course(emitter, 260, batch_size)
+        events = history_of(emitter, 260, batch_size)
         assert len(emitter.tip) > len(shell)  # it was deepened
         return [*events, emitter.charges, emitter.control_voltage]
 
@@ -293,7 +293,7 @@ def test_events_and_the_starts_of_ions_have_different_random_numbers(tip12):
 @pytest.mark.parametrize("temperature", [25.0, 80.0])
 @pytest.mark.parametrize("rate", [0.002, 0.05])
 def test_the_first_voltage_gives_the_wanted_rate(tip12, temperature, rate):
-    control = ae.VoltageControl(rate=rate)
+    control = ae.evaporation.VoltageControl(rate=rate)
     emitter = emitter_of(tip12, ae.Arrhenius(temperature), control=control)
     # 1e-15 of the voltage, where a bisection ends, is 4e-13 of the rate at 25 K
     assert emitter._core.chooser.rate * emitter.pulse_length == pytest.approx(rate, rel=2e-12)
@@ -302,7 +302,7 @@ def test_the_first_voltage_gives_the_wanted_rate(tip12, temperature, rate):
 
 def test_the_voltage_follows_the_waits(tip12):
     """Between two relaxations dlnV = s (wait over its mean - 1)/memory, with s = dlnV/dlnK = kT/(C <x>)."""
-    control = ae.VoltageControl(memory=40)
+    control = ae.evaporation.VoltageControl(memory=40)
     emitter = emitter_of(tip12, ae.Arrhenius(50.0), control=control, seed=2)
     x = np.where(tip12.evaporable[emitter.atoms], emitter.fields * emitter._core.control.voltage_factor / 35.0, -np.inf)
     weights = np.exp((x - x.max()) / (BOLTZMANN * 50.0))
@@ -336,7 +336,7 @@ def test_a_relaxation_keeps_the_rate(tip12, barrier):
 
 def test_a_relaxation_changes_the_voltage_only_to_the_second_order(tip12):
     """Between two relaxations the voltage is linear in the logarithm of the rates."""
-    control = ae.VoltageControl(memory=1000)
+    control = ae.evaporation.VoltageControl(memory=1000)
     emitter = emitter_of(tip12, ae.Arrhenius(50.0), control=control, seed=2)
     assert sum(map(len, emitter.advance(350))) == 350
     before, after = emitter._core.control.voltage_factor * emitter.voltage, emitter.control_voltage
@@ -348,9 +348,9 @@ def test_a_relaxation_changes_the_voltage_only_to_the_second_order(tip12):
 
 def test_the_mean_rate_is_the_wanted_one(tip12):
     """Ions per pulse, after the control has found the voltage of the first surface."""
-    control = ae.VoltageControl(rate=0.01, memory=10)
+    control = ae.evaporation.VoltageControl(rate=0.01, memory=10)
     emitter = emitter_of(tip12, ae.Arrhenius(50.0), control=control, seed=1)
-    _, _, waits, voltages = course(emitter, 1800)
+    _, _, waits, voltages = history_of(emitter, 1800)
     pulses = np.floor(np.cumsum(waits) / emitter.pulse_length)
     n = len(waits) - 300
     rate = n / (pulses[-1] - pulses[299])
@@ -362,15 +362,17 @@ def test_the_mean_rate_is_the_wanted_one(tip12):
 def test_a_longer_memory_is_a_smoother_voltage(small_tip):
     noise = []
     for memory in (10, 50, 250):
-        emitter = emitter_of(small_tip, ae.Arrhenius(50.0), control=ae.VoltageControl(memory=memory), seed=1)
-        noise.append(np.diff(np.log(course(emitter, 300)[3])).std())
+        emitter = emitter_of(
+            small_tip, ae.Arrhenius(50.0), control=ae.evaporation.VoltageControl(memory=memory), seed=1
+        )
+        noise.append(np.diff(np.log(history_of(emitter, 300)[3])).std())
     assert noise == sorted(noise, reverse=True)
 
 
 def test_the_voltage_does_not_depend_on_the_applied_one(tip12):
     """Charges are in proportion to the voltage, so the control finds the same one from any."""
-    one = course(ae.evaporation.Emitter(tip12, 1000.0, law=ae.Arrhenius(50.0), seed=1, n_threads=1), 100)
-    two = course(ae.evaporation.Emitter(tip12, 2000.0, law=ae.Arrhenius(50.0), seed=1, n_threads=1), 100)
+    one = history_of(ae.evaporation.Emitter(tip12, 1000.0, law=ae.Arrhenius(50.0), seed=1, n_threads=1), 100)
+    two = history_of(ae.evaporation.Emitter(tip12, 2000.0, law=ae.Arrhenius(50.0), seed=1, n_threads=1), 100)
     assert np.array_equal(one[0], two[0])
     assert two[1] == pytest.approx(2 * one[1], rel=1e-9)  # charges converge to rounding in the same steps
     assert two[3] == pytest.approx(one[3], rel=1e-9)
@@ -397,7 +399,7 @@ def test_numbers_of_the_working_point():
     # one ion per second of 100 candidates at 1e13 1/s: ln(1e15); equal but for the rounding of logarithms
     assert (barrier, length) == (pytest.approx(np.log(1e15), rel=1e-14), 0.0)
     assert barrier * BOLTZMANN * 50.0 == pytest.approx(0.149, abs=5e-4)  # to the last digit
-    barrier, length = law.working_point(1.0, ae.VoltageControl())
+    barrier, length = law.working_point(1.0, ae.evaporation.VoltageControl())
     # x = 0.927 there; with x = 1 it would be 0.20 ns
     assert length == pytest.approx(0.209e-9, abs=5e-13)
     assert barrier == pytest.approx(np.log(1e13 * length / 0.01 * 100), rel=1e-12)  # the fixed point has converged
@@ -412,8 +414,8 @@ def test_the_barrier_at_a_pulse_of_one_nanosecond(temperature, energy):
     assert barrier == pytest.approx(18.4, abs=0.05)
     assert barrier * thermal == pytest.approx(energy, abs=5e-4)
     x = 1 - barrier * thermal
-    width = 1e-9 / ae.VoltageControl(pulse_width=1.0).effective_width(thermal / x)  # ns for a pulse of 1 ns
-    found, length = ae.Arrhenius(temperature).working_point(1.0, ae.VoltageControl(pulse_width=width))
+    width = 1e-9 / ae.evaporation.VoltageControl(pulse_width=1.0).effective_width(thermal / x)  # ns for a pulse of 1 ns
+    found, length = ae.Arrhenius(temperature).working_point(1.0, ae.evaporation.VoltageControl(pulse_width=width))
     # a fixed point that converges to 1e-12
     assert (found, length) == (pytest.approx(barrier, rel=1e-11), pytest.approx(1e-9, rel=1e-11))
 
@@ -473,19 +475,21 @@ def test_temperatures_of_both_sides():
 
 def test_an_even_laser_is_a_higher_temperature(tip12):
     law, rate = ae.Arrhenius(30.0, laser=ae.evaporation.Laser(100.0, 100.0)), 1e-6
-    heated = emitter_of(tip12, law, control=ae.VoltageControl(rate=rate, pulse_fraction=0.0), seed=3)
+    heated = emitter_of(tip12, law, control=ae.evaporation.VoltageControl(rate=rate, pulse_fraction=0.0), seed=3)
     assert heated.pulse_length == law.working_point(1.0, heated.control)[1]
-    per_second = ae.VoltageControl(rate=rate / heated.pulse_length, pulse_fraction=0.0)
+    per_second = ae.evaporation.VoltageControl(rate=rate / heated.pulse_length, pulse_fraction=0.0)
     warm = emitter_of(tip12, ae.Arrhenius(130.0), control=per_second, seed=3)
-    assert same(course(heated, 150), course(warm, 150)) == [True] * 4
-    assert emitter_of(tip12, law).control == ae.VoltageControl(pulse_fraction=0.0)  # of a laser, without a choice
+    assert same(history_of(heated, 150), history_of(warm, 150)) == [True] * 4
+    assert emitter_of(tip12, law).control == ae.evaporation.VoltageControl(
+        pulse_fraction=0.0
+    )  # of a laser, without a choice
 
 
 def test_more_ions_come_from_the_hot_side(tip12):
     fractions = []
     for asymmetry in (0.0, 1.0):
         laser = ae.evaporation.Laser(100.0, 1.0, direction=(1.0, 1.0), asymmetry=asymmetry)
-        sites = course(emitter_of(tip12, ae.Arrhenius(30.0, laser=laser), seed=1), 700)[0]
+        sites = history_of(emitter_of(tip12, ae.Arrhenius(30.0, laser=laser), seed=1), 700)[0]
         fractions.append((tip12.positions[sites][:, :2] @ [1.0, 1.0] > 0).mean())
     # 1.9 % is a standard deviation of 700 draws; neighbouring events are correlated, so four times of it
     assert fractions[0] == pytest.approx(0.5, abs=0.076)
@@ -508,13 +512,15 @@ def test_time_of_a_laser_pulse(base, rise, decay):
 
 
 def test_light_on_one_side_of_a_cold_specimen(small_tip):
-    """The far side stays at 5 K: more atoms leave from the hot side, until it has become flatter."""
+    """The far side stays at 0 K: its atoms hardly leave, those of the hot side do.
+
+    Measured: 0.94 from x > -0.6 nm, as with a relaxation after every event; the cold side then carries more field.
+    """
     laser = ae.evaporation.Laser(100.0, asymmetry=1.0)
     emitter = emitter_of(small_tip, ae.Arrhenius(5.0, laser=laser), seed=1)
-    sites, _, waits, voltages = course(emitter, 100)
+    sites, _, waits, voltages = history_of(emitter, 100)
     assert np.isfinite(waits).all() and np.isfinite(voltages).all()
-    lit = small_tip.positions[sites, 0] > 0
-    assert lit[:50].mean() > 0.75 and lit.mean() > 0.65  # without the light about half; measured: 0.84 and 0.71
+    assert (small_tip.positions[sites, 0] > -0.6).mean() > 0.9
 
 
 def test_a_laser_needs_a_temperature():
@@ -532,16 +538,16 @@ def test_a_restored_emitter_continues_with_the_same_bits(shell):
         )
 
     first = emitter()
-    course(first, 275)  # deepened once, and 35 events after a relaxation
+    history_of(first, 275)  # deepened once, and 35 events after a relaxation
     assert len(first.tip) > len(shell)
     state = first.state()
     n = len(state.sites)
     assert 0 < 275 - n < 80 and state.voltage_factor != 1.0
-    columns = course(emitter(), 400)
+    columns = history_of(emitter(), 400)
     second, other = emitter(), emitter(seed=5)
     second.restore(state), other.restore(state)
-    assert same([values[n:] for values in columns], course(second, 400 - n)) == [True] * 4
-    assert not np.array_equal(columns[0][n:], course(other, 400 - n)[0])
+    assert same([values[n:] for values in columns], history_of(second, 400 - n)) == [True] * 4
+    assert not np.array_equal(columns[0][n:], history_of(other, 400 - n)[0])
 
 
 def simulation(**options):
@@ -573,7 +579,9 @@ def test_a_run_that_is_resumed_between_two_relaxations_has_the_same_bits(tmp_pat
 
 def test_times_and_voltages_are_in_the_fingerprint():
     """Before the first relaxation the control only sets the time: the memory changes no site."""
-    one, two = (run(20, control=ae.VoltageControl(pulse_fraction=0, rate=1.0, memory=m)) for m in (1000, 1_000_000))
+    one, two = (
+        run(20, control=ae.evaporation.VoltageControl(pulse_fraction=0, rate=1.0, memory=m)) for m in (1000, 1_000_000)
+    )
     assert np.array_equal(one.site, two.site) and np.array_equal(one.charges, two.charges)
     assert not np.array_equal(one.clock.voltages, two.clock.voltages)
     assert one.fingerprint() != two.fingerprint()
@@ -581,7 +589,7 @@ def test_times_and_voltages_are_in_the_fingerprint():
 
 def test_law_control_and_pulse_length_are_in_the_settings():
     law = ae.Arrhenius(60.0, {"Ni": 0.8}, 1e12, "parabolic", ae.evaporation.Laser(50.0, 2.0, (0.0, 1.0), 0.5))
-    settings = run(5, law=law, control=ae.VoltageControl(rate=0.02, pulse_fraction=0.0)).settings
+    settings = run(5, law=law, control=ae.evaporation.VoltageControl(rate=0.02, pulse_fraction=0.0)).settings
     assert settings["law"] == {
         "name": "Arrhenius",
         "temperature": 60.0,
@@ -592,7 +600,10 @@ def test_law_control_and_pulse_length_are_in_the_settings():
         "bonds": None,
     }
     assert settings["control"]["rate"] == 0.02 and settings["control"]["pulse_fraction"] == 0.0
-    assert settings["pulse_length"] == law.working_point(0.8, ae.VoltageControl(rate=0.02, pulse_fraction=0.0))[1]
+    assert (
+        settings["pulse_length"]
+        == law.working_point(0.8, ae.evaporation.VoltageControl(rate=0.02, pulse_fraction=0.0))[1]
+    )
 
 
 def test_a_run_without_a_temperature_has_no_times(small_tip):

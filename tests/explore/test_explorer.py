@@ -10,11 +10,11 @@ import pytest
 from rough import ROUGH
 
 import apt_evap as ae
-from apt_evap.cli.explore import _with_file, explorer_and_view
+from apt_evap.cli._explorer_of_files import explorer_and_view, with_file
 from apt_evap.cli.main import main
 from apt_evap.cli.parser import make_parser
 from apt_evap.explore.controls import MECHANISMS, controls_of, perturbation_of, values_of
-from apt_evap.explore.explorer import Explorer, View
+from apt_evap.explore.explorer import Explorer, ExplorerSettings
 from apt_evap.explore.placement import misplaced
 from apt_evap.explore.specimen_surface import surface_atoms
 
@@ -44,7 +44,8 @@ def run_in(run):
 def measured(run):
     """Ions of the same run with other random numbers, turned and scaled."""
     hits = TURNED.hits(replace(run, seed=2).hits(ae.RollUp(ENERGY)))
-    return ae.Hits(x=hits.x, y=hits.y, mass_to_charge=hits.mass_to_charge).within_circle(35.0)
+    pulses = np.arange(len(hits))
+    return ae.Hits(x=hits.x, y=hits.y, mass_to_charge=hits.mass_to_charge, pulse_id=pulses).within_circle(35.0)
 
 
 @pytest.fixture(scope="module")
@@ -65,20 +66,20 @@ def equal(first, second):
 def test_maps_have_the_bits_of_the_library(run_in, measured, perturbation, units):
     run = run_in[units]
     explorer = Explorer(run, measured, TURNED)
-    view = View(perturbation, 24, 2.0, flattening=8.0)
+    settings = ExplorerSettings(perturbation, 24, 2.0, flattening=8.0)
     for _ in range(2):  # also when everything is kept from the first time
-        shown = explorer.show(view)
+        maps = explorer.show(settings)
         like = explorer.bins_like(24)
         map = TURNED.hits(run.hits(perturbation)).map(like=like)
-        assert equal(shown.simulated, map) and shown.measured is like
+        assert equal(maps.simulated, map) and maps.measured is like
         similarity = ae.similarity(map.flattened(8.0), like.flattened(8.0), smoothing=2.0)
-        assert shown.similarity.value == similarity.value
-        assert np.array_equal(shown.pictures[0].density, map.flattened(8.0).smoothed(2.0).density, equal_nan=True)
-        assert shown.ions == len(run) and not shown.preview
-        explorer.show(replace(view, perturbation=ae.Unperturbed()))
+        assert maps.similarity.value == similarity.value
+        assert np.array_equal(maps.pictures[0].density, map.flattened(8.0).smoothed(2.0).density, equal_nan=True)
+        assert maps.ions == len(run) and not maps.preview
+        explorer.show(replace(settings, perturbation=ae.Unperturbed()))
     with pytest.raises(ValueError, match="sigma"):
-        explorer.show(replace(view, flattening=1e4))  # wider than the map
-    plain = explorer.show(replace(view, flattening=0.0))
+        explorer.show(replace(settings, flattening=1e4))  # wider than the map
+    plain = explorer.show(replace(settings, flattening=0.0))
     assert plain.ceiling.value == ae.maps.similarity_ceiling(like, smoothing=2.0).value
 
 
@@ -86,13 +87,13 @@ def test_a_flown_perturbation_has_the_bits_of_its_flights(small_tip):
     flown = ae.RollUp(ENERGY)
     run = ae.Simulation(small_tip, seed=3, **ROUGH).run(1200, [flown], progress=False)
     explorer = Explorer(run, preview=400)
-    shown = explorer.show(View(flown, 32, 0.0))
+    maps = explorer.show(ExplorerSettings(flown, 32, 0.0))
     like = explorer.bins_like(32)
-    assert equal(shown.simulated, run.hits(flown).map(like=like))
-    assert not np.array_equal(explorer.hits(shown.view).x, run.hits(flown, by_response=True).x)
+    assert equal(maps.simulated, run.hits(flown).map(like=like))
+    assert not np.array_equal(explorer.hits(maps.settings).x, run.hits(flown, by_response=True).x)
     every = run.hits(flown)[::3]
     assert np.array_equal(
-        explorer.show(View(flown, 32, 0.0), preview=True).simulated.values, every.map(like=like).values
+        explorer.show(ExplorerSettings(flown, 32, 0.0), preview=True).simulated.values, every.map(like=like).values
     )
 
 
@@ -108,24 +109,24 @@ def test_the_region_is_inside_both_maps(run, measured, explorer):
 
 
 def test_ions_from_to(run, explorer):
-    view = View(ae.RollUp(ENERGY), 24, 0.0, ions=(500, 1700))
+    settings = ExplorerSettings(ae.RollUp(ENERGY), 24, 0.0, ions=(500, 1700))
     expected = TURNED.hits(run.hits(ae.RollUp(ENERGY))).window(ion=(500, 1700)).map(like=explorer.bins_like(24))
-    assert equal(explorer.show(view).simulated, expected)
-    assert explorer.show(view).ions == 1200
+    assert equal(explorer.show(settings).simulated, expected)
+    assert explorer.show(settings).ions == 1200
     late = Explorer(replace(run, emissions=replace(run.emissions, ions=run.emissions.ions + 7000)))
     assert late.first_and_last == (7000, 9000)
-    assert late.hits(replace(view, ions=(7500, 8000))).ion[[0, -1]].tolist() == [7500, 7999]
+    assert late.hits(replace(settings, ions=(7500, 8000))).ion[[0, -1]].tolist() == [7500, 7999]
 
 
 def test_a_preview_is_every_nth_ion(run, measured):
     explorer = Explorer(run, measured, TURNED, preview=500)
-    view = View(ae.Combined(ENERGY, 0.4), 24, 2.0)
-    shown = explorer.show(view, preview=True)
-    hits = TURNED.hits(run.hits(view.perturbation)[::4])
-    assert shown.preview and shown.ions == 500
-    assert np.array_equal(shown.simulated.values, hits.map(like=explorer.bins_like(24)).values)
-    assert not explorer.show(view).preview
-    assert not Explorer(run, preview=2000).show(replace(view, bins=32), preview=True).preview  # all of its ions
+    settings = ExplorerSettings(ae.Combined(ENERGY, 0.4), 24, 2.0)
+    maps = explorer.show(settings, preview=True)
+    hits = TURNED.hits(run.hits(settings.perturbation)[::4])
+    assert maps.preview and maps.ions == 500
+    assert np.array_equal(maps.simulated.values, hits.map(like=explorer.bins_like(24)).values)
+    assert not explorer.show(settings).preview
+    assert not Explorer(run, preview=2000).show(replace(settings, bins=32), preview=True).preview  # all of its ions
 
 
 def test_without_a_measurement_it_is_the_map_of_the_command_line(run, tmp_path, monkeypatch):
@@ -133,12 +134,14 @@ def test_without_a_measurement_it_is_the_map_of_the_command_line(run, tmp_path, 
     monkeypatch.chdir(tmp_path)
     explorer = Explorer(run, run_arguments=["run.h5"])
     drawn = []
-    monkeypatch.setattr("apt_evap.cli.map.save_picture", lambda path, maps, titles, *_: drawn.append(maps[0]))
-    for view in (explorer.start, View(ae.Combined(ENERGY, 0.4), 48, 3.5, ions=(100, 1500))):
-        words = shlex.split(explorer.commands(view).shell)
+    monkeypatch.setattr(
+        "apt_evap.studies.workflows.written_pictures.save_picture", lambda path, maps, titles, *_: drawn.append(maps[0])
+    )
+    for settings in (explorer.start, ExplorerSettings(ae.Combined(ENERGY, 0.4), 48, 3.5, ions=(100, 1500))):
+        words = shlex.split(explorer.commands(settings).shell)
         assert words[:2] == ["apt-evap", "map"]
         assert main([*words[1:], "-o", "map.png", "--quiet"]) == 0
-        picture = explorer.show(view).pictures[0]
+        picture = explorer.show(settings).pictures[0]
         assert np.array_equal(drawn[-1].density, picture.density) and np.nanstd(picture.density) > 0.1
     assert explorer.show(explorer.start).similarity is None
 
@@ -154,19 +157,19 @@ def executed(python, **names):
 def test_python_lines_give_the_same_maps(run, measured, with_map, ions, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     explorer = Explorer(run, measured, TURNED) if with_map else Explorer(run)
-    view = View(ae.Combined(ae.TruncatedNormal(0.15, 0.05), 0.25), 30, 2.5, flattening=6.0, ions=ions)
-    names = executed(explorer.commands(view).python, run=run, measured=measured)
-    shown = explorer.show(view)
-    assert equal(names["simulated"], shown.simulated)
+    settings = ExplorerSettings(ae.Combined(ae.TruncatedNormal(0.15, 0.05), 0.25), 30, 2.5, flattening=6.0, ions=ions)
+    names = executed(explorer.commands(settings).python, run=run, measured=measured)
+    maps = explorer.show(settings)
+    assert equal(names["simulated"], maps.simulated)
     assert (tmp_path / "maps.png").stat().st_size > 10_000
     if with_map:
-        assert equal(names["measured"], shown.measured)
-        assert f"{shown.similarity.value:.4f}" in capsys.readouterr().out
+        assert equal(names["measured"], maps.measured)
+        assert f"{maps.similarity.value:.4f}" in capsys.readouterr().out
 
 
 @pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
 @pytest.mark.filterwarnings("ignore::apt_evap.warnings.ResponseWarning")
-def test_the_command_gives_the_same_view(run, measured, tmp_path, monkeypatch):
+def test_the_command_gives_the_same_maps(run, measured, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run.save("run.h5")
     ae.write("ions.epos", measured)
@@ -174,49 +177,51 @@ def test_the_command_gives_the_same_view(run, measured, tmp_path, monkeypatch):
     options = ["--mass", "50,", "--circle", "30,1,2", "--box=-25,25,-20,25", "--simulated", ",1800", "--flatten", "9"]
     line = ["explore", "run.h5", "ions.epos", registration, "--perturbation", "Combined:0.2,0.1,0.3", "--bins", "28"]
     line += [*options, "--real-units"]
-    explorer, view = explorer_and_view(make_parser().parse_args(line))
-    assert view.ions == (0, 1800) and view.bins == 28 and view.smoothing == explorer.smoothing_for(28)
-    commands = explorer.commands(view)
+    explorer, settings = explorer_and_view(make_parser().parse_args(line))
+    assert settings.ions == (0, 1800) and settings.bins == 28 and settings.smoothing == explorer.smoothing_for(28)
+    commands = explorer.commands(settings)
     words = shlex.split(commands.shell)
     assert words[0] == "apt-evap"
     other, again = explorer_and_view(make_parser().parse_args(words[1:]))
-    assert again == view and other.registration == explorer.registration
-    shown, same = explorer.show(view), other.show(again)
-    assert equal(shown.simulated, same.simulated) and equal(shown.measured, same.measured)
-    assert shown.similarity.value == same.similarity.value
+    assert again == settings and other.registration == explorer.registration
+    maps, same = explorer.show(settings), other.show(again)
+    assert equal(maps.simulated, same.simulated) and equal(maps.measured, same.measured)
+    assert maps.similarity.value == same.similarity.value
     assert other.commands(again) == commands
     # the Python lines read the files as the command does
     names = executed(commands.python)
-    assert equal(names["simulated"], shown.simulated) and equal(names["measured"], shown.measured)
+    assert equal(names["simulated"], maps.simulated) and equal(names["measured"], maps.measured)
 
 
 def test_a_rectangle_selects_ions(run, measured, explorer, tmp_path, monkeypatch):
-    view = View(ae.RollUp(ENERGY), 24, 0.0)
-    selection = explorer.selection(view, (10.0, -5.0), (-8.0, 6.0))
+    settings = ExplorerSettings(ae.RollUp(ENERGY), 24, 0.0)
+    selection = explorer.selection(settings, (10.0, -5.0), (-8.0, 6.0))
     names = executed(selection.python, run=run, measured=measured)
-    for name, hits in (("hits", explorer.hits(view)), ("measured", measured)):
+    for name, hits in (("hits", explorer.hits(settings)), ("measured", measured)):
         inside = (hits.x >= -5) & (hits.x < 10) & (hits.y >= -8) & (hits.y < 6)
         assert len(names[name]) == np.count_nonzero(inside) > 50
     monkeypatch.chdir(tmp_path)
     ae.write("MEASURED.epos", measured)
     drawn = []
-    monkeypatch.setattr("apt_evap.cli.map.save_picture", lambda path, maps, titles, *_: drawn.append(maps[0]))
+    monkeypatch.setattr(
+        "apt_evap.studies.workflows.written_pictures.save_picture", lambda path, maps, titles, *_: drawn.append(maps[0])
+    )
     words = shlex.split(selection.shell.replace("MEASURED", "MEASURED.epos"))
     assert main([*words[1:], "--quiet"]) == 0
     # an .epos has float32
     assert drawn[0].detected == pytest.approx(len(names["measured"]), abs=2)
     # of the run alone
     run.save("RUN.h5")
-    alone = Explorer(run).selection(view, (-50.0, 0.0), (-50.0, 50.0))
+    alone = Explorer(run).selection(settings, (-50.0, 0.0), (-50.0, 50.0))
     assert main([*shlex.split(alone.shell)[1:], "-o", "part.png", "--quiet"]) == 0
     assert drawn[1].detected == np.count_nonzero(executed(alone.python, run=run)["hits"].detected) > 100
     # a map has no ions
-    assert Explorer(run, measured.map(24), TURNED).selection(view, (-5, 5), (-5, 5)).shell == ""
+    assert Explorer(run, measured.map(24), TURNED).selection(settings, (-5, 5), (-5, 5)).shell == ""
 
 
 def test_atoms_at_a_place(run, explorer):
-    view = View(ae.RollUp(ENERGY), 24, 0.0, ions=(200, 1900))
-    atoms = explorer.atoms_at(view, 3.0, -2.0, 4.0)
+    settings = ExplorerSettings(ae.RollUp(ENERGY), 24, 0.0, ions=(200, 1900))
+    atoms = explorer.atoms_at(settings, 3.0, -2.0, 4.0)
     hits = TURNED.hits(run.hits(ae.RollUp(ENERGY)))
     near = [
         row
@@ -226,19 +231,19 @@ def test_atoms_at_a_place(run, explorer):
     assert len(near) > 5 and atoms.site.tolist() == run.site[near].tolist()
     assert np.array_equal(atoms.positions, run.emissions.positions[near])
     assert np.array_equal(atoms.extra["field"], run.fields[near])
-    assert len(explorer.atoms_at(view, 900.0, 0.0, 1.0)) == 0
+    assert len(explorer.atoms_at(settings, 900.0, 0.0, 1.0)) == 0
 
 
 def test_profiles_across_a_line(explorer):
-    shown = explorer.show(View(ae.RollUp(ENERGY), 32, 0.0))
-    rectangle, profiles = explorer.profiles(shown, [[-10.0, -10.0], [10.0, 10.0]], 12.0)
+    maps = explorer.show(ExplorerSettings(ae.RollUp(ENERGY), 32, 0.0))
+    rectangle, profiles = explorer.profiles(maps, [[-10.0, -10.0], [10.0, 10.0]], 12.0)
     assert rectangle.centre == (0.0, 0.0) and rectangle.angle == pytest.approx(45)
     assert rectangle.length == pytest.approx(20 * np.sqrt(2)) and rectangle.width == 12.0
-    for map, profile in zip((shown.simulated, shown.measured), profiles, strict=True):
+    for map, profile in zip((maps.simulated, maps.measured), profiles, strict=True):
         expected = ae.maps.zone_line_profile(map, rectangle, bins=len(profile.position))
         assert np.array_equal(profile.density, expected.density, equal_nan=True)
     with pytest.raises(ValueError, match="length"):
-        explorer.profiles(shown, [[1.0, 1.0], [1.0, 1.0]], 3.0)
+        explorer.profiles(maps, [[1.0, 1.0], [1.0, 1.0]], 3.0)
 
 
 def test_rings_about_the_pole(run20):
@@ -249,14 +254,14 @@ def test_rings_about_the_pole(run20):
     alone = Explorer(run)
     assert alone.pole.label == "$111$" and alone.pole.fold == 3
     assert alone.pole.place == pytest.approx((0.0, 0.0), abs=1e-9)  # mm: rounding
-    shown = alone.show(View(ae.Unperturbed(), 256, 0.0))
-    (rings,) = alone.rings(shown)
-    for ring, expected in zip(rings, ae.maps.ring_statistics(shown.simulated, projection, fold=3), strict=True):
+    maps = alone.show(ExplorerSettings(ae.Unperturbed(), 256, 0.0))
+    (rings,) = alone.rings(maps)
+    for ring, expected in zip(rings, ae.maps.ring_statistics(maps.simulated, projection, fold=3), strict=True):
         assert ring.contrast == pytest.approx(expected.contrast, rel=1e-9)
     measured = registration.hits(run.hits(ae.Unperturbed())).within_circle(30.0, registration.shift)
     explorer = Explorer(run, ae.Hits(x=measured.x, y=measured.y), registration)
     assert explorer.pole.place == pytest.approx((4.0, -3.0), abs=1e-9)
-    first, second = explorer.rings(explorer.show(View(ae.Unperturbed(), 256, 0.0)))
+    first, second = explorer.rings(explorer.show(ExplorerSettings(ae.Unperturbed(), 256, 0.0)))
     for one, other, moved in zip(first, second, rings, strict=True):
         assert one.contrast == pytest.approx(other.contrast, rel=1e-9)  # the same ions
         # other bins: within the noise of the counts
@@ -286,7 +291,7 @@ def test_the_best_registration_is_kept(run, measured):
     """Each better one is set at once; an error of the progress ends the search."""
     scores = iter([0.6, 0.9, 0.7])
     explorer, steps = Explorer(run, measured), []
-    explorer.near = {"rotations": 0.0}
+    explorer.registration_options = {"rotations": 0.0}
 
     def found(function, arguments):
         assert arguments[2] == {"rotations": 0.0}
@@ -327,13 +332,13 @@ def test_the_best_registration_is_kept(run, measured):
 def test_before_the_registration_both_maps_have_one_size(run, measured):
     explorer = Explorer(run, measured)
     assert not explorer.registered and explorer.registration.rotation == 0.0
-    shown = explorer.show(explorer.start)
-    assert shown.similarity is None and shown.ceiling is None
-    assert "--registration" not in explorer.commands(shown.view).shell
-    hits = explorer.hits(replace(shown.view, perturbation=ae.Unperturbed()))
+    maps = explorer.show(explorer.start)
+    assert maps.similarity is None and maps.ceiling is None
+    assert "--registration" not in explorer.commands(maps.settings).shell
+    hits = explorer.hits(replace(maps.settings, perturbation=ae.Unperturbed()))
     hits = hits[hits.detected]
     for own, other in ((hits.x, measured.x), (hits.y, measured.y)):
-        assert np.nanmedian(own) == pytest.approx(np.median(other), abs=6)  # mm, of a field of view of 70 mm
+        assert np.nanmedian(own) == pytest.approx(np.median(other), abs=6)  # mm, of a field of settings of 70 mm
     assert np.ptp(np.nanpercentile(hits.x, [1, 99])) == pytest.approx(
         np.ptp(np.percentile(measured.x, [1, 99])), rel=0.2
     )
@@ -342,9 +347,9 @@ def test_before_the_registration_both_maps_have_one_size(run, measured):
 
 
 def test_the_verdict_is_that_of_the_library(run, measured, explorer):
-    shown = explorer.show(View(ae.RollUp(ENERGY), 24, 2.0))
-    found = explorer.likeness(shown)
-    expected = ae.maps.likeness(shown.simulated, shown.measured, TURNED)
+    maps = explorer.show(ExplorerSettings(ae.RollUp(ENERGY), 24, 2.0))
+    found = explorer.likeness(maps)
+    expected = ae.maps.likeness(maps.simulated, maps.measured, TURNED)
     assert found.verdict == expected.verdict and found.reason == expected.reason
 
 
@@ -374,23 +379,26 @@ def test_a_measurement_alone(measured, as_map, tmp_path, monkeypatch):
     ions = ae.read("ions.epos")
     given = ions.map(64) if as_map else ions
     explorer = Explorer(None, given, measured_arguments=["ions.epos"], measured_code="ae.read('ions.epos')")
-    view = replace(explorer.start, bins=32)
-    shown = explorer.show(view)
-    assert shown.simulated is None and shown.similarity is None and shown.ions == 0
-    assert shown.measured.values.sum() >= 0.99 * len(ions) and shown.pictures == (shown.whole,)
-    assert np.array_equal(shown.whole.density, shown.measured.smoothed(view.smoothing).density, equal_nan=True)
-    assert max(shown.measured.values.shape) == 32
-    _, (profile,) = explorer.profiles(shown, [[-10.0, -10.0], [10.0, 10.0]], 12.0)
+    settings = replace(explorer.start, bins=32)
+    maps = explorer.show(settings)
+    assert maps.simulated is None and maps.similarity is None and maps.ions == 0
+    assert maps.measured.values.sum() >= 0.99 * len(ions) and maps.pictures == (maps.whole,)
+    assert np.array_equal(maps.whole.density, maps.measured.smoothed(settings.smoothing).density, equal_nan=True)
+    assert max(maps.measured.values.shape) == 32
+    _, (profile,) = explorer.profiles(maps, [[-10.0, -10.0], [10.0, 10.0]], 12.0)
     assert len(profile.density) > 3
     if not as_map:
-        names = executed(explorer.commands(view).python)
-        assert equal(names["measured"], shown.measured)
-        assert executed(explorer.selection(view, (0.0, 9.0), (0.0, 9.0)).python)["measured"].x.min() >= 0
+        names = executed(explorer.commands(settings).python)
+        assert equal(names["measured"], maps.measured)
+        assert executed(explorer.selection(settings, (0.0, 9.0), (0.0, 9.0)).python)["measured"].x.min() >= 0
         drawn = []
-        monkeypatch.setattr("apt_evap.cli.map.save_picture", lambda path, maps, titles, *_: drawn.append(maps[0]))
-        words = shlex.split(explorer.commands(view).shell)
+        monkeypatch.setattr(
+            "apt_evap.studies.workflows.written_pictures.save_picture",
+            lambda path, maps, titles, *_: drawn.append(maps[0]),
+        )
+        words = shlex.split(explorer.commands(settings).shell)
         assert main([*words[1:], "--quiet"]) == 0
-        assert np.array_equal(drawn[0].density, shown.whole.density, equal_nan=True)
+        assert np.array_equal(drawn[0].density, maps.whole.density, equal_nan=True)
 
 
 @pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
@@ -399,15 +407,15 @@ def test_the_command_opens_what_there_is(run, measured, tmp_path, monkeypatch, f
     monkeypatch.chdir(tmp_path)
     run.save("run.h5")
     ae.write("ions.epos", measured)
-    explorer, view = explorer_and_view(make_parser().parse_args(["explore", *files]))
+    explorer, settings = explorer_and_view(make_parser().parse_args(["explore", *files]))
     if not files:
-        assert explorer is view is None
+        assert explorer is settings is None
         return
     assert (explorer.run is not None, explorer.measured is not None) == tuple(
         name in files for name in ("run.h5", "ions.epos")
     )
     assert explorer.names == tuple(name if name in files else "" for name in ("run.h5", "ions.epos"))
-    assert explorer.show(view).pictures
+    assert explorer.show(settings).pictures
 
 
 @pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
@@ -416,18 +424,18 @@ def test_a_file_is_opened_beside_the_others(run, measured, tmp_path, monkeypatch
     run.save("run.h5")
     ae.write("ions.epos", measured)
     options = make_parser().parse_args(["explore", "--circle", "20"])
-    explorer, _ = _with_file(options, "ions.epos")
+    explorer, _ = with_file(options, "ions.epos")
     assert explorer.run is None and len(explorer.measured) == len(measured)  # the circle was of another file
     with pytest.raises(ValueError, match="none"):
-        _with_file(options, "none.epos")
-    explorer, view = _with_file(options, "run.h5")  # the file that failed is forgotten
-    assert explorer.names == ("run.h5", "ions.epos") and len(explorer.show(view).pictures) == 2
+        with_file(options, "none.epos")
+    explorer, settings = with_file(options, "run.h5")  # the file that failed is forgotten
+    assert explorer.names == ("run.h5", "ions.epos") and len(explorer.show(settings).pictures) == 2
 
 
 def test_what_is_refused(run, measured):
     bare = replace(run, responses=None)
     for arguments, sentence in [
-        ((bare,), "needs a run with responses"),
+        ((bare,), "run must have responses"),
         ((run, None, TURNED), "registration needs"),
         ((None, measured, TURNED), "registration needs"),
         ((), "run, measured"),
@@ -440,7 +448,7 @@ def test_what_is_refused(run, measured):
         Explorer(run, measured, replace(TURNED, shift=(300.0, 0.0))).bins_like(24)
     for changes in ({"bins": 0}, {"smoothing": -1.0}, {"ions": (5, 5)}, {"flattening": np.nan}):
         with pytest.raises(ValueError, match=next(iter(changes)).rstrip("s")):
-            replace(View(ae.Unperturbed(), 24, 0.0), **changes)
+            replace(ExplorerSettings(ae.Unperturbed(), 24, 0.0), **changes)
 
 
 # ---- controls and the specimen -------------------------------------------------------------------------------------
@@ -475,7 +483,7 @@ def test_maps_follow_every_option(small_tip):
     for options in ({}, {"sharpness": 0.15}, {"sharpness": 0.15, "probability": 0.5}, {"probability": 0.5}, {}):
         perturbation = ae.RollUp(ENERGY, **options)
         expected = run[:].hits(perturbation)  # a new run, which knows nothing of the previous ones
-        assert np.array_equal(explorer.hits(View(perturbation, 24, 0.0)).x, expected.x, equal_nan=True)
+        assert np.array_equal(explorer.hits(ExplorerSettings(perturbation, 24, 0.0)).x, expected.x, equal_nan=True)
 
 
 def test_perturbations_without_controls():

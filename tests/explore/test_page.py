@@ -11,7 +11,7 @@ import pytest
 from rough import ROUGH
 
 import apt_evap as ae
-from apt_evap.explore.explorer import Explorer, View
+from apt_evap.explore.explorer import Explorer, ExplorerSettings
 
 pytest.importorskip("bokeh")
 
@@ -22,8 +22,9 @@ from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
 from tornado.websocket import websocket_connect
 
 from apt_evap.cli._files import read_registration
-from apt_evap.explore.page import MODES, Page
-from apt_evap.explore.run_panel import Workbench
+from apt_evap.explore.map_views import MODES
+from apt_evap.explore.page import Page
+from apt_evap.explore.run_panel import ServerState
 from apt_evap.explore.server import serve
 
 SECONDS = 60  # until a test gives up: the machine may be busy
@@ -58,7 +59,7 @@ class Opened:
 
     def shows(self, preview=False):
         """Whether the page shows what its widgets say."""
-        return self.page.shown.view == self.page.view() and self.page.shown.preview == preview
+        return self.page.maps.settings == self.page.settings() and self.page.maps.preview == preview
 
 
 @pytest.fixture
@@ -69,7 +70,7 @@ def opened(run, measured):
 
 
 def _limits(page):
-    return [(each.low, each.high) for each in page.colors]
+    return [(each.low, each.high) for each in page.figures.colors]
 
 
 def image(source):
@@ -82,184 +83,209 @@ def throttled(slider, value):
     slider.trigger("value_throttled", None, value)
 
 
+def click(page, number, x, y):
+    """What a browser sends when a map is clicked."""
+    page.tools._clicked(number, SimpleNamespace(x=x, y=y))
+
+
 def test_a_slider_moves_the_map_as_the_core_computes_it(opened):
     page = opened.page
-    before = image(page.sources[0]).copy()
-    throttled(page.sliders["mean"], 0.33)
+    before = image(page.figures.sources[0]).copy()
+    throttled(page.emission.sliders["mean"], 0.33)
     opened.settle(opened.shows)
-    shown = page.explorer.show(page.view())
-    assert page.view().perturbation == ae.RollUp(ae.TruncatedNormal(0.33, 0.33))
-    assert not np.array_equal(image(page.sources[0]), before, equal_nan=True)
-    assert np.array_equal(image(page.sources[0]), shown.pictures[0].density.astype(np.float32), equal_nan=True)
+    shown = page.explorer.show(page.settings())
+    assert page.settings().perturbation == ae.RollUp(ae.TruncatedNormal(0.33, 0.33))
+    assert not np.array_equal(image(page.figures.sources[0]), before, equal_nan=True)
+    assert np.array_equal(image(page.figures.sources[0]), shown.pictures[0].density.astype(np.float32), equal_nan=True)
     # the whole measured map, relative to the mean where both are compared
     inside, whole = shown.measured.mask, shown.whole.density
     expected = (whole / whole[inside].mean()).astype(np.float32)
-    assert np.array_equal(image(page.sources[1]), expected, equal_nan=True)
-    assert f"{shown.similarity.value:.3f}" in page.readout.text
-    assert page.python.text == page.explorer.commands(page.view()).python
-    assert "RollUp:0.33,0.33" in page.shell.text
+    assert np.array_equal(image(page.figures.sources[1]), expected, equal_nan=True)
+    assert f"{shown.similarity.value:.3f}" in page.summary.readout.text
+    assert page.code.python.text == page.explorer.commands(page.settings()).python
+    assert "RollUp:0.33,0.33" in page.code.shell.text
 
 
 def test_every_widget_moves_something(opened):
     page = opened.page
-    page.mechanism.active = 3  # combined, which has all sliders but one
+    page.emission.mechanism.active = 3  # combined, which has all sliders but one
     opened.settle(opened.shows)
-    others = page.sliders["others"]
-    widgets = [each for each in page.sliders.values() if each is not others]
-    widgets += [page.smoothing, page.flattening, page.bins]
+    others = page.emission.sliders["others"]
+    widgets = [each for each in page.emission.sliders.values() if each is not others]
+    widgets += [page.display.smoothing, page.display.flattening, page.display.bins]
     assert all(each.visible for each in widgets) and len(widgets) >= 6 and not others.visible
     for widget in [*widgets, others]:
         if widget is others:
-            page.mechanism.active = 2  # roll-up, by now with a probability of 0.6
+            page.emission.mechanism.active = 2  # roll-up, by now with a probability of 0.6
             opened.settle(opened.shows)
             assert others.visible
-        before, text = image(page.sources[0]).copy(), page.python.text
-        throttled(widget, widget.start + 0.6 * (widget.end - widget.start) if widget is not page.bins else 20)
+        before, text = image(page.figures.sources[0]).copy(), page.code.python.text
+        throttled(widget, widget.start + 0.6 * (widget.end - widget.start) if widget is not page.display.bins else 20)
         opened.settle(opened.shows)
-        now = image(page.sources[0])
+        now = image(page.figures.sources[0])
         assert now.shape != before.shape or not np.array_equal(now, before, equal_nan=True), widget.title
-        assert page.python.text != text, widget.title
-    before = image(page.sources[0]).copy()
-    throttled(page.ions, (500, 1500))
+        assert page.code.python.text != text, widget.title
+    before = image(page.figures.sources[0]).copy()
+    throttled(page.ions.slider, (500, 1500))
     opened.settle(opened.shows)
-    assert page.view().ions == (500, 1500) and page.shown.ions == 1000
-    assert not np.array_equal(image(page.sources[0]), before, equal_nan=True)
-    page.mechanism.active = 0
+    assert page.settings().ions == (500, 1500) and page.maps.ions == 1000
+    assert not np.array_equal(image(page.figures.sources[0]), before, equal_nan=True)
+    page.emission.mechanism.active = 0
     opened.settle(opened.shows)
-    assert not any(each.visible for each in page.sliders.values())
-    assert page.view().perturbation == ae.Unperturbed()
+    assert not any(each.visible for each in page.emission.sliders.values())
+    assert page.settings().perturbation == ae.Unperturbed()
 
 
 def test_a_preview_is_grey(opened):
     page = opened.page
-    opened.settle(lambda: "rings about 111" in page.rings.text or "not here" in page.rings.text)
-    page.sliders["mean"].value = 0.4  # still moving
+    opened.settle(lambda: "rings about 111" in page.rings.text.text or "not here" in page.rings.text.text)
+    page.emission.sliders["mean"].value = 0.4  # still moving
     opened.settle(lambda: opened.shows(preview=True))
-    assert page.shown.ions == 500 and "preview" in page.readout.text
+    assert page.maps.ions == 500 and "preview" in page.summary.readout.text
     gray = "var(--faint)"
-    assert gray in page.readout.text
-    page.sliders["mean"].trigger("value_throttled", None, 0.4)
+    assert gray in page.summary.readout.text
+    page.emission.sliders["mean"].trigger("value_throttled", None, 0.4)
     opened.settle(opened.shows)
-    assert (gray not in page.readout.text and "2,000 ions" in page.readout.text) or "of" in page.readout.text
+    assert (
+        gray not in page.summary.readout.text and "2,000 ions" in page.summary.readout.text
+    ) or "of" in page.summary.readout.text
 
 
 def test_a_preview_sends_only_what_changes(opened):
     page = opened.page
     opened.settle(opened.shows)
-    limits, data = _limits(page), [dict(each.data) for each in (*page.sources, page.difference)]
-    page.sliders["mean"].value = 0.4
+    limits, data = _limits(page), [dict(each.data) for each in (*page.figures.sources, page.figures.difference)]
+    page.emission.sliders["mean"].value = 0.4
     opened.settle(lambda: opened.shows(preview=True))
-    simulated, measured, difference = (*page.sources, page.difference)
+    simulated, measured, difference = (*page.figures.sources, page.figures.difference)
     assert simulated.data["image"][0] is not data[0]["image"][0]
     assert measured.data["image"][0] is data[1]["image"][0] and difference.data["image"][0] is data[2]["image"][0]
     assert _limits(page) == limits
-    page.sliders["mean"].trigger("value_throttled", None, 0.4)
+    page.emission.sliders["mean"].trigger("value_throttled", None, 0.4)
     opened.settle(opened.shows)
     assert _limits(page) != limits
-    page.smoothing.value = 2.0  # changes both maps
+    page.display.smoothing.value = 2.0  # changes both maps
     opened.settle(lambda: opened.shows(preview=True))
     assert not np.array_equal(measured.data["image"][0], data[1]["image"][0], equal_nan=True)
 
 
-def test_overtaken_views_are_not_computed(opened, monkeypatch):
+def test_only_the_newest_maps_are_computed(opened, monkeypatch):
     page = opened.page
     opened.settle(opened.shows)
-    views = []
+    computed = []
     show = page.explorer.show
 
-    def slow(view, preview=False):
-        views.append(view)
+    def slow(settings, preview=False):
+        computed.append(settings)
         time.sleep(0.05)
-        return show(view, preview)
+        return show(settings, preview)
 
     monkeypatch.setattr(page.explorer, "show", slow)
     for value in np.linspace(0.2, 0.4, 41):
-        page.sliders["mean"].value = float(value)
-    page.sliders["mean"].trigger("value_throttled", None, 0.4)
+        page.emission.sliders["mean"].value = float(value)
+    page.emission.sliders["mean"].trigger("value_throttled", None, 0.4)
     opened.settle(opened.shows)
-    assert len(views) < 10  # of 42
-    assert views[-1] == page.view() and page.view().perturbation.energy.mean == 0.4
+    assert len(computed) < 10  # of 42
+    assert computed[-1] == page.settings() and page.settings().perturbation.energy.mean == 0.4
 
 
 def test_difference_and_blink(opened):
     page = opened.page
     opened.settle(opened.shows)
-    first, second = page.shown.pictures
-    page.mode.active = MODES.index("difference")
-    assert page.difference_image.visible and page.maps[1].title.text == "simulated - measured"
+    first, second = page.maps.pictures
+    page.figures.mode.active = MODES.index("difference")
+    assert page.figures.difference_image.visible and page.figures.figures[1].title.text == "simulated - measured"
     expected = (first.density - second.density).astype(np.float32)
-    assert np.array_equal(image(page.difference), expected, equal_nan=True)
-    assert page.difference_colors.low == -page.difference_colors.high < 0
+    assert np.array_equal(image(page.figures.difference), expected, equal_nan=True)
+    assert page.figures.difference_colors.low == -page.figures.difference_colors.high < 0
     # the bar beside the difference is its own
-    (bar,) = [each for each in page.maps[1].below if getattr(each, "color_mapper", None) and each.visible]
-    assert bar.color_mapper is page.difference_image.glyph.color_mapper and bar.title
-    assert page.bars[0].visible
-    page.mode.active = MODES.index("blink")
-    assert not page.difference_image.visible and page.maps[1].title.text == "measured"
-    assert page.bars[1].visible and not page.difference_bar.visible
+    (bar,) = [each for each in page.figures.figures[1].below if getattr(each, "color_mapper", None) and each.visible]
+    assert bar.color_mapper is page.figures.difference_image.glyph.color_mapper and bar.title
+    assert page.figures.bars[0].visible
+    page.figures.mode.active = MODES.index("blink")
+    assert not page.figures.difference_image.visible and page.figures.figures[1].title.text == "measured"
+    assert page.figures.bars[1].visible and not page.figures.difference_bar.visible
     (callback,) = page.document.session_callbacks
     titles = []
     for _ in range(4):
         callback.callback()
-        titles.append(page.maps[0].title.text)
-        assert page.blink_image.visible == (titles[-1] == "measured")
+        titles.append(page.figures.figures[0].title.text)
+        assert page.figures.blink_image.visible == (titles[-1] == "measured")
     assert titles == ["measured", "simulated"] * 2
-    page.mode.active = 0
-    assert page.document.session_callbacks == [] and not page.blink_image.visible
+    page.figures.mode.active = 0
+    assert page.document.session_callbacks == [] and not page.figures.blink_image.visible
 
 
 def test_linked_maps(opened):
-    first, second = opened.page.maps
+    first, second = opened.page.figures.figures
     assert first.x_range is second.x_range and first.y_range is second.y_range
 
 
 def test_a_line_gives_profiles(opened):
     page = opened.page
     curve = np.linspace(-20, 20, 30)
-    page.line.data = {"xs": [curve.tolist()], "ys": [(curve + np.sin(curve)).tolist()]}  # as a mouse draws
+    page.profile.line.data = {"xs": [curve.tolist()], "ys": [(curve + np.sin(curve)).tolist()]}  # as a mouse draws
     ends = [[-20, -20 + np.sin(-20)], [20, 20 + np.sin(20)]]
-    assert np.allclose(np.transpose([page.line.data["xs"][0], page.line.data["ys"][0]]), ends)  # straight
-    rectangle, profiles = page.explorer.profiles(page.shown, ends, page.width.value)
-    for source, profile in zip(page.curves, profiles, strict=True):
+    assert np.allclose(
+        np.transpose([page.profile.line.data["xs"][0], page.profile.line.data["ys"][0]]), ends
+    )  # straight
+    rectangle, profiles = page.explorer.profiles(page.maps, ends, page.profile.width.value)
+    for source, profile in zip(page.profile.curves, profiles, strict=True):
         assert np.array_equal(source.data["y"], profile.density, equal_nan=True) and len(profile.density) > 3
-    assert np.allclose(page.rectangle.data["x"], rectangle.corners[:, 0])
+    assert np.allclose(page.profile.rectangle.data["x"], rectangle.corners[:, 0])
     # a new line takes the place of the old one, and follows the map
-    page.line.data = {"xs": [*page.line.data["xs"], [0.0, 1.0, 10.0]], "ys": [*page.line.data["ys"], [0.0, 1.0, 0.0]]}
-    assert page.line.data == {"xs": [[0.0, 10.0]], "ys": [[0.0, 0.0]]}
-    before = np.array(page.curves[0].data["y"])
-    throttled(page.sliders["mean"], 0.5)
+    page.profile.line.data = {
+        "xs": [*page.profile.line.data["xs"], [0.0, 1.0, 10.0]],
+        "ys": [*page.profile.line.data["ys"], [0.0, 1.0, 0.0]],
+    }
+    assert page.profile.line.data == {"xs": [[0.0, 10.0]], "ys": [[0.0, 0.0]]}
+    before = np.array(page.profile.curves[0].data["y"])
+    throttled(page.emission.sliders["mean"], 0.5)
     opened.settle(opened.shows)
-    assert not np.array_equal(page.curves[0].data["y"], before, equal_nan=True)
+    assert not np.array_equal(page.profile.curves[0].data["y"], before, equal_nan=True)
 
 
 def test_a_click_shows_atoms(opened):
     page = opened.page
-    page._clicked(page.maps[0], SimpleNamespace(x=5.0, y=-3.0))
-    atoms = page.explorer.atoms_at(page.shown.view, 5.0, -3.0, page.radius.value)
-    assert len(atoms) > 0 and f"{len(atoms)} atoms land within" in page.specimen.figure.title.text
-    view = page.specimen
+    click(page, 0, x=5.0, y=-3.0)
+    atoms = page.explorer.atoms_at(page.maps.settings, 5.0, -3.0, page.specimen.radius.value)
+    assert len(atoms) > 0 and f"{len(atoms)} atoms land within" in page.specimen.view.figure.title.text
+    view = page.specimen.view
     assert np.array_equal(view.marked.data["px"] + view.centre[0], atoms.positions[:, 0])
-    assert page.click.data == {"x": [5.0], "y": [-3.0], "radius": [page.radius.value]}
+    assert page.specimen.click.data == {"x": [5.0], "y": [-3.0], "radius": [page.specimen.radius.value]}
     drawn = ae.explore.surface_atoms(page.explorer.run)
     assert np.allclose(view.points.data["z"] + view.centre[2], drawn.positions[:, 2], atol=1e-5)
     before = view.points.data["color"]
-    page.color.value = "field"
-    assert (view.points.data["color"] != before).any() and "phase" not in dict(page.color.options)
+    page.specimen.color.value = "field"
+    assert (view.points.data["color"] != before).any() and "phase" not in dict(page.specimen.color.options)
     assert view.colors.high <= page.explorer.run.fields.max()
     for _ in range(2):
-        page.side.active = 0
-        assert view.points.tags == [0.0, 90.0] and page.side.active is None
+        page.specimen.side.active = 0
+        assert view.points.tags == [0.0, 90.0] and page.specimen.side.active is None
         view.points.tags = [10.0, 20.0]  # as a mouse turns it
+
+
+def test_the_specimen_follows_the_ions(opened):
+    """Also after previews of the same ions, as those of a slider that moves."""
+    page = opened.page
+    before = len(page.specimen.view.points.data["z"])
+    page.ions.slider.value = (1500, 2000)
+    opened.settle(lambda: opened.shows(preview=True))
+    throttled(page.ions.slider, (1500, 2000))
+    opened.settle(opened.shows)
+    view, drawn = page.specimen.view, ae.explore.surface_atoms(page.explorer.run, ions=(1500, 2000))
+    assert len(drawn.positions) != before
+    assert np.allclose(view.points.data["z"] + view.centre[2], drawn.positions[:, 2], atol=1e-5)
 
 
 def test_a_rectangle_gives_commands(opened):
     page = opened.page
     box = {"type": "rect", "x0": -10.0, "x1": 5.0, "y0": 0.0, "y1": 8.0}
-    page._selected(SimpleNamespace(geometry=box, final=False))
-    assert "window" not in page.python.text
-    page._selected(SimpleNamespace(geometry=box, final=True))
-    expected = page.explorer.selection(page.shown.view, (-10.0, 5.0), (0.0, 8.0))
-    assert page.python.text == expected.python and "no ions" in page.shell.text
+    page.code._selected(SimpleNamespace(geometry=box, final=False))
+    assert "window" not in page.code.python.text
+    page.code._selected(SimpleNamespace(geometry=box, final=True))
+    expected = page.explorer.selection(page.maps.settings, (-10.0, 5.0), (0.0, 8.0))
+    assert page.code.python.text == expected.python and "no ions" in page.code.shell.text
 
 
 def test_a_registration_is_typed(run, measured):
@@ -267,37 +293,41 @@ def test_a_registration_is_typed(run, measured):
     opened = Opened(Explorer(run, measured, registration), registration_of=read_registration)
     page = opened.page
     opened.settle(opened.shows)
-    assert page.registration.value == "0.0,1.0,0.0,0.0"
-    before = image(page.sources[0]).copy()
-    page.registration.value = "nonsense"
-    assert "--registration must be" in page.notes.text and page.explorer.registration == registration
-    page.registration.value = "30,0.9,1,2,mirror"
+    assert page.registration.text.value == "0.0,1.0,0.0,0.0"
+    before = image(page.figures.sources[0]).copy()
+    page.registration.text.value = "nonsense"
+    assert "--registration must be" in page.summary.notes.text and page.explorer.registration == registration
+    page.registration.text.value = "30,0.9,1,2,mirror"
     assert page.explorer.registration == ae.Registration(30.0, 0.9, (1.0, 2.0), True)
-    opened.settle(lambda: not np.array_equal(image(page.sources[0]), before, equal_nan=True))
-    assert "--registration=30.0,0.9,1.0,2.0,mirror" in page.shell.text
+    opened.settle(lambda: not np.array_equal(image(page.figures.sources[0]), before, equal_nan=True))
+    assert "--registration=30.0,0.9,1.0,2.0,mirror" in page.code.shell.text
     page.close()
 
 
 def test_errors_and_warnings_are_shown(opened):
     page = opened.page
     opened.settle(opened.shows)
-    page.sliders["mean"].end = 9.0
-    throttled(page.sliders["mean"], 8.0)
+    page.emission.sliders["mean"].end = 9.0
+    throttled(page.emission.sliders["mean"], 8.0)
     opened.settle(opened.shows)
-    assert "launch above the energy limit" in page.notes.text
+    assert "launch above the energy limit" in page.summary.notes.text
     page.explorer.set_registration(ae.Registration(0.0, 1.0, (900.0, 0.0)))
-    page.ask(preview=False)
-    opened.settle(lambda: "hits is in x" in page.notes.text)
+    page.request(preview=False)
+    opened.settle(lambda: "hits is in x" in page.summary.notes.text)
 
 
 def test_one_map_without_a_measurement(run):
-    opened = Opened(Explorer(run), view=View(ae.LateralVelocity(0.2), 32, 4.0))
+    opened = Opened(Explorer(run), settings=ExplorerSettings(ae.LateralVelocity(0.2), 32, 4.0))
     page = opened.page
-    assert len(page.maps) == 1 and not page.mode.visible and page.tool.labels == ["move", "atoms", "line", "box"]
-    assert page.mechanism.active == 1 and page.sliders["relative_spread"].value == 0.0
-    throttled(page.sliders["mean"], 0.3)
+    assert (
+        len(page.figures.figures) == 1
+        and not page.figures.mode.visible
+        and page.tools.choice.labels == ["move", "atoms", "line", "box"]
+    )
+    assert page.emission.mechanism.active == 1 and page.emission.sliders["relative_spread"].value == 0.0
+    throttled(page.emission.sliders["mean"], 0.3)
     opened.settle(opened.shows)
-    assert "similarity" not in page.readout.text and page.shell.text.startswith("apt-evap map RUN.h5")
+    assert "similarity" not in page.summary.readout.text and page.code.shell.text.startswith("apt-evap map RUN.h5")
     page.document.validate()
     page.close()
 
@@ -305,13 +335,13 @@ def test_one_map_without_a_measurement(run):
 def test_a_measurement_alone(measured):
     opened = Opened(Explorer(None, measured, measured_arguments=["map.npz"]))
     page = opened.page
-    assert len(page.maps) == 1 and not page.sliders and "atoms" not in page.tool.labels
-    assert np.array_equal(image(page.sources[0]), page.shown.whole.density.astype(np.float32), equal_nan=True)
-    throttled(page.smoothing, 5.0)
-    opened.settle(lambda: page.shown.view.smoothing == 5.0)
-    page.line.data = {"xs": [[-20.0, 20.0]], "ys": [[0.0, 1.0]]}
-    assert len(page.curves) == 1 and len(page.curves[0].data["y"]) > 3
-    assert "map.npz" in page.facts.text and page.chip.text == ""
+    assert len(page.figures.figures) == 1 and page.emission is None and "atoms" not in page.tools.choice.labels
+    assert np.array_equal(image(page.figures.sources[0]), page.maps.whole.density.astype(np.float32), equal_nan=True)
+    throttled(page.display.smoothing, 5.0)
+    opened.settle(lambda: page.maps.settings.smoothing == 5.0)
+    page.profile.line.data = {"xs": [[-20.0, 20.0]], "ys": [[0.0, 1.0]]}
+    assert len(page.profile.curves) == 1 and len(page.profile.curves[0].data["y"]) > 3
+    assert "map.npz" in page.summary.facts.text and page.registration is None
     page.document.validate()
     page.close()
 
@@ -319,9 +349,9 @@ def test_a_measurement_alone(measured):
 def test_each_map_has_its_own_scale(opened):
     page = opened.page
     own = _limits(page)
-    assert own == [ae.plot.color_limits(each) for each in page.shown.pictures]
-    page.same_scale.active = True
-    assert _limits(page) == [ae.plot.common_limits(page.shown.pictures)] * 2
+    assert own == [ae.plot.color_limits(each) for each in page.maps.pictures]
+    page.figures.same_scale.active = True
+    assert _limits(page) == [ae.plot.common_limits(page.maps.pictures)] * 2
     page._reset_display()
     assert _limits(page) == own
 
@@ -329,34 +359,34 @@ def test_each_map_has_its_own_scale(opened):
 def test_what_is_not_compared_is_dimmed(run, measured):
     opened = Opened(Explorer(run, measured, ae.Registration(0.0, 0.5, (5.0, 0.0)), preview=500))
     page = opened.page
-    veil, shown = image(page.veil), page.shown
+    veil, shown = image(page.figures.veil), page.maps
     assert np.array_equal(veil != 0, shown.whole.mask & ~shown.measured.mask) and 0 < (veil != 0).mean() < 1
-    assert np.isfinite(image(page.sources[1]))[shown.whole.mask].all()
+    assert np.isfinite(image(page.figures.sources[1]))[shown.whole.mask].all()
     before = veil[veil != 0][0]
     page._next_style()
-    assert image(page.veil)[veil != 0][0] != before and page.style.label == "dark"
+    assert image(page.figures.veil)[veil != 0][0] != before and page.style.label == "dark"
     page.close()
 
 
 def test_groups_are_reset(opened):
     page = opened.page
-    start = page.view()
-    for slider in (page.sliders["mean"], page.smoothing, page.bins):
+    start = page.settings()
+    for slider in (page.emission.sliders["mean"], page.display.smoothing, page.display.bins):
         throttled(slider, slider.start + 0.5 * (slider.end - slider.start) // 1)
-    page.mechanism.active, page.ions.value = 1, (300, 900)
-    assert page.view() != start
-    for reset in (page._reset_emission, page._reset_display, page._reset_ions):
+    page.emission.mechanism.active, page.ions.slider.value = 1, (300, 900)
+    assert page.settings() != start
+    for reset in (page.emission.reset, page._reset_display, page.ions.reset):
         reset()
-    assert page.view() == start
+    assert page.settings() == start
     opened.settle(opened.shows)
 
 
 def test_a_number_is_typed(opened):
     """The field beside a slider moves it, and the slider the field."""
     (field,) = opened.page.document.select({"type": Spinner, "name": "mean energy [eV]"})
-    assert field.value == opened.page.sliders["mean"].value
+    assert field.value == opened.page.emission.sliders["mean"].value
     (callback,) = field.js_property_callbacks["change:value_throttled"]
-    assert callback.args["slider"] is opened.page.sliders["mean"]
+    assert callback.args["slider"] is opened.page.emission.sliders["mean"]
 
 
 def test_the_registration_arrives(run, measured, monkeypatch):
@@ -377,21 +407,28 @@ def test_the_registration_arrives(run, measured, monkeypatch):
         progress(2, 2)
 
     monkeypatch.setattr(page.explorer, "register", register)
-    assert "not registered" in page.chip.text and "similarity" not in page.readout.text
-    page._register(None)
-    opened.settle(lambda: "registering" in page.chip.text and "<progress" in page.chip.text)
-    throttled(page.sliders["mean"], 0.3)  # the page goes on
+    assert "not registered" in page.registration.status.text and "similarity" not in page.summary.readout.text
+    page.registration.search()
+    opened.settle(
+        lambda: "registering" in page.registration.status.text and "<progress" in page.registration.status.text
+    )
+    throttled(page.emission.sliders["mean"], 0.3)  # the page goes on
     opened.settle(opened.shows)
     go.release()
-    opened.settle(lambda: "similarity" in page.readout.text and 'value="1"' in page.chip.text)
+    opened.settle(lambda: "similarity" in page.summary.readout.text and 'value="1"' in page.registration.status.text)
     go.release()
-    opened.settle(lambda: "progress" not in page.chip.text and page.explorer.registration.score == 0.9)
-    opened.settle(lambda: page._verdict is not None and page._verdict.verdict in page.chip.text)
-    page._register(None)
-    page._stop_search()
+    opened.settle(lambda: "progress" not in page.registration.status.text and page.explorer.registration.score == 0.9)
+    opened.settle(
+        lambda: (
+            page.registration.likeness is not None
+            and page.registration.likeness.verdict in page.registration.status.text
+        )
+    )
+    page.registration.search()
+    page.registration.close()
     go.release()
     opened.settle(lambda: ended)
-    assert page._progress is None and "<progress" not in page.chip.text
+    assert page.registration._progress is None and "<progress" not in page.registration.status.text
     page.close()
 
 
@@ -400,23 +437,23 @@ def test_poles_are_clicked(measured):
     page, index = opened.page, opened.page.index
     index.material.value = "Ni"
     orientation, projection = ae.Orientation("Ni", axis=(1, 1, 1)), ae.detection.Projection(60.0)
-    page.tool.active = page.tool.labels.index("pole")
-    assert page.maps[0].toolbar.active_drag is index.tool
+    page.tools.choice.active = page.tools.choice.labels.index("pole")
+    assert page.figures.figures[0].toolbar.active_drag is index.tool
     for plane, family in (((1, 1, 1), "111"), ((0, 0, 2), "200"), ((0, 2, 0), "200"), ((1, 1, 3), "311")):
         index.family.value = family
         direction = np.array(plane) / np.linalg.norm(plane)
         ((x, y),) = projection.places(orientation.directions([direction]))
-        page._clicked(page.maps[0], SimpleNamespace(x=float(x), y=float(y)))
+        click(page, 0, x=float(x), y=float(y))
     opened.settle(lambda: len(index.read().poles) == 4 and "scale 60.0" in index.text.text)
     best, fitted, _ = index.candidates[0]
     assert fitted.scale == pytest.approx(60.0, rel=1e-6) and "RMS 0.00" in index.text.text
     assert len(index.poles.data["x"]) > 4 and np.isfinite(index.lines.data["x"]).sum() > 20
     names = {}
-    exec(page.python.text, names)
+    exec(page.code.python.text, names)
     assert np.allclose(names["orientation"].matrix, best.matrix) and names["projection"] == fitted
     index._undo()
-    page.tool.active = page.tool.labels.index("zone line")
-    page._clicked(page.maps[0], SimpleNamespace(x=1.0, y=2.0))
+    page.tools.choice.active = page.tools.choice.labels.index("zone line")
+    click(page, 0, x=1.0, y=2.0)
     marks = index.read()
     assert len(marks.poles) == 3 and marks.lines == [(marks.families.index("311"), [(1.0, 2.0)])]
     index._clear()
@@ -434,12 +471,12 @@ def test_a_fit_of_earlier_marks_is_not_shown(measured):
     for x, y in ((0.0, 0.0), (30.0, 0.0), (0.0, 30.0)):
         index.add(x, y, of_line=False)
     index._clear()  # before anything that was fitted can be put
-    opened.settle(lambda: not index.latest._busy)
+    opened.settle(lambda: not index._tasks._busy)
     assert index.candidates == [] and not any(shown) and len(index.lines.data["x"]) == 0
     for x, y in ((0.0, 0.0), (30.0, 0.0), (0.0, 30.0)):
         index.add(x, y, of_line=False)
     opened.settle(lambda: index.candidates)
-    opened.settle(lambda: not index.latest._busy)
+    opened.settle(lambda: not index._tasks._busy)
     assert len(shown) == 1 and "two poles" not in index.text.text
     # nor is a search, which takes seconds
     index._search(index.search)
@@ -493,7 +530,7 @@ def test_settings_are_written_and_run(measured, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     asked = []
     opened = Opened(Explorer(None, measured), opened=lambda path, document: lambda: asked.append(path))
-    page, index, panel = opened.page, opened.page.index, opened.page.simulate
+    page, index, panel = opened.page, opened.page.index, opened.page.simulation
     panel._write()
     opened.settle(lambda: not panel.write.disabled)
     assert "index the map first" in panel.text.text and not list(tmp_path.iterdir())
@@ -515,7 +552,7 @@ def test_settings_are_written_and_run(measured, tmp_path, monkeypatch):
     opened.settle(lambda: not panel.write.disabled)
     config = ae.config.read_config(path)
     assert config.tip["material"].name == "Ni" and "not searched" in path.read_text()
-    assert page.python.text == path.read_text() and str(path) in panel.text.text
+    assert page.code.python.text == path.read_text() and str(path) in panel.text.text
     # fewer ions, for the test
     path.write_text(path.read_text().replace(f"ions = {config.n_ions:_}", "ions = 200"))
     panel._start_or_stop()
@@ -523,7 +560,10 @@ def test_settings_are_written_and_run(measured, tmp_path, monkeypatch):
     opened.settle(lambda: "of 200 ions" in panel.text.text or asked)
     opened.settle(lambda: asked)
     assert asked == [str(tmp_path / "tip.h5")] and len(ae.load(tmp_path / "tip.h5")) == 200
-    assert page._bench.near[asked[0]]["start"].shift == index.settings(1.0, 1).near["start"].shift
+    assert (
+        page.simulation._state.registration_options[asked[0]]["start"].shift
+        == index.settings(1.0, 1).near["start"].shift
+    )
     assert panel.start.label == "start the run"
 
 
@@ -533,13 +573,13 @@ def test_a_page_made_again_shows_the_run(measured, tmp_path):
         active=True, finished=False, message="", ions=50, n_ions=200, seconds_left=20.0, output=tmp_path / "a.h5"
     )
     run.stop = lambda: setattr(run, "message", "stopping")
-    bench = Workbench()
-    bench.run = run
-    opened = Opened(Explorer(None, measured), bench=bench)
-    panel = opened.page.simulate
+    state = ServerState()
+    state.run = run
+    opened = Opened(Explorer(None, measured), state=state)
+    panel = opened.page.simulation
     assert "50 of 200 ions, 20 s left" in panel.text.text and panel.start.label == "stop the run"
     panel._start_or_stop()
-    panel._look()
+    panel._update()
     assert "stopping" in panel.text.text
     run.active, run.message = False, "stopped with 60 of 200 ions"
     opened.settle(lambda: "stopped with 60" in panel.text.text)
@@ -557,9 +597,9 @@ def test_a_file_is_opened(measured):
 
     opened = Opened(None, opened=read)
     page = opened.page
-    page.file.value = "bad"
-    opened.settle(lambda: "cannot read" in page.notes.text)
-    page.file.value = "good"
+    page.files.field.value = "bad"
+    opened.settle(lambda: "cannot read" in page.summary.notes.text)
+    page.files.field.value = "good"
     opened.settle(lambda: made == ["good"])
 
 

@@ -21,7 +21,7 @@ from apt_evap.explore import background_run, index_panel
 from apt_evap.explore.explorer import Explorer
 from apt_evap.explore.index_panel import IndexPanel
 from apt_evap.explore.page import Page
-from apt_evap.explore.run_panel import RunPanel, Workbench
+from apt_evap.explore.run_panel import RunPanel, ServerState
 from apt_evap.explore.search_process import ProcessEnded, SearchProcess
 
 SECONDS = 120  # until a test gives up: the machine may be busy
@@ -86,7 +86,7 @@ def test_a_process_computes_fails_and_ends():
 
 def test_a_search_whose_process_is_killed_is_over(measured):
     later = Later()
-    panel = IndexPanel(figure(), lambda: measured, "Ni", later, lambda text: None)
+    panel = IndexPanel([figure()], lambda: measured, "Ni", later, lambda text: None)
     kill_the_child()
     panel._search(panel.search)
     assert panel.search.disabled and panel.refine.disabled
@@ -96,7 +96,7 @@ def test_a_search_whose_process_is_killed_is_over(measured):
 
 def test_any_error_of_a_search_is_told(measured, monkeypatch):
     later = Later()
-    panel = IndexPanel(figure(), lambda: measured, "Ni", later, lambda text: None)
+    panel = IndexPanel([figure()], lambda: measured, "Ni", later, lambda text: None)
     monkeypatch.setattr(index_panel, "index", operator.neg)  # takes other arguments
     panel._search(panel.search)
     later.settle(lambda: not panel.search.disabled)
@@ -110,9 +110,9 @@ def test_a_registration_whose_process_is_killed_is_over(small_tip, measured):
     try:
         later.settle(lambda: True)
         kill_the_child()
-        page._register(None)
-        later.settle(lambda: "killed" in page.notes.text)
-        assert page._progress is None and not page.explorer.registered
+        page.registration.search()
+        later.settle(lambda: "killed" in page.summary.notes.text)
+        assert page.registration._progress is None and not page.explorer.registered
     finally:
         page.close()
 
@@ -125,7 +125,7 @@ def test_any_error_of_the_settings_is_told(error, tmp_path):
         raise error
 
     later = Later()
-    panel = RunPanel(settings, str(tmp_path / "a.toml"), Workbench(), later, lambda text: None)
+    panel = RunPanel(settings, str(tmp_path / "a.toml"), ServerState(), later, lambda text: None)
     panel._write()
     later.settle(lambda: not panel.write.disabled)
     assert "odd" in panel.text.text or "MemoryError" in panel.text.text
@@ -136,11 +136,11 @@ def test_any_error_of_the_settings_is_told(error, tmp_path):
 )
 def test_odd_names_of_a_settings_file_are_told(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    panel = RunPanel(lambda minutes, threads: None, name, Workbench(), Later(), lambda text: None)
+    panel = RunPanel(lambda minutes, threads: None, name, ServerState(), Later(), lambda text: None)
     for action in (panel._write, panel._start_or_stop):
         panel.text.text = ""
         action()
-        assert panel.text.text and panel.bench.run is None
+        assert panel.text.text and panel._state.run is None
         if name == "no/x.toml":
             break
 

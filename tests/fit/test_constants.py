@@ -112,7 +112,7 @@ def test_charge_states_and_a_map_without_ions(measured):
     checks = ae.fit.constants_of(detector_map, best, charged, ranges=ranges).checks
     ratio, field = checks[-2:]
     assert abs(ratio.z) < 4 and ratio.expected == pytest.approx(np.log(4), abs=4 * ratio.error)
-    assert field.found == pytest.approx(ae.emission.field_of_ratio("Ni", 1, 4.0), rel=0.01)
+    assert field.value == pytest.approx(ae.emission.field_of_ratio("Ni", 1, 4.0), rel=0.01)
     for wrong, name in (
         ({"efficiency": 0.0}, "efficiency"),
         ({"distance": -1.0}, "distance"),

@@ -70,7 +70,7 @@ def test_less_time_makes_a_smaller_tip(found):
     _, indexing = found
     large, small = (ae.fit.settings_of(indexing, minutes=minutes) for minutes in (20.0, 2.0))
     assert small.simulated_radius < large.simulated_radius
-    assert small.foresight.hours * 60 <= 2.0
+    assert small.cost.hours * 60 <= 2.0
     with pytest.raises(ValueError, match="minutes"):
         ae.fit.settings_of(indexing, minutes=1e-3)
 
@@ -144,7 +144,7 @@ def test_a_material_of_a_user_is_that_of_the_run(found, tmp_path, name):
 
 
 def test_a_pipe_in_the_place_of_the_settings_is_refused(found, tmp_path, monkeypatch, capsys):
-    from apt_evap.cli.start import is_start
+    from apt_evap.fit.start_settings import is_start
 
     os.mkfifo(tmp_path / "pipe.toml")
     with pytest.raises(ae.FileError, match="regular file"):

@@ -449,7 +449,7 @@ def test_noise_that_is_allowed_for_is_that_of_the_maps(run, other):
     sampler = Sampler(run, HERE, measured, whole, 0, 0)
     maps, noise = sampler.maps(LATERAL, draws)
     variance = comparison.variance_of(noise[None], maps)[comparison.inside].mean()
-    # the same ions drawn anew, forty times: their mean is free of noise
+    # the same ions drawn again, forty times: their mean is free of noise
     again = [Sampler(replace(run, seed=s), HERE, measured, whole, 0, 0).maps(LATERAL, draws)[0] for s in range(40)]
     again = np.concatenate(again)
     scatter = comparison.variance_of((again - again.mean(axis=0)) * np.sqrt(40 / 39), again.mean(axis=0, keepdims=True))
@@ -731,7 +731,7 @@ def test_gradients_of_the_instrument_do_not_move_the_energies(run, other):
 
 def test_studies_that_cannot_be(run, other):
     measured = seen(other, ROLLUP)
-    with pytest.raises(ValueError, match="run must have responses for fit_energies"):
+    with pytest.raises(ValueError, match="run must have responses"):
         fit_energies(replace(run, responses=None), measured, registration=HERE)
     with pytest.raises(ValueError, match="measured"):
         fit_energies(run, 3, registration=HERE)

@@ -46,7 +46,7 @@ def test_commands_undistort(tmp_path, capsys, rng):
     one = np.ones(500)
     ions = ae.Hits(
         x=places[:, 0], y=places[:, 1], mass_to_charge=29 * one, positions=np.zeros((500, 3)), time_of_flight=one,
-        voltage=one, pulse_voltage=one, pulses=one.astype(np.uint32), multiplicity=one.astype(np.uint32),
+        voltage=3000 * one, pulse_voltage=600 * one, pulse_id=np.arange(500),
     )  # fmt: skip
     epos = tmp_path / "ions.epos"
     ae.write(epos, ions)

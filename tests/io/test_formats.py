@@ -14,6 +14,7 @@ from ion_files import apt, apt_section, epos, ions_of, pyccapt_instrument, raw
 from apt_evap._common.files import FileError, TruncatedFile
 from apt_evap.detection.hits import Hits, Outcome
 from apt_evap.io.formats import FORMATS, chunks, left_out, read, write
+from apt_evap.simulation import read_file
 from apt_evap.simulation.run import Run
 from apt_evap.simulation.simulation import Simulation
 from apt_evap.warnings import DataWarning
@@ -170,12 +171,18 @@ def test_hdf5_is_recognised_whatever_its_name(tmp_path, small_tip):
     run = Simulation(small_tip, seed=1).run(20, responses=False, progress=False)
     run.save(tmp_path / "run.h5")
     (tmp_path / "run.h5").rename(tmp_path / "a.pos")
-    assert isinstance(read(tmp_path / "a.pos"), Run)
+    for format in (None, ".h5", "h5"):
+        assert isinstance(read_file.read(tmp_path / "a.pos", format=format), Run)
     with pytest.raises(FileError, match=r"a\.pos.*a run takes no columns, got \('x',\)"):
-        read(tmp_path / "a.pos", columns=("x",))
+        read_file.read(tmp_path / "a.pos", columns=("x",))
+    with pytest.raises(FileError, match=r"a\.pos.*takes no options, got 'partial'"):
+        read_file.read(tmp_path / "a.pos", partial=True)
+    with pytest.raises(FileError, match=r"a\.pos' is an HDF5 file of the kind 'run'"):
+        read(tmp_path / "a.pos")
     write(tmp_path / "b.nxs", run.hits(run.first_perturbation), elements=["Ni"])
     (tmp_path / "b.nxs").rename(tmp_path / "b.epos")
     assert isinstance(read(tmp_path / "b.epos"), Hits)
+    assert len(read_file.read(tmp_path / "b.epos", columns=("x", "y"))) == 20
     with pytest.raises(FileError, match=r"b\.epos.*partial"):
         read(tmp_path / "b.epos", partial=True)
     with h5py.File(tmp_path / "c.h5", "w") as file:

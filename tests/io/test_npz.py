@@ -20,7 +20,7 @@ DATA = Path(__file__).parents[3] / "shared" / "data"
 
 def test_counts_with_a_mask(tmp_path):
     np.savez(tmp_path / "map.npz", counts=COUNTS, x_edges_cm=X, y_edges_cm=Y, inside=INSIDE)
-    map = ae.read_map(tmp_path / "map.npz")
+    map = ae.io.read_map(tmp_path / "map.npz")
     assert map.is_counts and np.array_equal(map.counts, COUNTS) and np.array_equal(map.mask, INSIDE)
     assert map.ions == COUNTS[INSIDE].sum()
     assert map.x_edges == pytest.approx(10 * X) and map.y_edges == pytest.approx(10 * Y)
@@ -34,7 +34,7 @@ def test_counts_with_a_mask(tmp_path):
 def test_densities_are_nan_outside(tmp_path):
     values = np.where(INSIDE, COUNTS / 7, np.nan)
     np.savez_compressed(tmp_path / "map.npz", relative_density=values, x_edges_mm=X, y_edges_mm=Y)
-    map = ae.read_map(tmp_path / "map.npz")
+    map = ae.io.read_map(tmp_path / "map.npz")
     assert not map.is_counts and np.array_equal(map.mask, INSIDE)
     assert np.array_equal(map.values[INSIDE], values[INSIDE]) and np.array_equal(map.x_edges, X)
 
@@ -43,13 +43,13 @@ def test_names_and_unit_can_be_given(tmp_path):
     arrays = {"n": COUNTS, "other": COUNTS * 2, "u": X, "v": Y, "use": INSIDE, "ignore": ~INSIDE}
     np.savez(tmp_path / "map.npz", **arrays)
     names = {"values": "other", "x_edges": "u", "y_edges": "v", "mask": "use"}
-    map = ae.read_map(tmp_path / "map.npz", unit="um", **names)
+    map = ae.io.read_map(tmp_path / "map.npz", unit="um", **names)
     assert np.array_equal(map.values[INSIDE], 2.0 * COUNTS[INSIDE])
     assert map.x_edges == pytest.approx(1e-3 * X)
     with pytest.raises(ae.FileError, match=r"map\.npz.*the unit of u must be one of mm, cm, m, um, got 'u'"):
-        ae.read_map(tmp_path / "map.npz", **names)
+        ae.io.read_map(tmp_path / "map.npz", **names)
     with pytest.raises(ae.FileError, match=r"must contain an array 'w', it contains n int16\[10, 20\]"):
-        ae.read_map(tmp_path / "map.npz", unit="mm", **names | {"x_edges": "w"})
+        ae.io.read_map(tmp_path / "map.npz", unit="mm", **names | {"x_edges": "w"})
 
 
 @pytest.mark.parametrize(
@@ -75,7 +75,7 @@ def test_names_and_unit_can_be_given(tmp_path):
 def test_arrays_that_are_no_map(tmp_path, arrays, words):
     np.savez(tmp_path / "map.npz", **arrays)
     with pytest.raises(ae.FileError, match=rf"map\.npz.*{words}"):
-        ae.read_map(tmp_path / "map.npz")
+        ae.io.read_map(tmp_path / "map.npz")
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2, zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED])
@@ -85,12 +85,12 @@ def test_damage_in_every_kind_of_compression(tmp_path, method):
         for name, values in {"counts": COUNTS, "x_edges_mm": X, "y_edges_mm": Y}.items():
             with archive.open(f"{name}.npy", "w") as member:
                 np.save(member, values)
-    assert np.array_equal(ae.read_map(path).counts, COUNTS)
+    assert np.array_equal(ae.io.read_map(path).counts, COUNTS)
     whole, refused = path.read_bytes(), 0
     for place in range(0, len(whole), 7):
         path.write_bytes(whole[:place] + bytes([whole[place] ^ 0xFF]) + whole[place + 1 :])
         try:
-            ae.read_map(path)
+            ae.io.read_map(path)
         except ae.FileError:
             refused += 1
     assert refused > len(whole) // 7 // 2
@@ -101,9 +101,9 @@ def test_files_that_are_none(tmp_path):
     np.save(tmp_path / "one.npy", COUNTS)
     for name in ("empty.npz", "one.npy"):
         with pytest.raises(ae.FileError, match=f"{name}.*does not begin like an .npz file"):
-            ae.read_map(tmp_path / name)
+            ae.io.read_map(tmp_path / name)
     with pytest.raises(ae.FileError, match="No such file"):
-        ae.read_map(tmp_path / "none.npz")
+        ae.io.read_map(tmp_path / "none.npz")
 
 
 @given(place=st.integers(0, 10_000), byte=st.integers(0, 255), length=st.integers(0, 10_000), cut=st.booleans())
@@ -114,7 +114,7 @@ def test_damaged_files_are_refused_or_hold_a_map(tmp_path, place, byte, length, 
     whole[place % len(whole)] = byte
     path.write_bytes(whole[: length % len(whole)] if cut else whole)
     try:
-        map = ae.read_map(path)
+        map = ae.io.read_map(path)
     except ae.FileError as error:
         assert "damaged.npz" in str(error)
     else:
@@ -123,10 +123,10 @@ def test_damaged_files_are_refused_or_hold_a_map(tmp_path, place, byte, length, 
 
 @pytest.mark.skipif(not DATA.exists(), reason="no measured data beside the project")
 def test_measured_maps():
-    nickel = ae.read_map(DATA / "ni111_map.npz")
+    nickel = ae.io.read_map(DATA / "ni111_map.npz")
     assert not nickel.is_counts and nickel.values.shape == (113, 105)
     assert nickel.bin_size == pytest.approx((0.348, 0.325), abs=5e-4)
-    aluminium = ae.read_map(DATA / "al_oxcart_map.npz")
+    aluminium = ae.io.read_map(DATA / "al_oxcart_map.npz")
     assert aluminium.is_counts and aluminium.ions == pytest.approx(715_000, rel=1e-3)
     assert aluminium.x_edges[0] == pytest.approx(-26.46, abs=0.01)  # cm in the file
 
@@ -141,7 +141,7 @@ def test_a_shape_larger_than_its_data_takes_no_memory(tmp_path):
     tracemalloc.start()
     try:
         with pytest.raises(ae.FileError, match=r"map\.npz.*\(40000, 40000\)"):
-            ae.read_map(tmp_path / "map.npz")
+            ae.io.read_map(tmp_path / "map.npz")
         assert tracemalloc.get_traced_memory()[1] < 1 << 24  # a hundredth of the 12 GB of the shape would be too much
     finally:
         tracemalloc.stop()

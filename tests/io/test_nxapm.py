@@ -49,6 +49,9 @@ ATTRIBUTES = {
     **{name: {"version"} for name in FIELDS if name.endswith("/program")},
 }
 
+# of columns for which the format has no place
+pytestmark = pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
+
 
 def check_structure(path, own, is_simulation, elements):
     """Fail if a file is not as the validator wants it; `own` is the group that is not validated."""
@@ -91,6 +94,7 @@ def run():
     return simulation.run(30, [ae.RollUp(0.2)], progress=False).at_evaporation_field()
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.ResponseWarning")  # 0.2 eV are above the limit in true eV
 def test_a_run_is_as_nxapm_wants_it(run, tmp_path):
     run.save(tmp_path / "a.h5")
     check_structure(tmp_path / "a.h5", "entry1/simulation", True, "Ni, Al")

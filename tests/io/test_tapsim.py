@@ -11,6 +11,8 @@ from apt_evap.io.tapsim_nodes import write_nodes, write_types
 # two roundings to float32 of numbers in metres
 SINGLE = 2.5e-7
 
+pytestmark = pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")  # places of made ions are in metres
+
 
 @pytest.mark.parametrize("binary", [False, True])
 def test_every_column_of_a_table(tmp_path, binary):
@@ -147,8 +149,8 @@ def test_a_tip_there_and_back(tmp_path, binary):
 def test_types_of_the_nodes(tmp_path):
     """The order of the keys and blocks as the reader of TAPSim wants them."""
     tip = ae.Tip("Al", apex_radius=2.0, shank_length=2.0, solutes={"Cu": 0.1}, seed=1)
-    law = ae.Arrhenius(temperature=80.0, sensitivity={"Al": 0.9, "Cu": 1.1})
-    write_types(tmp_path / "a.aly", tip, law=law, voltage=2000.0)
+    energies = {"Cu": 2.2, "Al": 1.8}
+    write_types(tmp_path / "a.aly", tip, temperature=80.0, activation_energies=energies, voltage=2000.0)
     first, temperature, *blocks = (tmp_path / "a.aly").read_text().strip().split("\n\n")
     assert (first, temperature) == ("ASCII", "TEMPERATURE = 80")
     types = [dict(line.split(" = ") for line in block.splitlines()) for block in blocks]
@@ -160,6 +162,25 @@ def test_types_of_the_nodes(tmp_path):
     assert float(copper["EVAPORATION_ACTIVATION_ENERGY"]) == pytest.approx(2.2)  # its barrier has a factor 1/2
     assert (copper["REMOVABLE"], copper["DIRICHLET_BOUNDARY"], copper["POTENTIAL"]) == ("1", "1", "2000")
     assert (types[2]["NEUMANN_BOUNDARY"], types[2]["POTENTIAL"], types[1]["DIRICHLET_BOUNDARY"]) == ("1", "2000", "1")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"temperature": -1.0}, "temperature must be"),
+        ({"temperature": float("nan")}, "temperature must be"),
+        ({"activation_energies": "2"}, "activation_energies must be"),
+        ({"activation_energies": {"Al": 2.0}}, r"activation_energies must have a value for Cu, got \{'Al': 2.0\}"),
+        ({"activation_energies": {"Al": 2.0, "Cu": 2.0, "Ni": 2.0}}, "activation_energies must be of Al, Cu, got 'Ni'"),
+        ({"activation_energies": {"Al": 2.0, "Cu": -2.0}}, "activation energy of Cu must be"),
+        ({"voltage": 0.0}, "voltage must be"),
+    ],
+)
+def test_types_with_wrong_arguments_are_not_written(tmp_path, arguments, message):
+    tip = ae.Tip("Al", apex_radius=2.0, shank_length=2.0, solutes={"Cu": 0.1}, seed=1)
+    with pytest.raises(ValueError, match=message):
+        write_types(tmp_path / "a.aly", tip, **arguments)
+    assert not any(tmp_path.iterdir())
 
 
 def test_nodes_that_are_wrong(tmp_path):

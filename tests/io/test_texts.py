@@ -30,6 +30,7 @@ def test_tables_of_numbers(tmp_path):
             read_numbers(path, "a table", ("x", "y"))
 
 
+@pytest.mark.filterwarnings("ignore:.*are they in mm:apt_evap.warnings.DataWarning")
 @pytest.mark.parametrize(("suffix", "compress"), [(".gz", gzip), (".bz2", bz2), (".xz", lzma)])
 def test_compressed_ranges_and_tables(tmp_path, suffix, compress):
     for name, text in (("a.rng", RNG), ("a.env", ENV), ("a.rrng", "[Ranges]\nRange1=1 2 Ni:1\n")):

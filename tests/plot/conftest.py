@@ -15,5 +15,13 @@ def study(small_tip):
     energies = {"means": (0.1, 0.2, 0.3), "relative_spreads": (0.5, 1.0), "rollup_fractions": (0.5, 1.0)}
     here = ae.Registration(0.0, 1.0, (0.0, 0.0))
     return fit_energies(
-        run, measured, "combined", registration=here, replicas=1, resamples=5, progress=False, **energies
+        run,
+        measured,
+        "combined",
+        registration=here,
+        objective="similarity",
+        replicas=1,
+        resamples=5,
+        progress=False,
+        **energies,
     )

@@ -98,6 +98,7 @@ def test_imports_go_down_from_package_to_package():
         ("_common", "specimen"),
         ("specimen", "evaporation"),
         ("evaporation", "simulation"),
+        ("io", "simulation"),
         ("io", "studies"),
         ("maps", "simulation"),
         ("simulation", "analysis"),
@@ -124,6 +125,7 @@ def copy_of(package, target):
         ("detection/binning.py", "def f():\n    from apt_evap.detection.detector_map import DetectorMap", "modules"),
         ("_core/octree.pyx", "from apt_evap._core.flights cimport Flights", "modules"),
         ("detection/binning.py", "from apt_evap.maps.crystallography.directions import Poles", "packages"),
+        ("io/hdf5.py", "def f():\n    from apt_evap.simulation.run import load", "packages"),
     ],
 )
 def test_an_upward_import_or_a_circle_is_found(tmp_path, module, line, what):

@@ -1,5 +1,6 @@
 """The documentation: its Python runs, its commands and links are right, and every public name is described."""
 
+import argparse
 import ast
 import dataclasses
 import enum
@@ -79,7 +80,7 @@ def test_blocks_are_found():
 
 
 @pytest.mark.docs
-@pytest.mark.filterwarnings("ignore:.*left out of:UserWarning")
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")  # of small specimens, and ions that missed
 @pytest.mark.parametrize("path", [p for p in PAGES if python_blocks(p)], ids=name_of)
 def test_python_blocks_run(path, folder, monkeypatch):
     """All blocks of a page, one after the other, as a reader would; those of the README run below."""
@@ -96,7 +97,7 @@ def run_blocks(path, monkeypatch):
 
 
 @pytest.mark.docs
-@pytest.mark.filterwarnings("ignore:.*left out of:UserWarning")
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")  # of small specimens, and ions that missed
 def test_what_the_readme_makes(folder, monkeypatch):
     """Its blocks run, and the files it names are written."""
     run_blocks(README, monkeypatch)
@@ -115,11 +116,23 @@ def test_the_perturbation_of_the_extending_page(folder, monkeypatch):
     assert (np.hypot(above.x - plain.x, above.y - plain.y)[plain.detected & above.detected] > 0).all()
 
 
+def test_the_command_of_the_extending_page(folder, monkeypatch, capsys):
+    run_blocks(ROOT / "docs" / "extending.rst", monkeypatch)
+    page = sys.modules["__page__"]
+    ae.Simulation(ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1))).run(20, progress=False).save("few.h5")
+    parser = argparse.ArgumentParser()
+    page.arguments(parser)
+    capsys.readouterr()
+    assert page.execute(parser.parse_args(["few.h5"])) == 0
+    assert capsys.readouterr().out == "wrote charges.png\n"
+    assert (folder / "charges.png").stat().st_size > 5_000
+
+
 TUTORIALS = sorted(path.name for path in (ROOT / "examples").glob("tutorial_*.py"))
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:.*left out of:UserWarning")
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")  # of small specimens, and ions that missed
 @pytest.mark.parametrize("name", TUTORIALS)
 def test_examples_run(name, folder, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", [name, "200"])

@@ -38,10 +38,11 @@ def loaded(code):
         ("import apt_evap", DRAWING + NUMBERS),
         (HELP.format("['--help']"), DRAWING + NUMBERS),
         (HELP.format("['--version']"), DRAWING + NUMBERS),
+        ("from apt_evap.cli.parser import make_parser; make_parser().format_help()", DRAWING + NUMBERS),
         ("import apt_evap as ae\nae.Tip, ae.Simulation, ae.RollUp, ae.load, ae.read, ae.plot", DRAWING + SLOW),
         ("import apt_evap as ae\n[getattr(ae, name) for name in ae.__all__]", DRAWING + SLOW),
     ],
-    ids=["package", "help", "version", "first use", "every name"],
+    ids=["package", "help", "version", "options of all commands", "first use", "every name"],
 )
 def test_what_is_loaded(code, unwanted):
     found = loaded(code)

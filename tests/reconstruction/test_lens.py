@@ -91,7 +91,7 @@ def test_radii_can_be_given_with_a_lens():
     found = ae.reconstruct(hits, **known, radius=[20.0, 40.0], lens=lens)
     assert found.positions[1, 0] == pytest.approx(40 * math.sin(math.radians(lens.cap_angle(10.0, 40.0, 1.0, LENGTH))))
     assert found.angles[1] == pytest.approx(lens.cap_angle(10.0, 40.0, 1.0, LENGTH))
-    assert found.settings["lens"] is lens and "lens" in repr(found)
+    assert found.settings.lens is lens and "lens" in repr(found)
 
 
 @pytest.mark.parametrize(

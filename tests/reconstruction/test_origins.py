@@ -91,7 +91,7 @@ def test_a_shift_is_added_on_the_cap(table):
 @pytest.fixture(scope="module")
 def twins(nickel, made_once):
     """Runs of Ni[111], R = 12 a, that differ by the origin of the lattice and the seed."""
-    flight = ae.FlightSettings(opening_angle=0.6, tolerance=1e-2)
+    flight = ae.simulation.FlightSettings(opening_angle=0.6, tolerance=1e-2)
 
     def make(seed):
         tip = ae.Tip(nickel, apex_radius=12 * nickel.a, axis=(1, 1, 1), shank_length=12 * nickel.a, offset_seed=seed)

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
+from apt_evap.reconstruction.cap_geometry import CapGeometry
 from apt_evap.reconstruction.reconstruct import Reconstruction
+from apt_evap.reconstruction.reconstruction_settings import ReconstructionSettings
 
 RADIUS, DENSITY = 3.0, 60.0  # nm, ions / nm^3
 HALF = 8.0  # nm: the matrix is a cube of this half width
@@ -16,7 +18,9 @@ HALF = 8.0  # nm: the matrix is a cube of this half width
 def reconstruction_of(positions):
     """Reconstructed ions at given positions, with z as the depth."""
     hits = ae.Hits(x=np.zeros(len(positions)), y=np.zeros(len(positions)))
-    return Reconstruction(positions, hits, np.full(len(positions), 100.0), {})
+    settings = ReconstructionSettings(distance=90.0, atomic_volume=0.01, radius=100.0).resolved()
+    geometry = CapGeometry.of(settings, field_of_view=38.0)
+    return Reconstruction(positions, hits, np.full(len(positions), 100.0), settings, geometry)
 
 
 @pytest.fixture(scope="module")

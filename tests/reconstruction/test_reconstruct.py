@@ -1,6 +1,7 @@
 """Reconstruction of hits whose cap is known: closed forms, volumes, thinning, and files."""
 
 import copy
+import json
 import math
 import pickle
 from dataclasses import replace
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
+from apt_evap._common.codec import from_plain, to_plain
 
 DISTANCE = 90.0  # mm
 RIM = 38.0  # mm
@@ -233,7 +235,7 @@ def test_the_centre_and_a_wide_field_of_view():
     hits = ae.Hits(x=[0.0, 3.0], y=[0.0, 4.0])
     result = ae.reconstruct(hits, atomic_volume=VOLUME, distance=DISTANCE, radius=30.0)
     assert np.array_equal(result.positions[0], [0, 0, 0])
-    assert result.settings["field_of_view"] == 5.0
+    assert result.geometry.field_of_view == 5.0
     for compression, distance in ((1.5, 2.0), (8.0, 5.0)):
         with pytest.raises(ValueError, match="all angles on the cap must be < 90 degrees, got"):
             ae.reconstruct(hits, atomic_volume=VOLUME, distance=distance, compression=compression, radius=30.0)
@@ -278,18 +280,60 @@ def test_files_of_a_reconstruction(cone, tmp_path):
     assert not result.hits.positions.any()
     assert np.array_equal(result.to_hits().positions, result.positions)
     for suffix in (".pos", ".epos"):
-        result.write(tmp_path / f"a{suffix}")
+        ae.write(tmp_path / f"a{suffix}", result.to_hits())
         ions = ae.read(tmp_path / f"a{suffix}")
         assert np.array_equal(ions.positions, result.positions.astype(np.float32))
         assert (ions.mass_to_charge == 27.0).all()
-    result.write(tmp_path / "out.pos", frame="specimen")
+    ae.write(tmp_path / "out.pos", result.to_hits("specimen"))
     outwards = ae.read(tmp_path / "out.pos").positions
     assert np.array_equal(outwards, result.specimen_positions.astype(np.float32)) and outwards[:, 2].max() <= 0
-    result.write(tmp_path / "a.xyz", species="Al")
-    result.write(tmp_path / "a.vtp")
+    ae.write(tmp_path / "a.xyz", result.to_hits(), species="Al")
+    ae.write(tmp_path / "a.vtp", result.to_hits())
     assert (tmp_path / "a.xyz").read_text().startswith("500\n")
     assert repr(result).startswith("<Reconstruction: 500 ions, ") and "cap, bas, R 30.0 to 30.0 nm (shank)" in repr(
         result
     )
     for copied in (pickle.loads(pickle.dumps(result)), copy.deepcopy(result)):
         assert copied.settings == result.settings and np.array_equal(copied.positions, result.positions)
+
+
+def test_settings_as_an_object_or_as_keywords(cone):
+    hits = replace(cone[:2000], voltage=np.linspace(2000.0, 2100.0, 2000))
+    settings = ae.reconstruction.ReconstructionSettings(distance=DISTANCE, element="Al", detector_radius=RIM)
+    result = ae.reconstruct(hits, settings, compression=XI)
+    aluminium = ae.material("Al")
+    known = {"atomic_volume": aluminium.a**3 / 4, "evaporation_field": aluminium.evaporation_field}
+    by_name = ae.reconstruct(hits, **KNOWN | known)
+    assert result.positions == pytest.approx(by_name.positions, rel=1e-12)  # a^3 / 4 against 1 / (4 / a^3)
+    assert np.array_equal(
+        ae.reconstruct(hits, element="Al", **{**KNOWN, "atomic_volume": None}).positions, result.positions
+    )
+    # the settings of a result repeat it, and nothing of them depends on defaults
+    again = ae.reconstruct(hits, result.settings)
+    assert np.array_equal(again.positions, result.positions) and again.settings == result.settings
+    used = (result.settings.projection, result.settings.field_factor, result.settings.evaporation_field)
+    assert used == ("bas", 3.3, aluminium.evaporation_field)
+    assert settings.compression is None  # the object is as it was
+    with pytest.raises(ValueError, match=r"has no 'compresion' \(did you mean 'compression'"):
+        ae.reconstruct(hits, settings, compresion=1.5)
+    with pytest.raises(ValueError, match=r"has no 'compresion' \(did you mean 'compression'"):
+        ae.reconstruct(hits, **KNOWN, compresion=1.5)
+    with pytest.raises(ValueError, match="must have distance"):
+        ae.reconstruct(hits, element="Al")
+    with pytest.raises(ValueError, match=r"atomic_volume .* or element must be given, got None"):
+        ae.reconstruct(hits, distance=90.0, radius=30.0)
+
+
+def test_settings_with_radii_of_the_ions_are_compared_and_kept(cone):
+    radii = np.linspace(30.0, 31.0, 1000)
+    first, same, other = (
+        ae.reconstruction.ReconstructionSettings(distance=DISTANCE, atomic_volume=VOLUME, radius=values)
+        for values in (radii, radii.copy(), radii + 1)
+    )
+    assert first == same and first != other and first != replace(first, radius=30.0)
+    expected = ae.reconstruct(cone[:1000], first).positions
+    radii[:] = 1.0  # of the user, after the settings were made
+    assert np.array_equal(ae.reconstruct(cone[:1000], first).positions, expected)
+    with pytest.raises(ValueError, match="radius must have shape"):
+        ae.reconstruct(cone[:999], first)
+    assert from_plain(json.loads(json.dumps(to_plain(first))), type(first)) == first

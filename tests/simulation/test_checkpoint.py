@@ -504,8 +504,8 @@ def test_a_run_that_is_overwritten_keeps_its_mode(tmp_path):
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ({"lonely": np.array([10**9]), "lonely_normals": np.eye(3)[:1]}, "lonely must be surface atoms"),
-        ({"lonely": np.array([-1]), "lonely_normals": np.eye(3)[:1]}, "lonely must be surface atoms"),
+        ({"isolated": np.array([10**9]), "isolated_normals": np.eye(3)[:1]}, "isolated must be surface atoms"),
+        ({"isolated": np.array([-1]), "isolated_normals": np.eye(3)[:1]}, "isolated must be surface atoms"),
         ({"sites": np.array([10**9])}, "atoms to remove must be in the specimen"),
         ({"charges": np.ones(3)}, "start must have the charges of"),
         ({"rule_state": {}}, "potential_point"),

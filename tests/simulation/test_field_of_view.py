@@ -42,7 +42,7 @@ def tips(nickel):
 
 
 def simulate(tip, n=400, field_of_view=None, detector=DETECTOR, **options):
-    flights = ae.FlightSettings(field_of_view=field_of_view)
+    flights = ae.simulation.FlightSettings(field_of_view=field_of_view)
     return ae.Simulation(tip, seed=1, detector=detector, flight_settings=flights, **options).run(n, progress=False)
 
 
@@ -143,7 +143,7 @@ def test_a_smaller_energy_limit_flies_fewer_ions(tips):
 
 
 def test_bits_do_not_depend_on_threads_batches_and_interruptions(tips, tmp_path):
-    settings = {"flight_settings": ae.FlightSettings(field_of_view=20.0), "detector": DETECTOR, "seed": 1}
+    settings = {"flight_settings": ae.simulation.FlightSettings(field_of_view=20.0), "detector": DETECTOR, "seed": 1}
     one = ae.Simulation(tips["alloy"], n_threads=1, **settings).run(150, progress=False)
     two = ae.Simulation(tips["alloy"], n_threads=2, **settings).run(150, progress=False, batch_size=17)
     path = tmp_path / "run.h5"
@@ -157,7 +157,7 @@ def test_bits_do_not_depend_on_threads_batches_and_interruptions(tips, tmp_path)
         np.testing.assert_array_equal(run.not_flown, one.not_flown)
         assert run.field_of_view == 20.0
     with pytest.raises(ae.FileError, match="flights"):
-        settings["flight_settings"] = ae.FlightSettings(field_of_view=25.0)
+        settings["flight_settings"] = ae.simulation.FlightSettings(field_of_view=25.0)
         ae.Simulation(tips["alloy"], **settings).run(200, checkpoint=ae.simulation.Checkpoint(path, resume=True))
 
 
@@ -175,7 +175,7 @@ def test_ions_are_counted(wide_part):
 def test_perturbations_with_their_own_flights_are_flown_for_all_ions(tips):
     perturbations = (ae.Unperturbed(), ae.RollUp(0.5))
     run = ae.Simulation(
-        tips["nickel"], seed=1, detector=DETECTOR, flight_settings=ae.FlightSettings(field_of_view=15.0)
+        tips["nickel"], seed=1, detector=DETECTOR, flight_settings=ae.simulation.FlightSettings(field_of_view=15.0)
     ).run(100, perturbations, progress=False)
     assert run.not_flown.any()
     for flown, perturbation in zip(run.flown, perturbations, strict=True):
@@ -183,13 +183,13 @@ def test_perturbations_with_their_own_flights_are_flown_for_all_ions(tips):
         outside = np.hypot(*flown.directions.T) > stereographic_rim(15.0)
         np.testing.assert_array_equal(run.hits(perturbation).outcome == Outcome.OUTSIDE, outside)
     alone = ae.Simulation(
-        tips["nickel"], seed=1, detector=DETECTOR, flight_settings=ae.FlightSettings(field_of_view=15.0)
+        tips["nickel"], seed=1, detector=DETECTOR, flight_settings=ae.simulation.FlightSettings(field_of_view=15.0)
     ).run(100, perturbations, responses=False, progress=False)
     np.testing.assert_array_equal(alone.flown[1].directions, run.flown[1].directions)
 
 
 def test_ions_that_never_leave_are_not_outside(tips):
-    flights = ae.FlightSettings(field_of_view=15.0, max_steps=3)
+    flights = ae.simulation.FlightSettings(field_of_view=15.0, max_steps=3)
     run = ae.Simulation(tips["nickel"], flight_settings=flights, detector=DETECTOR).run(20, progress=False)
     assert run.summary()["never_left"] == 20 and not run.not_flown.any()
 
@@ -250,6 +250,7 @@ def test_a_detector_that_sees_more_is_warned_about(wide_part):
     assert len(recorded) and np.isfinite(recorded.x).all()
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.ResponseWarning")  # a few energies are above the limit
 def test_a_detector_behind_a_lens(tips):
     lens = ae.detection.LocalElectrode.preset("local electrode")
     detector = ae.Detector(distance=90.0, width=40.0)
@@ -276,7 +277,7 @@ def test_a_detector_behind_a_lens(tips):
 @pytest.mark.parametrize("value", [0.0, -5.0, 91.0, "all", True])
 def test_bad_fields_of_view_are_refused(value):
     with pytest.raises(ValueError, match="field_of_view"):
-        ae.FlightSettings(field_of_view=value)
+        ae.simulation.FlightSettings(field_of_view=value)
 
 
 @pytest.mark.parametrize("lens", ["", '[microscope]\npreset = "local electrode"\n'])

@@ -9,7 +9,7 @@ from apt_evap._core.journal import Journal
 from apt_evap._core.octree import Octree
 from apt_evap.units import COULOMB, NM_PER_MM
 
-DEFAULT = ae.FlightSettings()
+DEFAULT = ae.simulation.FlightSettings()
 
 
 def fly(tree, positions, velocities, groups=None, **options):

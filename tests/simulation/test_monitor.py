@@ -126,7 +126,7 @@ def test_one_warning_past_each_bound(small_tip):
     assert warned(small_tip) == []
     ((kind, text),) = warned(small_tip, monitor={"charge_bound": 1e-6})
     assert kind is ChargesWarning and "after 100 ions" in text and "bound of 1e-06" in text
-    flights = ae.FlightSettings(max_steps=3)
+    flights = ae.simulation.FlightSettings(max_steps=3)
     ((kind, text),) = warned(small_tip, flight_settings=flights)
     assert kind is RunWarning and text.startswith("100.0% of the last ions, up to number 100, never left the specimen")
     kinds = [kind for kind, _ in warned(small_tip, n=150, flight_settings=flights, responses=True)]

@@ -169,9 +169,12 @@ def test_flown_energies_are_not_taken_for_real_ones(tip12):
         without.at_evaporation_field().hits(ROLLED)
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.ResponseWarning")  # in true eV the limit is lower
 def test_a_run_in_real_units_is_saved_joined_and_turned_back(real, run, tmp_path):
     timed = run.at_evaporation_field(
-        field_reference="site", timing=ae.detection.Timing(temperature=30.0), control=ae.VoltageControl(rate=0.02)
+        field_reference="site",
+        timing=ae.detection.Timing(temperature=30.0),
+        control=ae.evaporation.VoltageControl(rate=0.02),
     )
     timed.save(tmp_path / "real.h5")
     loaded = ae.load(tmp_path / "real.h5")
@@ -189,6 +192,7 @@ def test_a_run_in_real_units_is_saved_joined_and_turned_back(real, run, tmp_path
     assert len(real.on_detector(ae.Detector(distance=50.0)).hits(ae.Unperturbed())) == len(run)
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.ResponseWarning")  # in true eV the limit is lower
 def test_an_epos_has_what_an_instrument_could_have_written(run, tmp_path):
     hits = run.at_evaporation_field(timing=ae.detection.Timing(temperature=50.0)).hits(ROLLED)
     hits = hits[hits.detected]

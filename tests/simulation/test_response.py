@@ -144,6 +144,7 @@ def run(tip12):
 
 
 @pytest.mark.parametrize("perturbation", FLOWN, ids=repr)
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.ResponseWarning")  # a few energies are above the limit
 def test_responses_say_where_ions_land(run, perturbation):
     flown = run.hits(perturbation)
     by_response = replace(run, perturbations=(), flown=()).hits(perturbation)
@@ -158,6 +159,7 @@ def test_responses_say_where_ions_land(run, perturbation):
     assert np.median(times) < 1e-4
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.ResponseWarning")  # a few energies are above the limit
 def test_higher_degree_is_better(tip12):
     """What the polynomials leave over shrinks with their degree."""
     perturbation = ae.Combined(WIDE, 0.25)

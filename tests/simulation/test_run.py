@@ -244,6 +244,10 @@ def test_texts_that_are_read_are_of_fixed_length(run, tmp_path):
                 texts.append(name)
                 assert kind.length is not None, name
 
+        if isinstance(item, h5py.Dataset) and (kind := h5py.check_string_dtype(item.dtype)) is not None and item.shape:
+            texts.append(item.name.rpartition("/")[2])
+            assert kind.length is not None, item.name
+
     with h5py.File(tmp_path / "a.h5") as file:
         look(file)
         file.visititems(lambda name, item: look(item, name))

@@ -12,7 +12,7 @@ from apt_evap.detection import Outcome
 from apt_evap.detection.microscope.conductors import simulated_flank
 from apt_evap.detection.microscope.lens import Lens
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
-from apt_evap.detection.microscope.run_lens import Course, RunLens
+from apt_evap.detection.microscope.run_lens import RadiusHistory, RunLens
 from apt_evap.units import FLIGHT_TIME
 
 ROLLED = ae.RollUp(0.2)
@@ -220,9 +220,9 @@ def test_a_specimen_from_positions_has_no_free_shape(run, lens):
     tip = {name: each for name, each in run.settings["tip"].items() if name != "apex_radius"}
     with pytest.raises(ValueError, match="lens"):
         replace(run, settings=run.settings | {"tip": tip}).on_detector(DETECTOR, lens)
-    course = Course(np.array([0]), np.array([np.nan]), np.array([np.nan]))
+    history = RadiusHistory(np.array([0]), np.array([np.nan]), np.array([np.nan]))
     with pytest.raises(ValueError, match="lens"):
-        RunLens.of(lens, run.settings["tip"], course)
+        RunLens.of(lens, run.settings["tip"], history)
 
 
 def test_a_reconstruction_takes_the_lens_of_the_run(real):

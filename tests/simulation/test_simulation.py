@@ -126,7 +126,9 @@ def test_a_detector_further_away_magnifies(small_tip):
 
 
 def test_ions_that_never_leave_are_counted(small_tip):
-    run = simulate(small_tip, 20, flight_settings=ae.FlightSettings(max_steps=3), emissions=[ae.Unperturbed()])
+    run = simulate(
+        small_tip, 20, flight_settings=ae.simulation.FlightSettings(max_steps=3), emissions=[ae.Unperturbed()]
+    )
     assert run.summary()["never_left"] == 20
     hits = run.hits(ae.Unperturbed())
     assert (hits.outcome == ae.detection.Outcome.NEVER_LEFT).all()
@@ -137,7 +139,7 @@ def test_ions_that_never_leave_are_counted(small_tip):
 
 
 @pytest.fixture(scope="module")
-def lonely_tip(nickel, small_tip):
+def isolated_tip(nickel, small_tip):
     """An atom on its own over the apex, further than a nearest neighbour distance from all others."""
     d = small_tip.nearest_neighbour_distance
     top = small_tip.positions[np.argmax(small_tip.positions[:, 2])] + [0, 0, 1.5 * d]
@@ -145,22 +147,22 @@ def lonely_tip(nickel, small_tip):
     return ae.Tip.from_positions(np.concatenate([small_tip.positions, [top]]), species, [nickel])
 
 
-def test_ions_without_a_neighbour_do_not_roll_and_are_counted(lonely_tip):
+def test_ions_without_a_neighbour_do_not_roll_and_are_counted(isolated_tip):
     flown = (ae.RollUp(0.3), ae.Combined(0.3, 0.5), ae.Unperturbed())
-    run = ae.Simulation(lonely_tip, seed=2).run(40, flown, progress=False)
-    lonely = ~np.isfinite(run.emissions.neighbours).all(axis=1)
-    assert lonely[0]  # it sticks out furthest, so it goes first
-    assert run.site[0] == len(lonely_tip) - 1
-    assert run.summary()["without_neighbour"] == lonely.sum() < 40
+    run = ae.Simulation(isolated_tip, seed=2).run(40, flown, progress=False)
+    isolated = ~np.isfinite(run.emissions.neighbours).all(axis=1)
+    assert isolated[0]  # it sticks out furthest, so it goes first
+    assert run.site[0] == len(isolated_tip) - 1
+    assert run.summary()["without_neighbour"] == isolated.sum() < 40
     assert not run.flagged[0]  # a roll-up that cannot be is no bad fit
     unflown = replace(run, perturbations=(), flown=())
     still = run.hits(ae.Unperturbed())
     for source in (run, unflown):
         rolled = source.hits(ae.RollUp(0.3))
-        assert rolled.x[lonely] == pytest.approx(still.x[lonely], abs=0.01)
+        assert rolled.x[isolated] == pytest.approx(still.x[isolated], abs=0.01)
         assert np.isfinite(source.hits(ae.Combined(0.3, 0.5)).x[0])
     moved = np.hypot(rolled.x - still.x, rolled.y - still.y)
-    assert np.nanmedian(moved[~lonely]) > 1.0  # the others land elsewhere
+    assert np.nanmedian(moved[~isolated]) > 1.0  # the others land elsewhere
 
 
 def few_atoms(nickel, small_tip, n):
@@ -169,6 +171,7 @@ def few_atoms(nickel, small_tip, n):
     return ae.Tip.from_positions(small_tip.positions, small_tip.species, [nickel], evaporable=may)
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.RunWarning")  # more ions than atoms
 def test_an_exhausted_specimen_ends_the_run(nickel, small_tip):
     simulation = ae.Simulation(few_atoms(nickel, small_tip, 12))
     run = simulation.run(100, progress=False)
@@ -178,6 +181,7 @@ def test_an_exhausted_specimen_ends_the_run(nickel, small_tip):
     assert run.ended in repr(run)
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.RunWarning")  # more ions than atoms
 def test_a_run_after_the_end_is_empty(nickel, small_tip):
     simulation = ae.Simulation(few_atoms(nickel, small_tip, 12))
     simulation.run(100, progress=False)
@@ -236,8 +240,8 @@ class Half:
         ),
         (lambda s: ae.Simulation(s.tip, seed=-1), "seed must be an integer"),
         (lambda s: ae.Simulation(s.tip, n_threads=0), "n_threads must be an integer"),
-        (lambda s: ae.FlightSettings(opening_angle=2.0), "opening_angle must be a finite number"),
-        (lambda s: ae.FlightSettings(tolerance=0.0), "tolerance must be a finite number"),
+        (lambda s: ae.simulation.FlightSettings(opening_angle=2.0), "opening_angle must be a finite number"),
+        (lambda s: ae.simulation.FlightSettings(tolerance=0.0), "tolerance must be a finite number"),
         (lambda s: ae.evaporation.ChargeSettings(patch_radius=0.5), "patch_radius must be a finite number"),
         (lambda s: ae.evaporation.ChargeSettings(update_radius=3.0), "update_radius must be a finite number"),
         (lambda s: ae.evaporation.ChargeSettings(sweep_interval=0), "sweep_interval must be an integer"),
@@ -407,4 +411,4 @@ def test_an_exception_keeps_what_is_done(small_tip):
 def test_reach_must_be_beyond_the_specimen(small_tip):
     with pytest.raises(ValueError, match="reach"):
         tip = ae.Tip("Ni", apex_radius=10.0, shank_length=60.0, depth=1.5)
-        ae.Simulation(tip, flight_settings=ae.FlightSettings(reach=120.0))
+        ae.Simulation(tip, flight_settings=ae.simulation.FlightSettings(reach=120.0))

@@ -26,6 +26,7 @@ def run(tip12):
 
 
 @pytest.mark.parametrize("perturbation", FLOWN, ids=repr)
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.ResponseWarning")  # a few energies are above the limit
 def test_hits_are_those_of_flights(run, perturbation):
     flown, fitted = run.hits(perturbation), run.hits(perturbation, by_response=True)
     both = flown.detected & fitted.detected
@@ -85,6 +86,7 @@ def test_the_probability_is_that_of_the_ions(run):
     np.testing.assert_array_equal(step, (ratios > 0.85).astype(float))
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.ResponseWarning")  # a few energies are above the limit
 def test_a_run_comes_back_from_its_file(run, tmp_path):
     run.save(tmp_path / "wide.h5")
     loaded = ae.load(tmp_path / "wide.h5")

@@ -1,4 +1,4 @@
-"""Warren-Cowley parameter and the order that evaporation feigns."""
+"""Warren-Cowley parameter and the apparent order by evaporation."""
 
 import numpy as np
 import pytest
@@ -61,7 +61,7 @@ def test_wrong_arguments_are_named(alloy, argument, name):
 
 
 @pytest.mark.slow
-def test_solutes_with_a_low_field_feign_order():
+def test_solutes_with_a_low_field_appear_ordered():
     nickel = ae.material("Ni")
     field = {"Al": 0.8 * nickel.evaporation_field}
     runs = []

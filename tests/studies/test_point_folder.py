@@ -75,7 +75,7 @@ def test_a_run_that_another_program_writes_is_no_failure(sweep):
         "config.simulation().run(60, progress=wait, checkpoint=sys.argv[1] + '/run.h5')"
     )
     other = subprocess.Popen(
-        [sys.executable, "-c", program, str(folder)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-P", "-c", program, str(folder)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
     assert other.stdout.readline() == "runs\n"
     state = run_point(folder)

@@ -1,8 +1,12 @@
+import json
+import tomllib
+
 import pytest
 from sweeps import BASE
 
 from apt_evap._common.files import FileError
 from apt_evap.config.simulation_file import key_of
+from apt_evap.studies.sweep.planning import plan_sweep
 from apt_evap.studies.sweep.study_file import JobSettings, read_study, value_at, with_values
 
 
@@ -118,3 +122,13 @@ def test_mistakes_are_explained(study, text, message):
 def test_a_missing_base_is_named(study):
     with pytest.raises(FileError, match=r"cannot read .*other\.toml"):
         study('[sweep]\n"tip.axis" = [[0, 0, 1]]', base="other.toml")
+
+
+def test_a_name_of_a_file_adds_no_settings(tmp_path):
+    name = 'a\noutput = "elsewhere.h5"\n#.toml'
+    (tmp_path / name).write_text(BASE)
+    (tmp_path / "study.toml").write_text(f"base = {json.dumps(name)}\n[sweep]\n'tip.apex_radius' = ['8 a', '9 a']\n")
+    sweep = plan_sweep(tmp_path / "study.toml")
+    for key in sweep.keys:
+        text = (sweep.folder_of(key) / "settings.toml").read_text()
+        assert "output" not in tomllib.loads(text)

@@ -61,7 +61,7 @@ def victims_of(process):
 
 def has_begun(sweep, *keys):
     """Whether checkpoints of all these points are on the disk."""
-    return all(any((sweep.folder_of(key) / "run.h5.unfinished").glob("*.h5")) for key in keys)
+    return all((sweep.folder_of(key) / "run.h5.unfinished").exists() for key in keys)
 
 
 def is_alive(number):
@@ -69,6 +69,11 @@ def is_alive(number):
         return Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
     except OSError:
         return False
+
+
+def before(folder):
+    """PYTHONPATH with a folder at its beginning; without an empty entry, which would be the current folder."""
+    return os.pathsep.join(filter(None, (str(folder), os.environ.get("PYTHONPATH"))))
 
 
 def test_two_points_by_two_processes(tmp_path):
@@ -127,7 +132,7 @@ def test_an_interrupt_ends_the_work_at_any_time(tmp_path, moment):
 def test_a_terminal_interrupts_each_run_once(tmp_path):
     """A second interrupt would lose the ions since the last checkpoint."""
     sweep = planned(tmp_path, TWO_LONG, LONG)
-    words = [sys.executable, "-m", "apt_evap.cli", "sweep", "work", str(sweep.folder), "--workers", "2"]
+    words = [sys.executable, "-P", "-m", "apt_evap.cli", "sweep", "work", str(sweep.folder), "--workers", "2"]
     process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True, start_new_session=True)
     until(lambda: has_begun(sweep, *sweep.keys))
     # two signals in succession are often one: the group of the terminal does not contain the runs
@@ -167,7 +172,7 @@ def test_the_runs_end_with_a_killed_command(tmp_path):
 
 def test_a_run_whose_command_ended_before_it_began_ends_at_once():
     program = "import sys\nfrom apt_evap._common.processes import die_with\ndie_with(int(sys.argv[1]))\nprint('lives')"
-    done = subprocess.run([sys.executable, "-c", program, "1"], capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-P", "-c", program, "1"], capture_output=True, text=True)
     assert done.returncode == -signal.SIGKILL and done.stdout == ""
 
 
@@ -177,7 +182,7 @@ def test_processes_that_are_always_killed_end_the_command(tmp_path):
     (tmp_path / "killed" / "sitecustomize.py").write_text(
         "import os, sys\nif '--multiprocessing-fork' in sys.orig_argv: os.kill(os.getpid(), 9)\n"
     )
-    process = command(sweep, PYTHONPATH=f"{tmp_path / 'killed'}:{os.environ.get('PYTHONPATH', '')}")
+    process = command(sweep, PYTHONPATH=before(tmp_path / "killed"))
     assert process.wait(60) == 2
     error = process.stderr.read()
     assert "the last 3 processes" in error and error.count("\n") == 1
@@ -202,7 +207,7 @@ def test_work_where_no_locks_are(tmp_path):
         "fcntl.flock = flock\n"
     )
     sweep = planned(tmp_path, TWO, SMALL)
-    process = command(sweep, PYTHONPATH=f"{tmp_path / 'no_flock'}:{os.environ.get('PYTHONPATH', '')}")
+    process = command(sweep, PYTHONPATH=before(tmp_path / "no_flock"))
     assert process.wait(60) == 0
     assert f"warning: point {sweep.keys[0]}: cannot lock" in process.stderr.read()
     check_done(sweep)

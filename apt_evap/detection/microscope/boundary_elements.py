@@ -127,9 +127,11 @@ class ChargedPanels:
         half = (nodes + 1) / 2
         graded, graded_weights = half**3, weights / 2 * 3 * half**2
         nodes, weights = np.concatenate([-graded, graded]), np.tile(graded_weights, 2)
-        own = panels.places(nodes)
-        itself = ring_potential(self.middles[:, :1], self.middles[:, 1:], own[..., 0], own[..., 1])
-        np.fill_diagonal(matrix, (itself * panels.areas(own, weights)).sum(axis=-1))
+        places_on_panels = panels.places(nodes)
+        itself = ring_potential(
+            self.middles[:, :1], self.middles[:, 1:], places_on_panels[..., 0], places_on_panels[..., 1]
+        )
+        np.fill_diagonal(matrix, (itself * panels.areas(places_on_panels, weights)).sum(axis=-1))
         densities = np.linalg.solve(matrix, panels.potentials)
         self.surface_fields: Floats = 4 * np.pi * densities
         """Field just outside each panel per unit of potential [1/nm], shape (n,)."""

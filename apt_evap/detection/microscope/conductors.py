@@ -21,7 +21,7 @@ _FOOT_POINTS = 40  # of the rounded foot of a simulated specimen
 
 
 class Flank(NamedTuple):
-    """Where a cap ends on the surface of a specimen."""
+    """Line where a cap ends on the surface of a specimen."""
 
     angle: float
     """Half angle of the shank there [rad]."""

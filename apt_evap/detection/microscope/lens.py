@@ -120,9 +120,9 @@ class Lens:
         if near.any():  # a cubic between the surface, whose potential and field are known, and the first good point
             edge, slope = self.potential_and_field(np.array([[0.0, self._start]]))
             share, length = distances[near] / self._start, self._start
-            at, there = -self._cap_field(0.0) * length, -float(slope[0, 1]) * length
+            at, at_edge = -self._cap_field(0.0) * length, -float(slope[0, 1]) * length
             rise = float(edge[0]) - 1.0
-            square, cube = 3 * rise - 2 * at - there, at + there - 2 * rise
+            square, cube = 3 * rise - 2 * at - at_edge, at + at_edge - 2 * rise
             potential[near] = 1 + share * (at + share * (square + share * cube))
             field[near] = -(at + share * (2 * square + share * 3 * cube)) / length
         return potential, field
@@ -154,6 +154,8 @@ class Lens:
         dtheta. An ion that starts at rest at the height h is displaced along it by (h (s - h) + (s - h)^2 / 6) F' / (R
         F), and its path has the inclination (s + 2 h) F' / (3 R F).
         """
+        # from the cap to the distance s = start: series of the displacement along the surface and of the time,
+        # t = sqrt(2 (s - h) / F) (1 + (s - h) / 6 R)
         radius, start, count = self.radius, max(self._start, 2 * height), len(angles)
         field = self._cap_field(angles**2)
         bend = 2 * angles * self._cap_field.deriv()(angles**2) / field / radius
@@ -163,7 +165,10 @@ class Lens:
         far = radius + start
         place = angles + bend * (height * way + way**2 / 6) / far + speed * time / radius * (1 - start / (1.5 * radius))
         rho, z = far * np.sin(place), far * np.cos(place) - radius
-        turning = speed * radius / far  # the angular momentum of the launch is conserved
+
+        # velocity at this distance: across by the angular momentum of the launch, which is conserved, and by the bent
+        # path; outwards by the conservation of energy
+        turning = speed * radius / far
         energy = 1 - height * field * (1 - height / radius) - self._charged.fields(np.abs(rho), z)[0] + lateral
         outwards = np.sqrt(2 * energy - turning**2)
         turning = turning + outwards * bend * (start + 2 * height) / 3
@@ -187,6 +192,7 @@ class Lens:
             return state[count : 2 * count].max() - _CLEAR * self.distance
 
         before_electrode.terminal = to_electrode  # type: ignore[attr-defined]
+        # equation of motion r'' = E(r) in the logarithm of the time, to far behind the electrode
         size = max(self.distance, self.aperture)
         last = math.log((self.distance + _END * size) / math.sqrt(2) / time.min())
         solved = scipy.integrate.solve_ivp(
@@ -229,7 +235,7 @@ class Lens:
         order = 1 if self.aperture < _NARROW * self.distance else 2
         ratio = np.polynomial.polynomial.polyfit(angles**2, np.radians(flights.angles) / angles, order)
         delay = np.polynomial.polynomial.polyfit(angles**2, flights.delays, order)
-        return np.concatenate([np.pad(each, (0, 2 - order)) for each in (ratio, delay)])
+        return np.concatenate([np.pad(row, (0, 2 - order)) for row in (ratio, delay)])
 
     @property
     def compression(self) -> float:

@@ -46,10 +46,10 @@ class LensProjection(NamedTuple):
         float or ndarray
             [degrees].
         """
-        given = _numbers(angles, "angles", at_least=0.0, below=180.0)
-        theta = np.radians(given)
+        degrees = _numbers(angles, "angles", at_least=0.0, below=180.0)
+        theta = np.radians(degrees)
         flown = np.degrees(theta * self._ratio(theta**2))
-        return _plain(np.where(given <= LAST_ANGLE, flown, np.nan))
+        return _plain(np.where(degrees <= LAST_ANGLE, flown, np.nan))
 
     def cap_angles(self, angles: ArrayLike) -> Any:
         """Angles on the cap of flights: the inverse of `flight_angles`.
@@ -81,8 +81,8 @@ class LensProjection(NamedTuple):
         return zeroth + square * (first + square * second)
 
 
-def _profile(given, name):
-    profile = check_array(given, name, ("n", 2))
+def _profile(rows, name):
+    profile = check_array(rows, name, ("n", 2))
     if len(profile) < 2 or (profile[:, 1] <= 0).any() or (profile[0, 0] < 0) or (np.diff(profile[:, 0]) <= 0).any():
         raise ValueError(
             f"{name} must contain at least two pairs of an increasing distance >= 0 and a radius > 0 [nm], got "
@@ -302,7 +302,7 @@ class LocalElectrode:
         ratio = _numbers(voltage, "voltage", above=0.0) / _numbers(field, "field", above=0.0)
         if ratio.size == 0:
             return ratio
-        low, high = (self._table.radius(float(each)) for each in (ratio.min(), ratio.max()))
+        low, high = (self._table.radius(float(value)) for value in (ratio.min(), ratio.max()))
         if not SMALLEST <= low <= high <= LARGEST:
             raise ValueError(
                 f"voltage / field must belong to a radius from {SMALLEST:g} to {LARGEST:g} nm, got ratios from "
@@ -401,10 +401,10 @@ class LocalElectrode:
         float or ndarray
             [ns]; NaN for ions that the detector turns back.
         """
-        given = _numbers(angle, "angle", at_least=0.0, below=180.0)
+        degrees = _numbers(angle, "angle", at_least=0.0, below=180.0)
         coefficients = self._table.coefficients(_radii(radius))
-        flown = np.radians(LensProjection(coefficients[..., :3]).flight_angles(given))
-        square = np.radians(given) ** 2
+        flown = np.radians(LensProjection(coefficients[..., :3]).flight_angles(degrees))
+        square = np.radians(degrees) ** 2
         delay = coefficients[..., 3] + square * (coefficients[..., 4] + square * coefficients[..., 5])
         mass, charge, voltage = (
             _numbers(value, name, above=0.0)
@@ -438,10 +438,10 @@ class LocalElectrode:
         return self._along_axis(distance, radius, voltage)[1]
 
     def _along_axis(self, distance, radius, voltage):
-        given = _numbers(distance, "distance", at_least=0.0)
+        distances = _numbers(distance, "distance", at_least=0.0)
         voltage = check_number(voltage, "voltage", above=0, unit="V")
         lens = self._table.lens(float(_radii(check_number(radius, "radius", unit="nm"))))
-        return tuple(_plain(voltage * each.reshape(given.shape)) for each in lens.along_axis(given.ravel()))
+        return tuple(_plain(voltage * values.reshape(distances.shape)) for values in lens.along_axis(distances.ravel()))
 
     def _drift(self, flown, voltage):
         """Factor by which the potential of the detector shortens the drift."""
@@ -500,7 +500,7 @@ class _Table:
         if radii.size == 0:
             return np.empty((*radii.shape, *np.shape(quantity(self._node(5)))))
         place = np.log2(radii)
-        first, last = (math.floor(each) for each in (place.min(), place.max()))
+        first, last = (math.floor(end) for end in (place.min(), place.max()))
         starts, widths = np.array([cell for octave in range(first, last + 1) for cell in self._cells_of(octave)]).T
         windows = np.array(
             [[quantity(self._node(place)) for place in starts + shift * widths] for shift in range(-1, 3)]
@@ -522,7 +522,7 @@ class _Table:
         middle, half = self._node(start + width / 2), width / 2
         around = [self._node(start + shift * width) for shift in range(-1, 3)]
         factor, coefficients = (
-            sum(weight * each for weight, each in zip(_MIDDLE, values, strict=True))
+            sum(weight * value for weight, value in zip(_MIDDLE, values, strict=True))
             for values in ([lens.field_factor for lens in around], [lens.coefficients for lens in around])
         )
         # change of the angle and of the path of a flight with the farthest angle on the cap

@@ -21,7 +21,7 @@ from apt_evap.units import FLIGHT_TIME, NM_PER_MM
 if TYPE_CHECKING:
     from apt_evap.specimen.tip import Tip
 
-_FAR = 1e9  # distance and aperture of an electrode that a specimen does not feel: 1 m [nm]
+_FAR = 1e9  # distance and aperture of an electrode without effect on the specimen: 1 m [nm]
 _FAR_ANGLE = math.radians(75)
 _BESIDE = 90.0  # degrees: an ion that flies away from the detector
 _STEP = 0.05  # relative change of the radius, or of the length in radii, from stage to stage
@@ -34,15 +34,15 @@ _COLUMNS = 11  # of a stage
 _DIGITS = 10  # of what is stored: the last digits of a solution depend on the library of linear algebra
 
 
-class Course(NamedTuple):
-    """The cap of a specimen during a run, each of shape (k,)."""
+class RadiusHistory(NamedTuple):
+    """Radius and apex of the cap during a run, each of shape (k,)."""
 
     ions: Integers
     """Number of evaporated ions."""
     radii: Floats
-    """Radius [nm]."""
+    """Radius of the cap [nm]."""
     apexes: Floats
-    """z of the apex [nm]."""
+    """Position of the apex along the axis [nm]."""
 
 
 # Stage of a specimen for the widest field of view: a flat cap, and a shank that is used up. The angle of free flights
@@ -51,8 +51,8 @@ _FLATTENED = 1.25
 _MARGIN = 1.0  # degrees
 
 
-def _stages(given, name):
-    rows = check_array(given, name, ("n", _COLUMNS))
+def _stages(stages, name):
+    rows = check_array(stages, name, ("n", _COLUMNS))
     return tuple(tuple(row) for row in rows.tolist())
 
 
@@ -60,7 +60,7 @@ def _stages(given, name):
 class RunLens:
     """Lens in front of the specimen of a run.
 
-    A simulated specimen stands in free space and has a short shank. Its ions leave at the angle theta on the cap and
+    A simulated specimen is in free space and has a short shank. Its ions leave at the angle theta on the cap and
     fly at the angle theta_free. In the instrument they leave at the same theta and fly at theta'. Both functions follow
     from boundary elements, so that theta'(theta_free) needs no new flights. Azimuths do not change. The place of an ion
     on the crystal, the energy that it needs there, and its field are those of the run.
@@ -93,7 +93,9 @@ class RunLens:
     )
 
     @classmethod
-    def of(cls, lens: LocalElectrode, tip: Mapping[str, Any], course: Course, distance: float = 0.0) -> "RunLens":
+    def of(
+        cls, lens: LocalElectrode, tip: Mapping[str, Any], history: RadiusHistory, distance: float = 0.0
+    ) -> "RunLens":
         """Put a lens in front of the specimen of a run.
 
         Parameters
@@ -102,7 +104,7 @@ class RunLens:
             The lens.
         tip : mapping
             Settings of the tip of the run.
-        course : Course
+        history : RadiusHistory
             The cap during the run.
         distance : float
             Nearest neighbour distance of the crystal [nm]; 0 for ions that start on the smooth cap.
@@ -114,10 +116,10 @@ class RunLens:
         """
         if tip.get("apex_radius") is None:
             raise ValueError("lens needs the shape of the free specimen, which a tip made from positions does not have")
-        known = np.isfinite(course.radii)
+        known = np.isfinite(history.radii)
         if not known.any():
             raise ValueError("lens needs the radius of the cap, which this run does not contain: too few surface atoms")
-        ions, radii, apexes = (np.asarray(each, float)[known] for each in course)
+        ions, radii, apexes = (np.asarray(column, float)[known] for column in history)
         change = max(float(np.log(radii.max() / radii.min())), float(np.ptp(apexes) / radii.min()))
         count = max(1, min(1 + math.ceil(change / _STEP), _MOST_STAGES, len(ions) // 2))
         at = np.linspace(ions[0], ions[-1], count)
@@ -155,8 +157,8 @@ class RunLens:
             division by the field factor of the free specimen, which is solved for each stage.
         """
         radii, factors = self._at(ions, slice(1, 2))[:, 0], self._at(ions, slice(4, 5))[:, 0]
-        own = model / factors
-        return field * self.lens.field_factor(radii) * own / np.mean(own / radii) if len(own) else own
+        ratio = model / factors
+        return field * self.lens.field_factor(radii) * ratio / np.mean(ratio / radii) if len(ratio) else ratio
 
     def seen(
         self,
@@ -281,8 +283,8 @@ def field_of_view(lens: LocalElectrode, tip: "Tip", detector: Detector) -> float
             "give the field of view as a number [degrees]"
         )
     radius = tip.settings.get("apex_radius")
-    course = Course(np.arange(2), np.full(2, _FLATTENED * (radius or np.nan)), np.zeros(2))
-    stages = RunLens.of(lens, tip.settings, course, tip.nearest_neighbour_distance)
+    history = RadiusHistory(np.arange(2), np.full(2, _FLATTENED * (radius or np.nan)), np.zeros(2))
+    stages = RunLens.of(lens, tip.settings, history, tip.nearest_neighbour_distance)
     angles = np.linspace(0.0, _BESIDE, 901)[:-1]
     lengths, ones = np.tan(np.radians(angles) / 2), np.ones(len(angles))
     directions, _ = stages.seen(

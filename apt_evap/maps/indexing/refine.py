@@ -24,6 +24,8 @@ from apt_evap.maps.noise import effective_ions
 BINS = 56
 """Bins across the disc: 1 degree for a field of view of 36 degrees half angle."""
 _STEPS = 15  # iterations at most
+_FIRST_MOVE = 2  # iteration: before, the slow part and the amplitudes are fitted alone
+_ATTEMPTS = 6  # values of the damping in an iteration
 _FINE = 0.3  # change of the deviance that ends the iteration: far below one standard error
 _DIFFERENCE = 2e-3  # [rad] of the numerical derivatives: a quarter of a pixel of the patterns
 _LONGEST = 3.0  # radii; a square has 1.4
@@ -31,7 +33,7 @@ _FEWEST = 100  # bins, for 15 slow polynomials and 7 numbers of an orientation
 _LEAST = 0.05  # expected counts of a bin at least, where residuals are divided by their error
 _REACH = 5  # bins: residuals farther apart count as independent
 NO_STRETCH = -0.01
-"""Radial stretch above which the projection of the answer is equidistant."""
+"""Radial stretch above which the projection of the result is equidistant."""
 _STRETCH = 0.05  # standard deviation of the prior of the radial stretch at the rim
 
 
@@ -100,7 +102,7 @@ class Refined:
 
 
 def _widened(stretch):
-    """Ratio of the scale from the centre to the rim to that at the centre, as in the projection of the answer."""
+    """Ratio of the scale from the centre to the rim to that at the centre, as in the projection of the result."""
     return 1.0 - stretch if stretch <= NO_STRETCH else 1.0
 
 
@@ -124,7 +126,7 @@ def bins_of(disc: Disc) -> Bins:
         return array[:ny, :nx].reshape(ny // factor, factor, nx // factor, factor).sum(axis=(1, 3))
 
     inside = combined(map.mask.astype(float)) == factor**2
-    places = np.column_stack([combined(each)[inside] / factor**2 for each in (x, y)])
+    places = np.column_stack([combined(coordinate)[inside] / factor**2 for coordinate in (x, y)])
     places = (places - disc.centre) / disc.radius
     counts = combined(values)[inside]
     if len(counts) < _FEWEST:
@@ -175,6 +177,137 @@ def _solve(columns, residuals, weights, prior=None):
     return np.linalg.solve(normal, right), normal
 
 
+class _State(NamedTuple):
+    """Parameters of the model, and the densities that follow from them."""
+
+    fit: Floats
+    """Coefficients of the slow polynomials, shape (k,)."""
+    amplitudes: Floats
+    """Of the two patterns, shape (2,)."""
+    geometry: Floats
+    """Rotation vector from the start [rad], logarithm of the scale at the rim [mm/rad], radial stretch; shape (5,)."""
+    contrasts: Floats
+    """Densities of the two patterns in each bin, minus 1, shape (2, n)."""
+
+
+class _Likelihood:
+    """Likelihood of the counts of a map, with the marks of a user, as a function of a `_State`.
+
+    Parameters
+    ----------
+    bins, disc, densities, matrix, marks, bounds
+        As for `refine`.
+    geometry : ndarray
+        Start. Each mark keeps the target that it has there; one that is far from all of them does not count.
+    """
+
+    def __init__(
+        self,
+        bins: Bins,
+        disc: Disc,
+        densities: Floats,
+        matrix: Floats,
+        marks: Sequence[Mark],
+        bounds: tuple[float, float] | None,
+        geometry: Floats,
+    ) -> None:
+        self._bins, self._disc, self._densities, self._matrix = bins, disc, densities, matrix
+        self._marks = marks
+        self._bounds = (-math.inf, math.inf) if bounds is None else np.log(bounds)
+        self._mark_places = [(mark.places - disc.centre) / disc.radius for mark in marks]
+        self.n_slow = bins.slow.shape[1]
+        directions = self.mark_directions(geometry)
+        self._targets = [mark.nearest(places) for mark, places in zip(marks, directions, strict=True)]
+
+    def rotation(self, geometry: Floats) -> Floats:
+        """Rotation from crystal to specimen, shape (3, 3)."""
+        return scipy.spatial.transform.Rotation.from_rotvec(geometry[:3]).as_matrix() @ self._matrix
+
+    def _crystal_directions(self, places, geometry):
+        """Directions in the crystal of places on the disc, shape (n, 3)."""
+        scale = float(np.exp(geometry[3]))
+        return directions_of(places, self._disc.radius, scale, geometry[4]) @ self.rotation(geometry)
+
+    def contrasts(self, geometry: Floats) -> Floats:
+        """Densities of the two patterns in each bin, minus 1, shape (2, n)."""
+        return sampled(self._densities, self._crystal_directions(self._bins.places, geometry)) - 1.0
+
+    def limits(self, stretch: float) -> Floats:
+        """Bounds of the logarithm of the scale from the centre to the rim, shape (2,)."""
+        return np.array(self._bounds) + math.log(_widened(stretch))
+
+    def expected(self, state: _State) -> tuple[Floats, Floats]:
+        """Expected counts, and the factor in them that comes from the patterns, each of shape (n,)."""
+        factor = np.maximum(1 + state.amplitudes @ state.contrasts, 0.02)
+        return np.exp(np.clip(self._bins.slow @ state.fit, -20, 20)) * factor, factor
+
+    def mark_directions(self, geometry: Floats) -> list[Floats]:
+        """Directions in the crystal of the places of every mark."""
+        return [self._crystal_directions(places, geometry) for places in self._mark_places]
+
+    def deviations(self, geometry: Floats) -> Floats:
+        """Of the marks from their targets, and of the stretch from 0, in standard errors."""
+        parts = [
+            mark.signed(directions, target)
+            for mark, directions, target in zip(self._marks, self.mark_directions(geometry), self._targets, strict=True)
+            if target is not None
+        ]
+        return np.concatenate([*parts, [geometry[4] / _STRETCH]])
+
+    def value(self, state: _State) -> float:
+        """Deviance of the counts, and the squared deviations of the marks: what is minimised."""
+        penalty = float((self.deviations(state.geometry) ** 2).sum())
+        return deviance(self._bins.counts, self.expected(state)[0]) + penalty
+
+    def normal_equations(self, state: _State, moving: bool) -> tuple[Floats, Floats]:
+        """Normal matrix and right side of a Gauss-Newton step; of the geometry only if it moves."""
+        mu, factor = self.expected(state)
+        columns = [self._bins.slow * mu[:, None], (state.contrasts * (mu / factor)).T]
+        if moving:
+            columns += [self._slope(state, k, mu, factor)[:, None] for k in range(5)]
+        columns = np.hstack(columns)
+        weights = 1 / mu
+        normal = columns.T @ (columns * weights[:, None])
+        right = columns.T @ ((self._bins.counts - mu) * weights)
+        if moving:
+            geometry = state.geometry
+            start = self.deviations(geometry)
+            shifts = _DIFFERENCE * np.eye(5)
+            slopes = np.stack([(self.deviations(geometry + shift) - start) / _DIFFERENCE for shift in shifts], axis=1)
+            normal[-5:, -5:] += slopes.T @ slopes
+            right[-5:] -= slopes.T @ start
+        return normal, right
+
+    def _slope(self, state, k, mu, factor):
+        """Numerical derivative of the expected counts by a number of the geometry, shape (n,)."""
+        shifted = state.geometry.copy()
+        shifted[k] += _DIFFERENCE
+        return (state.amplitudes @ (self.contrasts(shifted) - state.contrasts)) / _DIFFERENCE * mu / factor
+
+    def fixed_at_bounds(self, state: _State, normal: Floats, right: Floats) -> tuple[Floats, Floats]:
+        """The same equations, without a change of a scale that would leave its bounds."""
+        low, high = self.limits(state.geometry[4])
+        scale = state.geometry[3]
+        if not ((scale <= low and right[-2] < 0) or (scale >= high and right[-2] > 0)):
+            return normal, right
+        fixed, right = normal.copy(), right.copy()
+        fixed[-2, :], fixed[:, -2], right[-2] = 0.0, 0.0, 0.0
+        fixed[-2, -2] = normal[-2, -2]
+        return fixed, right
+
+    def moved(self, state: _State, change: np.ndarray, moving: bool) -> _State:
+        """State after a change of all parameters, limited to what a step may be."""
+        n_slow = self.n_slow
+        fit = state.fit + np.clip(change[:n_slow], -1, 1)
+        amplitudes = np.maximum(state.amplitudes + np.clip(change[n_slow : n_slow + 2], -0.3, 0.3), 0)
+        amplitudes /= max(1.0, amplitudes.sum())
+        if not moving:
+            return _State(fit, amplitudes, state.geometry, state.contrasts)
+        geometry = state.geometry + np.clip(change[n_slow + 2 :], -0.05, 0.05)
+        geometry[3] = np.clip(geometry[3], *self.limits(geometry[4]))
+        return _State(fit, amplitudes, geometry, self.contrasts(geometry))
+
+
 def refine(
     bins: Bins,
     disc: Disc,
@@ -209,124 +342,56 @@ def refine(
     -------
     Refined
     """
-    n_slow = bins.slow.shape[1]
-
-    def contrast(turn, log_scale, stretch):
-        directions = directions_of(bins.places, disc.radius, float(np.exp(log_scale)), stretch)
-        rotation = scipy.spatial.transform.Rotation.from_rotvec(turn).as_matrix() @ matrix
-        return sampled(densities, directions @ rotation) - 1.0
-
-    def limits(stretch):
-        """Bounds of the logarithm of the scale from the centre to the rim."""
-        low, high = (-math.inf, math.inf) if bounds is None else np.log(bounds)
-        return np.array([low, high]) + math.log(_widened(stretch))
-
     geometry = np.array([0.0, 0.0, 0.0, np.log(scale), 0.0])
-    geometry[3] = np.clip(geometry[3], *limits(0.0))
-    amplitudes = 0.5 * np.array([1 - rolled, rolled])
-    fit = bins.fit
-
-    def model(fit, amplitudes, contrasts):
-        factor = np.maximum(1 + amplitudes @ contrasts, 0.02)
-        return np.exp(np.clip(bins.slow @ fit, -20, 20)) * factor, factor
-
-    spots = [(mark.places - disc.centre) / disc.radius for mark in marks]
-
-    def of_marks(geometry):
-        """Crystal directions of the places of every mark."""
-        rotation = scipy.spatial.transform.Rotation.from_rotvec(geometry[:3]).as_matrix() @ matrix
-        scale, stretch = float(np.exp(geometry[3])), geometry[4]
-        return [directions_of(spot, disc.radius, scale, stretch) @ rotation for spot in spots]
-
-    # each mark keeps the target that it has at the start; one that is far from all of them does not count
-    targets = [mark.nearest(each) for mark, each in zip(marks, of_marks(geometry), strict=True)]
-
-    def deviations(geometry):
-        """Of the marks from their targets, and of the stretch from 0, in standard errors."""
-        parts = [
-            mark.signed(each, target)
-            for mark, each, target in zip(marks, of_marks(geometry), targets, strict=True)
-            if target is not None
-        ]
-        return np.concatenate([*parts, [geometry[4] / _STRETCH]])
-
-    def penalty(geometry):
-        return float((deviations(geometry) ** 2).sum())
-
-    contrasts = contrast(geometry[:3], *geometry[3:])
-    damping = 1e-3
+    if bounds is not None:
+        geometry[3] = np.clip(geometry[3], *np.log(bounds))
+    likelihood = _Likelihood(bins, disc, densities, matrix, marks, bounds, geometry)
+    state = _State(bins.fit, 0.5 * np.array([1 - rolled, rolled]), geometry, likelihood.contrasts(geometry))
+    damping, value = 1e-3, likelihood.value(state)
     for step in range(steps):
-        mu, factor = model(fit, amplitudes, contrasts)
-        value = deviance(bins.counts, mu) + penalty(geometry)
-        columns = [bins.slow * mu[:, None], (contrasts * (mu / factor)).T]
-        moving = step >= 2  # first the slow part and the amplitudes
-        if moving:
-            for k in range(5):
-                shifted = geometry.copy()
-                shifted[k] += _DIFFERENCE
-                columns.append(
-                    ((amplitudes @ (contrast(shifted[:3], *shifted[3:]) - contrasts)) / _DIFFERENCE * mu / factor)[
-                        :, None
-                    ]
-                )
-        columns = np.hstack(columns)
-        weights = 1 / mu
-        normal = columns.T @ (columns * weights[:, None])
-        right = columns.T @ ((bins.counts - mu) * weights)
-        if moving:
-            now = deviations(geometry)
-            slopes = np.stack(
-                [(deviations(geometry + shift) - now) / _DIFFERENCE for shift in _DIFFERENCE * np.eye(5)], axis=1
-            )
-            normal[-5:, -5:] += slopes.T @ slopes
-            right[-5:] -= slopes.T @ now
-        solved = normal
-        low, high = limits(geometry[4])
-        if moving and ((geometry[3] <= low and right[-2] < 0) or (geometry[3] >= high and right[-2] > 0)):
-            solved = normal.copy()  # the scale stays at its bound
-            solved[-2, :], solved[:, -2], right[-2] = 0.0, 0.0, 0.0
-            solved[-2, -2] = normal[-2, -2]
-        improved = False
-        for _ in range(6):
+        moving = step >= _FIRST_MOVE
+        normal, right = likelihood.normal_equations(state, moving)
+        solved, right = likelihood.fixed_at_bounds(state, normal, right) if moving else (normal, right)
+        # Levenberg's damping, larger until the likelihood improves
+        better = None
+        for _ in range(_ATTEMPTS):
             damped = solved + np.diag(damping * np.diag(solved) + 1e-12 * np.trace(solved))
-            change = np.linalg.solve(damped, right)
-            new_fit = fit + np.clip(change[:n_slow], -1, 1)
-            new_amplitudes = np.maximum(amplitudes + np.clip(change[n_slow : n_slow + 2], -0.3, 0.3), 0)
-            new_amplitudes /= max(1.0, new_amplitudes.sum())
-            new_geometry = geometry + (np.clip(change[n_slow + 2 :], -0.05, 0.05) if moving else 0.0)
-            if bounds is not None:
-                new_geometry[3] = np.clip(new_geometry[3], *limits(new_geometry[4]))
-            new_contrasts = contrast(new_geometry[:3], *new_geometry[3:]) if moving else contrasts
-            new_value = deviance(bins.counts, model(new_fit, new_amplitudes, new_contrasts)[0]) + penalty(new_geometry)
-            if new_value <= value:
-                improved = True
+            candidate = likelihood.moved(state, np.linalg.solve(damped, right), moving)
+            if (new_value := likelihood.value(candidate)) <= value:
+                better = candidate
                 break
             damping *= 10
-        if not improved:
+        if better is None:
             if moving:
                 break
             continue
-        fit, amplitudes, geometry, contrasts = new_fit, new_amplitudes, new_geometry, new_contrasts
+        gain, value, state = value - new_value, new_value, better
         damping = max(damping / 5, 1e-6)
-        if moving and value - new_value < _FINE:
+        if moving and gain < _FINE:
             break
-    mu, _ = model(fit, amplitudes, contrasts)
+    return _refined(bins, likelihood, state, normal if moving else None, marks)
+
+
+def _refined(bins, likelihood, state, normal, marks):
+    """Result for the parameters at the end; `normal` is the normal matrix there, None if the geometry did not move."""
+    mu, _ = likelihood.expected(state)
+    n_slow = likelihood.n_slow
     freedom = max(1, len(mu) - n_slow - 7)
     dispersion = max(pearson(bins.counts, mu) / freedom, 1.0)
-    covariance = (
-        np.linalg.pinv(normal)[n_slow + 2 : n_slow + 6, n_slow + 2 : n_slow + 6] if moving else np.full((4, 4), np.nan)
-    )
-    rotation = scipy.spatial.transform.Rotation.from_rotvec(geometry[:3]).as_matrix() @ matrix
+    covariance = np.full((4, 4), np.nan)
+    if normal is not None:
+        covariance = np.linalg.pinv(normal)[n_slow + 2 : n_slow + 6, n_slow + 2 : n_slow + 6]
+    directions = likelihood.mark_directions(state.geometry)
     return Refined(
-        rotation,
-        float(np.exp(geometry[3])),
-        float(geometry[4]),
-        amplitudes,
+        likelihood.rotation(state.geometry),
+        float(np.exp(state.geometry[3])),
+        float(state.geometry[4]),
+        state.amplitudes,
         bins.deviance - deviance(bins.counts, mu),
         1 - (pearson(bins.counts, mu) - freedom) / bins.structure if bins.structure > bins.structure_error else 0.0,
         dispersion * _correlated(bins, mu),
-        sum(mark.misfit(each)[0] for mark, each in zip(marks, of_marks(geometry), strict=True)),
-        np.array([mark.deviation(each) for mark, each in zip(marks, of_marks(geometry), strict=True)]),
+        sum(mark.misfit(places)[0] for mark, places in zip(marks, directions, strict=True)),
+        np.array([mark.deviation(places) for mark, places in zip(marks, directions, strict=True)]),
         covariance,
     )
 
@@ -336,10 +401,10 @@ def _correlated(bins, mu):
     image = np.zeros(bins.inside.shape)
     image[bins.inside] = (bins.counts - mu) / np.sqrt(np.maximum(mu, _LEAST))
     shape = [size + _REACH + 1 for size in image.shape]
-    spectra = (scipy.fft.rfft2(each, shape) for each in (image, bins.inside.astype(float)))
-    products, pairs = (scipy.fft.irfft2(np.abs(each) ** 2, shape) for each in spectra)
+    spectra = (scipy.fft.rfft2(values, shape) for values in (image, bins.inside.astype(float)))
+    products, pairs = (scipy.fft.irfft2(np.abs(spectrum) ** 2, shape) for spectrum in spectra)
     lags = np.arange(-_REACH, _REACH + 1)
     near = np.hypot(*np.meshgrid(lags, lags)) <= _REACH
-    products, pairs = (each[np.ix_(lags, lags)][near] for each in (products, pairs))
+    products, pairs = (sums[np.ix_(lags, lags)][near] for sums in (products, pairs))
     correlations = products / np.maximum(pairs, 1) / (products.max() / pairs.max())
     return max(1.0, float(correlations.sum()))

@@ -1,4 +1,4 @@
-"""One HTML file with its pictures, styles, script and data; nothing is loaded from elsewhere."""
+"""HTML pages in one file, with pictures, styles, script and data; nothing is loaded from elsewhere."""
 
 import base64
 import html
@@ -217,9 +217,9 @@ def read_report(path: AnyPath) -> dict[str, Any]:
         If the file cannot be read, or is not a report.
     """
     text = read_small_file(path, MAX_BYTES, "a report").decode(errors="replace")
-    found = re.findall(r'^<script type="application/json" id="([^"]+)">(.*)</script>$', text, re.MULTILINE)
+    blocks = re.findall(r'^<script type="application/json" id="([^"]+)">(.*)</script>$', text, re.MULTILINE)
     try:
-        content = {html.unescape(name): json.loads(data) for name, data in found}
+        content = {html.unescape(name): json.loads(data) for name, data in blocks}
     except ValueError as error:
         raise FileError(f"{str(path)!r} is a damaged report: {error}") from error
     if "origin" not in content:
@@ -313,9 +313,9 @@ def flat(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 def text_of(value: Any) -> str:
     """Text of a setting: a number, a text, or a list of them, str."""
     if isinstance(value, Mapping):
-        return ", ".join(f"{key} {text_of(each)}" for key, each in value.items())
+        return ", ".join(f"{key} {text_of(item)}" for key, item in value.items())
     if isinstance(value, list | tuple):
-        return ", ".join(text_of(each) for each in value)
+        return ", ".join(text_of(item) for item in value)
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, int):

@@ -22,12 +22,17 @@ def measurement_section(constants: Sequence[Any], checks: Sequence[Any], command
     -------
     str
     """
-    rows = [(each.name, each.text, each.depends) for each in constants]
+    rows = [(constant.name, constant.text, constant.depends) for constant in constants]
     parts = [heading("Constants of this measurement"), picture, table(rows, ("", "value", "known only together with"))]
     if checks:
         compared = [
-            (each.name, f"{each.found:.4g}", f"{each.expected:.4g} ± {each.error:.2g}, z = {each.z:+.1f}", each.meaning)
-            for each in checks
+            (
+                check.name,
+                f"{check.value:.4g}",
+                f"{check.expected:.4g} ± {check.error:.2g}, z = {check.z:+.1f}",
+                check.meaning,
+            )
+            for check in checks
         ]
         parts.append(table(compared, ("check, not used above", "found", "expected", "a deviation says")))
     parts.append(paragraph("Errors are standard errors by noise alone; z is the deviation in standard errors.", "note"))

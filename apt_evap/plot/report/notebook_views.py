@@ -1,4 +1,4 @@
-"""What a notebook shows of maps, runs, ions, specimens, materials and studies: a picture or a table."""
+"""Views of maps, runs, ions, specimens, materials and studies in a notebook: a picture or a table."""
 
 import io
 from html import escape
@@ -26,14 +26,16 @@ def picture(map: DetectorMap) -> bytes:
 
 
 def folded_table(data: Any) -> str:
-    """One line on the data, and a folded table of its contents, such as what `apt-evap info` prints, as HTML."""
+    """Description of the data in one line, and a folded table of the output of `apt-evap info`, as HTML."""
     if isinstance(data, Material):
         contents = to_plain(data)
         contents["sources"] = [f"{name}: {source}" for name, source in contents["sources"].items()]
-        rows = _table(contents, {name: each.unit for name, each in declared(Material).items() if each.unit})
+        rows = _table(contents, {name: setting.unit for name, setting in declared(Material).items() if setting.unit})
     elif isinstance(data, Study):
         scores = {name: str(score) for name, score in data.baselines.items()}
         rows = _table({"result": data.lines(), "similarity": {"best": str(data.optimum.score)} | scores}, {})
+    elif callable(contents := getattr(data, "notebook_contents", None)):  # of a package above this one
+        rows = _table(contents(), UNITS)
     else:
         rows = _table(describe(data), UNITS)
     return f"<details><summary><code>{escape(repr(data))}</code></summary>{rows}</details>"
@@ -51,7 +53,7 @@ def _cell(value, units):
     if isinstance(value, dict) and value:
         return _table(value, units)
     if isinstance(value, list | dict):
-        return ", ".join(_cell(each, units) for each in value) or "none"
+        return ", ".join(_cell(item, units) for item in value) or "none"
     if isinstance(value, int) and not isinstance(value, bool):
         return f"{value:,}"
     return "none" if value is None else escape(f"{value:g}" if isinstance(value, float) else str(value))

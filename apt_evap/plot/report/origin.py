@@ -97,7 +97,7 @@ def add_origin(page: Page, content: Mapping[str, Any]) -> None:
     if content["command"]:
         page.add(f"<pre>{escape(content['command'])}</pre>")
     if content["files"]:
-        rows = [(each["name"], f"{each['bytes']:,}", each["sha256"]) for each in content["files"]]
+        rows = [(file["name"], f"{file['bytes']:,}", file["sha256"]) for file in content["files"]]
         page.add(table(rows, ("File", "Bytes", "SHA-256")))
     versions = {"written by": content["made_by"], "written at": content["created"], **content["system"]}
     page.add(collapsed("Versions", table((name, text_of(value)) for name, value in versions.items())))

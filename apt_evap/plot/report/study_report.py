@@ -83,7 +83,7 @@ def write_study(
     page.add(*(paragraph(text, "doubt red") for text in of_registration))
     page.add(paragraph(f"{study.result[:1].upper()}{study.result[1:]}.", "result"))
     page.add(_blinking(page, study))
-    page.add(*(paragraph(text, "doubt") for text in (*others, *(f"Warning: {each}" for each in made["warnings"]))))
+    page.add(*(paragraph(text, "doubt") for text in (*others, *(f"Warning: {line}" for line in made["warnings"]))))
     page.add(*_poles(page, study), *_evidence(page, study))
     page.add(heading("Energies"), _energies(study), *sections)
     page.add(heading("Similarity with the measured map"), _scores(study))
@@ -224,7 +224,7 @@ def _poles(page, study):
     if orientation is None or projection is None:
         return []
     maps = {"measured": study.measured, "simulated": study.maps["optimum"]}
-    axes = plot.detector_maps([study.compared(each) for each in maps.values()], list(maps))
+    axes = plot.detector_maps([study.compared(map) for map in maps.values()], list(maps))
     for ax in axes:
         plot.poles(ax, orientation, projection, region=study.measured)
     text = "Poles and zone lines of the simulated crystal, as registered, on both maps."
@@ -238,7 +238,7 @@ def _evidence(page, study):
         return []
     parts = [paragraph(f"{scores.evidence[:1].upper()}{scores.evidence[1:]}.")]
     maps = {"measured": scores.measured, "unperturbed": scores.unperturbed, "best": scores.optimum}
-    known = {title: each.folded for title, each in maps.items() if each.folded is not None}
+    known = {title: scores_of_map.folded for title, scores_of_map in maps.items() if scores_of_map.folded is not None}
     if "measured" in known and len(known) > 1:
         pole = plain_label(scores.plane)
         parts.append(
@@ -253,7 +253,9 @@ def _evidence(page, study):
 def _matrices(study):
     """A table for each roll-up fraction and option."""
     *_, rows, columns = study.grid.shape
-    values, errors, shares = (each.reshape(-1, rows, columns) for each in (study.scores, study.errors, study.shares))
+    values, errors, shares = (
+        values.reshape(-1, rows, columns) for values in (study.scores, study.errors, study.shares)
+    )
     at = study.best_cell
     best = int(np.ravel_multi_index(at[:-2], study.grid.shape[:-2]))
     for layer, title in enumerate(study.grid.layers):

@@ -147,7 +147,7 @@ def _course(page, rows):
 
 
 def _score_name(compared):
-    """What the scores of the studies are: "SSIM", or "concordance" of folded maps."""
+    """Name of the scores of the studies: "SSIM", or "concordance" of folded maps."""
     return from_plain({"objective": compared[0].study["settings"]["objective"]}, FitSettings).score_name
 
 
@@ -169,7 +169,7 @@ def _gallery(page, rows):
     drawn = []
     for title in shown[0].panels:
         maps = [row.panels[title] for row in shown]
-        maps = [each.smoothed(default_smoothing(each, each.ions)) if each.values.any() else each for each in maps]
+        maps = [map.smoothed(default_smoothing(map, map.ions)) if map.values.any() else map for map in maps]
         axes = plot.detector_maps(
             maps, [_short(row) for row in shown], columns=min(math.ceil(math.sqrt(len(shown))), 3), title=title
         )

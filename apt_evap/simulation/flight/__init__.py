@@ -1,1 +1,1 @@
-"""Threads that compute the flights, detector hits, and responses of the ions to their launch velocities."""
+"""Flights of the ions: their threads, detector hits, and responses to the launch velocities."""

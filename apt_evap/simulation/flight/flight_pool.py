@@ -41,7 +41,8 @@ class FlightSettings:
     --------
     >>> tip = ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1))
     >>> hits = []
-    >>> for settings in (ae.FlightSettings(), ae.FlightSettings(opening_angle=0.6, tolerance=1e-2)):
+    >>> coarse = ae.simulation.FlightSettings(opening_angle=0.6, tolerance=1e-2)
+    >>> for settings in (ae.simulation.FlightSettings(), coarse):
     ...     hits.append(ae.Simulation(tip, flight_settings=settings).run(30).hits(ae.Unperturbed()))
     >>> deviation = np.hypot(hits[1].x - hits[0].x, hits[1].y - hits[0].y)
     >>> print(f"median {np.nanmedian(deviation):.3f}, largest {np.nanmax(deviation):.3f} mm")
@@ -108,7 +109,7 @@ class _Record:
     journals: list = field(default_factory=list)
 
 
-class FlightCrew:
+class FlightPool:
     """Threads that fly the ions of successive batches, each taken from the counter of its batch.
 
     Of n threads, n - 1 fly ions while the calling thread computes events. The calling thread also flies ions while it

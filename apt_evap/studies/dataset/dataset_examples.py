@@ -43,7 +43,7 @@ def examples_of(run: Run, point: Point, settings: DatasetSettings, split: str) -
     -------
     list of dict
     """
-    real = run.at_evaporation_field() if run.units is None else run
+    real = run.in_real_units()
     orientation = Orientation.known(run.settings["tip"])
     projection = _projection(real) if orientation is not None else None
     about = {

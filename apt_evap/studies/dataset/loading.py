@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apt_evap._common.files import FileError, check_path
+from apt_evap._common.notebook import as_table
 from apt_evap._common.optional_imports import optional_import
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_choice
@@ -165,6 +166,14 @@ class DataSet:
     def __repr__(self) -> str:
         return f"<DataSet: {len(self):,} examples of {sum(shard['runs'] for shard in self.shards):,} runs>"
 
+    _repr_html_ = as_table
+
+    def notebook_contents(self) -> dict[str, Any]:
+        """Table that a notebook shows: folder, examples, runs, and the fields of each table, dict."""
+        fields = {name: [column.name for column in columns] for name, columns in self.schema.items()}
+        runs = sum(shard["runs"] for shard in self.shards)
+        return {"folder": str(self.folder), "examples": len(self), "runs": runs, "fields": fields}
+
     @property
     def schema(self) -> Schema:
         """Fields by table, dict."""
@@ -308,8 +317,8 @@ def load_dataset(path: AnyPath) -> DataSet:
     Raises
     ------
     FileError
-        If it is not a finished data set. `verify` compares the checksums of all files, reading that of each file which
-        is used.
+        If it is not a finished data set. `verify_dataset` compares the checksums of all files. When a file is
+        read, its checksum is compared.
     """
     folder = check_path(path).absolute()
     content = read_finished(folder)

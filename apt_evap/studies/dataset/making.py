@@ -70,7 +70,7 @@ class Shard:
 
 @dataclass(frozen=True, repr=False)
 class PlannedSet:
-    """A planned data set; made by `plan_set`.
+    """A planned data set; made by `plan_dataset`.
 
     Parameters
     ----------
@@ -419,7 +419,7 @@ def _content(planned, shards=(), left_out=None):
         "title": settings.title or study.path.stem,
         "dataset": to_plain(settings),
         "points": list(planned.sweep.keys),
-        "study": {study.path.name: study.path.read_text(), study.base.name: study.base.read_text()},
+        "study": {path.name: path.read_text("utf-8-sig") for path in (study.path, study.base)},
         "versions": _versions(settings),
         "left_out": left_out or {},
         "counts": counts_of(shards),

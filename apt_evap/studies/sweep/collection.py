@@ -199,7 +199,7 @@ def write_maps(sweep: Sweep, keys: list[str], path: AnyPath, bins: int | None = 
     path : str or path-like
         File to write or replace.
     bins : int, optional
-        As for `collect`.
+        As for `collect_sweep`.
 
     Raises
     ------

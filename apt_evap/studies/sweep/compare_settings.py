@@ -13,7 +13,7 @@ from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.fit.fit_settings import FitSettings
 from apt_evap.fit.grid import EnergyGrid
-from apt_evap.io.formats import read
+from apt_evap.simulation.read_file import read
 
 _READING = ("format", "byte_order", "unit")
 

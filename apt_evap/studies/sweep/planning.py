@@ -12,13 +12,14 @@ from typing import Any
 
 from apt_evap._common.codec import from_plain, to_plain
 from apt_evap._common.files import FileError, read_small_file
+from apt_evap._common.notebook import as_table
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import short_text
 from apt_evap._version import __version__
 from apt_evap.config.cost_estimate import CostEstimate
 from apt_evap.config.simulation_file import Config, config_of, key_of
 from apt_evap.config.tables import check_table
-from apt_evap.config.toml_text import toml_text
+from apt_evap.config.toml_text import comment, toml_text
 from apt_evap.studies.sweep.compare_settings import CompareSettings
 from apt_evap.studies.sweep.point_folder import (
     SETTINGS,
@@ -47,7 +48,7 @@ _MAX_BYTES = 1 << 30
 
 @dataclass(frozen=True, repr=False)
 class Sweep:
-    """A planned sweep; made by `plan` and `open_sweep`.
+    """A planned sweep; made by `plan_sweep` and `open_sweep`.
 
     Parameters
     ----------
@@ -71,6 +72,14 @@ class Sweep:
 
     def __repr__(self) -> str:
         return f"<Sweep: {len(self.points):,} points in {str(self.folder)!r}>"
+
+    _repr_html_ = as_table
+
+    def notebook_contents(self) -> dict[str, Any]:
+        """Table that a notebook shows: settings that vary, and the number of points in each state, dict."""
+        states = [state.name for _, state in self.states()]
+        counts = {name: states.count(name) for name in STATES if name in states}
+        return {"folder": str(self.folder), "settings_that_vary": list(self.paths), "points": counts}
 
     @cached_property
     def by_key(self) -> dict[str, Point]:
@@ -152,7 +161,7 @@ def plan_sweep(path: AnyPath) -> Sweep:
             place = sweep.folder_of(point.key)
             place.mkdir(parents=True, exist_ok=True)
             settings = toml_text({key: value for key, value in point.document.items() if key != "output"})
-            write_text(place / SETTINGS, f"# made from {study.base.name}: {point}\n{settings}")
+            write_text(place / SETTINGS, f"{comment(f'made from {study.base.name}: {point}')}\n{settings}")
     except OSError as error:
         raise FileError(f"cannot write {error.filename!r}: {error.strerror}") from error
     write_text(folder / _TABLE, _table(sweep))

@@ -86,7 +86,7 @@ class SweepStudy:
     sha256 : str
         Of the bytes of both files, and of the files of specimens.
     dataset : dict
-        The table ``[dataset]``, for `apt_evap.dataset`.
+        The table ``[dataset]``, for `studies.make_dataset`.
     """
 
     path: Path

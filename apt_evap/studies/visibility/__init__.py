@@ -1,1 +1,1 @@
-"""Probability that an analysis finds a feature, origin operators and their emulator, spurious order."""
+"""Probability that an analysis finds a feature, origin operators and their emulator, apparent short-range order."""

@@ -1,4 +1,4 @@
-"""Short-range order: the Warren-Cowley parameter, and the order that evaporation alone feigns."""
+"""Short-range order: the Warren-Cowley parameter, and the apparent order by evaporation alone."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def false_order(
     block: float = 1.0,
     seed: int = 0,
 ) -> FalseOrder:
-    """Order that evaporation alone feigns in a random alloy.
+    """Apparent order of a random alloy, by evaporation alone.
 
     Parameters
     ----------

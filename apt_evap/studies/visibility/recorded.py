@@ -64,10 +64,10 @@ def recorded_ions(
     >>> tip = ae.Tip("Ni", apex_radius=2.5, solutes={"Al": 0.1}, seed=1)
     >>> run = ae.Simulation(tip, seed=1).run(300, [ae.Unperturbed()], responses=False)
     >>> ae.studies.recorded_ions(run).positions.shape
-    (191, 3)
+    (195, 3)
     """
     instrument = Instrument(field_of_view=160.0) if instrument is None else instrument
-    real = run if run.units is not None else run.at_evaporation_field()
+    real = run.in_real_units()
     tip = run.settings["tip"]
     if "apex_radius" not in tip:
         raise ValueError("run must be of a tip with an apex_radius, got a specimen from positions")

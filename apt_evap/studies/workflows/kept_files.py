@@ -1,4 +1,4 @@
-"""Files that a command keeps in a folder, with what they were made from."""
+"""Files that a workflow keeps in a folder, with what they were made from."""
 
 import hashlib
 import json
@@ -14,7 +14,7 @@ from apt_evap._version import __version__
 
 RECORD = "twin.json"
 _LARGEST = 1 << 24  # bytes
-_ELSEWHERE = "give another folder with -o"
+_ELSEWHERE = "give another folder with -o (folder=... in Python)"
 
 
 class KeptFiles:
@@ -78,7 +78,7 @@ class KeptFiles:
                 if name in self._files:
                     what = f"from another {name}"
                 else:
-                    option = f"--{name.replace('_', '-')}"
+                    option = f"--{name.replace('_', '-')}"  # its name in Python has no dashes
                     what = f"without {option}" if then is None else f"with {option} {short_text(then)}"
                     what += "" if now is None else f", not with {short_text(now)}"
                 raise FileError(f"{str(self.folder)!r} was made {what}: {_ELSEWHERE}")

@@ -4,15 +4,17 @@ import hashlib
 import json
 import os
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.cli import twin
-from apt_evap.cli._kept import RECORD, KeptFiles
 from apt_evap.cli.main import main
 from apt_evap.maps.indexing.master_pattern import master_patterns
+from apt_evap.studies.workflows import kept_files, twin_of_map
+from apt_evap.studies.workflows.kept_files import RECORD, KeptFiles
 
 ARGUMENTS = ("--element", "Ni", "--scales", "56,64")
 
@@ -46,38 +48,36 @@ def quick(tmp_path, monkeypatch):
     calls = []
     made = {}
 
-    def run(options):
+    def simulate(settings, output, **_):
         calls.append("run")
-        with open(options.output, "w") as file:
-            file.write("a run")
-        return 0
+        output.write_text("a run")
+        return SimpleNamespace(interrupted=False)
 
-    def compare(options, *_):
+    def compare(run, measured, folder, *_, **__):
         calls.append("compare")
-        os.makedirs(options.output, exist_ok=True)
-        with open(os.path.join(options.output, "report.html"), "w") as file:
-            file.write("a report")
+        folder.mkdir(exist_ok=True)
+        (folder / "report.html").write_text("a report")
         return _Likeness()
 
     class Run:
         def hits(self, emission):
             return emission
 
-    def index(options):
+    def index(measured, material, **options):
         calls.append("index")
-        key = (options.file, options.element, str(options.scales))
+        key = (measured.values.tobytes(), material, repr(options))
         if key not in made:
-            made[key] = start_of(options)
+            made[key] = index_map(measured, material, **options)
         return made[key]
 
-    start_of = twin.start_of
+    index_map = twin_of_map.index
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(twin.run_command, "execute", run)
-    monkeypatch.setattr(twin, "compare", compare)
-    monkeypatch.setattr(twin, "load", lambda path: Run())
-    monkeypatch.setattr(twin, "is_run", lambda path: path.read_text() == "a run")
-    monkeypatch.setattr(twin, "start_of", index)
-    monkeypatch.setattr(twin, "_registered", lambda *_: ae.Registration(1.0, 1.0, (0.0, 0.0)))
+    monkeypatch.setattr(twin_of_map, "simulate", simulate)
+    monkeypatch.setattr(twin_of_map, "compare", compare)
+    monkeypatch.setattr(twin_of_map, "load", lambda path: Run())
+    monkeypatch.setattr(twin_of_map, "is_run", lambda path: path.read_text() == "a run")
+    monkeypatch.setattr(twin_of_map, "index", index)
+    monkeypatch.setattr(twin_of_map, "_registered", lambda *_: ae.Registration(1.0, 1.0, (0.0, 0.0)))
     measurement("ni.epos")
     return calls
 
@@ -159,9 +159,7 @@ def test_after_every_write_the_command_continues(quick, capsys, tmp_path, monkey
     """Killed after the nth file that it writes; started again, it ends with the same files."""
     first = ["ni.epos", *ARGUMENTS, "-o"]
     assert main(["twin", *first, "whole"]) == 0
-    from apt_evap.cli import _kept
-
-    replace_file = _kept.replace_file
+    replace_file = kept_files.replace_file
     for last in range(1, 10):
         written = 0
 
@@ -172,10 +170,10 @@ def test_after_every_write_the_command_continues(quick, capsys, tmp_path, monkey
                 raise KeyboardInterrupt
             return replace_file(path)
 
-        monkeypatch.setattr(_kept, "replace_file", replaced)
+        monkeypatch.setattr(kept_files, "replace_file", replaced)
         code = main(["twin", *first, f"t{last}"])
         assert code == (130 if written > last else 0)
-        monkeypatch.setattr(_kept, "replace_file", replace_file)
+        monkeypatch.setattr(kept_files, "replace_file", replace_file)
         assert main(["twin", *first, f"t{last}"]) == 0
         for name in ("specimen.toml", "start.json", "registration.json", "answer.txt"):
             assert (tmp_path / f"t{last}" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
@@ -236,3 +234,59 @@ def test_ions_without_a_voltage_are_left_out_of_the_constants(tmp_path):
         assert "shank" in shanks[0].name
         np.testing.assert_allclose(shanks[1].value, shanks[0].value, rtol=0.02)
         assert np.isfinite(shanks[0].value) or options
+
+
+def test_a_twin_of_the_command_is_one_of_python(quick, capsys, tmp_path):
+    """The same folder for both, and nothing is done again; ions in memory are another measurement than their file."""
+    assert main(["twin", "ni.epos", *ARGUMENTS, "-o", "t"]) == 0
+    said = capsys.readouterr().out.splitlines()
+    quick.clear()
+    made = ae.twin("ni.epos", "Ni", scales=(56, 64), folder="t")
+    assert quick == ["run"] and capsys.readouterr().out == ""  # its notes go to `note`
+    assert made.report() == Path("t/study/report.html") and f"wrote {made.report()}" == said[-1]
+    assert made.registration == ae.Registration(1.0, 1.0, (0.0, 0.0))
+    assert made.candidate.orientation.material.name == "Ni" and made.indexing.verdict in repr(made)
+    assert quick == ["run", "index"]  # when it is asked for
+    assert set(made.measurement.arguments) > {"atomic_volume", "efficiency"}
+    assert [str(constant.name) in "\n".join(made.answer) for constant in made.measurement.constants].count(False) == 0
+    shown = made._repr_html_()
+    assert made.answer[0].partition(",")[0] in shown and "report.html" in shown
+    for changed in ({"minutes": 5.0}, {"lens": "local-electrode"}, {"poles": [(3.0, 4.0)]}, {"efficiency": 0.3}):
+        (name,) = changed
+        with pytest.raises(ae.FileError, match=f"'t' was made with.* --{name.removesuffix('s')}"):
+            ae.twin("ni.epos", "Ni", scales=(56, 64), folder="t", **changed)
+    with pytest.raises(ae.FileError, match="another FILE"):
+        ae.twin(ae.read("ni.epos"), "Ni", scales=(56, 64), folder="t")
+    assert quick == ["run", "index"]
+
+
+def test_a_folder_belongs_to_its_ions(quick):
+    ions = ae.read("ni.epos")
+    ae.twin(ions, "Ni", scales=(56, 64), folder="mine")
+    ae.twin(replace(ions, source="another name"), "Ni", scales=(56, 64), folder="mine")
+    assert quick == ["index", "run", "compare", "run"]
+    heavier = replace(ions, mass_to_charge=ions.mass_to_charge + 1)
+    for other in (ions[:-1], heavier, replace(ions, extent=(-40, 40, -40, 40)), ions.map(bins=64)):
+        with pytest.raises(ae.FileError, match="another FILE"):
+            ae.twin(other, "Ni", scales=(56, 64), folder="mine")
+    density = replace(ions.map(bins=64), is_counts=False)  # the same numbers, without their noise
+    ae.twin(ions.map(bins=64), "Ni", scales=(56, 64), folder="of_map")
+    with pytest.raises(ae.FileError, match="another FILE"):
+        ae.twin(density, "Ni", scales=(56, 64), folder="of_map")
+
+
+@pytest.mark.parametrize(
+    ("changed", "sentence"),
+    [
+        ({"minutes": 0}, "minutes must be a finite number [min] > 0, got 0"),
+        ({"efficiency": 1.5}, "efficiency must be"),
+        ({"measured": 3}, "path must be a file name, got 3"),
+        ({"measured": "run.h5"}, "measured must be ions or a map, 'run.h5' contains a Run"),
+    ],
+)
+def test_what_is_wrong_is_said_before_anything_is_done(quick, small_tip, changed, sentence):
+    ae.Simulation(small_tip, seed=1).run(10, responses=False, progress=False).save("run.h5")
+    arguments = {"measured": "ni.epos", "element": "Ni", "folder": "t"} | changed
+    with pytest.raises(ValueError) as error:
+        ae.twin(**arguments)
+    assert sentence in str(error.value) and quick == [] and not os.path.exists("t")

@@ -1,0 +1,36 @@
+"""A specimen in free space: what `RunLens` is for a specimen behind a lens."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from apt_evap._common.types import Floats, Integers
+
+
+class FreeSpecimen:
+    """The specimen of a simulation without a lens, whose flights are those of the instrument."""
+
+    lens: Any = None
+    """The lens of the instrument: none."""
+
+    def voltages(self, model: Floats, ions: ArrayLike, field: float) -> Floats:
+        """Voltages of the instrument [V], shape (n,): those of the model, as for `RunLens.voltages`."""
+        return model
+
+    def seen(
+        self,
+        directions: Floats,
+        times: Floats,
+        ions: ArrayLike,
+        masses: Floats,
+        charges: Integers,
+        model: Floats,
+        voltages: Floats,
+        flight_length: float,
+    ) -> tuple[Floats, Floats]:
+        """Directions and times of flights in the instrument: the same directions, times at its voltages.
+
+        Parameters and result are those of `RunLens.seen`.
+        """
+        return directions, times * np.sqrt(model / voltages)

@@ -1,0 +1,78 @@
+"""Panel of the files: a field that opens a run or a measurement."""
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from bokeh.models import AutocompleteInput
+
+from apt_evap.explore.search_process import start_thread
+from apt_evap.explore.widgets import LEFT
+
+_MOST_FILES = 300  # that are proposed
+_SUFFIXES = (".h5", ".epos", ".pos", ".apt", ".raw", ".nxs", ".npz")
+
+
+class FilePanel:
+    """Field for the path of a file.
+
+    Parameters
+    ----------
+    read : callable or None
+        Reads a file, from its path, in any thread; the function that it returns makes the page again. None if no file
+        can be opened: the field is then hidden.
+    close : callable
+        Closes the page.
+    note : callable
+        Shows a sentence.
+    later : callable
+        As for `Page`.
+    """
+
+    def __init__(
+        self,
+        read: Callable[[str], Callable[[], None]] | None,
+        close: Callable[[], None],
+        note: Callable[[str], None],
+        later: Callable[[Callable[[], None], int], Any],
+    ) -> None:
+        self._read, self._close, self._note, self._later = read, close, note, later
+        self.field = AutocompleteInput(
+            placeholder="open a file: a run or a measurement",
+            completions=[] if read is None else _files(),
+            restrict=False,
+            case_sensitive=False,
+            search_strategy="includes",
+            min_characters=1,
+            width=LEFT - 10,
+            visible=read is not None,
+        )
+        self.field.on_change("value", lambda attr, old, new: self._named())
+
+    def open(self, path: str) -> None:
+        """Read a file in a thread, and make the page again; only what cannot be read leaves the page."""
+        assert self._read is not None
+        read = self._read
+        self._note(f"reading {path}")
+
+        def work():
+            make_page = read(path)
+
+            def make_again():
+                self._close()
+                make_page()
+
+            self._later(make_again, 0)
+
+        start_thread(work, lambda sentence: self._later(partial(self._note, sentence), 0))
+
+    def _named(self):
+        if self._read is not None and (path := self.field.value.strip()):
+            self.open(path)
+
+
+def _files():
+    """Files of the current folder and the folders in it that can be opened."""
+    paths = [path for pattern in ("*", "*/*") for path in sorted(Path().glob(pattern))]
+    return [str(path) for path in paths if path.suffix.lower() in _SUFFIXES][:_MOST_FILES]

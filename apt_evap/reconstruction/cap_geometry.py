@@ -1,0 +1,182 @@
+"""The geometry of a reconstruction: detector, angles on the cap, and the depth of the apex."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from apt_evap._common.types import Floats
+from apt_evap.detection.hits import Hits
+from apt_evap.detection.microscope.lens import LAST_ANGLE
+from apt_evap.detection.microscope.local_electrode import LocalElectrode
+from apt_evap.reconstruction.reconstruction_settings import ReconstructionSettings
+
+_RIGHT_ANGLE = math.pi / 2
+_LAST_ON_LENS = math.radians(LAST_ANGLE)
+
+
+@dataclass(frozen=True)
+class CapGeometry:
+    """How a place on the detector, a radius and a number of ions become a position.
+
+    Parameters
+    ----------
+    protocol : str
+        Depth increment, "cap" or "bas".
+    projection : str
+        Relation of the distance on the detector to the angle on the cap: one of `PROJECTIONS`, or "lens".
+    compression : float
+        Image compression; with a lens a factor of the angles that the lens gives, 1 before a fit.
+    distance : float
+        Flight length [mm].
+    field_of_view : float
+        Radius of the field of view on the detector [mm].
+    volume : float
+        Volume of the specimen per detected ion [nm^3].
+    lens : LocalElectrode or None
+        The lens.
+    """
+
+    protocol: str
+    projection: str
+    compression: float
+    distance: float
+    field_of_view: float
+    volume: float
+    lens: LocalElectrode | None
+
+    @classmethod
+    def of(cls, settings: ReconstructionSettings, field_of_view: float) -> CapGeometry:
+        """Geometry for resolved settings and a radius of the field of view [mm]."""
+        return cls(
+            settings.protocol,
+            "lens" if settings.projection is None else settings.projection,
+            1.0 if settings.compression is None else settings.compression,
+            settings.distance,
+            field_of_view,
+            settings.atomic_volume / settings.efficiency,  # type: ignore[operator]
+            settings.lens,
+        )
+
+    @property
+    def largest_angle(self) -> float:
+        """Angle on the cap that no ion may reach [rad]."""
+        return _RIGHT_ANGLE if self.lens is None else _LAST_ON_LENS
+
+    def lens_voltages(self, hits: Hits) -> Floats | None:
+        """Voltage of each ion [V] for a detector with a potential; None if the lens does not need it."""
+        return voltages_of(hits) if self.lens is not None and self.lens.detector_potential else None
+
+    def angles(self, rho: ArrayLike, radii: Floats | None = None, voltages: Floats | None = None) -> Floats:
+        """Angles on the cap [rad].
+
+        Parameters
+        ----------
+        rho : array_like
+            Distances from the centre of the detector [mm].
+        radii, voltages : ndarray, optional
+            Radius [nm] and voltage [V] of each ion, for a lens.
+        """
+        if self.lens is None:
+            return _cap_angles(np.asarray(rho) / self.distance, self.projection, self.compression)
+        voltages = 1.0 if voltages is None else voltages  # type: ignore[assignment]
+        return self.compression * np.radians(self.lens.cap_angle(rho, radii, voltages, self.distance))  # type: ignore[arg-type]
+
+    def rim_angles(self, hits: Hits, radii: Floats) -> Floats:
+        """Angle on the cap at the rim of the field of view [rad]; with a lens for each ion."""
+        return self.angles(self.field_of_view, radii, self.lens_voltages(hits))
+
+    def places(self, hits: Hits, radii: Floats) -> tuple[Floats, Floats]:
+        """Place of each ion on the cap, x / R and y / R, shape (n, 2), and its angle on the cap [rad], shape (n,)."""
+        x, y = (column.astype(np.float64) for column in hits.require("x", "y"))
+        rho = np.hypot(x, y)
+        angles = self.angles(rho, radii, self.lens_voltages(hits))
+        sine_over_rho = np.divide(np.sin(angles), rho, out=np.zeros_like(rho), where=rho > 0)
+        return np.column_stack([sine_over_rho * x, sine_over_rho * y]), angles
+
+    def positions(self, hits: Hits, radii: Floats, shifts: Floats | None = None) -> Floats:
+        """Positions of ions on caps of known radii.
+
+        Parameters
+        ----------
+        hits : Hits
+            The ions.
+        radii : ndarray
+            Radius of the cap at each ion [nm], shape (n,).
+        shifts : ndarray, optional
+            Correction of x / R and y / R of each ion, shape (n, 2).
+
+        Returns
+        -------
+        ndarray
+            x, y and depth [nm], shape (n, 3).
+        """
+        places, angles = self.places(hits, radii)
+        # depth below the apex in units of R, 1 - cos(theta)
+        below = 2 * np.sin(angles / 2) ** 2
+        if shifts is not None:
+            places = places + shifts
+            squares = np.minimum((places**2).sum(axis=1), 1.0)
+            below = squares / (1 + np.sqrt(1 - squares))
+        swept, widening = self.cross_sections(radii, self.lens_voltages(hits))
+        depths = _apex_depths(radii, self.volume, swept, widening)
+        return np.column_stack([radii[:, None] * places, depths + radii * below])
+
+    def cross_sections(self, radii: Floats | None = None, voltages: Floats | None = None) -> tuple[Floats, Floats]:
+        """Areas in units of R^2 that the cap sweeps by its recession, and loses by its widening; arrays with a lens."""
+        if self.protocol == "bas" and self.lens is None:
+            return math.pi * (self.compression * self.field_of_view / self.distance) ** 2, 0.0  # type: ignore[return-value]
+        rim = self.angles(self.field_of_view, radii, voltages)
+        if self.protocol == "bas":  # xi = theta_m L / r
+            return math.pi * rim**2, 0.0  # type: ignore[return-value]
+        return math.pi * np.sin(rim) ** 2, math.pi * (1 - np.cos(rim)) ** 2
+
+
+def voltages_of(hits: Hits) -> Floats:
+    """Standing voltage plus pulse of each ion [V], shape (n,)."""
+    (voltages,) = hits.require("voltage")
+    voltages = voltages.astype(np.float64)
+    if hits.pulse_voltage is not None:
+        voltages += hits.pulse_voltage
+    wrong = np.flatnonzero(~(np.isfinite(voltages) & (voltages > 0)))
+    if len(wrong):
+        raise ValueError(
+            f"the voltage of every ion must be finite and > 0, got {voltages[wrong[0]]:g} V for ion {wrong[0]}"
+        )
+    return voltages
+
+
+def depths_below_apex(positions: Floats, radii: Floats) -> Floats:
+    """Depth below the apex of ions on the cap [nm], shape (n,)."""
+    squares = (positions[:, :2] ** 2).sum(axis=1)
+    return squares / (radii + np.sqrt(np.maximum(radii * radii - squares, 0.0)))
+
+
+def polar_angles(positions: Floats, radii: Floats) -> Floats:
+    """Polar angle of ions on the cap [degrees], shape (n,)."""
+    return np.degrees(np.arcsin(np.minimum(np.hypot(positions[:, 0], positions[:, 1]) / radii, 1.0)))
+
+
+def _cap_angles(ratios, projection, compression):
+    """Angles on the cap [rad] for distances on the detector divided by the flight length."""
+    if projection == "equidistant":
+        return compression * ratios
+    straight = np.arctan(ratios)
+    if projection == "compressed":
+        return compression * straight
+    sine = (compression - 1) * np.sin(straight)
+    return straight + np.arcsin(np.clip(sine, -1.0, 1.0)) + np.where(np.abs(sine) > 1, _RIGHT_ANGLE, 0.0)
+
+
+def _apex_depths(radii, volume, swept, widening):
+    """Depth of the apex at each ion [nm]: volume = <R^2> (swept dz - widening dR) between two ions."""
+    before, after = radii[:-1], radii[1:]
+    # areas half way between two ions
+    swept, widening = (area if np.ndim(area) == 0 else (area[:-1] + area[1:]) / 2 for area in (swept, widening))
+    squares = (before * before + before * after + after * after) / 3  # exact for dR proportional to dz
+    depths = np.zeros(len(radii))
+    np.cumsum((volume / squares + widening * (after - before)) / swept, out=depths[1:])
+    return depths

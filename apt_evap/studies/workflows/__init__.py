@@ -1,0 +1,1 @@
+"""Workflows: what the commands `run`, `compare` and `twin` do, as functions."""

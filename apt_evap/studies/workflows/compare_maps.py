@@ -1,0 +1,225 @@
+"""Fit of the emission energies of a run to a measured map, with its files in a folder."""
+
+import csv
+import json
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from apt_evap import plot
+from apt_evap._common.files import FileError, check_path, read_small_file, replace_file
+from apt_evap._common.types import AnyPath
+from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.detection.hits import Hits
+from apt_evap.fit.fit_energies import fit_energies
+from apt_evap.fit.fit_settings import FitSettings
+from apt_evap.fit.grid import EnergyGrid
+from apt_evap.fit.study import Study
+from apt_evap.maps.registration.register import Registration
+from apt_evap.simulation.run import Run, load
+from apt_evap.simulation.run_hdf5 import is_run
+from apt_evap.studies.workflows.measured_source import MeasuredSource, source_of
+from apt_evap.studies.workflows.simulate_file import no_note
+from apt_evap.studies.workflows.written_pictures import check_output
+from apt_evap.warnings import RegistrationWarning, StructureWarning
+
+STUDY, TABLE, OVERLAY, REPORT = "study.json", "scores.csv", "registration.png", "report.html"
+IN_LINES = (RegistrationWarning, StructureWarning)
+"""Warnings that are also in the lines of a study."""
+MAX_STUDY = 1 << 28  # bytes: a study contains three numbers for each point of its grid
+
+
+def compare(
+    run: Run | AnyPath,
+    measured: MeasuredSource | Hits | DetectorMap | AnyPath,
+    folder: AnyPath | None = None,
+    grid: EnergyGrid | None = None,
+    settings: FitSettings | None = None,
+    *,
+    registration: Registration | None = None,
+    threads: int | None = None,
+    overwrite: bool = False,
+    progress: bool | None = None,
+    note: Callable[[str], None] = no_note,
+    command: str = "",
+    sections: Sequence[str] = (),
+) -> Study:
+    """Fit the emission energies of a run to a measured map, as ``apt-evap compare`` does.
+
+    Parameters
+    ----------
+    run : Run, str or path-like
+        A run with responses, or its file.
+    measured : Hits, DetectorMap, str or path-like
+        Measured ions, a map, or the file of one of them.
+    folder : str or path-like, optional
+        Folder for study.json, scores.csv, pictures and report.html; by default nothing is written.
+    grid : EnergyGrid, optional
+        Mechanism of emission and energies.
+    settings : FitSettings, optional
+        Bins, smoothing, draws and resamples.
+    registration : Registration, optional
+        Carries simulated hits into the measured frame; by default found by `fit_energies`.
+    threads : int, optional
+        Number of threads; by default the number of processors that this process may use.
+    overwrite : bool
+        Whether to replace files of the folder that were not made by this package.
+    progress : bool, optional
+        Whether to show a progress bar; by default if the output is a terminal or a notebook.
+    note : callable
+        Receives lines of text: the result, and the files.
+    command : str
+        Command line to repeat the study, for the report.
+    sections : sequence of str
+        More parts of the report, as HTML.
+
+    Returns
+    -------
+    Study
+
+    Raises
+    ------
+    FileError
+        If a file cannot be read or written, or was not made by this package.
+    ValueError
+        If the run has no responses, or an argument is outside its range.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> run = ae.Simulation(ae.Tip("Ni", apex_radius=2.5, axis=(1, 1, 1)), seed=1).run(600)
+    >>> measured = run.hits(ae.RollUp(0.2)).map(bins=16, extent=(-60, 60, -60, 60))  # energy to be found
+    >>> grid = ae.fit.EnergyGrid("roll-up", means=(0.1, 0.2, 0.3), relative_spreads=(0.5, 1.0))
+    >>> identity = ae.Registration(rotation=0.0, scale=1.0, shift=(0.0, 0.0))
+    >>> quick = ae.fit.FitSettings(resamples=0)
+    >>> study = ae.compare(run, measured, "ni_study", grid, quick, registration=identity, progress=False)
+    >>> print(f"{study.optimum.mean} eV"); Path("ni_study/report.html").exists()
+    0.2 eV
+    True
+    """
+    from apt_evap.plot.report.origin import recorded_warnings  # with Matplotlib
+
+    with recorded_warnings() as messages:
+        if folder is not None:
+            folder = check_path(folder)
+            _check_folder(folder, overwrite)
+        source = source_of(measured)
+        content = source.read()
+        simulated = run if isinstance(run, Run) else load(run)
+        if simulated.responses is None:
+            name = "run" if isinstance(run, Run) else repr(str(run))
+            raise ValueError(f"{name} has no responses: repeat the run with responses = true in [simulation]")
+        study = fit_energies(
+            simulated,
+            content,
+            grid,
+            settings,
+            registration=registration,
+            n_threads=threads,
+            progress=progress,
+        )
+        if folder is not None:
+            files = [
+                path for path in (None if isinstance(run, Run) else check_path(run), source.path) if path is not None
+            ]
+            _write(
+                study,
+                simulated,
+                folder,
+                title=f"{source.name}: emission energies from {'a run' if isinstance(run, Run) else Path(run).name}",
+                files=files,
+                command=command,
+                # the report tells a doubtful registration by itself
+                warnings=[str(message) for message in messages if not isinstance(message, RegistrationWarning)],
+                sections=sections,
+            )
+    note("\n".join(study.lines()))
+    if folder is not None:
+        check = f"; check {OVERLAY}, --registration sets a known registration" if study.registration.doubtful else ""
+        note(f"wrote {', '.join(FILES)} to {folder}{check}")
+    return study
+
+
+def _check_folder(folder: Path, overwrite: bool) -> None:
+    """Check that the files can be written, and that no files of other programs would be overwritten."""
+    if folder.is_dir():
+        ours = _is_study(folder / STUDY)
+        for name in FILES:
+            check_output(folder / name, lambda path: ours, overwrite)
+    else:
+        check_output(folder, is_run, False)  # a file of this name, of any kind, is not a folder
+        if folder.exists():
+            raise FileError(f"cannot write to {str(folder)!r}: it is not a folder")
+
+
+def _is_study(path):
+    try:
+        return str(json.loads(read_small_file(path, MAX_STUDY, "a study")).get("made_by", "")).startswith("apt_evap")
+    except (ValueError, AttributeError, RecursionError):
+        return False
+
+
+def _write(study: Study, run: Run, folder: Path, **parts: Any) -> None:
+    """Write all files to a temporary folder, and move them when they are complete; `parts` are of the report."""
+    from apt_evap.plot.report.study_report import write_study
+
+    figures = {name: draw(study, run) for name, draw in _FIGURES.items()}
+    try:
+        with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as temporary:
+            written = Path(temporary)
+            study.save(written / STUDY)
+            _write_table(study, written / TABLE)
+            for name, figure in figures.items():
+                figure.savefig(written / name)
+            captions = {_CAPTIONS[name]: figure for name, figure in figures.items() if name in _CAPTIONS}
+            write_study(study, written / REPORT, figures=captions, **parts)
+            folder.mkdir(exist_ok=True)
+            for name in FILES:
+                with replace_file(folder / name) as file, open(written / name, "rb") as source:
+                    shutil.copyfileobj(source, file)
+    except OSError as error:
+        raise FileError(f"cannot write to {str(folder)!r}: {error.strerror or error}") from error
+
+
+def _write_table(study, path):
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file)
+        matrices = [study.scores, study.errors, study.shares]
+        names = [
+            *study.grid.options,
+            "rollup_fraction",
+            "relative_spread",
+            "mean_eV",
+            "score",
+            "error",
+            "share_of_resamples",
+        ]
+        if study.structure is not None:
+            matrices += [study.structure.misfit, study.structure.errors]
+            names += ["ring_misfit", "ring_misfit_error"]
+        table.writerow(names)
+        for cell in study.grid.cells:
+            values = (matrix[cell] for matrix in matrices)
+            energies = study.grid.values_at(np.array(cell))
+            table.writerow([f"{value:.6g}" for value in (*energies, *values)])
+
+
+def _overlay(study, run):
+    return plot.overlay(run.hits(study.optimum.perturbation), study.measured, study.registration).figure
+
+
+_FIGURES = {
+    "scores.png": lambda study, run: plot.score_matrix(study)[0].figure,
+    "maps.png": lambda study, run: plot.side_by_side(study)[0].figure,
+    OVERLAY: _overlay,
+}
+_CAPTIONS = {
+    "maps.png": "Maps as compared: flattened, smoothed, inside the common region.",
+    OVERLAY: "Registration: contours of the simulated map on the measured one, and the simulated map.",
+}
+FILES = (STUDY, TABLE, *_FIGURES, REPORT)
+"""Names of the files that are written."""

@@ -1,0 +1,545 @@
+"""Twin of a measured specimen: its map is indexed, simulated, registered and fitted, with a report."""
+
+import json
+import os
+import shlex
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from apt_evap import plot
+from apt_evap._common.codec import checked, choice, from_plain, number, settings, to_plain, vector
+from apt_evap._common.files import FileError, check_path, sha256_of
+from apt_evap._common.notebook import as_table
+from apt_evap._common.threads import thread_count
+from apt_evap._common.types import AnyPath
+from apt_evap._common.validation import check_kind, check_number, check_sequence, short_text
+from apt_evap.config.lens_text import read_lens
+from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.detection.hits import Hits
+from apt_evap.detection.mass_ranges import Ranges
+from apt_evap.detection.microscope.local_electrode import LocalElectrode
+from apt_evap.detection.projection import Projection
+from apt_evap.emission.perturbations import LateralVelocity, RollUp
+from apt_evap.fit.grid import EnergyGrid
+from apt_evap.fit.measured_constants import Measurement, constants_of
+from apt_evap.fit.start_settings import ENERGY, HEIGHT, ROLLS, SHARPNESS, StartSettings, near, settings_of
+from apt_evap.fit.study import Study
+from apt_evap.io.formats import read_ranges
+from apt_evap.maps.crystallography.orientation import Orientation
+from apt_evap.maps.indexing.index_map import Candidate, Indexing, index
+from apt_evap.maps.indexing.master_pattern import master_patterns
+from apt_evap.maps.registration.register import Registration, at_bound, register
+from apt_evap.simulation.run import Run, load
+from apt_evap.simulation.run_hdf5 import is_run
+from apt_evap.specimen.materials import Material, as_material
+from apt_evap.studies.workflows.compare_maps import IN_LINES, REPORT, compare
+from apt_evap.studies.workflows.kept_files import KeptFiles
+from apt_evap.studies.workflows.measured_source import MeasuredSource, source_of
+from apt_evap.studies.workflows.simulate_file import no_note, simulate
+from apt_evap.warnings import MapWarning, RegistrationWarning, WorkflowWarning, warn
+
+SETTINGS, FACTS, RUN, REGISTRATION, STUDY, ANSWER = (
+    "specimen.toml", "start.json", "run.h5", "registration.json", "study", "answer.txt",
+)  # fmt: skip
+_REPORT = f"{STUDY}/{REPORT}"
+_FRACTIONS = (0.2, 0.4, 0.6, 0.8, 1.0)  # that roll up, in the fit
+_BINS = 128  # of a map of ions
+
+
+def _text(value, name):
+    if not isinstance(value, str):
+        raise ValueError(f"{name} must be text, got {short_text(value)}")
+    return value
+
+
+def _candidates(value, name):
+    if not value:
+        raise ValueError(f"{name} must have at least one candidate, got none")
+    return tuple(value)
+
+
+def _read_candidates(plain, name):
+    return [
+        from_plain(candidate, _Candidate, what="a candidate") for candidate in check_sequence(plain, name, "tables")
+    ]
+
+
+@settings
+class _Candidate:
+    """A candidate, as it is in start.json."""
+
+    axis: tuple = vector("Crystal direction along the axis of the specimen", 3)
+    rotation: float = number("Rotation about the axis", unit="degrees")
+    scale: float = number("Scale of the map", above=0, unit="mm/rad")
+    centre: tuple = vector("Place of the axis", 2, unit="mm")
+    score: float = number("Explained fraction of the structure", at_least=0, at_most=1)
+    confidence: float = number("Confidence", at_least=0, at_most=1)
+    rolled: float = number("Part of the pattern of ions that roll up", at_least=0, at_most=1)
+    contrast: float = number("Sum of the amplitudes", at_least=0)
+    angle_error: float = number("Standard error of the orientation", at_least=0, unit="degrees")
+    pattern_radius: float = number("Radius of the tip of the pattern", above=0, unit="nm")
+    compression: float | None = number("Image compression", default=None, above=0)
+
+
+@settings
+class _Facts:
+    """Result of the first step, as it is in start.json."""
+
+    verdict: str = choice("Verdict of the indexing", ("indexed", "undecided"))
+    reason: str = checked("Reason of the verdict", "str", _text)
+    simulated_radius: float = number("Radius of the simulated tip", above=0, unit="nm")
+    candidates: tuple = checked("Candidates", "tuple", _candidates, read=_read_candidates)
+    radii: Any = checked("Radii of the specimen, which are in the settings, too", "list", lambda radii, _: radii)
+
+    @property
+    def best(self) -> _Candidate:
+        """The first candidate."""
+        return self.candidates[0]
+
+
+@dataclass(frozen=True)
+class _Options:
+    """What a twin is made with, beside the measurement."""
+
+    element: str | Material
+    minutes: float
+    lens: str | LocalElectrode | None
+    field_factor: float | None
+    distance: float | None
+    efficiency: float
+    scales: tuple[float, ...] | None
+    poles: tuple[Any, ...]
+    lines: tuple[Any, ...]
+    ranges: AnyPath | None
+
+    def __post_init__(self) -> None:
+        check_number(self.minutes, "minutes", above=0, unit="min")
+        check_number(self.efficiency, "efficiency", above=0, at_most=1)
+
+    @property
+    def electrode(self) -> LocalElectrode | None:
+        """The lens."""
+        return read_lens(self.lens) if isinstance(self.lens, str) else self.lens
+
+    @property
+    def read_ranges(self) -> Ranges | None:
+        """Ranges of mass."""
+        return None if self.ranges is None else read_ranges(self.ranges)
+
+    def to_plain(self) -> dict[str, Any]:
+        """Plain values of what changes a result, by the names of the options of the command."""
+        values = {name: getattr(self, name) for name in ("element", "minutes", "field_factor", "distance")}
+        values |= {"efficiency": self.efficiency, "scales": self.scales, "lens": self.electrode}
+        values |= {"pole": self.poles or None, "line": self.lines or None}
+        return {name: to_plain(value) for name, value in values.items()}
+
+
+class Twin:
+    """Twin of a measured specimen; made by `twin`.
+
+    What an earlier call has left in the folder is read. The indexing, the study and the measurement are not in it as
+    objects: they are computed again when they are first asked for, with the same result.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the files.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        source: MeasuredSource,
+        options: _Options,
+        *,
+        threads: int | None,
+        progress: Any,
+        note: Callable[[str], None],
+        command: str,
+    ) -> None:
+        self.folder = folder
+        self._source, self._options, self._threads = source, options, threads
+        self._progress, self._note, self._command = progress, note, command
+        ranges = None if options.ranges is None else sha256_of(options.ranges)
+        files = {"FILE": None, "file of --undistort": None, **source.files, "file of --ranges": ranges}
+        made_from = {**source.options, **options.to_plain()}
+        self._kept = KeptFiles(folder, files, made_from, (SETTINGS, FACTS, RUN, REGISTRATION, STUDY, ANSWER))
+
+    # ---- results -----------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def measured(self) -> Hits | DetectorMap:
+        """The measured ions, or the measured map."""
+        return check_kind(self._source.read(), "measured", (Hits, DetectorMap), "Hits or a DetectorMap")
+
+    @cached_property
+    def measured_map(self) -> DetectorMap:
+        """The measured map."""
+        return self.measured.map(bins=_BINS) if isinstance(self.measured, Hits) else self.measured
+
+    @cached_property
+    def indexing(self) -> Indexing:
+        """Which crystal direction is where on the measured map."""
+        options = self._options
+        return index(
+            self.measured_map,
+            options.element,
+            scales=options.scales,
+            distance=None if options.scales else options.distance,
+            poles=options.poles,
+            lines=options.lines,
+        )
+
+    @cached_property
+    def run(self) -> Run:
+        """The run of the simulated specimen."""
+        return load(self.folder / RUN)
+
+    @cached_property
+    def registration(self) -> Registration:
+        """Carries simulated hits into the measured frame."""
+        return self._read(REGISTRATION, Registration, "a registration")
+
+    @cached_property
+    def candidate(self) -> Candidate:
+        """The first candidate of the indexing, as it is simulated."""
+        best = self._facts.best
+        crystal = as_material(self._options.element)
+        patterns = master_patterns(crystal.structure)
+        try:
+            return Candidate(
+                orientation=Orientation(crystal, best.axis, best.rotation),
+                projection=Projection(best.scale, best.centre, compression=best.compression),
+                pattern=min(patterns, key=lambda pattern: abs(pattern.apex_radius - best.pattern_radius)),
+                **{name: getattr(best, name) for name in ("score", "confidence", "rolled", "contrast", "angle_error")},
+            )
+        except ValueError as error:
+            raise FileError(f"{str(self.folder / FACTS)!r} is not a result of apt-evap twin: {error}") from None
+
+    @cached_property
+    def measurement(self) -> Measurement:
+        """Constants of the measurement with errors, and checks."""
+        options = self._options
+        return constants_of(
+            self.measured_map,
+            self.candidate,
+            self.measured if isinstance(self.measured, Hits) else None,
+            lens=options.electrode,
+            field_factor=options.field_factor,
+            distance=options.distance,
+            efficiency=options.efficiency,
+            ranges=options.read_ranges,
+        )
+
+    @cached_property
+    def study(self) -> Study:
+        """The fit of the emission energies."""
+        return self._compared(self.run, self.measured, None)
+
+    @property
+    def answer(self) -> list[str]:
+        """Lines of the result: constants of the measurement, and what they depend on."""
+        return self._kept.read(ANSWER).decode(errors="replace").splitlines()
+
+    def report(self) -> Path:
+        """File of the report, HTML, Path."""
+        return self.folder / _REPORT
+
+    def __repr__(self) -> str:
+        return f"<Twin in {str(self.folder)!r}: {self._facts.verdict}, {self.candidate}>"
+
+    _repr_html_ = as_table
+
+    def notebook_contents(self) -> dict[str, Any]:
+        """Table that a notebook shows, dict."""
+        return {"result": self.answer, "report": str(self.report())}
+
+    # ---- steps -------------------------------------------------------------------------------------------------------
+
+    def make(self) -> None:
+        """Do the steps that are not done yet."""
+        kept, path = self._kept, self.folder / RUN
+        self._make_start()
+        _ = self.candidate
+        if os.path.lexists(path) and not is_run(path):
+            raise FileError(f"{str(path)!r} is not a run: remove it, or give another folder with -o (folder=...)")
+        simulated = simulate(
+            self.folder / SETTINGS,
+            path,
+            threads=self._threads,
+            resume=True,
+            progress=self._progress,
+            note=self._note,
+        )
+        if simulated.interrupted:
+            raise KeyboardInterrupt
+        told: list[str] = []
+        if not (kept.has(REGISTRATION) and kept.has(ANSWER) and kept.has(_REPORT)):
+            if not kept.has(REGISTRATION):
+                self._make_registration()
+            kept.forget(ANSWER, _REPORT)
+            self.study = self._compared(path, self._as_read(), self.folder / STUDY)
+            told = self.study.lines()  # by `compare`
+            kept.write({ANSWER: self._made_answer()}, [_REPORT])
+        self._note("\n".join(line for line in self.answer if line not in told))
+        self._note(f"wrote {self.report()}")
+
+    def _make_start(self):
+        """Write the settings of the simulation, and the indexing."""
+        kept = self._kept
+        if kept.has(SETTINGS) and kept.has(FACTS):
+            return
+        start = self._start()
+        self._note(str(start.indexing))
+        if not start.indexing.decided:
+            text = "the map does not decide: the first candidate is simulated; --pole, --line and --scales help"
+            warn(text, MapWarning)
+        kept.forget(SETTINGS, FACTS, REGISTRATION, ANSWER, _REPORT)
+        facts = (json.dumps(start.to_dict(), indent=1) + "\n").encode()
+        kept.write({SETTINGS: start.text.encode(), FACTS: facts})
+
+    def _start(self) -> StartSettings:
+        options = self._options
+        return settings_of(
+            self.indexing,
+            self.measured if isinstance(self.measured, Hits) else None,
+            lens=options.electrode,
+            field_factor=options.field_factor,
+            minutes=options.minutes,
+            threads=thread_count(self._threads),
+        )
+
+    def _make_registration(self):
+        self._kept.forget(ANSWER, _REPORT)
+        best = self._facts.best
+        emission: RollUp | LateralVelocity = LateralVelocity(ENERGY, HEIGHT)
+        if self._rolls:
+            emission = RollUp(ENERGY, best.rolled, SHARPNESS, HEIGHT)
+        registration = _registered(self.run.hits(emission), self.measured_map, near(best.centre, best.scale))
+        self._kept.write({REGISTRATION: (json.dumps(to_plain(registration), indent=1) + "\n").encode()})
+
+    def _compared(self, run, measured, folder):
+        """The study, with its files if there is a folder."""
+        from apt_evap.plot.report.origin import recorded_warnings  # with Matplotlib
+
+        options = {"probability": _FRACTIONS, "sharpness": (SHARPNESS,), "height": (HEIGHT,)}
+        grid = EnergyGrid("roll-up", options=options) if self._rolls else EnergyGrid("lateral", options=_HEIGHT)
+        written = folder is not None
+        with recorded_warnings(IN_LINES):
+            return compare(
+                run,
+                measured,
+                folder,
+                grid,
+                registration=self.registration,
+                threads=self._threads,
+                progress=False if self._progress is False else None,
+                note=self._note if written else no_note,
+                command=self._command,
+                sections=[self._section()] if written else (),
+            )
+
+    @cached_property
+    def _facts(self) -> _Facts:
+        return self._read(FACTS, _Facts, "the result of the first step")
+
+    def _read(self, name, kind, what):
+        try:
+            return from_plain(json.loads(self._kept.read(name)), kind, what=what)
+        except (ValueError, RecursionError) as error:
+            path = self.folder / name
+            raise FileError(f"{str(path)!r} is not a result of apt-evap twin: {error}") from None
+
+    @property
+    def _rolls(self):
+        """Whether the measured ions roll up."""
+        return self._facts.best.rolled >= ROLLS
+
+    def _as_read(self):
+        """The measurement, with its file for the report, without reading it again."""
+        return MeasuredSource(lambda: self.measured, self._source.path)
+
+    # ---- texts -------------------------------------------------------------------------------------------------------
+
+    def _section(self):
+        """Part of the report: the constants, and the measured map with the poles and zone lines of the candidate."""
+        from apt_evap.plot.report.html_page import Page
+        from apt_evap.plot.report.measurement_report import measurement_section
+
+        measured_map, candidate = self.measured_map, self.candidate
+        shown = measured_map.smoothed(max(measured_map.bin_size)) if measured_map.is_counts else measured_map
+        ax = plot.detector_map(shown, title=f"{candidate}")
+        plot.poles(ax, candidate.orientation, candidate.projection, region=shown, families=8)
+        caption = "Measured map with the poles and zone lines that it was simulated with"
+        picture = Page("").picture(ax.figure, f"{caption} ({self._facts.verdict}).")
+        return measurement_section(
+            self.measurement.constants, self.measurement.checks, self._reconstruct_command(), picture
+        )
+
+    def _reconstruct_command(self):
+        """Command that reconstructs with the constants, "" if there is no file, no ions or no flight length."""
+        known, path, lens = self.measurement.arguments, self._source.path, self._options.lens
+        if "distance" not in known or path is None:
+            return ""
+        name = self._options.element
+        words = ["apt-evap", "reconstruct", path_word(path), "--element", name if isinstance(name, str) else name.name]
+        for name in ("distance", "detector_radius", "efficiency", "compression", "field_factor", "projection"):
+            if name in known:
+                value = known[name] if isinstance(known[name], str) else f"{known[name]:.4g}"
+                words += [f"--{name.replace('_', '-')}", value]
+        words += [] if lens is None else ["--lens", lens if isinstance(lens, str) else _lens_text(lens)]
+        return shlex.join([*words, *self._source.words])
+
+    def _made_answer(self):
+        """Constants of the measurement, and what they depend on, as the content of a file."""
+        facts, best = self._facts, self._facts.best
+        lines = [
+            f"indexing: {facts.verdict}, {facts.reason}",
+            f"axis [{' '.join(f'{component:.3f}' for component in best.axis)}] at the centre of the map, rotation "
+            f"{best.rotation:.1f}, errors {best.angle_error:.1f} degrees by noise",
+            *str(self.measurement).splitlines(),
+        ]
+        if not self.measurement.arguments:
+            lines.append("radius: not known, the file has no voltages")
+        lines.append(f"simulated with R = {facts.simulated_radius:.1f} nm")
+        lines += self.study.lines()
+        lines.append("the energies depend on the radius and the voltage, and on the rule of the roll-up")
+        if command := self._reconstruct_command():
+            lines.append(f"reconstruct with: {command}")
+        return ("\n".join(lines) + "\n").encode(errors="backslashreplace")
+
+
+_HEIGHT: Mapping[str, Sequence[float]] = {"height": (HEIGHT,)}
+
+
+def _registered(hits, measured_map, bounds):
+    """Registration of a run; its scale is that of the indexing if the maps do not determine one within the bounds."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", RegistrationWarning)
+        registration = register(hits, measured_map, **bounds)
+    low, high = bounds["scales"]
+    if at_bound(registration.scale, (low, high)):
+        # poles of a smaller tip are wider, and a smaller scale makes them narrower again
+        text = f"the maps do not determine the scale of the registration within {low:g} to {high:g}: "
+        warn(f"{text}that of the indexing is kept", WorkflowWarning)
+        return register(hits, measured_map, **(bounds | {"scales": 1.0}))
+    for warning in caught:
+        warn(str(warning.message), RegistrationWarning)
+    return registration
+
+
+def path_word(path: str | Path) -> str:
+    """Word of a command line, a path with ./ before a dash, which would make an option of it."""
+    return f".{os.sep}{path}" if isinstance(path, Path) and str(path).startswith("-") else str(path)
+
+
+def _lens_text(lens):
+    """Text of a lens for the option of a command."""
+    changes = {name: value for name, value in to_plain(lens).items() if name != "name" and value is not None}
+    return f"local-electrode:{','.join(f'{name}={value!r}' for name, value in changes.items())}"
+
+
+def twin(
+    measured: MeasuredSource | Hits | DetectorMap | AnyPath,
+    element: str | Material,
+    *,
+    minutes: float = 10.0,
+    folder: AnyPath | None = None,
+    lens: str | LocalElectrode | None = None,
+    field_factor: float | None = None,
+    distance: float | None = None,
+    efficiency: float = 0.5,
+    scales: Sequence[float] | None = None,
+    poles: Sequence[Any] = (),
+    lines: Sequence[Any] = (),
+    ranges: AnyPath | None = None,
+    threads: int | None = None,
+    progress: Any = None,
+    note: Callable[[str], None] = no_note,
+    command: str = "",
+) -> Twin:
+    r"""Make a twin of a measured specimen, as ``apt-evap twin`` does.
+
+    The map is indexed, its specimen is simulated, the simulated map is registered on the measured one, the emission is
+    fitted, and a report is written. The same call continues after an interruption. A folder belongs to one measurement
+    and one set of arguments: others are refused.
+
+    Parameters
+    ----------
+    measured : str, path-like, Hits or DetectorMap
+        The file of measured ions or of a map, or ions, such as a selection of those of a file, or a map.
+    element : str or Material
+        The crystal.
+    minutes : float
+        Time that the simulation may take [min]; its tip is smaller than the measured one if necessary.
+    folder : str or path-like, optional
+        Folder for all files; by default the name of the file with _twin, in this folder.
+    lens : str or LocalElectrode, optional
+        Lens of the instrument, for the radius; a text as for `config.read_lens`.
+    field_factor : float, optional
+        Field factor without a lens; 3.3 by default.
+    distance : float, optional
+        Flight length of the instrument [mm].
+    efficiency : float
+        Fraction of the evaporated atoms that are among the ions, for the angle of the shank.
+    scales : sequence of two float, optional
+        Bounds of the scale of the map [mm/rad], if it is known.
+    poles, lines : sequence, optional
+        Poles and zone lines that you see, as for `index`.
+    ranges : str or path-like, optional
+        File of ranges of mass, for the charge states of the element.
+    threads : int, optional
+        Number of threads; by default the number of processors that this process may use.
+    progress : bool or callable, optional
+        Progress of the simulation, as for `simulate`.
+    note : callable
+        Receives lines of text on what is done.
+    command : str
+        Command line to repeat it, for the report.
+
+    Returns
+    -------
+    Twin
+        With ``indexing``, ``run``, ``registration``, ``study``, ``measurement``, and ``report()``, the path of the
+        report.
+
+    Raises
+    ------
+    FileError
+        If a file cannot be read or written, or the folder has files of another measurement or of other arguments.
+    ValueError
+        If an argument is outside its range.
+    KeyboardInterrupt
+        If it is interrupted; what is done so far is kept.
+
+    Examples
+    --------
+    The simulation takes minutes, so that this example is not run:
+
+    >>> made = ae.twin("R5083.epos", "Ni", distance=90.0, minutes=10)  # doctest: +SKIP
+    >>> print("\n".join(made.answer))  # doctest: +SKIP
+    >>> made.report()  # doctest: +SKIP
+    PosixPath('R5083_twin/study/report.html')
+    """
+    source = source_of(measured)
+    options = _Options(
+        element=element,
+        minutes=minutes,
+        lens=lens,
+        field_factor=field_factor,
+        distance=distance,
+        efficiency=efficiency,
+        scales=None if scales is None else tuple(scales),
+        poles=tuple(poles),
+        lines=tuple(lines),
+        ranges=ranges,
+    )
+    if folder is None:
+        folder = f"{Path(source.name).stem}_twin"
+    made = Twin(check_path(folder), source, options, threads=threads, progress=progress, note=note, command=command)
+    made.make()
+    return made
