@@ -84,11 +84,11 @@ def test_a_run_is_compared_with_its_sites(tmp_path, monkeypatch, small_tip, nick
         ("--distance 90 --element Ni --real-units", "--real-units needs a run (.h5)"),
         ("--distance 90 --element Ni -o ni.png", "format of 'ni.png' must be one of"),
         ("--distance 90 --element Ni --protocol geiser", "invalid choice: 'geiser'"),
-        ("--distance -1 --element Ni", "--distance: must be a finite number [mm] > 0, got -1.0"),
-        ("--distance far --element Ni", "--distance: must be a finite number [mm] > 0, got 'far'"),
-        ("--distance 90 --element Ni --efficiency 57", "--efficiency: must be a finite number > 0 and <= 1, got 57.0"),
+        ("--distance -1 --element Ni", "distance must be a finite number [mm] > 0, got -1.0"),
+        ("--distance far --element Ni", "--distance: invalid float value: 'far'"),
+        ("--distance 90 --element Ni --efficiency 57", "efficiency must be a finite number > 0 and <= 1, got 57.0"),
         ("--distance 90 --element Ni --smoothing 1.5", "--smoothing: must be an integer >= 1, got '1.5'"),
-        ("--distance 90 --element Ni --shank-angle 45", "--shank-angle: must be a finite number [degrees] >= 0"),
+        ("--distance 90 --element Ni --shank-angle 45", "shank_angle must be a finite number [degrees] >= 0"),
     ],
 )
 def test_wrong_options_are_one_sentence(measured, capsys, tmp_path, options, sentence):
