@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from textwrap import fill, indent
 from typing import Any, TypeVar
 
@@ -76,6 +76,8 @@ class Batch:
         The cap before the first event, if the surface was relaxed after the previous batch.
     voltages : ndarray or None
         Voltage of the control at each event [V], shape (n,). As `waits`, None for a law without a temperature.
+    columns : dict
+        All columns of the events by name, also those without a field here.
     """
 
     site: np.ndarray
@@ -91,6 +93,7 @@ class Batch:
     cap: Cap | None = None
     waits: np.ndarray | None = None
     voltages: np.ndarray | None = None
+    columns: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.site)
@@ -546,15 +549,17 @@ class Emitter:
         self._recorded = n if tree is not None else self._recorded + n
         columns = events.columns()
         self._sites.append(columns["site"].copy())
-        waits, rises = columns.pop("waits"), columns.pop("rises")
+        fields = {name: values for name, values in columns.items() if name in Batch.__annotations__}
+        if control is None:
+            fields["waits"] = None
         return Batch(
-            **columns,
+            **fields,
             journal=events.journal,
             tree=tree,
             status=status,
             cap=cap,
-            waits=None if control is None else waits,
-            voltages=None if control is None else self.voltage * control.voltage_factors(rises),
+            voltages=None if control is None else self.voltage * control.voltage_factors(columns["rises"]),
+            columns=columns,
         )
 
     def advance(

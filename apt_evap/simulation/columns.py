@@ -1,7 +1,8 @@
 """The columns of a run: every array with one row per ion, its type, and its unit.
 
 A column has a path, such as "site", "emissions/positions" or "flown/0/times"; a group is a part of the run. Selection
-of ions, joining of batches, the fingerprint and the file follow from this list.
+of ions, joining of batches, the fingerprint and the file follow from this list. A column of the events with the path
+"events/NAME" needs no more than its line here: it is ``run.events["NAME"]``.
 """
 
 import hashlib
@@ -138,10 +139,19 @@ def columns_of(run: Any, every: Iterable[Column]) -> dict[str, np.ndarray]:
             holder = run.flown[int(group.removeprefix("flown/"))]
         else:
             holder = getattr(run, group) if group else run
-        values = None if holder is None else getattr(holder, name)
+        if isinstance(holder, Mapping):
+            values = holder.get(name)
+        else:
+            values = None if holder is None else getattr(holder, name)
         if values is not None:
             arrays[column.path] = values
     return arrays
+
+
+def events_of(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Those columns of the events, by name, that a run keeps under "events"."""
+    names = [column.path.removeprefix("events/") for column in ALWAYS if column.path.startswith("events/")]
+    return {name: columns[name] for name in names}
 
 
 def every_column_of(run: Any) -> list[Column]:
@@ -175,6 +185,7 @@ def parts_of(arrays: Mapping[str, Any], nearest_neighbour_distance: float) -> di
         groups.setdefault(group, {})[name] = values
     return groups[""] | {
         "emissions": Emissions(**groups["emissions"], nearest_neighbour_distance=nearest_neighbour_distance),
+        "events": groups.get("events", {}),
         "flown": tuple(Flown(**each) for group, each in groups.items() if group.startswith("flown/")),
         "responses": Responses(**groups["responses"]) if "responses" in groups else None,
         "clock": Clock(**groups["clock"]) if "clock" in groups else None,

@@ -87,6 +87,8 @@ class Run:
         The cap of the surface after each relaxation, at the simulated voltage.
     clock : Clock or None
         Time and voltage of each event, for a law with a temperature.
+    events : dict
+        Columns of the events that have no field here, by name, see ``simulation/columns.py``.
     units : RealUnits or None
         Operating point of a run in real units, see `at_evaporation_field`.
     real : RealColumns or None
@@ -125,6 +127,7 @@ class Run:
     phase: Any = None
     cap: CapHistory = field(default_factory=CapHistory.empty)
     clock: Clock | None = None
+    events: dict[str, np.ndarray] = field(default_factory=dict)
     units: RealUnits | None = None
     real: RealColumns | None = None
 

@@ -28,7 +28,7 @@ from apt_evap.evaporation.law import Extremal, Law
 from apt_evap.evaporation.rule import CompiledRule, Rule
 from apt_evap.evaporation.voltage import VoltageControl, check_voltage
 from apt_evap.simulation.checkpoint import Checkpoint, CheckpointWriter
-from apt_evap.simulation.columns import Clock, Flown
+from apt_evap.simulation.columns import Clock, Flown, events_of
 from apt_evap.simulation.flight.field_of_view import scouts_of
 from apt_evap.simulation.flight.flight_pool import WHOLE_DETECTOR, FlightPool, FlightSettings, check_reach
 from apt_evap.simulation.flight.landing import land
@@ -333,6 +333,7 @@ class Simulation:
                 phase=self.tip.phase_at(batch.site),
                 cap=CapHistory.of(first_ion, batch.cap),
                 clock=None if batch.waits is None else Clock(batch.waits, batch.voltages),
+                events=events_of(batch.columns),
             )
 
         return finish
