@@ -30,4 +30,4 @@ def test_a_column_of_the_events_is_stored_by_one_line(run_with_rises, tmp_path):
 
 
 def test_other_columns_of_the_events_are_not_kept(small_tip):
-    assert ae.Simulation(small_tip, seed=1).run(20, progress=False).events == {}
+    assert "rises" not in ae.Simulation(small_tip, seed=1).run(20, progress=False).events
