@@ -233,9 +233,13 @@ def _point(content):
     key = key_of(document)
     if content["key"] != key:
         raise ValueError(f"the key of a point must be {key!r}, as of its settings, got {short_text(content['key'])}")
+    values = {}
     for path in content["paths"]:
         check_setting_path(path)
-    return Point(key, {path: value_at(document, path) for path in content["paths"]}, document)
+        values[path] = value_at(document, path)
+        if values[path] is None:
+            raise ValueError(f"the paths of point {key} must be settings of it, got {short_text(path)}")
+    return Point(key, values, document)
 
 
 def _table(sweep):
