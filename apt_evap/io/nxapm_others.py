@@ -58,7 +58,7 @@ _COLUMNS: dict[str, tuple[str, int, dict[str, float], str]] = {
     "pulse_number": (f"{_PULSER}/pulse_number", 1, {}, ""),
 }
 _ABSENT = ("positions", "mass_to_charge", "time_of_flight", "voltage", "hits")  # zero for all ions: not recorded
-_LARGEST = 1000  # entries that are looked for
+_LARGEST = 10  # entries that are looked for: entry, entry0 to entry9
 
 
 def _entry(file: CheckedFile) -> str | None:
