@@ -4,7 +4,7 @@ import argparse
 from typing import Any
 
 from apt_evap._common.codec import to_python
-from apt_evap.cli._files import in_real_units, ions_of_map, lens_of, read, read_registration
+from apt_evap.cli._files import in_real_units, ions_of_map, lens_of, read, read_registration, with_masses
 from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.explore.controls import values_of
@@ -110,7 +110,7 @@ def _measured(options):
         raise ValueError(f"MEASURED must be measured ions or a map, {options.file!r} is a run")
     if isinstance(content, DetectorMap):
         return content
-    return ions_of_map(content, options)
+    return ions_of_map(with_masses(content, options), options)
 
 
 # ---- the same in text ----------------------------------------------------------------------------------------------
@@ -150,6 +150,10 @@ def _measured_arguments(options):
     for name in _SELECTION:
         if (value := getattr(options, name)) is not None:
             arguments += [f"--{name}={','.join('' if bound is None else repr(bound) for bound in value)}"]
+    if options.distance is not None:
+        arguments += [f"--distance={options.distance!r}"]
+    if options.time_zero:
+        arguments += [f"--t0={options.time_zero!r}"]
     if options.circle is not None:
         radius, centre = options.circle
         arguments += [f"--circle={','.join(map(repr, (radius, *centre)))}"]
