@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
 from apt_evap._common.types import Floats
 from apt_evap.detection.hits import Hits
@@ -121,6 +120,8 @@ class FlightFit:
 
     def sharpened(self, hits: Hits) -> "FlightFit":
         """The fit with the time zero whose spectrum is sharpest, if the voltages vary enough to see it."""
+        from scipy.ndimage import uniform_filter1d
+
         voltage = total_voltage(hits)
         if not len(hits) or np.std(voltage) < _VARIED * np.mean(voltage):
             return self

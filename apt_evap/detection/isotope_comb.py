@@ -2,14 +2,12 @@
 
 import math
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from copy import copy
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d, uniform_filter1d
-from scipy.special import ndtr
 
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_kind, did_you_mean, short_text
@@ -90,7 +88,7 @@ def isotopes_of(formula: str) -> tuple[Floats, Floats]:
             hint = did_you_mean(element, ISOTOPES)
             raise ValueError(f"elements must be of {', '.join(ISOTOPES)}, got {short_text(element)}{hint}")
         for _ in range(number):
-            joined: Counter[float] = Counter()
+            joined: dict[float, float] = defaultdict(float)
             for mass, abundance in pattern.items():
                 for isotope, share in ISOTOPES[element]:
                     joined[round(mass + isotope, 3)] += abundance * share
@@ -147,6 +145,8 @@ class LogSpectrum:
 
     def peaks_without(self, named: Sequence[tuple[float, float]]) -> tuple[tuple[float, int], ...]:
         """Place [Da] and number of ions of each peak outside some intervals [Da], the largest first."""
+        from scipy.ndimage import uniform_filter1d
+
         ions, below = (uniform_filter1d(values, _PEAK) * _PEAK for values in (self.counts, self.background))
         above = ions > below + _SIGNIFICANT * np.sqrt(below + _SIGNIFICANT) + _FEWEST
         for low, high in named:
@@ -177,6 +177,8 @@ class LogSpectrum:
         Comb or None
             None without ions above the background.
         """
+        from scipy.ndimage import gaussian_filter1d
+
         masses, abundances = isotopes_of(formula)
         places = np.log(masses / charge) / STEP - self._first  # in bins
         margin = math.ceil(_MARGIN / STEP)
@@ -211,6 +213,8 @@ class LogSpectrum:
 
     def _intervals(self, places, abundances, width, number):
         """Bounds of the peaks of a number of ions at some places [bins], joined where they touch."""
+        from scipy.ndimage import uniform_filter1d
+
         smooth = uniform_filter1d(self.counts, 3)
         bounds: list[list[int]] = []
         common = abundances > _ENOUGH * abundances.max()
@@ -247,6 +251,8 @@ class LogSpectrum:
 
 def _shapes(places, abundances, size) -> Iterator[tuple[Floats, float]]:
     """Combs with peaks of several widths and tails, each with the sum 1, and their widths."""
+    from scipy.special import ndtr
+
     edges = np.arange(size + 1)
     for width in _WIDTHS:
         cumulative = ndtr((edges - places[:, None]) * STEP / width)
@@ -264,14 +270,16 @@ def _shapes(places, abundances, size) -> Iterator[tuple[Floats, float]]:
 
 def _background_of(counts):
     """Smooth number of ions below the peaks."""
+    from scipy.ndimage import uniform_filter1d
+
     half = round(_BACKGROUND / STEP)
     inside = np.ones(len(counts))
     # several bins together show peaks of few ions
-    sums = uniform_filter1d(counts, _PEAK, mode="nearest") * _PEAK
-    background = uniform_filter1d(counts, 2 * half + 1, mode="nearest")
+    sums = uniform_filter1d(counts, _PEAK) * _PEAK
+    background = uniform_filter1d(counts, 2 * half + 1)
     for _ in range(_ROUNDS):
         expected = _PEAK * background
         inside = (sums <= expected + _ABOVE * np.sqrt(expected + 1)).astype(float)
-        weights, total = (uniform_filter1d(v, 2 * half + 1, mode="nearest") for v in (inside, inside * counts))
+        weights, total = (uniform_filter1d(v, 2 * half + 1) for v in (inside, inside * counts))
         background = np.where(weights > 0.02, total / np.maximum(weights, 0.02), background)
     return background
