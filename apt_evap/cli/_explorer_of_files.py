@@ -60,7 +60,7 @@ def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer | None, Exp
     if run is not None:
         run.require_responses(repr(options.run))
         run = in_real_units(run, options)
-    measured = None if options.file is None else _measured(options)
+    measured, computed = (None, False) if options.file is None else _measured(options)
     registration = None
     if options.registration is not None:
         if measured is None or run is None:
@@ -76,7 +76,7 @@ def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer | None, Exp
         measured,
         registration,
         run_code="None" if run is None else _run_code(options),
-        measured_code="None" if options.file is None else _measured_code(options),
+        measured_code="None" if options.file is None else _measured_code(options, computed),
         run_arguments=[] if run is None else _run_arguments(options),
         measured_arguments=[] if options.file is None else _measured_arguments(options),
     )
@@ -105,12 +105,14 @@ def _ions(options, explorer):
 
 
 def _measured(options):
+    """Measured ions or the map, and whether masses of the ions are computed."""
     content = read(options)
     if isinstance(content, Run):
         raise ValueError(f"MEASURED must be measured ions or a map, {options.file!r} is a run")
     if isinstance(content, DetectorMap):
-        return content
-    return ions_of_map(with_masses(content, options), options)
+        return content, False
+    hits = with_masses(content, options)
+    return ions_of_map(hits, options), hits is not content
 
 
 # ---- the same in text ----------------------------------------------------------------------------------------------
@@ -162,8 +164,8 @@ def _measured_arguments(options):
     return arguments
 
 
-def _measured_code(options):
-    """Python expression that reads MEASURED."""
+def _measured_code(options, computed):
+    """Python expression that reads MEASURED; whether its masses are computed from times of flight."""
     if options.file.lower().endswith(".npz") or (options.format or "").lstrip(".").lower() == "npz":
         names = zip(("values", "x_edges", "y_edges", "mask"), (options.arrays or "").split(","), strict=False)
         parameters = {name: value for name, value in names if value} | ({"unit": options.unit} if options.unit else {})
@@ -172,6 +174,8 @@ def _measured_code(options):
         name: value for name in ("format", "partial", "byte_order", "voltage_unit") if (value := getattr(options, name))
     } | ({"detector_unit": options.unit} if options.unit else {})
     code = f"ae.read({_call(options.file, parameters)})"
+    if computed:
+        code += f".with_masses({options.distance!r}, {options.time_zero!r})"
     for name, column in _SELECTION.items():
         if (bounds := getattr(options, name)) is not None:
             code += f".window({column}={bounds!r})"

@@ -16,7 +16,6 @@ from apt_evap._common.validation import did_you_mean
 from apt_evap.cli._output import say
 from apt_evap.config.lens_text import read_lens
 from apt_evap.detection.detector_map import DetectorMap
-from apt_evap.detection.flight_fit import FlightFit
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.mass_spectrum import spectrum
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
@@ -138,7 +137,7 @@ def with_masses(hits: Hits, options: argparse.Namespace) -> Hits:
     columns = (hits.time_of_flight, hits.voltage, hits.x, hits.y)
     if hits.mass_to_charge is not None or options.distance is None or any(column is None for column in columns):
         return hits
-    return replace(hits, mass_to_charge=FlightFit(options.distance, options.time_zero).masses(hits))
+    return hits.with_masses(options.distance, options.time_zero)
 
 
 def of_element(hits: Hits, options: argparse.Namespace, computed: bool) -> Hits:
@@ -248,6 +247,7 @@ def measured_source(options: argparse.Namespace) -> MeasuredSource:
     for name in ("ions", "mass", "voltage"):
         if (bounds := getattr(options, name)) is not None:
             words += [f"--{name}", ",".join("" if bound is None else f"{bound:.10g}" for bound in bounds)]
+    words += [f"--t0={options.time_zero!r}"] if options.time_zero else []
     words += ["--ranges", path_word(Path(options.ranges))] if options.ranges is not None else []
     words += [f"--species={options.species}"] if options.species is not None else []
     return MeasuredSource(

@@ -9,7 +9,6 @@ import numpy as np
 from apt_evap._common.types import Floats
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.isotope_comb import Comb, LogSpectrum
-from apt_evap.detection.timing import mass_to_charge
 
 _SHAPE = 0.25  # of the width of a peak, by which its unknown shape may shift it
 _DRIFT = 3e-4  # of m/n, by which a measured voltage may shift it
@@ -62,8 +61,8 @@ class FlightFit:
 
     def masses(self, hits: Hits) -> Floats:
         """m/n of ions [Da], shape (n,)."""
-        time, x, y = hits.require("time_of_flight", "x", "y")
-        return mass_to_charge(total_voltage(hits), time - self.time_zero, x, y, self.distance)
+        (masses,) = hits.with_masses(self.distance, self.time_zero).require("mass_to_charge")
+        return masses
 
     def improved(self, hits: Hits, combs: Sequence[Comb]) -> "FlightFit":
         """The fit after a step of Newton's method.

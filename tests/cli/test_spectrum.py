@@ -101,3 +101,22 @@ def test_saving_without_a_name_leaves_nothing(tmp_path, monkeypatch, capsys):
     assert main(["spectrum", "noise.pos", "--save", "a.rrng"]) == 2
     assert "ranges need peaks" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["noise.pos"]
+
+
+def test_the_lines_of_the_explorer_have_the_same_masses(tmp_path):
+    from apt_evap.cli._explorer_of_files import explorer_and_view
+
+    rng = np.random.default_rng(2)
+    rows = np.zeros((3000, 8), "<f4")
+    rows[:, 0], rows[:, 1], rows[:, 5] = 5000.0, 1000.0, rng.uniform(300, 900, 3000)
+    rows[:, 3:5] = rng.uniform(-20, 20, (3000, 2))
+    rows[:, 7] = np.arange(1, 3001, dtype=np.uint32).view("<f4")
+    path = tmp_path / "a.raw"
+    rows.tofile(path)
+    words = ["explore", str(path), "--distance", "90", "--t0", "12.5", "--mass", "20,60"]
+    explorer, _ = explorer_and_view(make_parser("explore").parse_args(words))
+    hits = eval(explorer.measured_code, {"ae": ae})
+    assert np.array_equal(hits.mass_to_charge, explorer.measured.mass_to_charge) and 100 < len(hits) < 2900
+    # the voltage of an ion is that at the top of the pulse
+    time, across = hits.time_of_flight - 12.5, hits.x**2 + hits.y**2
+    assert np.allclose(hits.mass_to_charge, 1.92971e-4 * 6000 * time**2 / (90**2 + across), rtol=1e-4)
