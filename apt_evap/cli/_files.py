@@ -237,7 +237,7 @@ def measured_of(options: argparse.Namespace) -> Hits | DetectorMap:
 
 
 _READING = ("format", "partial", "byte_order", "arrays", "unit", "voltage_unit")
-_DEFAULTING = ("all_ions", "time_zero")
+_MASSES = ("all_ions", "time_zero")
 
 
 def measured_source(options: argparse.Namespace) -> MeasuredSource:
@@ -254,6 +254,7 @@ def measured_source(options: argparse.Namespace) -> MeasuredSource:
         partial(measured_of, options),
         Path(options.file),
         {name: None if path is None else sha256_of(path) for name, path in paths.items()},
-        {name: getattr(options, name) for name in (*_READING, *_SELECTING, *_DEFAULTING) if name != "ranges"},
+        # what is not given is None, as for a twin made in Python
+        {name: getattr(options, name) or None for name in (*_READING, *_SELECTING, *_MASSES) if name != "ranges"},
         tuple(words),
     )
