@@ -1,9 +1,9 @@
 """Isotopes of the elements, and the mass of each ion.
 
 Abundances: CIAAW, Isotopic compositions of the elements 2021 (Meija et al., Pure Appl. Chem. 88, 293 (2016), with later
-revisions). The commission gives ranges for Mg and Si: the values here are the representative ones of Berglund and
-Wieser, Pure Appl. Chem. 83, 397 (2011), which lie inside. Masses: AME2020 (Wang et al., Chinese Phys. C 45, 030003
-(2021)), rounded to 1e-4 Da.
+revisions). The commission gives ranges for H, B, C, N, O, Mg and Si: the values here are the representative ones of
+Berglund and Wieser, Pure Appl. Chem. 83, 397 (2011), which lie inside. Masses: AME2020 (Wang et al., Chinese Phys. C
+45, 030003 (2021)), rounded to 1e-4 Da.
 """
 
 from __future__ import annotations
@@ -52,13 +52,27 @@ ISOTOPES: dict[str, tuple[tuple[float, float], ...]] = {
 }
 """Mass [Da] and natural abundance (fraction) of each stable isotope, by element."""
 
+SPECTRUM_ISOTOPES: dict[str, tuple[tuple[float, float], ...]] = {
+    "H": ((1.0078, 0.999885), (2.0141, 0.000115)),
+    "B": ((10.0129, 0.199), (11.0093, 0.801)),
+    "C": ((12.0, 0.9893), (13.0034, 0.0107)),
+    "N": ((14.0031, 0.99636), (15.0001, 0.00364)),
+    "O": ((15.9949, 0.99757), (16.9991, 0.00038), (17.9992, 0.00205)),
+    "V": ((49.9472, 0.0025), (50.9440, 0.9975)),
+    "Mn": ((54.9380, 1.0),),
+    "Zr": ((89.9047, 0.5145), (90.9056, 0.1122), (91.9050, 0.1715), (93.9063, 0.1738), (95.9083, 0.0280)),
+    "Nb": ((92.9064, 1.0),),
+    "Re": ((184.9530, 0.3740), (186.9558, 0.6260)),
+} | ISOTOPES
+"""The same with elements that measured spectra have and whose charge states are not computed."""
+
 # relative: atomic weights rounded to three digits still count as natural, the isotopes of Ni, Cu, Fe and Si do not
 _SAME_MASS = 1e-3
 
 
 def mean_mass(element: str) -> float:
-    """Mean mass of the natural isotopes of an element of `ISOTOPES` [Da]; KeyError for others."""
-    return sum(mass * abundance for mass, abundance in ISOTOPES[element])
+    """Mean mass of the natural isotopes of an element of `SPECTRUM_ISOTOPES` [Da]; KeyError for others."""
+    return sum(mass * abundance for mass, abundance in SPECTRUM_ISOTOPES[element])
 
 
 def draw_isotopes(names: Sequence[str], species: ArrayLike, masses: ArrayLike, u: ArrayLike) -> Floats:

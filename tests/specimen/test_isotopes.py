@@ -4,7 +4,7 @@ from scipy import stats
 
 from apt_evap._common.ion_random import IonRandom
 from apt_evap.emission.post_ionisation import RATIO_PARAMETERS
-from apt_evap.specimen.isotopes import ISOTOPES, draw_isotopes, mean_mass
+from apt_evap.specimen.isotopes import ISOTOPES, SPECTRUM_ISOTOPES, draw_isotopes, mean_mass
 from apt_evap.specimen.materials import MATERIALS
 
 # standard atomic weights and their uncertainties (Prohaska et al., Pure Appl. Chem. 94, 573, 2022; abridged: Mg, Si)
@@ -31,6 +31,29 @@ ATOMIC_WEIGHTS = {
 
 def test_every_element_with_numbers_has_isotopes():
     assert set(ISOTOPES) == set(MATERIALS) | set(RATIO_PARAMETERS) == set(ATOMIC_WEIGHTS)
+
+
+# the same, abridged; H, B, C, N and O have ranges
+OTHER_WEIGHTS = {
+    "H": (1.0080, 2e-4),
+    "B": (10.81, 0.02),
+    "C": (12.011, 0.002),
+    "N": (14.007, 0.001),
+    "O": (15.999, 0.001),
+    "V": (50.9415, 1e-4),
+    "Mn": (54.938043, 2e-6),
+    "Zr": (91.222, 0.003),
+    "Nb": (92.90637, 1e-5),
+    "Re": (186.207, 0.001),
+}
+
+
+@pytest.mark.parametrize("name", sorted(set(SPECTRUM_ISOTOPES) - set(ISOTOPES)))
+def test_isotopes_of_spectra_give_the_standard_atomic_weight(name):
+    masses, abundances = np.array(SPECTRUM_ISOTOPES[name]).T
+    assert abundances.sum() == pytest.approx(1, abs=1e-15) and (np.diff(masses) > 0).all()
+    weight, uncertainty = OTHER_WEIGHTS[name]
+    assert mean_mass(name) == pytest.approx(weight, abs=uncertainty + 5e-5)
 
 
 @pytest.mark.parametrize("name", ISOTOPES)
