@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -361,3 +362,19 @@ def nearest_of_family(candidate, place, plane):
     directions = candidate.orientation.directions(point_group("fcc") @ normal)
     places = candidate.projection.places(directions)
     return float(np.nanmin(np.hypot(*(places - place).T)))
+
+
+def test_a_measured_map_of_nickel_is_not_decided_wrongly():
+    """Ten poles give [0.30 0.54 0.79] and 25.8 mm/rad."""
+    path = Path(__file__).parents[3] / "shared" / "data" / "ni111_map.npz"
+    if not path.exists():
+        pytest.skip(f"the measured map {path} is missing")
+    found = ae.index(ae.read(path), "Ni")
+    assert not found.decided or found.best.projection.scale == pytest.approx(25.8, rel=0.1)
+
+
+def test_an_orientation_that_explains_little_does_not_decide(monkeypatch):
+    _, map = made("fcc", (0.30, 0.54, 0.79), 20.0, ions=20_000)
+    monkeypatch.setattr("apt_evap.maps.indexing.index_map.LEAST_SCORE", 1.1)
+    found = quickly(map, "Ni")
+    assert not found.decided and "1.10" in found.reason

@@ -36,6 +36,9 @@ DECIDED = 12.0
 """Margin to the next different orientation above which a map decides, see the notes of `index`."""
 RIVAL = 0.8
 """Largest score of another orientation, relative to that of the first one, with which a map decides."""
+LEAST_SCORE = 1 / 3
+"""Smallest score with which a map decides, without marks: a measured nickel map reaches 0.28 for a wrong orientation
+with a margin of 26, a measured tungsten map 0.40 for the right one. Chosen with these two maps."""
 LEAST_IONS = 4_000
 """Fewest ions with which a map decides, without marks: of 11 decided maps of 1,500 to 4,300 ions 4 were wrong, all
 below 3,100 ions (articles/find_the_poles)."""
@@ -271,9 +274,9 @@ def index(
     of two orientations is twice the logarithm of the ratio of their likelihoods, divided by the variance of the sums of
     neighbouring residuals of the better one in units of Poisson's. So a model that leaves structure unexplained decides
     less. The map is `decided` if the margin to the next orientation that differs by more than 6 degrees is above 12.
-    Without marks of a user it also needs 4,000 ions, no such orientation may explain more than 0.8 of what the first
-    one explains, and no other crystal structure more. A map of noise has a score of 0. Marks that no orientation
-    explains, or that contradict the map, are named in the reason, and the map is not decided.
+    Without marks of a user it also needs 4,000 ions and a score of a third, no such orientation may explain more than
+    0.8 of what the first one explains, and no other crystal structure more. A map of noise has a score of 0. Marks that
+    no orientation explains, or that contradict the map, are named in the reason, and the map is not decided.
     `Indexing.deciding_marks` says which mark would decide.
 
     The axis is that at the centre of the field of view. An orientation and its mirror image look the same in crystals
@@ -451,6 +454,8 @@ def _judged(measured, disc, bins, material, patterns, fits, proper, n, bounds, m
         decided, reason = False, contradiction
     elif not marked and measured.is_counts and measured.ions < LEAST_IONS:
         decided, reason = False, f"{measured.ions:,} ions are too few to decide: {LEAST_IONS:,} are needed; {numbers}"
+    elif decided and not marked and best < LEAST_SCORE:
+        decided, reason = False, f"no orientation explains {LEAST_SCORE:.2f} of the structure: the first {numbers}"
     elif decided and best <= next_best:
         reason = f"only it fits the marks and the map (margin {margin:.0f}; {DECIDED:g} is needed)"
     elif decided:
