@@ -50,8 +50,8 @@ def deciding_marks(map: DetectorMap, candidates: Sequence[tuple[Orientation, Pro
                 and np.hypot(*(other.place - spot.place)) < _APART * np.radians(POLE_ERROR) * scale
             ]
             if not alike:
-                x, y = spot.place
-                sentences.append(f"if the spot at ({x:.0f}, {y:.0f}) mm is {{{spot.family}}}: candidate {number + 1}")
+                x, y = (round(float(value)) for value in spot.place)
+                sentences.append(f"if the spot at ({x}, {y}) mm is {{{spot.family}}}: candidate {number + 1}")
                 break
     return tuple(sentences)
 
