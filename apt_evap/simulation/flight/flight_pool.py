@@ -204,8 +204,8 @@ class FlightPool:
         ).ravel()
         end = np.empty((int(counts.sum()), 7))
         outcome = np.empty(len(end), np.int8)
-        event = np.arange(n)
-        start = np.concatenate([[0], np.cumsum(counts)])
+        event = np.arange(n, dtype=np.int64)
+        start = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
         launches = np.ascontiguousarray(positions[finite]), np.ascontiguousarray(velocities[finite])
         counter = np.zeros(1, np.int64)
 
@@ -267,7 +267,7 @@ def fly_at_rest(emitter: Emitter, positions: Floats, settings: FlightSettings) -
     n, tree = len(positions), emitter.tree
     end, outcome, counter = np.empty((n, 7)), np.empty(n, np.int8), np.zeros(1, np.int64)
     event = np.full(n, -1, np.int64)  # before the first event of the journal: nothing is replayed
-    start, halt = np.arange(n + 1), np.zeros(1, np.int64)
+    start, halt = np.arange(n + 1, dtype=np.int64), np.zeros(1, np.int64)
     places, velocities = np.ascontiguousarray(positions), np.zeros((n, 3))
     journal = Journal(emitter.tip.positions, 1)
 
