@@ -77,7 +77,9 @@ extensions = [
     Extension(
         f"apt_evap._core.{name}",
         [f"apt_evap/_core/{name}.pyx"],
-        depends=[f"apt_evap/_core/{part}.h" for part in ("kernels", "kernels_group", "kernels_point", "elementary", "index")],
+        depends=[
+            f"apt_evap/_core/{part}.h" for part in ("kernels", "kernels_group", "kernels_point", "elementary", "index")
+        ],
         include_dirs=["apt_evap/_core"],
         libraries=[] if platform.system() == "Windows" else ["m"],
     )

@@ -9,12 +9,12 @@
 # the modes of files as Linux has them. Its C library (of Wine 8) has no complex functions and no feholdexcept, which
 # NumPy 2, SciPy and HDF5 call: `unpack` compiles them into a library that passes on all other calls, and puts its name
 # into the files of the wheels.
-set -e
+set -e -o pipefail
 action=$1 folder=$(realpath "$2")
 shift 2
 cc=x86_64-w64-mingw32-gcc
 export WINEPREFIX=$folder/wine WINEDEBUG=${WINEDEBUG:--all} OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
-windows_python() { (cd "$folder/source" && wine "$folder/python/python.exe" "$@"); }
+windows_python() { (cd "$folder/source" && wine "$folder/python/python.exe" "$@" < /dev/null 2>&1 | cat); }   # Wine has no files as streams
 names() { x86_64-w64-mingw32-objdump -p "$1" | sed -n '/Ordinal\/Name Pointer/,$p' | sed -nE 's/^\s*\[ *[0-9]+\].* (\S+)$/\1/p'; }
 
 case $action in

@@ -327,12 +327,12 @@ def test_a_lock_that_its_owner_just_removed_is_not_taken(tmp_path, monkeypatch):
     first, path = FileLock(tmp_path / "lock", "run.h5"), tmp_path / "lock"
     take, others = FileLock._lock, []
 
-    def late(lock, file):
+    def late(lock, *arguments):
         if not others:
             others.append(None)
             first.release()
             others.append(FileLock(path, "run.h5"))
-        take(lock, file)
+        return take(lock, *arguments)
 
     monkeypatch.setattr(FileLock, "_lock", late)
     with pytest.raises(ae.FileError, match="is being written by"):

@@ -1,6 +1,5 @@
 """One point of a sweep: its state, and its run in this process."""
 
-import fcntl
 import json
 import os
 import resource
@@ -12,6 +11,7 @@ import sys
 import pytest
 from sweeps import check_bits, check_done, do, planned, poison
 
+from apt_evap._common.locks import try_lock
 from apt_evap.cli.main import main
 from apt_evap.studies.sweep import point_folder
 from apt_evap.studies.sweep.planning import plan_sweep, retry, sweep_status
@@ -54,13 +54,13 @@ def test_a_point_is_the_same_as_apt_evap_run_with_its_settings(sweep):
 def test_a_point_on_which_a_process_works_is_left_to_it(sweep):
     folder = sweep.folder_of(sweep.keys[0])
     with open(folder / "lock", "w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+        assert try_lock(file.fileno())
         assert [state.name for _, state in sweep.states()] == ["running", "waiting"]
         assert sweep_status(sweep)["counts"]["running"] == 1
         assert run_point(folder).name == "running"
     assert not (folder / "run.h5").exists() and sweep.state(folder.name).name == "waiting"
     with open(folder / "lock") as file:  # of a status, at this very moment
-        fcntl.flock(file, fcntl.LOCK_SH)
+        assert try_lock(file.fileno(), shared=True)
         assert sweep.state(folder.name).name == "waiting"
     assert run_point(folder).name == "done"
 
