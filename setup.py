@@ -77,9 +77,7 @@ extensions = [
     Extension(
         f"apt_evap._core.{name}",
         [f"apt_evap/_core/{name}.pyx"],
-        depends=[
-            f"apt_evap/_core/{part}.h" for part in ("kernels", "kernels_group", "kernels_point", "elementary", "index")
-        ],
+        depends=sorted(str(path) for path in Path("apt_evap/_core").glob("*.h")),
         include_dirs=["apt_evap/_core"],
         libraries=[] if platform.system() == "Windows" else ["m"],
     )

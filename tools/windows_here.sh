@@ -107,15 +107,15 @@ CONF
     windows_python -c 'import numpy, sys; print("Python", sys.version); print("NumPy", numpy.__version__)'
     ;;
 build)
-    git ls-files -z --cached apt_evap tests examples README.md CHANGELOG.md pyproject.toml docs |
+    git ls-files -z --cached --others --exclude-standard apt_evap tests examples README.md CHANGELOG.md pyproject.toml docs |
         xargs -0 tar -c | tar -x -C "$folder/source"
     flags=$(sed -n 's/^FLAGS = //p' setup.py | tr -d '[]",')
     python setup.py -q build_ext --inplace 2> /dev/null   # the C sources are the same on every system
     export folder flags cc
     find build/cython/apt_evap -name '*.c' | xargs -P "$(nproc)" -I FILE bash -c '
-        name=$(basename FILE .c)
-        $cc $flags -march=${MARCH:-x86-64} -g0 -w -fopenmp -DMS_WIN64 -Iapt_evap/_core -I"$folder/include" -shared FILE \
-            -o "$folder/source/apt_evap/_core/$name.cp311-win_amd64.pyd" "$folder/packages/libpython311.a"'
+        module=$folder/source/apt_evap/_core/$(basename FILE .c).cp311-win_amd64.pyd
+        [ "$module" -nt FILE ] || $cc $flags -g0 -w -fopenmp -DMS_WIN64 -Iapt_evap/_core -I"$folder/include" \
+            -shared FILE -o "$module" "$folder/packages/libpython311.a"'
     ;;
 example)
     windows_python -m apt_evap.cli run examples/ni111.toml "$@" -o "Z:$folder/ni111.h5"

@@ -61,7 +61,7 @@ def test_a_file_that_is_no_lock(tmp_path):
         FileLock(tmp_path / "lock", "it")
     assert (tmp_path / "lock").read_text() == "my notes"
     (tmp_path / "folder").mkdir()
-    with pytest.raises(FileError, match="cannot write .*folder"):
+    with pytest.raises(FileError, match=r"cannot write .*folder"):
         FileLock(tmp_path / "folder", "it")
     with pytest.raises(OSError):
         open_lock(tmp_path / "folder")
