@@ -2,6 +2,7 @@
 
 import os
 import platform
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -54,8 +55,19 @@ class BuildPython(build_py):
 class BuildCore(build_ext):
     """Adds the flags that the compiler at hand understands."""
 
+    def finalize_options(self):
+        """Prefer GCC to Microsoft's compiler."""
+        super().finalize_options()
+        if sys.platform == "win32" and self.compiler is None and shutil.which("gcc"):
+            self.compiler = "mingw32"
+
     def build_extensions(self):
         """Probe for OpenMP, with a serial build and one warning if there is none; leave out debug symbols."""
+        if self.compiler.compiler_type == "msvc":
+            raise SystemExit(
+                "the compiler of apt_evap must be GCC, such as that of MSYS2 (UCRT64) with gcc.exe in the PATH, got "
+                "Microsoft's"
+            )
         compiler = getattr(self.compiler, "compiler", None)
         if compiler:
             openmp = [] if os.environ.get("APT_EVAP_SERIAL") else ["-fopenmp"]
@@ -80,6 +92,7 @@ extensions = [
         depends=sorted(str(path) for path in Path("apt_evap/_core").glob("*.h")),
         include_dirs=["apt_evap/_core"],
         libraries=[] if platform.system() == "Windows" else ["m"],
+        define_macros=[("MS_WIN64", "")] if sys.platform == "win32" else [],  # for the headers of CPython and GCC
     )
     for name in MODULES
 ]

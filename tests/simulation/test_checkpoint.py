@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import resource
 import signal
 import subprocess
 import sys
@@ -252,6 +251,7 @@ def test_an_error_keeps_what_is_done(tmp_path):
 
 def test_a_full_disk_loses_nothing(tmp_path):
     """A limit on the size of files, as they meet a full disk: writing fails part of the way."""
+    resource = pytest.importorskip("resource")  # not on Windows
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (12_000, before[1]))
     try:

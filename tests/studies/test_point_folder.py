@@ -2,7 +2,6 @@
 
 import json
 import os
-import resource
 import shutil
 import signal
 import subprocess
@@ -108,6 +107,7 @@ def test_an_error_that_is_not_expected_fails_the_point_too(sweep, monkeypatch):
 def test_a_full_disk_is_no_failure(sweep):
     """Files larger than a limit are errors of the system, as on a full disk."""
     folder = sweep.folder_of(sweep.keys[0])
+    resource = pytest.importorskip("resource")  # not on Windows
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     previous = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (8000, limits[1]))

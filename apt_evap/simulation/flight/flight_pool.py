@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from apt_evap._common.codec import checked, count, number, settings
+from apt_evap._common.threads import map_of_threads
 from apt_evap._common.types import Booleans, Floats
 from apt_evap._common.validation import check_number
 from apt_evap._core.flights import LEFT, NEVER_LEFT, NOT_FLOWN, Flights
@@ -271,13 +272,12 @@ def fly_at_rest(emitter: Emitter, positions: Floats, settings: FlightSettings) -
     places, velocities = np.ascontiguousarray(positions), np.zeros((n, 3))
     journal = Journal(emitter.tip.positions, 1)
 
-    def fly():
+    def fly(number):
         flights = Flights(tree, **_options(emitter.tip, settings))
         flights.fly(journal, event, start, places, velocities, end, outcome, counter, halt)
 
-    with ThreadPoolExecutor(emitter.n_threads) as pool:
-        for helper in [pool.submit(fly) for _ in range(emitter.n_threads)]:
-            helper.result()
+    with map_of_threads(emitter.n_threads) as apply:
+        list(apply(fly, range(emitter.n_threads)))
     end = end[:, None]
     return Ends(end[..., :3], end[..., 3:6], end[..., 6], (outcome == LEFT)[:, None])
 
