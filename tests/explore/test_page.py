@@ -461,6 +461,7 @@ def test_poles_are_clicked(measured):
     page.close()
 
 
+@pytest.mark.slow
 def test_a_fit_of_earlier_marks_is_not_shown(measured):
     """Marks are faster than fits: what is shown is the fit of all marks, or of none."""
     opened = Opened(Explorer(None, measured))
