@@ -471,7 +471,8 @@ def twin(
     Parameters
     ----------
     measured : str, path-like, Hits or DetectorMap
-        The file of measured ions or of a map, or ions, such as a selection of those of a file, or a map.
+        The file of measured ions or of a map, or ions, or a map. All ions count: those of the crystal alone are
+        ``spectrum(hits, "W").select("W")``, as ``apt-evap twin`` takes them.
     element : str or Material
         The crystal.
     minutes : float
