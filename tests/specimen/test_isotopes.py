@@ -61,8 +61,8 @@ def test_isotopes_give_the_standard_atomic_weight(name):
 
 @pytest.mark.parametrize("name", MATERIALS)
 def test_isotopes_agree_with_the_mass_of_the_material(name):
-    # the material's mass has five digits: half a unit of the last one is 2.6e-5 of the mass for Pt
-    assert mean_mass(name) == pytest.approx(MATERIALS[name].mass, rel=3e-5)
+    # atomic weights have five digits, of some elements with an uncertainty of 1 or 2 in the last one
+    assert mean_mass(name) == pytest.approx(MATERIALS[name].mass, rel=9e-5)
 
 
 @pytest.mark.parametrize("name", ISOTOPES)
