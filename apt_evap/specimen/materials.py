@@ -187,6 +187,13 @@ _WORDS = {
 }
 
 
+def unknown_name(name: Any) -> str:
+    """Message that no material has this name, with the nearest and all names."""
+    symbol = _WORDS.get(name.strip().lower()) if isinstance(name, str) else None
+    hint = did_you_mean(symbol or name, MATERIALS)
+    return f"no material is named {short_text(name)}{hint}; known are {', '.join(MATERIALS)}"
+
+
 def material(name: str, **changes: Any) -> Material:
     """Return a known material, optionally with changed numbers.
 
@@ -221,10 +228,7 @@ def material(name: str, **changes: Any) -> Material:
                 f"a material has no {short_text(change)}{did_you_mean(change, known)}; it has {', '.join(known)}"
             )
     if not isinstance(name, str) or name not in MATERIALS:
-        known = f"known are {', '.join(MATERIALS)}, define others as Material(...)"
-        symbol = _WORDS.get(name.strip().lower()) if isinstance(name, str) else None
-        hint = did_you_mean(symbol or name, MATERIALS)
-        raise ValueError(f"no material is named {short_text(name)}{hint}; {known}")
+        raise ValueError(f"{unknown_name(name)}, define others as Material(...)")
     element = MATERIALS[name]
     return replace(element, **changes, sources=element.sources | dict.fromkeys(changes, "given by the user"))
 
