@@ -140,7 +140,7 @@ class Migration(_ByChargeRatio):
 
     @classmethod
     def of(cls, material: Material | str, temperature: float = 80.0) -> Migration:
-        """Make the law of a metal, with its evaporation field.
+        """Make the rule of a metal, with its evaporation field.
 
         Parameters
         ----------
