@@ -2,6 +2,7 @@
 
 import os
 import platform
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -22,6 +23,11 @@ DIRECTIVES = {
     "cdivision": True,
     "initializedcheck": False,
 }
+# APT_EVAP_ABI3=1 builds one wheel for Python 3.11 and later; it is not the default before its speed is measured.
+ABI3 = bool(os.environ.get("APT_EVAP_ABI3"))
+MACROS = [("Py_LIMITED_API", "0x030b0000")] * ABI3
+if sys.platform == "win32":
+    MACROS.append(("MS_WIN64", ""))  # for the headers of CPython and GCC
 # -fno-math-errno lets sqrt vectorise (4-17 times); -ffp-contract=off keeps the bits the same on every processor.
 FLAGS = ["-O3", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=off"]
 
@@ -54,8 +60,19 @@ class BuildPython(build_py):
 class BuildCore(build_ext):
     """Adds the flags that the compiler at hand understands."""
 
+    def finalize_options(self):
+        """Prefer GCC to Microsoft's compiler."""
+        super().finalize_options()
+        if sys.platform == "win32" and self.compiler is None and shutil.which("gcc"):
+            self.compiler = "mingw32"
+
     def build_extensions(self):
         """Probe for OpenMP, with a serial build and one warning if there is none; leave out debug symbols."""
+        if self.compiler.compiler_type == "msvc":
+            raise SystemExit(
+                "the compiler of apt_evap must be GCC, such as that of MSYS2 (UCRT64) with gcc.exe in the PATH, got "
+                "Microsoft's"
+            )
         compiler = getattr(self.compiler, "compiler", None)
         if compiler:
             openmp = [] if os.environ.get("APT_EVAP_SERIAL") else ["-fopenmp"]
@@ -77,8 +94,10 @@ extensions = [
     Extension(
         f"apt_evap._core.{name}",
         [f"apt_evap/_core/{name}.pyx"],
-        depends=[f"apt_evap/_core/{part}.h" for part in ("kernels", "kernels_group", "kernels_point", "elementary")],
+        depends=sorted(str(path) for path in Path("apt_evap/_core").glob("*.h")),
         include_dirs=["apt_evap/_core"],
+        define_macros=MACROS,
+        py_limited_api=ABI3,
         libraries=[] if platform.system() == "Windows" else ["m"],
     )
     for name in MODULES
@@ -86,9 +105,10 @@ extensions = [
 setup(
     ext_modules=cythonize(
         extensions,
-        build_dir="build/cython-bounds" if BOUNDS else "build/cython",
+        build_dir="build/cython" + "-bounds" * BOUNDS + "-abi3" * ABI3,  # their objects differ
         compiler_directives=DIRECTIVES,
         quiet="-q" in sys.argv,
     ),
+    options={"bdist_wheel": {"py_limited_api": "cp311"}} if ABI3 else {},
     cmdclass={"build_ext": BuildCore, "build_py": BuildPython},
 )

@@ -20,6 +20,7 @@ from .detection.detector import Detector as Detector
 from .detection.detector_map import DetectorMap as DetectorMap
 from .detection.hits import Hits as Hits
 from .detection.instrument import Instrument as Instrument
+from .detection.mass_spectrum import spectrum as spectrum
 from .emission.energies import TruncatedNormal as TruncatedNormal
 from .emission.perturbations import Combined as Combined
 from .emission.perturbations import LateralVelocity as LateralVelocity

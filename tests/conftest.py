@@ -1,6 +1,5 @@
 """Small specimens, made once for all tests, and runs, made once for all processes that test."""
 
-import fcntl
 import gc
 import os
 import signal
@@ -22,6 +21,7 @@ sys.path.append(str(Path(__file__).parent))  # for twins.py, whatever the import
 from rough import ROUGH
 
 import apt_evap as ae
+from apt_evap._common.locks import FileLock
 
 # a shell that has put the tests into the background lets them ignore Ctrl-C, which some of them press
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -62,10 +62,12 @@ def made_once(tmp_path_factory):
 
     def load(name, make):
         path = folder / f"{name}.h5"
-        with open(path.with_suffix(".lock"), "w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)  # until the file is closed
+        lock = FileLock(path.with_suffix(".lock"), name, wait=lambda: None)
+        try:
             if not path.exists():
                 make().save(path)
+        finally:
+            lock.release()
         return read_only(ae.load(path))
 
     return load

@@ -24,6 +24,7 @@ from apt_evap._common.types import AnyPath
 
 _FORMAT = "apt_evap {} 1"
 _CHUNK = 1 << 20  # bytes; HDF5 keeps chunks up to this size while rows of them are read
+_DEFLATED = 1032  # largest ratio of deflate: 258 bytes in 2 bits (zlib.net/zlib_tech.html)
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _FOREIGN = "data outside the file are not read"
 _READ_ERRORS = (KeyError, IndexError, RuntimeError, TypeError, ValueError, AttributeError, OverflowError)
@@ -240,6 +241,8 @@ class CheckedFile:
         dtype: DTypeLike | None,
         shape: tuple[int | None, ...] | None,
         rows: slice = slice(None),
+        *,
+        compressed: bool = False,
     ) -> NDArray[Any]:
         """Check the type, the shape and the place of a dataset, and read it.
 
@@ -253,6 +256,8 @@ class CheckedFile:
             Expected shape; None for any length, or for any shape.
         rows : slice
             Rows to read.
+        compressed : bool
+            Read data that are compressed by deflate, as other programs write them.
 
         Returns
         -------
@@ -284,11 +289,15 @@ class CheckedFile:
             raise ValueError(f"{path} must have shape ({lengths}), got {dimensions}")
         if external or layout == h5py.h5d.VIRTUAL:
             raise ValueError(f"{path} is in another file: {_FOREIGN}")
-        if max(math.prod(dimensions), math.prod(chunks)) * stored.itemsize > self._size:
+        level = filters.pop(h5py.h5z.FILTER_DEFLATE, (0,))[0]
+        if compressed:
+            filters.pop(h5py.h5z.FILTER_SHUFFLE, None)
+        largest = _DEFLATED if compressed and level else 1
+        if max(math.prod(dimensions), math.prod(chunks)) * stored.itemsize > self._size * largest:
             raise ValueError(f"{path} has shape {dimensions}, more than the {self._size} bytes of the file")
-        if filters.pop(h5py.h5z.FILTER_DEFLATE, (0,))[0] or filters.keys() - {h5py.h5z.FILTER_FLETCHER32}:
+        if (level and not compressed) or filters.keys() - {h5py.h5z.FILTER_FLETCHER32}:
             raise ValueError(f"{path} is compressed or filtered: h5repack -f NONE writes a copy that is not")
-        if n_bytes < math.prod(dimensions) * stored.itemsize:
+        if n_bytes * largest < math.prod(dimensions) * stored.itemsize:
             raise ValueError(f"{path} is incomplete")
         with _damage(self.name):
             return item[rows] if dimensions else item[()]

@@ -2,11 +2,14 @@
 
 import os
 import socket
+import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from apt_evap._common.files import FileError, check_regular
+from apt_evap._common.types import AnyPath
 from apt_evap.warnings import RunWarning, warn
 
 try:
@@ -18,6 +21,44 @@ except ImportError:  # Windows
 _OWNER = "process "  # first word of a lock file
 _FLAGS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
 _LOCKED_BYTE = 1 << 20  # behind the text: nobody can read a locked byte on Windows
+_PAUSE = 0.2  # seconds between two tries
+
+
+def open_lock(path: AnyPath, flags: int = os.O_RDWR | os.O_CREAT) -> int:
+    """Open a lock file, with the flags of `os.open`; OSError if it is a link or not a regular file."""
+    descriptor = os.open(path, flags | _FLAGS, 0o666)
+    try:
+        check_regular(os.fstat(descriptor))
+    except OSError:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def try_lock(descriptor: int, shared: bool = False) -> bool:
+    """Lock an open file until it is closed; return whether it was free.
+
+    Parameters
+    ----------
+    descriptor : int
+        Of the open file.
+    shared : bool
+        Whether others may have shared locks of it at the same time; Windows has no such locks.
+
+    Raises
+    ------
+    OSError
+        If the file system has no locks.
+    """
+    try:
+        if fcntl is None:
+            os.lseek(descriptor, _LOCKED_BYTE, os.SEEK_SET)
+            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+        else:
+            fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError):
+        return False
+    return True
 
 
 class FileLock:
@@ -29,6 +70,8 @@ class FileLock:
         The lock file.
     of : str
         Name of what it protects, for messages.
+    wait : callable, optional
+        Called once if another process has locked it, to wait for its end; by default that is an error.
 
     Raises
     ------
@@ -36,14 +79,17 @@ class FileLock:
         If another process has locked it, or if it cannot be written.
     """
 
-    def __init__(self, path: Path, of: str) -> None:
+    def __init__(self, path: Path, of: str, wait: Callable[[], object] | None = None) -> None:
         self._path, self._of = path, of
         self._file: Any = None
         try:
             while self._file is None:  # again if its owner has just removed it
                 file = open(path, "r+", encoding="utf-8", errors="replace", opener=_opened)
                 try:
-                    self._lock(file)
+                    if not self._lock(file, wait):
+                        wait = _say_nothing
+                        time.sleep(_PAUSE)
+                        continue
                     with suppress(FileNotFoundError):
                         if os.path.samestat(os.fstat(file.fileno()), os.stat(path)):
                             self._sign(file)
@@ -54,22 +100,25 @@ class FileLock:
         except OSError as error:
             raise FileError(f"cannot write {str(path)!r}: {error.strerror or error}") from error
 
-    def _lock(self, file):
+    def _lock(self, file, wait):
+        """Whether the file is locked now, or cannot be. If another has locked it, `wait` or raise an error."""
         try:
-            if fcntl is None:
-                os.lseek(file.fileno(), _LOCKED_BYTE, os.SEEK_SET)
-                msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
-            else:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except (BlockingIOError, PermissionError):
-            file.seek(0)
-            owner = file.read(100) or "another process"
-            raise FileError(f"{self._of!r} is being written by {owner}; wait for it or choose another file") from None
+            is_free = try_lock(file.fileno())
         except OSError as error:
             warn(
                 f"cannot lock {self._of!r} ({error.strerror}): make sure that no other process writes it",
                 RunWarning,
             )
+            return True
+        if not is_free:
+            if wait is None:
+                file.seek(0)
+                owner = file.read(100) or "another process"
+                raise FileError(
+                    f"{self._of!r} is being written by {owner}; wait for it or choose another file"
+                ) from BlockingIOError()
+            wait()
+        return is_free
 
     def _sign(self, file):
         """Write this process into the file, in place of an earlier one."""
@@ -92,10 +141,8 @@ class FileLock:
 
 
 def _opened(path, flags):
-    descriptor = os.open(path, flags | os.O_CREAT | _FLAGS, 0o666)
-    try:
-        check_regular(os.fstat(descriptor))
-    except OSError:
-        os.close(descriptor)
-        raise
-    return descriptor
+    return open_lock(path, flags | os.O_CREAT)
+
+
+def _say_nothing():
+    pass

@@ -6,7 +6,7 @@ NXcollection, which are not validated. Texts of NeXus have variable length, beca
 They are not needed to read a file. https://fairmat-nfdi.github.io/nexus_definitions/classes/applications/NXapm.html
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import h5py
@@ -23,6 +23,8 @@ HITS = f"{ATOM_PROBE}/hit_finding/hit_positions"
 TIMES = f"{ATOM_PROBE}/voltage_and_bowl/raw_tof"
 MASSES = f"{ATOM_PROBE}/mass_to_charge_conversion/mass_to_charge"
 MULTIPLICITY = f"{ATOM_PROBE}/hit_finding/hit_multiplicity"
+PULSER = f"{ENTRY}/measurement/event1/instrument/pulser"
+POSITIONS = f"{ATOM_PROBE}/reconstruction/reconstructed_positions"
 _FRAME = f"{ENTRY}/laboratory_reference_frame"
 
 
@@ -106,6 +108,27 @@ def put_nxapm(
     if masses is not None:  # NXapm requires them of this step
         _put_process(file, MASSES, version)
         put_field(file, MASSES, masses, "Da")
+
+
+def put_links(file: h5py.File, columns: Mapping[str, Any]) -> None:
+    """Link datasets to the paths at which other programs look for them.
+
+    NXapm allows these groups only with data that are not recorded here, such as the pressure. They are therefore of the
+    class NXcollection.
+
+    Parameters
+    ----------
+    file : h5py.File
+        Open for writing.
+    columns : mapping
+        Datasets by path, such as `POSITIONS`.
+    """
+    for path, dataset in columns.items():
+        *folders, name = path.split("/")
+        group = file
+        for folder in folders:
+            group = group[folder] if folder in group else put_group(group, folder, "NXcollection")
+        group[name] = dataset
 
 
 def _put_process(file, field, version):

@@ -1,6 +1,10 @@
-"""Number of threads to use."""
+"""Number of threads to use, and their use."""
 
 import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Any
 
 from apt_evap._common.validation import check_count
 
@@ -50,3 +54,13 @@ def thread_count(n_threads: int | None = None) -> int:
             raise ValueError(f"n_threads (--threads) must be <= {MAX_THREADS}, got {n_threads}")
         return n_threads
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def map_of_threads(n_threads: int) -> Iterator[Callable[..., Any]]:
+    """Function like `map` that calls by this number of threads; of one thread, it is `map`, and starts none."""
+    if n_threads == 1:
+        yield map
+        return
+    with ThreadPoolExecutor(n_threads) as pool:
+        yield pool.map

@@ -4,11 +4,12 @@ from libc.math cimport INFINITY, ldexp
 
 import numpy as np
 
+from apt_evap._core.index cimport Index
 from apt_evap._core.octree cimport Octree
 
 
 cdef extern from "elementary.h":
-    double exponential_parts(double, long long*) noexcept nogil
+    double exponential_parts(double, Index*) noexcept nogil
     double natural_logarithm(double) noexcept nogil
 
 
@@ -16,13 +17,13 @@ cdef extern from *:
     """
     #define NO_RATE (-(1LL << 62))   /* exponent of a rate of 0; no enum, because it does not fit into an int */
     """
-    const long long NO_RATE
+    const Index NO_RATE
 
 
 cdef class Chooser:
     """Interface of a chooser over the keys of the slots of a tree."""
 
-    cdef void update(self, const int* slots, long n) noexcept nogil:
+    cdef void update(self, const int* slots, Index n) noexcept nogil:
         # To be called when the keys of these slots have changed.
         pass
 
@@ -61,7 +62,7 @@ cdef class Largest(Chooser):
     """
 
     def __init__(self, Octree tree, double[::1] key):
-        cdef long node
+        cdef Index node
         self.key, self.atom = key, tree.atom
         self.leaves = 1
         while self.leaves < key.shape[0]:
@@ -84,13 +85,13 @@ cdef class Largest(Chooser):
             return self.key[a] > self.key[b]
         return self.atom[a] < self.atom[b]
 
-    cdef void play(self, long node) noexcept nogil:
+    cdef void play(self, Index node) noexcept nogil:
         cdef int a = self.winner[2 * node], b = self.winner[2 * node + 1]
         self.winner[node] = b if self.better(b, a) else a
 
-    cdef void update(self, const int* slots, long n) noexcept nogil:
+    cdef void update(self, const int* slots, Index n) noexcept nogil:
         # Update the matches of changed keys level by level: neighbouring slots soon have common matches.
-        cdef long i, left
+        cdef Index i, left
         cdef int node
         for i in range(n):
             self.rising[i] = <int>self.leaves + slots[i]
@@ -121,7 +122,7 @@ cdef class RateSum(Chooser):
     """
 
     def __init__(self, Octree tree, double[::1] key):
-        cdef long node
+        cdef Index node
         cdef int slot
         self.key, self.draws = key, True
         self.leaves = 1
@@ -137,16 +138,16 @@ cdef class RateSum(Chooser):
 
     cdef void set_rate(self, int slot) noexcept nogil:
         # The rate of a slot from its key.
-        cdef long leaf = self.leaves + slot
+        cdef Index leaf = self.leaves + slot
         if self.key[slot] >= -1e15:
             self.value[leaf] = exponential_parts(self.key[slot], &self.exponent[leaf])
         else:
             self.value[leaf], self.exponent[leaf] = 0.0, NO_RATE
 
-    cdef void add(self, long node) noexcept nogil:
+    cdef void add(self, Index node) noexcept nogil:
         # The sum of two nodes; the smaller exponent is at most 2000 below, or its node adds nothing.
-        cdef long left = 2 * node, right = 2 * node + 1
-        cdef long long gap
+        cdef Index left = 2 * node, right = 2 * node + 1
+        cdef Index gap
         if self.exponent[left] < self.exponent[right]:
             left, right = right, left
         self.exponent[node] = self.exponent[left]
@@ -156,8 +157,8 @@ cdef class RateSum(Chooser):
             self.value[node] += self.value[right] if gap == 0 else ldexp(self.value[right], -<int>gap)
 
     cdef int choose(self, double u) noexcept nogil:
-        cdef long node = 1, left
-        cdef long long gap
+        cdef Index node = 1, left
+        cdef Index gap
         cdef double below, part
         if self.value[1] <= 0.0:
             return -1
@@ -184,9 +185,9 @@ cdef class RateSum(Chooser):
             return -INFINITY
         return natural_logarithm(self.value[1]) + 0.69314718055994531 * <double>self.exponent[1]
 
-    cdef void update(self, const int* slots, long n) noexcept nogil:
+    cdef void update(self, const int* slots, Index n) noexcept nogil:
         # Recompute the sums above changed keys level by level: neighbouring slots soon have common sums.
-        cdef long i, left
+        cdef Index i, left
         cdef int node
         for i in range(n):
             self.rising[i] = <int>self.leaves + slots[i]

@@ -1,5 +1,6 @@
 """Rule of the constant potential."""
 
+from apt_evap._core.index cimport Index
 from apt_evap._core.octree cimport Octree
 from apt_evap._core.potentials cimport Potentials
 from apt_evap._core.robin cimport Robin
@@ -10,7 +11,7 @@ cdef class ConstantPotential(FieldRule):
     cdef readonly double tolerance
     cdef readonly double self_term      # potential of an atom by its own charge 1 [1/nm]; 0 before the first solution
     cdef readonly bint gaussian, sees_others
-    cdef readonly long n_iterations     # of all patches
+    cdef readonly Index n_iterations    # of all patches
     cdef double requested_self_term, potential        # self term of the user, or 0; potential of the specimen [e/nm]
     cdef double[::1] value              # (capacity,) potential of each slot with that of its own charge [e/nm]
     cdef double[:, ::1] normals         # (capacity, 3) by slot
@@ -18,12 +19,12 @@ cdef class ConstantPotential(FieldRule):
     cdef Robin robin
     cdef float[::1] matrix, residual, direction, image, spreads
 
-    cdef void squared_distances(self, const double[:, ::1] atoms, long atom, double[::1] squares) noexcept nogil
-    cdef int grow(self, long stride) except -1 nogil
-    cdef long nearest(self, Octree tree, long slot) noexcept nogil
-    cdef double at(self, Octree tree, long slot) noexcept nogil
-    cdef double corrections(self, Octree tree, long slot, const double* sources, long n) noexcept nogil
+    cdef void squared_distances(self, const double[:, ::1] atoms, Index atom, double[::1] squares) noexcept nogil
+    cdef int grow(self, Index stride) except -1 nogil
+    cdef Index nearest(self, Octree tree, Index slot) noexcept nogil
+    cdef double at(self, Octree tree, Index slot) noexcept nogil
+    cdef double corrections(self, Octree tree, Index slot, const double* sources, Index n) noexcept nogil
     cdef int patch_charges(self, Octree tree, double[:, ::1] normals, Patch* patch) except -1 nogil
-    cdef void act_on(self, const Hole* hole, long first, long m, long padded, long n, const float* x, const float* y,
-                     const float* z, const float* change) noexcept nogil
+    cdef void act_on(self, const Hole* hole, Index first, Index m, Index padded, Index n, const float* x,
+                     const float* y, const float* z, const float* change) noexcept nogil
     cdef void correct_spread(self, const Hole* hole, const Patch* patch) noexcept nogil

@@ -21,6 +21,7 @@ import numpy as np
 
 from apt_evap._core import elementary
 
+from apt_evap._core.index cimport Index
 from apt_evap._core.interactions cimport InteractionLists
 from apt_evap._core.octree cimport Octree
 from apt_evap._core.potentials cimport Potentials
@@ -32,13 +33,13 @@ from apt_evap._core.sources cimport sources_field, sources_potential
 cdef extern from "kernels.h":
     const int GROUP
     const double SAME_PLACE
-    void patch_row_potential(long, const float*, const float*, const float*, float, float, float, float,
+    void patch_row_potential(Index, const float*, const float*, const float*, float, float, float, float,
                              float*) noexcept nogil
-    void patch_potential(long, const float*, const float*, const float*, long, const float*, const float*,
+    void patch_potential(Index, const float*, const float*, const float*, Index, const float*, const float*,
                          const float*, const float*, float*) noexcept nogil
-    void patch_potential_and_field(long, const float*, const float*, const float*, long, const float*, const float*,
+    void patch_potential_and_field(Index, const float*, const float*, const float*, Index, const float*, const float*,
                                    const float*, const float*, float*, float*, float*, float*) noexcept nogil
-    float patch_dot(long, const float*, const float*) noexcept nogil
+    float patch_dot(Index, const float*, const float*) noexcept nogil
 
 
 LATTICE_SUM = 3.92
@@ -79,7 +80,7 @@ def gaussian_table(double eta):
     per_square : float
         Entries per nm^2.
     """
-    cdef long k
+    cdef Index k
     ends = _FAR * np.sqrt(np.arange(_ENTRIES + 1) / _ENTRIES)
     gauss = elementary.exponential(-ends * ends)
     between = elementary.exponential(-0.25 * (ends[1:] + ends[:_ENTRIES]) ** 2)
@@ -134,7 +135,7 @@ cdef class ConstantPotential(FieldRule):
     def solve(self, Octree tree, double[:, ::1] normals, InteractionLists lists, *, double potential, double tolerance,
               int max_sweeps=200, bint double_precision=False, int n_threads=1):
         """Solve the charges by conjugate gradients: see `ChargingRule.solve`."""
-        cdef long n = tree.n_slots
+        cdef Index n = tree.n_slots
         cdef int sweeps = 0
         cdef double residual
         cdef bint first = self.self_term == 0.0
@@ -217,7 +218,7 @@ cdef class ConstantPotential(FieldRule):
         """Residuals with the differences of their means over blocks of slots divided by the potentials of these."""
         cdef const double[::1] fine = residuals
         cdef double[::1] coarse, result, lead
-        cdef long n = fine.shape[0], i, k, block, first, last
+        cdef Index n = fine.shape[0], i, k, block, first, last
         cdef double total
 
         # means over blocks of 1, 4, 16, ... slots
@@ -279,7 +280,7 @@ cdef class ConstantPotential(FieldRule):
         The charges are the weights of the mean: with them, the mean field does not depend on the rule (see `Cap`).
         """
         cdef double flux = 0.0, squares = 0.0
-        cdef long i
+        cdef Index i
         for i in range(tree.n_slots):
             squares += tree.q[i] * tree.q[i]
             flux += tree.q[i] * (self.field[i, 0] * self.normals[i, 0] + self.field[i, 1] * self.normals[i, 1]
@@ -300,7 +301,7 @@ cdef class ConstantPotential(FieldRule):
         cdef double[:, ::1] missing = np.empty((len(chosen), 5))
         cdef double[::1] squares = np.empty(len(positions))
         cdef double total
-        cdef long i, j, k, atom
+        cdef Index i, j, k, atom
         for i in range(missing.shape[0]):
             self.squared_distances(atoms, chosen[i], squares)
             for j, atom in enumerate(np.argsort(squares, kind="stable")[:5]):
@@ -315,15 +316,15 @@ cdef class ConstantPotential(FieldRule):
         at_atom, near = np.asarray(missing)[:, 0], np.asarray(missing)[:, 1:].mean(axis=1)
         return (at_atom - near) / (self.self_term * charges.mean()) + near / self.potential
 
-    cdef void squared_distances(self, const double[:, ::1] atoms, long atom, double[::1] squares) noexcept nogil:
-        cdef long k
+    cdef void squared_distances(self, const double[:, ::1] atoms, Index atom, double[::1] squares) noexcept nogil:
+        cdef Index k
         for k in range(atoms.shape[0]):
             squares[k] = ((atoms[k, 0] - atoms[atom, 0]) ** 2 + (atoms[k, 1] - atoms[atom, 1]) ** 2
                           + (atoms[k, 2] - atoms[atom, 2]) ** 2)
 
     # ---- events ----------------------------------------------------------------------------------------------------
 
-    cdef double strength(self, Octree tree, long slot) noexcept nogil:
+    cdef double strength(self, Octree tree, Index slot) noexcept nogil:
         if self.sees_others:   # twice, as just outside a charged surface
             return 2.0 * (self.field[slot, 0] * self.normals[slot, 0] + self.field[slot, 1] * self.normals[slot, 1]
                           + self.field[slot, 2] * self.normals[slot, 2])
@@ -331,7 +332,7 @@ cdef class ConstantPotential(FieldRule):
 
     cdef void removed(self, Octree tree, const Hole* hole) noexcept nogil:
         cdef double dx, dy, dz, s, over
-        cdef long i
+        cdef Index i
         cdef int slot
         for i in range(hole.n):
             slot = hole.slot[i]
@@ -344,10 +345,10 @@ cdef class ConstantPotential(FieldRule):
         if self.sees_others:
             FieldRule.removed(self, tree, hole)
 
-    cdef int exposed(self, Octree tree, long slot, double opening_angle) except -1 nogil:
+    cdef int exposed(self, Octree tree, Index slot, double opening_angle) except -1 nogil:
         # The potential of a neighbour plus the difference between the two places, in which the errors of distant cells
         # cancel.
-        cdef long other = self.nearest(tree, slot)
+        cdef Index other = self.nearest(tree, slot)
         cdef double dx = 0.0, dy = 0.0, dz = 0.0
         if other >= 0:
             dx, dy, dz = tree.x[other] - tree.x[slot], tree.y[other] - tree.y[slot], tree.z[other] - tree.z[slot]
@@ -360,9 +361,9 @@ cdef class ConstantPotential(FieldRule):
             sources_field(&self.sources, tree.x[slot], tree.y[slot], tree.z[slot], &self.field[slot, 0])
         return 0
 
-    cdef long nearest(self, Octree tree, long slot) noexcept nogil:
+    cdef Index nearest(self, Octree tree, Index slot) noexcept nogil:
         # The nearest atom in the same leaf; -1 if there is none.
-        cdef long leaf = tree.leaf[slot], k = tree.first[leaf], best = -1
+        cdef Index leaf = tree.leaf[slot], k = tree.first[leaf], best = -1
         cdef double s, least = 1e30
         while k >= 0:
             s = (tree.x[k] - tree.x[slot]) ** 2 + (tree.y[k] - tree.y[slot]) ** 2 + (tree.z[k] - tree.z[slot]) ** 2
@@ -371,7 +372,7 @@ cdef class ConstantPotential(FieldRule):
             k = tree.following(leaf, k)
         return best
 
-    cdef double at(self, Octree tree, long slot) noexcept nogil:
+    cdef double at(self, Octree tree, Index slot) noexcept nogil:
         # Potential of the collected sources at a slot, without its own charge.
         cdef double total = sources_potential(&self.sources, tree.x[slot], tree.y[slot], tree.z[slot])
         if self.gaussian:   # also cells: one so close contains one atom
@@ -379,9 +380,9 @@ cdef class ConstantPotential(FieldRule):
             total += self.corrections(tree, slot, self.sources.cells, self.sources.n_cells)
         return total
 
-    cdef double corrections(self, Octree tree, long slot, const double* sources, long n) noexcept nogil:
+    cdef double corrections(self, Octree tree, Index slot, const double* sources, Index n) noexcept nogil:
         # Differences between Gaussian and point charges at a slot, for sources in columns x y z q.
-        cdef long k, stride = self.sources.capacity
+        cdef Index k, stride = self.sources.capacity
         cdef double total = 0.0, s
         for k in range(n):
             s = ((tree.x[slot] - sources[k]) ** 2 + (tree.y[slot] - sources[stride + k]) ** 2
@@ -391,8 +392,8 @@ cdef class ConstantPotential(FieldRule):
         return total
 
     cdef int solve_patch(self, Octree tree, double[:, ::1] normals, const Hole* hole, Patch* patch) except -1 nogil:
-        cdef long i, padded = (hole.n + GROUP - 1) // GROUP * GROUP
-        cdef long near = min((hole.n_near + GROUP - 1) // GROUP * GROUP, padded)
+        cdef Index i, padded = (hole.n + GROUP - 1) // GROUP * GROUP
+        cdef Index near = min((hole.n_near + GROUP - 1) // GROUP * GROUP, padded)
         cdef int slot
         if 4 * padded > self.spreads.shape[0]:
             with gil:
@@ -418,7 +419,7 @@ cdef class ConstantPotential(FieldRule):
                 self.field[slot, 2] += self.spreads[3 * padded + i]
         return 0
 
-    cdef void act_on(self, const Hole* hole, long first, long m, long padded, long n, const float* x,
+    cdef void act_on(self, const Hole* hole, Index first, Index m, Index padded, Index n, const float* x,
                      const float* y, const float* z, const float* change) noexcept nogil:
         # Potentials, and fields if a law sees them, of n changes at m slots around the hole.
         cdef float* at = &self.spreads[first]
@@ -430,7 +431,7 @@ cdef class ConstantPotential(FieldRule):
 
     cdef void correct_spread(self, const Hole* hole, const Patch* patch) noexcept nogil:
         # Differences between Gaussian and point charges in these potentials.
-        cdef long i, k
+        cdef Index i, k
         cdef float dx, dy, dz, s, most = <float>self.sums.reach_squared
         for i in range(hole.n):
             for k in range(patch.n):
@@ -439,7 +440,7 @@ cdef class ConstantPotential(FieldRule):
                 if SAME_PLACE < s < most:
                     self.spreads[i] += patch.change[k] * <float>self.sums.difference(s)
 
-    cdef int grow(self, long stride) except -1 nogil:
+    cdef int grow(self, Index stride) except -1 nogil:
         if stride > self.residual.shape[0]:
             with gil:
                 self.matrix = np.zeros(stride * stride, np.float32)
@@ -452,7 +453,7 @@ cdef class ConstantPotential(FieldRule):
         # Conjugate gradients for the changes: A x = V - potentials of the old charges.
         cdef double mean = 0.0
         cdef float largest = 0.0, square, before, curvature, step, bound, s, most = <float>self.sums.reach_squared
-        cdef long i, k, n = patch.n, stride = patch.stride
+        cdef Index i, k, n = patch.n, stride = patch.stride
         cdef int _iteration
         self.grow(stride)
         cdef float* residual = &self.residual[0]

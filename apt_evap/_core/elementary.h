@@ -6,6 +6,8 @@
 
 #include <math.h>
 
+#include "index.h"
+
 /* Horner's scheme; coefficients from the lowest order. */
 static inline double horner(int n, const double *coefficient, double x)
 {
@@ -28,7 +30,7 @@ static inline void sine_cosine(double angle, double *sine, double *cosine)
     const double x = ((angle - turns * 1.5707963267341256) - turns * 6.077100506303966e-11)
                      - turns * 2.0222662487959506e-21;
     const double a = x * horner(9, s, x * x), b = horner(10, c, x * x);
-    const long quarter = (long)turns & 3;
+    const Index quarter = (Index)turns & 3;
     *sine = quarter == 0 ? a : quarter == 1 ? b : quarter == 2 ? -a : -b;
     *cosine = quarter == 0 ? b : quarter == 1 ? -a : quarter == 2 ? -b : a;
 }
@@ -67,7 +69,7 @@ static inline double natural_logarithm(double x)
 /* exp(x) = value 2^exponent with 0.7 < value < 1.42, for |x| <= 1e15: no overflow; relative errors below 4e-16 |x| for
  * large |x|, where the rounding of x itself limits, and below 4e-16 for |x| < 700. Taylor series for |r| <= log(2) / 2;
  * the first part of log(2) has 32 bits, as above. */
-static inline double exponential_parts(double x, long long *exponent)
+static inline double exponential_parts(double x, Index *exponent)
 {
     static const double c[15] = {1.0, 1.0, 0.5, 0.16666666666666666, 0.041666666666666664, 0.008333333333333333,
         0.001388888888888889, 0.0001984126984126984, 2.48015873015873e-05, 2.7557319223985893e-06,
@@ -75,14 +77,14 @@ static inline double exponential_parts(double x, long long *exponent)
         1.1470745597729725e-11};
     const double k = rint(x * 1.4426950408889634);
     const double r = (x - k * 0.6931471803691238) - k * 1.9082149292705877e-10;
-    *exponent = (long long)k;
+    *exponent = (Index)k;
     return horner(15, c, r);
 }
 
 /* exp(x), 0 and infinity outside the range of float64; NaN for NaN. */
 static inline double exponential_of(double x)
 {
-    long long exponent;
+    Index exponent;
     if (x != x) return x;
     if (x > 709.8) return INFINITY;
     if (x < -745.2) return 0.0;

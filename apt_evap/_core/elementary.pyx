@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from apt_evap._core.index cimport Index
+
 
 cdef extern from "elementary.h":
     void sine_cosine(double, double*, double*) noexcept nogil
@@ -14,7 +16,7 @@ cdef extern from "elementary.h":
 
 def sine_and_cosine(angles):
     """Sine and cosine of angles [rad] up to 1e5, of any shape; errors below 3e-16."""
-    cdef long i
+    cdef Index i
     shape = np.shape(angles)
     cdef const double[::1] values = np.ascontiguousarray(angles, np.float64).reshape(-1)
     cdef double[::1] sine = np.empty(values.shape[0]), cosine = np.empty(values.shape[0])
@@ -26,7 +28,7 @@ def sine_and_cosine(angles):
 
 cdef apply(double (*function)(double) noexcept nogil, numbers):
     # A function of each of the numbers, in their shape.
-    cdef long i
+    cdef Index i
     cdef const double[::1] values = np.ascontiguousarray(numbers, np.float64).reshape(-1)
     cdef double[::1] results = np.empty(values.shape[0])
     with nogil:

@@ -2,6 +2,7 @@
 
 from apt_evap._core.chooser cimport Chooser
 from apt_evap._core.control cimport Control
+from apt_evap._core.index cimport Index
 from apt_evap._core.journal cimport Journal
 from apt_evap._core.law cimport LawKernel
 from apt_evap._core.neighbourhood cimport Neighbourhood
@@ -17,12 +18,12 @@ cdef class Evaporation:
     cdef readonly double potential, coulomb, field_unit, patch_radius, update_radius, opening_angle
     cdef readonly double potential_bound
     cdef readonly object start          # start values of the last relaxation of the whole surface
-    cdef readonly long n_removed, since_relaxation
-    cdef readonly long n_partial        # relaxations of a part since that of the whole surface
-    cdef long n_slots_before            # slots of the tree after the last relaxation
+    cdef readonly Index n_removed, since_relaxation
+    cdef readonly Index n_partial       # relaxations of a part since that of the whole surface
+    cdef Index n_slots_before           # slots of the tree after the last relaxation
     cdef readonly signed char[::1] disturbed  # (capacity,) 1 for slots near holes since the last relaxation
-    cdef public long n_clipped          # negative charges that were set to 0
-    cdef public long n_unsettled        # patches that did not converge
+    cdef public Index n_clipped         # negative charges that were set to 0
+    cdef public Index n_unsettled       # patches that did not converge
     cdef readonly Control control       # of the voltage
     cdef readonly double target_stretch  # squared reach of a roll-up over that of a nearest neighbour
     cdef readonly unsigned long long seed
@@ -40,19 +41,19 @@ cdef class Evaporation:
     cdef float[:, ::1] patch_float      # (8, capacity)
     cdef int[::1] far_slot              # (capacity,)
     cdef double[::1] strength, key      # (capacity,) of the patch, for the law
-    cdef long long[::1] key_atom
+    cdef Index[::1] key_atom
     cdef int[::1] key_bonds
 
-    cdef void allocate(self, long capacity)
+    cdef void allocate(self, Index capacity)
     cdef update_chooser(self, double factor, log_rate_at, int n_threads)
     cdef Chooser new_chooser(self, double voltage_factor, int n_threads)
-    cdef void strongest_neighbours(self, long atom, double stretch, long long* neighbour,
+    cdef void strongest_neighbours(self, Index atom, double stretch, Index* neighbour,
                                    double* charge) noexcept nogil
     cdef void add_to_patch(self, int slot, double dx, double dy, double dz) noexcept nogil
     cdef void sort_near_first(self, Hole* hole) noexcept nogil
-    cdef int surroundings(self, long atom) noexcept nogil
-    cdef double hopping(self, double key, double strength, long atom) noexcept nogil
-    cdef int update_keys(self, const int* slots, long n) except -1 nogil
-    cdef int event(self, long atom, Journal journal) except -1 nogil
+    cdef int surroundings(self, Index atom) noexcept nogil
+    cdef double hopping(self, double key, double strength, Index atom) noexcept nogil
+    cdef int update_keys(self, const int* slots, Index n) except -1 nogil
+    cdef int event(self, Index atom, Journal journal) except -1 nogil
     cdef int scale(self, Journal journal) except -1 nogil
     cdef int expose(self, const int* fresh, int n_fresh, int removed_slot, Journal journal) except -1 nogil

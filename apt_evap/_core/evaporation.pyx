@@ -15,6 +15,7 @@ import numpy as np
 
 from apt_evap._core.control cimport Control
 from apt_evap._core.events cimport TARGETS, Event, Events
+from apt_evap._core.index cimport Index
 from apt_evap._core.interactions cimport InteractionLists
 from apt_evap._core.journal cimport Journal
 from apt_evap._core.neighbourhood cimport MAX_NEAR
@@ -55,10 +56,10 @@ cdef class RelaxationStart:
     arrays).
     """
 
-    cdef readonly long n_removed
+    cdef readonly Index n_removed
     cdef readonly object charges, isolated, isolated_normals, rule_state
 
-    def __init__(self, long n_removed, charges, isolated, isolated_normals, rule_state):
+    def __init__(self, Index n_removed, charges, isolated, isolated_normals, rule_state):
         self.n_removed, self.charges, self.rule_state = n_removed, charges, rule_state
         self.isolated, self.isolated_normals = isolated, isolated_normals
 
@@ -109,7 +110,7 @@ cdef class Evaporation:
         self.slot_of = np.full(atoms.n_atoms, -1, np.int32)
         self.allocate(INITIAL_CAPACITY)
 
-    cdef void allocate(self, long capacity):
+    cdef void allocate(self, Index capacity):
         # Buffers for this number of slots around a hole, and for the newly exposed atoms.
         self.hole_slot = np.empty(capacity + MAX_NEAR, np.int32)
         self.hole_float = np.empty((3, capacity + MAX_NEAR + GROUP), np.float32)
@@ -136,7 +137,7 @@ cdef class Evaporation:
         self.has_support = bool(np.asarray(atoms.support).any())
         self.atoms, self.law, self.slot_of = atoms, law, slot_of
 
-    def relax(self, *, double tolerance=1e-4, int max_sweeps=200, bint double_precision=False, long extra=0,
+    def relax(self, *, double tolerance=1e-4, int max_sweeps=200, bint double_precision=False, Index extra=0,
               double opening_angle=0.0, int n_threads=1, start=None):
         """Rebuild the tree and solve the charges of the whole surface at its potential.
 
@@ -164,7 +165,7 @@ cdef class Evaporation:
         residual : float
             Largest change of a charge in the last sweep, relative to the mean charge.
         """
-        cdef long n, slot
+        cdef Index n, slot
         cdef int builders
         cdef int[::1] slot_of = np.full(self.atoms.n_atoms, -1, np.int32)
         surface = self.atoms.surface
@@ -247,7 +248,7 @@ cdef class Evaporation:
         exposed = self.tree.n_slots - self.n_slots_before
         return self.tree.n_slots + 2 * exposed + MAX_NEAR > self.tree.capacity
 
-    def remove(self, const long long[::1] atoms):
+    def remove(self, const Index[::1] atoms):
         """Remove atoms as if they had evaporated, without charges; call `relax` next."""
         self.atoms.remove_atoms(atoms)
         self.n_removed += atoms.shape[0]
@@ -273,9 +274,9 @@ cdef class Evaporation:
 
     cdef Chooser new_chooser(self, double voltage_factor, int n_threads):
         # The chooser for recomputed keys of all slots, for a voltage over that of the charges.
-        cdef long n = self.tree.n_slots, slot
+        cdef Index n = self.tree.n_slots, slot
         cdef int[::1] bonds = np.zeros(n, np.int32)
-        cdef long long[::1] atom = np.maximum(self.tree.atoms[:n], 0)   # empty slots get a key, which is removed below
+        cdef Index[::1] atom = np.maximum(self.tree.atoms[:n], 0)   # empty slots get a key, which is removed below
         cdef double[::1] key = np.full(self.tree.capacity, -INFINITY), strength = self.rule.strengths(self.tree)
         for slot in prange(n, nogil=True, schedule="static", num_threads=n_threads):
             bonds[slot] = self.surroundings(atom[slot])
@@ -289,11 +290,11 @@ cdef class Evaporation:
                 key[slot] = -INFINITY
         return self.law.chooser(self.tree, key)
 
-    def current_start(self, const long long[::1] surface, int n_threads=1):
+    def current_start(self, const Index[::1] surface, int n_threads=1):
         """Start values of a relaxation of the current surface; equal charges if it has none yet."""
         cdef double[::1] charges = np.ones(len(surface))
         cdef char[::1] alone = np.zeros(len(surface), np.int8)
-        cdef long i, slot
+        cdef Index i, slot
         isolated, normals = np.empty(0, np.int64), np.empty((0, 3))
         if self.tree is not None:
             for i in prange(surface.shape[0], nogil=True, schedule="static", num_threads=n_threads):
@@ -306,13 +307,13 @@ cdef class Evaporation:
 
     # ---- one event -------------------------------------------------------------------------------------------------
 
-    cdef void strongest_neighbours(self, long atom, double stretch, long long* neighbour,
+    cdef void strongest_neighbours(self, Index atom, double stretch, Index* neighbour,
                                    double* charge) noexcept nogil:
         # The TARGETS surface neighbours of an atom with the highest charges, in descending order; -1 if there are
         # fewer. Nearest neighbours, and with a stretch above 1 also those of the second shell.
         cdef int[MAX_NEAR] others
         cdef int n, i, k, m
-        cdef long other
+        cdef Index other
         cdef double q
         for k in range(TARGETS):
             neighbour[k] = -1
@@ -333,7 +334,7 @@ cdef class Evaporation:
     cdef void add_to_patch(self, int slot, double dx, double dy, double dz) noexcept nogil:
         # Add a slot at (dx, dy, dz) from the hole to the patch. Its normal may have changed if the hole was a
         # neighbour.
-        cdef long n = self.patch.n
+        cdef Index n = self.patch.n
         cdef double reach = 1.001 * self.atoms.radius
         self.patch.slot[n] = slot
         self.patch.x[n], self.patch.y[n], self.patch.z[n] = <float>dx, <float>dy, <float>dz
@@ -344,7 +345,7 @@ cdef class Evaporation:
     cdef void sort_near_first(self, Hole* hole) noexcept nogil:
         # Order the slots around a hole: first those near the patch.
         cdef double near = self.rule.near * self.patch_radius, dx, dy, dz
-        cdef long i, n_far = 0
+        cdef Index i, n_far = 0
         cdef int slot
         hole.n_near = 0
         for i in range(hole.n):
@@ -359,13 +360,13 @@ cdef class Evaporation:
         for i in range(n_far):
             hole.slot[hole.n_near + i] = self.far_slot[i]
 
-    cdef int surroundings(self, long atom) noexcept nogil:
+    cdef int surroundings(self, Index atom) noexcept nogil:
         # Bonds of an atom for the law: their number, or their code.
         return self.atoms.bond_code[atom] if self.atoms.has_codes else self.atoms.bonds[atom]
 
-    cdef double hopping(self, double key, double strength, long atom) noexcept nogil:
+    cdef double hopping(self, double key, double strength, Index atom) noexcept nogil:
         # Key of an atom that may hop onto its strongest nearest neighbour, from its key without hops.
-        cdef long long[TARGETS] neighbour
+        cdef Index[TARGETS] neighbour
         cdef double[TARGETS] charge
         cdef int slot = self.slot_of[atom]
         if slot < 0 or self.atoms.bonds[atom] > self.law.hop_bonds or not self.tree.q[slot] > 0.0:
@@ -373,9 +374,9 @@ cdef class Evaporation:
         self.strongest_neighbours(atom, 1.0, neighbour, charge)   # for which phi was solved, whatever rolls
         return self.law.hopping(key, strength, charge[0] / self.tree.q[slot])
 
-    cdef int update_keys(self, const int* slots, long n) except -1 nogil:
+    cdef int update_keys(self, const int* slots, Index n) except -1 nogil:
         # New keys of slots whose fields or bonds have changed.
-        cdef long i
+        cdef Index i
         if n == 0:
             return 0
         for i in range(n):
@@ -391,13 +392,13 @@ cdef class Evaporation:
         self.chooser.update(slots, n)
         return 0
 
-    cdef int event(self, long atom, Journal journal) except -1 nogil:
+    cdef int event(self, Index atom, Journal journal) except -1 nogil:
         cdef int[MAX_NEAR] fresh
         cdef int removed_slot = self.slot_of[atom], n_fresh, slot
         cdef double dx, dy, dz, s
         cdef Hole* hole = &self.hole
         cdef Patch* patch = &self.patch
-        cdef long capacity, i, at
+        cdef Index capacity, i, at
 
         # remove the atom from the tree, the chooser and the neighbourhoods; the removal exposes the atoms `fresh`
         hole.x, hole.y = self.atoms.positions[atom, 0], self.atoms.positions[atom, 1]
@@ -470,7 +471,7 @@ cdef class Evaporation:
         # Multiply all charges by the factor 1 / (1 + drift), which restores the potential inside. These are then the
         # changes by the event.
         cdef double factor = 1.0 / (1.0 + self.rule.drift)
-        cdef long slot, at = journal.start[journal.n_events] + 1
+        cdef Index slot, at = journal.start[journal.n_events] + 1
         journal.reserve(self.tree.n_slots + 1, 0)
         for slot in range(self.tree.n_slots):
             if self.tree.atom[slot] >= 0:
@@ -491,7 +492,7 @@ cdef class Evaporation:
         cdef double px, py, pz, s, nearest
         cdef Hole* hole = &self.hole
         cdef int slot, best
-        cdef long i, k, at
+        cdef Index i, k, at
         journal.reserve(self.patch.n + n_fresh + 1, n_fresh)
         journal.fresh_start[journal.n_events + 1] = journal.fresh_start[journal.n_events] + n_fresh
         for k in range(n_fresh):
@@ -521,7 +522,7 @@ cdef class Evaporation:
             self.add_to_patch(slot, px - hole.x, py - hole.y, pz - hole.z)
         return 0
 
-    def evaporate(self, Events events, long sweep_interval):
+    def evaporate(self, Events events, Index sweep_interval):
         """Evaporate atoms until the table of events is full.
 
         Stops early if a relaxation or an extension of the shell is needed, or no atom is left. Atoms that have lost all
@@ -542,7 +543,7 @@ cdef class Evaporation:
         """
         cdef Journal journal = events.journal
         cdef Event* event
-        cdef long leaving
+        cdef Index leaving
         cdef int status = STATUS_DONE, best, axis
         cdef double u = 0.5
         cdef bint drawn

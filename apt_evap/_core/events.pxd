@@ -1,5 +1,6 @@
 """The table of events, for the sequence that fills it."""
 
+from apt_evap._core.index cimport Index
 from apt_evap._core.journal cimport Journal
 
 
@@ -10,11 +11,11 @@ cdef enum:
 cdef struct Event:
     # One row, for the compiled code. `COLUMNS` of events.pyx has the units and meanings; the import checks that both
     # have the same fields.
-    long long site
+    Index site
     double charges
     double fields
     double[3] normals
-    long long[TARGETS] targets
+    Index[TARGETS] targets
     double[TARGETS] target_charges
     double waits
     double rises

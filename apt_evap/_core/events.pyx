@@ -4,6 +4,8 @@ import typing
 
 import numpy as np
 
+from apt_evap._core.index cimport Index
+
 
 class Column(typing.NamedTuple):
     """A number, or a few numbers, of every event."""
@@ -58,7 +60,7 @@ cdef class Events:
         Number of rows.
     """
 
-    def __init__(self, positions, long max_events):
+    def __init__(self, positions, Index max_events):
         self.journal = Journal(positions, max_events)
         self.table = np.empty(max_events, ROW)
         self.rows = self.table

@@ -1,5 +1,7 @@
 """Expansion of a field about a ball, for the other compiled modules."""
 
+from apt_evap._core.index cimport Index
+
 cdef enum:
     ORDER = 6                                        # of the potential
     SAMPLES = 24                                     # points at which the field is summed
@@ -15,4 +17,4 @@ cdef class FarField:
 
     cdef void point(self, int sample, double* position) noexcept nogil
     cdef void expand(self, const double* field) noexcept nogil
-    cdef void add(self, long n, const double* positions, const long* which, double* field) noexcept nogil
+    cdef void add(self, Index n, const double* positions, const Index* which, double* field) noexcept nogil

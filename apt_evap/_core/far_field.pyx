@@ -16,6 +16,8 @@ import numpy as np
 
 import apt_evap._core.elementary as elementary
 
+from apt_evap._core.index cimport Index
+
 cdef extern from "kernels.h":
     const int SINGLE_LANES
     void polynomial_field(int, const float*, const float*, const float*, const float*,
@@ -141,13 +143,13 @@ cdef class FarField:
         for j in range(3 * MONOMIALS):
             self.coefficients[j] = <float>total[j]
 
-    cdef void add(self, long n, const double* positions, const long* which, double* field) noexcept nogil:
+    cdef void add(self, Index n, const double* positions, const Index* which, double* field) noexcept nogil:
         # Adds the field at the points (., 3) with the indices `which`.
         cdef float[16] x, y, z, ex, ey, ez
         cdef double scale = 1.0 / self.radius
-        cdef long first = 0, lane, m, i
+        cdef Index first = 0, lane, m, i
         while first < n:
-            m = min(<long>SINGLE_LANES, n - first)
+            m = min(<Index>SINGLE_LANES, n - first)
             for lane in range(SINGLE_LANES):
                 i = 3 * which[first + min(lane, m - 1)]
                 x[lane] = <float>((positions[i] - self.centre[0]) * scale)
@@ -174,9 +176,9 @@ cdef class FarField:
 
     def fields(self, const double[:, ::1] positions):
         """Field at points in the ball [nm], shape (n, 3)."""
-        cdef long n = positions.shape[0]
+        cdef Index n = positions.shape[0]
         cdef double[:, ::1] field = np.zeros((n, 3))
-        cdef long[::1] which = np.arange(n)
+        cdef Index[::1] which = np.arange(n, dtype=np.int64)
         if n:
             self.add(n, &positions[0, 0], &which[0], &field[0, 0])
         return np.asarray(field)

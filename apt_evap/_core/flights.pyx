@@ -13,6 +13,7 @@ from libc.math cimport INFINITY, NAN, sqrt
 from libc.stdlib cimport free, malloc
 
 from apt_evap._core.far_field cimport SAMPLES, FarField
+from apt_evap._core.index cimport Index
 from apt_evap._core.journal cimport Journal
 from apt_evap._core.octree cimport Octree
 from apt_evap._core.sources cimport (
@@ -26,12 +27,14 @@ cdef extern from "elementary.h":
 
 cdef extern from *:
     """
+    #include "index.h"
+
     /* The next piece of work of several threads. */
-    static long fetch_next(long long *counter) { return (long)__atomic_fetch_add(counter, 1, __ATOMIC_RELAXED); }
-    static int is_set(long long *flag) { return __atomic_load_n(flag, __ATOMIC_RELAXED) != 0; }
+    static Index fetch_next(Index *counter) { return (Index)__atomic_fetch_add(counter, 1, __ATOMIC_RELAXED); }
+    static int is_set(Index *flag) { return __atomic_load_n(flag, __ATOMIC_RELAXED) != 0; }
     """
-    long fetch_next(long long* counter) nogil
-    bint is_set(long long* flag) nogil
+    Index fetch_next(Index* counter) nogil
+    bint is_set(Index* flag) nogil
 
 cdef enum:
     STAGES = 9
@@ -54,8 +57,8 @@ cdef double SCOUT_TOLERANCE = 3e-2
 # 1.4 um. Many flights are those of wide responses, whose polynomials deviate more: 2.0e-5, 2 um and above.
 cdef double FAR = 4.5
 cdef double FAR_OF_MANY = 3.5
-cdef long MANY = 32
-cdef long MOST_REFUSED = 12   # successive steps that hit an atom, each a tenth of the one before: it starts at one
+cdef Index MANY = 32
+cdef Index MOST_REFUSED = 12  # successive steps that hit an atom, each a tenth of the one before: it starts at one
 
 cdef double[9] NODE = [0.0, 1 / 20.0, 1 / 10.0, 3 / 10.0, 1 / 2.0, 7 / 10.0, 9 / 10.0, 1.0, 1.0]
 cdef double[81] STAGE = [
@@ -110,18 +113,18 @@ cdef class Flights:
     """
 
     cdef Octree tree
-    cdef long n_replayed
+    cdef Index n_replayed
     cdef Sources sources
     cdef SingleSources near, far
     cdef FarField far_field
     cdef bint expanded
     cdef double coulomb, length, reach, opening_angle, tolerance
     cdef double[3] centre
-    cdef long max_steps, fewest
-    cdef long capacity
+    cdef Index max_steps, fewest
+    cdef Index capacity
     cdef double* work          # (STAGES + 3, capacity, 3): accelerations, then position, velocity, trial position
-    cdef long* flying          # (capacity,) flights that have not ended
-    cdef readonly long n_steps, n_evaluations, n_pairs
+    cdef Index* flying         # (capacity,) flights that have not ended
+    cdef readonly Index n_steps, n_evaluations, n_pairs
 
     def __cinit__(self, *args, **kwargs):
         self.work = NULL
@@ -131,7 +134,7 @@ cdef class Flights:
         self.near.atoms = self.near.cells = self.far.atoms = self.far.cells = NULL
 
     def __init__(self, Octree tree, *, double coulomb, double length, centre, double reach, double opening_angle,
-                 double tolerance, long max_steps):
+                 double tolerance, Index max_steps):
         self.coulomb, self.length, self.reach = coulomb, length, reach
         self.opening_angle, self.tolerance, self.max_steps = opening_angle, tolerance, max_steps
         self.centre[0], self.centre[1], self.centre[2] = centre
@@ -160,10 +163,10 @@ cdef class Flights:
                 self.n_replayed += 1
         self.n_replayed = 0
 
-    def fly(self, Journal journal, const long long[::1] event, const long long[::1] start,
+    def fly(self, Journal journal, const Index[::1] event, const Index[::1] start,
             const double[:, ::1] positions, const double[:, ::1] velocities, double[:, ::1] end,
-            signed char[::1] outcome, long long[::1] counter, long long[::1] halt,
-            const long long[::1] families=None, long scouts=-1, double rim=0.0, double margin=0.0, double plane=0.0):
+            signed char[::1] outcome, Index[::1] counter, Index[::1] halt,
+            const Index[::1] families=None, Index scouts=-1, double rim=0.0, double margin=0.0, double plane=0.0):
         """Fly groups of launches, each in the field after its event.
 
         Several objects can work in parallel threads: `counter` distributes the ions. Call `follow` before another
@@ -203,7 +206,7 @@ cdef class Flights:
         plane : float
             z of the plane on which ions arrive [nm].
         """
-        cdef long ion, group, k, n = event.shape[0], n_groups = (start.shape[0] - 1) // max(1, event.shape[0])
+        cdef Index ion, group, k, n = event.shape[0], n_groups = (start.shape[0] - 1) // max(1, event.shape[0])
         with nogil:
             while not is_set(&halt[0]):
                 ion = fetch_next(&counter[0])
@@ -227,7 +230,7 @@ cdef class Flights:
                         self.fly_with_retries(start[group], start[group + 1], positions, velocities, end, outcome)
                     group += 1
 
-    cdef int fly_scouts(self, long m, const double* positions, const double* velocities, double* end,
+    cdef int fly_scouts(self, Index m, const double* positions, const double* velocities, double* end,
                         signed char* outcome) except -1 nogil:
         cdef double opening_angle = self.opening_angle, tolerance = self.tolerance
         self.opening_angle, self.tolerance = max(opening_angle, SCOUT_ANGLE), max(tolerance, SCOUT_TOLERANCE)
@@ -236,10 +239,10 @@ cdef class Flights:
         self.opening_angle, self.tolerance, self.fewest = opening_angle, tolerance, FEWEST
         return 0
 
-    cdef int fly_with_retries(self, long first, long last, const double[:, ::1] positions,
+    cdef int fly_with_retries(self, Index first, Index last, const double[:, ::1] positions,
                               const double[:, ::1] velocities, double[:, ::1] end, signed char[::1] outcome
                               ) except -1 nogil:
-        cdef long k
+        cdef Index k
         if last > first:
             self.fly_group(last - first, &positions[first, 0], &velocities[first, 0], &end[first, 0], &outcome[first])
         if last > first + 1:   # a launch that hits an atom stops its whole group
@@ -248,13 +251,13 @@ cdef class Flights:
                     self.fly_group(1, &positions[k, 0], &velocities[k, 0], &end[k, 0], &outcome[k])
         return 0
 
-    cdef bint stays_outside(self, const long long[::1] families, const double* end, const signed char* outcome,
+    cdef bint stays_outside(self, const Index[::1] families, const double* end, const signed char* outcome,
                             double rim, double margin, double plane) noexcept nogil:
         # Whether no launch of the ion can arrive within the rim, from the ends of its scouts.
         cdef double[2] origin, s
         cdef double[3][2] base
         cdef double x, y, sine, cosine, speed, away, least = INFINITY, largest = 0.0
-        cdef long family, k, first = 0
+        cdef Index family, k, first = 0
         cdef int azimuth, step
         for family in range(families.shape[0]):
             for k in range(families[family]):
@@ -295,21 +298,21 @@ cdef class Flights:
         remaining = sqrt(place[0] ** 2 + place[1] ** 2 + place[2] ** 2) + place[2]
         s[0], s[1] = place[0] / remaining, place[1] / remaining
 
-    cdef int fly_group(self, long m, const double* positions, const double* velocities, double* end,
+    cdef int fly_group(self, Index m, const double* positions, const double* velocities, double* end,
                        signed char* outcome) except -1 nogil:
         cdef double* a
         cdef double* x
         cdef double* v
         cdef double* trial
         cdef double time = 0.0, dt, largest, s, length, away
-        cdef long i, flying = m, steps, refused = 0
+        cdef Index i, flying = m, steps, refused = 0
         cdef int stage, k, axis
         if m > self.capacity:
             free(self.work)
             free(self.flying)
             self.capacity = m
             self.work = <double*>malloc((STAGES + 3) * 3 * m * sizeof(double))
-            self.flying = <long*>malloc(m * sizeof(long))
+            self.flying = <Index*>malloc(m * sizeof(Index))
             if self.work == NULL or self.flying == NULL:
                 with gil:
                     raise MemoryError
@@ -390,12 +393,12 @@ cdef class Flights:
                 end[7 * i + 6] = time
         return 0
 
-    cdef double time_to_reach(self, long m, const double* x, const double* v,
+    cdef double time_to_reach(self, Index m, const double* x, const double* v,
                               const signed char* outcome) noexcept nogil:
         # Time in which the slowest flight close to `reach` crosses it in a straight line, so that no flight ends far
         # beyond; flights that need more than the largest step are ignored.
         cdef double rr, rv, vv, dx, longest = 0.0
-        cdef long i
+        cdef Index i
         cdef int axis
         for i in range(m):
             if outcome[i] == ION_NEVER_LEFT:
@@ -410,7 +413,7 @@ cdef class Flights:
                 longest = max(longest, (sqrt(max(0.0, rv * rv + vv * (self.reach * self.reach - rr))) - rv) / vv)
         return 1.0001 * longest
 
-    cdef double step_error(self, long i, long m, double dt, const double* a, const double* v, const double* origin,
+    cdef double step_error(self, Index i, Index m, double dt, const double* a, const double* v, const double* origin,
                            const double* trial) noexcept nogil:
         # Largest error of the step, relative to the tolerance.
         cdef double dx, dv, ex = 0.0, ev = 0.0, path = 0.0, speed = 0.0, new
@@ -430,13 +433,13 @@ cdef class Flights:
         ev = dt * sqrt(ev) / (self.tolerance * sqrt(speed))
         return max(ex, ev) if ex == ex and ev == ev else INFINITY
 
-    cdef int gather(self, long m, const double* x, const double* v, const double* a, const signed char* outcome,
+    cdef int gather(self, Index m, const double* x, const double* v, const double* a, const signed char* outcome,
                     double dt) except -1 nogil:
         # Collects the sources for a ball that contains all flights until the end of the step.
         cdef double cx = 0.0, cy = 0.0, cz = 0.0, radius = 0.0, far, dx, dy, dz
         cdef double[3] origin, point
         cdef double[3 * SAMPLES] samples
-        cdef long i, n = 0
+        cdef Index i, n = 0
         for i in range(m):
             if outcome[i] == ION_NEVER_LEFT:
                 n += 1
@@ -473,9 +476,9 @@ cdef class Flights:
             self.n_pairs += SAMPLES * (self.far.n_atoms + self.far.n_cells)
         return 0
 
-    cdef void evaluate(self, long m, const double* x, double* a, const signed char* outcome) noexcept nogil:
+    cdef void evaluate(self, Index m, const double* x, double* a, const signed char* outcome) noexcept nogil:
         # Accelerations [V/nm] of the unfinished flights.
-        cdef long i, n = 0
+        cdef Index i, n = 0
         cdef int axis
         for i in range(m):
             if outcome[i] == ION_NEVER_LEFT:

@@ -12,19 +12,20 @@ from libc.math cimport sqrt
 
 import numpy as np
 
+from apt_evap._core.index cimport Index
 from apt_evap._core.octree cimport Octree
 
 
 cdef extern from "kernels.h":
     const int GROUP
-    void group_atoms_single(long, const int*, const double*, const double*, const double*, const double*,
+    void group_atoms_single(Index, const int*, const double*, const double*, const double*, const double*,
                             const double*, const float*, float*) noexcept nogil
-    void group_cells_single(long, const int*, const double*, const double*, const float*, float*) noexcept nogil
-    void group_atoms_double(long, const int*, const double*, const double*, const double*, const double*,
+    void group_cells_single(Index, const int*, const double*, const double*, const float*, float*) noexcept nogil
+    void group_atoms_double(Index, const int*, const double*, const double*, const double*, const double*,
                             const double*, const double*, double*) noexcept nogil
-    void point_atoms_double(long, const double*, const double*, const double*, const double*,
+    void point_atoms_double(Index, const double*, const double*, const double*, const double*,
                             double, double, double, double*) noexcept nogil
-    void group_cells_double(long, const int*, const double*, const double*, const double*, double*) noexcept nogil
+    void group_cells_double(Index, const int*, const double*, const double*, const double*, double*) noexcept nogil
 
 
 cdef enum:
@@ -36,10 +37,11 @@ ctypedef fused real:
     double
 
 
-cdef void group_field(InteractionLists lists, Octree tree, long group, double[:, ::1] field, real* work) noexcept nogil:
+cdef void group_field(InteractionLists lists, Octree tree, Index group, double[:, ::1] field,
+                      real* work) noexcept nogil:
     # Field at one group; `work` has space for the 32 targets and their sums, relative to the centre of the group.
-    cdef long first = lists.starts[group, 0], n_cells = lists.starts[group + 1, 0] - first
-    cdef long range_first = lists.starts[group, 1], n_ranges = lists.starts[group + 1, 1] - range_first, k, lane
+    cdef Index first = lists.starts[group, 0], n_cells = lists.starts[group + 1, 0] - first
+    cdef Index range_first = lists.starts[group, 1], n_ranges = lists.starts[group + 1, 1] - range_first, k, lane
     cdef const double* ball = &lists.ball[group, 0]
     cdef real* sums = work + 3 * GROUP
     for lane in range(GROUP):
@@ -83,11 +85,11 @@ cdef class InteractionLists:
 
     def __init__(self, Octree tree, double opening_angle, int n_threads=1, const signed char[::1] disturbed=None,
                  bint samples=False):
-        cdef long node = 0, leaf, n = 0, group, chunk, n_chunks = 0, n_blocks = 0
-        cdef long[::1] chunk_slot = np.zeros(tree.n_nodes + 1, np.int64)
-        cdef long[::1] chunk_group = np.zeros(tree.n_nodes + 1, np.int64)
+        cdef Index node = 0, leaf, n = 0, group, chunk, n_chunks = 0, n_blocks = 0
+        cdef Index[::1] chunk_slot = np.zeros(tree.n_nodes + 1, np.int64)
+        cdef Index[::1] chunk_group = np.zeros(tree.n_nodes + 1, np.int64)
         cdef int[::1] slots = np.empty(tree.n_slots, np.int32), targets
-        cdef long[:, ::1] blocks = np.empty((tree.n_nodes if samples else 0, 3), np.int64)
+        cdef Index[:, ::1] blocks = np.empty((tree.n_nodes if samples else 0, 3), np.int64)
         cdef bint whole
         self.tree, self.opening_angle, self.disturbed = tree, opening_angle, disturbed
 
@@ -133,9 +135,9 @@ cdef class InteractionLists:
             self.walk(tree, group, opening_angle, &self.cells[0] + self.starts[group, 0],
                       &self.ranges[0] + 2 * self.starts[group, 1], NULL)
 
-    cdef bint has_disturbed(self, Octree tree, long node) noexcept nogil:
+    cdef bint has_disturbed(self, Octree tree, Index node) noexcept nogil:
         # Whether a slot below a node is disturbed.
-        cdef long leaf, slot
+        cdef Index leaf, slot
         for leaf in range(node, tree.skip[node]):
             slot = tree.first[leaf] if tree.skip[leaf] == leaf + 1 else -1
             while slot >= 0:
@@ -144,11 +146,11 @@ cdef class InteractionLists:
                 slot = tree.following(leaf, slot)
         return False
 
-    cdef long middle_of(self, Octree tree, long node) noexcept nogil:
+    cdef Index middle_of(self, Octree tree, Index node) noexcept nogil:
         # The leaf below a node that is nearest to the mean position of its leaves.
         cdef double[3] mean
         cdef double s, least = 1e30
-        cdef long leaf, best = node, n = 0
+        cdef Index leaf, best = node, n = 0
         cdef int axis
         for axis in range(3):
             mean[axis] = 0.0
@@ -166,9 +168,9 @@ cdef class InteractionLists:
                     best, least = leaf, s
         return best
 
-    cdef long targets_of(self, Octree tree, long node, int* slots, long n) noexcept nogil:
+    cdef Index targets_of(self, Octree tree, Index node, int* slots, Index n) noexcept nogil:
         # Adds the atoms below a node to the n slots listed so far; returns their number.
-        cdef long leaf, slot
+        cdef Index leaf, slot
         for leaf in range(node, tree.skip[node]):
             slot = tree.first[leaf] if tree.skip[leaf] == leaf + 1 else -1
             while slot >= 0:
@@ -178,14 +180,14 @@ cdef class InteractionLists:
                 slot = tree.following(leaf, slot)
         return n
 
-    cdef void split(self, Octree tree, int* slots, long n, long group) noexcept nogil:
+    cdef void split(self, Octree tree, int* slots, Index n, Index group) noexcept nogil:
         # Splits n slots across their longest side into halves of complete groups, down to groups numbered from `group`
         # on.
         cdef double[3] low, high
         cdef double middle, far = 0.0, s
         cdef const double* c
         cdef double* ball
-        cdef long k, left, half, i, j, begin = 0, end = n - 1
+        cdef Index k, left, half, i, j, begin = 0, end = n - 1
         cdef int axis = 0, swap
         low[0] = low[1] = low[2] = 1e30
         high[0] = high[1] = high[2] = -1e30
@@ -234,13 +236,13 @@ cdef class InteractionLists:
         self.split(tree, slots, half, group)
         self.split(tree, slots + half, n - half, group + left)
 
-    cdef void walk(self, Octree tree, long group, double opening_angle, int* cells, int* ranges,
-                   long* counts) noexcept nogil:
+    cdef void walk(self, Octree tree, Index group, double opening_angle, int* cells, int* ranges,
+                   Index* counts) noexcept nogil:
         # Lists of one group: accepted cells, and slots [begin, end) of the leaves whose atoms are summed one by one,
         # adjacent ranges merged; atoms added to a leaf later are ranges of one slot. Without lists it only counts
         # cells, ranges and atoms.
         cdef const double* ball = &self.ball[group, 0]
-        cdef long node = 0, n_cells = 0, n_ranges = 0, n_atoms = 0, open_end = -1, slot
+        cdef Index node = 0, n_cells = 0, n_ranges = 0, n_atoms = 0, open_end = -1, slot
         cdef double dx, dy, dz, reach, factor = 2.0 / opening_angle if opening_angle > 0.0 else 1e30
         while node < tree.n_nodes:
             dx, dy, dz = ball[0] - tree.ball[node, 0], ball[1] - tree.ball[node, 1], ball[2] - tree.ball[node, 2]
@@ -286,18 +288,18 @@ cdef class InteractionLists:
             Number of threads.
         """
         cdef Octree tree = self.tree
-        cdef long group
+        cdef Index group
         for group in prange(self.n_groups, nogil=True, schedule="dynamic", chunksize=8, num_threads=n_threads):
             if double_precision:
                 self.sweep_double(tree, group, field)
             else:
                 self.sweep_single(tree, group, field)
 
-    cdef void sweep_single(self, Octree tree, long group, double[:, ::1] field) noexcept nogil:
+    cdef void sweep_single(self, Octree tree, Index group, double[:, ::1] field) noexcept nogil:
         cdef float[6 * 32] work
         group_field[float](self, tree, group, field, work)
 
-    cdef void sweep_double(self, Octree tree, long group, double[:, ::1] field) noexcept nogil:
+    cdef void sweep_double(self, Octree tree, Index group, double[:, ::1] field) noexcept nogil:
         cdef double[6 * 32] work
         group_field[double](self, tree, group, field, work)
 
@@ -332,7 +334,7 @@ def direct_field(const double[:, ::1] points, const double[:, ::1] positions, co
     """
     cdef const double[:, ::1] columns = np.ascontiguousarray(np.asarray(positions).T)
     cdef double[:, ::1] field = np.zeros((points.shape[0], 3))
-    cdef long i
+    cdef Index i
     with nogil:
         for i in range(points.shape[0]):
             point_atoms_double(charges.shape[0], &columns[0, 0], &columns[1, 0], &columns[2, 0], &charges[0],

@@ -6,13 +6,14 @@ recomputed from charges, so a copy has the same bits as the original tree.
 
 import numpy as np
 
+from apt_evap._core.index cimport Index
 from apt_evap._core.octree cimport Octree
 
 
 cdef class Journal:
     """Changes of the tree by each event of a batch, to be replayed on a copy bit by bit."""
 
-    def __init__(self, const double[:, ::1] positions, long max_events):
+    def __init__(self, const double[:, ::1] positions, Index max_events):
         self.n_events = 0
         self.positions = positions
         self.start = np.zeros(max_events + 1, np.int64)
@@ -22,7 +23,7 @@ cdef class Journal:
         self.fresh_atom = np.empty(max_events * 8, np.int32)
         self.fresh_leaf = np.empty(max_events * 8, np.int32)
 
-    cdef int reserve(self, long changes, long fresh) except -1 nogil:
+    cdef int reserve(self, Index changes, Index fresh) except -1 nogil:
         # Make space for one more event.
         if self.start[self.n_events] + changes > self.slot.shape[0]:
             with gil:
@@ -34,9 +35,9 @@ cdef class Journal:
                 self.fresh_leaf = np.resize(np.asarray(self.fresh_leaf), 2 * self.fresh_leaf.shape[0] + fresh)
         return 0
 
-    cdef void replay(self, long event, Octree tree) noexcept nogil:
+    cdef void replay(self, Index event, Octree tree) noexcept nogil:
         # The same calls in the same order as in the event.
-        cdef long k
+        cdef Index k
         cdef int atom
         tree.remove_atom(self.slot[self.start[event]])
         for k in range(self.fresh_start[event], self.fresh_start[event + 1]):
@@ -47,7 +48,7 @@ cdef class Journal:
             tree.set_charge(self.slot[k], self.charge[k])
         tree.refresh()
 
-    def replay_on(self, Octree tree, long event):
+    def replay_on(self, Octree tree, Index event):
         """Replay event number `event` of this journal on a copy of the tree."""
         if not 0 <= event < self.n_events:
             raise IndexError(f"event must be from 0 to {self.n_events - 1}, got {event}")

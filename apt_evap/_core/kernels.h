@@ -11,6 +11,8 @@
 #include <math.h>
 #include <string.h>
 
+#include "index.h"
+
 /* musl and macOS have no ifunc, and GCC before 12 does not know these levels: then the baseline of the build applies. */
 #if defined(__GNUC__) && !defined(__clang__) && __GNUC__ >= 12 && defined(__x86_64__) && defined(__GLIBC__)
 #define APT_CLONES __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default"), unused))
@@ -71,8 +73,8 @@ APT_CLONES static void polynomial_field(int degree, const float *restrict coeffi
 {
     float px[MAX_POWERS][SINGLE_LANES], py[MAX_POWERS][SINGLE_LANES], pz[MAX_POWERS][SINGLE_LANES];
     float fx[SINGLE_LANES] = {0}, fy[SINGLE_LANES] = {0}, fz[SINGLE_LANES] = {0};
-    const long stride = (long)(degree + 1) * (degree + 2) * (degree + 3) / 6;
-    long at = 0;
+    const Index stride = (Index)(degree + 1) * (degree + 2) * (degree + 3) / 6;
+    Index at = 0;
     for (int l = 0; l < SINGLE_LANES; l++)
         px[0][l] = py[0][l] = pz[0][l] = 1.0f;
     for (int d = 1; d <= degree; d++) {
@@ -106,12 +108,12 @@ APT_CLONES static void polynomial_field(int degree, const float *restrict coeffi
 #define PATCH_LANES 64
 
 /* One row of the Robin matrix: row[k] = n . (p - r_k)/|p - r_k|^3 for the atom at p with normal n. */
-APT_CLONES static void patch_row(long n, const float *restrict x, const float *restrict y, const float *restrict z,
+APT_CLONES static void patch_row(Index n, const float *restrict x, const float *restrict y, const float *restrict z,
                                  float px, float py, float pz, const double *normal, float *restrict row)
 {
     const float nx = (float)normal[0], ny = (float)normal[1], nz = (float)normal[2];
 #pragma omp simd
-    for (long k = 0; k < n; k++) {
+    for (Index k = 0; k < n; k++) {
         const float dx = px - x[k], dy = py - y[k], dz = pz - z[k];
         const float s = dx * dx + dy * dy + dz * dz;
         row[k] = s > (float)SAME_PLACE ? (nx * dx + ny * dy + nz * dz) / (s * sqrtf(s)) : 0.0f;
@@ -119,10 +121,10 @@ APT_CLONES static void patch_row(long n, const float *restrict x, const float *r
 }
 
 /* Dot product in PATCH_LANES fixed partial sums. */
-APT_CLONES static float patch_dot(long n, const float *restrict a, const float *restrict b)
+APT_CLONES static float patch_dot(Index n, const float *restrict a, const float *restrict b)
 {
     float sum[PATCH_LANES] = {0}, s[16];
-    for (long k = 0; k < n; k += PATCH_LANES) {
+    for (Index k = 0; k < n; k += PATCH_LANES) {
 #pragma omp simd
         for (int l = 0; l < PATCH_LANES; l++)
             sum[l] += a[k + l] * b[k + l];
@@ -135,12 +137,12 @@ APT_CLONES static float patch_dot(long n, const float *restrict a, const float *
 }
 
 /* One row of the potential matrix: row[k] = 1/|p - r_k|, and `self` for the atom at p. */
-APT_CLONES static void patch_row_potential(long n, const float *restrict x, const float *restrict y,
+APT_CLONES static void patch_row_potential(Index n, const float *restrict x, const float *restrict y,
                                            const float *restrict z, float px, float py, float pz, float self,
                                            float *restrict row)
 {
 #pragma omp simd
-    for (long k = 0; k < n; k++) {
+    for (Index k = 0; k < n; k++) {
         const float dx = px - x[k], dy = py - y[k], dz = pz - z[k];
         const float s = dx * dx + dy * dy + dz * dz;
         row[k] = s > (float)SAME_PLACE ? 1.0f / sqrtf(s) : self;
@@ -151,12 +153,12 @@ APT_CLONES static void patch_row_potential(long n, const float *restrict x, cons
  * Targets are in the lanes: with the sources in the lanes, the sum over the lanes takes longer than the terms. The sums
  * start from the values in memory and each source has its own variables; otherwise GCC 12 replaces the lanes by scalars
  * (16 times slower). */
-APT_CLONES static void patch_field(long m, const float *restrict targets_x, const float *restrict targets_y,
-                                   const float *restrict targets_z, long n, const float *restrict x,
+APT_CLONES static void patch_field(Index m, const float *restrict targets_x, const float *restrict targets_y,
+                                   const float *restrict targets_z, Index n, const float *restrict x,
                                    const float *restrict y, const float *restrict z, const float *restrict q,
                                    float *restrict field_x, float *restrict field_y, float *restrict field_z)
 {
-    for (long k = 0; k < m; k += GROUP) {
+    for (Index k = 0; k < m; k += GROUP) {
         float tx[GROUP], ty[GROUP], tz[GROUP], ex[GROUP], ey[GROUP], ez[GROUP];
         memcpy(tx, targets_x + k, sizeof tx);
         memcpy(ty, targets_y + k, sizeof ty);
@@ -164,7 +166,7 @@ APT_CLONES static void patch_field(long m, const float *restrict targets_x, cons
         memcpy(ex, field_x + k, sizeof ex);
         memcpy(ey, field_y + k, sizeof ey);
         memcpy(ez, field_z + k, sizeof ez);
-        for (long i = 0; i < n; i++) {
+        for (Index i = 0; i < n; i++) {
             const float sx = x[i], sy = y[i], sz = z[i], charge = q[i];
 #pragma omp simd
             for (int l = 0; l < GROUP; l++) {
@@ -183,18 +185,18 @@ APT_CLONES static void patch_field(long m, const float *restrict targets_x, cons
 }
 
 /* Adds the potential of the n charges q of the patch at m targets; see patch_field. */
-APT_CLONES static void patch_potential(long m, const float *restrict targets_x, const float *restrict targets_y,
-                                       const float *restrict targets_z, long n, const float *restrict x,
+APT_CLONES static void patch_potential(Index m, const float *restrict targets_x, const float *restrict targets_y,
+                                       const float *restrict targets_z, Index n, const float *restrict x,
                                        const float *restrict y, const float *restrict z, const float *restrict q,
                                        float *restrict potential)
 {
-    for (long k = 0; k < m; k += GROUP) {
+    for (Index k = 0; k < m; k += GROUP) {
         float tx[GROUP], ty[GROUP], tz[GROUP], sum[GROUP];
         memcpy(tx, targets_x + k, sizeof tx);
         memcpy(ty, targets_y + k, sizeof ty);
         memcpy(tz, targets_z + k, sizeof tz);
         memcpy(sum, potential + k, sizeof sum);
-        for (long i = 0; i < n; i++) {
+        for (Index i = 0; i < n; i++) {
             const float sx = x[i], sy = y[i], sz = z[i], charge = q[i];
 #pragma omp simd
             for (int l = 0; l < GROUP; l++) {
@@ -209,11 +211,11 @@ APT_CLONES static void patch_potential(long m, const float *restrict targets_x, 
 
 /* Adds both; see patch_field. The inverse distance is used for the potential and the field. */
 APT_CLONES static void patch_potential_and_field(
-    long m, const float *restrict targets_x, const float *restrict targets_y, const float *restrict targets_z, long n,
+    Index m, const float *restrict targets_x, const float *restrict targets_y, const float *restrict targets_z, Index n,
     const float *restrict x, const float *restrict y, const float *restrict z, const float *restrict q,
     float *restrict potential, float *restrict field_x, float *restrict field_y, float *restrict field_z)
 {
-    for (long k = 0; k < m; k += GROUP) {
+    for (Index k = 0; k < m; k += GROUP) {
         float tx[GROUP], ty[GROUP], tz[GROUP], sum[GROUP], ex[GROUP], ey[GROUP], ez[GROUP];
         memcpy(tx, targets_x + k, sizeof tx);
         memcpy(ty, targets_y + k, sizeof ty);
@@ -222,7 +224,7 @@ APT_CLONES static void patch_potential_and_field(
         memcpy(ex, field_x + k, sizeof ex);
         memcpy(ey, field_y + k, sizeof ey);
         memcpy(ez, field_z + k, sizeof ez);
-        for (long i = 0; i < n; i++) {
+        for (Index i = 0; i < n; i++) {
             const float sx = x[i], sy = y[i], sz = z[i], charge = q[i];
 #pragma omp simd
             for (int l = 0; l < GROUP; l++) {

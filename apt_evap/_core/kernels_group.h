@@ -5,7 +5,7 @@
  */
 
 /* Atoms in n_ranges ranges [ranges[2 k], ranges[2 k + 1]). */
-APT_CLONES static void GROUP_NAME(group_atoms)(long n_ranges, const int *ranges, const double *x, const double *y,
+APT_CLONES static void GROUP_NAME(group_atoms)(Index n_ranges, const int *ranges, const double *x, const double *y,
                                                const double *z, const double *q, const double *origin,
                                                const REAL *restrict targets, REAL *restrict field)
 {
@@ -16,8 +16,8 @@ APT_CLONES static void GROUP_NAME(group_atoms)(long n_ranges, const int *ranges,
     memcpy(ex, field, sizeof ex);
     memcpy(ey, field + GROUP, sizeof ey);
     memcpy(ez, field + 2 * GROUP, sizeof ez);
-    for (long range = 0; range < n_ranges; range++) {
-        for (long k = ranges[2 * range]; k < ranges[2 * range + 1]; k++) {
+    for (Index range = 0; range < n_ranges; range++) {
+        for (Index k = ranges[2 * range]; k < ranges[2 * range + 1]; k++) {
             const REAL sx = (REAL)(x[k] - origin[0]), sy = (REAL)(y[k] - origin[1]), sz = (REAL)(z[k] - origin[2]);
             const REAL charge = (REAL)q[k];
 #pragma omp simd
@@ -38,7 +38,7 @@ APT_CLONES static void GROUP_NAME(group_atoms)(long n_ranges, const int *ranges,
 
 /* Cells by their indices. The loop over the lanes is in two halves, with a start that GCC 12 cannot analyse; otherwise
  * it replaces all 32 lanes by scalars (12 times slower). */
-APT_CLONES static void GROUP_NAME(group_cells)(long n, const int *list, const double *cells, const double *origin,
+APT_CLONES static void GROUP_NAME(group_cells)(Index n, const int *list, const double *cells, const double *origin,
                                                const REAL *restrict targets, REAL *restrict field)
 {
     REAL tx[GROUP], ty[GROUP], tz[GROUP], ex[GROUP], ey[GROUP], ez[GROUP];
@@ -48,8 +48,8 @@ APT_CLONES static void GROUP_NAME(group_cells)(long n, const int *list, const do
     memcpy(ex, field, sizeof ex);
     memcpy(ey, field + GROUP, sizeof ey);
     memcpy(ez, field + 2 * GROUP, sizeof ez);
-    for (long k = 0; k < n; k++) {
-        const double *cell = cells + CELL * (long)list[k];
+    for (Index k = 0; k < n; k++) {
+        const double *cell = cells + CELL * (Index)list[k];
         const REAL sx = (REAL)(cell[0] - origin[0]), sy = (REAL)(cell[1] - origin[1]);
         const REAL sz = (REAL)(cell[2] - origin[2]), charge = (REAL)cell[3];
         const REAL xx = (REAL)cell[4], xy = (REAL)cell[5], xz = (REAL)cell[6];
@@ -77,7 +77,7 @@ APT_CLONES static void GROUP_NAME(group_cells)(long n, const int *list, const do
 /* Potentials: partial sums over at most CHUNK sources in REAL, starting from `zero`, are added to `potential` in double,
  * because a potential is a sum of many terms of one sign, of which only small differences matter. `zero` is an array of
  * GROUP zeros in memory: with a constant, GCC 12 replaces the lanes by scalars. */
-APT_CLONES static void GROUP_NAME(group_atoms_potential)(long n_ranges, const int *ranges, const double *x,
+APT_CLONES static void GROUP_NAME(group_atoms_potential)(Index n_ranges, const int *ranges, const double *x,
                                                          const double *y, const double *z, const double *q,
                                                          const double *origin, const REAL *restrict targets,
                                                          const REAL *restrict zero, double *restrict potential)
@@ -86,12 +86,12 @@ APT_CLONES static void GROUP_NAME(group_atoms_potential)(long n_ranges, const in
     memcpy(tx, targets, sizeof tx);
     memcpy(ty, targets + GROUP, sizeof ty);
     memcpy(tz, targets + 2 * GROUP, sizeof tz);
-    for (long range = 0; range < n_ranges; range++) {
-        for (long first = ranges[2 * range]; first < ranges[2 * range + 1]; first += CHUNK) {
-            const long last = first + CHUNK < ranges[2 * range + 1] ? first + CHUNK : ranges[2 * range + 1];
+    for (Index range = 0; range < n_ranges; range++) {
+        for (Index first = ranges[2 * range]; first < ranges[2 * range + 1]; first += CHUNK) {
+            const Index last = first + CHUNK < ranges[2 * range + 1] ? first + CHUNK : ranges[2 * range + 1];
             REAL sum[GROUP];
             memcpy(sum, zero, sizeof sum);
-            for (long k = first; k < last; k++) {
+            for (Index k = first; k < last; k++) {
                 const REAL sx = (REAL)(x[k] - origin[0]), sy = (REAL)(y[k] - origin[1]), sz = (REAL)(z[k] - origin[2]);
                 const REAL charge = (REAL)q[k];
 #pragma omp simd
@@ -108,7 +108,7 @@ APT_CLONES static void GROUP_NAME(group_atoms_potential)(long n_ranges, const in
 }
 
 /* Cells by their indices, with charge, dipole, quadrupole and octupole about the centre of their ball. */
-APT_CLONES static void GROUP_NAME(group_cells_potential)(long n, const int *list, const double *cells,
+APT_CLONES static void GROUP_NAME(group_cells_potential)(Index n, const int *list, const double *cells,
                                                          const double *origin, const REAL *restrict targets,
                                                          const REAL *restrict zero, double *restrict potential)
 {
@@ -116,12 +116,12 @@ APT_CLONES static void GROUP_NAME(group_cells_potential)(long n, const int *list
     memcpy(tx, targets, sizeof tx);
     memcpy(ty, targets + GROUP, sizeof ty);
     memcpy(tz, targets + 2 * GROUP, sizeof tz);
-    for (long first = 0; first < n; first += CHUNK) {
-        const long last = first + CHUNK < n ? first + CHUNK : n;
+    for (Index first = 0; first < n; first += CHUNK) {
+        const Index last = first + CHUNK < n ? first + CHUNK : n;
         REAL sum[GROUP];
         memcpy(sum, zero, sizeof sum);
-        for (long k = first; k < last; k++) {
-            const double *cell = cells + MULTIPOLE * (long)list[k];
+        for (Index k = first; k < last; k++) {
+            const double *cell = cells + MULTIPOLE * (Index)list[k];
             const REAL sx = (REAL)(cell[0] - origin[0]), sy = (REAL)(cell[1] - origin[1]);
             const REAL sz = (REAL)(cell[2] - origin[2]), charge = (REAL)cell[3];
             const REAL px = (REAL)cell[4], py = (REAL)cell[5], pz = (REAL)cell[6];

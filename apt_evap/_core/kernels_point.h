@@ -6,12 +6,12 @@
  */
 
 /* Adds the field of n point charges at (px, py, pz). */
-APT_CLONES static void POINT_NAME(point_atoms)(long n, const REAL *restrict x, const REAL *restrict y,
+APT_CLONES static void POINT_NAME(point_atoms)(Index n, const REAL *restrict x, const REAL *restrict y,
                                                 const REAL *restrict z, const REAL *restrict q, REAL px, REAL py,
                                                 REAL pz, double *restrict field)
 {
     REAL ex[POINT_LANES] = {0}, ey[POINT_LANES] = {0}, ez[POINT_LANES] = {0};
-    for (long k = 0; k + POINT_LANES <= n; k += POINT_LANES) {
+    for (Index k = 0; k + POINT_LANES <= n; k += POINT_LANES) {
 #pragma omp simd
         for (int l = 0; l < POINT_LANES; l++) {
             const REAL dx = px - x[k + l], dy = py - y[k + l], dz = pz - z[k + l];
@@ -22,7 +22,7 @@ APT_CLONES static void POINT_NAME(point_atoms)(long n, const REAL *restrict x, c
             ez[l] += w * dz;
         }
     }
-    for (long k = n - n % POINT_LANES; k < n; k++) {
+    for (Index k = n - n % POINT_LANES; k < n; k++) {
         const REAL dx = px - x[k], dy = py - y[k], dz = pz - z[k];
         const REAL s = dx * dx + dy * dy + dz * dz;
         const REAL w = s > (REAL)SAME_PLACE ? q[k] / (s * REAL_SQRT(s)) : (REAL)0;
@@ -39,17 +39,17 @@ APT_CLONES static void POINT_NAME(point_atoms)(long n, const REAL *restrict x, c
 
 /* Adds the field of n cells at (px, py, pz) to field[3]; c holds CELL rows of `stride` numbers, n a multiple of
  * POINT_LANES (padded by the caller with cells without charge). */
-APT_CLONES static void POINT_NAME(point_cells)(long n, long stride, const REAL *restrict c, REAL px, REAL py,
+APT_CLONES static void POINT_NAME(point_cells)(Index n, Index stride, const REAL *restrict c, REAL px, REAL py,
                                                 REAL pz, double *restrict field)
 {
     const REAL *restrict x = c, *restrict y = c + stride, *restrict z = c + 2 * stride, *restrict q = c + 3 * stride;
     const REAL *restrict xx = c + 4 * stride, *restrict xy = c + 5 * stride, *restrict xz = c + 6 * stride;
     const REAL *restrict yy = c + 7 * stride, *restrict yz = c + 8 * stride, *restrict zz = c + 9 * stride;
     REAL ex[POINT_LANES] = {0}, ey[POINT_LANES] = {0}, ez[POINT_LANES] = {0};
-    for (long k = 0; k < n; k += POINT_LANES) {
+    for (Index k = 0; k < n; k += POINT_LANES) {
 #pragma omp simd
         for (int l = 0; l < POINT_LANES; l++) {
-            const long j = k + l;
+            const Index j = k + l;
             const REAL dx = px - x[j], dy = py - y[j], dz = pz - z[j];
             const REAL w2 = (REAL)1 / (dx * dx + dy * dy + dz * dz);
             const REAL w3 = w2 * REAL_SQRT(w2), w5 = w3 * w2;

@@ -1,6 +1,7 @@
 """Interface of a law for the sequence of events: the key of an atom."""
 
 from apt_evap._core.chooser cimport Chooser
+from apt_evap._core.index cimport Index
 from apt_evap._core.octree cimport Octree
 
 
@@ -8,8 +9,8 @@ cdef class LawKernel:
     cdef readonly object surroundings   # BondCodes if `key` needs the bonds by species; None: their number
     cdef readonly int hop_bonds         # most nearest neighbours of an atom that can hop; -1: none can
 
-    cdef double key(self, double strength, long long atom, int bonds) noexcept nogil
-    cdef int keys(self, long n, const double* strength, const long long* atom, const int* bonds,
+    cdef double key(self, double strength, Index atom, int bonds) noexcept nogil
+    cdef int keys(self, Index n, const double* strength, const Index* atom, const int* bonds,
                   double* key) except -1 nogil
     cdef double hopping(self, double key, double strength, double ratio) noexcept nogil
     cdef Chooser chooser(self, Octree tree, double[::1] key)
@@ -22,7 +23,7 @@ cdef class WeightedField(LawKernel):
     cdef bint by_bonds
     cdef double at_rest, by_charge, gain_needed, hop_weight   # of a hop
 
-    cdef double ratio(self, double strength, long long atom, int bonds) noexcept nogil
+    cdef double ratio(self, double strength, Index atom, int bonds) noexcept nogil
 
 
 cdef class ThermalRate(WeightedField):

@@ -5,6 +5,7 @@ from libc.math cimport INFINITY, fabs, sqrt
 import numpy as np
 
 from apt_evap._core.chooser cimport Chooser, Largest, RateSum
+from apt_evap._core.index cimport Index
 from apt_evap._core.octree cimport Octree
 
 
@@ -24,16 +25,16 @@ cdef class LawKernel:
     def begin(self, double field_unit):
         """Set the field of strength 1 [V/nm], after each relaxation."""
 
-    cdef double key(self, double strength, long long atom, int bonds) noexcept nogil:
+    cdef double key(self, double strength, Index atom, int bonds) noexcept nogil:
         # Key of one atom from the field just outside (in the unit set by `begin`), its index in the specimen and its
         # number of nearest neighbours (with `surroundings`, their code); <= 0 for an atom that cannot evaporate, for
         # rates -inf.
         return 0.0
 
-    cdef int keys(self, long n, const double* strength, const long long* atom, const int* bonds,
+    cdef int keys(self, Index n, const double* strength, const Index* atom, const int* bonds,
                   double* key) except -1 nogil:
         # Keys of several atoms.
-        cdef long i
+        cdef Index i
         for i in range(n):
             key[i] = self.key(strength[i], atom[i], bonds[i])
         return 0
@@ -47,7 +48,7 @@ cdef class LawKernel:
         # The chooser for these keys.
         return Largest(tree, key)
 
-    def evaluate(self, const double[::1] strength, const long long[::1] atom, const int[::1] bonds):
+    def evaluate(self, const double[::1] strength, const Index[::1] atom, const int[::1] bonds):
         """Keys of atoms as in the sequence of events, shape (n,)."""
         cdef double[::1] key = np.empty(strength.shape[0])
         if strength.shape[0]:
@@ -86,13 +87,13 @@ cdef class WeightedField(LawKernel):
         self.table = np.empty((0, 1)) if table is None else np.ascontiguousarray(table, np.float64)
         self.species = np.empty(0, np.int32) if species is None else np.ascontiguousarray(species, np.int32)
 
-    cdef double ratio(self, double strength, long long atom, int bonds) noexcept nogil:
+    cdef double ratio(self, double strength, Index atom, int bonds) noexcept nogil:
         # all strengths have the same unit, which does not change the order
         if self.by_bonds:
             return strength * self.weight[atom] * self.table[self.species[atom], bonds]
         return strength * self.weight[atom]
 
-    cdef double key(self, double strength, long long atom, int bonds) noexcept nogil:
+    cdef double key(self, double strength, Index atom, int bonds) noexcept nogil:
         return self.ratio(strength, atom, bonds)
 
     cdef double hopping(self, double key, double strength, double ratio) noexcept nogil:
@@ -140,7 +141,7 @@ cdef class ThermalRate(WeightedField):
         """Set the field of strength 1 [V/nm]."""
         self.unit = field_unit
 
-    cdef double key(self, double strength, long long atom, int bonds) noexcept nogil:
+    cdef double key(self, double strength, Index atom, int bonds) noexcept nogil:
         cdef double x = self.ratio(self.unit * strength, atom, bonds), s = self.stiffness[atom], missing
         if not x > 0.0:
             return -INFINITY
@@ -174,12 +175,12 @@ cdef class PythonLaw(LawKernel):
         """Set the field of strength 1 [V/nm]."""
         self.field_unit = field_unit
 
-    cdef int keys(self, long n, const double* strength, const long long* atom, const int* bonds,
+    cdef int keys(self, Index n, const double* strength, const Index* atom, const int* bonds,
                   double* key) except -1 nogil:
-        cdef long i
+        cdef Index i
         cdef double[::1] keys
         with gil:
-            atoms = np.asarray(<const long long[:n]> atom).copy()
+            atoms = np.asarray(<const Index[:n]> atom).copy()
             fields = self.field_unit * np.asarray(<const double[:n]> strength)
             bond_counts = np.asarray(<const int[:n]> bonds).copy()
             keys = np.ascontiguousarray(self.law.keys(self.tip, atoms, fields, bond_counts), np.float64)

@@ -9,6 +9,8 @@ from libc.stdlib cimport free, malloc
 
 import numpy as np
 
+from apt_evap._core.index cimport Index
+
 
 cdef enum:
     BITS = 21            # bits of a coordinate in the key
@@ -56,7 +58,7 @@ def morton_order(const double[:, ::1] positions, int n_threads=1):
     keys : ndarray of uint64, shape (n,)
         Keys in this order: interleaved bits of x, y and z, from the highest.
     """
-    cdef long n = positions.shape[0], n_blocks = (n + BLOCK - 1) // BLOCK, block, i
+    cdef Index n = positions.shape[0], n_blocks = (n + BLOCK - 1) // BLOCK, block, i
     cdef double scale
     cdef double[3] low
     cdef double[:, :, ::1] box = np.empty((n_blocks, 2, 3))
@@ -73,9 +75,9 @@ def morton_order(const double[:, ::1] positions, int n_threads=1):
     return sort(keys, n_threads)
 
 
-cdef void enclose(const double[:, ::1] positions, long begin, long end, double* low, double* high) noexcept nogil:
+cdef void enclose(const double[:, ::1] positions, Index begin, Index end, double* low, double* high) noexcept nogil:
     # Bounding box of positions.
-    cdef long i
+    cdef Index i
     cdef int axis
     for axis in range(3):
         low[axis], high[axis] = INFINITY, -INFINITY
@@ -85,10 +87,10 @@ cdef void enclose(const double[:, ::1] positions, long begin, long end, double* 
 
 cdef sort(Key[::1] keys, int n_threads):
     # Order and sorted keys, by stable passes from the lowest digit to the highest.
-    cdef long n = keys.shape[0], n_blocks = (n + BLOCK - 1) // BLOCK, block, bucket, total, count
+    cdef Index n = keys.shape[0], n_blocks = (n + BLOCK - 1) // BLOCK, block, bucket, total, count
     cdef int shift
     cdef Key[::1] other_keys = np.empty(n, np.uint64)
-    cdef long long[::1] order = np.arange(n, dtype=np.int64), other_order = np.empty(n, np.int64)
+    cdef Index[::1] order = np.arange(n, dtype=np.int64), other_order = np.empty(n, np.int64)
     cdef int[:, ::1] place = np.empty((n_blocks, BUCKETS), np.int32)   # counts, then next positions
     for shift in range(0, 3 * BITS, DIGIT):
         for block in prange(n_blocks, nogil=True, schedule="dynamic", num_threads=n_threads):
@@ -108,17 +110,17 @@ cdef sort(Key[::1] keys, int n_threads):
     return np.asarray(order), np.asarray(keys)
 
 
-cdef void count_digits(const Key[::1] keys, long begin, long end, int shift, int* count) noexcept nogil:
-    cdef long i
+cdef void count_digits(const Key[::1] keys, Index begin, Index end, int shift, int* count) noexcept nogil:
+    cdef Index i
     for i in range(BUCKETS):
         count[i] = 0
     for i in range(begin, end):
         count[keys[i] >> shift & (BUCKETS - 1)] += 1
 
 
-cdef void move(const Key[::1] keys, const long long[::1] order, Key[::1] to_keys, long long[::1] to_order,
-               long begin, long end, int shift, int* place) noexcept nogil:
-    cdef long i, digit
+cdef void move(const Key[::1] keys, const Index[::1] order, Key[::1] to_keys, Index[::1] to_order,
+               Index begin, Index end, int shift, int* place) noexcept nogil:
+    cdef Index i, digit
     for i in range(begin, end):
         digit = keys[i] >> shift & (BUCKETS - 1)
         to_keys[place[digit]] = keys[i]
@@ -143,11 +145,11 @@ def split(const Key[::1] keys, int leaf_size, int n_threads=1):
     first, last, parent, skip : ndarray of int32, shape (n_nodes,)
         Slots [first, last), the node above (-1 for the root), and the next node outside the subtree.
     """
-    cdef long n = keys.shape[0], n_top, t, begin
+    cdef Index n = keys.shape[0], n_top, t, begin
     # a split node has at least two children, so m atoms have less than 2 m nodes: subtrees do not overlap
     cdef Node* top = <Node*>malloc(2 * n * sizeof(Node))
     cdef Node* below = <Node*>malloc(2 * n * sizeof(Node))
-    cdef long[::1] start
+    cdef Index[::1] start
     cdef int[::1] first, last, parent, skip
     if top == NULL or below == NULL:
         free(top)
@@ -177,21 +179,21 @@ def split(const Key[::1] keys, int leaf_size, int n_threads=1):
     return np.asarray(first), np.asarray(last), np.asarray(parent), np.asarray(skip)
 
 
-cdef void copy(const Node* nodes, long n, long begin, int* first, int* last, int* parent, int* skip) noexcept nogil:
+cdef void copy(const Node* nodes, Index n, Index begin, int* first, int* last, int* parent, int* skip) noexcept nogil:
     # The nodes of a subtree, numbered from `begin` on.
-    cdef long i
+    cdef Index i
     for i in range(n):
         first[i], last[i] = nodes[i].first, nodes[i].last
         parent[i], skip[i] = <int>begin + nodes[i].parent, <int>begin + nodes[i].skip
 
 
-cdef long grow(const Key[::1] keys, long begin, long end, int level, int leaf_size, Node* nodes) noexcept nogil:
+cdef Index grow(const Key[::1] keys, Index begin, Index end, int level, int leaf_size, Node* nodes) noexcept nogil:
     # Nodes over the slots [begin, end), numbered from 0; returns their number. Preorder with an explicit stack; a range
     # with all atoms in one octant goes one level down without a node.
     cdef Node[STACK] stack
     cdef Node* node
-    cdef long[9] cut
-    cdef long count = 0, low, high, middle, octant
+    cdef Index[9] cut
+    cdef Index count = 0, low, high, middle, octant
     cdef int depth = 1, i
     cdef bint whole
     stack[0].first, stack[0].last, stack[0].parent, stack[0].level = <int>begin, <int>end, -1, level
@@ -208,7 +210,7 @@ cdef long grow(const Key[::1] keys, long begin, long end, int level, int leaf_si
                 low, high = cut[octant - 1], end
                 while low < high:
                     middle = (low + high) // 2
-                    if <long>(keys[middle] >> level & 7) < octant:
+                    if <Index>(keys[middle] >> level & 7) < octant:
                         low = middle + 1
                     else:
                         high = middle

@@ -15,6 +15,8 @@ from libc.math cimport floor, sqrt
 
 import numpy as np
 
+from apt_evap._core.index cimport Index
+
 
 cdef int root(int* parent, int i) noexcept nogil:
     # The part that an atom belongs to, of parts that have met.
@@ -62,7 +64,7 @@ cdef class Neighbourhood:
                  bond_length=0.0, int n_threads=1, Neighbourhood before=None,
                  const signed char[::1] anchored=None, codes=None, const signed char[::1] kinds=None,
                  const signed char[::1] outer=None):
-        cdef long n = positions.shape[0], i
+        cdef Index n = positions.shape[0], i
         if n == 0:
             raise ValueError("a specimen must have at least one atom, got none")
         self.n_atoms = n
@@ -125,7 +127,7 @@ cdef class Neighbourhood:
 
     def find_voids(self, const signed char[::1] outer, Neighbourhood before=None):
         """Hide the walls of closed voids, and detach atoms without bonds to an anchored atom."""
-        cdef long i, n_old = 0 if before is None else before.n_atoms
+        cdef Index i, n_old = 0 if before is None else before.n_atoms
         hidden = np.asarray(self.exposed).view(bool) & ~np.asarray(outer).view(bool)
         if before is not None:
             hidden[:n_old] &= ~np.asarray(before.exposed).view(bool)
@@ -145,10 +147,10 @@ cdef class Neighbourhood:
             self.detach(i)
         self.stack = np.empty(self.n_hidden, np.int32)
 
-    cdef long open_from(self, long atom) noexcept nogil:
+    cdef Index open_from(self, Index atom) noexcept nogil:
         # Exposes the walls of the void next to an exposed atom; returns the number of their atoms.
         cdef int[MAX_NEAR] others
-        cdef long n = 0, n_opened = 0
+        cdef Index n = 0, n_opened = 0
         cdef int m, k
         while True:
             m = self.near(atom, others)
@@ -171,7 +173,7 @@ cdef class Neighbourhood:
     cdef void mark_attached(self, signed char[::1] attached) noexcept nogil:
         # Marks all atoms with a chain of bonds to an anchored atom.
         cdef int[MAX_NEAR] others
-        cdef long i, n = 0
+        cdef Index i, n = 0
         cdef int m, k
         for i in range(self.n_atoms):
             if self.anchored[i] and self.alive[i] and not attached[i]:
@@ -188,20 +190,21 @@ cdef class Neighbourhood:
                     self.stack[n] = others[k]
                     n += 1
 
-    cdef int kind_of(self, long atom) noexcept nogil:
+    cdef int kind_of(self, Index atom) noexcept nogil:
         # Kind of an atom.
         return self.kind[atom] if self.has_kinds else 0
 
-    cdef int near(self, long atom, int* others) noexcept nogil:
+    cdef int near(self, Index atom, int* others) noexcept nogil:
         # The remaining atoms within the largest radius of an atom, in the order of the cells; -1: more than MAX_NEAR.
         return self.within(atom, self.radius * self.radius, others)
 
-    cdef int within(self, long atom, double reach, int* others) noexcept nogil:
+    cdef int within(self, Index atom, double reach, int* others) noexcept nogil:
         # The remaining atoms within a squared distance, not larger than the largest radius; otherwise as `near`.
         cdef double px = self.positions[atom, 0], py = self.positions[atom, 1], pz = self.positions[atom, 2]
         cdef double dx, dy, dz
-        cdef long ci = <long>floor((px - self.low[0]) / self.radius), cj = <long>floor((py - self.low[1]) / self.radius)
-        cdef long ck = <long>floor((pz - self.low[2]) / self.radius), i, j, m, row
+        cdef Index ci = <Index>floor((px - self.low[0]) / self.radius)
+        cdef Index cj = <Index>floor((py - self.low[1]) / self.radius)
+        cdef Index ck = <Index>floor((pz - self.low[2]) / self.radius), i, j, m, row
         cdef int other, n = 0
         for i in range(max(ci - 1, 0), min(ci + 2, self.shape[0])):
             for j in range(max(cj - 1, 0), min(cj + 2, self.shape[1])):
@@ -218,7 +221,7 @@ cdef class Neighbourhood:
                         n += 1
         return n
 
-    cdef void gather(self, long atom) noexcept nogil:
+    cdef void gather(self, Index atom) noexcept nogil:
         # Count, bonds and sum of offsets of the neighbours; a count of -1 means too many.
         cdef int[MAX_NEAR] others
         cdef int atom_kind = self.kind_of(atom), n = self.within(atom, self.reach[atom_kind], others), i
@@ -241,13 +244,13 @@ cdef class Neighbourhood:
         if n_near > MAX_CODED or n_far > MAX_CODED:
             self.too_many = True    # the same value from all threads
 
-    cdef int code_of(self, long atom, double s, double bond) noexcept nogil:
+    cdef int code_of(self, Index atom, double s, double bond) noexcept nogil:
         # What an atom adds to the code of an atom at this squared distance, with this squared bond length.
         if s <= bond:
             return self.code[atom]
         return self.far_code[atom] if s <= self.second_length * self.second_length else 0
 
-    cdef bint is_surface_atom(self, long atom) noexcept nogil:
+    cdef bint is_surface_atom(self, Index atom) noexcept nogil:
         # Whether the atom is a surface atom by its neighbours; an isolated atom is.
         cdef double sx = self.offset[atom, 0], sy = self.offset[atom, 1], sz = self.offset[atom, 2]
         if self.support[atom]:
@@ -255,14 +258,14 @@ cdef class Neighbourhood:
         return self.count[atom] == 0 or sqrt(sx * sx + sy * sy + sz * sz) > (
             self.threshold[self.kind_of(atom)] * self.count[atom])
 
-    cdef void normal(self, long atom, double* normal) noexcept nogil:
+    cdef void normal(self, Index atom, double* normal) noexcept nogil:
         # Outward unit normal; an atom with zero offset keeps its last normal.
         cdef double sx = self.offset[atom, 0], sy = self.offset[atom, 1], sz = self.offset[atom, 2]
         cdef double length = sqrt(sx * sx + sy * sy + sz * sz)
         if self.count[atom] > 0 and length > 1e-9:
             normal[0], normal[1], normal[2] = -sx / length, -sy / length, -sz / length
 
-    cdef int remove(self, long atom, int* fresh) noexcept nogil:
+    cdef int remove(self, Index atom, int* fresh) noexcept nogil:
         # Removes an atom and updates the normals around it; lists the newly exposed atoms and returns their number.
         cdef int[MAX_NEAR] others
         cdef int[MAX_BONDS] nearest
@@ -312,7 +315,7 @@ cdef class Neighbourhood:
 
     # ---- detached atoms ----------------------------------------------------------------------------------------------
 
-    cdef bint bonded(self, long first, long second, double stretch=1.0) noexcept nogil:
+    cdef bint bonded(self, Index first, Index second, double stretch=1.0) noexcept nogil:
         # Whether two atoms are nearest neighbours; `stretch` multiplies the squared length of the bond.
         cdef double s = 0.0, step
         cdef int axis
@@ -329,7 +332,7 @@ cdef class Neighbourhood:
         cdef int[MAX_BONDS] parent, front, last
         cdef bint[MAX_BONDS] attached
         cdef int i, j, k, m, piece, other_piece, growing, n_attached
-        cdef long at, known, n_visited = 0
+        cdef Index at, known, n_visited = 0
 
         # parts of neighbours that are bonded to each other, by union and find; most often there is only one
         for i in range(n):
@@ -410,10 +413,10 @@ cdef class Neighbourhood:
         for i in range(self.table.shape[0]):
             self.table[i] = -1
 
-    cdef long visit(self, int atom, int piece, long n, long* known) noexcept nogil:
+    cdef Index visit(self, int atom, int piece, Index n, Index* known) noexcept nogil:
         # Adds an atom to those visited, of which there are n; returns their new number. known: place of an atom that
         # was visited before, or -1.
-        cdef long size = self.table.shape[0], key = (<long>atom * 40503) % size
+        cdef Index size = self.table.shape[0], key = (<Index>atom * 40503) % size
         while self.table[key] >= 0:
             if self.visited[self.table[key]] == atom:
                 known[0] = self.table[key]
@@ -424,7 +427,7 @@ cdef class Neighbourhood:
         self.visited[n], self.piece_of[n], self.following[n] = atom, piece, -1
         return n + 1
 
-    cdef void append(self, long at, int piece, int* front, int* last) noexcept nogil:
+    cdef void append(self, Index at, int piece, int* front, int* last) noexcept nogil:
         # Adds a visited atom to those from which its part still has to grow.
         if front[piece] < 0:
             front[piece] = <int>at
@@ -434,7 +437,7 @@ cdef class Neighbourhood:
 
     cdef void detach(self, int atom) noexcept nogil:
         # Adds an atom to those that leave next, sorted by index.
-        cdef long i = self.n_waiting
+        cdef Index i = self.n_waiting
         if i == self.waiting.shape[0]:
             with gil:
                 self.waiting = np.concatenate([self.waiting, np.empty(i, np.int32)])
@@ -445,9 +448,9 @@ cdef class Neighbourhood:
         self.waiting[i] = atom
         self.n_waiting += 1
 
-    cdef long next_detached(self, const int* slot_of) noexcept nogil:
+    cdef Index next_detached(self, const int* slot_of) noexcept nogil:
         # The next detached atom with a slot; -1 if there is none.
-        cdef long i, n = 0, atom, best = -1
+        cdef Index i, n = 0, atom, best = -1
         for i in range(self.n_waiting):
             atom = self.waiting[i]
             if self.alive[atom]:
@@ -464,7 +467,7 @@ cdef class Neighbourhood:
         waiting = np.asarray(self.waiting)[:self.n_waiting]
         return waiting[np.asarray(self.alive)[waiting].view(bool)].astype(np.int64)
 
-    cdef bint reaches_support(self, long atom) noexcept nogil:
+    cdef bint reaches_support(self, Index atom) noexcept nogil:
         # Whether the removal of this atom could expose support atoms.
         cdef int[MAX_NEAR] others
         cdef int n = self.near(atom, others), i
@@ -473,15 +476,15 @@ cdef class Neighbourhood:
                 return True
         return False
 
-    def remove_atom(self, long atom):
+    def remove_atom(self, Index atom):
         """Remove an atom; return the newly exposed atoms, shape (m,)."""
         cdef int[::1] fresh = np.empty(MAX_NEAR, np.int32)
         return np.asarray(fresh)[:self.remove(atom, &fresh[0])].copy()
 
-    def remove_atoms(self, const long long[::1] atoms):
+    def remove_atoms(self, const Index[::1] atoms):
         """Remove atoms one by one, as events do; ValueError for an atom that was already removed."""
         cdef int[::1] fresh = np.empty(MAX_NEAR, np.int32)
-        cdef long i
+        cdef Index i
         for i in range(atoms.shape[0]):
             if not (0 <= atoms[i] < self.n_atoms and self.alive[atoms[i]]):
                 raise ValueError(f"atoms to remove must be in the specimen, got {atoms[i]} of {self.n_atoms}")
@@ -494,10 +497,10 @@ cdef class Neighbourhood:
         """Indices of the surface atoms, shape (m,)."""
         return np.flatnonzero(np.asarray(self.exposed).view(bool))   # as bool: seven times faster
 
-    def positions_of(self, const long long[::1] atoms, int n_threads=1):
+    def positions_of(self, const Index[::1] atoms, int n_threads=1):
         """Positions of atoms [nm], shape (m, 3); slow, because they are scattered in memory."""
         cdef double[:, ::1] positions = np.empty((len(atoms), 3))
-        cdef long i
+        cdef Index i
         for i in prange(atoms.shape[0], nogil=True, schedule="static", num_threads=n_threads):
             positions[i, 0] = self.positions[atoms[i], 0]
             positions[i, 1] = self.positions[atoms[i], 1]
@@ -506,9 +509,9 @@ cdef class Neighbourhood:
 
     def normals_of(self, atoms, int n_threads=1):
         """Outward unit normals of atoms, shape (m, 3); (0, 0, 1) for zero offset of the neighbours."""
-        cdef long long[::1] chosen = np.ascontiguousarray(atoms, np.int64)
+        cdef Index[::1] chosen = np.ascontiguousarray(atoms, np.int64)
         cdef double[:, ::1] normals = np.tile([0.0, 0.0, 1.0], (len(chosen), 1))
-        cdef long i
+        cdef Index i
         for i in prange(chosen.shape[0], nogil=True, schedule="static", num_threads=n_threads):
             self.normal(chosen[i], &normals[i, 0])
         return np.asarray(normals)

@@ -11,6 +11,7 @@ cell does not replace its atoms: its smaller cells or its atoms act one by one.
 from cython.parallel cimport prange
 from libc.math cimport sqrt
 
+from apt_evap._core.index cimport Index
 from apt_evap._core.sources cimport (
     CELL, LANES, SingleSources, Sources, single_pad, single_reserve, sources_field, sources_free, sources_grow,
     sources_init, sources_potential,
@@ -42,11 +43,11 @@ cdef class Octree:
     """
 
     def __init__(self, const double[:, ::1] positions, const double[::1] charges, atoms=None, int leaf_size=16,
-                 long extra=0, int n_threads=1):
-        cdef long n = positions.shape[0], capacity = n + extra, i, k
-        cdef long long[::1] order
+                 Index extra=0, int n_threads=1):
+        cdef Index n = positions.shape[0], capacity = n + extra, i, k
+        cdef Index[::1] order
         cdef bint numbered = atoms is None
-        cdef const long long[::1] numbers = np.empty(0, np.int64) if numbered else np.asarray(atoms, np.int64)
+        cdef const Index[::1] numbers = np.empty(0, np.int64) if numbered else np.asarray(atoms, np.int64)
         if n == 0:
             raise ValueError("an octree needs at least one atom, got none")
         order, keys = morton.morton_order(positions, n_threads)
@@ -71,7 +72,7 @@ cdef class Octree:
 
     cdef enclose(self, int n_threads):
         # Leaf of every slot, and ball of every node: centre of its bounding box, and distance of its farthest atom.
-        cdef long node
+        cdef Index node
         cdef int up, axis
         cdef double[:, ::1] low = np.full((self.n_nodes, 3), np.inf), high = np.full((self.n_nodes, 3), -np.inf)
         for node in prange(self.n_nodes, nogil=True, schedule="dynamic", chunksize=256, num_threads=n_threads):
@@ -87,18 +88,18 @@ cdef class Octree:
         for node in prange(self.n_nodes, nogil=True, schedule="dynamic", chunksize=256, num_threads=n_threads):
             self.ball_of_box(node, &low[node, 0], &high[node, 0])
 
-    cdef void box_of_leaf(self, long node, double* low, double* high) noexcept nogil:
-        cdef long k
+    cdef void box_of_leaf(self, Index node, double* low, double* high) noexcept nogil:
+        cdef Index k
         for k in range(self.first[node], self.last[node]):
             self.leaf[k] = <int>node
             low[0], high[0] = min(low[0], self.x[k]), max(high[0], self.x[k])
             low[1], high[1] = min(low[1], self.y[k]), max(high[1], self.y[k])
             low[2], high[2] = min(low[2], self.z[k]), max(high[2], self.z[k])
 
-    cdef void ball_of_box(self, long node, const double* low, const double* high) noexcept nogil:
+    cdef void ball_of_box(self, Index node, const double* low, const double* high) noexcept nogil:
         cdef double far = 0.0
         cdef double* ball = &self.ball[node, 0]
-        cdef long k
+        cdef Index k
         cdef int axis
         for axis in range(3):
             ball[axis] = 0.5 * (low[axis] + high[axis])
@@ -106,7 +107,7 @@ cdef class Octree:
             far = max(far, (self.x[k] - ball[0]) ** 2 + (self.y[k] - ball[1]) ** 2 + (self.z[k] - ball[2]) ** 2)
         ball[3] = sqrt(far)
 
-    cdef inline long following(self, long node, long slot) noexcept nogil:
+    cdef inline Index following(self, Index node, Index slot) noexcept nogil:
         # The next slot of a leaf: first those in order, then those added later; -1 after the last.
         if slot + 1 < self.last[node]:
             return slot + 1
@@ -114,11 +115,11 @@ cdef class Octree:
 
     # ---- charges and moments ---------------------------------------------------------------------------------------
 
-    cdef void moments(self, long node) noexcept nogil:
+    cdef void moments(self, Index node) noexcept nogil:
         # Charge, centre of charge and traceless quadrupole sum q (3 d d - d^2) of one node, from its atoms or children.
         cdef double charge = 0.0, cx = 0.0, cy = 0.0, cz = 0.0, q, dx, dy, dz, s
         cdef double xx = 0.0, xy = 0.0, xz = 0.0, yy = 0.0, yz = 0.0, zz = 0.0
-        cdef long k, leaf, end = self.skip[node]
+        cdef Index k, leaf, end = self.skip[node]
         cdef bint by_atoms = end == node + 1
         cdef double* ball = &self.ball[node, 0]
         cdef double* cell
@@ -193,7 +194,7 @@ cdef class Octree:
 
     def refresh_all(self):
         """Recompute the moments of every node from the charges."""
-        cdef long node
+        cdef Index node
         for node in prange(self.n_nodes, nogil=True, schedule="dynamic", chunksize=256, num_threads=self.n_threads):
             if self.skip[node] == node + 1:
                 self.moments(node)
@@ -202,26 +203,26 @@ cdef class Octree:
                 if self.skip[node] > node + 1:
                     self.moments(node)
 
-    cdef void mark(self, long node) noexcept nogil:
+    cdef void mark(self, Index node) noexcept nogil:
         while node >= 0 and not self.dirty[node]:
             self.dirty[node] = 1
             self.queue[self.n_dirty] = <int>node
             self.n_dirty += 1
             node = self.parent[node]
 
-    cdef void set_charge(self, long slot, double charge) noexcept nogil:
+    cdef void set_charge(self, Index slot, double charge) noexcept nogil:
         # The moments are updated at the next refresh().
         self.q[slot] = charge
         self.mark(self.leaf[slot])
 
-    cdef void remove_atom(self, long slot) noexcept nogil:
+    cdef void remove_atom(self, Index slot) noexcept nogil:
         # The slot remains, without charge and without an atom.
         self.atom[slot] = -1
         self.set_charge(slot, 0.0)
 
-    cdef long insert_atom(self, long long atom, double px, double py, double pz, int leaf) noexcept nogil:
+    cdef Index insert_atom(self, Index atom, double px, double py, double pz, int leaf) noexcept nogil:
         # Adds an atom to the leaf of a neighbouring atom; the balls above grow to contain it. -1: no space left.
-        cdef long slot = self.n_slots, node = leaf
+        cdef Index slot = self.n_slots, node = leaf
         cdef double far
         if slot >= self.x.shape[0]:
             return -1
@@ -242,7 +243,7 @@ cdef class Octree:
 
     cdef void refresh(self) noexcept nogil:
         # Recomputes moments of the nodes above changed charges, children before parents: descending preorder numbers.
-        cdef long i, j
+        cdef Index i, j
         cdef int node
         if 4 * self.n_dirty > self.n_nodes:   # faster than sorting
             for node in range(self.n_nodes - 1, -1, -1):
@@ -269,7 +270,7 @@ cdef class Octree:
                   Sources* sources) except -1 nogil:
         # Lists the sources for the targets in a ball: a cell if its ball appears under less than the opening angle from
         # every point of the ball of the targets, otherwise its atoms.
-        cdef long node = 0, k
+        cdef Index node = 0, k
         cdef double dx, dy, dz, apart, factor = 2.0 / opening_angle if opening_angle > 0.0 else 1e30
         sources.n_atoms = sources.n_cells = 0
         while node < self.n_nodes:
@@ -298,7 +299,7 @@ cdef class Octree:
     cdef int collect(self, double cx, double cy, double cz, double radius, double opening_angle,
                      Sources* sources) except -1 nogil:
         # Copies the sources of a walk into columns.
-        cdef long k, m, stride
+        cdef Index k, m, stride
         cdef int slot
         self.walk(cx, cy, cz, radius, opening_angle, sources)
         stride = sources.capacity
@@ -325,7 +326,7 @@ cdef class Octree:
         cdef SingleSources* part
         cdef double dx, dy, dz
         cdef const double* cell
-        cdef long k, at
+        cdef Index k, at
         cdef int slot, m
         self.walk(centre[0], centre[1], centre[2], radius, opening_angle, sources)
         single_reserve(near, sources.capacity, centre)
@@ -354,10 +355,10 @@ cdef class Octree:
         single_pad(far)
         return 0
 
-    cdef long within(self, double px, double py, double pz, double radius, int* slots, long most) noexcept nogil:
+    cdef Index within(self, double px, double py, double pz, double radius, int* slots, Index most) noexcept nogil:
         # Slots of the atoms within a radius, in the order of the tree; lists up to `most` of them, returns their
         # number.
-        cdef long node = 0, k, n = 0
+        cdef Index node = 0, k, n = 0
         cdef double dx, dy, dz, reach
         while node < self.n_nodes:
             dx, dy, dz = px - self.ball[node, 0], py - self.ball[node, 1], pz - self.ball[node, 2]
@@ -397,7 +398,7 @@ cdef class Octree:
             Field q r/r^3 [e/nm^2]; times COULOMB it is in V/nm.
         """
         cdef double[:, ::1] field = np.empty((points.shape[0], 3))
-        cdef long i
+        cdef Index i
         for i in prange(points.shape[0], nogil=True, schedule="dynamic", chunksize=16, num_threads=n_threads):
             self.field_at(points[i, 0], points[i, 1], points[i, 2], opening_angle, &field[i, 0])
         return np.asarray(field)
@@ -413,7 +414,7 @@ cdef class Octree:
     def potentials(self, const double[:, ::1] points, double opening_angle, int n_threads=1):
         """Potential q/r at points in space [e/nm], shape (m,); times COULOMB it is in V. Parameters as in `fields`."""
         cdef double[::1] potential = np.empty(points.shape[0])
-        cdef long i
+        cdef Index i
         for i in prange(points.shape[0], nogil=True, schedule="dynamic", chunksize=16, num_threads=n_threads):
             potential[i] = self.potential_at(points[i, 0], points[i, 1], points[i, 2], opening_angle)
         return np.asarray(potential)

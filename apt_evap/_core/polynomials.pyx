@@ -5,6 +5,8 @@ A monomial is a product of powers of the variables, and is given by its exponent
 
 import numpy as np
 
+from apt_evap._core.index cimport Index
+
 cdef enum:
     MAX_DEGREE = 12
     MAX_VARIABLES = 8
@@ -16,7 +18,7 @@ HIGHEST_DEGREE = MAX_DEGREE
 cdef void fill(const signed char[:, ::1] exponents, const double* variables, double* monomial) noexcept nogil:
     # All monomials at one point.
     cdef double power[MAX_VARIABLES * (MAX_DEGREE + 1)]
-    cdef long c, v, d, n_variables = exponents.shape[1]
+    cdef Index c, v, d, n_variables = exponents.shape[1]
     for v in range(n_variables):
         power[v * (MAX_DEGREE + 1)] = 1.0
         for d in range(MAX_DEGREE):
@@ -38,7 +40,7 @@ def _check(exponents):
 
 def monomials(const signed char[:, ::1] exponents, const double[:, ::1] variables):
     """Monomials at points, shapes (c, v) and (n, v) -> (n, c)."""
-    cdef long i
+    cdef Index i
     cdef double[:, ::1] values = np.empty((variables.shape[0], exponents.shape[0]))
     _check(np.asarray(exponents))
     with nogil:
@@ -61,7 +63,7 @@ def fit(const double[:, ::1] inverse, const double[:, :, ::1] values):
     -------
     ndarray, shape (n, 3, c)
     """
-    cdef long i, j, k, c, n = values.shape[0], m = values.shape[1]
+    cdef Index i, j, k, c, n = values.shape[0], m = values.shape[1]
     cdef double total
     cdef double[:, :, ::1] coefficients = np.empty((n, 3, inverse.shape[0]))
     with nogil:
@@ -87,7 +89,7 @@ def misfits(const double[:, ::1] matrix, const double[:, :, ::1] coefficients, c
     values : ndarray, shape (n, m, 3)
         Results of the launches.
     """
-    cdef long i, j, k, c
+    cdef Index i, j, k, c
     cdef double total, squares
     cdef double[::1] sums = np.empty(values.shape[0])
     with nogil:
@@ -122,7 +124,7 @@ def evaluate(const signed char[:, ::1] exponents, const float[:, :, ::1] coeffic
     """
     cdef double monomial[MAX_MONOMIALS]
     cdef double total
-    cdef long i, n = variables.shape[0]
+    cdef Index i, n = variables.shape[0]
     cdef int k, c, m = <int>exponents.shape[0]
     cdef double[:, ::1] values = np.empty((n, 3))
     _check(np.asarray(exponents))

@@ -1,5 +1,6 @@
 """Potentials of charges of either sign at all atoms of a tree, for the charging rules."""
 
+from apt_evap._core.index cimport Index
 from apt_evap._core.interactions cimport InteractionLists
 from apt_evap._core.octree cimport Octree
 
@@ -13,15 +14,15 @@ cdef class Potentials:
     cdef double per_square               # entries of this table per nm^2
     cdef double reach_squared            # squared distance of its last entry [nm^2]
 
-    cdef void leaf_moments(self, Octree tree, long node, const double* charges) noexcept nogil
-    cdef void node_moments(self, Octree tree, long node) noexcept nogil
-    cdef void traceless(self, long node) noexcept nogil
+    cdef void leaf_moments(self, Octree tree, Index node, const double* charges) noexcept nogil
+    cdef void node_moments(self, Octree tree, Index node) noexcept nogil
+    cdef void traceless(self, Index node) noexcept nogil
     cdef double difference(self, double s) noexcept nogil
-    cdef void correct(self, InteractionLists lists, Octree tree, long group, const double* charges,
+    cdef void correct(self, InteractionLists lists, Octree tree, Index group, const double* charges,
                       double* potential) noexcept nogil
-    cdef void correct_range(self, InteractionLists lists, Octree tree, long group, long first, long last,
+    cdef void correct_range(self, InteractionLists lists, Octree tree, Index group, Index first, Index last,
                             const double* charges, double* potential) noexcept nogil
-    cdef void group_single(self, InteractionLists lists, Octree tree, long group, const double* charges,
+    cdef void group_single(self, InteractionLists lists, Octree tree, Index group, const double* charges,
                            double* potential) noexcept nogil
-    cdef void group_double(self, InteractionLists lists, Octree tree, long group, const double* charges,
+    cdef void group_double(self, InteractionLists lists, Octree tree, Index group, const double* charges,
                            double* potential) noexcept nogil

@@ -9,6 +9,7 @@ from cython.parallel cimport prange
 
 import numpy as np
 
+from apt_evap._core.index cimport Index
 from apt_evap._core.interactions cimport InteractionLists
 from apt_evap._core.octree cimport Octree
 
@@ -16,13 +17,13 @@ from apt_evap._core.octree cimport Octree
 cdef extern from "kernels.h":
     const int GROUP, MULTIPOLE
     const double SAME_PLACE
-    void group_atoms_potential_single(long, const int*, const double*, const double*, const double*, const double*,
+    void group_atoms_potential_single(Index, const int*, const double*, const double*, const double*, const double*,
                                       const double*, const float*, const float*, double*) noexcept nogil
-    void group_cells_potential_single(long, const int*, const double*, const double*, const float*, const float*,
+    void group_cells_potential_single(Index, const int*, const double*, const double*, const float*, const float*,
                                       double*) noexcept nogil
-    void group_atoms_potential_double(long, const int*, const double*, const double*, const double*, const double*,
+    void group_atoms_potential_double(Index, const int*, const double*, const double*, const double*, const double*,
                                       const double*, const double*, const double*, double*) noexcept nogil
-    void group_cells_potential_double(long, const int*, const double*, const double*, const double*, const double*,
+    void group_cells_potential_double(Index, const int*, const double*, const double*, const double*, const double*,
                                       double*) noexcept nogil
 
 
@@ -31,11 +32,11 @@ ctypedef fused real:
     double
 
 
-cdef void group_potential(Potentials self, InteractionLists lists, Octree tree, long group, const double* charges,
+cdef void group_potential(Potentials self, InteractionLists lists, Octree tree, Index group, const double* charges,
                           double* potential, real* work) noexcept nogil:
     # Potential at one group; `work` has space for the 32 targets, relative to the centre of the group, and for zeros.
-    cdef long first = lists.starts[group, 0], n_cells = lists.starts[group + 1, 0] - first
-    cdef long range_first = lists.starts[group, 1], n_ranges = lists.starts[group + 1, 1] - range_first, k, lane
+    cdef Index first = lists.starts[group, 0], n_cells = lists.starts[group + 1, 0] - first
+    cdef Index range_first = lists.starts[group, 1], n_ranges = lists.starts[group + 1, 1] - range_first, k, lane
     cdef const double* ball = &lists.ball[group, 0]
     cdef double[32] sums
     for lane in range(GROUP):
@@ -99,7 +100,7 @@ cdef class Potentials:
             Number of threads.
         """
         cdef Octree tree = self.lists.tree
-        cdef long node, group
+        cdef Index node, group
         for node in prange(tree.n_nodes, nogil=True, schedule="dynamic", chunksize=256, num_threads=n_threads):
             if tree.skip[node] == node + 1:
                 self.leaf_moments(tree, node, &charges[0])
@@ -115,10 +116,10 @@ cdef class Potentials:
             else:
                 self.group_single(self.lists, tree, group, &charges[0], &potential[0])
 
-    cdef void leaf_moments(self, Octree tree, long node, const double* charges) noexcept nogil:
+    cdef void leaf_moments(self, Octree tree, Index node, const double* charges) noexcept nogil:
         cdef double* m = &self.raw[node, 0]
         cdef double q, x, y, z
-        cdef long k
+        cdef Index k
         for k in range(20):
             m[k] = 0.0
         self.empty[node] = True
@@ -154,12 +155,12 @@ cdef class Potentials:
             m[19] += q * z * z * z
             k = tree.following(node, k)
 
-    cdef void node_moments(self, Octree tree, long node) noexcept nogil:
+    cdef void node_moments(self, Octree tree, Index node) noexcept nogil:
         # Moments of the children, shifted to the centre of this node.
         cdef double* m = &self.raw[node, 0]
         cdef const double* c
         cdef double x, y, z
-        cdef long k = node + 1, i
+        cdef Index k = node + 1, i
         for i in range(20):
             m[i] = 0.0
         self.empty[node] = True
@@ -194,7 +195,7 @@ cdef class Potentials:
             m[19] += c[19] + 3.0 * c[9] * z + 3.0 * c[3] * z * z + c[0] * z * z * z
             k = tree.skip[k]
 
-    cdef void traceless(self, long node) noexcept nogil:
+    cdef void traceless(self, Index node) noexcept nogil:
         # Coefficients of the potential q/r + p.d/r^3 + (3 d d - d^2)/2 r^5 + (5 d d d - 3 d^2 d)/2 r^7 as polynomials
         # of the vector from the centre to the target.
         cdef const double* m = &self.raw[node, 0]
@@ -213,15 +214,15 @@ cdef class Potentials:
     cdef double difference(self, double s) noexcept nogil:
         # Potential of a Gaussian charge less that of a point charge, at the squared distance s.
         cdef double at = s * self.per_square
-        cdef long k = <long>at
+        cdef Index k = <Index>at
         if k + 1 >= self.gaussian.shape[0]:
             return 0.0
         return self.gaussian[k] + (at - k) * (self.gaussian[k + 1] - self.gaussian[k])
 
-    cdef void correct(self, InteractionLists lists, Octree tree, long group, const double* charges,
+    cdef void correct(self, InteractionLists lists, Octree tree, Index group, const double* charges,
                       double* potential) noexcept nogil:
         # Add the difference between Gaussian and point charges at small distances. Cells of one atom can be close, too.
-        cdef long index, node, slot
+        cdef Index index, node, slot
         for index in range(lists.starts[group, 1], lists.starts[group + 1, 1]):
             self.correct_range(lists, tree, group, lists.ranges[2 * index], lists.ranges[2 * index + 1], charges,
                                potential)
@@ -234,11 +235,11 @@ cdef class Potentials:
                     self.correct_range(lists, tree, group, slot, slot + 1, charges, potential)
                     slot = tree.next_extra[slot]
 
-    cdef void correct_range(self, InteractionLists lists, Octree tree, long group, long first, long last,
+    cdef void correct_range(self, InteractionLists lists, Octree tree, Index group, Index first, Index last,
                             const double* charges, double* potential) noexcept nogil:
         cdef const double* ball = &lists.ball[group, 0]
         cdef double most = self.reach_squared, reach = ball[3], dx, dy, dz, s
-        cdef long k, lane, at
+        cdef Index k, lane, at
         for k in range(first, last):
             dx, dy, dz = tree.x[k] - ball[0], tree.y[k] - ball[1], tree.z[k] - ball[2]
             s = dx * dx + dy * dy + dz * dz
@@ -251,12 +252,12 @@ cdef class Potentials:
                 if SAME_PLACE < s < most:
                     potential[lane] += charges[k] * self.difference(s)
 
-    cdef void group_single(self, InteractionLists lists, Octree tree, long group, const double* charges,
+    cdef void group_single(self, InteractionLists lists, Octree tree, Index group, const double* charges,
                            double* potential) noexcept nogil:
         cdef float[4 * 32] work
         group_potential[float](self, lists, tree, group, charges, potential, work)
 
-    cdef void group_double(self, InteractionLists lists, Octree tree, long group, const double* charges,
+    cdef void group_double(self, InteractionLists lists, Octree tree, Index group, const double* charges,
                            double* potential) noexcept nogil:
         cdef double[4 * 32] work
         group_potential[double](self, lists, tree, group, charges, potential, work)

@@ -1,5 +1,6 @@
 """Robin's rule, and the scalar product of the charging rules."""
 
+from apt_evap._core.index cimport Index
 from apt_evap._core.interactions cimport InteractionLists
 from apt_evap._core.octree cimport Octree
 from apt_evap._core.rule cimport FieldRule, Patch
@@ -20,8 +21,8 @@ cdef class Robin(FieldRule):
 
     cdef sample_fields(self, const double[:, ::1] normals, InteractionLists lists)
     cdef scale_others(self, Octree tree, InteractionLists lists, ratios)
-    cdef double along(self, const double[:, ::1] normals, long i) noexcept nogil
+    cdef double along(self, const double[:, ::1] normals, Index i) noexcept nogil
     cdef normal_field(self, Octree tree, const double[:, ::1] normals)
     cdef double inside(self, double x, double y, double z, double charge) noexcept nogil
-    cdef int grow(self, long stride) except -1 nogil
+    cdef int grow(self, Index stride) except -1 nogil
     cdef int patch_charges(self, Octree tree, double[:, ::1] normals, Patch* patch) except -1 nogil

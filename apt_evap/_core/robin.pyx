@@ -11,15 +11,16 @@ import numpy as np
 
 from apt_evap._core import interactions
 
+from apt_evap._core.index cimport Index
 from apt_evap._core.octree cimport Octree
 from apt_evap._core.rule cimport FieldRule, Hole, Patch
 from apt_evap._core.interactions cimport InteractionLists
 
 
 cdef extern from "kernels.h":
-    void patch_row(long, const float*, const float*, const float*, float, float, float, const double*,
+    void patch_row(Index, const float*, const float*, const float*, float, float, float, const double*,
                    float*) noexcept nogil
-    float patch_dot(long, const float*, const float*) noexcept nogil
+    float patch_dot(Index, const float*, const float*) noexcept nogil
 
 
 OUTLIER = 4.0
@@ -35,7 +36,7 @@ cdef smooth_functions(places):
 cdef double dot(const double[::1] first, const double[::1] second) noexcept nogil:
     # Scalar product; eight sums allow vectorisation in an order that does not depend on the processor.
     cdef double sums[8]
-    cdef long i, n = first.shape[0]
+    cdef Index i, n = first.shape[0]
     cdef int lane
     for lane in range(8):
         sums[lane] = 0.0
@@ -50,7 +51,7 @@ cdef double dot(const double[::1] first, const double[::1] second) noexcept nogi
 cdef eliminate(double[:, ::1] matrix, double[::1] right):
     # Solution of a small symmetric positive definite system by Gaussian elimination, stored in `right`. Not by LAPACK,
     # whose bits depend on the processor.
-    cdef long i, j, k, n = right.shape[0]
+    cdef Index i, j, k, n = right.shape[0]
     cdef double factor
     for k in range(n):
         for i in range(k + 1, n):
@@ -181,7 +182,7 @@ cdef class Robin(FieldRule):
         residual : float
             Largest change of a charge in the last sweep, relative to the mean charge.
         """
-        cdef long n = tree.n_slots
+        cdef Index n = tree.n_slots
         cdef int sweeps = 0
         cdef double residual = np.inf
         if lists.disturbed is None:
@@ -220,7 +221,7 @@ cdef class Robin(FieldRule):
         # Mean field along the normals of the samples of each block [e/nm^2].
         cdef double[::1] means = np.zeros(lists.blocks.shape[0])
         cdef const int[::1] slots = lists.slots
-        cdef long block, k, begin, end
+        cdef Index block, k, begin, end
         for block in range(lists.blocks.shape[0]):
             begin, end = lists.blocks[block, 1], lists.blocks[block, 2]
             for k in range(begin, end):
@@ -233,7 +234,7 @@ cdef class Robin(FieldRule):
         cdef const double[::1] low, high, c
         cdef signed char[::1] kept = np.zeros(tree.n_slots, np.int8)
         cdef double x, y, z, scale
-        cdef long i
+        cdef Index i
 
         # coordinates of the blocks from -1 to 1
         places = np.asarray(tree.ball)[np.asarray(lists.blocks)[:, 0], :3]
@@ -267,7 +268,7 @@ cdef class Robin(FieldRule):
                 self.field[i, 1] *= scale
                 self.field[i, 2] *= scale
 
-    cdef double along(self, const double[:, ::1] normals, long i) noexcept nogil:
+    cdef double along(self, const double[:, ::1] normals, Index i) noexcept nogil:
         # Field of all other charges along the normal of a slot [e/nm^2].
         return (self.field[i, 0] * normals[i, 0] + self.field[i, 1] * normals[i, 1]
                 + self.field[i, 2] * normals[i, 2])
@@ -275,7 +276,7 @@ cdef class Robin(FieldRule):
     cdef normal_field(self, Octree tree, const double[:, ::1] normals):
         # Field of all other charges along the normals of all slots [e/nm^2]; 0 where an atom was removed.
         cdef double[::1] along = np.zeros(tree.n_slots)
-        cdef long i
+        cdef Index i
         for i in range(tree.n_slots):
             if tree.atom[i] >= 0:
                 along[i] = self.along(normals, i)
@@ -315,7 +316,7 @@ cdef class Robin(FieldRule):
         self.drift -= self.inside(hole.x, hole.y, hole.z, hole.charge)
 
     cdef int solve_patch(self, Octree tree, double[:, ::1] normals, const Hole* hole, Patch* patch) except -1 nogil:
-        cdef long i, slot
+        cdef Index i, slot
         FieldRule.solve_patch(self, tree, normals, hole, patch)
         for i in range(patch.n):
             slot = patch.slot[i]
@@ -323,14 +324,14 @@ cdef class Robin(FieldRule):
         return 0
 
     cdef void scaled(self, Octree tree, double factor) noexcept nogil:
-        cdef long slot
+        cdef Index slot
         cdef int axis
         for slot in range(tree.n_slots):
             for axis in range(3):
                 self.field[slot, axis] *= factor
         self.drift = 0.0
 
-    cdef int grow(self, long stride) except -1 nogil:
+    cdef int grow(self, Index stride) except -1 nogil:
         if stride > self.residual.shape[0]:
             with gil:
                 self.matrix = np.zeros(stride * stride, np.float32)
@@ -342,7 +343,7 @@ cdef class Robin(FieldRule):
         # charges.
         cdef double c = self.area / (2.0 * M_PI), mean = 0.0
         cdef float new, largest
-        cdef long i, slot
+        cdef Index i, slot
         cdef int _iteration
         self.grow(patch.stride)
 

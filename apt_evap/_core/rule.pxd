@@ -5,6 +5,7 @@ calls is: `solve` for a new tree; then for every event `removed`, `exposed` for 
 `solve_patch`, which solves the charges around the hole and updates the fields of its surroundings.
 """
 
+from apt_evap._core.index cimport Index
 from apt_evap._core.octree cimport Octree
 from apt_evap._core.sources cimport Sources
 
@@ -16,8 +17,8 @@ cdef struct Hole:
     double y
     double z
     double charge           # its charge [e]
-    long n
-    long n_near             # of these, the slots for which the atoms of the patch count one by one
+    Index n
+    Index n_near            # of these, the slots for which the atoms of the patch count one by one
     int* slot
     float* near_x           # [nm]
     float* near_y
@@ -27,20 +28,20 @@ cdef struct Hole:
 cdef struct Patch:
     # The slots around a hole whose charges are solved. x, y, z and change have `stride` elements, a multiple of
     # PATCH_LANES; elements from n on have no charge and are distant.
-    long n
-    long stride
+    Index n
+    Index stride
     int* slot
     double* charge          # new charges [e]
     float* change           # new charges minus the charges in the tree [e]
     float* x                # relative to the hole [nm]
     float* y
     float* z
-    long n_merged           # the changes of the patch merged by four, for distant slots; padded as above
+    Index n_merged          # the changes of the patch merged by four, for distant slots; padded as above
     float* merged_change
     float* merged_x
     float* merged_y
     float* merged_z
-    long n_clipped          # negative charges that were set to 0
+    Index n_clipped         # negative charges that were set to 0
     bint unsettled          # whether the iteration did not converge
 
 
@@ -53,10 +54,10 @@ cdef class ChargingRule:
     cdef readonly double drift          # relative change of the potential inside the specimen by events
 
     cdef void removed(self, Octree tree, const Hole* hole) noexcept nogil
-    cdef int exposed(self, Octree tree, long slot, double opening_angle) except -1 nogil
+    cdef int exposed(self, Octree tree, Index slot, double opening_angle) except -1 nogil
     cdef int solve_patch(self, Octree tree, double[:, ::1] normals, const Hole* hole, Patch* patch) except -1 nogil
     cdef void scaled(self, Octree tree, double factor) noexcept nogil
-    cdef double strength(self, Octree tree, long slot) noexcept nogil
+    cdef double strength(self, Octree tree, Index slot) noexcept nogil
 
 
 cdef class FieldRule(ChargingRule):

@@ -4,6 +4,7 @@ from libc.math cimport M_PI, sqrt
 
 import numpy as np
 
+from apt_evap._core.index cimport Index
 from apt_evap._core.interactions cimport InteractionLists
 from apt_evap._core.octree cimport Octree
 from apt_evap._core.sources cimport sources_field, sources_free, sources_init
@@ -11,14 +12,14 @@ from apt_evap._core.sources cimport sources_field, sources_free, sources_init
 
 cdef extern from "kernels.h":
     const int GROUP
-    void patch_field(long, const float*, const float*, const float*, long, const float*, const float*, const float*,
+    void patch_field(Index, const float*, const float*, const float*, Index, const float*, const float*, const float*,
                      const float*, float*, float*, float*) noexcept nogil
 
 
 cdef void merge(Octree tree, Patch* patch) noexcept nogil:
     # Merge up to four successive changes of one sign in one leaf into one at their centre of charge.
     cdef double x, y, z, total, change
-    cdef long i = 0, n = 0, end
+    cdef Index i = 0, n = 0, end
     cdef int leaf
     cdef bint rises
     while i < patch.n:
@@ -112,7 +113,7 @@ cdef class ChargingRule:
     def strengths(self, Octree tree):
         """Strength of every slot of the tree, shape (n_slots,)."""
         cdef double[::1] values = np.empty(tree.n_slots)
-        cdef long slot
+        cdef Index slot
         with nogil:
             for slot in range(tree.n_slots):
                 values[slot] = self.strength(tree, slot)
@@ -141,7 +142,7 @@ cdef class ChargingRule:
         # An atom has evaporated, with its charge: the tree no longer contains it.
         pass
 
-    cdef int exposed(self, Octree tree, long slot, double opening_angle) except -1 nogil:
+    cdef int exposed(self, Octree tree, Index slot, double opening_angle) except -1 nogil:
         # An atom without charge was exposed, in this slot of the tree.
         return 0
 
@@ -154,7 +155,7 @@ cdef class ChargingRule:
         # All charges were multiplied by a factor that removes `drift`; only for rules that compute it.
         pass
 
-    cdef double strength(self, Octree tree, long slot) noexcept nogil:
+    cdef double strength(self, Octree tree, Index slot) noexcept nogil:
         # Field just outside a slot, in units of `field_unit`.
         return tree.q[slot]
 
@@ -171,7 +172,7 @@ cdef class FieldRule(ChargingRule):
 
     cdef void removed(self, Octree tree, const Hole* hole) noexcept nogil:
         cdef double dx, dy, dz, s, over
-        cdef long i
+        cdef Index i
         cdef int slot
         for i in range(hole.n):
             slot = hole.slot[i]
@@ -182,13 +183,13 @@ cdef class FieldRule(ChargingRule):
             self.field[slot, 1] -= over * dy
             self.field[slot, 2] -= over * dz
 
-    cdef int exposed(self, Octree tree, long slot, double opening_angle) except -1 nogil:
+    cdef int exposed(self, Octree tree, Index slot, double opening_angle) except -1 nogil:
         tree.collect(tree.x[slot], tree.y[slot], tree.z[slot], 0.0, opening_angle, &self.sources)
         sources_field(&self.sources, tree.x[slot], tree.y[slot], tree.z[slot], &self.field[slot, 0])
         return 0
 
     cdef int solve_patch(self, Octree tree, double[:, ::1] normals, const Hole* hole, Patch* patch) except -1 nogil:
-        cdef long i, near, padded = (hole.n + GROUP - 1) // GROUP * GROUP
+        cdef Index i, near, padded = (hole.n + GROUP - 1) // GROUP * GROUP
         cdef int slot
         cdef float *field_x
         cdef float *field_y
@@ -241,7 +242,7 @@ cdef class PythonRule(FieldRule):
     def solve(self, Octree tree, double[:, ::1] normals, InteractionLists lists, *, double potential, double tolerance,
               int max_sweeps=200, bint double_precision=False, int n_threads=1):
         """Solve the charges of the whole surface: see `ChargingRule.solve`."""
-        cdef long n = tree.n_slots
+        cdef Index n = tree.n_slots
         self.field = np.zeros((tree.x.shape[0], 3))
 
         def field_of(charges):
@@ -275,7 +276,7 @@ cdef class PythonRule(FieldRule):
         return np.full(len(chosen), np.nan) if residuals is None else residuals(positions, normals, charges, chosen)
 
     cdef int patch_charges(self, Octree tree, double[:, ::1] normals, Patch* patch) except -1 nogil:
-        cdef long i
+        cdef Index i
         cdef double[::1] solved
         with gil:
             slots = np.asarray(<int[:patch.n]> patch.slot)

@@ -3,6 +3,8 @@
 from libc.math cimport sqrt
 from libc.stdlib cimport free, malloc, realloc
 
+from apt_evap._core.index cimport Index
+
 
 cdef int sources_init(Sources* sources) except -1 nogil:
     sources.n_atoms = sources.n_cells = 0
@@ -44,7 +46,7 @@ cdef int sources_grow(Sources* sources) except -1 nogil:
 cdef void sources_field(const Sources* sources, double px, double py, double pz, double* field) noexcept nogil:
     # Field [e/nm^2] of all collected sources at one point.
     cdef const double* a = sources.atoms
-    cdef long stride = sources.capacity
+    cdef Index stride = sources.capacity
     field[0] = field[1] = field[2] = 0.0
     point_atoms_double(sources.n_atoms, a, a + stride, a + 2 * stride, a + 3 * stride, px, py, pz, field)
     point_cells_double(sources.n_cells, stride, sources.cells, px, py, pz, field)
@@ -55,7 +57,7 @@ cdef double sources_potential(const Sources* sources, double px, double py, doub
     cdef const double* a = sources.atoms
     cdef const double* c
     cdef double total = 0.0, dx, dy, dz, s, w2
-    cdef long k, stride = sources.capacity
+    cdef Index k, stride = sources.capacity
     for k in range(sources.n_atoms):
         dx, dy, dz = px - a[k], py - a[stride + k], pz - a[2 * stride + k]
         s = dx * dx + dy * dy + dz * dz
@@ -71,7 +73,7 @@ cdef double sources_potential(const Sources* sources, double px, double py, doub
     return total
 
 
-cdef int single_reserve(SingleSources* single, long capacity, const double* origin) except -1 nogil:
+cdef int single_reserve(SingleSources* single, Index capacity, const double* origin) except -1 nogil:
     # Removes all sources, with space for this many and for padding. The memory must be NULL at the first call.
     cdef int axis
     if single.atoms == NULL or single.capacity < capacity + SINGLE_LANES:
@@ -110,7 +112,7 @@ cdef void single_free(SingleSources* single) noexcept nogil:
 cdef void single_field(const SingleSources* single, double px, double py, double pz, double* field) noexcept nogil:
     # Field [e/nm^2] at one point, as `sources_field`.
     cdef const float* a = single.atoms
-    cdef long stride = single.capacity
+    cdef Index stride = single.capacity
     cdef float x = <float>(px - single.origin[0]), y = <float>(py - single.origin[1])
     cdef float z = <float>(pz - single.origin[2])
     field[0] = field[1] = field[2] = 0.0

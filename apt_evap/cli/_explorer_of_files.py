@@ -4,7 +4,7 @@ import argparse
 from typing import Any
 
 from apt_evap._common.codec import to_python
-from apt_evap.cli._files import in_real_units, ions_of_map, lens_of, read, read_registration
+from apt_evap.cli._files import in_real_units, ions_of_map, lens_of, read, read_registration, with_masses
 from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.explore.controls import values_of
@@ -60,7 +60,7 @@ def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer | None, Exp
     if run is not None:
         run.require_responses(repr(options.run))
         run = in_real_units(run, options)
-    measured = None if options.file is None else _measured(options)
+    measured, computed = (None, False) if options.file is None else _measured(options)
     registration = None
     if options.registration is not None:
         if measured is None or run is None:
@@ -76,7 +76,7 @@ def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer | None, Exp
         measured,
         registration,
         run_code="None" if run is None else _run_code(options),
-        measured_code="None" if options.file is None else _measured_code(options),
+        measured_code="None" if options.file is None else _measured_code(options, computed),
         run_arguments=[] if run is None else _run_arguments(options),
         measured_arguments=[] if options.file is None else _measured_arguments(options),
     )
@@ -105,12 +105,14 @@ def _ions(options, explorer):
 
 
 def _measured(options):
+    """Measured ions or the map, and whether masses of the ions are computed."""
     content = read(options)
     if isinstance(content, Run):
         raise ValueError(f"MEASURED must be measured ions or a map, {options.file!r} is a run")
     if isinstance(content, DetectorMap):
-        return content
-    return ions_of_map(content, options)
+        return content, False
+    hits = with_masses(content, options)
+    return ions_of_map(hits, options), hits is not content
 
 
 # ---- the same in text ----------------------------------------------------------------------------------------------
@@ -150,6 +152,10 @@ def _measured_arguments(options):
     for name in _SELECTION:
         if (value := getattr(options, name)) is not None:
             arguments += [f"--{name}={','.join('' if bound is None else repr(bound) for bound in value)}"]
+    if options.distance is not None:
+        arguments += [f"--distance={options.distance!r}"]
+    if options.time_zero:
+        arguments += [f"--t0={options.time_zero!r}"]
     if options.circle is not None:
         radius, centre = options.circle
         arguments += [f"--circle={','.join(map(repr, (radius, *centre)))}"]
@@ -158,8 +164,8 @@ def _measured_arguments(options):
     return arguments
 
 
-def _measured_code(options):
-    """Python expression that reads MEASURED."""
+def _measured_code(options, computed):
+    """Python expression that reads MEASURED; whether its masses are computed from times of flight."""
     if options.file.lower().endswith(".npz") or (options.format or "").lstrip(".").lower() == "npz":
         names = zip(("values", "x_edges", "y_edges", "mask"), (options.arrays or "").split(","), strict=False)
         parameters = {name: value for name, value in names if value} | ({"unit": options.unit} if options.unit else {})
@@ -168,6 +174,8 @@ def _measured_code(options):
         name: value for name in ("format", "partial", "byte_order", "voltage_unit") if (value := getattr(options, name))
     } | ({"detector_unit": options.unit} if options.unit else {})
     code = f"ae.read({_call(options.file, parameters)})"
+    if computed:
+        code += f".with_masses({options.distance!r}, {options.time_zero!r})"
     for name, column in _SELECTION.items():
         if (bounds := getattr(options, name)) is not None:
             code += f".window({column}={bounds!r})"

@@ -13,16 +13,19 @@ import numpy as np
 from apt_evap._common.codec import from_plain
 from apt_evap._common.files import FileError, read_small_file, sha256_of
 from apt_evap._common.validation import did_you_mean
+from apt_evap.cli._output import say
 from apt_evap.config.lens_text import read_lens
+from apt_evap.config.material_text import read_material
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
+from apt_evap.detection.mass_spectrum import spectrum
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
-from apt_evap.detection.timing import mass_to_charge
 from apt_evap.io.distortion_grid import read_grid
 from apt_evap.io.formats import read_ranges
 from apt_evap.maps.registration.register import Registration
 from apt_evap.simulation.read_file import read as read_file
 from apt_evap.simulation.run import Run, load
+from apt_evap.specimen.isotopes import ISOTOPES
 from apt_evap.studies.workflows.compare_maps import MAX_STUDY
 from apt_evap.studies.workflows.measured_source import MeasuredSource
 from apt_evap.studies.workflows.twin_of_map import path_word
@@ -132,10 +135,45 @@ def _of_species(hits, names, ranges):
 def with_masses(hits: Hits, options: argparse.Namespace) -> Hits:
     """The ions with mass-to-charge ratios from their times of flight, if they have none and the distance is given."""
     columns = (hits.time_of_flight, hits.voltage, hits.x, hits.y)
-    if hits.mass_to_charge is not None or options.distance is None or any(each is None for each in columns):
+    if hits.mass_to_charge is not None or options.distance is None or any(column is None for column in columns):
         return hits
-    time, voltage, x, y = columns
-    return replace(hits, mass_to_charge=mass_to_charge(voltage, time, x, y, options.distance))
+    return hits.with_masses(options.distance, options.time_zero)
+
+
+def of_element(hits: Hits, options: argparse.Namespace, computed: bool) -> Hits:
+    """The ions in the peaks of the crystal, unless the options select masses or all ions; which ones is printed.
+
+    Parameters
+    ----------
+    hits : Hits
+        Ions that the options select.
+    computed : bool
+        Whether their m/n follows from the times of flight, so that its scale is not known.
+    """
+    chosen = options.all_ions or options.mass is not None or options.species is not None
+    element = read_material(options.element, "--element").name
+    if chosen or hits.mass_to_charge is None or element not in ISOTOPES:
+        return hits
+    source = replace(hits, mass_to_charge=None) if computed else hits
+    flight = {"distance": options.distance, "time_zero": options.time_zero} if computed else {}
+    named = spectrum(source, element, **flight)
+    try:
+        inside = named.inside(element)
+    except ValueError as error:
+        say("note", f"all ions are used: {error}")
+        return hits
+    peaks = "; ".join(
+        f"{peak.name} at {', '.join(f'{low:.4g} to {high:.4g}' for low, high in peak.intervals)} Da"
+        for peak in named.peaks
+    )
+    number = int(np.count_nonzero(inside))
+    say(
+        "note",
+        f"{number:,} of {len(hits):,} ions are used, those of {peaks}; --all-ions, --mass or --species change it",
+    )
+    if named.flight is not None and named.flight.peaks:
+        say("note", f"{named.flight}")
+    return hits[inside]
 
 
 def check_columns(hits: Hits, options: argparse.Namespace) -> None:
@@ -192,10 +230,14 @@ def measured_of(options: argparse.Namespace) -> Hits | DetectorMap:
     content = read(options)
     if isinstance(content, Run):
         raise ValueError(f"a measured file is needed, {options.file!r} contains a run, whose orientation is known")
-    return content if isinstance(content, DetectorMap) else ions_of_map(with_masses(content, options), options)
+    if isinstance(content, DetectorMap):
+        return content
+    selection = ions_of_map(with_masses(content, options), options)
+    return of_element(selection, options, content.mass_to_charge is None)
 
 
 _READING = ("format", "partial", "byte_order", "arrays", "unit", "voltage_unit")
+_MASSES = ("all_ions", "time_zero")
 
 
 def measured_source(options: argparse.Namespace) -> MeasuredSource:
@@ -205,12 +247,14 @@ def measured_source(options: argparse.Namespace) -> MeasuredSource:
     for name in ("ions", "mass", "voltage"):
         if (bounds := getattr(options, name)) is not None:
             words += [f"--{name}", ",".join("" if bound is None else f"{bound:.10g}" for bound in bounds)]
+    words += [f"--t0={options.time_zero!r}"] if options.time_zero else []
     words += ["--ranges", path_word(Path(options.ranges))] if options.ranges is not None else []
     words += [f"--species={options.species}"] if options.species is not None else []
     return MeasuredSource(
         partial(measured_of, options),
         Path(options.file),
         {name: None if path is None else sha256_of(path) for name, path in paths.items()},
-        {name: getattr(options, name) for name in (*_READING, *_SELECTING) if name != "ranges"},
+        # what is not given is None, as for a twin made in Python
+        {name: getattr(options, name) or None for name in (*_READING, *_SELECTING, *_MASSES) if name != "ranges"},
         tuple(words),
     )

@@ -46,7 +46,12 @@ def add_indexing(parser: argparse.ArgumentParser) -> None:
     """Add options of the crystal on a measured map."""
     group = parser.add_argument_group("crystal")
     group.add_argument("--element", metavar="NAME", required=True, help=f"the crystal: {MATERIAL_HELP}")
-    group.add_argument("--distance", type=number_type("mm"), metavar="MM", help="flight length of the instrument")
+    add_flight(group)
+    group.add_argument(
+        "--all-ions",
+        action="store_true",
+        help="use all ions; default: those in the peaks of the crystal, if there is no --mass or --species",
+    )
     group.add_argument(
         "--scales",
         type=numbers_type,
@@ -62,6 +67,24 @@ def add_indexing(parser: argparse.ArgumentParser) -> None:
         action="append",
         metavar="X,Y,X,Y[,U,V,W]",
         help="two points of a zone line that you see [mm], and its zone axis if you know it; repeat it",
+    )
+
+
+def add_flight(parser: Any) -> None:
+    """Add options of the flight, from which masses follow."""
+    parser.add_argument("--distance", type=number_type("mm"), metavar="MM", help="flight length of the instrument")
+    add_time_zero(parser)
+
+
+def add_time_zero(parser: Any) -> None:
+    """Add the option of the time zero of the times of flight."""
+    parser.add_argument(
+        "--t0",
+        dest="time_zero",
+        type=_time,
+        default=0.0,
+        metavar="NS",
+        help="time that is subtracted from the times of flight; default: 0",
     )
 
 
@@ -132,6 +155,17 @@ def number_type(unit: str) -> Callable[[str], float]:
         return value
 
     return number
+
+
+def _time(text: str) -> float:
+    """Finite number."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = inf
+    if not isfinite(value):
+        raise argparse.ArgumentTypeError(f"must be a number [ns], got {text!r:.80}")
+    return value
 
 
 def numbers_type(text: str) -> tuple[float, ...]:

@@ -11,7 +11,15 @@ from collections.abc import Iterator
 from functools import partial
 from html import escape
 
-from apt_evap.cli._options import MAX_BINS, add_reading, add_real_units, bounds_type, integer_type, number_type
+from apt_evap.cli._options import (
+    MAX_BINS,
+    add_flight,
+    add_reading,
+    add_real_units,
+    bounds_type,
+    integer_type,
+    number_type,
+)
 from apt_evap.cli._output import put, say
 
 
@@ -42,6 +50,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--smooth", type=number_type("mm"), metavar="MM", help="sigma of a Gaussian; default: one bin")
     parser.add_argument("--flatten", type=number_type("mm"), metavar="MM", help="sigma for flattening; default: none")
     parser.add_argument("--simulated", type=bounds_type, metavar="FIRST,LAST", help="ions of the run; default: all")
+    add_flight(parser)
     parser.add_argument("--port", type=integer_type(0, 65535), default=0, metavar="N", help="default: a free one")
     parser.add_argument("--no-browser", dest="browser", action="store_false", help="only print the address")
     parser.add_argument(

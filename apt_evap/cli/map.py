@@ -6,6 +6,7 @@ from pathlib import Path
 from apt_evap.cli._options import (
     FILE_HELP,
     MAX_BINS,
+    add_flight,
     add_reading,
     add_real_units,
     add_speech,
@@ -75,7 +76,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument("--rotation", type=float, metavar="DEGREES", help="of the crystal about its axis; no search")
     group.add_argument("--scale", type=number_type("mm/rad"), metavar="S", help="scale of the map [mm/rad]")
-    group.add_argument("--distance", type=number_type("mm"), metavar="MM", help="flight length of the instrument")
+    add_flight(group)
     add_real_units(parser)
     parser.add_argument("--force", action="store_true", help="overwrite a file not made by apt-evap")
     add_speech(parser)

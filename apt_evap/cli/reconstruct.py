@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from apt_evap.cli._options import MATERIAL_HELP, add_reading, add_real_units, add_speech, integer_type
+from apt_evap.cli._options import MATERIAL_HELP, add_reading, add_real_units, add_speech, add_time_zero, integer_type
 from apt_evap.cli._output import tell, tell_json
 
 _CONSTANTS = (
@@ -58,6 +58,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         help="angle on the cap; default: bas, of a run compressed",
     )
     constants.add_argument("--distance", type=float, metavar="MM", help="flight length; default: that of the run")
+    add_time_zero(constants)
     constants.add_argument(
         "--detector-radius",
         type=float,

@@ -26,6 +26,7 @@ from apt_evap.detection.binning import find_quantisations
 from apt_evap.detection.dataframe import to_dataframe
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.distortion import DistortionGrid
+from apt_evap.detection.timing import mass_to_charge
 from apt_evap.warnings import DataWarning, warn
 
 if TYPE_CHECKING:
@@ -247,6 +248,30 @@ class Hits:
         if ranges is not None:
             columns["species"] = check_kind(ranges, "ranges", "labels", "Ranges").labels(self, "")
         return to_dataframe(columns | self.extra, source=self.source, units=self.units)
+
+    def with_masses(self, distance: float, time_zero: float = 0.0) -> Hits:
+        """The ions with m/n from their times of flight and total voltages, see `mass_to_charge`.
+
+        Parameters
+        ----------
+        distance : float
+            Distance from the apex to the detector [mm].
+        time_zero : float
+            Time that is subtracted from the times of flight [ns].
+
+        Returns
+        -------
+        Hits
+
+        Raises
+        ------
+        ValueError
+            If a column is missing, or a number is outside its range.
+        """
+        time, voltage, x, y = self.require("time_of_flight", "voltage", "x", "y")
+        time_zero = check_number(time_zero, "time_zero", unit="ns")
+        total = voltage if self.pulse_voltage is None else voltage + self.pulse_voltage
+        return replace(self, mass_to_charge=mass_to_charge(total, time - time_zero, x, y, distance))
 
     def within_circle(self, radius: float, centre: ArrayLike = (0.0, 0.0)) -> Hits:
         """Select the detected ions within a circle on the detector.

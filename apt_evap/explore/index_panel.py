@@ -242,7 +242,7 @@ class IndexPanel:
         """Search over all orientations by `index`, or refine one, in another process; marks narrow it."""
         marks = self.read()
         options: dict[str, Any] = {
-            "poles": [place for _, place in marks.poles],
+            "poles": [(*place, marks.planes[number]) for number, place in marks.poles],
             "lines": [(*points[0], *points[-1]) for _, points in marks.lines if len(points) > 1],
         }
         if start is not None:
@@ -273,7 +273,7 @@ class IndexPanel:
 
     def _put_searched(self, indexing, text):
         rows = [] if indexing is None else [
-            (candidate.orientation, candidate.projection, f"{candidate.confidence:.0%}, score {candidate.score:.2f}")
+            (candidate.orientation, candidate.projection, f"score {candidate.score:.2f}")
             for candidate in indexing.candidates
         ]  # fmt: skip
         self._put(rows, text, indexing)

@@ -57,6 +57,7 @@ class Marks:
         crystal = poles(self.material, FAMILIES)
         self._members = _families(crystal)
         self.families = tuple(plain(crystal.labels[members[0]]) for members in self._members)
+        self.planes = tuple(tuple(crystal.planes[members[0]].tolist()) for members in self._members)
         self._crystal = crystal
 
     def fits(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import product
 from typing import Any
@@ -13,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from apt_evap._common.codec import to_plain
 from apt_evap._common.progress import progress_bar
+from apt_evap._common.threads import map_of_threads
 from apt_evap._common.types import Floats
 from apt_evap.detection.binning import field_of_view
 from apt_evap.detection.detector_map import DetectorMap
@@ -128,7 +128,7 @@ class EnergySearch:
         places = [np.arange(number) for number in self.grid.shape] if places is None else places
         perturbations = [self.perturbation(index) for index in product(*places)]
         with (
-            ThreadPoolExecutor(self.n_threads) as pool,
+            map_of_threads(self.n_threads) as apply,
             progress_bar(total=len(perturbations), unit=" maps", desc=note, disable=self.disable) as bar,
         ):
 
@@ -140,7 +140,7 @@ class EnergySearch:
                 bar.update()
                 return similarities, structure
 
-            values, structures = zip(*pool.map(scores, perturbations), strict=True)
+            values, structures = zip(*apply(scores, perturbations), strict=True)
         names = [] if measure is None else list(structures)
         return np.stack(values, axis=1).reshape(-1, *map(len, places)), names
 

@@ -4,5 +4,6 @@ from .formats import TruncatedFile as TruncatedFile
 from .formats import chunks as chunks
 from .formats import read_ranges as read_ranges
 from .npz import read_map as read_map
+from .rrng import write_rrng as write_rrng
 from .tapsim_nodes import write_nodes as write_nodes
 from .tapsim_nodes import write_types as write_types

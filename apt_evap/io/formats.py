@@ -79,9 +79,9 @@ def _read_hdf5(path, *, columns=None):
 
 
 def _read_nxapm(path, *, columns=None):
-    from apt_evap.io.nxapm import read_nxapm
+    from apt_evap.io.hdf5 import read_hdf5
 
-    return read_nxapm(path, columns=columns)
+    return read_hdf5(path, columns=columns)
 
 
 def _write_nxapm(path, hits, *, elements=(), start_time=None):

@@ -12,7 +12,19 @@ import numpy as np
 
 from apt_evap._common.checked_hdf5 import CheckedFile, open_hdf5, put_field, put_text, write_hdf5
 from apt_evap._common.files import FileError
-from apt_evap._common.nexus import ENTRY, HITS, IONS, MASSES, MULTIPLICITY, TIMES, put_group, put_nxapm
+from apt_evap._common.nexus import (
+    ENTRY,
+    HITS,
+    IONS,
+    MASSES,
+    MULTIPLICITY,
+    POSITIONS,
+    PULSER,
+    TIMES,
+    put_group,
+    put_links,
+    put_nxapm,
+)
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_kind, check_sequence, short_text
 from apt_evap._version import __version__
@@ -23,6 +35,13 @@ from apt_evap.io._texts import ELEMENTS
 KIND = "ions"
 _OWN = f"{ENTRY}/ions"
 _NAMED = {"time_of_flight": TIMES, "mass_to_charge": MASSES, "multiplicity": MULTIPLICITY, "ion": IONS}
+# paths of other programs for columns in the group of this package
+_LINKED = {
+    "positions": POSITIONS,
+    "voltage": f"{PULSER}/standing_voltage",
+    "pulse_voltage": f"{PULSER}/pulse_voltage",
+    "pulse_id": f"{PULSER}/pulse_number",
+}
 _UNITS = {"x": "mm", "y": "mm", "voltage": "V", "pulse_voltage": "V", "positions": "nm"}
 
 
@@ -79,6 +98,7 @@ def write_nxapm(path: AnyPath, hits: Hits, *, elements: Sequence[str], start_tim
             group.attrs["extent"] = hits.extent
         for name in names:
             put_field(group, name, getattr(hits, name), _UNITS.get(name))
+        put_links(file, {place: group[name] for name, place in _LINKED.items() if name in names})
         numeric = {name: values for name, values in hits.extra.items() if values.dtype.kind in "biuf"}
         put_text(group, "extra", json.dumps([[name, hits.units.get(name)] for name in numeric]))
         for index, (name, values) in enumerate(numeric.items()):

@@ -9,7 +9,7 @@ import re
 
 import numpy as np
 
-from apt_evap._common.files import FileError
+from apt_evap._common.files import FileError, check_path, replace_file
 from apt_evap._common.types import AnyPath
 from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.io._texts import atoms_in, atoms_of, formula, number, read_text, species_name
@@ -58,6 +58,44 @@ def read_rrng(path: AnyPath) -> Ranges:
     names, low, high, volume, colour, composition, species = zip(*parts, strict=True)
     _warn_of_charges(path, low, high, species)
     return Ranges(names, np.array(low), np.array(high), np.array(volume), colour, composition, source=str(path))
+
+
+def write_rrng(path: AnyPath, ranges: Ranges) -> None:
+    """Write an .rrng file of ranges of mass.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file.
+    ranges : Ranges
+        Ranges whose ions have a composition.
+
+    Raises
+    ------
+    FileError
+        If it cannot be written.
+    ValueError
+        If a range has no composition.
+    """
+    assert ranges.composition is not None and ranges.colour is not None
+    for name, atoms in zip(ranges.names, ranges.composition, strict=True):
+        if not atoms:
+            raise ValueError(f"ranges must have a composition for an .rrng file, got none for {name!r}")
+    elements = list(dict.fromkeys(element for atoms in ranges.composition for element in atoms))
+    lines = ["[Ions]", f"Number={len(elements)}"]
+    lines += [f"Ion{at}={element}" for at, element in enumerate(elements, 1)]
+    lines += ["[Ranges]", f"Number={len(ranges)}"]
+    for at, (low, high, volume, atoms, colour) in enumerate(
+        zip(ranges.low, ranges.high, ranges.volume, ranges.composition, ranges.colour, strict=True),  # type: ignore[arg-type]
+        1,
+    ):
+        parts = [f"{low:.4f} {high:.4f}"]
+        parts += [f"Vol:{volume:.5f}"] if np.isfinite(volume) else []
+        parts += [f"{element}:{count}" for element, count in atoms.items()]
+        parts += [f"Color:{colour.lstrip('#').upper()}"] if colour else []
+        lines.append(f"Range{at}={' '.join(parts)}")
+    with replace_file(check_path(path)) as file:
+        file.write(("\n".join(lines) + "\n").encode())
 
 
 def _lines(text):

@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 
 from apt_evap._common.validation import check_array, check_choice, check_kind, check_number, check_sequence
 from apt_evap.detection.hits import Hits
+from apt_evap.detection.mass_spectrum import Spectrum
 from apt_evap.plot._figure import DrawnAxes, ion_label, new_figure
 from apt_evap.simulation.run import Run
 from apt_evap.specimen.isotopes import ISOTOPES
@@ -24,7 +25,7 @@ _HIGHEST_CHARGE = 4
 
 
 def spectrum(
-    ions: Run | Hits | Sequence[Run | Hits],
+    ions: Run | Hits | Spectrum | Sequence[Run | Hits],
     labels: Sequence[str] | None = None,
     ax: Axes | None = None,
     *,
@@ -36,9 +37,9 @@ def spectrum(
 
     Parameters
     ----------
-    ions : Run or Hits or sequence of them
+    ions : Run or Hits or sequence of them, or a Spectrum
         Detected ions with mass_to_charge. A run has to be in real units (`Run.at_evaporation_field`); the hits of its
-        first perturbation are drawn.
+        first perturbation are drawn. The result of `apt_evap.spectrum` is drawn with background, ranges and names.
     labels : sequence of str, optional
         One label each.
     ax : matplotlib.axes.Axes, optional
@@ -63,6 +64,8 @@ def spectrum(
         If there are no ions with mass_to_charge, a run is not in real units, an element is unknown, there are too many
         bins, or the number of labels differs.
     """
+    if isinstance(ions, Spectrum):
+        return _draw_named(ions, labels, ax, bin_width, limits)
     spectra = [ions] if isinstance(ions, Run | Hits) else list(check_sequence(ions, "ions", "runs or hits"))
     labels = [None] * len(spectra) if labels is None else list(labels)
     if not spectra or len(labels) != len(spectra):
@@ -105,6 +108,59 @@ def spectrum(
     if any(labels):
         ax.legend(loc="upper center", frameon=False, fontsize="small", ncols=min(len(labels), 3))
     return ax
+
+
+def _draw_named(spectrum_of_ions, labels, ax, bin_width, limits):
+    """Draw a spectrum with its background, its ranges, and the names of its peaks."""
+    intervals = [interval for peak in spectrum_of_ions.peaks for interval in peak.intervals]
+    if limits is None:
+        low, high = _default_limits([_masses(spectrum_of_ions.hits)])
+        ends = np.array(intervals or [(low, high)])
+        margin = _MARGIN * (max(high, ends.max()) - min(low, ends.min()))
+        limits = max(min(low, ends.min() - margin), 0.0), max(high, ends.max() + margin)
+    ax = spectrum(spectrum_of_ions.hits, labels, ax, bin_width=bin_width, limits=limits, elements=())
+    edges = bin_width * np.arange(np.floor(limits[0] / bin_width), np.ceil(limits[1] / bin_width) + 1)
+    ax.stairs(
+        spectrum_of_ions.background(edges),
+        edges,
+        baseline=None,
+        color="0.25",
+        linewidth=1.2,
+        label="background",
+        zorder=3,
+    )
+    mass = _masses(spectrum_of_ions.hits)
+    count = np.histogram(mass, edges)[0]
+    formulas = list(dict.fromkeys(peak.formula for peak in spectrum_of_ions.peaks))
+    places: list[float] = []
+    for peak in spectrum_of_ions.peaks:
+        color = f"C{1 + formulas.index(peak.formula) % 9}"
+        for low, high in peak.intervals:
+            ax.axvspan(low, high, color=color, alpha=0.2, linewidth=0)
+        tops = [
+            (int(inside.max()), float(edges[first + int(np.argmax(inside))]))
+            for first, inside in (
+                (bins.start, count[bins]) for bins in (_bins_between(edges, *i) for i in peak.intervals)
+            )
+            if inside.size
+        ]
+        if not tops or any(abs(max(tops)[1] - place) < _WIDTH_OF_LABEL * (limits[1] - limits[0]) for place in places):
+            continue
+        top, place = max(tops)
+        places.append(place)
+        charge = f"{peak.charge}{{+}}" if peak.charge > 1 else "{+}"
+        ax.annotate(
+            f"{_subscripts(peak.formula)}$^{{{charge}}}$", (place, max(top, 1)), xytext=(0, 4),
+            textcoords="offset points", ha="center", va="bottom", color=color, annotation_clip=True,
+        )  # fmt: skip
+    bottom, top = ax.get_ylim()
+    ax.set_ylim(bottom, top * (top / bottom) ** 0.12)
+    ax.legend(loc="upper right", frameon=False, fontsize="small")
+    return ax
+
+
+def _subscripts(formula):
+    return "".join(f"$_{{{character}}}$" if character.isdigit() else character for character in formula)
 
 
 def _masses(ions):

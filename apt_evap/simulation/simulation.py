@@ -290,7 +290,7 @@ class Simulation:
         """Start the flights of a batch; return a function that waits for them and returns the batch as a Run."""
         first_ion = self.n_evaporated
         self.n_evaporated += len(batch)
-        ions = np.arange(first_ion, self.n_evaporated)
+        ions = np.arange(first_ion, self.n_evaporated, dtype=np.int64)
         emission_batch = self._emissions(batch, ions)
         launches = [
             check_launches(perturbation, perturbation.launch(emission_batch, IonRandom(self.seed, ions)), len(batch))

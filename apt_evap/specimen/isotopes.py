@@ -11,6 +11,14 @@ from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_sequence
 from apt_evap.specimen.nuclides import ISOTOPES
 
+# fmt: off
+SPECTRUM_ELEMENTS = (
+    "H", "B", "C", "N", "O", "V", "Mn", "Zr", "Nb", "Re", "Mg", "Al", "Si", "Ti", "Cr", "Fe", "Co", "Ni", "Cu", "Mo",
+    "Rh", "Ag", "Ta", "W", "Ir", "Pt", "Au",
+)
+# fmt: on
+"""Elements that the ions of a spectrum are compared with, also if nobody names them."""
+
 # relative: atomic weights rounded to three digits still count as natural, the isotopes of Ni, Cu, Fe and Si do not
 _SAME_MASS = 1e-3
 

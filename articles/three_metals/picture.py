@@ -1,7 +1,9 @@
 """Measured maps of three metals and those of one law, folded about their poles, beside each other.
 
-python picture.py three_metals.png --W W3.epos RUNS/W_160_others_1_wide.h5 --Ni MAP.npz RUNS/Ni_160_others_1_wide.h5
-    --Al MAP.npz RUNS/Al_160_others_1_wide.h5
+python picture.py three_metals.png --W RUNS/W_160_others_1_wide.h5 --Ni RUNS/Ni_160_others_1_wide.h5
+    --Al RUNS/Al_160_others_1_wide.h5
+
+The measured maps are the folded densities in measured.npz, made by measured_numbers.py.
 """
 
 import argparse
@@ -9,14 +11,15 @@ import warnings
 
 import matplotlib.pyplot as plt
 import numpy as np
-from judge import METALS, folded, map_of, measured_of, projection_of
+from judge import METALS, folded, map_of, projection_of
+from measured_numbers import measured_fold
 
 import apt_evap as ae
 
 TITLES = {"W": "tungsten [011]", "Ni": "nickel [111]", "Al": "aluminium [111], 47 mm/rad"}
 
 
-def pair_of(name, measured, path):
+def pair_of(name, path):
     """Folded measured map, and the simulated one."""
     run = ae.load(path)
     scale = float(np.median(run.at_evaporation_field().energy_scales))
@@ -24,7 +27,7 @@ def pair_of(name, measured, path):
     part = rule.probability.probabilities(run.emissions[~run.not_flown]).mean()
     orientation = ae.Orientation.from_settings(run.settings["tip"])
     simulated = folded(map_of(run, rule), orientation, projection_of(run), METALS[name])
-    return folded(*measured_of(name, measured), METALS[name]), simulated, part
+    return measured_fold(name), simulated, part
 
 
 def main():
@@ -32,12 +35,12 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("picture")
     for name in TITLES:
-        parser.add_argument(f"--{name}", nargs=2, required=True, metavar=("MEASURED", "RUN"))
+        parser.add_argument(f"--{name}", required=True, metavar="RUN")
     options = parser.parse_args()
     warnings.simplefilter("ignore", ae.warnings.ResponseWarning)
     figure, axes = plt.subplots(2, 3, figsize=(10.5, 7.2), layout="constrained")
     for column, name in zip(axes.T, TITLES, strict=True):
-        measured, simulated, part = pair_of(name, *getattr(options, name))
+        measured, simulated, part = pair_of(name, getattr(options, name))
         end = measured.angles[-1]
         text = f"the law of migration: {part:.0%} roll\ncorrelation {simulated.correlation(measured):.2f}"
         for ax, each, title in zip(column, (measured, simulated), (TITLES[name], text), strict=True):

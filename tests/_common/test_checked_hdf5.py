@@ -39,7 +39,8 @@ def refused(path, match=r"\.h5' is damaged", reader=ae.load):
 # ---- any damage ----------------------------------------------------------------------------------------------------
 
 
-def test_every_changed_bit_is_noticed(path, run):
+@pytest.mark.parametrize("flips", [60, pytest.param(600, marks=pytest.mark.slow)])
+def test_every_changed_bit_is_noticed(path, run, flips):
     """Or it is in a gap of the file, in what only NeXus needs, or one of the five bits that pad a block of deflate."""
     whole, is_read = path.read_bytes(), np.zeros(path.stat().st_size, bool)
     n_same = 0
@@ -56,7 +57,7 @@ def test_every_changed_bit_is_noticed(path, run):
     whole_path = path.with_name("whole.h5")
     whole_path.write_bytes(whole)
     random = np.random.default_rng(1)
-    for place in random.integers(len(whole), size=600):
+    for place in random.integers(len(whole), size=flips):
         content = bytearray(whole)
         content[place] ^= 1 << random.integers(8)
         path.write_bytes(content)
@@ -69,7 +70,7 @@ def test_every_changed_bit_is_noticed(path, run):
             assert other.fingerprint() == run.fingerprint() and other.settings == run.settings
             assert other.perturbations == ae.load(whole_path).perturbations
             assert other.state.charges.tobytes() == run.state.charges.tobytes() and other.ended == run.ended
-    assert n_same <= 5  # measured: 1 of 600
+    assert n_same <= 1 + flips // 150  # measured: 1 of 600
 
 
 def test_zeros_cuts_and_insertions_are_noticed(path, run):

@@ -1,7 +1,6 @@
 """Files that are read and replaced: regular ones only, complete or not at all."""
 
 import os
-import resource
 import stat
 import threading
 import time
@@ -156,6 +155,7 @@ def test_a_file_is_closed_before_it_is_renamed(tmp_path, monkeypatch):
 
 def test_a_full_disk_is_one_sentence_and_leaves_nothing(tmp_path):
     """A limit on the size of files, which meets a write as a full disk does."""
+    resource = pytest.importorskip("resource")  # not on Windows
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (5000, before[1]))
     try:

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
+from apt_evap._common.threads import map_of_threads
+from apt_evap.simulation.flight.flight_pool import FlightSettings, fly_at_rest
 
 
 def charges(tip, queue):
@@ -85,3 +87,25 @@ def test_an_interrupted_run_does_not_stop_a_pool(small_tip):
 def test_what_cannot_be_pickled_says_what_to_do(small_tip, make):
     with pytest.raises(TypeError, match=r"cannot be pickled or copied: .*make a new"):
         pickle.dumps(make(small_tip))
+
+
+def test_one_thread_starts_none(small_tip, monkeypatch, tmp_path):
+    """Where no threads can be started, as in a browser."""
+    starts = np.array([[0.0, 0.0, small_tip.apex + 1.0]])
+    reference = ae.Simulation(small_tip, n_threads=2).run(60, (ae.Unperturbed(), ae.RollUp(0.1)), progress=False)
+    at_rest = fly_at_rest(ae.evaporation.Emitter(small_tip, n_threads=2), starts, FlightSettings())
+
+    def refuse(*arguments, **options):
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading, "_start_new_thread", refuse)
+    with pytest.raises(RuntimeError, match="can't start new thread"):
+        ae.Simulation(small_tip, n_threads=2).run(60, progress=False)
+    run = ae.Simulation(small_tip, n_threads=1).run(60, (ae.Unperturbed(), ae.RollUp(0.1)), progress=False)
+    assert run.fingerprint() == reference.fingerprint()
+    run.save(tmp_path / "run.h5")
+    assert ae.load(tmp_path / "run.h5").fingerprint() == reference.fingerprint()
+    alone = fly_at_rest(ae.evaporation.Emitter(small_tip, n_threads=1), starts, FlightSettings())
+    assert np.array_equal(alone.positions, at_rest.positions)
+    with map_of_threads(1) as apply:
+        assert list(apply(abs, [-1, 2])) == [1, 2]

@@ -304,6 +304,7 @@ def test_times_of_inclined_flights(lens):
 # ---- shanks and electrodes -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_table_of_a_profile_with_a_kink_agrees_with_solutions():
     """More radii where the shank changes its angle. Measured: 4e-5; with powers of 2 alone 2e-3 to 5e-3."""
     setting = LocalElectrode(4e4, 2e4, 5.0, profile=((0.0, 10.0), (100.0, 20.0), (1000.0, 150.0)))
@@ -330,6 +331,7 @@ def test_a_profile_of_a_cone_is_a_cone():
         assert given.lens(radius).field_factor == pytest.approx(plain.lens(radius).field_factor, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_shank_that_widens_has_a_field_factor_between(lens):
     depths = np.linspace(0.0, 2000.0, 41)
     widening = 20.0 + np.tan(math.radians(2.0)) * depths + 5e-5 * depths**2  # from 2 to 13 degrees

@@ -67,6 +67,7 @@ def test_the_wall_of_a_closed_void_is_no_surface_until_it_opens():
     assert np.isfinite(emitter.charges).all() and emitter.charges.min() >= 0
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::apt_evap.warnings.ChargesWarning")  # a long interval between relaxations
 def test_a_void_that_opens_is_the_same_in_a_deeper_shell_and_after_a_resume(tmp_path):
     tip = with_void(depth=1.7)

@@ -36,7 +36,14 @@ def misorientation(first, second):
     return np.degrees(np.arccos(np.clip((normals[0] @ normals[1].T).max(axis=1).min(), -1, 1)))
 
 
-@pytest.mark.parametrize(("metal", "axis"), [("Al", (0.2, 0.3, 1.0)), ("W", (0.1, 1.0, 0.9)), ("Ti", (1, 0, -1, 3))])
+@pytest.mark.parametrize(
+    ("metal", "axis"),
+    [
+        ("Al", (0.2, 0.3, 1.0)),
+        pytest.param("W", (0.1, 1.0, 0.9), marks=pytest.mark.slow),
+        pytest.param("Ti", (1, 0, -1, 3), marks=pytest.mark.slow),
+    ],
+)
 def test_families_of_poles_are_enough(metal, axis):
     """A fit that knows no member finds the orientation, to the noise of the clicks, and says how good it is."""
     orientation = ae.Orientation(metal, axis=axis, rotation=33.0)
@@ -58,6 +65,7 @@ def test_two_poles_have_several_candidates():
     assert all(each.rms > 1.0 for each in known[1:])  # mm
 
 
+@pytest.mark.slow
 def test_of_equal_fits_the_usual_field_of_view_comes_first():
     """Three poles {200} about [111] fit at 54.7 degrees as they do at 125.3, where no instrument sees them."""
     orientation = ae.Orientation("Ni", axis=(1, 1, 1), rotation=20.0)

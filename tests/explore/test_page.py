@@ -461,6 +461,7 @@ def test_poles_are_clicked(measured):
     page.close()
 
 
+@pytest.mark.slow
 def test_a_fit_of_earlier_marks_is_not_shown(measured):
     """Marks are faster than fits: what is shown is the fit of all marks, or of none."""
     opened = Opened(Explorer(None, measured))
@@ -483,6 +484,20 @@ def test_a_fit_of_earlier_marks_is_not_shown(measured):
     index._clear()
     opened.settle(lambda: not index.search.disabled)
     assert index.candidates == [] and index.search.label == "search"
+    opened.page.close()
+
+
+def test_a_search_keeps_the_families_of_marked_poles(measured, monkeypatch):
+    monkeypatch.setattr("apt_evap.explore.index_panel.start_thread", lambda *arguments: None)
+    opened = Opened(Explorer(None, measured))
+    index = opened.page.index
+    index.material.value = "Ni"
+    for family, x in (("311", 3.0), ("111", -4.0)):
+        index.family.value = family
+        index.add(x, 1.0, of_line=False)
+    index._search(index.search)
+    poles = index._awaited[1]["poles"]
+    assert [(x, y, sorted(map(abs, plane))) for x, y, plane in poles] == [(3.0, 1.0, [1, 1, 3]), (-4.0, 1.0, [1, 1, 1])]
     opened.page.close()
 
 

@@ -80,6 +80,7 @@ def test_checks_see_a_change_and_no_change(measured):
     assert other["scale"] > 2 and other["share"] > 10
 
 
+@pytest.mark.slow
 def test_a_lens_gives_radius_field_factor_and_compression(measured):
     detector_map, best = measured
     lens = ae.detection.LocalElectrode(distance=40e3, aperture=20e3, shank_angle=5.0)

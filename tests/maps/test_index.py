@@ -1,5 +1,9 @@
 """Indexing: known orientations are found, the map decides or not, marks of a user count."""
 
+import re
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -240,9 +244,14 @@ def test_few_ions_do_not_decide(monkeypatch):
 def test_the_picture_of_an_answer_shows_its_candidates():
     _, map = made("fcc", (0.30, 0.54, 0.79), ions=20_000)
     found = quickly(map, "Ni")
-    assert found.decided and len(ae.plot.indexing(found)) == 2
+    assert found.decided and len(ae.plot.indexing(found)) == 3
     axes = ae.plot.indexing(found, candidates=2)
-    assert len(axes) == 3 and f"{found.best}" in axes[1].get_title()
+    assert len(axes) == 5 and f"{found.best}" in axes[1].get_title()
+    # the pattern beside it is that of the map
+    predicted = found.best.predicted(map)
+    inside = map.mask
+    smooth = map.smoothed(1.0).values[inside]
+    assert np.corrcoef(predicted.values[inside], smooth)[0, 1] > 0.7
     assert DECIDED > 0
 
 
@@ -325,3 +334,47 @@ def test_marks_that_contradict_each_other_or_the_map_are_named():
     # no scale makes two poles 111 as near as these
     near = quickly(map, "Ni", poles=[(*third, (1, 1, 1)), (third[0] + 15.0, third[1], (1, 1, 1))])
     assert not near.decided and "contradict each other" in near.reason and near.reason.count("called 111") == 2
+
+
+def test_marks_that_would_decide_are_named():
+    """The named spot is a pole of its candidate, of a family that no other candidate has there."""
+    _, map = made("fcc", (0.30, 0.54, 0.79), 20.0, ions=30_000, rolled=0.5)
+    found = quickly(map, "Ni")
+    assert found.decided and found.deciding_marks == () and "%" not in str(found)
+    undecided = replace(found, decided=False)
+    sentences = undecided.deciding_marks
+    assert len(undecided.candidates) > 1 and sentences and all(sentence in str(undecided) for sentence in sentences)
+    assert "%" not in str(undecided) and undecided.to_dict()["deciding_marks"] == list(sentences)
+    for sentence in sentences:
+        x, y, family, number = re.fullmatch(
+            r"if the spot at \((-?\d+), (-?\d+)\) mm is \{(\d+)\}: candidate (\d)", sentence
+        ).groups()
+        marked = (float(x), float(y)), tuple(int(index) for index in family)
+        distances = [nearest_of_family(candidate, *marked) for candidate in undecided.candidates[:3]]
+        first = distances.pop(int(number) - 1)
+        # rounded to 1 mm; 4.5 degrees are 4.7 mm
+        assert first < 0.8 and min(distances) > 3.5
+
+
+def nearest_of_family(candidate, place, plane):
+    """Distance of the nearest pole of a family [mm]."""
+    normal = np.array(plane) / np.linalg.norm(plane)
+    directions = candidate.orientation.directions(point_group("fcc") @ normal)
+    places = candidate.projection.places(directions)
+    return float(np.nanmin(np.hypot(*(places - place).T)))
+
+
+def test_a_measured_map_of_nickel_is_not_decided_wrongly():
+    """Ten poles give [0.30 0.54 0.79] and 25.8 mm/rad."""
+    path = Path(__file__).parents[3] / "shared" / "data" / "ni111_map.npz"
+    if not path.exists():
+        pytest.skip(f"the measured map {path} is missing")
+    found = ae.index(ae.read(path), "Ni")
+    assert not found.decided or found.best.projection.scale == pytest.approx(25.8, rel=0.1)
+
+
+def test_an_orientation_that_explains_little_does_not_decide(monkeypatch):
+    _, map = made("fcc", (0.30, 0.54, 0.79), 20.0, ions=20_000)
+    monkeypatch.setattr("apt_evap.maps.indexing.index_map.LEAST_SCORE", 1.1)
+    found = quickly(map, "Ni")
+    assert not found.decided and "1.10" in found.reason

@@ -1,5 +1,6 @@
 import json
 import math
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +48,53 @@ def test_a_matrix_and_back(name, seed):
     np.testing.assert_allclose(orientation.matrix, matrix, atol=1e-13)
     plain = json.loads(json.dumps([orientation.axis, orientation.rotation]))
     np.testing.assert_array_equal(Orientation(name, *plain).matrix, orientation.matrix)
+
+
+@pytest.mark.parametrize("name", PLANES)
+@given(seed=seeds)
+def test_euler_angles(name, seed):
+    rotation = Rotation.random(random_state=seed)
+    angles = Orientation.from_matrix(name, rotation.as_matrix()).euler()
+    # intrinsic rotations about z, x and z, as those of Bunge
+    back = Rotation.from_euler("ZXZ", angles, degrees=True)
+    assert between(back.as_matrix(), rotation.as_matrix()) < 1e-6
+    assert all(0 <= angle < 360 for angle in angles) and angles[1] <= 180
+
+
+@pytest.mark.parametrize("tilt", [0.0, 180.0])
+@pytest.mark.parametrize("about", [0.0, 30.0, -1e-15])
+def test_euler_angles_of_a_crystal_with_its_axis_along_z(tilt, about):
+    rotation = Rotation.from_euler("ZX", [about, tilt], degrees=True)
+    angles = Orientation.from_matrix("Ni", rotation.as_matrix()).euler()
+    assert angles[2] == 0 and 0 <= angles[0] < 360 and angles[1] == pytest.approx(tilt, abs=1e-6)
+    assert between(Rotation.from_euler("ZXZ", angles, degrees=True).as_matrix(), rotation.as_matrix()) < 1e-6
+
+
+def test_euler_angles_of_named_orientations():
+    # [001] along z and [100] along x: nothing is rotated; by 20 degrees about z: phi1
+    assert Orientation("Ni").euler() == (0.0, 0.0, 0.0)
+    assert Orientation("Ni", rotation=20.0).euler() == pytest.approx((20.0, 0.0, 0.0))
+    assert Orientation("Ni", axis=(1, 1, 1)).euler()[1] == pytest.approx(math.degrees(math.acos(1 / math.sqrt(3))))
+
+
+@pytest.mark.parametrize("name", PLANES)
+def test_orix_has_the_same_directions_and_angles(name):
+    vectors = pytest.importorskip("orix.vector")
+    orientation = Orientation.from_matrix(name, Rotation.from_rotvec([0.3, -0.7, 1.1]).as_matrix())
+    other = orientation.to_orix()
+    np.testing.assert_allclose(other.to_matrix()[0], orientation.matrix.T, atol=1e-12)
+    vector = np.array([[0.2, -0.5, 0.8]])
+    in_specimen = ~other * vectors.Vector3d(vector)
+    np.testing.assert_allclose(in_specimen.data, orientation.directions(vector), atol=1e-12)
+    np.testing.assert_allclose(np.degrees(other.to_euler()[0]), orientation.euler(), atol=1e-6)
+    assert other.symmetry.size == (24 if name == "Ti" else 48)
+
+
+def test_orix_that_is_missing_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "orix", None)
+    monkeypatch.setitem(sys.modules, "orix.quaternion", None)
+    with pytest.raises(ImportError, match="to_orix needs orix, which is not installed: pip install orix"):
+        Orientation("Ni").to_orix()
 
 
 def test_an_orientation_goes_straight_into_a_tip():

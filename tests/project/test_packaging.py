@@ -1,10 +1,14 @@
 """Files for package indexes and journals: they agree with the package."""
 
 import re
+import runpy
+import sys
 import tomllib
+import types
 from pathlib import Path
 
 import pytest
+from setuptools import Distribution
 
 from apt_evap import __version__
 
@@ -90,3 +94,14 @@ def test_the_numbers_of_the_paper_are_those_of_the_documentation():
 def test_yaml_is_valid(name):
     yaml = pytest.importorskip("yaml")
     assert isinstance(yaml.safe_load((ROOT / name).read_text()), dict)
+
+
+def test_the_compiler_of_microsoft_is_refused(monkeypatch):
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(sys, "argv", ["setup.py"])
+    monkeypatch.setattr("setuptools.setup", lambda **options: None)
+    monkeypatch.setattr("Cython.Build.cythonize", lambda extensions, **options: extensions)
+    command = runpy.run_path("setup.py")["BuildCore"](Distribution())
+    command.compiler = types.SimpleNamespace(compiler_type="msvc")
+    with pytest.raises(SystemExit, match=r"must be GCC, .* got Microsoft's$"):
+        command.build_extensions()

@@ -123,6 +123,7 @@ def test_the_place_on_the_detector_and_the_angle_are_inverse(lens):
 # ---- the shank -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_shank_angle_follows_from_the_voltages(lens, receding):
     if lens.detector_potential:
         pytest.skip("the other lens suffices")

@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import resource
 import signal
 import subprocess
 import sys
@@ -252,6 +251,7 @@ def test_an_error_keeps_what_is_done(tmp_path):
 
 def test_a_full_disk_loses_nothing(tmp_path):
     """A limit on the size of files, as they meet a full disk: writing fails part of the way."""
+    resource = pytest.importorskip("resource")  # not on Windows
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (12_000, before[1]))
     try:
@@ -327,12 +327,12 @@ def test_a_lock_that_its_owner_just_removed_is_not_taken(tmp_path, monkeypatch):
     first, path = FileLock(tmp_path / "lock", "run.h5"), tmp_path / "lock"
     take, others = FileLock._lock, []
 
-    def late(lock, file):
+    def late(lock, *arguments):
         if not others:
             others.append(None)
             first.release()
             others.append(FileLock(path, "run.h5"))
-        take(lock, file)
+        return take(lock, *arguments)
 
     monkeypatch.setattr(FileLock, "_lock", late)
     with pytest.raises(ae.FileError, match="is being written by"):

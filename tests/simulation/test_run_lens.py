@@ -131,6 +131,7 @@ def test_ions_that_the_electrode_stops_miss_the_detector(run, lens):
     assert np.hypot(stopped.x[passed], stopped.y[passed]).max() <= 90.0 * last * 1.02
 
 
+@pytest.mark.slow
 def test_the_image_compression_of_a_run_is_that_of_its_lens(large_run, lens):
     """The compression measured from the hits, free and behind the lens, against both solutions."""
     own, seen = image_compression(large_run), image_compression(large_run.on_detector(DETECTOR, lens))

@@ -4,10 +4,11 @@ from scipy import stats
 
 from apt_evap._common.ion_random import IonRandom
 from apt_evap.emission.post_ionisation import RATIO_PARAMETERS
-from apt_evap.specimen.isotopes import ISOTOPES, draw_isotopes, mean_mass
+from apt_evap.specimen.isotopes import ISOTOPES, SPECTRUM_ELEMENTS, draw_isotopes, mean_mass
 from apt_evap.specimen.materials import MATERIALS
 
-# standard atomic weights and their uncertainties (Prohaska et al., Pure Appl. Chem. 94, 573, 2022; abridged: Mg, Si)
+# standard atomic weights and their uncertainties (Prohaska et al., Pure Appl. Chem. 94, 573, 2022; abridged: Mg, Si,
+# H, B, C, N, O)
 ATOMIC_WEIGHTS = {
     "Mg": (24.305, 0.002),
     "Al": (26.9815384, 3e-7),
@@ -26,11 +27,22 @@ ATOMIC_WEIGHTS = {
     "Ir": (192.217, 0.002),
     "Pt": (195.084, 0.009),
     "Au": (196.966570, 4e-6),
+    "H": (1.0080, 2e-4),
+    "B": (10.81, 0.02),
+    "C": (12.011, 0.002),
+    "N": (14.007, 0.001),
+    "O": (15.999, 0.001),
+    "V": (50.9415, 1e-4),
+    "Mn": (54.938043, 2e-6),
+    "Zr": (91.222, 0.003),
+    "Nb": (92.90637, 1e-5),
+    "Re": (186.207, 0.001),
 }
 
 
 def test_every_element_with_numbers_has_isotopes():
-    assert set(ISOTOPES) >= set(MATERIALS) | set(RATIO_PARAMETERS) | set(ATOMIC_WEIGHTS)
+    assert set(SPECTRUM_ELEMENTS) >= set(RATIO_PARAMETERS)
+    assert set(ISOTOPES) >= set(SPECTRUM_ELEMENTS) | set(MATERIALS) | set(RATIO_PARAMETERS) | set(ATOMIC_WEIGHTS)
 
 
 # the commission states ranges: specimens of these elements differ by up to 1.5e-4

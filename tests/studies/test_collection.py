@@ -122,6 +122,7 @@ def test_status_corrects_the_hours_by_those_of_finished_points(sweep):
     json.dumps(content)
 
 
+@pytest.mark.slow
 def test_a_sweep_finds_the_tip_of_a_measured_map(tmp_path, capsys, monkeypatch):
     """From the study file to the table. The search for the registration is that of `fit_energies`, tested there."""
     planned(tmp_path, STUDY, BASE.replace("150", "400"))

@@ -1,7 +1,6 @@
 """Data sets: their truth is that of the runs, and their bytes depend on the study alone."""
 
 import errno
-import fcntl
 import filecmp
 import hashlib
 import json
@@ -21,6 +20,7 @@ from sweeps import do
 
 import apt_evap as ae
 from apt_evap._common.files import FileError, sha256_of
+from apt_evap._common.locks import try_lock
 from apt_evap.analysis.apex import fit_caps, image_compression
 from apt_evap.cli.main import main
 from apt_evap.simulation.run import load
@@ -688,7 +688,7 @@ def test_runs_of_another_process_are_waited_for(made, tmp_path, monkeypatch):
     folder, notes = plan.sweep.folder_of(key), []
     run = (folder / "run.h5").rename(tmp_path / "run.h5")
     with open(folder / "lock", "w") as lock:  # as another process does
-        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert try_lock(lock.fileno())
 
         def end(seconds):
             shutil.copy(run, folder / "run.h5")

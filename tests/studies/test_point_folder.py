@@ -1,9 +1,7 @@
 """One point of a sweep: its state, and its run in this process."""
 
-import fcntl
 import json
 import os
-import resource
 import shutil
 import signal
 import subprocess
@@ -12,6 +10,7 @@ import sys
 import pytest
 from sweeps import check_bits, check_done, do, planned, poison
 
+from apt_evap._common.locks import try_lock
 from apt_evap.cli.main import main
 from apt_evap.studies.sweep import point_folder
 from apt_evap.studies.sweep.planning import plan_sweep, retry, sweep_status
@@ -54,13 +53,13 @@ def test_a_point_is_the_same_as_apt_evap_run_with_its_settings(sweep):
 def test_a_point_on_which_a_process_works_is_left_to_it(sweep):
     folder = sweep.folder_of(sweep.keys[0])
     with open(folder / "lock", "w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+        assert try_lock(file.fileno())
         assert [state.name for _, state in sweep.states()] == ["running", "waiting"]
         assert sweep_status(sweep)["counts"]["running"] == 1
         assert run_point(folder).name == "running"
     assert not (folder / "run.h5").exists() and sweep.state(folder.name).name == "waiting"
     with open(folder / "lock") as file:  # of a status, at this very moment
-        fcntl.flock(file, fcntl.LOCK_SH)
+        assert try_lock(file.fileno(), shared=True)
         assert sweep.state(folder.name).name == "waiting"
     assert run_point(folder).name == "done"
 
@@ -108,6 +107,7 @@ def test_an_error_that_is_not_expected_fails_the_point_too(sweep, monkeypatch):
 def test_a_full_disk_is_no_failure(sweep):
     """Files larger than a limit are errors of the system, as on a full disk."""
     folder = sweep.folder_of(sweep.keys[0])
+    resource = pytest.importorskip("resource")  # not on Windows
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     previous = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (8000, limits[1]))

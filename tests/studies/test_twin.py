@@ -155,6 +155,7 @@ def test_a_name_with_a_dash_is_not_an_option(quick, capsys, tmp_path):
     assert " ./-ni.epos " in command
 
 
+@pytest.mark.slow
 def test_after_every_write_the_command_continues(quick, capsys, tmp_path, monkeypatch):
     """Killed after the nth file that it writes; started again, it ends with the same files."""
     first = ["ni.epos", *ARGUMENTS, "-o"]

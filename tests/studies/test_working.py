@@ -142,6 +142,7 @@ def test_a_terminal_interrupts_each_run_once(tmp_path):
     assert all((sweep.folder_of(key) / "run.h5").exists() for key in sweep.keys)
 
 
+@pytest.mark.slow
 def test_a_killed_process_does_not_stop_the_others(tmp_path):
     sweep = planned(tmp_path, TWO_LONG, LONG)
     process = command(sweep)  # one after the other

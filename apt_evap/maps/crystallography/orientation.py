@@ -13,6 +13,7 @@ import scipy
 from numpy.typing import ArrayLike
 
 from apt_evap._common.codec import checked, number, settings
+from apt_evap._common.optional_imports import optional_import
 from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_sequence, check_switch, short_text
@@ -22,6 +23,7 @@ from apt_evap.maps.crystallography.symmetry import point_group, pole_symmetry
 from apt_evap.specimen import lattice
 from apt_evap.specimen.materials import as_material
 
+_ROUNDING = 1e-9  # sines below this come from rounding
 _SAME = math.radians(0.1)  # directions closer than this count as one
 
 
@@ -121,6 +123,45 @@ class Orientation:
     def known(cls, settings: Mapping[str, Any]) -> Orientation | None:
         """Make the orientation as `from_settings`; None for a tip made from positions."""
         return cls.from_settings(settings) if "axis" in settings else None
+
+    def euler(self) -> tuple[float, float, float]:
+        """Euler angles of Bunge: rotations about z, x and z that take the frame of the specimen to that of the crystal.
+
+        `matrix` takes the components of a vector from crystal to specimen, and the orientation matrix g of Bunge, of
+        MTEX and of orix is its transpose; the angles are the same.
+
+        Returns
+        -------
+        tuple of float
+            phi1 and phi2 from 0 to 360 and Phi from 0 to 180 [degrees]: `matrix` is Rz(phi1) Rx(Phi) Rz(phi2). With a
+            Phi of 0 or 180, phi2 is 0.
+        """
+        matrix = self.matrix
+        sine = math.hypot(matrix[2, 0], matrix[2, 1])
+        if sine > _ROUNDING:
+            first, last = math.atan2(matrix[0, 2], -matrix[1, 2]), math.atan2(matrix[2, 0], matrix[2, 1])
+        else:
+            first, last = math.atan2(matrix[1, 0], matrix[0, 0]), 0.0
+        tilt = math.degrees(math.atan2(sine, matrix[2, 2]))
+        return math.degrees(first) % 360.0 % 360.0, tilt, math.degrees(last) % 360.0 % 360.0
+
+    def to_orix(self) -> Any:
+        """Make an orientation of orix, with the symmetry of the lattice.
+
+        Returns
+        -------
+        orix.quaternion.Orientation
+            Its matrix is the transpose of `matrix`: orix takes vectors from specimen to crystal.
+
+        Raises
+        ------
+        ImportError
+            If orix is not installed.
+        """
+        quaternion = optional_import("orix.quaternion", "to_orix")
+        groups = optional_import("orix.quaternion.symmetry", "to_orix")
+        symmetry = groups.D6h if self.material.structure == "hcp" else groups.Oh
+        return quaternion.Orientation.from_matrix(self.matrix.T, symmetry=symmetry)
 
     def directions(self, crystal_directions: ArrayLike) -> Floats:
         """Rotate vectors from the frame of the crystal to the frame of the specimen, both of shape (n, 3)."""

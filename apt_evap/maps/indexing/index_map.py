@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from apt_evap.detection.projection import Projection
 from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.crystallography.symmetry import point_group
 from apt_evap.maps.folded_map import FoldedMap, folded
+from apt_evap.maps.indexing.deciding_marks import deciding_marks
 from apt_evap.maps.indexing.marked_poles import check_places, contradictory_marks, contradictory_pair, marks_of
 from apt_evap.maps.indexing.master_pattern import MasterPattern, master_patterns
 from apt_evap.maps.indexing.orientation_search import Start, disc_of, misorientation, search
@@ -34,6 +36,9 @@ DECIDED = 12.0
 """Margin to the next different orientation above which a map decides, see the notes of `index`."""
 RIVAL = 0.8
 """Largest score of another orientation, relative to that of the first one, with which a map decides."""
+LEAST_SCORE = 1 / 3
+"""Smallest score with which a map decides, without marks: a measured nickel map reaches 0.28 for a wrong orientation
+with a margin of 26, a measured tungsten map 0.40 for the right one. Chosen with these two maps."""
 LEAST_IONS = 4_000
 """Fewest ions with which a map decides, without marks: of 11 decided maps of 1,500 to 4,300 ions 4 were wrong, all
 below 3,100 ions (articles/find_the_poles)."""
@@ -43,10 +48,13 @@ from slow changes by more than the second one, in standard errors: 52 maps of no
 maps of 1,000 simulated ions 50 to 88."""
 LEAST_COMPRESSION, LARGEST_COMPRESSION = 1.2, 2.2
 """Image compressions between which the scale is searched, if only the flight length is known."""
+SHOWN = 3
+"""Largest number of candidates of an undecided map in texts and pictures."""
 _STARTS, _FINAL = 12, 6  # orientations that are refined, and that are refined to the end
 _QUICK, _RIVALS = 7, 4  # steps of a first refinement; orientations of each other structure that are tried
 _BEYOND = 1.1  # refined scales may leave bounds that nobody gave by this factor: the stretch changes the scale
 _MAP_BINS = 128
+_SHOWN_SIGMA = 0.7  # smoothing of a pattern that is drawn [degrees]
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +93,25 @@ class Candidate:
 
     def __repr__(self) -> str:
         return short_repr(self)
+
+    def predicted(self, like: DetectorMap) -> DetectorMap:
+        """Density of the pattern in the bins of a map, with a mean of 1, without noise or a change of efficiency.
+
+        Parameters
+        ----------
+        like : DetectorMap
+            The map.
+
+        Returns
+        -------
+        DetectorMap
+        """
+        x, y = (values.ravel() for values in np.meshgrid(*like.centres))
+        directions = self.projection.directions(np.column_stack([x, y])) @ self.orientation.matrix
+        parts = self.pattern.at(directions, sigma=_SHOWN_SIGMA)
+        density = ((1 - self.rolled) * parts[0] + self.rolled * parts[1]).reshape(like.values.shape)
+        density = np.where(like.mask, density / density[like.mask].mean(), np.nan)
+        return DetectorMap.from_array(density, like.x_edges, like.y_edges, like.mask, source=f"pattern of {self}")
 
     def _plain(self):
         projection = self.projection
@@ -163,13 +190,14 @@ class Indexing:
         Returns
         -------
         dict
-            verdict, reason, and of each candidate its axis, rotation, scale, centre, compression, score, confidence,
-            rolled, contrast, angle_error and the radius of the pattern.
+            verdict, reason, of each candidate its axis, rotation, scale, centre, compression, score, confidence,
+            rolled, contrast, angle_error and the radius of the pattern, and the sentences of `deciding_marks`.
         """
         return {
             "verdict": self.verdict,
             "reason": self.reason,
             "candidates": [candidate._plain() for candidate in self.candidates],
+            "deciding_marks": list(self.deciding_marks),
         }
 
     def __repr__(self) -> str:
@@ -177,10 +205,17 @@ class Indexing:
 
     def __str__(self):
         rows = [f"{self.verdict}: {self.reason}"]
-        rows += [
-            f"{candidate.confidence:5.0%}  score {candidate.score:.2f}  {candidate}" for candidate in self.candidates
-        ]
-        return "\n".join(rows)
+        shown = self.candidates[: 1 if self.decided else SHOWN]
+        rows += [f"{number}. score {candidate.score:.2f}  {candidate}" for number, candidate in enumerate(shown, 1)]
+        return "\n".join(rows + list(self.deciding_marks))
+
+    @cached_property
+    def deciding_marks(self) -> tuple[str, ...]:
+        """Sentences: which marked pole would decide between the first candidates of an undecided map."""
+        if self.decided or self.best.score == 0:
+            return ()
+        shown = self.candidates[:SHOWN]
+        return deciding_marks(self.map, [(candidate.orientation, candidate.projection) for candidate in shown])
 
 
 def index(
@@ -238,10 +273,11 @@ def index(
     the likelihood of the counts, with free amplitudes of both patterns and a slow change of the efficiency. The margin
     of two orientations is twice the logarithm of the ratio of their likelihoods, divided by the variance of the sums of
     neighbouring residuals of the better one in units of Poisson's. So a model that leaves structure unexplained decides
-    less. The map is `decided` if the margin to the next orientation that differs by more than 6 degrees is above 12,
-    and without marks of a user it has 4,000 ions, no such orientation explains more than 0.8 of what the first one
-    explains, and no other crystal structure explains more. A map of noise has a score of 0. Marks that no orientation
-    explains, or that contradict the map, are named in the reason, and the map is not decided.
+    less. The map is `decided` if the margin to the next orientation that differs by more than 6 degrees is above 12.
+    Without marks of a user it also needs 4,000 ions and a score of a third, no such orientation may explain more than
+    0.8 of what the first one explains, and no other crystal structure more. A map of noise has a score of 0. Marks that
+    no orientation explains, or that contradict the map, are named in the reason, and the map is not decided.
+    `Indexing.deciding_marks` says which mark would decide.
 
     The axis is that at the centre of the field of view. An orientation and its mirror image look the same in crystals
     with mirror planes: a map does not decide its handedness.
@@ -418,6 +454,8 @@ def _judged(measured, disc, bins, material, patterns, fits, proper, n, bounds, m
         decided, reason = False, contradiction
     elif not marked and measured.is_counts and measured.ions < LEAST_IONS:
         decided, reason = False, f"{measured.ions:,} ions are too few to decide: {LEAST_IONS:,} are needed; {numbers}"
+    elif decided and not marked and best < LEAST_SCORE:
+        decided, reason = False, f"no orientation explains {LEAST_SCORE:.2f} of the structure: the first {numbers}"
     elif decided and best <= next_best:
         reason = f"only it fits the marks and the map (margin {margin:.0f}; {DECIDED:g} is needed)"
     elif decided:

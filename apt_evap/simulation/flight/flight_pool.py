@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from apt_evap._common.codec import checked, count, number, settings
+from apt_evap._common.threads import map_of_threads
 from apt_evap._common.types import Booleans, Floats
 from apt_evap._common.validation import check_number
 from apt_evap._core.flights import LEFT, NEVER_LEFT, NOT_FLOWN, Flights
@@ -204,8 +205,8 @@ class FlightPool:
         ).ravel()
         end = np.empty((int(counts.sum()), 7))
         outcome = np.empty(len(end), np.int8)
-        event = np.arange(n)
-        start = np.concatenate([[0], np.cumsum(counts)])
+        event = np.arange(n, dtype=np.int64)
+        start = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
         launches = np.ascontiguousarray(positions[finite]), np.ascontiguousarray(velocities[finite])
         counter = np.zeros(1, np.int64)
 
@@ -267,17 +268,16 @@ def fly_at_rest(emitter: Emitter, positions: Floats, settings: FlightSettings) -
     n, tree = len(positions), emitter.tree
     end, outcome, counter = np.empty((n, 7)), np.empty(n, np.int8), np.zeros(1, np.int64)
     event = np.full(n, -1, np.int64)  # before the first event of the journal: nothing is replayed
-    start, halt = np.arange(n + 1), np.zeros(1, np.int64)
+    start, halt = np.arange(n + 1, dtype=np.int64), np.zeros(1, np.int64)
     places, velocities = np.ascontiguousarray(positions), np.zeros((n, 3))
     journal = Journal(emitter.tip.positions, 1)
 
-    def fly():
+    def fly(number):
         flights = Flights(tree, **_options(emitter.tip, settings))
         flights.fly(journal, event, start, places, velocities, end, outcome, counter, halt)
 
-    with ThreadPoolExecutor(emitter.n_threads) as pool:
-        for helper in [pool.submit(fly) for _ in range(emitter.n_threads)]:
-            helper.result()
+    with map_of_threads(emitter.n_threads) as apply:
+        list(apply(fly, range(emitter.n_threads)))
     end = end[:, None]
     return Ends(end[..., :3], end[..., 3:6], end[..., 6], (outcome == LEFT)[:, None])
 

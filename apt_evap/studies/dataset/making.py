@@ -15,6 +15,7 @@ import scipy
 from apt_evap._common.codec import from_plain, to_plain
 from apt_evap._common.files import FileError, check_path, is_unfinished, sha256_of
 from apt_evap._common.kept import check_made_from, digest_of
+from apt_evap._common.locks import FileLock
 from apt_evap._common.optional_imports import optional_import
 from apt_evap._common.types import AnyPath
 from apt_evap._version import __version__
@@ -45,11 +46,8 @@ from apt_evap.studies.sweep.sampling import drawn
 from apt_evap.studies.sweep.study_file import Point, SweepStudy, read_study
 from apt_evap.studies.sweep.working import run_sweep
 
-try:
-    import fcntl
-except ImportError:  # not on this system: two processes may write the same bytes
-    fcntl = None  # type: ignore[assignment]
-
+LOCK = ".lock"
+"""Lock of the folder of a data set, which exists while a process writes into it."""
 _WAIT = 2.0  # seconds between two looks at runs that another process makes
 # Measured for runs of 60 to 2,000 ions with responses: 470 to 507 bytes per ion, 56 kB for the rest
 _RUN_BYTES_PER_ION, _RUN_BYTES = 510, 6e4
@@ -271,7 +269,7 @@ def _begin(planned, folder):
     It names all files that may be replaced. Nothing else in the folder is.
     """
     try:
-        names = [name for name in os.listdir(folder) if not is_unfinished(name)]
+        names = [name for name in os.listdir(folder) if not is_unfinished(name) and name != LOCK]
     except OSError as error:
         raise FileError(f"cannot read {str(folder)!r}: {error.strerror}") from error
     if not names:
@@ -335,23 +333,13 @@ def _alone(folder: Path, note: Callable[[str], object]) -> Iterator[None]:
     """Make a folder, and wait until no other process on this machine writes into it."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(folder, os.O_RDONLY) if fcntl is not None else None
     except OSError as error:
         raise FileError(f"cannot write {str(folder)!r}: {error.strerror}") from error
-    if descriptor is None:
-        yield
-        return
+    lock = FileLock(folder / LOCK, str(folder), wait=lambda: note(f"waiting for another process that writes {folder}"))
     try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            note(f"waiting for another process that writes {folder}")
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-        except OSError:  # this file system has no locks: the other process writes the same bytes
-            pass
         yield
     finally:
-        os.close(descriptor)
+        lock.release()
 
 
 def _record(planned, folder, shards, content, note):

@@ -16,15 +16,11 @@ from typing import Any
 
 from apt_evap._common.checked_hdf5 import label_of
 from apt_evap._common.files import FileError, check_path, read_small_file, replace_file
+from apt_evap._common.locks import open_lock, try_lock
 from apt_evap._common.types import AnyPath
 from apt_evap.config.simulation_file import read_config
 from apt_evap.simulation.checkpoint import Checkpoint
 from apt_evap.simulation.stop_reason import StopReason
-
-try:
-    import fcntl
-except ImportError:  # not on this system: points on which a process works are not noticed
-    fcntl = None  # type: ignore[assignment]
 
 SETTINGS, RUN, WORK, LOCK = "settings.toml", "run.h5", "work.json", "lock"
 """Files of a point."""
@@ -32,7 +28,6 @@ STATES = ("done", "running", "waiting", "failed", "wrong")
 """States of a point."""
 _AT_WORK = "a process works on it"
 _MAX_BYTES = 1 << 20
-_OPEN_LOCK = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
 _LOCK_TRIES, _LOCK_WAIT = 10, 0.05  # `state_of` locks for an instant [s]
 
 
@@ -212,12 +207,12 @@ def _notes(folder):
 def _locked(folder: Path) -> Iterator[bool]:
     """Lock a point until the end of the block; False if another process has locked it."""
     try:
-        descriptor = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | _OPEN_LOCK, 0o666)
+        descriptor = open_lock(folder / LOCK)
     except OSError as error:
-        raise FileError(f"cannot write {str(folder / LOCK)!r}: {error.strerror}") from error
+        raise FileError(f"cannot write {str(folder / LOCK)!r}: {error.strerror or error}") from error
     try:
         for _ in range(_LOCK_TRIES):
-            if is_free := _lock(descriptor, shared=False):
+            if is_free := _is_free(descriptor, shared=False):
                 break
             time.sleep(_LOCK_WAIT)
         yield is_free
@@ -227,22 +222,18 @@ def _locked(folder: Path) -> Iterator[bool]:
 
 def _is_locked(folder):
     try:
-        descriptor = os.open(folder / LOCK, os.O_RDONLY | _OPEN_LOCK)
+        descriptor = open_lock(folder / LOCK, os.O_RDONLY)
     except OSError:
         return False
     try:
-        return not _lock(descriptor, shared=True)
+        return not _is_free(descriptor, shared=True)
     finally:
         os.close(descriptor)
 
 
-def _lock(descriptor, shared):
+def _is_free(descriptor, shared):
     """Lock an open file; return whether it was free, also where the file system has no locks."""
-    if fcntl is not None:
-        try:
-            fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return False
-        except OSError:
-            pass
-    return True
+    try:
+        return try_lock(descriptor, shared)
+    except OSError:
+        return True

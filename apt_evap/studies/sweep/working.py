@@ -114,8 +114,9 @@ def _stopped_by_interrupts() -> Iterator[threading.Event]:
 
     def interrupt(number, frame):
         stop.set()
-        for process in multiprocessing.active_children():
-            os.kill(process.pid, signal.SIGINT)
+        if sys.platform != "win32":  # there, the console sends Ctrl-C to them, and os.kill would end them at once
+            for process in multiprocessing.active_children():
+                os.kill(process.pid, signal.SIGINT)
 
     previous = signal.signal(signal.SIGINT, interrupt)
     try:

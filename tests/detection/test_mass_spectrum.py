@@ -1,0 +1,197 @@
+"""Mass spectra: known ions, background, time zero and flight length are found; noise and wrong elements are not."""
+
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+import apt_evap as ae
+from apt_evap.detection.isotope_comb import STEP, LogSpectrum, isotopes_of
+from apt_evap.detection.timing import MASS_TO_CHARGE
+from apt_evap.io.formats import read_ranges
+
+DATA = Path(__file__).parents[3] / "shared" / "data"
+NICKEL = {("Ni", 2): 5, ("Ni", 1): 3}
+STEEL = {("Fe", 2): 8, ("Cr", 2): 1, ("Al", 2): 0.5}
+
+
+def masses_of(ions, n, rng):
+    """m/n of n ions in given proportions [Da], shape (n,)."""
+    shares = np.array(list(ions.values()), float)
+    which, masses = rng.choice(len(ions), n, p=shares / shares.sum()), np.zeros(n)
+    for number, (formula, charge) in enumerate(ions):
+        isotopes, abundances = isotopes_of(formula)
+        rows = which == number
+        masses[rows] = rng.choice(isotopes, np.count_nonzero(rows), p=abundances) / charge
+    return masses
+
+
+def recorded(ions, distance, time_zero, voltages=(4000, 4400), n=20_000, background=4000, seed=1):
+    """Hits of an instrument, with noise of 0.3 ns, and ions at any time."""
+    rng = np.random.default_rng(seed)
+    total = n + background
+    voltage = np.linspace(*voltages, total)
+    radius, angle = 35 * np.sqrt(rng.random(total)), 2 * np.pi * rng.random(total)
+    x, y = radius * np.cos(angle), radius * np.sin(angle)
+    time = rng.uniform(0, 1500, total)
+    rows = rng.permutation(total)[:n]
+    path = distance**2 + radius[rows] ** 2
+    time[rows] = np.sqrt(masses_of(ions, n, rng) * path / (MASS_TO_CHARGE * voltage[rows])) + time_zero
+    time[rows] += 0.3 * rng.standard_normal(n)
+    return ae.Hits(x=x, y=y, time_of_flight=time, voltage=voltage)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(
+    ("ions", "distance", "time_zero", "voltages"),
+    [
+        (NICKEL, 90.0, 20.0, (4000, 4400)),
+        (NICKEL, 95.0, 0.0, (4000, 7000)),
+        (NICKEL, 90.0, 20.0, (4000, 7000)),  # without the time zero, the voltages smear the peaks
+        ({("Al", 1): 5, ("Al", 2): 1}, 92.0, 5.0, (5000, 5200)),
+        ({("Cu", 1): 4, ("Cu", 2): 1}, 100.0, -12.0, (5000, 8000)),
+    ],
+)
+def test_flight_length_and_time_zero_are_found_within_three_errors(ions, distance, time_zero, voltages, seed):
+    hits = recorded(ions, distance, time_zero, voltages, seed=seed)
+    element = next(iter(ions))[0]
+    result = ae.spectrum(hits, element, distance=1.01 * distance)
+    fit = result.flight
+    assert abs(fit.distance - distance) < 3 * fit.distance_error < 0.01 * distance
+    assert abs(fit.time_zero - time_zero) < 3 * fit.time_zero_error < 5.0
+    assert {peak.name for peak in result.peaks} == {f"{f}{c if c > 1 else ''}+" for f, c in ions}
+
+
+def test_one_charge_state_gives_a_factor_only():
+    hits = recorded({("W", 3): 1}, 310.0, 30.0, (9000, 9100))
+    fit = ae.spectrum(hits, "W", distance=305.0).flight
+    assert fit.time_zero == 0 and np.isinf(fit.time_zero_error) and fit.peaks == ("W3+",)
+    assert "cannot separate" in str(fit)
+    # the factor puts the peak in its place: the length is that of the whole time of flight
+    masses = fit.masses(hits)
+    inside = (masses > 60) & (masses < 62.3)
+    assert np.count_nonzero(inside) > 19_900
+    assert abs(masses[inside].mean() / 61.28 - 1) < 2e-3
+
+
+def test_ions_and_background_of_peaks_are_counted():
+    rng = np.random.default_rng(2)
+    n, below = 30_000, 60_000
+    mass = np.concatenate([masses_of(STEEL, n, rng) * rng.normal(1, 5e-4, n), rng.uniform(1, 100, below)])
+    result = ae.spectrum(ae.Hits(mass_to_charge=mass))
+    assert [peak.name for peak in result.peaks] == ["Fe2+", "Cr2+", "Al2+"]
+    for peak, share in zip(result.peaks, (8, 1, 0.5), strict=True):
+        width = sum(high - low for low, high in peak.intervals)
+        expected = below / 99 * width
+        assert abs(peak.background - expected) < 0.1 * expected + 5
+        assert abs(peak.ions - peak.background - n * share / 9.5) < 0.03 * n * share / 9.5 + 3 * np.sqrt(peak.ions)
+    edges = np.arange(40.0, 50.0)
+    assert np.allclose(result.background(edges), below / 99, rtol=0.05)
+    labels = result.ranges.labels(ae.Hits(mass_to_charge=mass[:n]))
+    assert np.mean(labels == "Fe") == pytest.approx(8 / 9.5, rel=0.03)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("element", [None, "W", "Cu"])
+def test_noise_has_no_ions(element, seed):
+    hits = recorded(NICKEL, 90.0, 0.0, n=0, background=30_000, seed=seed)
+    result = ae.spectrum(hits, element, distance=90.0)
+    assert result.peaks == () and not result.flight.peaks
+    with pytest.raises(ValueError, match=r"must|no peaks|needs|ranges need"):
+        result.ranges  # noqa: B018
+    with pytest.raises(ValueError, match="no peaks"):
+        result.select("W")
+
+
+@pytest.mark.parametrize("element", ["Cu", "Co", "Fe", "Pt", "Al", "Rh", "Ta", "Re"])
+def test_a_wrong_element_is_refused_in_a_sentence(element):
+    hits = recorded({("W", 3): 1}, 310.0, 0.0, (9000, 9100))
+    result = ae.spectrum(hits, element, distance=305.0)
+    assert result.peaks == ()
+    with pytest.raises(ValueError, match=f"^no peaks of {element}: ") as error:
+        result.select(element)
+    assert "\n" not in str(error.value)
+
+
+def test_few_ions_make_no_map():
+    rng = np.random.default_rng(3)
+    result = ae.spectrum(ae.Hits(mass_to_charge=masses_of(NICKEL, 2000, rng) * rng.normal(1, 5e-4, 2000)), "Ni")
+    assert result.peaks
+    with pytest.raises(ValueError, match=r"^only (2,000|1,9..) ions"):
+        result.select("Ni")
+
+
+def test_isotopes_of_a_molecule():
+    masses, abundances = isotopes_of("O2")
+    assert masses[0] == pytest.approx(31.990, abs=1e-3)
+    assert abundances[0] == pytest.approx(0.99757**2, abs=1e-3)
+    chromium, shares = isotopes_of("CrO")
+    assert chromium[np.argmax(shares)] == pytest.approx(51.9405 + 15.9949, abs=1e-3)
+    assert abundances.sum() == pytest.approx(1) and shares.sum() == pytest.approx(1)
+
+
+@pytest.mark.parametrize("elements", ["w", "Xx", "", "W3+", "W W", ["W", 3], ["Ni", "N0"], "W" * 50])
+def test_unknown_ions_are_refused(elements):
+    with pytest.raises(ValueError, match=r"^elements must be"):
+        ae.spectrum(ae.Hits(mass_to_charge=[58.0, 60.0]), elements)
+
+
+def test_what_a_spectrum_needs_is_named():
+    with pytest.raises(ValueError, match="mass_to_charge, or times of flight with time_of_flight, voltage"):
+        ae.spectrum(ae.Hits(x=[0.0], y=[0.0]), distance=90.0)
+    hits = recorded(NICKEL, 90.0, 0.0, n=100, background=0)
+    with pytest.raises(ValueError, match="with distance"):
+        ae.spectrum(hits)
+    with pytest.raises(ValueError, match="distance must be"):
+        ae.spectrum(hits, distance=-1.0)
+
+
+@pytest.mark.parametrize("mass", [[], [np.nan, np.inf, -3.0, 0.0], [1e30, 5.0]])
+def test_strange_masses_have_no_peaks(mass):
+    assert ae.spectrum(ae.Hits(mass_to_charge=np.array(mass))).peaks == ()
+
+
+def test_a_slow_comb_gives_the_same():
+    """The best factor by a loop over factors, with the masses themselves and not their logarithms in bins."""
+    rng = np.random.default_rng(5)
+    mass = masses_of({("Cu", 1): 1}, 8000, rng) * rng.normal(1.031, 7e-4, 8000)
+    comb = LogSpectrum(mass).comb("Cu", 1, 0.95, 1.08)
+    isotopes, _ = isotopes_of("Cu")
+    factors = np.arange(0.95, 1.08, 1e-4)
+    near = [np.sum(np.abs(mass[:, None] / (f * isotopes) - 1).min(axis=1) < 1e-3) for f in factors]
+    assert abs(comb.factor - factors[np.argmax(near)]) < 3 * STEP
+    assert comb.fill > 0.9
+
+
+def test_saved_ranges_are_read_again(tmp_path):
+    rng = np.random.default_rng(6)
+    ions = {("Cr", 2): 3, ("CrO", 1): 1}
+    hits = ae.Hits(mass_to_charge=masses_of(ions, 20_000, rng) * rng.normal(1, 5e-4, 20_000))
+    ranges = ae.spectrum(hits, ["Cr", "CrO"]).ranges
+    ae.io.write_rrng(tmp_path / "a.rrng", ranges)
+    again = read_ranges(tmp_path / "a.rrng")
+    assert sorted(again.names) == sorted(ranges.names) and set(again.names) == {"Cr", "CrO"}
+    assert np.abs(np.sort(again.low) - np.sort(ranges.low)).max() < 1e-4
+    assert np.array_equal(again.labels(hits), ranges.labels(hits))
+    with pytest.raises(ValueError, match="composition"):
+        ae.io.write_rrng(tmp_path / "b.rrng", ae.detection.Ranges(["?"], [1.0], [2.0]))
+    assert not (tmp_path / "b.rrng").exists()
+
+
+def test_a_named_spectrum_is_drawn():
+    result = ae.spectrum(recorded(NICKEL, 90.0, 10.0), "Ni", distance=90.0)
+    ax = ae.plot.spectrum(result)
+    assert {text.get_text() for text in ax.texts} == {"Ni$^{2{+}}$", "Ni$^{{+}}$"}
+    assert "background" in [text.get_text() for text in ax.get_legend().get_texts()]
+    plt.close(ax.figure)
+
+
+@pytest.mark.skipif(not (DATA / "W_tap.raw").exists(), reason="needs the measured tungsten, which is not distributed")
+def test_measured_tungsten():
+    hits = ae.read(DATA / "W_tap.raw")
+    result = ae.spectrum(hits, "W", distance=305.0)
+    assert [peak.name for peak in result.peaks] == ["W3+", "W4+"]
+    assert 64_000 < len(result.select("W")) < 67_000
+    for element in ("Ni", "Re", "Ta", "Pt"):
+        assert ae.spectrum(hits, element, distance=305.0).peaks == ()
