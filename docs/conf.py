@@ -55,6 +55,7 @@ bibtex_default_style = "alpha"
 generate.api(GENERATED / "api")
 generate.commands(GENERATED / "commands.inc")
 generate.settings(GENERATED / "settings.inc")
+generate.materials(GENERATED / "materials.inc")
 generate.atlas(GENERATED / "atlas.html")
 generate.dataset_fields(GENERATED / "dataset_fields.inc")
 

@@ -38,7 +38,7 @@ _GUIDES = {
     "maps": "map_measures howto/find_orientation howto/correct_distortion",
     "reconstruction": "reconstruction reconstruction_errors",
     "simulation": "flights howto/resume real_units",
-    "specimen": "specimens howto/own_structure",
+    "specimen": "specimens materials howto/own_structure",
     "studies": "howto/sweep howto/data_set howto/visibility",
     "units": "conventions",
 }
@@ -117,6 +117,18 @@ def dataset_fields(path):
             rows.append((f"``{field.name}``", field.kind, str(field.row) if field.row else "", field.unit, field.text))
         lines += [f".. rubric:: {name}", "", *_table("15 10 12 8 55", rows, 1)]
     _write(path, lines)
+
+
+def materials(path):
+    """Write a table of the known materials."""
+    rows = [("Material", "Structure", "a, c [nm]", "Field [V/nm]", "Charge [e]", "Mass [Da]", "Cohesive energy [eV]")]
+    for entry in apt_evap.specimen.materials.MATERIALS.values():
+        lengths = f"{entry.a:.3f}" if entry.c is None else f"{entry.a:.3f}, {entry.c:.3f}"
+        computed = " (computed)" if "computed" in entry.sources["evaporation_field"] else ""
+        field = f"{entry.evaporation_field:g}{computed}"
+        numbers = (str(entry.charge_state), f"{entry.mass:g}", f"{entry.cohesive_energy:.2f}")
+        rows.append((entry.name, entry.structure, lengths, field, *numbers))
+    _write(path, _table("10 12 14 20 10 14 20", rows, 1))
 
 
 def atlas(path):

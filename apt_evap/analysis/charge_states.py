@@ -16,7 +16,7 @@ from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.emission.post_ionisation import RATIO_PARAMETERS, field_of_ratio
-from apt_evap.specimen.isotopes import ISOTOPES, mean_mass
+from apt_evap.specimen.isotopes import ISOTOPES
 
 LEAST = 20
 """Fewest ions of both charges for a ratio: 1.5 % of the field where both are equally frequent."""
@@ -424,10 +424,8 @@ def _charges_of_ranges(ranges, element):
     charges = []
     for i, (low, high, atoms) in enumerate(zip(ranges.low, ranges.high, ranges.composition, strict=True)):
         single = atoms == {element: 1} if atoms else name.fullmatch(ranges.names[i].replace(" ", ""))
-        charge = round(2 * mean_mass(element) / (low + high)) if single else 0
-        if single and not (
-            charge and low < (1 + _CLOSE) * masses.max() / charge and high > (1 - _CLOSE) * masses.min() / charge
-        ):
+        charge = _nearest_charge(masses, (low + high) / 2) if single else 0
+        if single and not (low < (1 + _CLOSE) * masses.max() / charge and high > (1 - _CLOSE) * masses.min() / charge):
             raise ValueError(
                 f"{ranges.source or 'ranges'}: {low:g} to {high:g} Da is not a range of {element}, whose isotopes have "
                 f"{masses.min():.1f} to {masses.max():.1f} Da over the charge"
@@ -439,6 +437,12 @@ def _charges_of_ranges(ranges, element):
             f"{', '.join(ranges.species_names)}"
         )
     return charges
+
+
+def _nearest_charge(masses, mass_to_charge):
+    """Charge with which an isotope is nearest to a mass-to-charge ratio [Da]."""
+    charges = np.arange(1, _HIGHEST + 1)
+    return 1 + int(abs(masses[:, None] / charges - mass_to_charge).min(axis=0).argmin())
 
 
 def _check_masses(masses, element):

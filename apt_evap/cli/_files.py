@@ -15,6 +15,7 @@ from apt_evap._common.files import FileError, read_small_file, sha256_of
 from apt_evap._common.validation import did_you_mean
 from apt_evap.cli._output import say
 from apt_evap.config.lens_text import read_lens
+from apt_evap.config.material_text import read_material
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.mass_spectrum import spectrum
@@ -25,7 +26,6 @@ from apt_evap.maps.registration.register import Registration
 from apt_evap.simulation.read_file import read as read_file
 from apt_evap.simulation.run import Run, load
 from apt_evap.specimen.isotopes import ISOTOPES
-from apt_evap.specimen.materials import as_material
 from apt_evap.studies.workflows.compare_maps import MAX_STUDY
 from apt_evap.studies.workflows.measured_source import MeasuredSource
 from apt_evap.studies.workflows.twin_of_map import path_word
@@ -151,7 +151,7 @@ def of_element(hits: Hits, options: argparse.Namespace, computed: bool) -> Hits:
         Whether their m/n follows from the times of flight, so that its scale is not known.
     """
     chosen = options.all_ions or options.mass is not None or options.species is not None
-    element = as_material(options.element).name
+    element = read_material(options.element, "--element").name
     if chosen or hits.mass_to_charge is None or element not in ISOTOPES:
         return hits
     source = replace(hits, mass_to_charge=None) if computed else hits

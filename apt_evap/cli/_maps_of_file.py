@@ -9,6 +9,7 @@ from apt_evap.analysis.apex import image_compression
 from apt_evap.analysis.ion_image import field_ion_image
 from apt_evap.cli._files import in_real_units, ions_of_map, read, select, selects, with_masses
 from apt_evap.cli._output import say, tell
+from apt_evap.config.material_text import read_material
 from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.projection import Projection
@@ -67,19 +68,20 @@ def _crystal(content, options, title):
         return title, (Orientation.from_settings(content.settings["tip"]), projection)
     if not options.poles:
         raise ValueError("--poles needs the crystal of a measured map, such as --poles W")
+    material = read_material(options.poles, "--poles")
     counts = content if isinstance(content, DetectorMap) else content.map(bins=128)
     centre = disc_of(counts).centre
     if rotation is not None:
         if not axis or scale is None:
             raise ValueError("--rotation needs --axis and --scale [mm/rad]; without it, it is searched")
-        orientation, projection = Orientation(options.poles, axis, rotation), Projection(scale, centre)
+        orientation, projection = Orientation(material, axis, rotation), Projection(scale, centre)
         how = "as given"
     else:
         if any(component != round(component) for component in axis or ()):
             raise ValueError(f"--axis without --rotation must be the indices of a pole, got {options.axis}")
         indexing = index(
             counts,
-            options.poles,
+            material,
             scales=None if scale is None else (scale, scale),
             distance=options.distance if scale is None else None,
             poles=[(*centre, tuple(map(int, axis)))] if axis else (),

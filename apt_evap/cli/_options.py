@@ -11,6 +11,8 @@ MAX_BINS = 16384
 """That of `detection.binning`. Help must be fast, and modules of the physics import NumPy."""
 FILE_HELP = "a run (.h5), measured ions (.epos, ...) or a map (.npz)"
 """Help of an argument for any file."""
+MATERIAL_HELP = "Ni, or a material of your own, as a table {name = ...} or a file .toml with a table [material]"
+"""Help of an argument for a material."""
 
 
 def add_reading(parser: argparse.ArgumentParser) -> Any:
@@ -43,7 +45,7 @@ def add_reading(parser: argparse.ArgumentParser) -> Any:
 def add_indexing(parser: argparse.ArgumentParser) -> None:
     """Add options of the crystal on a measured map."""
     group = parser.add_argument_group("crystal")
-    group.add_argument("--element", metavar="NAME", required=True, help="the crystal, such as Ni")
+    group.add_argument("--element", metavar="NAME", required=True, help=f"the crystal: {MATERIAL_HELP}")
     add_flight(group)
     group.add_argument(
         "--all-ions",

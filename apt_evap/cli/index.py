@@ -48,11 +48,12 @@ def execute(options: argparse.Namespace) -> int:
 
 def indexed(measured: Any, options: argparse.Namespace) -> Any:
     """Index measured ions or a map by the options."""
+    from apt_evap.config.material_text import read_material
     from apt_evap.maps.indexing.index_map import index
 
     return index(
         measured,
-        options.element,
+        read_material(options.element, "--element"),
         scales=options.scales,
         distance=None if options.scales else options.distance,
         poles=options.pole or (),

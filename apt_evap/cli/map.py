@@ -65,7 +65,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         const="",
         metavar="NAME",
-        help="draw them, of a run or of a crystal such as W; where they are is searched as by apt-evap index",
+        help="draw them, of a run or of a crystal such as W, or of a material of your own, as for apt-evap index, "
+        "which also searches where they are",
     )
     group.add_argument(
         "--axis",

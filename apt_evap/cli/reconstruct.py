@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from apt_evap.cli._options import add_reading, add_real_units, add_speech, add_time_zero, integer_type
+from apt_evap.cli._options import MATERIAL_HELP, add_reading, add_real_units, add_speech, add_time_zero, integer_type
 from apt_evap.cli._output import tell, tell_json
 
 _CONSTANTS = (
@@ -69,7 +69,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "--compression", type=float, metavar="XI", help="image compression; default: 1.5, of a run its own"
     )
     constants.add_argument("--efficiency", type=float, metavar="ETA", help="of the detector; default: 1")
-    constants.add_argument("--element", metavar="NAME", help="material that gives the atomic volume and the field")
+    constants.add_argument("--element", metavar="NAME", help=f"gives atomic volume and field: {MATERIAL_HELP}")
     constants.add_argument("--atomic-volume", type=float, metavar="NM3", help="default: that of the element")
     constants.add_argument(
         "--radius", default="voltage", metavar="R", help="voltage, shank, or a constant radius [nm]; default: voltage"
@@ -191,16 +191,16 @@ def _field(options):
     return options.evaporation_field
 
 
-def _element(name):
-    from apt_evap.specimen.materials import MATERIALS, material
+def _element(text):
+    from apt_evap._common.files import FileError
+    from apt_evap.config.material_text import read_material
 
     try:
-        return material(name)
+        return read_material(text, "--element")
+    except FileError:
+        raise
     except ValueError as error:
-        raise ValueError(
-            f"--element must be one of {', '.join(MATERIALS)}, got {name!r:.80}: for other elements use "
-            "--atomic-volume [nm^3] and --evaporation-field [V/nm]"
-        ) from error
+        raise ValueError(f"{error}, or use --atomic-volume [nm^3] and --evaporation-field [V/nm]") from error
 
 
 def _radius(text):

@@ -42,11 +42,12 @@ def execute(options: argparse.Namespace) -> int:
     """Run the command; finished steps are not repeated."""
     from apt_evap.cli._files import measured_source
     from apt_evap.cli._progress import run_progress
+    from apt_evap.config.material_text import read_material
     from apt_evap.studies.workflows.twin_of_map import twin
 
     twin(
         measured_source(options),
-        options.element,
+        read_material(options.element, "--element"),
         minutes=options.minutes,
         folder=options.output,
         lens=options.lens,

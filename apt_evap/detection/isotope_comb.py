@@ -11,7 +11,7 @@ import numpy as np
 
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_kind, did_you_mean, short_text
-from apt_evap.specimen.isotopes import SPECTRUM_ISOTOPES
+from apt_evap.specimen.isotopes import ISOTOPES
 
 STEP = 5e-4
 """Width of a bin of the logarithm of m/n: half the width of a peak of a good instrument."""
@@ -77,20 +77,20 @@ def isotopes_of(formula: str) -> tuple[Floats, Floats]:
     Raises
     ------
     ValueError
-        If the text is not a formula of elements of `SPECTRUM_ISOTOPES`.
+        If the text is not a formula of elements of `ISOTOPES`.
     """
     check_kind(formula, "elements", str, 'formulas such as "W" or "CrO"')
     if not re.fullmatch(r"([A-Z][a-z]?[1-9]?)+", formula) or len(formula) > 20:
         raise ValueError(f'elements must be formulas such as "W" or "CrO2", got {short_text(formula)}')
     pattern = {0.0: 1.0}
     for element, number in atoms_of_formula(formula).items():
-        if element not in SPECTRUM_ISOTOPES:
-            hint = did_you_mean(element, SPECTRUM_ISOTOPES)
-            raise ValueError(f"elements must be of {', '.join(SPECTRUM_ISOTOPES)}, got {short_text(element)}{hint}")
+        if element not in ISOTOPES:
+            hint = did_you_mean(element, ISOTOPES)
+            raise ValueError(f"elements must be chemical symbols such as W, got {short_text(element)}{hint}")
         for _ in range(number):
             joined: dict[float, float] = defaultdict(float)
             for mass, abundance in pattern.items():
-                for isotope, share in SPECTRUM_ISOTOPES[element]:
+                for isotope, share in ISOTOPES[element]:
                     joined[round(mass + isotope, 3)] += abundance * share
             pattern = {mass: abundance for mass, abundance in joined.items() if abundance > _RARE / 10}
     masses, abundances = np.array(sorted(pattern.items())).T

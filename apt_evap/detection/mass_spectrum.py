@@ -14,7 +14,7 @@ from apt_evap.detection.flight_fit import FlightFit
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.isotope_comb import LARGEST_MISFIT, Comb, LogSpectrum, atoms_of_formula, isotopes_of
 from apt_evap.detection.mass_ranges import Ranges
-from apt_evap.specimen.isotopes import SPECTRUM_ISOTOPES, mean_mass
+from apt_evap.specimen.isotopes import ISOTOPES, SPECTRUM_ELEMENTS, mean_mass
 
 FEWEST_OF_ELEMENT = 4000
 """Ions of an element that are enough for a map."""
@@ -275,7 +275,7 @@ def _candidates(counts, formulas, tolerance):
     bounds = 1.0 - tolerance, 1.0 + tolerance
     combs = [
         comb
-        for formula in dict.fromkeys([*SPECTRUM_ISOTOPES, *_MOLECULES, *(formulas or ())])
+        for formula in dict.fromkeys([*SPECTRUM_ELEMENTS, *_MOLECULES, *(formulas or ())])
         for charge in _charges(formula, formula in (formulas or ()))
         if (comb := counts.comb(formula, charge, *bounds)) is not None
         and comb.fill >= 1 - LARGEST_MISFIT
@@ -293,7 +293,7 @@ def _candidates(counts, formulas, tolerance):
 def _charges(formula, expected):
     """Charge states of an ion that are tried."""
     highest = _EXPECTED if expected else 1
-    if formula in SPECTRUM_ISOTOPES:
+    if formula in ISOTOPES:
         highest = max(highest, next(charge for mass, charge in _HIGHEST_CHARGES if mean_mass(formula) < mass))
     elif expected:
         highest = _EXPECTED

@@ -445,8 +445,8 @@ def perturbation_of(perturbation: Any) -> Any:
     return from_plain(perturbation, *PERTURBATIONS, what="perturbation")
 
 
-def warn_if_not_for(rule: str | None, perturbation: Any) -> None:
-    """Warn if a perturbation, or one of a mixture, has a `Migration`, and the charges are those of Robin's rule.
+def warn_if_not_for(rule: str | None, perturbation: Any, elements: Sequence[str] = ()) -> None:
+    """Warn if a perturbation, or one of a mixture, has a `Migration`: not for Robin's charges, nor for alloys.
 
     Parameters
     ----------
@@ -454,14 +454,24 @@ def warn_if_not_for(rule: str | None, perturbation: Any) -> None:
         Name of the charging rule, if it is known.
     perturbation : perturbation or Extremal
         A `Migration` is its `probability` or its `hop`.
+    elements : sequence of str
+        Names of the elements that evaporate.
     """
-    if rule != "Robin":
+    if rule != "Robin" and len(elements) < 2:
         return
     members = [perturbation]
     for member in members:  # grows while it is read
         members += getattr(member, "perturbations", ())
     laws = [getattr(member, name, None) for member in members for name in ("probability", "hop")]
-    if any(isinstance(law, Migration) for law in laws):
+    if not any(isinstance(law, Migration) for law in laws):
+        return
+    if len(elements) > 1:
+        warn(
+            f"Migration has the numbers of one metal, but atoms of {', '.join(elements)} evaporate: all of them roll "
+            "up like atoms of this metal, which is at best right for those of a dilute alloy's host",
+            EmissionWarning,
+        )
+    if rule == "Robin":
         warn(
             "Migration holds for charges at a constant potential, but those of this run follow from Robin's rule, with "
             "which other atoms roll up: run with rule=ConstantPotential(), or [rule] in a settings file",

@@ -105,7 +105,7 @@ class Migration(_ByChargeRatio):
     :math:`b = 1/2` is the part of the bonds of a kink atom that an adatom of a close-packed facet has lost (3 of 6 on
     fcc {111}, 2 of 4 on bcc {110}). :math:`\alpha` is an effective polarisability, selected with a measured map of
     tungsten: see :doc:`/results/three_metals`. Both the image of a dipole in the metal and the field between the sites
-    are in it. All atoms have the same numbers: an alloy is not described.
+    are in it. All atoms have the same numbers: an alloy is not described, and its run gives an ``EmissionWarning``.
 
     With Robin's charges the ratios are others, and other atoms would roll: 51 instead of 11 % of iron. A run with such
     charges then gives an ``EmissionWarning``.
@@ -140,7 +140,7 @@ class Migration(_ByChargeRatio):
 
     @classmethod
     def of(cls, material: Material | str, temperature: float = 80.0) -> Migration:
-        """Make the law of a metal, with its evaporation field.
+        """Make the rule of a metal, with its evaporation field.
 
         Parameters
         ----------

@@ -9,32 +9,39 @@ from apt_evap._common.codec import checked, from_plain, is_plain, number, settin
 from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_count, check_number, short_text
 from apt_evap.specimen.lattice import SECOND_SHELL_FACTORS
+from apt_evap.specimen.materials import MATERIALS
 from apt_evap.specimen.tip import Tip
 
-_KITTEL = "Kittel, Introduction to Solid State Physics, 8th ed. (2005), ch. 3, table 1"
-COHESIVE_ENERGIES = {
-    "Al": 3.39,
-    "Si": 4.63,
-    "Ti": 4.85,
-    "Fe": 4.28,
-    "Ni": 4.44,
-    "Cu": 3.49,
-    "W": 8.90,
-    "Pt": 5.84,
-    "Au": 3.81,
-}
-f"""Cohesive energies [eV] ({_KITTEL})."""
-
 IONISATION_WORKS = {
+    "Be": 17.6,
+    "Mg": 4.0,
     "Al": 1.7,
     "Si": 14.8,
     "Ti": 11.8,
+    "V": 12.8,
+    "Cr": 2.3,
     "Fe": 15.1,
+    "Co": 15.0,
     "Ni": 2.5,
     "Cu": 3.1,
+    "Zn": 5.1,
+    "Ge": 13.8,
+    "Zr": 11.7,
+    "Nb": 12.5,
+    "Mo": 14.0,
+    "Ru": 14.7,
+    "Rh": 15.6,
+    "Pd": 3.2,
+    "Ag": 3.3,
+    "Hf": 13.6,
+    "Ta": 34.1,
     "W": 36.6,
+    "Re": 14.5,
+    "Os": 15.8,
+    "Ir": 15.4,
     "Pt": 16.2,
     "Au": 4.1,
+    "Pb": 3.2,
 }
 """Sum of the ionisation energies less n work functions [eV], for the charge n at the barrier in `MATERIALS`.
 
@@ -162,7 +169,7 @@ class PairEnergies:
     """
 
     cohesive_energies: Mapping[str, float] | None = checked(
-        "Cohesive energy by element; by default `COHESIVE_ENERGIES`.",
+        "Cohesive energy by element; by default that of the material.",
         "mapping",
         _by_element,
         default=None,
@@ -201,11 +208,26 @@ class PairEnergies:
         """Whether second neighbours are counted."""
         return self.second_weight > 0
 
-    def _number(self, overrides, known, name, what):
-        values = known if overrides is None else {**known, **overrides}
-        if name not in values:
-            raise ValueError(f"{what} must have a value for {name}, got {short_text(list(values))}")
-        return values[name]
+    def _cohesive_energy(self, element):
+        value = (self.cohesive_energies or {}).get(element.name, element.cohesive_energy)
+        if value is None:
+            raise ValueError(
+                f"cohesive_energies must have a value for {element.name}, whose material has no cohesive_energy [eV], "
+                f"got {short_text(list(self.cohesive_energies or ()))}"
+            )
+        return value
+
+    def _work(self, element):
+        works = self.ionisation_works or {}
+        if element.name in works:
+            return works[element.name]
+        known = MATERIALS.get(element.name)
+        if known is None or known.charge_state != element.charge_state:
+            raise ValueError(
+                f"ionisation_works must have a value for {element.name} with a charge of {element.charge_state} e "
+                f"at the barrier, got {short_text(list(works))}"
+            )
+        return IONISATION_WORKS[element.name]
 
     def pair_energy(self, tip: Tip, first: int, second: int) -> float:
         """Energy of a bond between two species [eV]."""
@@ -213,7 +235,7 @@ class PairEnergies:
         for index in (first, second):
             element = tip.elements[index]
             near, far = COORDINATION[tip.elements[0].structure]
-            cohesive = self._number(self.cohesive_energies, COHESIVE_ENERGIES, element.name, "cohesive_energies")
+            cohesive = self._cohesive_energy(element)
             energies.append(2.0 * cohesive / (near + self.second_weight * far))
         names = [tip.elements[index].name for index in (first, second)]
         extra = self.ordering.get("-".join(names), self.ordering.get("-".join(names[::-1]), 0.0))
@@ -230,8 +252,8 @@ class PairEnergies:
     def fields(self, tip: Tip, species: int, nearest: Integers, second: Integers) -> Floats:
         """Evaporation fields [V/nm]: see `BondField.fields`."""
         element = tip.elements[species]
-        cohesive = self._number(self.cohesive_energies, COHESIVE_ENERGIES, element.name, "cohesive_energies")
-        work = self._number(self.ionisation_works, IONISATION_WORKS, element.name, "ionisation_works")
+        cohesive = self._cohesive_energy(element)
+        work = self._work(element)
         ratio = (self.energies(tip, species, nearest, second) + work) / (cohesive + work)
         ratio = np.maximum(ratio, _LEAST)
         return element.evaporation_field * ratio * ratio

@@ -11,16 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from apt_evap._common.codec import for_json, to_plain
+from apt_evap._common.codec import for_json
 from apt_evap._common.files import open_for_reading, replace_file
 from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import AnyPath, Booleans, Floats
 from apt_evap._common.validation import check_count, check_kind, check_number
 from apt_evap._version import __version__
 from apt_evap.config.cost_estimate import CostEstimate, estimate_cost
+from apt_evap.config.material_text import material_value
 from apt_evap.config.perturbation_text import write_perturbation
 from apt_evap.config.simulation_file import config_of
-from apt_evap.config.toml_text import comment, inline
+from apt_evap.config.toml_text import comment
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.emission.perturbations import RollUp
@@ -28,7 +29,6 @@ from apt_evap.maps.indexing.index_map import Indexing
 from apt_evap.maps.indexing.orientation_search import disc_of
 from apt_evap.maps.registration.register import Registration
 from apt_evap.specimen.lattice import atom_density
-from apt_evap.specimen.materials import MATERIALS
 
 MARK = "# Settings of a simulation, made from a measured map by apt_evap"
 """Beginning of the first line of the text."""
@@ -254,7 +254,7 @@ def _text(indexing, radii, size, lens, factor):
         comment(f"Measured: {indexing.map.source or 'a map'}"),
         "",
         "[tip]",
-        f"material = {_material_text(material)}",
+        f"material = {material_value(material)}",
         f"axis = [{axis}]    # at the centre of the map, within {best.angle_error:.1f} degrees by its noise",
         f"# {sure}",
         *others,
@@ -309,14 +309,6 @@ def _radius_text(material, radii, lens, factor):
         f"the specimen has R = {radii[0]:.0f} to {radii[1]:.0f} nm, by V = k_f F R with {by} and F = "
         f"{material.evaporation_field:g} V/nm"
     )
-
-
-def _material_text(material):
-    """Value of the key material: the name of a known material, or a table of another one."""
-    if material == MATERIALS.get(material.name):
-        return inline(material.name)
-    # with its sources, so that no field is that of a known material with this name
-    return inline({name: value for name, value in to_plain(material).items() if value is not None})
 
 
 def _emission(rolled):

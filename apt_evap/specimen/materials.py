@@ -11,7 +11,12 @@ from apt_evap.specimen.lattice import BASES, nearest_neighbour_distance
 from apt_evap.units import ELEMENTARY_CHARGE
 
 _KITTEL = "Kittel, Introduction to Solid State Physics, 8th ed. (2005), ch. 1, table 3"
+_COHESION = "Kittel, Introduction to Solid State Physics, 8th ed. (2005), ch. 3, table 1"
 _TSONG = "Tsong, Surf. Sci. 70, 211 (1978), image-hump model, charge state of lowest field"
+_IMAGE_HUMP = (
+    "computed by the image-hump model of Tsong (1978), with cohesive energies of Kittel (2005), ionisation energies of "
+    "NIST and work functions of Michaelson (1977); charge state of lowest field"
+)
 _MULLER = "measured; Mueller and Tsong, Field Ion Microscopy (1969)"
 _IUPAC = "IUPAC standard atomic weights, abridged (Prohaska et al., Pure Appl. Chem. 94, 573, 2022)"
 _SHAIKH = "Shaikh et al., arXiv 2509.13744, appendix on polarization"
@@ -85,43 +90,108 @@ def _element(name, structure, a, evaporation_field, charge_state, mass, *, field
         "structure": _KITTEL,
         "a": _KITTEL,
         "evaporation_field": field_source,
-        "charge_state": _TSONG,
+        "charge_state": _IMAGE_HUMP if field_source == _IMAGE_HUMP else _TSONG,
         "mass": _IUPAC,
     }
-    sources |= {name: _KITTEL for name in ("c", "cohesive_energy") if name in more}
-    sources |= {"polarizability": _SHAIKH} if "polarizability" in more else {}
+    known = {"c": _KITTEL, "cohesive_energy": _COHESION, "polarizability": _SHAIKH}
+    sources |= {name: source for name, source in known.items() if name in more}
     return Material(name, structure, a, evaporation_field, charge_state, mass, sources=sources, **more)
+
+
+def _computed(name, structure, a, evaporation_field, charge_state, mass, cohesive_energy, **more):
+    return _element(
+        name,
+        structure,
+        a,
+        evaporation_field,
+        charge_state,
+        mass,
+        cohesive_energy=cohesive_energy,
+        field_source=_IMAGE_HUMP,
+        **more,
+    )
 
 
 MATERIALS = {
     element.name: element
     for element in (
+        _computed("Be", "hcp", 0.227, 38.0, 2, 9.012, 3.32, c=0.359),
+        _computed("Mg", "hcp", 0.321, 21.0, 1, 24.305, 1.51, c=0.521),
         _element("Al", "fcc", 0.405, 19.0, 1, 26.982, polarizability=9.8e-40, cohesive_energy=3.39),
         _element("Si", "diamond", 0.543, 33.0, 2, 28.085, cohesive_energy=4.63),
         _element("Ti", "hcp", 0.295, 26.0, 2, 47.867, c=0.468, cohesive_energy=4.85),
+        _computed("V", "bcc", 0.303, 28.0, 2, 50.942, 5.31),
+        _computed("Cr", "bcc", 0.288, 28.0, 1, 51.996, 4.10),
         _element("Fe", "bcc", 0.287, 33.0, 2, 55.845, cohesive_energy=4.28),
+        _computed("Co", "hcp", 0.251, 33.0, 2, 58.933, 4.39, c=0.407),
         _element("Ni", "fcc", 0.352, 35.0, 1, 58.693, polarizability=6.8e-40, cohesive_energy=4.44),
         _element("Cu", "fcc", 0.361, 30.0, 1, 63.546, cohesive_energy=3.49),
+        _computed("Zn", "hcp", 0.266, 29.0, 1, 65.38, 1.35, c=0.495),
+        _computed("Ge", "diamond", 0.566, 27.0, 2, 72.630, 3.85),
+        _computed("Zr", "hcp", 0.323, 28.0, 2, 91.224, 6.25, c=0.515),
+        _computed("Nb", "bcc", 0.330, 35.0, 2, 92.906, 7.57),
+        _computed("Mo", "bcc", 0.315, 38.0, 2, 95.95, 6.82),
+        _computed("Ru", "hcp", 0.271, 40.0, 2, 101.07, 6.74, c=0.428),
+        _computed("Rh", "fcc", 0.380, 40.0, 2, 102.91, 5.75),
+        _computed("Pd", "fcc", 0.389, 35.0, 1, 106.42, 3.89),
+        _computed("Ag", "fcc", 0.409, 27.0, 1, 107.87, 2.95),
+        _computed("Hf", "hcp", 0.319, 35.0, 2, 178.49, 6.44, c=0.505),
+        _computed("Ta", "bcc", 0.330, 46.0, 3, 180.95, 8.10),
         _element("W", "bcc", 0.316, 57.0, 3, 183.84, field_source=_MULLER, cohesive_energy=8.9),
+        _computed("Re", "hcp", 0.276, 44.0, 2, 186.21, 8.03, c=0.446),
+        _computed("Os", "hcp", 0.274, 50.0, 2, 190.23, 8.17, c=0.432),
+        _computed("Ir", "fcc", 0.384, 43.0, 2, 192.22, 6.94),
         _element("Pt", "fcc", 0.392, 48.0, 2, 195.08, cohesive_energy=5.84),
         _element("Au", "fcc", 0.408, 53.0, 1, 196.97, cohesive_energy=3.81),
+        _computed("Pb", "fcc", 0.495, 19.0, 1, 207.2, 2.03),
     )
 }
-"""Known materials by name. Ni and Au are observed as 1+ and 2+: their evaporation fields are close."""
+"""Known materials by name. Ni and Au are observed as 1+ and 2+: their evaporation fields are close.
+
+Evaporation fields are known to about 10 %: other work functions and ionisation energies change the computed ones by up
+to a fifth. Mn and Sn are not in the table: a Tip has no lattice of their structures.
+"""
 
 
 _WORDS = {
+    "beryllium": "Be",
+    "magnesium": "Mg",
     "aluminium": "Al",
     "aluminum": "Al",
     "silicon": "Si",
     "titanium": "Ti",
+    "vanadium": "V",
+    "chromium": "Cr",
     "iron": "Fe",
+    "cobalt": "Co",
     "nickel": "Ni",
     "copper": "Cu",
+    "zinc": "Zn",
+    "germanium": "Ge",
+    "zirconium": "Zr",
+    "niobium": "Nb",
+    "molybdenum": "Mo",
+    "ruthenium": "Ru",
+    "rhodium": "Rh",
+    "palladium": "Pd",
+    "silver": "Ag",
+    "hafnium": "Hf",
+    "tantalum": "Ta",
     "tungsten": "W",
+    "rhenium": "Re",
+    "osmium": "Os",
+    "iridium": "Ir",
     "platinum": "Pt",
     "gold": "Au",
+    "lead": "Pb",
 }
+
+
+def unknown_name(name: Any) -> str:
+    """Message that no material has this name, with the nearest and all names."""
+    symbol = _WORDS.get(name.strip().lower()) if isinstance(name, str) else None
+    hint = did_you_mean(symbol or name, MATERIALS)
+    return f"no material is named {short_text(name)}{hint}; known are {', '.join(MATERIALS)}"
 
 
 def material(name: str, **changes: Any) -> Material:
@@ -158,10 +228,7 @@ def material(name: str, **changes: Any) -> Material:
                 f"a material has no {short_text(change)}{did_you_mean(change, known)}; it has {', '.join(known)}"
             )
     if not isinstance(name, str) or name not in MATERIALS:
-        known = f"known are {', '.join(MATERIALS)}, define others as Material(...)"
-        symbol = _WORDS.get(name.strip().lower()) if isinstance(name, str) else None
-        hint = did_you_mean(symbol or name, MATERIALS)
-        raise ValueError(f"no material is named {short_text(name)}{hint}; {known}")
+        raise ValueError(f"{unknown_name(name)}, define others as Material(...)")
     element = MATERIALS[name]
     return replace(element, **changes, sources=element.sources | dict.fromkeys(changes, "given by the user"))
 

@@ -248,10 +248,11 @@ def test_charges_of_a_measured_file():
 
 @pytest.mark.parametrize("element", list(ISOTOPES))
 def test_every_isotope_has_its_charge(element):
+    electrons = list(ISOTOPES).index(element) + 1 if element in ("H", "He") else 4
     for mass, _ in ISOTOPES[element]:
-        for charge in (1, 2, 3, 4):
+        for charge in range(1, electrons + 1):
             ranges = ae.detection.Ranges([element], [mass / charge - 0.1], [mass / charge + 0.3])
-            assert ion_charges(ae.Hits(mass_to_charge=[mass / charge, 1.0]), element, ranges).tolist() == [charge, 0]
+            assert ion_charges(ae.Hits(mass_to_charge=[mass / charge, 0.3]), element, ranges).tolist() == [charge, 0]
 
 
 def test_only_single_atoms_have_charges():

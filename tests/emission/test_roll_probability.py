@@ -136,6 +136,19 @@ def test_the_charge_after_a_roll_up(metal):
     assert (field > 1.0).all()
 
 
+def test_migration_of_an_alloy_warns():
+    """It has the numbers of one metal: atoms of another one would roll like its own."""
+    wide, rule = ae.ResponseSettings.wide(energy_limit=20.0), ae.ConstantPotential()
+    copper = ae.material("Cu", evaporation_field=19.0)
+    alloy = ae.Tip("Al", apex_radius=2.4, axis=(0, 0, 1), shank_length=2.4, solutes={copper: 0.2}, seed=1)
+    run = ae.Simulation(alloy, seed=1, n_threads=1, response_settings=wide, rule=rule).run(60, progress=False)
+    assert len(np.unique(run.species)) == 2
+    with pytest.warns(EmissionWarning, match="atoms of Al, Cu evaporate") as caught:
+        run.hits(ae.RollUp.of_metal("Al"))
+    assert len(caught) == 1
+    run.hits(ae.RollUp(0.1, ae.emission.ChargeRatio(0.8)))  # no warning, which would be an error
+
+
 def test_migration_with_robins_charges_warns(tip12):
     """Its line over the charge ratios is that of a constant potential: nickel rolls 1.5 times too often otherwise."""
     wide, law = ae.ResponseSettings.wide(energy_limit=20.0), ae.RollUp.of_metal("Ni")

@@ -268,8 +268,16 @@ def test_energies_and_works_of_a_users_own():
     assert given.fields(tip, 0, np.array([[6]]), np.zeros((1, 1), int)) == pytest.approx(21.0, rel=1e-14)
     with pytest.raises(ValueError, match="cohesive_energies"):
         ae.evaporation.PairEnergies().fields(tip, 0, np.array([[6]]), np.zeros((1, 1), int))
-    with pytest.raises(ValueError, match="ionisation_works"):
+    # the known number is for Mg+
+    with pytest.raises(ValueError, match="ionisation_works must have a value for Mg with a charge of 2 e"):
         ae.evaporation.PairEnergies({"Mg": 1.51}).fields(tip, 0, np.array([[6]]), np.zeros((1, 1), int))
+
+
+def test_the_cohesive_energy_is_that_of_the_material():
+    strong = ae.material("Cu", cohesive_energy=4.0)
+    tip = ae.Tip.from_positions([[0, 0, 0], [0, 0, 0.26]], [0, 0], [strong])
+    fields = ae.evaporation.PairEnergies().fields(tip, 0, np.array([[5]]), np.zeros((1, 1), int))
+    assert fields == pytest.approx(30.0 * ((4.0 * 5 / 6 + 3.1) / (4.0 + 3.1)) ** 2, rel=1e-14)  # a few roundings
 
 
 # ---- tables --------------------------------------------------------------------------------------------------------

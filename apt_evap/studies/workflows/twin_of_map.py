@@ -18,6 +18,7 @@ from apt_evap._common.threads import thread_count
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_kind, check_number, check_sequence, short_text
 from apt_evap.config.lens_text import read_lens
+from apt_evap.config.material_text import write_material
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.mass_ranges import Ranges
@@ -132,7 +133,8 @@ class _Options:
 
     def to_plain(self) -> dict[str, Any]:
         """Plain values of what changes a result, by the names of the options of the command."""
-        values = {name: getattr(self, name) for name in ("element", "minutes", "field_factor", "distance")}
+        values = {name: getattr(self, name) for name in ("minutes", "field_factor", "distance")}
+        values |= {"element": write_material(as_material(self.element))}
         values |= {"efficiency": self.efficiency, "scales": self.scales, "lens": self.electrode}
         values |= {"pole": self.poles or None, "line": self.lines or None}
         return {name: to_plain(value) for name, value in values.items()}
@@ -385,8 +387,8 @@ class Twin:
         known, path, lens = self.measurement.arguments, self._source.path, self._options.lens
         if "distance" not in known or path is None:
             return ""
-        name = self._options.element
-        words = ["apt-evap", "reconstruct", path_word(path), "--element", name if isinstance(name, str) else name.name]
+        element = write_material(as_material(self._options.element))
+        words = ["apt-evap", "reconstruct", path_word(path), "--element", element]
         for name in ("distance", "detector_radius", "efficiency", "compression", "field_factor", "projection"):
             if name in known:
                 value = known[name] if isinstance(known[name], str) else f"{known[name]:.4g}"
