@@ -166,9 +166,9 @@ class Config:
                 return Tip(**self.tip)
             settings = dict(self.tip)
             expected = settings.pop("sha256", None)
-            if expected is not None and (found := sha256_of(settings["path"])) != expected:
+            if expected is not None and (digest := sha256_of(settings["path"])) != expected:
                 raise ValueError(
-                    f"{str(settings['path'])!r} has changed: expected sha256 {short_text(expected)}, got {found!r}"
+                    f"{str(settings['path'])!r} has changed: expected sha256 {short_text(expected)}, got {digest!r}"
                 )
             try:
                 return read_tip(**settings)
@@ -223,7 +223,7 @@ class Config:
         return replace(run, provenance=run.provenance | origin)
 
     def as_saved(self, run: Run) -> Run:
-        """The run as it is saved: with its origin, and in real units if the file asks for them.
+        """The run as it is saved: with its origin, and in real units if the file has a table for them.
 
         Raises
         ------
@@ -422,9 +422,9 @@ def key_of(document: Mapping[str, Any]) -> str:
 def _canonical(value):
     match value:
         case Mapping():
-            return {key: _canonical(each) for key, each in value.items()}
+            return {key: _canonical(item) for key, item in value.items()}
         case list():
-            return [_canonical(each) for each in value]
+            return [_canonical(item) for item in value]
         case float() if math.isfinite(value):
             return int(value) if value.is_integer() else value
         case bool() | int() | str() | None:

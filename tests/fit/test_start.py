@@ -31,7 +31,7 @@ def test_the_settings_are_those_of_the_map(found, tmp_path):
     made = ae.Orientation(**tip)
     # what the tip shows at the centre of its detector is what the map shows at the centre of its field of view
     places = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 12.0]])
-    centre = np.array(start.near["start"].shift)
+    centre = np.array(start.registration["start"].shift)
     simulated = config.detector.seen_from_apex.compressed(1.03).directions(places) @ made.matrix
     measured = ae.detection.Projection(60.0).directions(places + centre) @ truth.matrix
     group = ae.maps.point_group("fcc")

@@ -30,7 +30,9 @@ def test_exact_points_give_the_exact_map(rng, degree, mirror):
     assert found.mirror == mirror and found.distortion.degree == (degree or 2)
     other, places = points_of(rng, 50, mirror=mirror)
     assert np.column_stack(found.points(*other.T)) == pytest.approx(places, abs=1e-9)
-    assert np.column_stack(found.back(*places.T)) == pytest.approx(other, abs=1e-4)  # 1e-6 of 20 mm over the scale
+    assert np.column_stack(found.inverse_points(*places.T)) == pytest.approx(
+        other, abs=1e-4
+    )  # 1e-6 of 20 mm over the scale
     assert found.residual < 1e-9
 
 
@@ -98,13 +100,13 @@ def test_back_is_the_inverse(seed):
         distortion=ae.maps.Distortion(3, (0.0, 0.0), 20.0, tuple(coefficients)),
     )  # fmt: skip
     x, y = rng.uniform(-12, 12, (2, 100))
-    u, v = registration.back(*registration.points(x, y))
+    u, v = registration.inverse_points(*registration.points(x, y))
     # not where a distortion of up to 8 x 0.5 mm over 20 mm folds the plane over: that is NaN
     good = np.isfinite(u)
     assert good.mean() > 0.9 and np.abs(u - x)[good].max() < 1e-3 and np.abs(v - y)[good].max() < 1e-3
     plain = for_json(registration)
     assert for_json(from_plain(plain, ae.Registration)) == plain
-    with pytest.raises(ValueError, match="no inverse Registration, use back"):
+    with pytest.raises(ValueError, match="no inverse Registration, use inverse_points"):
         registration.inverse  # noqa: B018
 
 

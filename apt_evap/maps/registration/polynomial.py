@@ -75,17 +75,17 @@ class Distortion:
             c * w**j * np.conj(w) ** k for c, (j, k) in zip(self.coefficients, terms_of(self.degree), strict=True)
         )
 
-    def forth(self, points: Any) -> Any:
+    def apply(self, points: Any) -> Any:
         """Distort points, complex of any shape [mm]."""
         return points + self.shift(points)
 
-    def back(self, points: Any) -> Any:
-        """Points that `forth` moves to these, by fixed point iteration; NaN where it does not converge."""
+    def apply_inverse(self, points: Any) -> Any:
+        """Points that `apply` moves to these, by fixed point iteration; NaN where it does not converge."""
         origins = np.asarray(points, complex)
         with np.errstate(over="ignore", invalid="ignore"):
             for _ in range(_ITERATIONS):
                 origins = points - self.shift(origins)
-            wrong = ~(np.abs(self.forth(origins) - points) <= 1e-6 * self.radius)
+            wrong = ~(np.abs(self.apply(origins) - points) <= 1e-6 * self.radius)
         return np.where(wrong, np.nan, origins)
 
 

@@ -35,8 +35,8 @@ class Ions(NamedTuple):
 
 def names_of(elements: tuple) -> tuple[list[str], NDArray[np.int64]]:
     """Names of the elements in alphabetical order, and the label of each species: fields are not seen by the mass."""
-    names = sorted({str(getattr(each, "name", each)) for each in elements})
-    return names, np.array([names.index(str(getattr(each, "name", each))) for each in elements])
+    names = sorted({str(getattr(element, "name", element)) for element in elements})
+    return names, np.array([names.index(str(getattr(element, "name", element))) for element in elements])
 
 
 def recorded_ions(

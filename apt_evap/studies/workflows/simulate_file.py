@@ -191,8 +191,8 @@ def simulate(
     new = "" if not n_previous else f", {len(run) - n_previous:,} of them new,"
     note(f"{len(run):,} ions{new} in {seconds:.1f} s, {(len(run) - n_previous) / seconds:,.0f} ions/s")
     _note_outcomes(config, run, path, note)
-    if run.units is not None:
-        note(real_units_line(run))
+    if line := real_units_line(run):
+        note(line)
     note(f"{'replaced' if replaced and not resume else 'wrote'} {path}")
     try:
         maps, titles = run_maps(run, config.maps)
@@ -231,10 +231,11 @@ def _note_outcomes(config: Config, run: Run, path: Path, note: Callable[[str], N
     for panel in config.maps.panels:
         hit, missed, never_left, outside = run.hits(panel.perturbation).counts.values()
         frequent_misses += [missed] if 2 * missed > len(run) else []
-        view = "" if run.field_of_view is None else f", {outside:,} are outside the field of view"
+        view = f", {outside:,} are outside the field of view" if outside else ""
         note(f"{panel.title}: {hit:,} hit the detector, {missed:,} missed it, {never_left:,} never left the tip{view}")
     if run.responses is not None:
-        view = "" if run.field_of_view is None else f", {run.not_flown.sum():,} ions not flown"
+        not_flown = int(run.not_flown.sum())
+        view = f", {not_flown:,} ions not flown" if not_flown else ""
         note(f"responses: {run.flagged.sum():,} ions flagged as inexact{view}")
     if frequent_misses:
         warn(

@@ -26,7 +26,7 @@ from apt_evap.detection.projection import Projection
 from apt_evap.emission.perturbations import LateralVelocity, RollUp
 from apt_evap.fit.grid import EnergyGrid
 from apt_evap.fit.measured_constants import Measurement, constants_of
-from apt_evap.fit.start_settings import ENERGY, HEIGHT, ROLLS, SHARPNESS, StartSettings, near, settings_of
+from apt_evap.fit.start_settings import ENERGY, HEIGHT, ROLLS, SHARPNESS, StartSettings, registration_start, settings_of
 from apt_evap.fit.study import Study
 from apt_evap.io.formats import read_ranges
 from apt_evap.maps.crystallography.orientation import Orientation
@@ -319,7 +319,9 @@ class Twin:
         emission: RollUp | LateralVelocity = LateralVelocity(ENERGY, HEIGHT)
         if self._rolls:
             emission = RollUp(ENERGY, best.rolled, SHARPNESS, HEIGHT)
-        registration = _registered(self.run.hits(emission), self.measured_map, near(best.centre, best.scale))
+        registration = _registered(
+            self.run.hits(emission), self.measured_map, registration_start(best.centre, best.scale)
+        )
         self._kept.write({REGISTRATION: (json.dumps(to_plain(registration), indent=1) + "\n").encode()})
 
     def _compared(self, run, measured, folder):
