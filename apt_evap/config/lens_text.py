@@ -29,7 +29,8 @@ def read_lens(settings: str | Mapping[str, Any]) -> LocalElectrode:
 
     Examples
     --------
-    >>> ae.config.read_lens("local-electrode:shank_angle=7").shank_angle  # degrees
+    >>> from apt_evap.config.lens_text import read_lens
+    >>> read_lens("local-electrode:shank_angle=7").shank_angle  # degrees
     7.0
     """
     if isinstance(settings, str):

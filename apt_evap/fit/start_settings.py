@@ -169,7 +169,8 @@ def settings_of(
     >>> measured = pattern.map(truth, ae.detection.Projection(60.0), width=70.0, ions=20_000, seed=1)
     >>> start = ae.fit.settings_of(ae.index(measured, "W", scales=(58, 62)), minutes=1)
     >>> start.save("w.toml")
-    >>> ae.config.read_config("w.toml").tip["material"].name
+    >>> from apt_evap.config.simulation_file import read_config
+    >>> read_config("w.toml").tip["material"].name
     'W'
     """
     check_kind(indexing, "indexing", Indexing, "an Indexing, the result of index")

@@ -96,7 +96,8 @@ def warren_cowley(positions: ArrayLike, solute: ArrayLike, shell: float = SHELL)
     Examples
     --------
     >>> chain = np.column_stack([0.25 * np.arange(100), np.zeros(100), np.zeros(100)])
-    >>> ae.studies.warren_cowley(chain, np.arange(100) % 2 == 0)
+    >>> from apt_evap.studies.visibility.false_order import warren_cowley
+    >>> warren_cowley(chain, np.arange(100) % 2 == 0)
     1.0
     """
     places = check_array(positions, "positions", ("n", 3))

@@ -394,7 +394,8 @@ def permutation_p_value(
     >>> places = np.random.default_rng(1).random((500, 3))
     >>> def analysis(positions, labels):
     ...     return positions[labels == 1, 0].mean()
-    >>> ae.studies.permutation_p_value(analysis, places, (places[:, 0] > 0.5).astype(int))
+    >>> from apt_evap.studies.visibility.probability import permutation_p_value
+    >>> permutation_p_value(analysis, places, (places[:, 0] > 0.5).astype(int))
     0.01
     """
     places = check_array(positions, "positions", ("n", 3))

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from apt_evap import plot
 from apt_evap._common.files import FileError, check_path
 from apt_evap._common.notebook import as_table
 from apt_evap._common.types import AnyPath
@@ -100,7 +99,7 @@ def simulate(
     Parameters
     ----------
     settings : str or path-like
-        The settings file (TOML, see `config.read_config`).
+        The settings file (TOML, see `read_config`).
     output : str or path-like, optional
         File of the run, .h5; by default ``output`` of the settings, or their name with .h5 in this folder.
     ions : int, optional
@@ -194,9 +193,11 @@ def simulate(
     if line := real_units_line(run):
         note(line)
     note(f"{'replaced' if replaced and not resume else 'wrote'} {path}")
+    from apt_evap.plot.map_figures import specimen_title  # with Matplotlib
+
     try:
         maps, titles = run_maps(run, config.maps)
-        save_picture(picture, maps, titles, title=plot.specimen_title(run))
+        save_picture(picture, maps, titles, title=specimen_title(run))
     except ValueError as error:
         raise ValueError(f"no maps are drawn, the run is in {str(path)!r}: {error}") from error
     note(f"wrote {picture}")

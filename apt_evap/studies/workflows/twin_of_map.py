@@ -481,7 +481,7 @@ def twin(
     folder : str or path-like, optional
         Folder for all files; by default the name of the file with _twin, in this folder.
     lens : str or LocalElectrode, optional
-        Lens of the instrument, for the radius; a text as for `config.read_lens`.
+        Lens of the instrument, for the radius; a text as for `read_lens`.
     field_factor : float, optional
         Field factor without a lens; 3.3 by default.
     distance : float, optional
