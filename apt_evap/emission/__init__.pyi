@@ -1,4 +1,5 @@
 # The public names of this package: read by type checkers, and by the lazy loader in __init__.py.
+from .emissions import Emissions as Emissions
 from .emissions import Launches as Launches
 from .energies import Thermal as Thermal
 from .perturbations import IonRandom as IonRandom

@@ -24,7 +24,7 @@ import apt_evap as ae
 class FromAbove:
     height: float
 
-    def launch(self, emissions: Emissions, random: ae.emission.IonRandom) -> ae.emission.Launches:
+    def launch(self, emissions: ae.emission.Emissions, random: ae.emission.IonRandom) -> ae.emission.Launches:
         n = len(emissions)
         return ae.emission.Launches(emissions.positions + self.height, np.zeros((n, 3)), np.zeros(n, bool))
 

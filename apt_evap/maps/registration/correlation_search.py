@@ -255,11 +255,13 @@ def refine(
     values, inside = measured.flatten(NARROW * pixel, broad).sample(points)
     points, values = points[inside], values[inside]
     image = simulated.flatten(NARROW * pixel / transform.scale, broad / transform.scale)
+    # start: about the centre of the measured map, or about the point of the bounds, moved into them
     start = transform.anchored(measured.centre)
     if shift_bounds is not None:
         offset = transform.apply(shift_bounds.anchor) - shift_bounds.place
         offset = complex(*np.clip((offset.real, offset.imag), -shift_bounds.tolerance, shift_bounds.tolerance))
         start = replace(transform, anchor=shift_bounds.anchor, place=shift_bounds.place + offset)
+    # unknowns in units of the steps of the search, with their bounds; equal bounds fix an unknown
     free = [rotations is None or rotations[0] < rotations[1], scales is None or scales[0] < scales[1], True, True]
     units = np.array([ROTATION_STEP / 2, SCALE_STEP / 2, pixel, pixel])
     low, high = np.full(4, -np.inf), np.full(4, np.inf)
@@ -287,6 +289,7 @@ def refine(
         return Fit(transform, correlation(values_there[shared], values[shared]) if overlap >= least else -1.0, overlap)
 
     low, high = np.minimum(low, 0)[free], np.maximum(high, 0)[free]  # the start is inside, apart from rounding
+    # simplex of one step along each unknown, backwards at an upper bound
     simplex = np.vstack([np.zeros(len(low)), np.diag(np.where(high >= 1, 1.0, -1.0))])
     options = {"initial_simplex": np.clip(simplex, low, high), "xatol": 2e-3, "fatol": 1e-6, "maxiter": 400}
     bounds = scipy.optimize.Bounds(low, high)

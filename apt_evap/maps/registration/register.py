@@ -329,22 +329,11 @@ def register(
         raise ValueError(f"start must be a Registration, got {start!r:.80}")
     least = check_number(overlap, "overlap", above=0, at_most=1)
     shift_bounds = _shift_bounds(start, pole, tolerance, measured)
-    if start is not None:
-        rotations = (start.rotation - 15, start.rotation + 15) if rotations is None else rotations
-        scales = (start.scale / 1.2, start.scale * 1.2) if scales is None else scales
-        mirrors = (start.mirror,) if mirrors is None else mirrors
-    if rotations is not None:
-        rotations = _range(rotations, "rotations", unit="degrees")
-        rotations = None if rotations[1] - rotations[0] >= 360 else rotations
-    if scales is None:
-        ratio = measured.diameter / simulated.diameter
-        scale_range, scales = (np.sqrt(0.5) * ratio, 5 * ratio), None
-    else:
-        scale_range = scales = _range(scales, "scales", above=0)
-    mirrors = (False, True) if mirrors is None else check_sequence(mirrors, "mirrors", "True and False")
-    mirrors = tuple(dict.fromkeys(check_switch(mirror, "mirrors") for mirror in mirrors))
-    if not mirrors:
-        raise ValueError("mirrors must contain False, True or both, got none")
+    rotations, scales, mirrors = _transform_bounds(start, rotations, scales, mirrors)
+    ratio = measured.diameter / simulated.diameter
+    scale_range = (np.sqrt(0.5) * ratio, 5 * ratio) if scales is None else scales
+
+    # all transforms on a grid of rotations and scales, with the best shift of each
     angles = np.arange(0, 360, ROTATION_STEP) if rotations is None else _steps(rotations, ROTATION_STEP)
     fits = search(
         simulated, measured, angles, np.exp(_steps(np.log(scale_range), SCALE_STEP)), mirrors, least, shift_bounds
@@ -354,6 +343,8 @@ def register(
             f"the simulated map must cover at least {least:.0%} of the measured field of view (overlap), which is "
             f"impossible for scales of {scale_range[0]:.3g} to {scale_range[1]:.3g}"
         )
+
+    # the best of them refined with few pixels, then with many; those within the noise of the best one are ties
     bounds = rotations, scales, shift_bounds
     fits = [refine(simulated, measured, fit.transform, MEDIUM, least, *bounds) for fit in distinct(fits, _MAX_FITS)]
     fits = distinct(sorted(fits, key=lambda fit: -fit.rank), _MAX_FITS)
@@ -363,6 +354,8 @@ def register(
     fits = sorted(fits, key=lambda fit: -fit.rank)
     fits = distinct([fit for fit in fits if fit.rank > fits[0].rank - _noise(fits[0], FINE)], _MAX_FITS)
     fits.sort(key=lambda fit: fit.transform.mirror)  # stable: each kind stays in the order of its rank
+
+    # the result, with what may be wrong
     method = "search" if shift_bounds is None else "start" if pole is None else "pole"
     best, *ties = (_registration(fit, method) for fit in fits)
     best = replace(best, ties=tuple(ties))
@@ -586,6 +579,24 @@ def _least_squares(source, target, mirror):
     shift = (float(shift.real), float(shift.imag))
     angle = float(np.degrees(np.angle(factor)))
     return Registration(angle, float(abs(factor)), shift, mirror, residual=float(residual), method="points")
+
+
+def _transform_bounds(start, rotations, scales, mirrors):
+    """Ranges of rotations [degrees] and scales, None for all, and kinds of mirrors; by default those about a start."""
+    if start is not None:
+        rotations = (start.rotation - 15, start.rotation + 15) if rotations is None else rotations
+        scales = (start.scale / 1.2, start.scale * 1.2) if scales is None else scales
+        mirrors = (start.mirror,) if mirrors is None else mirrors
+    if rotations is not None:
+        rotations = _range(rotations, "rotations", unit="degrees")
+        rotations = None if rotations[1] - rotations[0] >= 360 else rotations
+    if scales is not None:
+        scales = _range(scales, "scales", above=0)
+    mirrors = (False, True) if mirrors is None else check_sequence(mirrors, "mirrors", "True and False")
+    mirrors = tuple(dict.fromkeys(check_switch(mirror, "mirrors") for mirror in mirrors))
+    if not mirrors:
+        raise ValueError("mirrors must contain False, True or both, got none")
+    return rotations, scales, mirrors
 
 
 def _shift_bounds(start, pole, tolerance, measured):

@@ -299,6 +299,7 @@ def estimate_visibility(
     if full and operators is not None:
         raise ValueError("operators must be None if full is True, because they replace the simulations")
     full = is_simulated_in_full(feature) if full is None else full
+    # operators in place of full simulations, and the range of the sizes
     axes = None if sizes is None else {"size": sizes}
     if operators is not None:
         operators.check(feature, specimen, instrument, perturbation, axes=axes, n_threads=n_threads, **settings)
@@ -320,6 +321,7 @@ def estimate_visibility(
             ions = operators.emulate(number, instrument.efficiency, **values_of(variant, chosen, operators.axes))
         return _analysed(variant, ions, analysis, reach, permutations, significance, random)
 
+    # twins of the feature, and of sizes with equal probabilities per relative change
     drawn = np.exp(random.uniform(math.log(low), math.log(high), twins)) if low < high else np.empty(0)
     nominal = [twin(seed + 1000 + k, size) for k in range(twins)]
     sized = [twin(seed + 1000 + twins + k, value) for k, value in enumerate(drawn)]
