@@ -330,14 +330,7 @@ def config_of(document: dict[str, Any], path: Path, *, own_classes: bool = False
             raise ValueError("[[phases]] cannot be combined with a specimen file")
         tip = _tip_from_file(document["tip"], path) if "file" in document["tip"] else _tip(document["tip"], phases)
     with _located(path, "simulation"):
-        simulation = document["simulation"]
-        check_keys(simulation, ("ions", "voltage", "seed", "responses"), ("ions",))
-        n_ions = check_count(simulation["ions"], "ions", at_least=1)
-        voltage = check_voltage(simulation.get("voltage", 1000.0))
-        seed = check_seed(simulation.get("seed", 0))
-        responses = simulation.get("responses", True)
-        if not isinstance(responses, bool):
-            raise ValueError(f"responses must be true or false, got {short_text(responses)}")
+        simulation = _simulation(document["simulation"])
     # tables that are the fields of a class; objects of the user's own classes are checked as those of Python
     objects = {}
     for name, kinds in _CLASSES.items():
@@ -364,10 +357,7 @@ def config_of(document: dict[str, Any], path: Path, *, own_classes: bool = False
     return Config(
         path=path,
         tip=tip,
-        n_ions=n_ions,
-        responses=responses,
-        voltage=voltage,
-        seed=seed,
+        **simulation,
         detector=objects["detector"],
         charge_settings=objects["charges"],
         flight_settings=objects["flights"],
@@ -382,6 +372,20 @@ def config_of(document: dict[str, Any], path: Path, *, own_classes: bool = False
         microscope=microscope,
         key=key,
     )
+
+
+def _simulation(table):
+    """Fields of `Config` from the table [simulation]."""
+    check_keys(table, ("ions", "voltage", "seed", "responses"), ("ions",))
+    responses = table.get("responses", True)
+    if not isinstance(responses, bool):
+        raise ValueError(f"responses must be true or false, got {short_text(responses)}")
+    return {
+        "n_ions": check_count(table["ions"], "ions", at_least=1),
+        "voltage": check_voltage(table.get("voltage", 1000.0)),
+        "seed": check_seed(table.get("seed", 0)),
+        "responses": responses,
+    }
 
 
 def _check_tables(document):

@@ -129,19 +129,8 @@ def visibility_of_file(path: str | Path, *, n_threads: int | None = None) -> Vis
     document = read_document(path)
     folder = Path(path).parent
     try:
-        check_keys(document, _TABLES)
-        table = document.pop("visibility", {})
-        check_table(table, "[visibility]")
-        chosen = from_plain(table, VisibilitySettings, what="[visibility]")
+        chosen = _settings(document)
         analysis = _function(folder, chosen.analysis)
-        for name in ("simulation", "tip"):
-            check_table(document.get(name, {}), f"[{name}]")
-        ignored = [f"[simulation] {key}" for key in document.get("simulation", {}) if key != "voltage"]
-        ignored += [f"[tip] {key}" for key in document.get("tip", {}) if key in ("offset_seed", "depth")]
-        if chosen.seed is not None and "seed" in document.get("tip", {}):
-            ignored.append("[tip] seed (beside that of [visibility])")
-        if ignored:
-            raise ValueError(f"{ignored[0]} must not be given, because it would be ignored")
     except ValueError as error:
         raise FileError(f"{str(path)!r}: {error}") from error
     document["simulation"] = {"ions": 1, **document.get("simulation", {})}
@@ -202,6 +191,23 @@ def _function(folder: Path, text: str) -> Callable[..., Any]:
         return getattr(module, function)
     except AttributeError:
         raise ValueError(f"analysis: {str(file)!r} has no function {function!r}") from None
+
+
+def _settings(document):
+    """Settings of the table [visibility], which is removed; ValueError for keys that would be ignored."""
+    check_keys(document, _TABLES)
+    table = document.pop("visibility", {})
+    check_table(table, "[visibility]")
+    chosen = from_plain(table, VisibilitySettings, what="[visibility]")
+    for name in ("simulation", "tip"):
+        check_table(document.get(name, {}), f"[{name}]")
+    ignored = [f"[simulation] {key}" for key in document.get("simulation", {}) if key != "voltage"]
+    ignored += [f"[tip] {key}" for key in document.get("tip", {}) if key in ("offset_seed", "depth")]
+    if chosen.seed is not None and "seed" in document.get("tip", {}):
+        ignored.append("[tip] seed (beside that of [visibility])")
+    if ignored:
+        raise ValueError(f"{ignored[0]} must not be given, because it would be ignored")
+    return chosen
 
 
 def _operators(file, feature, specimen, chosen, seed, simulation):
