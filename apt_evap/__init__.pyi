@@ -1,10 +1,8 @@
 # The public names of the package: read by type checkers, and by the lazy loader in __init__.py.
 from . import analysis as analysis
-from . import config as config
 from . import detection as detection
 from . import emission as emission
 from . import evaporation as evaporation
-from . import explore as explore
 from . import fit as fit
 from . import io as io
 from . import maps as maps

@@ -21,6 +21,7 @@ from apt_evap._core.interactions import InteractionLists, direct_field
 from apt_evap._core.journal import Journal
 from apt_evap._core.octree import Octree
 from apt_evap._core.robin import Robin
+from apt_evap.emission.surface_frame import tangent_frame
 from apt_evap.evaporation.emitter import Emitter
 from apt_evap.units import COULOMB
 
@@ -298,7 +299,7 @@ def flights(radii=(20, 40, 80, 120), shank=2.0, ions=256, group=17):
         for launches in (1, group):
             flier = flier_over(batch.tree, tip, settings)
             angle = np.tile(2 * np.pi * np.arange(launches) / launches, len(batch))
-            first, second = (np.repeat(t, launches, axis=0) for t in ae.emission.tangent_frame(batch.normals))
+            first, second = (np.repeat(t, launches, axis=0) for t in tangent_frame(batch.normals))
             velocities = speed * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second)
             positions = np.repeat(tip.positions[batch.site], launches, axis=0)
             start = time.perf_counter()

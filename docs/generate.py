@@ -19,6 +19,7 @@ from PIL import Image
 import apt_evap
 from apt_evap._common.codec import declared
 from apt_evap.cli.parser import EXIT_CODES, make_parser
+from apt_evap.maps.crystallography.directions import direction_normals
 from apt_evap.maps.indexing import master_pattern
 from apt_evap.studies.dataset.fields import TABLES
 
@@ -28,11 +29,9 @@ HERE = Path(__file__).parent
 # pages that explain the names of a namespace
 _GUIDES = {
     "analysis": "charge_states real_units field_ion_image",
-    "config": "settings",
     "detection": "instruments microscope howto/correct_distortion",
     "emission": "emission charge_states extending",
     "evaporation": "charging_rules laws temperature extending_physics",
-    "explore": "howto/explore",
     "fit": "fits howto/fit_energies howto/simulate_my_specimen",
     "io": "formats",
     "maps": "map_measures howto/find_orientation howto/correct_distortion",
@@ -140,7 +139,7 @@ def atlas(path):
         poles, zones = apt_evap.maps.poles(material, 7), apt_evap.maps.zones(material)
         views = {"[0001]": (0, 0, 0, 1), "[10-10]": (1, 0, -1, 0), "[11-20]": (1, 1, -2, 0)} if hexagonal else {
             "[001]": (0, 0, 1), "[011]": (0, 1, 1), "[111]": (1, 1, 1), "[112]": (1, 1, 2)}  # fmt: skip
-        normals = apt_evap.maps.direction_normals(material, list(views.values()))
+        normals = direction_normals(material, list(views.values()))
         crystals[material.structure] = {
             "name": f"{material.structure} ({element})",
             "radii": {

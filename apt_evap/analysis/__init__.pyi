@@ -1,21 +1,11 @@
 # The public names of this package: read by type checkers, and by the lazy loader in __init__.py.
-from .apex import field_factor as field_factor
 from .apex import fit_caps as fit_caps
 from .apex import image_compression as image_compression
 from .charge_states import charge_history as charge_history
 from .charge_states import charge_state_ratio_history as charge_state_ratio_history
 from .charge_states import charge_state_ratio_map as charge_state_ratio_map
-from .charge_states import field_of_counts as field_of_counts
-from .charge_states import ion_charges as ion_charges
-from .charge_states import ratio_of_counts as ratio_of_counts
-from .description import describe as describe
 from .ion_image import ImagingGas as ImagingGas
-from .ion_image import critical_distance as critical_distance
 from .ion_image import field_ion_image as field_ion_image
-from .ion_image import tunnel_factor as tunnel_factor
 from .pattern_of_runs import master_pattern as master_pattern
 from .response_tracks import lateral_tracks as lateral_tracks
 from .response_tracks import rollup_tracks as rollup_tracks
-from .voltage_history import evaporation_fields as evaporation_fields
-from .voltage_history import evaporation_voltages as evaporation_voltages
-from .voltage_history import smoothed_history as smoothed_history

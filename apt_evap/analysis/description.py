@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apt_evap._common.codec import to_plain
 from apt_evap._common.types import Floats
 from apt_evap.detection.binning import find_quantisations
 from apt_evap.detection.detector_map import DetectorMap
@@ -243,19 +242,17 @@ def _real_units(run):
 
 def microscope_of(run: Run) -> dict[str, Any] | None:
     """Lens of a run, and its radii, field factors and compressions, dict; None without a lens."""
-    if run.lens is None:
-        return None
-    lens, radii = run.lens.lens, run.lens.radii(run.emissions.ions)
-    return to_plain(lens, short=True) | {
-        "radius": _extent(radii),
-        "field_factor": _extent(lens.field_factor(radii)),
-        "compression": _extent(lens.compression(radii)),
-    }
+    lens = run.observation.lens
+    return (
+        lens.lens_settings() | {name: _extent(figure) for name, figure in lens.figures(run.emissions.ions).items()}
+        or None
+    )
 
 
 def real_units_line(run: Run) -> str:
-    """Description of a run in real units in one line, str."""
-    real = _real_units(run)
+    """Description of a run in real units in one line, str; "" at the simulated voltage."""
+    if not (real := _real_units(run)):
+        return ""
     low, high = real["voltages"] or (np.nan, np.nan)
     charges = ", ".join(f"{count:,} {name}" for name, count in real["flight_charges"].items())
     line = (

@@ -116,7 +116,8 @@ def tunnel_factor(field: ArrayLike, ionisation_energy: float) -> Any:
     --------
     Five per cent of the field of neon are a factor of 2.2 of the brightness:
 
-    >>> tunnel = ae.analysis.tunnel_factor
+    >>> from apt_evap.analysis.ion_image import tunnel_factor
+    >>> tunnel = tunnel_factor
     >>> round(tunnel(1.05 * 35.0, 21.565) / tunnel(35.0, 21.565), 1)
     2.2
     """
@@ -148,7 +149,8 @@ def critical_distance(field: float, ionisation_energy: float, work_function: flo
 
     Examples
     --------
-    >>> round(ae.analysis.critical_distance(44.0, 24.587), 2)
+    >>> from apt_evap.analysis.ion_image import critical_distance
+    >>> round(critical_distance(44.0, 24.587), 2)
     0.46
     """
     field = check_number(field, "field", above=0, unit="V/nm")

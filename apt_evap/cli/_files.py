@@ -71,7 +71,7 @@ def _read(options):
 
 
 def in_real_units(run: Run, options: argparse.Namespace) -> Run:
-    """The run, in real units if the options ask for them, as a lens does; a run that already is keeps its own."""
+    """The run, in real units with one of --real-units and --lens; a run that already is keeps its own."""
     lens, reference = lens_of(options), options.real_units
     if lens is None and reference in (None, run.observation.operating.field_reference):
         return run

@@ -219,6 +219,6 @@ def _mark(n: int) -> Callable[[str], tuple[Any, ...]]:
         is_whole = all(index.is_integer() for index in indices)  # no infinity, no NaN
         if len(numbers) < n or len(indices) not in (0, 3, 4) or not is_whole:
             raise argparse.ArgumentTypeError(f"must be {n} coordinates [mm], perhaps with indices, got {text!r:.80}")
-        return (*numbers[:n], tuple(int(each) for each in indices)) if indices else numbers
+        return (*numbers[:n], tuple(int(index) for index in indices)) if indices else numbers
 
     return mark

@@ -100,7 +100,6 @@ def _with_errors(run, options):
 
     from apt_evap.detection.timing import Timing
 
-    if run.units is None:
-        raise ValueError("--temperature and --jitter need a run in real units: add --real-units")
+    units = run.require_real_units("--temperature or --jitter")
     timing = Timing(jitter=options.jitter or 0.0, temperature=options.temperature)
-    return replace(run, units=replace(run.units, timing=timing))
+    return replace(run, units=replace(units, timing=timing))

@@ -151,8 +151,6 @@ def _ions(options):
     content = read(options)
     if isinstance(content, Run):
         run = in_real_units(content, options)
-        if run.units is None and options.radius == "voltage":
-            raise ValueError(f"{options.file!r} has the voltages of a simulation: add --real-units")
         perturbation = run.first_perturbation
         if options.perturbation is not None:
             perturbation = read_perturbation(options.perturbation)

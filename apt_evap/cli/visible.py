@@ -24,19 +24,19 @@ def execute(options: argparse.Namespace) -> int:
     """Run the command."""
     from apt_evap.studies.visibility.visibility_file import visibility_of_file
 
-    answer = visibility_of_file(options.config, n_threads=options.threads)
-    found = answer.probability
-    tell(options, f"probability to be found: {found.value:.2f} ± {found.error:.2f}")
-    for name, number in (("N50", answer.n50), ("N95", answer.n95)):
+    result = visibility_of_file(options.config, n_threads=options.threads)
+    probability = result.probability
+    tell(options, f"probability to be found: {probability.value:.2f} ± {probability.error:.2f}")
+    for name, number in (("N50", result.n50), ("N95", result.n95)):
         if math.isfinite(number.value):
             tell(options, f"{name}: {number.value:.0f} ± {number.error:.0f} recorded ions of the feature")
-        elif answer.sized is not None and len(answer.sized.ions):
-            low, high = answer.sized.ions.min(), answer.sized.ions.max()
+        elif result.sized is not None and len(result.sized.ions):
+            low, high = result.sized.ions.min(), result.sized.ions.max()
             tell(options, f"{name}: not between {low:,} and {high:,} recorded ions of the feature")
-    for name, error in answer.errors.items():
+    for name, error in result.errors.items():
         unit = "" if name.endswith("composition") else " nm"
         tell(
             options, f"{name}: bias {error.bias:+.3f} ± {error.bias_error:.3f}{unit}, scatter {error.scatter:.3f}{unit}"
         )
-    tell_json(options, answer.to_dict())
+    tell_json(options, result.to_dict())
     return 0

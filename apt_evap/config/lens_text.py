@@ -29,7 +29,8 @@ def read_lens(settings: str | Mapping[str, Any]) -> LocalElectrode:
 
     Examples
     --------
-    >>> ae.config.read_lens("local-electrode:shank_angle=7").shank_angle  # degrees
+    >>> from apt_evap.config.lens_text import read_lens
+    >>> read_lens("local-electrode:shank_angle=7").shank_angle  # degrees
     7.0
     """
     if isinstance(settings, str):
@@ -41,7 +42,7 @@ def read_lens(settings: str | Mapping[str, Any]) -> LocalElectrode:
     table = dict(check_kind(settings, "lens", Mapping, "a text or a table"))
     if "preset" in table:
         name = table.pop("preset")
-        known = {each.replace(" ", "-"): each for each in ELECTRODE_PRESETS}
+        known = {preset.replace(" ", "-"): preset for preset in ELECTRODE_PRESETS}
         if not isinstance(name, str) or name.replace(" ", "-") not in known:
             raise ValueError(f"preset must be {' or '.join(map(repr, ELECTRODE_PRESETS))}, got {short_text(name)}")
         table = {**ELECTRODE_PRESETS[known[name.replace(" ", "-")]], **table}

@@ -108,8 +108,8 @@ def title_of(perturbation: Any) -> str:
     if name == "Mixture":
         weights = perturbation.weights or (1.0,) * len(perturbation.perturbations)
         parts = [
-            f"{each / sum(weights):.2g} {title_of(one)}"
-            for one, each in zip(perturbation.perturbations, weights, strict=True)
+            f"{weight / sum(weights):.2g} {title_of(one)}"
+            for one, weight in zip(perturbation.perturbations, weights, strict=True)
         ]
         return "; ".join(parts)
     words = {"Unperturbed": "unperturbed", "LateralVelocity": "lateral velocity", "RollUp": "roll-up"}

@@ -166,9 +166,9 @@ class Config:
                 return Tip(**self.tip)
             settings = dict(self.tip)
             expected = settings.pop("sha256", None)
-            if expected is not None and (found := sha256_of(settings["path"])) != expected:
+            if expected is not None and (digest := sha256_of(settings["path"])) != expected:
                 raise ValueError(
-                    f"{str(settings['path'])!r} has changed: expected sha256 {short_text(expected)}, got {found!r}"
+                    f"{str(settings['path'])!r} has changed: expected sha256 {short_text(expected)}, got {digest!r}"
                 )
             try:
                 return read_tip(**settings)
@@ -223,7 +223,7 @@ class Config:
         return replace(run, provenance=run.provenance | origin)
 
     def as_saved(self, run: Run) -> Run:
-        """The run as it is saved: with its origin, and in real units if the file asks for them.
+        """The run as it is saved: with its origin, and in real units if the file has a table for them.
 
         Raises
         ------
@@ -283,6 +283,18 @@ def read_document(path: str | Path) -> dict[str, Any]:
         raise FileError(f"{str(path)!r} is not a TOML file: {error}") from error
 
 
+# tables with the fields of a class, and the classes, of which the first one is the default
+_CLASSES: dict[str, tuple[Any, ...]] = {
+    "detector": (Detector,),
+    "charges": (ChargeSettings,),
+    "flights": (FlightSettings,),
+    "monitor": (Monitor,),
+    "law": LAWS,
+    "rule": RULES,
+    "control": (VoltageControl,),
+}
+
+
 def config_of(document: dict[str, Any], path: Path, *, own_classes: bool = False) -> Config:
     """Settings of a simulation from the content of a TOML file.
 
@@ -305,30 +317,10 @@ def config_of(document: dict[str, Any], path: Path, *, own_classes: bool = False
         If a table, key or value is wrong; the message names it.
     """
     with _located(path):
-        tables = (
-            "tip",
-            "simulation",
-            "detector",
-            "charges",
-            "flights",
-            "responses",
-            "monitor",
-            "law",
-            "rule",
-            "control",
-            "real_units",
-            "microscope",
-            "maps",
-        )
-        check_keys(document, ("output", "phases", *tables), ("tip", "simulation"))
-        for name in tables:
-            check_table(document.get(name, {}), f"[{name}]")
-        check_levels(document)
+        _check_tables(document)
         key = key_of(document)
         document = with_own_objects(document, path.parent if own_classes else None)
-        output = document.get("output")
-        if output is not None and not (isinstance(output, str) and output):
-            raise ValueError(f"output must be a file name such as 'run.h5', got {short_text(output)}")
+    # the specimen
     phases = None
     if "phases" in document:
         with _located(path, "phases"):
@@ -338,34 +330,19 @@ def config_of(document: dict[str, Any], path: Path, *, own_classes: bool = False
             raise ValueError("[[phases]] cannot be combined with a specimen file")
         tip = _tip_from_file(document["tip"], path) if "file" in document["tip"] else _tip(document["tip"], phases)
     with _located(path, "simulation"):
-        simulation = document["simulation"]
-        check_keys(simulation, ("ions", "voltage", "seed", "responses"), ("ions",))
-        n_ions = check_count(simulation["ions"], "ions", at_least=1)
-        voltage = check_voltage(simulation.get("voltage", 1000.0))
-        seed = check_seed(simulation.get("seed", 0))
-        responses = simulation.get("responses", True)
-        if not isinstance(responses, bool):
-            raise ValueError(f"responses must be true or false, got {short_text(responses)}")
-    sections = []
-    for name, *kinds in (
-        ("detector", Detector),
-        ("charges", ChargeSettings),
-        ("flights", FlightSettings),
-        ("monitor", Monitor),
-        ("law", *LAWS),
-        ("rule", *RULES),
-        ("control", VoltageControl),
-    ):
+        simulation = _simulation(document["simulation"])
+    # tables that are the fields of a class; objects of the user's own classes are checked as those of Python
+    objects = {}
+    for name, kinds in _CLASSES.items():
         with _located(path, name):
             table = document.get(name, {})
             if is_plain(table):
                 table = from_plain(table, *kinds, what=name) if table else kinds[0]()
-            sections.append(table)
-    detector, charges, flights, monitor, law, rule, control = sections
+            objects[name] = table
     with _located(path, "law"):
-        check_law(law)
+        check_law(objects["law"])
     with _located(path, "rule"):
-        check_rule(rule)
+        check_rule(objects["rule"])
     with _located(path, "responses"):
         response_settings = ResponseSettings.of_table(document.get("responses", {}))
     with _located(path, "real_units"):
@@ -376,28 +353,51 @@ def config_of(document: dict[str, Any], path: Path, *, own_classes: bool = False
         microscope = read_lens(document["microscope"]) if "microscope" in document else None
     with _located(path, "maps"):
         maps = from_plain(document.get("maps", {}), MapSettings, what="maps")
-        maps.check_detector(detector)
+        maps.check_detector(objects["detector"])
     return Config(
         path=path,
         tip=tip,
-        n_ions=n_ions,
-        responses=responses,
-        voltage=voltage,
-        seed=seed,
-        detector=detector,
-        charge_settings=charges,
-        flight_settings=flights,
+        **simulation,
+        detector=objects["detector"],
+        charge_settings=objects["charges"],
+        flight_settings=objects["flights"],
         response_settings=response_settings,
-        monitor=monitor,
+        monitor=objects["monitor"],
         maps=maps,
-        output=output,
-        law=law,
-        control=control if document.get("control") else None,
+        output=document.get("output"),
+        law=objects["law"],
+        control=objects["control"] if document.get("control") else None,
         real_units=real_units,
-        rule=rule,
+        rule=objects["rule"],
         microscope=microscope,
         key=key,
     )
+
+
+def _simulation(table):
+    """Fields of `Config` from the table [simulation]."""
+    check_keys(table, ("ions", "voltage", "seed", "responses"), ("ions",))
+    responses = table.get("responses", True)
+    if not isinstance(responses, bool):
+        raise ValueError(f"responses must be true or false, got {short_text(responses)}")
+    return {
+        "n_ions": check_count(table["ions"], "ions", at_least=1),
+        "voltage": check_voltage(table.get("voltage", 1000.0)),
+        "seed": check_seed(table.get("seed", 0)),
+        "responses": responses,
+    }
+
+
+def _check_tables(document):
+    """Raise ValueError unless the document has tables with known names, and a name of the output."""
+    tables = ("tip", "simulation", *_CLASSES, "responses", "real_units", "microscope", "maps")
+    check_keys(document, ("output", "phases", *tables), ("tip", "simulation"))
+    for name in tables:
+        check_table(document.get(name, {}), f"[{name}]")
+    check_levels(document)
+    output = document.get("output")
+    if output is not None and not (isinstance(output, str) and output):
+        raise ValueError(f"output must be a file name such as 'run.h5', got {short_text(output)}")
 
 
 def key_of(document: Mapping[str, Any]) -> str:
@@ -422,9 +422,9 @@ def key_of(document: Mapping[str, Any]) -> str:
 def _canonical(value):
     match value:
         case Mapping():
-            return {key: _canonical(each) for key, each in value.items()}
+            return {key: _canonical(item) for key, item in value.items()}
         case list():
-            return [_canonical(each) for each in value]
+            return [_canonical(item) for item in value]
         case float() if math.isfinite(value):
             return int(value) if value.is_integer() else value
         case bool() | int() | str() | None:

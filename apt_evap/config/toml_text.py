@@ -106,5 +106,5 @@ def inline(value: Any) -> str:
         case list() | tuple():
             return "[" + ", ".join(map(inline, value)) + "]"
         case Mapping():
-            return "{" + ", ".join(f"{_key(key)} = {inline(each)}" for key, each in value.items()) + "}"
+            return "{" + ", ".join(f"{_key(key)} = {inline(item)}" for key, item in value.items()) + "}"
     raise ValueError(f"settings must be texts, numbers, booleans, lists and tables, got {short_text(value)}")

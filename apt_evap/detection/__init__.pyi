@@ -1,12 +1,8 @@
 # The public names of this package: read by type checkers, and by the lazy loader in __init__.py.
-from .distortion import DistortionGrid as DistortionGrid
 from .hits import Outcome as Outcome
-from .instrument import INSTRUMENT_PRESETS as INSTRUMENT_PRESETS
 from .instrument import Detection as Detection
 from .mass_ranges import Ranges as Ranges
-from .microscope.local_electrode import ELECTRODE_PRESETS as ELECTRODE_PRESETS
 from .microscope.local_electrode import LocalElectrode as LocalElectrode
-from .microscope.run_lens import RunLens as RunLens
 from .microscope.run_lens import field_of_view as field_of_view
 from .projection import Projection as Projection
 from .timing import Cooling as Cooling

@@ -97,9 +97,9 @@ class FlightFit:
             return self
         shift, of_time, of_length, error, number = np.array(groups).T
         # the shape of a peak, which is not known, shifts all its groups alike: an unknown of its own, about zero
-        own = (number[:, None] == np.arange(len(names))).astype(float)
+        of_peak = (number[:, None] == np.arange(len(names))).astype(float)
         width = np.array([comb.width * _SHAPE for comb in combs if comb.name in names])
-        design = np.column_stack([of_length, own, of_time]) / error[:, None]
+        design = np.column_stack([of_length, of_peak, of_time]) / error[:, None]
         design = np.vstack([design, np.column_stack([np.zeros(len(names)), np.diag(1 / width), np.zeros(len(names))])])
         target = np.append(shift / error, np.zeros(len(names)))
         for unknowns in (design.shape[1], design.shape[1] - 1):  # first with the time, then without

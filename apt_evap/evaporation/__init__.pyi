@@ -1,16 +1,11 @@
 # The public names of this package: read by type checkers, and by the lazy loader in __init__.py.
 from .bonds import TUNGSTEN_TABLE as TUNGSTEN_TABLE
-from .bonds import BondField as BondField
 from .bonds import CoordinationTable as CoordinationTable
 from .bonds import PairEnergies as PairEnergies
 from .charge_settings import ChargeSettings as ChargeSettings
-from .emitter import Batch as Batch
 from .emitter import Emitter as Emitter
 from .law import Law as Law
 from .losses import conditions as conditions
-from .rule import CompiledRule as CompiledRule
 from .rule import Rule as Rule
-from .state import EmitterState as EmitterState
 from .thermal import Laser as Laser
-from .voltage import ThermalLaw as ThermalLaw
 from .voltage import VoltageControl as VoltageControl

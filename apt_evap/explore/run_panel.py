@@ -127,7 +127,7 @@ class RunPanel:
         self.write.disabled = False
         self._show(text)
         if made is not None:
-            self._state.registration_options[str(path.with_suffix(".h5"))] = made.near
+            self._state.registration_options[str(path.with_suffix(".h5"))] = made.registration
             self._put_code(made.text)
 
     def _start_or_stop(self):

@@ -67,7 +67,8 @@ def surface_atoms(run: Run, color: str = "order", ions: tuple[int, int] | None =
     Examples
     --------
     >>> run = ae.Simulation(ae.Tip("Ni", apex_radius=2.0), seed=1).run(100, progress=False)
-    >>> atoms = ae.explore.surface_atoms(run, "field")
+    >>> from apt_evap.explore.specimen_surface import surface_atoms
+    >>> atoms = surface_atoms(run, "field")
     >>> atoms.positions.shape == (len(atoms.values), 3)
     True
     """

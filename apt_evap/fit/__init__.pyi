@@ -1,10 +1,7 @@
 # The public names of this package: read by type checkers, and by the lazy loader in __init__.py.
 from .fit_settings import FitSettings as FitSettings
 from .grid import EnergyGrid as EnergyGrid
-from .measured_constants import Measurement as Measurement
 from .measured_constants import constants_of as constants_of
 from .radius import fit_radius as fit_radius
 from .start_settings import settings_of as settings_of
-from .structure import Structure as Structure
-from .study import Study as Study
 from .tips import fit_tips as fit_tips

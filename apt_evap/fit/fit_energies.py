@@ -310,7 +310,7 @@ def real_units_of(run: Run) -> dict[str, Any] | None:
         return None
     units = real.require_real_units("an operating point")
     # simulated energies per real one, and per one of the study
-    scale, study_scale = (float(np.median(each.energy_scales)) for each in (real, run))
+    scale, study_scale = (float(np.median(one.energy_scales)) for one in (real, run))
     charges, counts = np.unique(real.flight_charges, return_counts=True)
     return {
         "real_per_study": study_scale / scale,

@@ -54,7 +54,7 @@ _LIMITS = 1.5, 5.0
 _FEWEST, _MOST = 10_000, 150_000  # ions
 
 
-def near(centre: Sequence[float], scale: float) -> dict[str, Any]:
+def registration_start(centre: Sequence[float], scale: float) -> dict[str, Any]:
     """Start and bounds of the registration of a run with the settings of a `StartSettings`, for `register`.
 
     Parameters
@@ -89,8 +89,8 @@ class StartSettings:
         voltages.
     simulated_radius : float
         Radius of the simulated tip [nm].
-    near : dict
-        Where the simulated map is on the measured one, for `register`, see `near`.
+    registration : dict
+        Where the simulated map is on the measured one, for `register`, see `registration_start`.
     cost : CostEstimate
         Time and memory that the simulation needs.
     """
@@ -99,7 +99,7 @@ class StartSettings:
     indexing: Indexing
     radii: tuple[float, float]
     simulated_radius: float
-    near: dict
+    registration: dict
     cost: CostEstimate
 
     def __repr__(self) -> str:
@@ -169,7 +169,8 @@ def settings_of(
     >>> measured = pattern.map(truth, ae.detection.Projection(60.0), width=70.0, ions=20_000, seed=1)
     >>> start = ae.fit.settings_of(ae.index(measured, "W", scales=(58, 62)), minutes=1)
     >>> start.save("w.toml")
-    >>> ae.config.read_config("w.toml").tip["material"].name
+    >>> from apt_evap.config.simulation_file import read_config
+    >>> read_config("w.toml").tip["material"].name
     'W'
     """
     check_kind(indexing, "indexing", Indexing, "an Indexing, the result of index")
@@ -196,7 +197,12 @@ def settings_of(
             f"minutes must be at least {60 * (needs.hours or 0.0) / threads:.1f} for the smallest tip, got {minutes:g}"
         )
     return StartSettings(
-        text, indexing, radii, size * material.a, near(best.projection.centre, best.projection.scale), needs
+        text,
+        indexing,
+        radii,
+        size * material.a,
+        registration_start(best.projection.centre, best.projection.scale),
+        needs,
     )
 
 

@@ -63,7 +63,7 @@ class RegisteredProjection:
     def directions(self, places: ArrayLike) -> Floats:
         """Unit vectors at positions on the detector, shape (n, 3), as `Projection.directions`."""
         x, y = np.asarray(places, float).T
-        return self.projection.directions(np.column_stack(self.registration.back(x, y)))
+        return self.projection.directions(np.column_stack(self.registration.inverse_points(x, y)))
 
 
 class Structure(NamedTuple):

@@ -1,6 +1,5 @@
 # The public names of this package: read by type checkers, and by the lazy loader in __init__.py.
 from .distortion_grid import read_grid as read_grid
-from .formats import TruncatedFile as TruncatedFile
 from .formats import chunks as chunks
 from .formats import read_ranges as read_ranges
 from .npz import read_map as read_map

@@ -1,16 +1,9 @@
 # The public names of this package: read by type checkers, and by the lazy loader in __init__.py.
-from .crystallography.directions import direction_normals as direction_normals
-from .crystallography.directions import plane_normals as plane_normals
 from .crystallography.directions import poles as poles
 from .crystallography.directions import zones as zones
 from .crystallography.orientation import fit_orientation as fit_orientation
-from .crystallography.symmetry import point_group as point_group
-from .crystallography.symmetry import pole_symmetry as pole_symmetry
-from .crystallography.symmetry import symmetry_about_axis as symmetry_about_axis
 from .folded_map import folded as folded
-from .indexing.master_pattern import MasterPattern as MasterPattern
 from .indexing.master_pattern import master_patterns as master_patterns
-from .noise import effective_ions as effective_ions
 from .pole_profiles import pole_line_profile as pole_line_profile
 from .pole_profiles import pole_profile as pole_profile
 from .profiles import Rectangle as Rectangle
@@ -18,7 +11,6 @@ from .profiles import azimuthal_profile as azimuthal_profile
 from .profiles import compare_profiles as compare_profiles
 from .profiles import radial_profile as radial_profile
 from .profiles import zone_line_profile as zone_line_profile
-from .registration.polynomial import Distortion as Distortion
 from .registration.register import register_distortion as register_distortion
 from .registration.register import register_points as register_points
 from .registration.register import score_surface as score_surface

@@ -129,7 +129,7 @@ def folded(
     pole : array_like
         Direction of the pole in the frame of the projection, shape (3,).
     symmetry : str
-        Symmetry about the pole: 1, 2, 3, 4, 6, m, 2mm, 3m, 4mm or 6mm, as from `maps.pole_symmetry`.
+        Symmetry about the pole: 1, 2, 3, 4, 6, m, 2mm, 3m, 4mm or 6mm, as from `pole_symmetry`.
     toward : array_like, optional
         Another direction, shape (3,): its azimuth is 0, and a mirror plane contains it. Required with mirror planes.
     reach : float

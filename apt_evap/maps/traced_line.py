@@ -128,6 +128,7 @@ def trace_line(map: DetectorMap, ends: ArrayLike, *, width: float) -> TracedLine
         raise ValueError(f"ends must be two different points, got {first.tolist()} twice")
     width = check_number(width, "width", above=0, unit="mm")
     rectangle = Rectangle(tuple((first + second) / 2), math.degrees(math.atan2(*(second - first)[::-1])), length, width)
+    # bins inside the rectangle, in coordinates from -1/2 to 1/2, and their density relative to the mean
     hits, known = hits_per_bin(map, None)
     along, across = rectangle.along_and_across(*(grid[map.mask] for grid in np.meshgrid(*map.centres)))
     inside = (np.abs(along) < length / 2) & (np.abs(across) < width / 2)
@@ -141,6 +142,7 @@ def trace_line(map: DetectorMap, ends: ArrayLike, *, width: float) -> TracedLine
         line = np.exp2(-((2 * (across - place - slope * along) / size) ** 2))
         return ground + gradient * along + tilt * across + height * line
 
+    # least squares from the best line of a grid
     no_line = f"no line of at most the width {width:g} mm near the ends {rectangle}"
     start, low = _best_of_grid(along, across, density), max(map.bin_size) / width
     bounds = [-0.5, -np.inf, low, *[-np.inf] * 4], [0.5, np.inf, 1.0, *[np.inf] * 4]
@@ -159,6 +161,7 @@ def trace_line(map: DetectorMap, ends: ArrayLike, *, width: float) -> TracedLine
     height_error = math.sqrt(max(covariance[3, 3], 0.0))
     if not (_SIGNIFICANT * height_error < abs(height) and abs(place) < 0.49 and low < size < 0.99):
         raise ValueError(f"{no_line}: the fit gave a height of {height:.2g} ± {height_error:.2g}")
+    # from the coordinates of the rectangle to the map
     angle = math.atan(slope * width / length)
     turn = math.radians(rectangle.angle)
     normal = np.array([-math.sin(turn), math.cos(turn)])

@@ -50,7 +50,7 @@ def history(run: Run | Hits, axes: Sequence[Axes] | None = None, *, points: int 
     panels = _panels(run)
     axes = _stacked(axes, len(panels), run, 2.3)
     for ax, (label, values) in zip(axes, panels, strict=True):
-        _draw_course(ax, values, points)
+        _draw_history(ax, values, points)
         ax.set(ylabel=label, xlim=(0, len(values)))
         ax.grid(alpha=0.3)
     axes[0].legend(loc="best", frameon=False, ncols=2)
@@ -136,7 +136,7 @@ def _label_ions(ax):
     ax.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
 
 
-def _draw_course(ax, values, points):
+def _draw_history(ax, values, points):
     ions, low, median, high = smoothed_history(values, points)
     ax.fill_between(ions, low, high, color="C0", alpha=0.25, linewidth=0, label="90 % of the ions")
     ax.plot(ions, median, color="C0", linewidth=1.3, label="median")
@@ -166,11 +166,13 @@ def _panels_of_run(run, points, element):
         at = run.cap.ions[known]
         fields = run.cap.fields[known] * np.interp(at, ions, run.voltages) / run.voltage
         panels.append((_draw_field, at - ions[0], fields, operating.cap_field))
-    panels += _rate_of_run(run, points)
-    if run.real is not None:
+    edges = _sections(len(run), points)
+    if rates := operating.ion_rates(edges):
+        panels.append((_draw_rate, edges, rates.values, f"ions per {rates.per}", rates.goal))
+    if "charge_state" in (columns := operating.truth()):
         element = run.elements[0] if element is None else check_choice(element, "element", run.elements)
         names = np.array(run.elements)[run.species]
-        panels += _charges(np.where(names == element, run.real.charges, 0), element, points)
+        panels += _charges(np.where(names == element, columns["charge_state"], 0), element, points)
     return panels
 
 
@@ -186,21 +188,6 @@ def _panels_of_hits(hits, points, element, ranges):
         charges = hits.extra["charge_state"] if element is None else ion_charges(hits, element, ranges)
         panels += _charges(np.where(hits.detected, charges, 0), element, points)
     return panels
-
-
-def _rate_of_run(run, points):
-    """Panel with the rate; none without a clock or pulses."""
-    edges = _sections(len(run), points)
-    if run.clock is not None:
-        pulse_length = run.settings.get("pulse_length")
-        time = np.add.reduceat(run.clock.waits, edges[:-1]) / (pulse_length or 1.0)
-        goal = (run.settings.get("control") or {}).get("rate")
-        return [(_draw_rate, edges, np.diff(edges) / time, f"ions per {'pulse' if pulse_length else 'second'}", goal)]
-    control = run.units.control
-    if control.pulse_fraction == 0:
-        return []
-    pulses = np.diff(run.real.pulse_ids[edges[1:] - 1], prepend=0)
-    return [(_draw_rate, edges, np.diff(edges) / np.maximum(pulses, 1), "ions per pulse", control.rate)]
 
 
 def _charges(charges, element, points):
@@ -220,7 +207,7 @@ def _sections(n, points):
 
 
 def _draw_voltage(ax, voltages, points, label):
-    _draw_course(ax, voltages, points)
+    _draw_history(ax, voltages, points)
     ax.set_ylabel(label)
 
 

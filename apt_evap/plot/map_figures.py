@@ -158,7 +158,8 @@ def specimen_title(run: Run) -> str:
     Examples
     --------
     >>> run = ae.Simulation(ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1)), seed=1).run(100, progress=False)
-    >>> ae.plot.specimen_title(run)
+    >>> from apt_evap.plot.map_figures import specimen_title
+    >>> specimen_title(run)
     'Ni, axis [$111$], R = 2.0 nm'
     """
     tip = check_kind(run, "run", Run, "a Run").settings["tip"]
@@ -192,7 +193,8 @@ def binned(hits: Hits, bins: int | None = None, smoothing: float | None = None) 
     Examples
     --------
     >>> places = np.random.default_rng(1).uniform(-20, 20, (2, 3000))  # mm
-    >>> ae.plot.binned(ae.Hits(x=places[0], y=places[1]))
+    >>> from apt_evap.plot.map_figures import binned
+    >>> binned(ae.Hits(x=places[0], y=places[1]))
     <DetectorMap: 3,000 ions, 128 x 128 bins of 0.3124 x 0.3124 mm, smoothed by 0.624811 mm>
     """
     ions = int(np.count_nonzero(check_kind(hits, "hits", Hits, "Hits").detected))

@@ -62,7 +62,7 @@ def overlay(
     image = view.flatten(_SMOOTHING * measured_view.diameter / scale, BROAD * measured_view.diameter / scale)
     low_x, high_x, low_y, high_y = measured.extent
     x, y = np.meshgrid(np.linspace(low_x, high_x, 400), np.linspace(low_y, high_y, 400))
-    back_x, back_y = registration.back(x, y)
+    back_x, back_y = registration.inverse_points(x, y)
     values, covered = image.sample(back_x + 1j * back_y)
     common = _on(measured, x, y) & covered  # contours outside the measured map are meaningless
     legend = []

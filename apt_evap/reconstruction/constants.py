@@ -59,12 +59,11 @@ def run_constants(run: Run, evaporation_field: float | None = None) -> dict[str,
         constants["projection"] = "compressed"
     except ValueError:  # too few ions
         pass
-    if run.lens is not None:
+    if of_lens := run.observation.lens.constants(voltages, run.detector.distance):
         for name in ("field_factor", "compression", "projection"):
             constants.pop(name, None)
-        constants["lens"] = run.lens.lens
-        rim = run.lens.rim(float(np.min(run.instrument_voltages)), run.detector.distance)
-        constants["detector_radius"] = min(constants["detector_radius"], rim)
+        constants["lens"] = of_lens["lens"]
+        constants["detector_radius"] = min(constants["detector_radius"], of_lens["rim"])
     return constants
 
 

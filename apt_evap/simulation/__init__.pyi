@@ -4,9 +4,7 @@ from .flight.flight_pool import FlightSettings as FlightSettings
 from .flight.launch_designs import Design as Design
 from .flight.launch_designs import WideDesign as WideDesign
 from .monitor import Monitor as Monitor
-from .monitor import charge_residuals as charge_residuals
 from .real_units import OperatingPoint as OperatingPoint
 from .recorder import RunInterrupted as RunInterrupted
 from .recorder import RunNotSaved as RunNotSaved
-from .stop_reason import StopReason as StopReason
 from .surface import surface_after as surface_after

@@ -108,7 +108,9 @@ class CheckpointWriter:
         self._due_at, self._n_written = time.monotonic() + 60 * checkpoint.minutes, 0
         self.previous: Run | None = None  # the ions so far of a resumed run
         self.complete = False  # whether all requested ions are in the file
-        self._setup = dict(_flat(settings), responses=responses, flown=[described(each) for each in perturbations])
+        self._setup = dict(
+            _flat(settings), responses=responses, flown=[described(perturbation) for perturbation in perturbations]
+        )
         self._lock = FileLock(checkpoint._beside(".lock"), self._name)
         try:
             self._prepare(n_ions)
@@ -198,7 +200,7 @@ class CheckpointWriter:
             dict(
                 _flat(run.settings),
                 responses=run.responses is not None,
-                flown=[described(each) for each in run.perturbations],
+                flown=[described(perturbation) for perturbation in run.perturbations],
             ),
         )
         differences = [

@@ -32,7 +32,7 @@ class Flown(NamedTuple):
 
 
 class Clock(NamedTuple):
-    """Course of a run with a temperature; each of shape (n,)."""
+    """Times and voltages of the events of a run with a temperature; each of shape (n,)."""
 
     waits: Floats
     """Time before each event [s]; with pulses, time at the top of pulses."""
@@ -186,7 +186,7 @@ def parts_of(arrays: Mapping[str, Any], nearest_neighbour_distance: float) -> di
     return groups[""] | {
         "emissions": Emissions(**groups["emissions"], nearest_neighbour_distance=nearest_neighbour_distance),
         "events": groups.get("events", {}),
-        "flown": tuple(Flown(**each) for group, each in groups.items() if group.startswith("flown/")),
+        "flown": tuple(Flown(**arrays) for group, arrays in groups.items() if group.startswith("flown/")),
         "responses": Responses(**groups["responses"]) if "responses" in groups else None,
         "clock": Clock(**groups["clock"]) if "clock" in groups else None,
         "real": RealColumns(**groups["real"]) if "real" in groups else None,

@@ -66,7 +66,7 @@ def charge_residuals(emitter: Emitter, sample: int, seed: int) -> Floats:
     return emitter.charge_residuals(selection)
 
 
-class Watch:
+class MonitorState:
     """Checks the charges of a run at intervals, and counts its ions.
 
     Parameters
@@ -130,12 +130,12 @@ class Watch:
             )
             events = (outcome == Outcome.MISSED, outcome == Outcome.NEVER_LEFT, flagged)
             n_flown = max(1, np.count_nonzero(~not_flown))
-            fractions = [float(np.count_nonzero(each) / n_flown) for each in events]
+            fractions = [float(np.count_nonzero(event) / n_flown) for event in events]
             self._rows.append((*self._open, *fractions, float(np.mean(fields))))
-            self._judge(*fractions)
+            self._compare_with_bounds(*fractions)
         self._open, self._since = None, []
 
-    def _judge(self, missed, never_left, flagged):
+    def _compare_with_bounds(self, missed, never_left, flagged):
         self._latest |= {"missed": f"{missed:.1%}", "never left": f"{never_left:.1%}", "flagged": f"{flagged:.1%}"}
         for fraction, kind, what, advice in (
             (
@@ -164,7 +164,7 @@ class Watch:
             self._warned.add(what)
             warn(message, kind)
 
-    def take(self) -> History:
+    def pop_history(self) -> History:
         """Return and clear the history of the checks since the last call."""
         rows, self._rows = self._rows, []
         columns = list(zip(*rows, strict=True)) or History.empty()

@@ -4,7 +4,7 @@ Both classes have the same attributes, so that whoever needs voltages, charges o
 """
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -17,6 +17,25 @@ from apt_evap.simulation.real_units import RealColumns, RealUnits, random_of
 
 if TYPE_CHECKING:
     from apt_evap.simulation.run import Run
+
+
+class IonRates(NamedTuple):
+    """Number of ions per pulse or second, in sections of a run."""
+
+    values: Floats
+    """Ions per unit of time in each section."""
+    per: str
+    """The unit of time: "pulse" or "second"."""
+    goal: float | None
+    """Rate that the control of the voltage aims at, if there is one."""
+
+
+def rates_of_clock(run: Any, edges: Integers) -> IonRates:
+    """Rates of a run with a clock between these rows; the last edge is the end of the run."""
+    pulse_length = run.settings.get("pulse_length")
+    time = np.add.reduceat(run.clock.waits, edges[:-1]) / (pulse_length or 1.0)
+    goal = (run.settings.get("control") or {}).get("rate")
+    return IonRates(np.diff(edges) / time, "pulse" if pulse_length else "second", goal)
 
 
 class SimulatedVoltage:
@@ -40,6 +59,8 @@ class SimulatedVoltage:
         self.run = run
         self.flight_voltages = np.full(len(run), run.voltage)
         """Voltage of the free specimen in the flights [V], shape (n,), also if a control had another for the events."""
+        self.voltages: Floats = self.flight_voltages if run.clock is None else run.clock.voltages
+        """Voltage at each event [V], shape (n,)."""
 
     def __repr__(self) -> str:
         return f"{self.run.voltage:g} V"
@@ -47,18 +68,12 @@ class SimulatedVoltage:
     @property
     def is_constant(self) -> bool:
         """Whether all events have the same voltage."""
-        return self.run.clock is None
+        return self.voltages is self.flight_voltages
 
     @property
     def control(self) -> VoltageControl:
         """Rate, pulses and control of the voltage; the usual ones if the run has none."""
         return from_plain(self.run.settings.get("control") or {}, VoltageControl)
-
-    @property
-    def voltages(self) -> Floats:
-        """Voltage at each event [V], shape (n,)."""
-        clock = self.run.clock
-        return self.flight_voltages if clock is None else clock.voltages
 
     @property
     def instrument_voltages(self) -> Floats:
@@ -95,7 +110,17 @@ class SimulatedVoltage:
 
     def require_units(self, what: str) -> RealUnits:
         """Operating point of the run; ValueError for a run that is not in real units."""
-        raise ValueError(f"{what} needs a run in real units: use run.at_evaporation_field(), got {self.run!r}")
+        raise ValueError(
+            f"{what} needs a run in real units: use run.at_evaporation_field(), or --real-units, got {self.run!r}"
+        )
+
+    def in_real_units(self) -> "Run":
+        """The run in real units, at its evaporation field."""
+        return self.run.at_evaporation_field()
+
+    def ion_rates(self, edges: Integers) -> IonRates | None:
+        """Rates of the ions between these rows, by the clock of the run; None without one."""
+        return None if self.is_constant else rates_of_clock(self.run, edges)
 
     def columns(self, times: Floats, outcome: Integers) -> dict[str, Any]:
         """Columns of `Hits` that depend on the voltage.
@@ -164,6 +189,19 @@ class RealVoltage:
     def require_units(self, what: str) -> RealUnits:
         """Operating point of the run."""
         return self.units
+
+    def in_real_units(self) -> "Run":
+        """The run, which is in real units."""
+        return self.run
+
+    def ion_rates(self, edges: Integers) -> IonRates | None:
+        """Rates of the ions between these rows: by the clock, or by the pulses; None without both."""
+        if self.run.clock is not None:
+            return rates_of_clock(self.run, edges)
+        if self.control.pulse_fraction == 0:
+            return None
+        pulses = np.diff(self.real.pulse_ids[edges[1:] - 1], prepend=0)
+        return IonRates(np.diff(edges) / np.maximum(pulses, 1), "pulse", self.control.rate)
 
     def columns(self, times: Floats, outcome: Integers) -> dict[str, Any]:
         """Columns of `Hits` that an instrument would record: voltages, pulses, times with their errors, m/n of these.

@@ -43,7 +43,7 @@ def joined(parts: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     first, *others = parts
     systems = list(first.get("systems", ()))
     for part in others:
-        systems += [each for each in part.get("systems", ()) if each not in systems]
+        systems += [system for system in part.get("systems", ()) if system not in systems]
     return {**first, "systems": systems} if systems else dict(first)
 
 

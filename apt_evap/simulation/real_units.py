@@ -28,9 +28,9 @@ _SEED_STEP = 0x5851F42D4C957F2D  # other random numbers than those of the pertur
 _COLUMNS = 5  # random numbers per ion: isotope, charge, pulse, energy deficit, delay
 
 
-def _flight_charges(given, name):
+def _flight_charges(charges, name):
     """Charges in flight: one for all, by element (checked with the elements of a run), or `PostIonisation`."""
-    return given if isinstance(given, PostIonisation | Mapping) else check_count(given, name, at_least=1)
+    return charges if isinstance(charges, PostIonisation | Mapping) else check_count(charges, name, at_least=1)
 
 
 def _read_flight_charges(plain, name):
@@ -371,8 +371,7 @@ def _instrument_voltages(run, field_factor, voltages, operating_field):
     """Voltages of an instrument with a lens or a field factor, from those of the model."""
     if field_factor is None:
         return run.observation.lens.voltages(voltages, run.emissions.ions, operating_field)
-    if run.lens is not None:
-        raise ValueError(f"field_factor follows from the lens, got field_factor={field_factor:g} and a lens")
+    run.observation.lens.check_field_factor(field_factor)
     radius = run.settings["tip"].get("apex_radius")
     if radius is None:
         raise ValueError("field_factor needs the apex radius, which a tip made from positions does not have")
@@ -382,8 +381,9 @@ def _instrument_voltages(run, field_factor, voltages, operating_field):
 def _pulse_ids(run, control, excess, u):
     """Number of the pulse of each ion: from the clock, or drawn for the rate, or without pulses its own."""
     pulse_length = run.settings["pulse_length"]
-    if run.clock is not None and pulse_length:
-        return np.floor(np.cumsum(run.clock.waits) / pulse_length).astype(np.int64)
-    if run.clock is not None or control.pulse_fraction == 0:
+    if run.clock is not None:
+        in_pulses = np.floor(np.cumsum(run.clock.waits) / (pulse_length or 1.0)).astype(np.int64)
+        return in_pulses if pulse_length else np.arange(len(run))
+    if control.pulse_fraction == 0:
         return np.arange(len(run))
     return pulses_of(excess, control.rate, u)

@@ -11,7 +11,7 @@ from apt_evap._core.evaporation import EXHAUSTED, SWEEP_DUE
 from apt_evap.evaporation.emitter import Batch, Emitter
 from apt_evap.simulation.checkpoint import CheckpointWriter
 from apt_evap.simulation.history import History
-from apt_evap.simulation.monitor import Monitor, Watch
+from apt_evap.simulation.monitor import Monitor, MonitorState
 from apt_evap.simulation.run import Run
 from apt_evap.simulation.stop_reason import StopReason
 
@@ -95,7 +95,7 @@ class Recorder:
         self._first_event = self._stored[0].first_event if self._stored else emitter.counts["events"]
         self._started = len(self)
         interval = settings.interval or 10 * emitter.sweep_interval
-        self._monitor = Watch(settings, interval, n_evaporated - len(self), self._stored)
+        self._monitor = MonitorState(settings, interval, n_evaporated - len(self), self._stored)
         self._ending = StopReason.COMPLETE
         self._report = progress if callable(progress) else None
         self._bar = progress_bar(
@@ -168,7 +168,9 @@ class Recorder:
         """All ions so far as one run, with the last state whose events are all among them."""
         self._gather()
         run = Run.join([*self._stored, *self._new])
-        run = replace(run, history=History.join([run.history, self._monitor.take()]))  # which returns a check once
+        run = replace(
+            run, history=History.join([run.history, self._monitor.pop_history()])
+        )  # which returns a check once
         self._stored, self._new = [run], []
         state = self._emitter.state()
         if len(state.sites) <= self._first_event + len(run):

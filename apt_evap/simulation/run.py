@@ -174,8 +174,8 @@ class Run:
     def __repr__(self) -> str:
         flown = ", ".join(perturbation_text(perturbation) for perturbation in self.perturbations)
         responses = "" if self.responses is None else f"responses, {self.flagged.sum():,} of them flagged"
-        if responses and self.field_of_view is not None:
-            responses += f"; {self.not_flown.sum():,} ions not flown"
+        if not_flown := int(self.not_flown.sum()):
+            responses += f"; {not_flown:,} ions not flown"
         details = "; ".join(part for part in (responses, flown and f"flown: {flown}", self.ended) if part)
         operating = self.observation.operating
         return f"<Run: {len(self):,} ions of {', '.join(self.elements)} at {operating}; {details}>"
@@ -395,7 +395,7 @@ class Run:
 
     def in_real_units(self) -> "Run":
         """The same run in real units: itself if it is, otherwise at its evaporation field."""
-        return self if self.units is not None else self.at_evaporation_field()
+        return self.observation.operating.in_real_units()
 
     def require_real_units(self, what: str) -> RealUnits:
         """Operating point of a run in real units; ValueError, which begins with `what` needs it, for any other."""

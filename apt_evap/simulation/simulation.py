@@ -311,8 +311,8 @@ class Simulation:
             (ends, every), apex = flight(), self.tip.apex
             flown_ions = every if limited else None
             flown = []
-            for each in ends[: len(emissions)]:
-                directions, times = land(each, slowness, self.detector, apex)
+            for flights in ends[: len(emissions)]:
+                directions, times = land(flights, slowness, self.detector, apex)
                 flown.append(Flown(directions[:, 0], times[:, 0]))
             return Run(
                 emissions=emission_batch,
@@ -365,10 +365,10 @@ class Simulation:
         distances = np.array([criterion.nearest_neighbour_distance for criterion in self.tip.criteria])
         if (distances == distances[0]).all():
             return None
-        own = self.tip.phase_at(batch.site)
+        phase = self.tip.phase_at(batch.site)
         target = batch.targets[:, 0]
-        other = np.where(target >= 0, self.tip.phase_at(target), own)
-        return 0.5 * (distances[own] + distances[other])
+        other = np.where(target >= 0, self.tip.phase_at(target), phase)
+        return 0.5 * (distances[phase] + distances[other])
 
     def _check_atoms(self, n_ions):
         """Warn if there are fewer evaporable atoms than requested ions."""

@@ -1,8 +1,6 @@
 # The public names of this package: read by type checkers, and by the lazy loader in __init__.py.
 from .alloy import Segregation as Segregation
-from .isotopes import draw_isotopes as draw_isotopes
 from .lattice import atom_density as atom_density
-from .lattice import nearest_neighbour_distance as nearest_neighbour_distance
 from .lattice import rotation_to_axis as rotation_to_axis
 from .ordered import Superlattice as Superlattice
 from .ordered import UnitCell as UnitCell
@@ -14,4 +12,3 @@ from .regions import HalfSpace as HalfSpace
 from .regions import Layer as Layer
 from .regions import Sphere as Sphere
 from .regions import Union as Union
-from .shape import TaperedCap as TaperedCap

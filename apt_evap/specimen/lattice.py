@@ -303,6 +303,7 @@ def lattice_sites_in(
     origin = check_array(origin, "origin", (3,))
     bounds = check_array(bounds, "bounds", (2, 3))
     basis = np.array(BASES[structure], dtype=np.float64)
+    # blocks of cells that cover the bounds: indices of the first one, number, and radius of the sphere around one
     corners = np.array([[x, y, z] for x in bounds[:, 0] for y in bounds[:, 1] for z in bounds[:, 2]])
     corners = matrix_product(corners - origin, orientation) / edges
     first = np.floor((corners.min(axis=0) - 1) / block).astype(np.int64)
@@ -321,8 +322,10 @@ def lattice_sites_in(
         """Points of one layer of blocks; its first cell indices occur in no other layer."""
         rows = np.indices((1, count[1], count[2])).reshape(3, -1)
         rows[0] = layer
+        # blocks whose sphere reaches into the body
         low = (rows + first[:, None]) * block
         low = low[:, inside(_to_specimen((low + 0.5 * block) * edges[:, None], orientation, origin), reach)]
+        # sites of their cells, in parts that fit into the memory
         for start in range(0, low.shape[1], step):
             cell = (low[:, start : start + step, None] + cells[:, None, :]).reshape(3, -1)
             for site, fraction in enumerate(basis):
@@ -333,6 +336,7 @@ def lattice_sites_in(
                     labels = label(points, cell[:, mask], site)
                     mask[mask] = occupied = labels >= 0
                     points, labels = points[occupied], labels[occupied].astype(np.int32)
+                # key of a site: its place in the sequence of cells, whatever the blocks are
                 i, j, k = cell[:, mask] - (first * block)[:, None]
                 yield ((i * count[1] * block + j) * count[2] * block + k) * len(basis) + site, points, labels
 

@@ -27,7 +27,7 @@ def in_the_measured_frame(simulated, measured, registration):
     within = np.random.default_rng(0).uniform(-0.5, 0.5, (2, len(x)))
     x, y = registration.points(*(np.stack([x, y]) + within * np.array(simulated.bin_size)[:, None]))
     values, _, _ = np.histogram2d(y, x, (measured.y_edges, measured.x_edges))
-    back = registration.back(*(each.ravel() for each in np.meshgrid(*measured.centres)))
+    back = registration.inverse_points(*(each.ravel() for each in np.meshgrid(*measured.centres)))
     inside = (np.hypot(*back) < 0.49 * WIDTH).reshape(values.shape) & measured.mask
     return ae.DetectorMap.from_array(values, measured.x_edges, measured.y_edges, mask=inside, is_counts=True)
 

@@ -18,6 +18,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 import apt_evap as ae
+from apt_evap.plot.responses import ion_colors
+from apt_evap.plot.specimen_figures import mark_atoms
 
 ENERGIES = np.linspace(0, 1, 51)  # eV
 # numbers of nearest neighbours: 6 at a kink, 7 at a step, 8 in a row along a step; and directions from the cap centre
@@ -86,10 +88,10 @@ for (apex_view, detector), (element, axis, mechanism) in zip(
     rows, [("Al", (0, 1, 2), "lateral velocity"), ("Ni", (1, 1, 1), "roll-up")], strict=True
 ):
     emitter, run, ions = respond(element, axis, radius)
-    colors = ae.plot.ion_colors(len(ions))
+    colors = ion_colors(len(ions))
     name = f"{element}[{''.join(map(str, axis))}]"
     ae.plot.specimen(emitter, ax=apex_view, colormap="bone", title=f"{name}, R = {radius:g} a")
-    ae.plot.mark_atoms(run.emissions.positions[ions], apex_view, colors=colors)
+    mark_atoms(run.emissions.positions[ions], apex_view, colors=colors)
     ae.plot.response(run, ions, mechanism, detector, energies=ENERGIES, zoom=1, title=f"{name}, {mechanism}")
 
     unperturbed = ae.analysis.lateral_tracks(run, ions, [0.0], [0.0])

@@ -15,6 +15,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import apt_evap as ae
+from apt_evap.plot.profile_figures import rectangles as draw_rectangles
 
 # energies of Shaikh et al. for nickel
 ROLL_UP = ae.RollUp(ae.TruncatedNormal(mean=0.155, standard_deviation=0.155))
@@ -102,7 +103,7 @@ for row, (kind, rectangle) in enumerate(RECTANGLES.items()):
     map_axes = figure.add_subplot(panels[0, 0].get_gridspec()[2 * row : 2 * row + 2, 0])
     density = hits[0].map(like=ae.Detector(width=150.0).grid(150), position_step=None).smoothed(1.0)
     ae.plot.detector_map(density, map_axes, title=f"{kind} lines, {names[0]}")
-    ae.plot.rectangles(rectangles, map_axes)
+    draw_rectangles(rectangles, map_axes)
     axes = panels[2 * row : 2 * row + 2, 1]
     axes[1].sharex(axes[0])
     ae.plot.profile_comparison(*profiles, names, axes, lines=lines)

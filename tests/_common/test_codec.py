@@ -28,6 +28,7 @@ from apt_evap._common.codec import (
     to_python,
     vector,
 )
+from apt_evap.maps.registration.polynomial import Distortion
 
 NICKEL = ae.material("Ni")
 EXAMPLES = [
@@ -72,7 +73,7 @@ EXAMPLES = [
         ae.specimen.Superlattice("L1_2", "Al"),
         {"Cu": 0.1},
     ),
-    ae.maps.Distortion(2, (0.0, 1.0), 20.0, (1j, 0.1, 0.2 + 1j, 0.3)),
+    Distortion(2, (0.0, 1.0), 20.0, (1j, 0.1, 0.2 + 1j, 0.3)),
     ae.Registration(10.0, 0.5, (1.0, 2.0), True, ties=(ae.Registration(0.0, 1.0, (0, 0)),)),
 ]
 

@@ -34,11 +34,20 @@ from apt_evap._common.validation import (
     check_values,
     short_text,
 )
+from apt_evap.analysis.apex import field_factor
+from apt_evap.analysis.ion_image import critical_distance, tunnel_factor
+from apt_evap.analysis.voltage_history import evaporation_fields, evaporation_voltages, smoothed_history
 from apt_evap.config.cost_estimate import CostEstimate
 from apt_evap.config.simulation_file import read_config
+from apt_evap.emission.emissions import Emissions
 from apt_evap.emission.perturbations import perturbation_of
-from apt_evap.emission.surface_frame import target_shares
+from apt_evap.emission.surface_frame import tangent_frame, target_shares
+from apt_evap.maps.crystallography.directions import direction_normals, plane_normals
+from apt_evap.maps.crystallography.symmetry import point_group, pole_symmetry, symmetry_about_axis
+from apt_evap.maps.noise import effective_ions
+from apt_evap.maps.registration.polynomial import Distortion
 from apt_evap.simulation.real_units import RealUnits
+from apt_evap.specimen.lattice import nearest_neighbour_distance
 from apt_evap.specimen.materials import polarization_energy
 from apt_evap.specimen.shape import TaperedCap
 
@@ -305,7 +314,7 @@ CASES = [
     ),
     row(ae.maps.line_amplitude, {"ring": azimuths, "measured": azimuths}),
     row(ae.analysis.charge_history, {"charges": [1, 2, 2], "element": "Ni"}, sections=[0], least=[0]),
-    row(ae.analysis.smoothed_history, {"values": [1.0, 2.0]}, points=[0]),
+    row(smoothed_history, {"values": [1.0, 2.0]}, points=[0]),
     row(ae.analysis.charge_state_ratio_map, {"element": "Ni"}),
     row(ae.analysis.charge_state_ratio_history, {"element": "Ni"}),
     row(ae.Instrument, dead_time=[-0.1], dead_zone=[-0.1], resolution=[-0.1], quantisation=[(0.0, 1.0), (1.0, -1.0)]),
@@ -339,7 +348,7 @@ CASES = [
     row(ae.emission.IonRandom, {"seed": 1, "ions": [1]}, ions=[[0.5], [NAN], [2**70]]),
     row(ae.emission.IonRandom(1, [1]).uniform, columns=[0]),
     row(
-        ae.emission.Emissions,
+        Emissions,
         EMISSIONS,
         "nearest_neighbour_distance",
         normals=[[[0, 0, 2.0]], np.zeros((2, 3))],
@@ -355,7 +364,7 @@ CASES = [
         velocities=[np.zeros((2, 3))],
         rolled=[[1], [True, True]],
     ),
-    row(ae.emission.tangent_frame),
+    row(tangent_frame),
     row(
         ae.Hits,
         HITS,
@@ -552,7 +561,7 @@ CASES = [
         pole=[(0, 0, 0)],
         bins=[0],
     ),
-    row(ae.maps.effective_ions),
+    row(effective_ions),
     row(ae.io.read_grid, path=["a\x00b", "none.csv"]),
     row(ae.read_tip, path=["a\x00b", "none.lmp"]),
     row(
@@ -562,7 +571,7 @@ CASES = [
         rotations=[(2.0, 1.0)],
     ),
     row(ae.maps.register_distortion, {"simulated": grid, "measured": grid}),
-    row(ae.maps.Distortion, {"degree": 1, "centre": (0.0, 0.0), "radius": 1.0, "coefficients": (1.0,)}),
+    row(Distortion, {"degree": 1, "centre": (0.0, 0.0), "radius": 1.0, "coefficients": (1.0,)}),
     row(ae.fit.EnergyGrid, means=[[NAN], [0.0], [2.0, 1.0]]),
     row(ae.load, path=["a\x00b", "none.h5"]),
     row(ae.read, path=["a\x00b", "none.epos"]),
@@ -577,25 +586,25 @@ CASES = [
     ),
     row(ae.emission.field_of_ratio, {"element": "Ni", "charge": 1, "ratio": 0.1}, charge=[0, 1.5, 9], ratio=[-1.0]),
     row(
-        ae.analysis.tunnel_factor,
+        tunnel_factor,
         {"field": 44.0, "ionisation_energy": 24.6},
         "ionisation_energy",
         field=[0, -1.0, [1.0, 0.0], 10**400],
     ),
     row(
-        ae.analysis.critical_distance,
+        critical_distance,
         {"field": 44.0, "ionisation_energy": 24.6},
         "field ionisation_energy work_function",
     ),
-    row(ae.maps.plane_normals, {"material": nickel, "planes": [(1, 1, 1)]}, name=None),
-    row(ae.maps.direction_normals, {"material": nickel, "directions": [(1, 1, 1)]}, name=None),
+    row(plane_normals, {"material": nickel, "planes": [(1, 1, 1)]}, name=None),
+    row(direction_normals, {"material": nickel, "directions": [(1, 1, 1)]}, name=None),
     row(ae.maps.poles, {"material": nickel}),
     row(ae.maps.zones, {"material": nickel}),
-    row(ae.maps.point_group, {"structure": "fcc"}),
-    row(ae.maps.pole_symmetry, {"material": nickel, "direction": (1, 1, 1)}),
-    row(ae.maps.symmetry_about_axis, {"material": nickel, "orientation": np.eye(3)}),
+    row(point_group, {"structure": "fcc"}),
+    row(pole_symmetry, {"material": nickel, "direction": (1, 1, 1)}),
+    row(symmetry_about_axis, {"material": nickel, "orientation": np.eye(3)}),
     row(ae.specimen.atom_density, {"structure": "hcp", "a": 0.35}, "a c"),
-    row(ae.specimen.nearest_neighbour_distance, {"structure": "hcp", "a": 0.35}, "a c"),
+    row(nearest_neighbour_distance, {"structure": "hcp", "a": 0.35}, "a c"),
     row(ae.specimen.rotation_to_axis, {"material": nickel, "axis": (1, 1, 1)}),
     row(
         ae.detection.mass_to_charge,
@@ -650,9 +659,9 @@ NEEDS_A_RUN = [
     row(ae.analysis.field_ion_image),
     row(target_shares, {"sharpness": 0.1}),
     row(ae.analysis.image_compression),
-    row(ae.analysis.field_factor),
-    row(ae.analysis.evaporation_fields),
-    row(ae.analysis.evaporation_voltages),
+    row(field_factor),
+    row(evaporation_fields),
+    row(evaporation_voltages),
     row(ae.reconstruction.run_constants),
     row(ae.analysis.lateral_tracks, {"ions": [0], "energies": [0.1]}),
     row(ae.analysis.rollup_tracks, {"ions": [0], "energies": [0.1]}),
@@ -753,7 +762,7 @@ def test_bad_arguments_of_a_simulation_are_refused_by_name(tmp_path, monkeypatch
 
 
 # names of these are tried in the tests of their packages
-OTHER_PACKAGES = (ae.plot, ae.explore, ae.studies, ae.config)
+OTHER_PACKAGES = (ae.plot, ae.studies)
 # made by the package
 MADE = {"FileError", "TruncatedFile", "Outcome", "StopReason", "RunInterrupted", "RunNotSaved", "Run", "EmitterState"}
 MADE |= {"Reconstruction", "Study", "ZoneLine", "History", "CapHistory", "Ring", "RadiusFit", "TipFit", "Distortion"}

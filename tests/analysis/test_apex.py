@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
+from apt_evap.analysis.apex import field_factor
+from apt_evap.emission.emissions import Emissions
 from apt_evap.maps.crystallography.directions import poles
 
 
@@ -20,9 +22,7 @@ class Receding:
         sites = around * (self.radius + rng.uniform(-0.1, 0.1, n))[:, None] - np.outer(self.depth, [0, 0, 1])
         self.fields = self.voltage / (2.5 * self.radius)
         zeros = np.zeros(n)
-        self.emissions = ae.emission.Emissions(
-            sites, around, np.full((n, 3), np.nan), zeros + 1, zeros + 58.7, np.arange(n), 0.25
-        )
+        self.emissions = Emissions(sites, around, np.full((n, 3), np.nan), zeros + 1, zeros + 58.7, np.arange(n), 0.25)
         seen = 100.0 * (np.tan(angle / compression) if projection == "plane" else angle / compression)
         inside = np.maximum(np.abs(seen * np.cos(azimuth)), np.abs(seen * np.sin(azimuth))) <= 100
         outcome = np.where(inside, ae.detection.Outcome.HIT, ae.detection.Outcome.MISSED)
@@ -79,7 +79,7 @@ def test_without_the_centre_of_the_moment_the_compression_is_wrong():
 
 def test_the_field_factor_of_a_run_is_that_of_its_apex():
     run = Receding(1.5)
-    np.testing.assert_allclose(ae.analysis.field_factor(run), 2.5, rtol=0.01)  # the radii are known to 0.08 of 14 nm
+    np.testing.assert_allclose(field_factor(run), 2.5, rtol=0.01)  # the radii are known to 0.08 of 14 nm
 
 
 def test_poles_fall_on_the_dark_spots_of_a_simulated_map(run20):

@@ -18,6 +18,7 @@ from rough import ROUGH
 import apt_evap as ae
 from apt_evap._common.codec import for_json
 from apt_evap.cli.main import main
+from apt_evap.plot.report.html_page import read_report
 
 ROLLUP = ae.RollUp(ae.TruncatedNormal(0.2, 0.1))
 FILES = {"study.json", "scores.csv", "scores.png", "maps.png", "registration.png", "report.html"}
@@ -97,7 +98,7 @@ def test_everything_is_written(folder, capsys, rough_layout):
     for name in FILES:
         if name.endswith(".png"):
             assert imread(f"study/{name}")[..., :3].std() > 0.05
-    report = ae.plot.read_report("study/report.html")
+    report = read_report("study/report.html")
     assert report["study"] == held
     assert report["origin"]["command"] == shlex.join(
         ["apt-evap", "compare", "run.h5", "map.npz", "-o", "study", *QUICK, *HERE]
@@ -234,7 +235,7 @@ def test_a_doubtful_registration_is_told_once_and_kept(folder, capsys):
     out, err = capsys.readouterr()
     assert "registration" not in err and out.count("the registration, correlation") == 1
     assert "registration.png, --registration sets" in out
-    told = ae.plot.read_report("noise/report.html")["origin"]["warnings"]
+    told = read_report("noise/report.html")["origin"]["warnings"]
     assert not any("registration" in text for text in told)  # the report has a sentence of its own
     assert Path("noise/report.html").read_text().count("The registration is doubtful") == 1
     assert json.loads(Path("noise/study.json").read_text())["registration"]["doubtful"] is True

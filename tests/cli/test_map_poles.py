@@ -6,6 +6,7 @@ import pytest
 import apt_evap as ae
 from apt_evap import plot
 from apt_evap.cli.main import main
+from apt_evap.maps.crystallography.symmetry import point_group
 
 
 @pytest.fixture
@@ -40,7 +41,7 @@ def test_poles_of_a_measured_map_are_searched_or_given(drawn, capsys):
     (orientation, there), (searched, where) = drawn
     assert orientation == truth and there.scale == 60.0
     # an axis and its mirror image look alike; 0.5 degrees: a bin of the map is 0.52 degrees wide
-    axes = ae.maps.point_group("bcc") @ truth.matrix[2]
+    axes = point_group("bcc") @ truth.matrix[2]
     assert np.degrees(np.arccos((axes @ searched.matrix[2]).max())) < 0.5
     assert where.scale == pytest.approx(60.0, rel=0.02)
     for wrong, name in (

@@ -138,7 +138,7 @@ def test_ions_are_exported_as_an_instrument_would_write_them(made, tmp_path, mon
     assert main(["export", "ni.epos", "-o", "other.epos", "--perturbation", "Unperturbed"]) == 2
     assert "--perturbation needs a run (.h5), 'ni.epos' contains measured ions" in capsys.readouterr().err
     assert main(["export", str(made / "cold.h5"), "-o", "x.pos", "--jitter", "0.1"]) == 2
-    assert "add --real-units" in capsys.readouterr().err
+    assert "or --real-units" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -59,7 +59,10 @@ def test_a_run_is_compared_with_its_sites(tmp_path, monkeypatch, small_tip, nick
     command = ["reconstruct", "ni.h5", "--real-units", "--element", "Ni", "--field-factor", "1.3"]
     command += ["--detector-radius", "80", "-o", "ni.pos"]
     assert main([word for word in command if word != "--real-units"]) == 2
-    assert "'ni.h5' has the voltages of a simulation: add --real-units" in capsys.readouterr().err
+    assert (
+        "the field factor needs a run in real units: use run.at_evaporation_field(), or --real-units"
+        in capsys.readouterr().err
+    )
     assert main([*command, "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["settings"]["distance"] == 100.0

@@ -9,7 +9,8 @@ import pytest
 import apt_evap as ae
 from apt_evap._common.files import FileError
 from apt_evap.cli.main import main
-from apt_evap.config.simulation_file import config_of, read_document
+from apt_evap.config.perturbation_text import read_perturbation
+from apt_evap.config.simulation_file import config_of, read_config, read_document
 
 MODULE = '''
 from __future__ import annotations
@@ -98,7 +99,7 @@ def folder(tmp_path, monkeypatch):
 def read(folder, text, responses="true"):
     path = folder / "a.toml"
     path.write_text(SETTINGS.format(responses=responses) + text)
-    return ae.config.read_config(path)
+    return read_config(path)
 
 
 def test_a_perturbation_without_responses_is_flown(folder):
@@ -154,7 +155,7 @@ def test_a_rule_bonds_and_a_region_of_ones_own(folder):
     text = '[tip]\napex_radius = 1.5\nseed = 1\n[simulation]\nions = 5\n[[phases]]\nname = "a:b"\nmaterial = "Ni"\n'
     text += '[[phases]]\nname = "ball"\nmaterial = "Ni"\nsolutes = { Al = 0.5 }\n'
     (folder / "b.toml").write_text(text + 'region = { name = "mine:Ball", radius = 1.0 }\n')
-    phases = ae.config.read_config(folder / "b.toml").tip["phases"]
+    phases = read_config(folder / "b.toml").tip["phases"]
     assert phases[0].name == "a:b" and phases[1].region.radius == 1.0
 
 
@@ -206,5 +207,5 @@ def test_settings_that_the_user_has_not_given_import_nothing(folder):
     (folder / "study.toml").write_text('base = "a.toml"\n[sweep]\n"tip.apex_radius" = [1.5, 2.0]\n')
     assert main(["sweep", str(folder / "study.toml"), "-o", "work", "--plan"]) == 2
     with pytest.raises(ValueError, match="mine:FromAbove"):
-        ae.config.read_perturbation(json.loads('{"name": "mine:FromAbove", "height": 0.3}'))
+        read_perturbation(json.loads('{"name": "mine:FromAbove", "height": 0.3}'))
     assert not list(folder.rglob("imported"))

@@ -14,6 +14,8 @@ from apt_evap.detection.detector import Detector
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.io.formats import read
+from apt_evap.plot.limits import color_limits
+from apt_evap.plot.map_figures import describe
 
 SILICON = Path(__file__).parents[3] / "shared" / "data" / "Si.epos"
 
@@ -275,8 +277,8 @@ def test_pictures_share_a_scale_and_state_what_they_show(tmp_path):
     ax.figure.savefig(tmp_path / "a.png")
     axes = plot.detector_maps([map, map.smoothed(1.0)], ["as it is", "smoothed"])
     assert len({ax.images[0].get_clim() for ax in axes}) == 1
-    low, high = plot.color_limits(map)
-    assert low < 1 < high and "smoothed by 1 mm" in plot.describe(map.smoothed(1.0))
+    low, high = color_limits(map)
+    assert low < 1 < high and "smoothed by 1 mm" in describe(map.smoothed(1.0))
     with pytest.raises(ValueError, match="one title per map"):
         plot.detector_maps([map], ["a", "b"])
 
@@ -286,9 +288,9 @@ def test_what_lies_outside_is_counted():
     map = Hits(x=np.append(x, 25.0), y=np.append(y, 0.0)).map(bins=175)
     inside = int(map.counts[map.mask].sum())
     for each in (map, map.smoothed(0.5), map.flattened(5.0)):
-        assert plot.describe(each).startswith(f"{inside:,} of 100,001 ions, ") and "of 100,001 ions" in repr(each)
+        assert describe(each).startswith(f"{inside:,} of 100,001 ions, ") and "of 100,001 ions" in repr(each)
     whole = Hits(x=x, y=y).map(bins=4, mask=np.ones((4, 4), bool))
-    assert plot.describe(whole).startswith("100,000 ions, ")
+    assert describe(whole).startswith("100,000 ions, ")
 
 
 @pytest.mark.skipif(not SILICON.exists(), reason="the measured Si.epos is not there")

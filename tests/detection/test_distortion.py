@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import apt_evap as ae
+from apt_evap.detection.distortion import DistortionGrid
 
 SIDE = 0.28  # of the squares of the grid [mm]
 MAGNIFICATION = 11.0
@@ -42,7 +43,7 @@ def similarity(first, second):
 def test_a_distortion_is_removed(rng):
     """Places between the crossings: within what a piecewise affine map leaves, an eighth of h^2 f'' (0.03 mm)."""
     grid = crossings()
-    distortion = ae.detection.DistortionGrid(distorted(grid), grid)
+    distortion = DistortionGrid(distorted(grid), grid)
     inside = rng.uniform(-1.2, 1.2, (2000, 2))
     x, y = distortion.undistorted(*distorted(inside).T)
     # up to the similarity transform that fits the crossings best
@@ -59,12 +60,12 @@ def test_crossings_stay_crossings(seed, mirror):
     grid = crossings(7)
     flipped = grid * [1, -1 if mirror else 1]
     places = distorted(grid, 0.002)
-    distortion = ae.detection.DistortionGrid(places, flipped)
+    distortion = DistortionGrid(places, flipped)
     rng = np.random.default_rng(seed)
     middle = places[np.hypot(*grid.T) < 0.6]
     x, y = distortion.undistorted(*middle.T)
     assert ae.maps.register_points(grid[np.hypot(*grid.T) < 0.6], np.column_stack([x, y])).residual < 1e-12
-    straight = ae.detection.DistortionGrid(similar(grid), flipped)
+    straight = DistortionGrid(similar(grid), flipped)
     some = similar(rng.uniform(-0.5, 0.5, (20, 2)))
     assert np.column_stack(straight.undistorted(*some.T)) == pytest.approx(some, abs=1e-12)
     assert straight.residual < 1e-12
@@ -72,7 +73,7 @@ def test_crossings_stay_crossings(seed, mirror):
 
 def test_ions_outside_are_counted(rng):
     grid = crossings()
-    distortion = ae.detection.DistortionGrid(distorted(grid), grid)
+    distortion = DistortionGrid(distorted(grid), grid)
     places = distorted(rng.uniform(-1.9, 1.9, (1000, 2)))
     far = np.hypot(*(places - [1.5, -0.8]).T) > 24
     hits = ae.Hits(x=places[:, 0], y=places[:, 1], voltage=np.arange(1000.0))
@@ -93,7 +94,7 @@ def test_ions_outside_are_counted(rng):
 def test_quantised_coordinates_become_continuous(rng):
     """With steps of 0.1 mm: no steps and no empty bins afterwards, the same for the same seed."""
     grid = crossings()
-    distortion = ae.detection.DistortionGrid(distorted(grid), grid)
+    distortion = DistortionGrid(distorted(grid), grid)
     x, y = (np.round(rng.uniform(-8, 8, 100_000) / 0.1) * 0.1 for _ in "xy")
     hits = ae.Hits(x=x, y=y)
     assert hits.map(64).position_step == pytest.approx((0.1, 0.1))
@@ -117,4 +118,4 @@ def test_quantised_coordinates_become_continuous(rng):
 )
 def test_bad_grids_are_refused(change, words):
     with pytest.raises(ValueError, match=words):
-        ae.detection.DistortionGrid(*change(distorted(crossings()), crossings()))
+        DistortionGrid(*change(distorted(crossings()), crossings()))

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.emission import Emissions, Migration
+from apt_evap.emission import Migration
+from apt_evap.emission.emissions import Emissions
 from apt_evap.emission.roll_probability import AT_REST, BY_CHARGE
 from apt_evap.specimen.materials import material
 from apt_evap.units import BOLTZMANN, ELEMENTARY_CHARGE

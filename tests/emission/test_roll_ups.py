@@ -7,7 +7,7 @@ import apt_evap as ae
 from apt_evap._common import ion_random
 from apt_evap._common.ion_random import IonRandom
 from apt_evap.emission.emissions import Emissions
-from apt_evap.emission.surface_frame import rollup_direction, target_shares
+from apt_evap.emission.surface_frame import roll_ups, rollup_direction, target_shares
 
 ENERGY = ae.TruncatedNormal(0.2, 0.1)
 
@@ -48,9 +48,9 @@ def test_launches_follow_every_option(emissions):
 
 
 def test_roll_ups_are_computed_once(emissions):
-    kept = ae.emission.roll_ups(emissions, 0.2)
-    assert ae.emission.roll_ups(emissions, 0.2) is kept
-    assert ae.emission.roll_ups(emissions, 0.3) is not kept and ae.emission.roll_ups(emissions, 0.2) is not kept
+    kept = roll_ups(emissions, 0.2)
+    assert roll_ups(emissions, 0.2) is kept
+    assert roll_ups(emissions, 0.3) is not kept and roll_ups(emissions, 0.2) is not kept
     for array in kept:
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 0
@@ -58,12 +58,12 @@ def test_roll_ups_are_computed_once(emissions):
 
 def test_roll_ups_have_the_shares_of_their_targets(emissions):
     shares = target_shares(emissions, 0.2)
-    possible, *along, kept = ae.emission.roll_ups(emissions, 0.2)
+    possible, *along, kept = roll_ups(emissions, 0.2)
     np.testing.assert_array_equal(kept, shares)
     np.testing.assert_array_equal([possible, *along], rollup_direction(emissions, shares))
     np.testing.assert_array_equal(possible, np.isfinite(emissions.targets[:, 0]).all(axis=1))
     assert 0 < possible.sum() < 500
-    assert ae.emission.roll_ups(emissions).shares is None
+    assert roll_ups(emissions).shares is None
 
 
 def test_unknown_targets_are_refused(emissions):
@@ -72,9 +72,9 @@ def test_unknown_targets_are_refused(emissions):
         Emissions(**(columns | {"targets": None}), nearest_neighbour_distance=0.25)
     del columns["targets"], columns["charge_ratios"]
     without = Emissions(**columns, nearest_neighbour_distance=0.25)
-    assert ae.emission.roll_ups(without).possible.any()
+    assert roll_ups(without).possible.any()
     with pytest.raises(ValueError, match="wide"):
-        ae.emission.roll_ups(without, 0.2)
+        roll_ups(without, 0.2)
     with pytest.raises(ValueError, match="wide"):
         rollup_direction(without, np.full((500, 3), 1 / 3))
 

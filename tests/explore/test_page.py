@@ -11,7 +11,10 @@ import pytest
 from rough import ROUGH
 
 import apt_evap as ae
+from apt_evap.config.simulation_file import read_config
 from apt_evap.explore.explorer import Explorer, ExplorerSettings
+from apt_evap.explore.specimen_surface import surface_atoms
+from apt_evap.plot.limits import color_limits, common_limits
 
 pytest.importorskip("bokeh")
 
@@ -253,7 +256,7 @@ def test_a_click_shows_atoms(opened):
     view = page.specimen.view
     assert np.array_equal(view.marked.data["px"] + view.centre[0], atoms.positions[:, 0])
     assert page.specimen.click.data == {"x": [5.0], "y": [-3.0], "radius": [page.specimen.radius.value]}
-    drawn = ae.explore.surface_atoms(page.explorer.run)
+    drawn = surface_atoms(page.explorer.run)
     assert np.allclose(view.points.data["z"] + view.centre[2], drawn.positions[:, 2], atol=1e-5)
     before = view.points.data["color"]
     page.specimen.color.value = "field"
@@ -273,7 +276,7 @@ def test_the_specimen_follows_the_ions(opened):
     opened.settle(lambda: opened.shows(preview=True))
     throttled(page.ions.slider, (1500, 2000))
     opened.settle(opened.shows)
-    view, drawn = page.specimen.view, ae.explore.surface_atoms(page.explorer.run, ions=(1500, 2000))
+    view, drawn = page.specimen.view, surface_atoms(page.explorer.run, ions=(1500, 2000))
     assert len(drawn.positions) != before
     assert np.allclose(view.points.data["z"] + view.centre[2], drawn.positions[:, 2], atol=1e-5)
 
@@ -349,9 +352,9 @@ def test_a_measurement_alone(measured):
 def test_each_map_has_its_own_scale(opened):
     page = opened.page
     own = _limits(page)
-    assert own == [ae.plot.color_limits(each) for each in page.maps.pictures]
+    assert own == [color_limits(each) for each in page.maps.pictures]
     page.figures.same_scale.active = True
-    assert _limits(page) == [ae.plot.common_limits(page.maps.pictures)] * 2
+    assert _limits(page) == [common_limits(page.maps.pictures)] * 2
     page._reset_display()
     assert _limits(page) == own
 
@@ -565,7 +568,7 @@ def test_settings_are_written_and_run(measured, tmp_path, monkeypatch):
     assert "exists" in panel.text.text and str(path) in panel.text.text and path.read_text() == "mine"
     panel._write()
     opened.settle(lambda: not panel.write.disabled)
-    config = ae.config.read_config(path)
+    config = read_config(path)
     assert config.tip["material"].name == "Ni" and "not searched" in path.read_text()
     assert page.code.python.text == path.read_text() and str(path) in panel.text.text
     # fewer ions, for the test
@@ -577,7 +580,7 @@ def test_settings_are_written_and_run(measured, tmp_path, monkeypatch):
     assert asked == [str(tmp_path / "tip.h5")] and len(ae.load(tmp_path / "tip.h5")) == 200
     assert (
         page.simulation._state.registration_options[asked[0]]["start"].shift
-        == index.settings(1.0, 1).near["start"].shift
+        == index.settings(1.0, 1).registration["start"].shift
     )
     assert panel.start.label == "start the run"
 

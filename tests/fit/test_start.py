@@ -10,7 +10,9 @@ import pytest
 
 import apt_evap as ae
 from apt_evap.cli.main import main
+from apt_evap.config.simulation_file import read_config
 from apt_evap.fit.start_settings import FIELD_FACTOR, MARK
+from apt_evap.maps.crystallography.symmetry import point_group
 from apt_evap.maps.indexing.master_pattern import master_patterns
 
 
@@ -26,15 +28,15 @@ def test_the_settings_are_those_of_the_map(found, tmp_path):
     truth, indexing = found
     start = ae.fit.settings_of(indexing, minutes=5)
     start.save(tmp_path / "nickel.toml")
-    config = ae.config.read_config(tmp_path / "nickel.toml")
+    config = read_config(tmp_path / "nickel.toml")
     tip = {name: config.tip[name] for name in ("material", "axis", "rotation")}
     made = ae.Orientation(**tip)
     # what the tip shows at the centre of its detector is what the map shows at the centre of its field of view
     places = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 12.0]])
-    centre = np.array(start.near["start"].shift)
+    centre = np.array(start.registration["start"].shift)
     simulated = config.detector.seen_from_apex.compressed(1.03).directions(places) @ made.matrix
     measured = ae.detection.Projection(60.0).directions(places + centre) @ truth.matrix
-    group = ae.maps.point_group("fcc")
+    group = point_group("fcc")
     angles = [np.degrees(np.arccos(np.clip((simulated @ each * measured).sum(axis=1), -1, 1))).max() for each in group]
     assert min(angles) < 1.5  # of the indexing
     assert config.detector.width > 70.0
@@ -138,7 +140,7 @@ def test_a_material_of_a_user_is_that_of_the_run(found, tmp_path, name):
     best = replace(indexing.best, orientation=replace(indexing.best.orientation, material=mine))
     start = ae.fit.settings_of(replace(indexing, candidates=(best,)), minutes=5)
     start.save(tmp_path / "mine.toml")
-    config = ae.config.read_config(tmp_path / "mine.toml")
+    config = read_config(tmp_path / "mine.toml")
     assert config.tip["material"] == mine and config.tip["material"].polarizability is None
     assert config.tip["apex_radius"] == pytest.approx(start.simulated_radius)
 

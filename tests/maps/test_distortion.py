@@ -7,11 +7,11 @@ from hypothesis import strategies as st
 
 import apt_evap as ae
 from apt_evap._common.codec import for_json, from_plain
-from apt_evap.maps.registration.polynomial import fit_polynomial, terms_of
+from apt_evap.maps.registration.polynomial import Distortion, fit_polynomial, terms_of
 
 TRUE = ae.Registration(
     17.0, 0.4, (3.0, -2.0),
-    distortion=ae.maps.Distortion(2, (2.5, -1.5), 20.0, (0.3 + 0.1j, 0.9 - 0.5j, -0.6 + 0.4j, 0.2j)),
+    distortion=Distortion(2, (2.5, -1.5), 20.0, (0.3 + 0.1j, 0.9 - 0.5j, -0.6 + 0.4j, 0.2j)),
 )  # fmt: skip
 
 
@@ -30,7 +30,9 @@ def test_exact_points_give_the_exact_map(rng, degree, mirror):
     assert found.mirror == mirror and found.distortion.degree == (degree or 2)
     other, places = points_of(rng, 50, mirror=mirror)
     assert np.column_stack(found.points(*other.T)) == pytest.approx(places, abs=1e-9)
-    assert np.column_stack(found.back(*places.T)) == pytest.approx(other, abs=1e-4)  # 1e-6 of 20 mm over the scale
+    assert np.column_stack(found.inverse_points(*places.T)) == pytest.approx(
+        other, abs=1e-4
+    )  # 1e-6 of 20 mm over the scale
     assert found.residual < 1e-9
 
 
@@ -95,23 +97,23 @@ def test_back_is_the_inverse(seed):
     coefficients = 0.4 * (rng.normal(size=8) + 1j * rng.normal(size=8))
     registration = ae.Registration(
         rng.uniform(-180, 180), 0.5, (1.0, 2.0), bool(seed % 2),
-        distortion=ae.maps.Distortion(3, (0.0, 0.0), 20.0, tuple(coefficients)),
+        distortion=Distortion(3, (0.0, 0.0), 20.0, tuple(coefficients)),
     )  # fmt: skip
     x, y = rng.uniform(-12, 12, (2, 100))
-    u, v = registration.back(*registration.points(x, y))
+    u, v = registration.inverse_points(*registration.points(x, y))
     # not where a distortion of up to 8 x 0.5 mm over 20 mm folds the plane over: that is NaN
     good = np.isfinite(u)
     assert good.mean() > 0.9 and np.abs(u - x)[good].max() < 1e-3 and np.abs(v - y)[good].max() < 1e-3
     plain = for_json(registration)
     assert for_json(from_plain(plain, ae.Registration)) == plain
-    with pytest.raises(ValueError, match="no inverse Registration, use back"):
+    with pytest.raises(ValueError, match="no inverse Registration, use inverse_points"):
         registration.inverse  # noqa: B018
 
 
 def test_terms():
     assert len(terms_of(0)) == 0 and len(terms_of(1)) == 1 and len(terms_of(2)) == 4 and len(terms_of(3)) == 8
     with pytest.raises(ValueError, match="coefficients"):
-        ae.maps.Distortion(2, (0, 0), 1.0, (1.0,))
+        Distortion(2, (0, 0), 1.0, (1.0,))
 
 
 def test_a_distortion_is_found_from_maps(run20):

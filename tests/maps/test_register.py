@@ -251,20 +251,20 @@ def test_order_of_the_steps():
 def test_an_anchor_changes_no_transform(registration, place, point):
     anchored = registration.transform.anchored(place)
     assert anchored.place == place
-    assert anchored.forth(anchored.anchor) == place
-    assert anchored.forth(point) == pytest.approx(registration.transform.forth(point), abs=1e-6)
-    assert anchored.back(anchored.forth(point)) == pytest.approx(point, abs=1e-6)
-    assert anchored.inverse.forth(place) == anchored.anchor
-    assert anchored.inverse.forth(point) == pytest.approx(anchored.back(point), abs=1e-6)
+    assert anchored.apply(anchored.anchor) == place
+    assert anchored.apply(point) == pytest.approx(registration.transform.apply(point), abs=1e-6)
+    assert anchored.apply_inverse(anchored.apply(point)) == pytest.approx(point, abs=1e-6)
+    assert anchored.inverse.apply(place) == anchored.anchor
+    assert anchored.inverse.apply(point) == pytest.approx(anchored.apply_inverse(point), abs=1e-6)
 
 
 @given(transforms, st.floats(-180, 180), st.floats(0.1, 10))
 def test_turning_and_stretching_leaves_the_anchor_where_it_is(registration, rotation, scale):
     anchored = registration.transform.anchored(3 - 4j)
     turned = replace(anchored, rotation=anchored.rotation + rotation, scale=anchored.scale * scale)
-    assert turned.forth(turned.anchor) == 3 - 4j
-    distance = abs(anchored.forth(anchored.anchor + 1) - (3 - 4j))
-    assert abs(turned.forth(turned.anchor + 1) - (3 - 4j)) == pytest.approx(scale * distance)
+    assert turned.apply(turned.anchor) == 3 - 4j
+    distance = abs(anchored.apply(anchored.anchor + 1) - (3 - 4j))
+    assert abs(turned.apply(turned.anchor + 1) - (3 - 4j)) == pytest.approx(scale * distance)
 
 
 def test_a_registration_moves_points_as_its_formula_says():

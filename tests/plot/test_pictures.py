@@ -20,6 +20,10 @@ from apt_evap.analysis.charge_states import charge_history, charge_state_ratio_m
 from apt_evap.analysis.voltage_history import evaporation_voltages, smoothed_history
 from apt_evap.maps.profiles import Profile
 from apt_evap.plot._figure import set_log_ticks
+from apt_evap.plot.map_figures import specimen_title
+from apt_evap.plot.profile_figures import rectangles
+from apt_evap.plot.responses import ion_colors
+from apt_evap.plot.specimen_figures import mark_atoms
 
 
 @pytest.fixture(scope="module")
@@ -145,7 +149,7 @@ def test_a_round_field_of_view_is_a_circle_and_a_run_has_a_title(run):
         assert len(drawn) == circles
         for circle in drawn:  # the mean of 4,400 bins of 0.4 mm
             assert circle.center == pytest.approx((2, -1), abs=0.02) and circle.radius == pytest.approx(15, abs=0.02)
-    (ax,) = plot.detector_maps([run.hits(ae.Unperturbed())], ["own"], title=plot.specimen_title(run))
+    (ax,) = plot.detector_maps([run.hits(ae.Unperturbed())], ["own"], title=specimen_title(run))
     assert ax.get_title() == "own" and ax.figure.get_suptitle() == "Ni, axis [$111$], R = 2.1 nm"
     assert_nothing_cut_off(ax.figure)
 
@@ -249,7 +253,7 @@ def test_a_slice_shows_the_atoms_of_each_phase(tmp_path):
 def test_marks_are_around_the_atoms(emitter):
     ax = plot.specimen(emitter, elevation=30, azimuth=-60)
     atoms = np.argsort(-emitter.normals[:, 2], kind="stable")[[0, 7]]  # they face upwards, so are drawn
-    plot.mark_atoms(emitter.positions[atoms], ax, colors=["red", "blue"], elevation=30, azimuth=-60)
+    mark_atoms(emitter.positions[atoms], ax, colors=["red", "blue"], elevation=30, azimuth=-60)
     marks = ax.collections[-1]
     drawn = discs_of(ax).get_offsets()
     for place in marks.get_offsets():
@@ -514,7 +518,7 @@ def test_response_to_lateral_velocities(run, tmp_path):
     tracks = ae.analysis.lateral_tracks(run, ions, [1.0], np.arange(0, 360, 2))
     farthest = cloud.get_offsets()[cloud.get_array() == 1]
     np.testing.assert_allclose(farthest[:, 0], tracks.x.ravel(), atol=1e-9)
-    np.testing.assert_array_equal(dots.get_facecolors(), [to_rgba(color) for color in plot.ion_colors(3)])
+    np.testing.assert_array_equal(dots.get_facecolors(), [to_rgba(color) for color in ion_colors(3)])
     (inset,) = ax.child_axes
     assert np.all(
         np.abs(np.subtract(dots.get_offsets()[1], [np.mean(inset.get_xlim()), np.mean(inset.get_ylim())])) < 10
@@ -581,7 +585,7 @@ def test_rectangles_on_a_map():
     random = np.random.default_rng(1)
     ax = plot.detector_map(ae.Hits(x=random.uniform(-9, 9, 4000), y=random.uniform(-9, 9, 4000)).map(bins=20))
     chosen = ae.maps.Rectangle((1, 2), 30, 6, 4)
-    plot.rectangles([chosen, chosen.turned(120)], ax, labels=["a", "b"])
+    rectangles([chosen, chosen.turned(120)], ax, labels=["a", "b"])
     assert [text.get_text() for text in ax.texts[-2:]] == ["a", "b"]
     np.testing.assert_allclose(ax.patches[-2].get_xy()[:4], chosen.corners)
 

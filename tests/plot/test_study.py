@@ -19,6 +19,7 @@ from matplotlib.image import imread
 from rough import ROUGH
 
 import apt_evap as ae
+from apt_evap.plot.report.html_page import read_report
 from apt_evap.plot.report.origin import recorded_warnings
 from apt_evap.plot.report.study_report import doubts
 
@@ -84,7 +85,7 @@ def test_the_reader_sees_what_would_be_loaded():
 
 
 def test_the_study_is_inside(study, page):
-    content = ae.plot.read_report(page)
+    content = read_report(page)
     assert content["study"] == json.loads(json.dumps(study.to_dict()))
     origin = content["origin"]
     assert origin["command"] == "apt-evap compare 'a b'" and origin["warnings"] == ["1 < 2"]
@@ -190,7 +191,7 @@ def test_hostile_names_are_text(study, tmp_path):
     seen = Reader((tmp_path / "r.html").read_text())
     assert len(seen.all("img")) == 4 and all(each.startswith(("data:", "#")) for each in seen.addresses)
     assert seen.text.count("</script><img src=http:x onerror=alert(1)>&\N{REPLACEMENT CHARACTER}$title") == 4
-    assert ae.plot.read_report(tmp_path / "r.html")["origin"]["command"] == name
+    assert read_report(tmp_path / "r.html")["origin"]["command"] == name
 
 
 def test_what_is_refused(study, tmp_path):
@@ -203,10 +204,10 @@ def test_what_is_refused(study, tmp_path):
     assert os.listdir(tmp_path) == []
     (tmp_path / "r.html").write_text("<html></html>")
     with pytest.raises(ae.FileError, match="is not a report"):
-        ae.plot.read_report(tmp_path / "r.html")
+        read_report(tmp_path / "r.html")
     (tmp_path / "r.html").write_text('<script type="application/json" id="origin">{</script>')
     with pytest.raises(ae.FileError, match="is a damaged report"):
-        ae.plot.read_report(tmp_path / "r.html")
+        read_report(tmp_path / "r.html")
 
 
 def test_warnings_are_recorded_and_shown():

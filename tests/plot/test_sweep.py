@@ -7,6 +7,7 @@ import pytest
 from html_reader import Reader
 
 import apt_evap as ae
+from apt_evap.plot.report.html_page import read_report
 from apt_evap.plot.report.sweep_report import SweepRow
 
 
@@ -39,7 +40,7 @@ def test_points_in_the_order_of_their_similarity(study, tmp_path):
     assert len(seen.all("tr", "best")) == 1 and len(seen.all("span", "red")) == 1
     # measured and simulated map of the best point, and the similarity against the radius
     assert len(seen.all("img")) == 3 and all(each.startswith(("data:", "#")) for each in seen.addresses)
-    content = ae.plot.read_report(tmp_path / "s.html")
+    content = read_report(tmp_path / "s.html")
     assert [row["name"] for row in content["points"]] == ["0b1d", "3f9c", "77aa"]
     assert content["points"][1]["study"] == json.loads(json.dumps(study.to_dict()))
 

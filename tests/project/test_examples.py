@@ -1,12 +1,15 @@
-"""The examples in the docstrings of the public names run, and their output is as shown.
+"""The examples in the docstrings run, and their output is as shown.
 
 Examples do not repeat ``import apt_evap as ae`` and ``import numpy as np``. Each runs in an empty folder.
 """
 
+import ast
 import doctest
+import importlib
 import inspect
 from itertools import pairwise
 from operator import attrgetter
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,6 +30,18 @@ NAMES = [
     *FRONT_ROW,
     *(name for name in (*SPACES, *IN_SPACES) if ">>>" in (inspect.getdoc(attrgetter(name)(ae)) or "")),
 ]
+PACKAGE = Path(ae.__file__).parent
+
+
+def of_modules():
+    """Module and name of each function or class with an example, but for the public ones."""
+    public = {id(attrgetter(name)(ae)) for name in NAMES}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        module = ".".join(("apt_evap", *path.relative_to(PACKAGE).with_suffix("").parts))
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and ">>>" in (ast.get_docstring(node) or ""):
+                if id(getattr(importlib.import_module(module), node.name)) not in public:
+                    yield f"{module}:{node.name}"
 
 
 def titles(docstring):
@@ -62,6 +77,16 @@ def test_examples_are_the_last_section(name):
     found = titles(inspect.getdoc(attrgetter(name)(ae)))
     assert found[-1] == "Examples"
     assert found == sorted(found, key=SECTIONS.index) and len(set(found)) == len(found)
+
+
+@pytest.mark.docs
+@pytest.mark.filterwarnings("error::UserWarning")
+@pytest.mark.parametrize("place", [*of_modules()])
+def test_examples_of_helpers_show_what_they_print(place, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    module, name = place.split(":")
+    helper = getattr(importlib.import_module(module), name)
+    assert run_examples(doctest.DocTestFinder().find(helper, name, globs={"ae": ae, "np": np})) == ""
 
 
 def test_a_wrong_example_is_found():

@@ -232,3 +232,13 @@ def test_a_reconstruction_takes_the_lens_of_the_run(real):
     assert constants["lens"] == real.lens.lens and "field_factor" not in constants
     found = ae.reconstruct(seen.hits(ae.Unperturbed()), **constants)
     assert found.radii == pytest.approx(real.lens.radii(found.hits.ion), rel=0.05)
+
+
+def test_both_lenses_and_both_voltages_have_the_same_interface(run, real):
+    """Code takes a voltage or a lens from the observation, whichever of the two it is."""
+    for simulated, observed in (
+        (run.observation.lens, real.observation.lens),
+        (run.observation.operating, real.observation.operating),
+    ):
+        names = {name for name in dir(simulated) if not name.startswith("_")}
+        assert len(names) > 4 and names <= set(dir(observed))

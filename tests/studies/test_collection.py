@@ -8,6 +8,7 @@ from sweeps import do, planned
 
 import apt_evap as ae
 from apt_evap.cli.main import main
+from apt_evap.plot.report.html_page import read_report
 from apt_evap.studies.sweep import collection as collection_module
 from apt_evap.studies.sweep.collection import collect_sweep
 from apt_evap.studies.sweep.planning import open_sweep, sweep_status
@@ -79,7 +80,7 @@ def test_the_maps_are_those_of_the_runs(sweep, collected):
 
 def test_the_report_has_all_points(sweep, collected):
     assert collected["files"][-1] == str(sweep.folder / "report.html")
-    rows = {row["name"]: row for row in ae.plot.read_report(sweep.folder / "report.html")["points"]}
+    rows = {row["name"]: row for row in read_report(sweep.folder / "report.html")["points"]}
     assert set(rows) == set(sweep.keys)
     states = {point.key: state for point, state in sweep.states()}
     for key, row in rows.items():
@@ -151,7 +152,7 @@ def test_a_sweep_finds_the_tip_of_a_measured_map(tmp_path, capsys, monkeypatch):
     assert content["settings_of_best"] == {"tip.axis": [1, 1, 1], "tip.offset_seed": 1}
     assert len(content["compare"]["sha256"]) == 64
     assert float(best["similarity"]) == pytest.approx(content["table"][0]["similarity"], rel=1e-5)
-    made = ae.plot.read_report(sweep.folder / "report.html")
+    made = read_report(sweep.folder / "report.html")
     assert [row["name"] for row in made["points"]] == [sweep.keys[1], sweep.keys[0]]
     assert made["points"][0]["study"]["optimum"]["score"]["value"] > 0
     assert "sweep collect" in made["origin"]["command"]

@@ -5,6 +5,7 @@ import pytest
 
 import apt_evap as ae
 from apt_evap.specimen.lattice import lattice_sites_in
+from apt_evap.studies.visibility.false_order import warren_cowley
 
 A = 0.352  # nm
 
@@ -21,7 +22,7 @@ def cube():
 
 def test_a_perfect_order_has_no_like_neighbours(cube):
     sites, corners = cube
-    assert ae.studies.warren_cowley(sites, corners) == 1.0
+    assert warren_cowley(sites, corners) == 1.0
 
 
 def test_the_parameter_is_that_of_a_double_loop(cube):
@@ -30,7 +31,7 @@ def test_the_parameter_is_that_of_a_double_loop(cube):
     distances = np.linalg.norm(sites[:, None] - sites, axis=2)
     near = (distances <= 0.4) & (distances > 0)
     like = near[solute][:, solute].sum() / near[solute].sum()
-    assert ae.studies.warren_cowley(sites, solute, 0.4) == pytest.approx(1 - like / solute.mean(), abs=1e-12)
+    assert warren_cowley(sites, solute, 0.4) == pytest.approx(1 - like / solute.mean(), abs=1e-12)
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,8 @@ import scipy
 import apt_evap as ae
 from apt_evap._common.codec import to_plain
 from apt_evap.studies.visibility.cases import bottom_of, coordinates, simulated, specimen_of, varied
-from apt_evap.studies.visibility.probability import apparent_shape
+from apt_evap.studies.visibility.probability import apparent_shape, permutation_p_value
+from apt_evap.studies.visibility.recorded import recorded_ions
 
 NICKEL = ae.material("Ni")
 FIELD = NICKEL.evaporation_field
@@ -96,7 +97,7 @@ def test_permuted_labels_have_uniform_p_values(operators):
     ions = operators.emulate(1, size=0.8)
     some = slice(None, None, 5)
     p_values = [
-        ae.studies.permutation_p_value(
+        permutation_p_value(
             lambda positions, labels: positions[labels == 0, 2].mean(),
             ions.positions[some], random.permutation(ions.labels[some]), permutations=99, seed=random,
         )
@@ -115,7 +116,7 @@ def test_a_sequential_p_value_stops_and_is_as_large():
         calls.append(0)
         return places[kinds == 1, 0].mean()
 
-    p = ae.studies.permutation_p_value(analysis, positions, labels, permutations=999, exceedances=5)
+    p = permutation_p_value(analysis, positions, labels, permutations=999, exceedances=5)
     assert len(calls) < 500 and p == 5 / (len(calls) - 1)
 
 
@@ -154,7 +155,7 @@ def test_the_emulator_agrees_with_full_simulations(ratio, limit):
         run = simulated(variant, arguments, seed=50 + number, depth=operators.depth, n_threads=1)
         emulated = [operators.emulate(k, size=size, field_ratio=ratio) for k in range(20)]
         rows = []
-        for ions in (ae.studies.recorded_ions(run, EVERYTHING), *emulated):
+        for ions in (recorded_ions(run, EVERYTHING), *emulated):
             seen, true = apparent_shape(variant, ions, 1)
             rows.append([seen["lateral"], seen["depth"], seen["composition"] - true["composition"]])
         full, mean = np.array(rows[0]), np.mean(rows[1:], axis=0)
@@ -250,7 +251,7 @@ def test_an_analysis_without_a_number_is_named(returned):
         return returned
 
     with pytest.raises(ValueError, match=r"analysis .*of_three must return a number"):
-        ae.studies.permutation_p_value(of_three, places, np.arange(50) % 2)
+        permutation_p_value(of_three, places, np.arange(50) % 2)
 
 
 def test_permuted_labels_without_a_number_are_an_error():
@@ -260,7 +261,7 @@ def test_permuted_labels_without_a_number_are_an_error():
         return 1.0 if np.array_equal(kinds, labels) else math.nan
 
     with pytest.raises(ValueError, match="unstable"):
-        ae.studies.permutation_p_value(unstable, places, labels)
+        permutation_p_value(unstable, places, labels)
 
 
 @pytest.mark.parametrize(("permutations", "significance"), [(18, 0.05), (98, 0.01), (1, 0.3)])

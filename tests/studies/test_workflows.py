@@ -11,6 +11,7 @@ from rough import ROUGH
 
 import apt_evap as ae
 from apt_evap.cli.main import main
+from apt_evap.plot.report.html_page import read_report
 from apt_evap.warnings import WorkflowWarning
 
 SMALL = """
@@ -110,7 +111,7 @@ def test_a_comparison_is_that_of_the_command(folder, pair, capsys):
     assert contents[0] == contents[1] == study.to_dict()
     names = {path.name for path in Path("shell").iterdir()}
     assert {path.name for path in Path("mine").iterdir()} == names
-    origin = ae.plot.read_report("mine/report.html")["origin"]
+    origin = read_report("mine/report.html")["origin"]
     assert [described["name"] for described in origin["files"]] == ["run.h5", "map.npz"] and not origin["command"]
 
 

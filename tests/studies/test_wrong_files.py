@@ -17,6 +17,7 @@ import apt_evap as ae
 from apt_evap._common.files import FileError
 from apt_evap.cli.main import main
 from apt_evap.config.simulation_file import key_of
+from apt_evap.plot.report.html_page import read_report
 from apt_evap.simulation.checkpoint import Checkpoint
 from apt_evap.studies.sweep.collection import collect_sweep
 from apt_evap.studies.sweep.planning import open_sweep, plan_sweep, retry, sweep_status
@@ -189,7 +190,7 @@ def test_one_damaged_run_does_not_stop_the_others(sweep, damage):
     row = row_of(sweep, key)
     assert row["state"] == "wrong" and "run.h5" in row["message"] and "\n" not in row["message"]
     assert [row_of(sweep, each)["state"] for each in sweep.keys if each != key] == ["done"] * 3
-    assert len(ae.plot.read_report(sweep.folder / "report.html")["points"]) == 4
+    assert len(read_report(sweep.folder / "report.html")["points"]) == 4
 
 
 # ---- links and pipes -----------------------------------------------------------------------------------------------

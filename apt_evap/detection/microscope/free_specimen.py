@@ -14,6 +14,21 @@ class FreeSpecimen:
     lens: Any = None
     """The lens of the instrument: none."""
 
+    def lens_settings(self) -> dict[str, Any]:
+        """Settings of the lens: none."""
+        return {}
+
+    def figures(self, ions: ArrayLike) -> dict[str, Floats]:
+        """Figures of the lens for each ion: none."""
+        return {}
+
+    def constants(self, voltages: Floats, flight_length: float) -> dict[str, Any]:
+        """Constants of a reconstruction that follow from the lens: none."""
+        return {}
+
+    def check_field_factor(self, field_factor: float) -> None:
+        """Any field factor is possible."""
+
     def voltages(self, model: Floats, ions: ArrayLike, field: float) -> Floats:
         """Voltages of the instrument [V], shape (n,): those of the model, as for `RunLens.voltages`."""
         return model

@@ -157,6 +157,7 @@ class Lens:
         # from the cap to the distance s = start: series of the displacement along the surface and of the time,
         # t = sqrt(2 (s - h) / F) (1 + (s - h) / 6 R)
         radius, start, count = self.radius, max(self._start, 2 * height), len(angles)
+        # first part of the path, where the elements of the surface are inaccurate: series in its length over the radius
         field = self._cap_field(angles**2)
         bend = 2 * angles * self._cap_field.deriv()(angles**2) / field / radius
         way = start - height

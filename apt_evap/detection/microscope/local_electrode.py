@@ -179,7 +179,7 @@ class LocalElectrode:
         Parameters
         ----------
         name : str
-            One of `detection.ELECTRODE_PRESETS`.
+            One of `ELECTRODE_PRESETS`.
         **changes
             Parameters of `LocalElectrode` that are changed, such as the angle of the shank.
 

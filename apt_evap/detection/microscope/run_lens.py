@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from apt_evap._common.codec import checked, part, settings
+from apt_evap._common.codec import checked, part, settings, to_plain
 from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_array, check_kind
 from apt_evap.detection.detector import Detector
@@ -137,6 +137,27 @@ class RunLens:
         """Radius of the image that the electrode leaves [mm], on a plane at this flight length [mm]; the least one."""
         angles, radii = self._table[:, 2], self._table[:, 1]
         return float(np.nanmin(self.lens.distance_from_axis(angles, radii, voltage, flight_length)))
+
+    def lens_settings(self) -> dict[str, Any]:
+        """Settings of the lens in plain types, those that differ from the defaults."""
+        return to_plain(self.lens, short=True)
+
+    def figures(self, ions: ArrayLike) -> dict[str, Floats]:
+        """Radius of the cap [nm], field factor and compression when these ions leave, each of shape (n,)."""
+        radii = self.radii(ions)
+        return {
+            "radius": radii,
+            "field_factor": self.lens.field_factor(radii),
+            "compression": self.lens.compression(radii),
+        }
+
+    def constants(self, voltages: Floats, flight_length: float) -> dict[str, Any]:
+        """Constants of a reconstruction that follow from the lens: itself, and the radius of the image [mm]."""
+        return {"lens": self.lens, "rim": self.rim(float(np.min(voltages)), flight_length)}
+
+    def check_field_factor(self, field_factor: float) -> None:
+        """Raise ValueError: the field factor is that of the lens."""
+        raise ValueError(f"field_factor follows from the lens, got field_factor={field_factor:g} and a lens")
 
     def voltages(self, model: Floats, ions: ArrayLike, field: float) -> Floats:
         """Voltages of the instrument.

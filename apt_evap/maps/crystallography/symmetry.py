@@ -69,8 +69,9 @@ def pole_symmetry(material: Any, direction: ArrayLike) -> PoleSymmetry:
 
     Examples
     --------
+    >>> from apt_evap.maps.crystallography.symmetry import pole_symmetry
     >>> for direction in ((0, 0, 1), (1, 1, 1), (0, 1, 1), (1, 1, 3), (1, 2, 3)):
-    ...     print(ae.maps.pole_symmetry(ae.material("Ni"), direction).name)
+    ...     print(pole_symmetry(ae.material("Ni"), direction).name)
     4mm
     3m
     2mm

@@ -39,7 +39,7 @@ class Fit(NamedTuple):
         return self.score * np.sqrt(self.overlap)
 
 
-class Near(NamedTuple):
+class ShiftBounds(NamedTuple):
     """Bounds of the shift: the measured position of a simulated point."""
 
     anchor: complex
@@ -156,7 +156,7 @@ def search(
     scales: Any,
     mirrors: Any,
     least: float,
-    near: Near | None = None,
+    shift_bounds: ShiftBounds | None = None,
 ) -> list[Fit]:
     """Find the best shift for every rotation, scale and mirror.
 
@@ -168,7 +168,7 @@ def search(
         Values to try: [degrees], numbers, bools.
     least : float
         Smallest common fraction of the measured field of view.
-    near : Near, optional
+    shift_bounds : ShiftBounds, optional
         Bounds of the shift.
 
     Returns
@@ -181,7 +181,7 @@ def search(
     image = measured.flatten(NARROW * pixel, broad)
     # frames at the measured centre that rotate with the simulated map
     frames = [SimilarityTransform(float(rotation), 1.0, place=measured.centre) for rotation in rotations]
-    rotated = [image.sample(frame.forth(grid)) for frame in frames]
+    rotated = [image.sample(frame.apply(grid)) for frame in frames]
     fits = []
     for scale in scales:
         image = simulated.flatten(NARROW * pixel / scale, broad / scale)
@@ -194,17 +194,17 @@ def search(
         fixed = [spectra(*values, size) for values in rotated]
         for mirror in mirrors:
             unshifted = SimilarityTransform(0.0, float(scale), mirror, simulated.centre)
-            moving = spectra(*image.sample(unshifted.back(points)), size)
+            moving = spectra(*image.sample(unshifted.apply_inverse(points)), size)
             allowed: Any = True
             for frame, values, (_, inside) in zip(frames, fixed, rotated, strict=True):
-                if near is not None:
-                    target = frame.back(near.place) - unshifted.forth(near.anchor)
-                    allowed = np.abs(shifts - target) <= max(near.tolerance, pixel)
+                if shift_bounds is not None:
+                    target = frame.apply_inverse(shift_bounds.place) - unshifted.apply(shift_bounds.anchor)
+                    allowed = np.abs(shifts - target) <= max(shift_bounds.tolerance, pixel)
                 score, shared = correlate(moving, values, size)
                 overlap = np.minimum(shared / np.count_nonzero(inside), 1)
                 best = np.argmax(np.where(allowed & (overlap >= least), score * np.sqrt(overlap), -1))
                 if overlap.flat[best] >= least:
-                    place = complex(frame.forth(shifts.flat[best]))
+                    place = complex(frame.apply(shifts.flat[best]))
                     transform = replace(unshifted, rotation=frame.rotation, place=place)
                     fits.append(Fit(transform, float(score.flat[best]), float(overlap.flat[best])))
     return sorted(fits, key=lambda fit: -fit.rank)
@@ -227,7 +227,7 @@ def refine(
     least: float,
     rotations: tuple[float, ...] | None = None,
     scales: tuple[float, ...] | None = None,
-    near: Near | None = None,
+    shift_bounds: ShiftBounds | None = None,
 ) -> Fit:
     """Maximise the correlation near a transform.
 
@@ -243,7 +243,7 @@ def refine(
         Smallest common fraction of the measured field of view.
     rotations, scales : tuple of float, optional
         Lower and upper bound; equal bounds fix the value.
-    near : Near, optional
+    shift_bounds : ShiftBounds, optional
         Bounds of the shift.
 
     Returns
@@ -255,11 +255,13 @@ def refine(
     values, inside = measured.flatten(NARROW * pixel, broad).sample(points)
     points, values = points[inside], values[inside]
     image = simulated.flatten(NARROW * pixel / transform.scale, broad / transform.scale)
+    # start: about the centre of the measured map, or about the point of the bounds, moved into them
     start = transform.anchored(measured.centre)
-    if near is not None:
-        offset = transform.forth(near.anchor) - near.place
-        offset = complex(*np.clip((offset.real, offset.imag), -near.tolerance, near.tolerance))
-        start = replace(transform, anchor=near.anchor, place=near.place + offset)
+    if shift_bounds is not None:
+        offset = transform.apply(shift_bounds.anchor) - shift_bounds.place
+        offset = complex(*np.clip((offset.real, offset.imag), -shift_bounds.tolerance, shift_bounds.tolerance))
+        start = replace(transform, anchor=shift_bounds.anchor, place=shift_bounds.place + offset)
+    # unknowns in units of the steps of the search, with their bounds; equal bounds fix an unknown
     free = [rotations is None or rotations[0] < rotations[1], scales is None or scales[0] < scales[1], True, True]
     units = np.array([ROTATION_STEP / 2, SCALE_STEP / 2, pixel, pixel])
     low, high = np.full(4, -np.inf), np.full(4, np.inf)
@@ -267,9 +269,9 @@ def refine(
         low[0], high[0] = (np.asarray(rotations) - start.rotation) / units[0]
     if scales is not None:
         low[1], high[1] = np.log(np.asarray(scales) / start.scale) / units[1]
-    if near is not None:
+    if shift_bounds is not None:
         offset = np.array([offset.real, offset.imag])
-        low[2:], high[2:] = (-near.tolerance - offset) / pixel, (near.tolerance - offset) / pixel
+        low[2:], high[2:] = (-shift_bounds.tolerance - offset) / pixel, (shift_bounds.tolerance - offset) / pixel
 
     def moved(steps):
         turn, stretch, x, y = _spread(steps, free) * units
@@ -282,11 +284,12 @@ def refine(
 
     def fit(steps):
         transform = moved(steps)
-        values_there, shared = image.sample(transform.back(points))
+        values_there, shared = image.sample(transform.apply_inverse(points))
         overlap = np.count_nonzero(shared) / len(points)
         return Fit(transform, correlation(values_there[shared], values[shared]) if overlap >= least else -1.0, overlap)
 
     low, high = np.minimum(low, 0)[free], np.maximum(high, 0)[free]  # the start is inside, apart from rounding
+    # simplex of one step along each unknown, backwards at an upper bound
     simplex = np.vstack([np.zeros(len(low)), np.diag(np.where(high >= 1, 1.0, -1.0))])
     options = {"initial_simplex": np.clip(simplex, low, high), "xatol": 2e-3, "fatol": 1e-6, "maxiter": 400}
     bounds = scipy.optimize.Bounds(low, high)

@@ -16,7 +16,7 @@ _FILLED = 0.7  # fraction of a patch inside both maps
 
 
 def patch_displacements(
-    simulated: View, measured: View, back: Callable[[Any, Any], Any], scale: float
+    simulated: View, measured: View, inverse_points: Callable[[Any, Any], Any], scale: float
 ) -> tuple[Any, Any, Floats]:
     """Places of patches by a registration, their places on the measured map, and weights.
 
@@ -24,8 +24,8 @@ def patch_displacements(
     ----------
     simulated, measured : View
         The maps.
-    back : callable
-        `Registration.back`.
+    inverse_points : callable
+        `Registration.inverse_points`.
     scale : float
         Scale of the registration.
 
@@ -54,7 +54,7 @@ def patch_displacements(
     patches = []
     for centre in (measured.centre + places + 1j * places[:, None]).ravel():
         points = centre + patch
-        x, y = back(points.real, points.imag)
+        x, y = inverse_points(points.real, points.imag)
         known = np.isfinite(x)
         values, inside = moving.sample(np.where(known, x + 1j * y, 1e9))
         if np.count_nonzero(inside) < _FILLED * inside.size:

@@ -75,17 +75,17 @@ class Distortion:
             c * w**j * np.conj(w) ** k for c, (j, k) in zip(self.coefficients, terms_of(self.degree), strict=True)
         )
 
-    def forth(self, points: Any) -> Any:
+    def apply(self, points: Any) -> Any:
         """Distort points, complex of any shape [mm]."""
         return points + self.shift(points)
 
-    def back(self, points: Any) -> Any:
-        """Points that `forth` moves to these, by fixed point iteration; NaN where it does not converge."""
+    def apply_inverse(self, points: Any) -> Any:
+        """Points that `apply` moves to these, by fixed point iteration; NaN where it does not converge."""
         origins = np.asarray(points, complex)
         with np.errstate(over="ignore", invalid="ignore"):
             for _ in range(_ITERATIONS):
                 origins = points - self.shift(origins)
-            wrong = ~(np.abs(self.forth(origins) - points) <= 1e-6 * self.radius)
+            wrong = ~(np.abs(self.apply(origins) - points) <= 1e-6 * self.radius)
         return np.where(wrong, np.nan, origins)
 
 
@@ -126,6 +126,7 @@ def fit_polynomial(source: Any, target: Any, degree: int | None, weights: ArrayL
     source, target = np.asarray(source, complex), np.asarray(target, complex)
     n = len(source)
     weights = np.ones(n) if weights is None else check_array(weights, "weights", (n,))
+    # similarity transform, then coordinates about the centre of the moved points in units of their radius
     linear = np.column_stack([source, np.ones(n)])
     root = np.sqrt(weights)
     similarity = np.linalg.lstsq(linear * root[:, None], target * root, rcond=None)[0]
@@ -133,6 +134,7 @@ def fit_polynomial(source: Any, target: Any, degree: int | None, weights: ArrayL
     centre = complex(np.mean(moved))
     radius = max(float(np.abs(moved - centre).max()), 1e-9)
     w = (moved - centre) / radius
+    # fits of rising degree, as long as errors have a freedom
     fits = {}
     for trial in range(LARGEST_DEGREE + 1) if degree is None else sorted({0, degree}):
         matrix = np.column_stack([w, np.ones(n), *(w**j * np.conj(w) ** k for j, k in terms_of(trial))])
@@ -141,6 +143,7 @@ def fit_polynomial(source: Any, target: Any, degree: int | None, weights: ArrayL
                 raise ValueError(f"degree {degree} needs more than {matrix.shape[1]} points, got {n}")
             break
         fits[trial] = _least_squares(matrix, target, root)
+    # degree: the largest one that an F test and the left-out points prefer to the one before
     chosen, probabilities = 0, {}
     for trial in sorted(fits)[1:]:
         lower, higher = fits[chosen], fits[trial]
@@ -151,6 +154,7 @@ def fit_polynomial(source: Any, target: Any, degree: int | None, weights: ArrayL
         probabilities[trial] = float(scipy.stats.f.sf(ratio, more, freedom))
         if degree is not None or (probabilities[trial] < SIGNIFICANCE and higher.validated < lower.validated):
             chosen = trial
+    # linear part and the rest of the best fit
     best = fits[chosen]
     turn, shift, *others = best.values
     distortion = None

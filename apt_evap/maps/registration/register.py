@@ -30,7 +30,7 @@ from apt_evap.maps.registration.correlation_search import (
     NARROW,
     ROTATION_STEP,
     SCALE_STEP,
-    Near,
+    ShiftBounds,
     View,
     distinct,
     refine,
@@ -153,12 +153,12 @@ class Registration:
             Measured detector coordinates [mm].
         """
         z = check_values(x, "x", finite=False) + 1j * check_values(y, "y", finite=False)
-        z = self.transform.forth(z)
+        z = self.transform.apply(z)
         if self.distortion is not None:
-            z = self.distortion.forth(z)
+            z = self.distortion.apply(z)
         return z.real, z.imag
 
-    def back(self, x: ArrayLike, y: ArrayLike) -> tuple[Floats, Floats]:
+    def inverse_points(self, x: ArrayLike, y: ArrayLike) -> tuple[Floats, Floats]:
         """Move points of the measured frame into the simulated one; NaN where a distortion cannot be inverted.
 
         Parameters
@@ -173,8 +173,8 @@ class Registration:
         """
         z = check_values(x, "x", finite=False) + 1j * check_values(y, "y", finite=False)
         if self.distortion is not None:
-            z = self.distortion.back(z)
-        z = self.transform.back(z)
+            z = self.distortion.apply_inverse(z)
+        z = self.transform.apply_inverse(z)
         return z.real, z.imag
 
     def hits(self, hits: Hits) -> Hits:
@@ -200,13 +200,13 @@ class Registration:
         Raises
         ------
         ValueError
-            With a distortion: use `back`.
+            With a distortion: use `inverse_points`.
         """
         if self.distortion is not None:
-            raise ValueError("a registration with a distortion has no inverse Registration, use back(x, y)")
+            raise ValueError("a registration with a distortion has no inverse Registration, use inverse_points(x, y)")
         inverse = self.transform.inverse
         back = Registration(inverse.rotation, inverse.scale, (0.0, 0.0), inverse.mirror)
-        shift = -back.transform.forth(inverse.anchor)  # with the angle of `back`, to the last bit
+        shift = -back.transform.apply(inverse.anchor)  # with the angle of `back`, to the last bit
         return replace(back, shift=(float(shift.real), float(shift.imag)))
 
     @property
@@ -328,31 +328,24 @@ def register(
     if start is not None and not isinstance(start, Registration):
         raise ValueError(f"start must be a Registration, got {start!r:.80}")
     least = check_number(overlap, "overlap", above=0, at_most=1)
-    near = _near(start, pole, tolerance, measured)
-    if start is not None:
-        rotations = (start.rotation - 15, start.rotation + 15) if rotations is None else rotations
-        scales = (start.scale / 1.2, start.scale * 1.2) if scales is None else scales
-        mirrors = (start.mirror,) if mirrors is None else mirrors
-    if rotations is not None:
-        rotations = _range(rotations, "rotations", unit="degrees")
-        rotations = None if rotations[1] - rotations[0] >= 360 else rotations
-    if scales is None:
-        ratio = measured.diameter / simulated.diameter
-        scale_range, scales = (np.sqrt(0.5) * ratio, 5 * ratio), None
-    else:
-        scale_range = scales = _range(scales, "scales", above=0)
-    mirrors = (False, True) if mirrors is None else check_sequence(mirrors, "mirrors", "True and False")
-    mirrors = tuple(dict.fromkeys(check_switch(mirror, "mirrors") for mirror in mirrors))
-    if not mirrors:
-        raise ValueError("mirrors must contain False, True or both, got none")
+    shift_bounds = _shift_bounds(start, pole, tolerance, measured)
+    rotations, scales, mirrors = _transform_bounds(start, rotations, scales, mirrors)
+    ratio = measured.diameter / simulated.diameter
+    scale_range = (np.sqrt(0.5) * ratio, 5 * ratio) if scales is None else scales
+
+    # all transforms on a grid of rotations and scales, with the best shift of each
     angles = np.arange(0, 360, ROTATION_STEP) if rotations is None else _steps(rotations, ROTATION_STEP)
-    fits = search(simulated, measured, angles, np.exp(_steps(np.log(scale_range), SCALE_STEP)), mirrors, least, near)
+    fits = search(
+        simulated, measured, angles, np.exp(_steps(np.log(scale_range), SCALE_STEP)), mirrors, least, shift_bounds
+    )
     if not fits:
         raise ValueError(
             f"the simulated map must cover at least {least:.0%} of the measured field of view (overlap), which is "
             f"impossible for scales of {scale_range[0]:.3g} to {scale_range[1]:.3g}"
         )
-    bounds = rotations, scales, near
+
+    # the best of them refined with few pixels, then with many; those within the noise of the best one are ties
+    bounds = rotations, scales, shift_bounds
     fits = [refine(simulated, measured, fit.transform, MEDIUM, least, *bounds) for fit in distinct(fits, _MAX_FITS)]
     fits = distinct(sorted(fits, key=lambda fit: -fit.rank), _MAX_FITS)
     fits = [fit for fit in fits if fit.rank > fits[0].rank - 2 * _noise(fits[0], MEDIUM)]
@@ -361,7 +354,9 @@ def register(
     fits = sorted(fits, key=lambda fit: -fit.rank)
     fits = distinct([fit for fit in fits if fit.rank > fits[0].rank - _noise(fits[0], FINE)], _MAX_FITS)
     fits.sort(key=lambda fit: fit.transform.mirror)  # stable: each kind stays in the order of its rank
-    method = "search" if near is None else "start" if pole is None else "pole"
+
+    # the result, with what may be wrong
+    method = "search" if shift_bounds is None else "start" if pole is None else "pole"
     best, *ties = (_registration(fit, method) for fit in fits)
     best = replace(best, ties=tuple(ties))
     best.warn_if_doubtful()
@@ -485,8 +480,8 @@ def register_distortion(
     moving, fixed = _view(simulated, "simulated"), _view(measured, "measured")
     best = replace(registration, distortion=None)
     for _ in range(2):  # repeated with patches of the distorted map
-        centres, targets, weights = patch_displacements(moving, fixed, best.back, best.scale)
-        x, y = best.back(centres.real, centres.imag)
+        centres, targets, weights = patch_displacements(moving, fixed, best.inverse_points, best.scale)
+        x, y = best.inverse_points(centres.real, centres.imag)
         source = x - 1j * y if best.mirror else x + 1j * y
         fit = fit_polynomial(source, targets, degree, weights)
         if fit.degree == 0:
@@ -586,13 +581,31 @@ def _least_squares(source, target, mirror):
     return Registration(angle, float(abs(factor)), shift, mirror, residual=float(residual), method="points")
 
 
-def _near(start, pole, tolerance, measured):
+def _transform_bounds(start, rotations, scales, mirrors):
+    """Ranges of rotations [degrees] and scales, None for all, and kinds of mirrors; by default those about a start."""
+    if start is not None:
+        rotations = (start.rotation - 15, start.rotation + 15) if rotations is None else rotations
+        scales = (start.scale / 1.2, start.scale * 1.2) if scales is None else scales
+        mirrors = (start.mirror,) if mirrors is None else mirrors
+    if rotations is not None:
+        rotations = _range(rotations, "rotations", unit="degrees")
+        rotations = None if rotations[1] - rotations[0] >= 360 else rotations
+    if scales is not None:
+        scales = _range(scales, "scales", above=0)
+    mirrors = (False, True) if mirrors is None else check_sequence(mirrors, "mirrors", "True and False")
+    mirrors = tuple(dict.fromkeys(check_switch(mirror, "mirrors") for mirror in mirrors))
+    if not mirrors:
+        raise ValueError("mirrors must contain False, True or both, got none")
+    return rotations, scales, mirrors
+
+
+def _shift_bounds(start, pole, tolerance, measured):
     """Bounds of the shift from a pole or a start, or None."""
     if pole is not None:
         (x, y), (at_x, at_y) = check_array(pole, "pole", (2, 2)).tolist()
         anchor, place, fraction = complex(x, y), complex(at_x, at_y), 1 / 50
     elif start is not None:
-        x, y = start.back(measured.centre.real, measured.centre.imag)
+        x, y = start.inverse_points(measured.centre.real, measured.centre.imag)
         anchor, place, fraction = complex(x, y), measured.centre, 1 / 5
     elif tolerance is not None:
         raise ValueError(f"tolerance needs a pole or a start, got {short_text(tolerance)} alone")
@@ -600,7 +613,7 @@ def _near(start, pole, tolerance, measured):
         return None
     if tolerance is None:
         tolerance = fraction * measured.diameter
-    return Near(anchor, place, check_number(tolerance, "tolerance", at_least=0, unit="mm"))
+    return ShiftBounds(anchor, place, check_number(tolerance, "tolerance", at_least=0, unit="mm"))
 
 
 def at_bound(value: float, ends: tuple[float, float]) -> bool:
@@ -608,7 +621,7 @@ def at_bound(value: float, ends: tuple[float, float]) -> bool:
     return min(value - ends[0], ends[1] - value) < _AT_BOUND * (ends[1] - ends[0])
 
 
-def _bounds_reached(transform, rotations, scales, near):
+def _bounds_reached(transform, rotations, scales, shift_bounds):
     """Descriptions of the numbers of a transform that are within 1 % of a bound of the search."""
     reached = []
     for name, value, ends in (("rotation", transform.rotation, rotations), ("scale", transform.scale, scales)):
@@ -618,11 +631,11 @@ def _bounds_reached(transform, rotations, scales, near):
                 value = low + (value - low + 180.0) % 360.0 - 180.0 if value < low or value > high else value
             if at_bound(value, ends):
                 reached.append(f"{name} {value:.4g} of {low:.4g} to {high:.4g}")
-    if near is not None and near.tolerance > 0:
-        away = transform.forth(near.anchor) - near.place
-        if max(abs(away.real), abs(away.imag)) > (1 - 2 * _AT_BOUND) * near.tolerance:
+    if shift_bounds is not None and shift_bounds.tolerance > 0:
+        away = transform.apply(shift_bounds.anchor) - shift_bounds.place
+        if max(abs(away.real), abs(away.imag)) > (1 - 2 * _AT_BOUND) * shift_bounds.tolerance:
             reached.append(
-                f"shift ({away.real:.2g}, {away.imag:.2g}) mm of at most {near.tolerance:.2g} mm (tolerance)"
+                f"shift ({away.real:.2g}, {away.imag:.2g}) mm of at most {shift_bounds.tolerance:.2g} mm (tolerance)"
             )
     return reached
 
@@ -655,7 +668,7 @@ def _noise(fit, pixels):
 
 def _registration(fit, method):
     transform = fit.transform
-    shift = complex(transform.forth(0j))  # image of the origin
+    shift = complex(transform.apply(0j))  # image of the origin
     return Registration(
         rotation=float(transform.rotation),
         scale=float(transform.scale),

@@ -40,19 +40,19 @@ class SimilarityTransform:
         """Rotation and scale as one complex factor."""
         return self.scale * np.exp(1j * np.radians(self.rotation))
 
-    def forth(self, points: Any) -> Any:
+    def apply(self, points: Any) -> Any:
         """Move simulated points into the measured frame, complex of any shape."""
         offset = points - self.anchor
         return self.place + self.factor * (np.conj(offset) if self.mirror else offset)
 
-    def back(self, points: Any) -> Any:
+    def apply_inverse(self, points: Any) -> Any:
         """Move measured points into the simulated frame, complex of any shape."""
         offset = (points - self.place) / self.factor
         return self.anchor + (np.conj(offset) if self.mirror else offset)
 
     def anchored(self, place: complex) -> "SimilarityTransform":
         """Return the same transform, with the point that is moved to `place` as its anchor."""
-        return replace(self, anchor=self.back(place), place=place)
+        return replace(self, anchor=self.apply_inverse(place), place=place)
 
     @property
     def inverse(self) -> "SimilarityTransform":

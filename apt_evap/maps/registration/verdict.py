@@ -108,7 +108,7 @@ def likeness(
         half = np.random.default_rng(check_seed(seed)).binomial(measured.counts, 0.5)
         parts = (replace(maps[1], values=part) for part in (half, measured.counts - half))
         halves = _agreement(*(_symmetry(part, centre) for part in parts))
-    return _judged(agreement, halves, registration.doubtful)
+    return _verdict(agreement, halves, registration.doubtful)
 
 
 def symmetric_places(orientation: Orientation | None, projection: Projection | None) -> list[tuple[float, float]]:
@@ -131,7 +131,7 @@ def symmetric_places(orientation: Orientation | None, projection: Projection | N
     return [(float(x), float(y)) for x, y in projection.places(orientation.symmetric_poles())] or [(0.0, 0.0)]
 
 
-def _judged(agreement, halves, doubtful):
+def _verdict(agreement, halves, doubtful):
     numbers = f"their symmetries about a pole agree to {agreement:.2f}"
     if np.isnan(agreement):
         reason = "no pole near the axis of the specimen is far enough from the rim of the maps for a verdict"

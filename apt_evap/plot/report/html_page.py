@@ -153,7 +153,7 @@ class Page:
         )
 
     def data(self, name: str, content: Any) -> None:
-        """Store data for programs, which `plot.read_report` reads.
+        """Store data for programs, which `read_report` reads.
 
         Parameters
         ----------

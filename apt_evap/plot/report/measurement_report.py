@@ -12,7 +12,7 @@ def measurement_section(constants: Sequence[Any], checks: Sequence[Any], command
     Parameters
     ----------
     constants, checks : sequence of Constant, and of Observed
-        Those of a `fit.Measurement`.
+        Those of a `Measurement`.
     command : str
         Command line that reconstructs with these constants.
     picture : str

@@ -48,7 +48,7 @@ def write_study(
 
     The file contains its pictures and needs no network. Measured and simulated map are drawn on the same place; a press
     on the picture or the key B switches between them, so that errors of the registration are visible as motion. The
-    content of `Study.to_dict` is inside, too (`plot.read_report`).
+    content of `Study.to_dict` is inside, too (`read_report`).
 
     Parameters
     ----------

@@ -71,7 +71,7 @@ def write_sweep(
     """Write a sweep as one HTML file, with a row for each point.
 
     The points are in the order of their similarity with the measured map; points without a study follow in their own
-    order. The file needs no network. The rows are inside as data (`plot.read_report`).
+    order. The file needs no network. The rows are inside as data (`read_report`).
 
     Parameters
     ----------

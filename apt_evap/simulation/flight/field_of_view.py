@@ -66,7 +66,7 @@ def scouts_of(emissions: Emissions, settings: ResponseSettings) -> Scouts:
     second = along_surface(emissions.normals, np.zeros_like(fastest), fastest)
     rest = np.zeros_like(first)
     starts = [place[:, number] for place in places for number in (0, 0, 0, *range(1, place.shape[1]))]
-    velocities = [each for place in places for each in (rest, first, second, *[rest] * (place.shape[1] - 1))]
+    velocities = [velocity for place in places for velocity in (rest, first, second, *[rest] * (place.shape[1] - 1))]
     positions = np.stack(starts, axis=1)
     # an ion that cannot roll up has its site only
     positions = np.where(np.isfinite(positions), positions, emissions.positions[:, None])

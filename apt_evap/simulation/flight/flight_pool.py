@@ -28,10 +28,10 @@ _MAX_STEPS = 1_000_000  # flights take a few tens
 WHOLE_DETECTOR = "detector"
 
 
-def _field_of_view(given, name):
-    if given == WHOLE_DETECTOR:
-        return given
-    return check_number(given, name, above=0, at_most=90, unit="degrees", why=f'or "{WHOLE_DETECTOR}"')
+def _field_of_view(angle, name):
+    if angle == WHOLE_DETECTOR:
+        return angle
+    return check_number(angle, name, above=0, at_most=90, unit="degrees", why=f'or "{WHOLE_DETECTOR}"')
 
 
 @settings
@@ -239,13 +239,13 @@ class FlightPool:
 
     def _flights_at(self, record, number):
         """Flights of the calling thread, after the events of the first `number` journals of the record."""
-        own = self._own
-        if getattr(own, "record", None) is not record:
-            own.flights, own.record, own.followed = Flights(record.tree, **self._options), record, 0
-        while own.followed < number:
-            own.flights.follow(record.journals[own.followed])
-            own.followed += 1
-        return own.flights
+        local = self._own
+        if getattr(local, "record", None) is not record:
+            local.flights, local.record, local.followed = Flights(record.tree, **self._options), record, 0
+        while local.followed < number:
+            local.flights.follow(record.journals[local.followed])
+            local.followed += 1
+        return local.flights
 
 
 def fly_at_rest(emitter: Emitter, positions: Floats, settings: FlightSettings) -> Ends:

@@ -273,8 +273,8 @@ class ResponseModel:
         """
         rows = slice(None) if flown is None else flown
         coefficients, residuals = [], []
-        for design, each in zip(self.settings.designs, ends, strict=True):
-            directions, times = land(each.rows(rows), slowness[rows], self.detector, apex)
+        for design, flights in zip(self.settings.designs, ends, strict=True):
+            directions, times = land(flights.rows(rows), slowness[rows], self.detector, apex)
             n, m = times.shape
             values = fit_quantities(directions.reshape(-1, 2), times.ravel()).reshape(n, m, 3)
             polynomials, residual = design.fit(values)

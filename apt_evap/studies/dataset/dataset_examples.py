@@ -57,7 +57,7 @@ def examples_of(run: Run, point: Point, settings: DatasetSettings, split: str) -
         "fingerprint": run.fingerprint(),
         **_crystal(orientation),
     }
-    found = []
+    examples = []
     for number, emission in enumerate(settings.plan):
         seed = seed_of(point.key, number)
         random = np.random.default_rng(seed)
@@ -72,7 +72,7 @@ def examples_of(run: Run, point: Point, settings: DatasetSettings, split: str) -
             tables["zone_lines"] = _zone_lines(orientation, projection, real, instrument)
         if "cap" in settings.fields:
             tables["cap"] = {"number": run.cap.ions, "radius": run.cap.radii, "apex": run.cap.apexes}
-        own = {
+        of_example = {
             "name": f"{point.key}-{number}",
             "first_ion": 0,
             "ions": len(hits),
@@ -80,9 +80,9 @@ def examples_of(run: Run, point: Point, settings: DatasetSettings, split: str) -
             "instrument": _json(to_plain(instrument)),
             "seed": seed,
         }
-        tables["examples"] = {name: [value] for name, value in (about | own).items()}
-        found.append(tables)
-    return found
+        tables["examples"] = {name: [value] for name, value in (about | of_example).items()}
+        examples.append(tables)
+    return examples
 
 
 def _json(thing):
@@ -135,15 +135,15 @@ def _places(directions: Floats, projection: Any, real: Run, instrument: Instrume
 
 
 def _poles(orientation, families, projection, real, instrument):
-    found = poles(orientation, families)
-    normals = orientation.directions(found.normals)
+    crystal_poles = poles(orientation, families)
+    normals = orientation.directions(crystal_poles.normals)
     places = _places(normals, projection, real, instrument)
     with np.errstate(invalid="ignore"):
         visible = np.hypot(*places.T) <= instrument.field_of_view / 2
     return {
-        "indices": found.planes[:, [0, 1, -1]],
+        "indices": crystal_poles.planes[:, [0, 1, -1]],
         "normal": normals,
-        "spacing": found.spacings,
+        "spacing": crystal_poles.spacings,
         "x": places[:, 0],
         "y": places[:, 1],
         "visible": visible,
@@ -151,8 +151,8 @@ def _poles(orientation, families, projection, real, instrument):
 
 
 def _zone_lines(orientation, projection, real, instrument):
-    found = zones(orientation)
-    directions = orientation.directions(found.directions)
+    crystal_zones = zones(orientation)
+    directions = orientation.directions(crystal_zones.directions)
     angles = np.radians(np.linspace(-90.0, 90.0, LINE_POINTS))[:, None]
     lines = []
     for axis in directions:
@@ -167,7 +167,11 @@ def _zone_lines(orientation, projection, real, instrument):
         with np.errstate(invalid="ignore"):
             places[~(np.hypot(*places.T) <= instrument.field_of_view / 2)] = np.nan
         lines.append(places)
-    axes = found.axes if found.axes.shape[1] == 3 else found.axes[:, [0, 1, 3]] - found.axes[:, [2, 2, 2]] * [1, 1, 0]
+    axes = (
+        crystal_zones.axes
+        if crystal_zones.axes.shape[1] == 3
+        else crystal_zones.axes[:, [0, 1, 3]] - crystal_zones.axes[:, [2, 2, 2]] * [1, 1, 0]
+    )
     x, y = np.moveaxis(np.array(lines), 2, 0)
     return {"indices": axes, "direction": directions, "x": x, "y": y}
 

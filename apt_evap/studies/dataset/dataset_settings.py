@@ -68,22 +68,22 @@ def _check_drawn(value, name, read):
 def _emissions(value, name):
     if not isinstance(value, list | tuple) or not value:
         raise ValueError(f'{name} must be a list such as ["RollUp:0.2"], got {short_text(value)}')
-    for each in value:
-        if not isinstance(each, str | Mapping):
-            raise ValueError(f"{name} must contain texts and tables, got {short_text(each)}")
-        _check_drawn(each, name, read_perturbation)
+    for emission in value:
+        if not isinstance(emission, str | Mapping):
+            raise ValueError(f"{name} must contain texts and tables, got {short_text(emission)}")
+        _check_drawn(emission, name, read_perturbation)
     return tuple(value)
 
 
 def _fields(value, name):
     if not isinstance(value, list | tuple) or not value:
         raise ValueError(f'{name} must be a list such as ["x", "y"], got {short_text(value)}')
-    for each in value:
-        if each not in CHOICES:
+    for field in value:
+        if field not in CHOICES:
             raise ValueError(
-                f"{name} has no {short_text(each)}{did_you_mean(each, CHOICES)}; known are {', '.join(CHOICES)}"
+                f"{name} has no {short_text(field)}{did_you_mean(field, CHOICES)}; known are {', '.join(CHOICES)}"
             )
-    return tuple(each for each in CHOICES if each in value)
+    return tuple(field for field in CHOICES if field in value)
 
 
 def _fractions(value, name):
@@ -142,7 +142,7 @@ class DatasetSettings:
     @property
     def plan(self) -> list[Any]:
         """Emission of each example of a run, with its ranges, list."""
-        return [each for each in self.emissions for _ in range(self.draws if has_options(each) else 1)]
+        return [emission for emission in self.emissions for _ in range(self.draws if has_options(emission) else 1)]
 
     @property
     def per_run(self) -> int:

@@ -68,7 +68,7 @@ class Example:
         known = ("x", "y", "time_of_flight", "mass_to_charge", "voltage", "pulse_voltage", "multiplicity")
         columns: dict[Any, Any] = {name: self.ions[name] for name in known if name in self.ions}
         other = {"pulse_id": "pulse", "positions": "site", "ion": "number"}
-        columns |= {name: self.ions[own] for name, own in other.items() if own in self.ions}
+        columns |= {name: self.ions[stored] for name, stored in other.items() if stored in self.ions}
         extra = {name: self.ions[name] for name in ("species", "phase", "charge") if name in self.ions}
         half = self.instrument.field_of_view / 2
         return Hits(**columns, extra=extra, source=self.about["name"], extent=(-half, half, -half, half))
@@ -254,12 +254,12 @@ class DataSet:
         ions = np.cumsum([0, *(shard["ions"] for shard in self.shards)])
         offsets = {"example": self._firsts, "first_ion": ions}
         columns = {}
-        for each in fields:
-            values = [part[each.name] for part in parts]
-            if each.name in offsets:
-                values = [part + start for part, start in zip(values, offsets[each.name], strict=False)]
-            dtype = object if each.dtype == TEXT else each.dtype
-            columns[each.name] = np.concatenate([np.empty((0, *each.row), dtype), *map(np.asarray, values)]).astype(
+        for column in fields:
+            values = [part[column.name] for part in parts]
+            if column.name in offsets:
+                values = [part + start for part, start in zip(values, offsets[column.name], strict=False)]
+            dtype = object if column.dtype == TEXT else column.dtype
+            columns[column.name] = np.concatenate([np.empty((0, *column.row), dtype), *map(np.asarray, values)]).astype(
                 dtype
             )
         return columns
@@ -279,7 +279,7 @@ class DataSet:
         """
         columns = {key: values.reshape(len(values), -1) if values.ndim > 2 else values
                    for key, values in self.table(name).items()}  # fmt: skip
-        units = {each.name: each.unit for each in self.schema[name] if each.unit}
+        units = {column.name: column.unit for column in self.schema[name] if column.unit}
         return to_dataframe(columns, source=str(self.folder), units=units)
 
     def to_xarray(self) -> "xarray.Dataset":
@@ -294,11 +294,11 @@ class DataSet:
         variables = {}
         for name, fields in self.schema.items():
             columns = self.table(name)
-            for each in fields:
-                values = columns[each.name]
-                axes = (name, *(f"{each.name}_{axis}" for axis in range(values.ndim - 1)))
-                about = {"description": each.text, **({"units": each.unit} if each.unit else {})}
-                variables[f"{name}_{each.name}"] = xarray.Variable(axes, values, about)
+            for column in fields:
+                values = columns[column.name]
+                axes = (name, *(f"{column.name}_{axis}" for axis in range(values.ndim - 1)))
+                about = {"description": column.text, **({"units": column.unit} if column.unit else {})}
+                variables[f"{name}_{column.name}"] = xarray.Variable(axes, values, about)
         return xarray.Dataset(variables, attrs={"title": self.content["title"]})
 
 

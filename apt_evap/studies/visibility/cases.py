@@ -149,8 +149,8 @@ def simulated(
 
 def depth_for(feature: Phase, specimen: Mapping[str, Any], nodes: list[dict[str, float]]) -> float:
     """Depth that evaporates [nm] so that the lowest of several variants of a feature is behind the apex."""
-    each = (varied(feature, specimen, **values) for values in nodes)
-    return max(bottom_of(variant, arguments["apex_radius"]) for variant, arguments in each) + _BELOW
+    variants = (varied(feature, specimen, **values) for values in nodes)
+    return max(bottom_of(variant, arguments["apex_radius"]) for variant, arguments in variants) + _BELOW
 
 
 def coordinates(feature: Phase, sites: Floats, radius: float) -> tuple[Floats, Floats]:

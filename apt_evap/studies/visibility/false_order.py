@@ -96,7 +96,8 @@ def warren_cowley(positions: ArrayLike, solute: ArrayLike, shell: float = SHELL)
     Examples
     --------
     >>> chain = np.column_stack([0.25 * np.arange(100), np.zeros(100), np.zeros(100)])
-    >>> ae.studies.warren_cowley(chain, np.arange(100) % 2 == 0)
+    >>> from apt_evap.studies.visibility.false_order import warren_cowley
+    >>> warren_cowley(chain, np.arange(100) % 2 == 0)
     1.0
     """
     places = check_array(positions, "positions", ("n", 3))
@@ -153,7 +154,7 @@ def false_order(
     check_number(shell, "shell", above=0, unit="nm")
     check_number(block, "block", above=0, unit="nm")
     random = np.random.default_rng(check_seed(seed))
-    found: list[list[Integers]] = [[], []]  # neighbours of solutes, and solutes among them, by block
+    counts: list[list[Integers]] = [[], []]  # neighbours of solutes, and solutes among them, by block
     shuffled = np.zeros((check_count(permutations, "permutations", at_least=2), 2), dtype=np.int64)
     ions = solutes = 0
     for run in runs:
@@ -165,13 +166,13 @@ def false_order(
         ions, solutes = ions + len(chosen), solutes + int(chosen.sum())
         cells = np.unique(np.floor(recorded.sites[:, :2] / block), axis=0, return_inverse=True)[1].ravel()
         pairs = _pairs(recorded.positions, shell)
-        found[0].append(_by_block(pairs, chosen, cells))
-        found[1].append(_by_block(_pairs(recorded.sites, shell), chosen, cells))
+        counts[0].append(_by_block(pairs, chosen, cells))
+        counts[1].append(_by_block(_pairs(recorded.sites, shell), chosen, cells))
         for row in shuffled:
             row += _counts(pairs, random.permutation(chosen))
     fraction = solutes / ions
     by_chance = [_parameter(neighbours, like, fraction) for neighbours, like in shuffled]
-    reconstructed, true = (_bootstrap(np.concatenate(parts), fraction, random) for parts in found)
+    reconstructed, true = (_bootstrap(np.concatenate(parts), fraction, random) for parts in counts)
     return FalseOrder(
         reconstructed, Estimated(float(np.mean(by_chance)), float(np.std(by_chance, ddof=1))), true, ions, solutes
     )

@@ -237,7 +237,7 @@ class OriginOperators:
 
     def _case(self):
         specimen = dict(self.settings["specimen"])
-        specimen["phases"] = tuple(from_plain(each, Phase, what="phases") for each in specimen["phases"])
+        specimen["phases"] = tuple(from_plain(phase, Phase, what="phases") for phase in specimen["phases"])
         return from_plain(self.settings["feature"], Phase, what="feature"), specimen
 
     def _at(self, feature, arguments, values):
@@ -320,7 +320,7 @@ def origin_operators(
         arrived = _arrived(made(variant, chosen, seed + number, depth), ions, chosen["apex_radius"], depth)
         parts.append((*_moments(variant, ions, len(elements), chosen["apex_radius"]), arrived))
     shape = tuple(len(values) for values in grid.values())
-    means, covariances, recorded = (np.reshape(each, shape + each[0].shape) for each in zip(*parts, strict=True))
+    means, covariances, recorded = (np.reshape(tables, shape + tables[0].shape) for tables in zip(*parts, strict=True))
     plain = described(feature, arguments) | {
         "instrument": to_plain(instrument),
         "perturbation": to_plain(Unperturbed() if perturbation is None else perturbation),
@@ -378,9 +378,9 @@ def _cell(values, edges):
 
 def _between(table, groups, places, edges):
     """Bilinear interpolation between the centres of the cells, of the group of each site."""
-    centres = [(each[1:] + each[:-1]) / 2 for each in edges]
+    centres = [(bounds[1:] + bounds[:-1]) / 2 for bounds in edges]
     steps = [np.interp(places[:, k], centres[k], np.arange(len(centres[k]))) for k in (0, 1)]
-    low = [np.minimum(step.astype(np.int64), len(each) - 2) for step, each in zip(steps, centres, strict=True)]
+    low = [np.minimum(step.astype(np.int64), len(bounds) - 2) for step, bounds in zip(steps, centres, strict=True)]
     first, second = (step - below for step, below in zip(steps, low, strict=True))
     flat = table.reshape(-1, table.shape[-1])
     rows = (groups * len(centres[0]) + low[0]) * len(centres[1]) + low[1]
@@ -416,13 +416,13 @@ def _filled(cells, values, shape):
     out = np.zeros((*shape, values.shape[1]))
     for group in range(shape[0]):
         count = n.reshape(shape)[group]
-        each = sums.reshape(*shape, -1)[group]
+        summed = sums.reshape(*shape, -1)[group]
         enough = count >= _FEWEST
         if not enough.any():
-            out[group] = each.sum(axis=(0, 1)) / max(1, count.sum())
+            out[group] = summed.sum(axis=(0, 1)) / max(1, count.sum())
             continue
         nearest = scipy.ndimage.distance_transform_edt(~enough, return_distances=False, return_indices=True)
-        out[group] = (each / np.maximum(count, 1)[..., None])[tuple(nearest)]
+        out[group] = (summed / np.maximum(count, 1)[..., None])[tuple(nearest)]
     return out
 
 
@@ -441,11 +441,11 @@ def _arrived(tip, ions, radius, depth):
     """Fraction of the sites whose ions arrive, in cells of the depth below the apex and the distance from the axis."""
     # a cap at this depth reaches from there to the height of the rim
     shape = math.ceil((depth / radius + 0.5) / _CELL) + 2, math.ceil(1 / _CELL) + 2
-    every, some = (
+    every, arrived = (
         np.bincount(_place(sites, radius, shape), minlength=shape[0] * shape[1])
         for sites in (tip.positions, ions.sites)
     )
-    fractions = (some / np.maximum(every, 1)).reshape(shape)
+    fractions = (arrived / np.maximum(every, 1)).reshape(shape)
     # a cell between the planes of the crystal contains no site: that of another shift of the lattice may
     empty = (every == 0).reshape(shape)
     nearest = scipy.ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)

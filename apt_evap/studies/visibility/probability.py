@@ -91,7 +91,7 @@ class Visibility:
     measured, true : dict
         Measured and true values of each twin, each of shape (n,). Lengths in nm, composition as a fraction. Those of
         the analysis have its names. "apparent lateral", "apparent depth", "apparent thickness" and "apparent
-        composition" are what one would find who knows which ions belong to the feature.
+        composition" are those of an analysis with the true ions of the feature.
     sized : SizedTwins or None
         Twins with different sizes, for N50, N95 and `true_size`.
     operators : OriginOperators or None
@@ -156,9 +156,9 @@ class Visibility:
         """
         if self.sized is None:
             raise ValueError("name must be that of a measured size: this answer has no twins with different sizes")
-        known = [each for each in self.sized.measured if each.removeprefix("apparent ") in _SIZES]
+        known = [quantity for quantity in self.sized.measured if quantity.removeprefix("apparent ") in _SIZES]
         if name is None:
-            name = next(iter(each for each in ("size", *known) if each in known), "size")
+            name = next(iter(quantity for quantity in ("size", *known) if quantity in known), "size")
         seen = self.sized.measured[check_choice(name, "name", known)]
         usable = np.isfinite(seen) & (seen > 0)
         value = math.log(check_number(measured, "measured", above=0, unit="nm"))
@@ -185,7 +185,7 @@ class Visibility:
         """
         numbers = {"size": self.size, "significance": self.significance, "twins": len(self.p_values)}
         parts = {name: getattr(self, name)._asdict() for name in ("probability", "n50", "n95")}
-        parts["errors"] = {name: each._asdict() for name, each in self.errors.items()}
+        parts["errors"] = {name: number._asdict() for name, number in self.errors.items()}
         return _finite(numbers | parts)
 
     def _ions_for(self, probability):
@@ -299,6 +299,7 @@ def estimate_visibility(
     if full and operators is not None:
         raise ValueError("operators must be None if full is True, because they replace the simulations")
     full = is_simulated_in_full(feature) if full is None else full
+    # operators in place of full simulations, and the range of the sizes
     axes = None if sizes is None else {"size": sizes}
     if operators is not None:
         operators.check(feature, specimen, instrument, perturbation, axes=axes, n_threads=n_threads, **settings)
@@ -318,8 +319,9 @@ def estimate_visibility(
             ions = recorded_ions(run, instrument, perturbation, number)
         else:
             ions = operators.emulate(number, instrument.efficiency, **values_of(variant, chosen, operators.axes))
-        return _judged(variant, ions, analysis, reach, permutations, significance, random)
+        return _analysed(variant, ions, analysis, reach, permutations, significance, random)
 
+    # twins of the feature, and of sizes with equal probabilities per relative change
     drawn = np.exp(random.uniform(math.log(low), math.log(high), twins)) if low < high else np.empty(0)
     nominal = [twin(seed + 1000 + k, size) for k in range(twins)]
     sized = [twin(seed + 1000 + twins + k, value) for k, value in enumerate(drawn)]
@@ -327,13 +329,13 @@ def estimate_visibility(
     return Visibility(
         size,
         significance,
-        np.array([each.p_value for each in nominal]),
+        np.array([one.p_value for one in nominal]),
         measured,
         true,
         SizedTwins(
             drawn,
-            np.array([each.ions for each in sized]),
-            np.array([each.p_value <= significance for each in sized]),
+            np.array([one.ions for one in sized]),
+            np.array([one.p_value <= significance for one in sized]),
             _columns(sized)[0],
         )
         if sized
@@ -394,7 +396,8 @@ def permutation_p_value(
     >>> places = np.random.default_rng(1).random((500, 3))
     >>> def analysis(positions, labels):
     ...     return positions[labels == 1, 0].mean()
-    >>> ae.studies.permutation_p_value(analysis, places, (places[:, 0] > 0.5).astype(int))
+    >>> from apt_evap.studies.visibility.probability import permutation_p_value
+    >>> permutation_p_value(analysis, places, (places[:, 0] > 0.5).astype(int))
     0.01
     """
     places = check_array(positions, "positions", ("n", 3))
@@ -410,14 +413,14 @@ def permutation_p_value(
     return (k + 1) / (permutations + 1)
 
 
-class _Judged(NamedTuple):
+class _Analysed(NamedTuple):
     p_value: float
     ions: int
     measured: dict[str, float]
     true: dict[str, float]
 
 
-def _judged(feature, ions: Ions, analysis, reach, permutations, significance, random) -> _Judged:
+def _analysed(feature, ions: Ions, analysis, reach, permutations, significance, random) -> _Analysed:
     """What an analysis finds in the ions of a twin."""
     solute = _solute(ions)
     shape, true = apparent_shape(feature, ions, solute)
@@ -433,11 +436,11 @@ def _judged(feature, ions: Ions, analysis, reach, permutations, significance, ra
         analysis, positions, labels, permutations=permutations, exceedances=max(1, enough), seed=random
     )
     known = {name: true[name.removeprefix("apparent ")] for name in measured if name.removeprefix("apparent ") in true}
-    return _Judged(p, int(ions.inside.sum()), measured, known)
+    return _Analysed(p, int(ions.inside.sum()), measured, known)
 
 
 def apparent_shape(feature: Phase, ions: Ions, solute: int) -> tuple[dict[str, float], dict[str, float]]:
-    """Shape and composition that one would find who knows which ions belong to a feature, and the true values.
+    """Shape and composition of an analysis with the true ions of a feature, and the true values.
 
     Of a sphere the semi-axes of the ellipsoid with the second moments of its ions, of a layer the thickness of one with
     the second moment along the normal, and the composition of all ions within.
@@ -471,12 +474,12 @@ def _solute(ions):
     return int(np.argmax(inside / inside.sum() - outside / outside.sum()))
 
 
-def _columns(judged):
+def _columns(twins):
     """Measured and true values of all twins."""
     return tuple(
-        {name: np.array([getattr(each, part).get(name, math.nan) for each in judged]) for name in names}
+        {name: np.array([getattr(one, part).get(name, math.nan) for one in twins]) for name in names}
         for part in ("measured", "true")
-        for names in [dict.fromkeys(name for each in judged for name in getattr(each, part))]
+        for names in [dict.fromkeys(name for one in twins for name in getattr(one, part))]
     )
 
 
@@ -497,12 +500,12 @@ def _results(analysis, positions, labels):
     return numbers
 
 
-def _threshold(ions, found, probability):
+def _threshold(ions, is_found, probability):
     """Number of ions where a logistic function of its logarithm has a value; NaN outside the given numbers."""
     x = np.log(np.maximum(ions, 1))
-    if len(np.unique(found)) < 2:
+    if len(np.unique(is_found)) < 2:
         return math.nan
-    centre, sign = x.mean(), 2.0 * found - 1
+    centre, sign = x.mean(), 2.0 * is_found - 1
 
     def loss(constants):
         return np.logaddexp(0, -sign * (constants[0] + constants[1] * (x - centre))).sum() + _WEAK * constants[1] ** 2
@@ -516,5 +519,5 @@ def _threshold(ions, found, probability):
 
 def _finite(value):
     if isinstance(value, dict):
-        return {name: _finite(each) for name, each in value.items()}
+        return {name: _finite(item) for name, item in value.items()}
     return value if not isinstance(value, float) or math.isfinite(value) else None

@@ -35,8 +35,8 @@ class Ions(NamedTuple):
 
 def names_of(elements: tuple) -> tuple[list[str], NDArray[np.int64]]:
     """Names of the elements in alphabetical order, and the label of each species: fields are not seen by the mass."""
-    names = sorted({str(getattr(each, "name", each)) for each in elements})
-    return names, np.array([names.index(str(getattr(each, "name", each))) for each in elements])
+    names = sorted({str(getattr(element, "name", element)) for element in elements})
+    return names, np.array([names.index(str(getattr(element, "name", element))) for element in elements])
 
 
 def recorded_ions(
@@ -63,7 +63,8 @@ def recorded_ions(
     --------
     >>> tip = ae.Tip("Ni", apex_radius=2.5, solutes={"Al": 0.1}, seed=1)
     >>> run = ae.Simulation(tip, seed=1).run(300, [ae.Unperturbed()], responses=False)
-    >>> ae.studies.recorded_ions(run).positions.shape
+    >>> from apt_evap.studies.visibility.recorded import recorded_ions
+    >>> recorded_ions(run).positions.shape
     (195, 3)
     """
     instrument = Instrument(field_of_view=160.0) if instrument is None else instrument

@@ -129,19 +129,8 @@ def visibility_of_file(path: str | Path, *, n_threads: int | None = None) -> Vis
     document = read_document(path)
     folder = Path(path).parent
     try:
-        check_keys(document, _TABLES)
-        table = document.pop("visibility", {})
-        check_table(table, "[visibility]")
-        chosen = from_plain(table, VisibilitySettings, what="[visibility]")
+        chosen = _settings(document)
         analysis = _function(folder, chosen.analysis)
-        for name in ("simulation", "tip"):
-            check_table(document.get(name, {}), f"[{name}]")
-        ignored = [f"[simulation] {key}" for key in document.get("simulation", {}) if key != "voltage"]
-        ignored += [f"[tip] {key}" for key in document.get("tip", {}) if key in ("offset_seed", "depth")]
-        if chosen.seed is not None and "seed" in document.get("tip", {}):
-            ignored.append("[tip] seed (beside that of [visibility])")
-        if ignored:
-            raise ValueError(f"{ignored[0]} must not be given, because it would be ignored")
     except ValueError as error:
         raise FileError(f"{str(path)!r}: {error}") from error
     document["simulation"] = {"ions": 1, **document.get("simulation", {})}
@@ -166,23 +155,12 @@ def visibility_of_file(path: str | Path, *, n_threads: int | None = None) -> Vis
     }
     operators = None
     if chosen.operators is not None:
-        file = folder / chosen.operators
         if is_simulated_in_full(feature):
             raise FileError(
                 f"{str(path)!r}, [visibility]: operators must be those of a sphere or layer without an order: "
                 f"the twins of {feature.name!r} are simulated in full"
             )
-        axes = default_axes(feature) if chosen.sizes is None else {"size": chosen.sizes}
-        if os.path.lexists(file):
-            operators = OriginOperators.load(file)
-            made_with = {"axes": operators.axes, "seed": operators.settings["seed"]}
-            asked = {"axes": {**operators.axes, **grid_of(axes)}, "seed": seed + 1}
-            check_made_from(file, to_plain(made_with), asked, REMEDY)
-        else:
-            operators = origin_operators(
-                feature, specimen, chosen.instrument, chosen.perturbation, axes=axes, seed=seed + 1, **simulation
-            )
-            operators.save(file)
+        operators = _operators(folder / chosen.operators, feature, specimen, chosen, seed + 1, simulation)
     return estimate_visibility(
         feature,
         specimen,
@@ -213,3 +191,36 @@ def _function(folder: Path, text: str) -> Callable[..., Any]:
         return getattr(module, function)
     except AttributeError:
         raise ValueError(f"analysis: {str(file)!r} has no function {function!r}") from None
+
+
+def _settings(document):
+    """Settings of the table [visibility], which is removed; ValueError for keys that would be ignored."""
+    check_keys(document, _TABLES)
+    table = document.pop("visibility", {})
+    check_table(table, "[visibility]")
+    chosen = from_plain(table, VisibilitySettings, what="[visibility]")
+    for name in ("simulation", "tip"):
+        check_table(document.get(name, {}), f"[{name}]")
+    ignored = [f"[simulation] {key}" for key in document.get("simulation", {}) if key != "voltage"]
+    ignored += [f"[tip] {key}" for key in document.get("tip", {}) if key in ("offset_seed", "depth")]
+    if chosen.seed is not None and "seed" in document.get("tip", {}):
+        ignored.append("[tip] seed (beside that of [visibility])")
+    if ignored:
+        raise ValueError(f"{ignored[0]} must not be given, because it would be ignored")
+    return chosen
+
+
+def _operators(file, feature, specimen, chosen, seed, simulation):
+    """Operators from a file that was made with these settings; without it they are made and saved."""
+    axes = default_axes(feature) if chosen.sizes is None else {"size": chosen.sizes}
+    if os.path.lexists(file):
+        operators = OriginOperators.load(file)
+        made_with = {"axes": operators.axes, "seed": operators.settings["seed"]}
+        requested = {"axes": {**operators.axes, **grid_of(axes)}, "seed": seed}
+        check_made_from(file, to_plain(made_with), requested, REMEDY)
+        return operators
+    operators = origin_operators(
+        feature, specimen, chosen.instrument, chosen.perturbation, axes=axes, seed=seed, **simulation
+    )
+    operators.save(file)
+    return operators

@@ -1,4 +1,4 @@
-"""Detector maps of a run as its settings ask for, and which crystal direction is where on a map."""
+"""Detector maps of a run by its settings, and which crystal direction is where on a map."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace

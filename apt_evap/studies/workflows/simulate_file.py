@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from apt_evap import plot
 from apt_evap._common.files import FileError, check_path
 from apt_evap._common.notebook import as_table
 from apt_evap._common.types import AnyPath
@@ -100,7 +99,7 @@ def simulate(
     Parameters
     ----------
     settings : str or path-like
-        The settings file (TOML, see `config.read_config`).
+        The settings file (TOML, see `read_config`).
     output : str or path-like, optional
         File of the run, .h5; by default ``output`` of the settings, or their name with .h5 in this folder.
     ions : int, optional
@@ -191,12 +190,14 @@ def simulate(
     new = "" if not n_previous else f", {len(run) - n_previous:,} of them new,"
     note(f"{len(run):,} ions{new} in {seconds:.1f} s, {(len(run) - n_previous) / seconds:,.0f} ions/s")
     _note_outcomes(config, run, path, note)
-    if run.units is not None:
-        note(real_units_line(run))
+    if line := real_units_line(run):
+        note(line)
     note(f"{'replaced' if replaced and not resume else 'wrote'} {path}")
+    from apt_evap.plot.map_figures import specimen_title  # with Matplotlib
+
     try:
         maps, titles = run_maps(run, config.maps)
-        save_picture(picture, maps, titles, title=plot.specimen_title(run))
+        save_picture(picture, maps, titles, title=specimen_title(run))
     except ValueError as error:
         raise ValueError(f"no maps are drawn, the run is in {str(path)!r}: {error}") from error
     note(f"wrote {picture}")
@@ -231,10 +232,11 @@ def _note_outcomes(config: Config, run: Run, path: Path, note: Callable[[str], N
     for panel in config.maps.panels:
         hit, missed, never_left, outside = run.hits(panel.perturbation).counts.values()
         frequent_misses += [missed] if 2 * missed > len(run) else []
-        view = "" if run.field_of_view is None else f", {outside:,} are outside the field of view"
+        view = f", {outside:,} are outside the field of view" if outside else ""
         note(f"{panel.title}: {hit:,} hit the detector, {missed:,} missed it, {never_left:,} never left the tip{view}")
     if run.responses is not None:
-        view = "" if run.field_of_view is None else f", {run.not_flown.sum():,} ions not flown"
+        not_flown = int(run.not_flown.sum())
+        view = f", {not_flown:,} ions not flown" if not_flown else ""
         note(f"responses: {run.flagged.sum():,} ions flagged as inexact{view}")
     if frequent_misses:
         warn(

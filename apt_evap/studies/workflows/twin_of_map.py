@@ -27,7 +27,7 @@ from apt_evap.detection.projection import Projection
 from apt_evap.emission.perturbations import LateralVelocity, RollUp
 from apt_evap.fit.grid import EnergyGrid
 from apt_evap.fit.measured_constants import Measurement, constants_of
-from apt_evap.fit.start_settings import ENERGY, HEIGHT, ROLLS, SHARPNESS, StartSettings, near, settings_of
+from apt_evap.fit.start_settings import ENERGY, HEIGHT, ROLLS, SHARPNESS, StartSettings, registration_start, settings_of
 from apt_evap.fit.study import Study
 from apt_evap.io.formats import read_ranges
 from apt_evap.maps.crystallography.orientation import Orientation
@@ -321,7 +321,9 @@ class Twin:
         emission: RollUp | LateralVelocity = LateralVelocity(ENERGY, HEIGHT)
         if self._rolls:
             emission = RollUp(ENERGY, best.rolled, SHARPNESS, HEIGHT)
-        registration = _registered(self.run.hits(emission), self.measured_map, near(best.centre, best.scale))
+        registration = _registered(
+            self.run.hits(emission), self.measured_map, registration_start(best.centre, best.scale)
+        )
         self._kept.write({REGISTRATION: (json.dumps(to_plain(registration), indent=1) + "\n").encode()})
 
     def _compared(self, run, measured, folder):
@@ -482,7 +484,7 @@ def twin(
     folder : str or path-like, optional
         Folder for all files; by default the name of the file with _twin, in this folder.
     lens : str or LocalElectrode, optional
-        Lens of the instrument, for the radius; a text as for `config.read_lens`.
+        Lens of the instrument, for the radius; a text as for `read_lens`.
     field_factor : float, optional
         Field factor without a lens; 3.3 by default.
     distance : float, optional

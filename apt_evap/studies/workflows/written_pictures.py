@@ -36,7 +36,9 @@ def save_picture(
     crystal: tuple[Orientation, Projection] | None = None,
 ) -> None:
     """Draw maps side by side into a file, perhaps with the poles of a crystal."""
-    axes = plot.detector_maps(maps, titles, limits=plot.common_limits(maps), title=title)
+    from apt_evap.plot.limits import common_limits  # with Matplotlib
+
+    axes = plot.detector_maps(maps, titles, limits=common_limits(maps), title=title)
     if crystal is not None:
         for ax, detector_map in zip(axes, maps, strict=True):
             plot.poles(ax, *crystal, region=detector_map, families=8)
