@@ -239,8 +239,9 @@ def _note_outcomes(config: Config, run: Run, path: Path, note: Callable[[str], N
     if frequent_misses:
         warn(
             f"{max(frequent_misses):,} of {len(run):,} ions miss the detector, which is {run.detector.width:g} mm "
-            f"wide at {run.detector.distance:g} mm: use a larger width or a smaller distance in [detector]",
+            f"wide at {run.detector.distance:g} mm",
             WorkflowWarning,
+            "use a larger width or a smaller distance in [detector]",
         )
     if run.ended == StopReason.INTERRUPTED:
         text = f"interrupted; {len(run):,} of {config.n_ions:,} ions are in {str(path)!r}; {_CONTINUE}"
