@@ -16,6 +16,7 @@ from .map_figures import detector_maps as detector_maps
 from .map_figures import specimen_title as specimen_title
 from .overlays import overlay as overlay
 from .overlays import score_surface as score_surface
+from .paper_figures import paper_maps as paper_maps
 from .pole_labels import poles as poles
 from .profile_figures import profile as profile
 from .profile_figures import profile_comparison as profile_comparison

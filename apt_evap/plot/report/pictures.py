@@ -1,6 +1,7 @@
 """Pictures of maps on one place, switched by a press or a key."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -8,7 +9,6 @@ from matplotlib.figure import Figure
 from apt_evap import plot
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.maps.crystallography.orientation import Orientation
-from apt_evap.maps.pole_frame import Directions
 from apt_evap.plot._figure import OUTSIDE
 from apt_evap.plot.report.html_page import Page, switched
 
@@ -19,7 +19,7 @@ def blinking_pictures(
     page: Page,
     maps: Mapping[str, DetectorMap],
     width: float = 5.4,
-    crystal: tuple[Orientation, Directions] | None = None,
+    crystal: tuple[Orientation, Any] | None = None,
 ) -> str:
     """Maps side by side, which a press or a key puts on one place, as HTML.
 

@@ -171,7 +171,8 @@ def simulate(
     check_output(picture, is_picture, overwrite)
 
     n_ions = config.n_ions
-    note(f"{estimate_cost(config, 1)} of one thread")
+    cost = estimate_cost(config, 1)
+    note(f"{cost}" if cost.hours is None else f"{cost} of one thread")
     note("building the specimen and relaxing the charges of its surface")
     simulation = config.simulation(n_threads=threads)
     note(f"{str(simulation.tip).strip('<>')}; {len(simulation.emitter):,} atoms on the surface")
