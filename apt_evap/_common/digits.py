@@ -38,6 +38,9 @@ def rounded_text(value: float, error: float, digits: int = 3) -> str:
     str
     """
     if not (math.isfinite(error) and error > 0 and math.isfinite(value)):
-        return f"{value:.{digits}g}"
+        if not 1 <= abs(value) < 1e6:
+            return f"{value:.{digits}g}"
+        places = digits - 1 - math.floor(math.log10(abs(value)))
+        return f"{round(value, places):.{max(places, 0)}f}"
     places = decimals_for(error)
     return f"{round(value, places):z.{max(places, 0)}f}"

@@ -61,7 +61,7 @@ class Constant(NamedTuple):
             number, low, high = (rounded_text(value, width) for value in (self.value, *self.between))
             return f"{number} ({low} to {high})"
         if math.isnan(self.error):
-            return f"{self.value:.3g}"
+            return rounded_text(self.value, math.nan, 4)
         return f"{rounded_text(self.value, self.error)} ± {rounded_text(self.error, self.error)}"
 
 

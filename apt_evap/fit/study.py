@@ -307,7 +307,7 @@ class Study:
         doubts = []
         if self.registration.doubtful:
             doubts.append(f"the registration, correlation {self.registration.score:.2f}")
-        if best.at_edge:
+        if best.at_edge and self.likeness.verdict == "alike":
             doubts.append(f"best at the end of the grid in {' and '.join(best.at_edge)}")
         if self.structure is not None and self.structure.lost:
             doubts.append("the best map has lost the zone lines")

@@ -73,7 +73,7 @@ def test_a_faint_measured_line_decides_nothing():
 @pytest.mark.parametrize("value, error, text", [
     (77.413, 48.0, "80"), (77.413, 3.0, "77.4"), (77.413, 6.0, "77"),
     (0.16634, 0.0321, "0.166"), (0.16634, 0.04, "0.17"),
-    (1234.5, 99.6, "1230"), (1234.5, 0.0, "1.23e+03"), (77.413, float("nan"), "77.4"), (-0.001, 0.2, "0.00"),
+    (1234.5, 99.6, "1230"), (1234.5, 0.0, "1230"), (77.413, float("nan"), "77.4"), (-0.001, 0.2, "0.00"),
 ])  # fmt: skip
 def test_digits_are_those_of_the_error(value, error, text):
     assert rounded_text(value, error) == text
