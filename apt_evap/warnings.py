@@ -10,6 +10,9 @@ _BETWEEN = ("contextlib", "functools")  # modules with frames between two functi
 class AptWarning(UserWarning):
     """Base of all warnings of this package."""
 
+    fact: str = ""
+    """The text without the advice, for those who did not choose the settings that it is about."""
+
 
 class DataWarning(AptWarning):
     """Incomplete or ambiguous ions, ranges, specimens or files: the text says what was lost, skipped or assumed."""
@@ -51,7 +54,7 @@ class WorkflowWarning(AptWarning):
     """What to know about the result of a workflow: ions that miss the detector, an interrupt, an assumption."""
 
 
-def warn(message: str, category: type[AptWarning]) -> None:
+def warn(message: str, category: type[AptWarning], advice: str = "") -> None:
     """Issue a warning for the line outside the package that has called it.
 
     Parameters
@@ -60,11 +63,15 @@ def warn(message: str, category: type[AptWarning]) -> None:
         Text.
     category : type
         One of these classes.
+    advice : str
+        Settings to change; follows the text.
     """
     level, frame = 2, sys._getframe(1)
     while frame.f_back is not None and _is_inside(frame):
         level, frame = level + 1, frame.f_back
-    warnings.warn(message, category, stacklevel=level)
+    warning = category(f"{message}: {advice}" if advice else message)
+    warning.fact = message
+    warnings.warn(warning, stacklevel=level)
 
 
 def _is_inside(frame):

@@ -1,5 +1,6 @@
 """Progress bars of long computations."""
 
+import warnings
 from typing import Any
 
 
@@ -15,6 +16,10 @@ def progress_bar(**options: Any) -> Any:
     -------
     tqdm.tqdm
     """
-    from tqdm.auto import tqdm  # 0.1 s, half of it asyncio
+    from tqdm import TqdmWarning
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", TqdmWarning)  # in a notebook without ipywidgets, where it is a line of text
+        from tqdm.auto import tqdm  # 0.1 s, half of it asyncio
 
     return tqdm(**options)

@@ -14,6 +14,7 @@ from apt_evap.analysis.description import UNITS, describe, describe_atoms
 from apt_evap.cli._files import read, select, selects
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.io._texts import without_compression
+from apt_evap.io.formats import RANGE_FORMATS, read_ranges
 from apt_evap.io.specimens import read_atoms, specimen_format, tip_of, types_of
 from apt_evap.simulation.run import Run
 from apt_evap.simulation.stop_reason import StopReason
@@ -23,7 +24,26 @@ from apt_evap.warnings import SpecimenWarning
 
 def summary_of_file(options: argparse.Namespace) -> dict[str, Any]:
     """Summary of the file of a command, in plain types."""
-    return _specimen(options) or _content(options)
+    return _ranges(options) or _specimen(options) or _content(options)
+
+
+def _ranges(options):
+    """Summary of a file of mass ranges, or None for another file."""
+    suffix = without_compression(Path(options.file)).suffix.lower() if options.format is None else options.format
+    if suffix not in RANGE_FORMATS:
+        return None
+    if selects(options):
+        raise FileError(f"{options.file!r} contains ranges of mass: there are no ions to select")
+    ranges = read_ranges(options.file, format=options.format)
+    spans: dict[str, list[list[float]]] = {}
+    for name, low, high in zip(ranges.names, ranges.low.tolist(), ranges.high.tolist(), strict=True):
+        spans.setdefault(name, []).append([low, high])
+    return {
+        "kind": "ranges of mass",
+        "ranges": len(ranges.names),
+        "mass_to_charge": [float(ranges.low.min()), float(ranges.high.max())],
+        "species": {name: [f"{low:g} to {high:g}" for low, high in parts] for name, parts in spans.items()},
+    }
 
 
 def _content(options):
@@ -87,7 +107,17 @@ def summary_lines(summary: Mapping[str, Any], indent: int = 0, of_columns: bool 
 
 
 _SPECIMENS = (".xyz", ".cfg", ".cif", ".vasp")  # of ASE; other formats are recognised by their content
-_EXTENTS = ("extent_x", "extent_y", "extent_z", "field_before_leaving", "x", "y", "values", "voltages")
+_EXTENTS = (
+    "mass_to_charge",
+    "extent_x",
+    "extent_y",
+    "extent_z",
+    "field_before_leaving",
+    "x",
+    "y",
+    "values",
+    "voltages",
+)
 _SIZES = ("bins", "bin_size", "detector_extent", "detector_quantum")
 
 

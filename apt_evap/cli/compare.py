@@ -32,7 +32,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--mechanism", choices=("roll-up", "lateral", "combined"), help="default: roll-up")
     for name, default, what in (
         ("means", "0.01,0.0825,0.155,0.2275,0.3,0.3725", "means of the energy [eV]"),
-        ("relative_spreads", "0.01,0.0316,0.1,0.316,1,3.16", "standard deviations relative to the means"),
+        ("relative-spreads", "0.01,0.0316,0.1,0.316,1,3.16", "standard deviations relative to the means"),
         ("rollup-fractions", "0,0.25,0.5,0.75,1", "roll-up fractions for the mechanism combined"),
     ):
         parser.add_argument(f"--{name}", type=numbers_type, metavar="N,N,...", help=f"{what}; default: {default}")

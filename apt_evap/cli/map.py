@@ -27,6 +27,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "  apt-evap map ni111.h5 --perturbation Unperturbed --perturbation RollUp:0.3,0.1 -o energies.png\n"
         "  apt-evap map ni111.h5 --field-ion Ne -o image.png\n"
         "  apt-evap map ni111.h5 --poles\n"
+        "  apt-evap map ni111.h5 --width 85 -o figure.pdf\n"
         "  apt-evap map R5083.epos --poles W --axis 0,1,1 --distance 90\n\n"
         "a perturbation is NAME, NAME:NUMBERS or a TOML table:\n"
         "  Unperturbed              RollUp:0.2 (eV, all ions)    RollUp:0.155,0.155 (mean, standard deviation)\n"
@@ -58,6 +59,12 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         choices=("He", "Ne", "Ar", "H2"),
         metavar="GAS",
         help="field-ion image of the surface at the end of a run, in He, Ne, Ar or H2; default: Ne",
+    )
+    parser.add_argument(
+        "--width",
+        type=number_type("mm"),
+        metavar="MM",
+        help="figure for a paper, this wide, such as 85: panel letters and a scale bar, no titles",
     )
     group = parser.add_argument_group("crystal", "Poles and zone lines over the map.")
     group.add_argument(
@@ -91,7 +98,8 @@ def execute(options: argparse.Namespace) -> int:
     picture = picture_path(options.output or f"{Path(options.file).stem}_map.png")
     check_output(picture, is_picture, options.force)
     maps, titles, title, crystal = maps_of_file(options)
-    save_picture(picture, maps, titles, title, crystal)
+    colors = {} if options.field_ion is None else {"colormap": "gray", "label": "brightness / mean"}
+    save_picture(picture, maps, titles, title, crystal, width=options.width, **colors)
     tell(options, f"wrote {picture}")
     tell_json(options, {"wrote": str(picture), "file": options.file, "maps": map_summaries(maps, titles)})
     return 0

@@ -32,7 +32,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "example:\n"
         "  apt-evap reconstruct R5083.epos --element Si --distance 90 --efficiency 0.57 -o R5083.pos\n"
-        "  apt-evap reconstruct R5083.epos --element Si --distance 90 --ranges R5083.rrng --picture R5083.png\n"
+        "  apt-evap reconstruct R5083.epos --element Si --distance 90 --ranges R5083.rrng\n"
         "  apt-evap reconstruct ni111.h5 --real-units\n"
         "  apt-evap reconstruct R5083.epos --atomic-volume 0.02 --distance 90 --radius shank --initial-radius 30 \\\n"
         "      --shank-angle 5"
@@ -48,7 +48,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--picture",
         metavar="P.png",
-        help="draw side view, top view, depth profile and composition; --ranges gives the species of measured ions",
+        help="side view, top view, depth profile and composition; --ranges gives the species of measured ions; "
+        "default: the name of OUT with .png",
     )
     constants = parser.add_argument_group("constants", "The defaults of a run are its own constants.")
     constants.add_argument("--protocol", choices=("cap", "bas"), help="depth increment; default: cap")
@@ -96,6 +97,7 @@ def execute(options: argparse.Namespace) -> int:
     from apt_evap._common.files import FileError, check_path
     from apt_evap.cli._files import select, with_masses
     from apt_evap.io.formats import read_ranges, write
+    from apt_evap.plot.reconstructions import FEWEST
     from apt_evap.reconstruction.origins import OriginTable
     from apt_evap.reconstruction.reconstruct import reconstruct
     from apt_evap.studies.workflows.written_pictures import check_output, is_picture, picture_path, save_figure
@@ -103,9 +105,8 @@ def execute(options: argparse.Namespace) -> int:
     output = check_path(options.output or f"{Path(options.file).stem}_reconstructed.pos")
     if output.exists() and not options.force:
         raise FileError(f"{str(output)!r} exists: --force overwrites it")
-    picture = None if options.picture is None else picture_path(options.picture)
-    if picture is not None:
-        check_output(picture, is_picture, options.force)
+    picture = output.with_suffix(".png") if options.picture is None else picture_path(options.picture)
+    check_output(picture, is_picture, options.force)
     hits, known = _ions(options)
     settings = _settings(options, known)
     if not {"atomic_volume", "element"} & set(settings):
@@ -117,16 +118,19 @@ def execute(options: argparse.Namespace) -> int:
             f"{options.file!r} has no voltages: --radius shank, or a radius [nm], needs none, got --radius voltage"
         )
     # ranges without species are only for the picture
-    ranges = read_ranges(options.ranges) if picture is not None and options.ranges is not None else None
+    ranges = read_ranges(options.ranges) if options.ranges is not None else None
     if ranges is not None and options.species is None:
         options.ranges = None
     origins = None if options.origins is None else OriginTable.load(options.origins)
     reconstruction = reconstruct(select(with_masses(hits, options), options), origins=origins, **settings)
+    figure = None
+    if options.picture is not None or len(reconstruction) >= FEWEST:
+        figure = plot.reconstruction(reconstruction, ranges)[0].figure
     write(output, reconstruction.to_hits(options.frame))
     tell(options, f"{reconstruction!r}")
     result = {"wrote": str(output), "file": options.file, "ions": len(reconstruction)}
-    if picture is not None:
-        save_figure(picture, plot.reconstruction(reconstruction, ranges)[0].figure)
+    if figure is not None:
+        save_figure(picture, figure)
         result["picture"] = str(picture)
     result["settings"] = for_json(reconstruction.settings)
     if hits.outcome is not None and len(reconstruction) > 2:  # simulated: the true sites are known
@@ -134,8 +138,7 @@ def execute(options: argparse.Namespace) -> int:
         result["errors"] = errors.to_dict()
         tell(options, f"RMS errors: {errors.lateral_rms:.3f} nm lateral, {errors.depth_rms:.3f} nm in depth")
     tell(options, f"wrote {len(reconstruction):,} ions to {output}")
-    if picture is not None:
-        tell(options, f"wrote {picture}")
+    tell(options, f"no picture of fewer than {FEWEST} ions" if figure is None else f"wrote {picture}")
     tell_json(options, result)
     return 0
 

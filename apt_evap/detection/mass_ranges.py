@@ -86,6 +86,10 @@ class Ranges:
     def __len__(self) -> int:
         return len(self.names)
 
+    @property
+    def _name(self):
+        return f"the ranges of {self.source!r}" if self.source else "these ranges"
+
     def __repr__(self) -> str:
         source = f" from {self.source!r}" if self.source else ""
         return f"<Ranges: {len(self)} of {', '.join(self.species_names)}{source}>"
@@ -197,9 +201,7 @@ class Ranges:
         for name in names or (None,):
             if name not in known:
                 hint = did_you_mean(name, known)
-                raise ValueError(
-                    f"{self.source or 'these ranges'} have no species {short_text(name)}{hint}, only {', '.join(known)}"
-                )
+                raise ValueError(f"{self._name} have no species {short_text(name)}{hint}, only {', '.join(known)}")
         species = self.species(hits)
         self._warn_of_others(species)
         return hits[np.isin(species, [known.index(name) for name in names])]

@@ -22,7 +22,9 @@ from apt_evap.detection.projection import Projection
 from apt_evap.emission.perturbations import Perturbation, RollUp, TruncatedNormal, Unperturbed
 from apt_evap.explore.controls import MECHANISMS, Control, controls_of, perturbation_of
 from apt_evap.explore.placement import misplaced
+from apt_evap.fit.confirmation import confirmed
 from apt_evap.fit.fit_energies import BINS, measured_map
+from apt_evap.fit.structure import PoleMeasure
 from apt_evap.maps.crystallography.directions import poles
 from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.crystallography.symmetry import pole_symmetry
@@ -547,7 +549,7 @@ class Explorer:
         return tuple(ring_statistics(counts, projection, fold=pole.fold) for counts in _present(maps))
 
     def likeness(self, maps: ExplorerMaps) -> Likeness:
-        """Whether both maps show the same crystal along the same axis, see `likeness`, and lie on each other."""
+        """Whether both maps show the same crystal along the same axis, as `Study.likeness`, and lie on each other."""
         assert maps.simulated is not None and maps.measured is not None and self.registration is not None
         arguments = maps.simulated, maps.measured, self.registration
         try:
@@ -556,9 +558,20 @@ class Explorer:
             projection = None
         orientation = Orientation.known(self.run.settings["tip"])
         result = likeness(*arguments, about=symmetric_places(orientation, projection))
+        if result.verdict == "alike":
+            result = confirmed(result, *self._structures(maps))
         if result.verdict == "alike" and (why := misplaced(*arguments)):
             return result._replace(verdict="doubtful", reason=f"{result.reason}, but {why}: check the registration")
         return result
+
+    def _structures(self, maps):
+        """Structure of both maps about a pole, None without one whose rings are on the maps."""
+        region = replace(maps.measured, mask=maps.measured.mask & maps.simulated.mask)
+        try:
+            measure = PoleMeasure(self.run, self.registration, region)
+        except ValueError:
+            return None, None
+        return tuple(measure.structure(replace(counts, mask=region.mask)) for counts in (maps.simulated, region))
 
     def profiles(self, maps: ExplorerMaps, ends: Any, width: float) -> tuple[Rectangle, tuple[Profile, ...]]:
         """Profiles across a line on the maps.

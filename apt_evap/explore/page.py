@@ -143,7 +143,7 @@ class Page:
         if explorer.is_comparison:
             emission = self.emission
             self.registration = RegistrationPanel(
-                explorer, lambda: emission.perturbation, registration_of, request, note, self._later
+                explorer, lambda: emission.perturbation, registration_of, request, note, self._later, self.summary.judge
             )
             self._panels.append(self.registration)
         self.tools = MouseTools(figures, tools, self.figures.show_whole)

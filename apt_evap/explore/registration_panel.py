@@ -1,6 +1,5 @@
 """Panel of the registration: its search in another process, a typed one, and the verdict on both maps."""
 
-import math
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -16,6 +15,7 @@ from apt_evap.explore.explorer import Explorer, ExplorerMaps
 from apt_evap.explore.search_process import SearchProcess, start_thread
 from apt_evap.explore.widgets import LEFT
 from apt_evap.maps.registration.register import Registration
+from apt_evap.maps.registration.verdict import Likeness
 
 _VERDICT_COLORS = {"alike": "#2e7d4f", "doubtful": "#a8741a", "not alike": "#a93a3a"}
 
@@ -41,6 +41,8 @@ class RegistrationPanel:
         Shows a sentence.
     later : callable
         As for `Page`.
+    judged : callable
+        Receives maps, and whether they are alike.
     """
 
     def __init__(
@@ -51,9 +53,10 @@ class RegistrationPanel:
         request: Callable[[bool], None],
         note: Callable[[str], None],
         later: Callable[[Callable[[], None], int], Any],
+        judged: Callable[[ExplorerMaps, Likeness], None],
     ) -> None:
         self._explorer, self._registration_of = explorer, registration_of
-        self._request, self._note, self._later = request, note, later
+        self._request, self._note, self._later, self._judged = request, note, later, judged
         self._process: SearchProcess | None = None
         self._number = 0  # of the search whose result is awaited
         self._progress: tuple[int, int] | None = None
@@ -165,6 +168,7 @@ class RegistrationPanel:
     def _put_likeness(self, maps, likeness):
         if maps is self._maps:
             self.likeness = likeness
+            self._judged(maps, likeness)
             self._put_status()
 
     def _put_status(self):
@@ -179,12 +183,11 @@ class RegistrationPanel:
         registration = self._explorer.registration
         if self._explorer.registered and registration is not None and self.likeness is not None:
             text, reason = self.likeness.verdict, self.likeness.reason
-            symmetry = "" if math.isnan(self.likeness.symmetry) else f" ({self.likeness.symmetry:.2f})"
             if registration.doubtful:
                 reason += f"; the correlation of the registered maps is only {registration.score:.2f}"
             parts.append(
                 f'<span title="{escape(reason)}" style="background: {_VERDICT_COLORS[text]}; color: white;'
-                f' border-radius: 10px; padding: 3px 10px; white-space: nowrap">{text}{symmetry}</span>'
+                f' border-radius: 10px; padding: 3px 10px; white-space: nowrap">{text}</span>'
             )
         elif self._progress is None and not self._explorer.registered:
             parts.append("<small>not registered</small>")

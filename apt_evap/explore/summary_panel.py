@@ -10,6 +10,7 @@ from bokeh.models import Div
 
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.explore.explorer import Explorer, ExplorerMaps
+from apt_evap.maps.registration.verdict import Likeness
 
 READOUT_DELAY = 60
 """Delay of the numbers of a preview [ms]: a text changes the layout, which takes as long as to paint a map (50 ms)."""
@@ -29,6 +30,7 @@ class SummaryPanel:
     def __init__(self, explorer: Explorer | None, later: Callable[[Callable[[], None], int], Any]) -> None:
         self._later = later
         self._maps: ExplorerMaps | None = None
+        self._verdict = ""  # of the last maps that were judged
         self._readout_waits = False
         facts = ["<b>apt-evap explore</b>"] if explorer is None else _facts(explorer)
         self.facts = Div(text=" &nbsp; ".join(facts), sizing_mode="stretch_width")
@@ -44,6 +46,12 @@ class SummaryPanel:
             self._readout_waits = True
             self._later(self._put_preview, READOUT_DELAY)
 
+    def judge(self, maps: ExplorerMaps, likeness: Likeness) -> None:
+        """Take the verdict on maps: the similarity is a number for maps that are alike."""
+        self._verdict = likeness.verdict
+        if maps is self._maps:
+            self._put_numbers(maps)
+
     def note(self, sentence: str) -> None:
         """Show a sentence, in place of all notes."""
         self._put_notes([sentence])
@@ -56,6 +64,8 @@ class SummaryPanel:
     def _put_numbers(self, maps):
         text = ""
         if maps.similarity is not None:
+            text = "no similarity: the maps are " + self._verdict + "<br>" if self._verdict else ""
+        if maps.similarity is not None and self._verdict == "alike":
             halves = "" if maps.ceiling is None else f"; of two halves of the measurement {maps.ceiling.value:.3f}"
             text = f'<span style="font-size: 26px">{maps.similarity.value:.3f}</span> similarity{halves}<br>'
         ions = "" if maps.simulated is None else f"{maps.simulated.shown_ions} on the map"

@@ -205,9 +205,9 @@ def _warn_of_lost_lines(structure, settings):
 def _warn_of_few_ions(density, measured):
     if density < FEWEST_IONS:
         warn(
-            f"the run has {density:.2g} ions per compared bin, but a map needs at least {FEWEST_IONS:g}: "
-            f"use fewer bins than {max(measured.values.shape)}, or simulate more ions",
+            f"the run has {density:.2g} ions per compared bin, but a map needs at least {FEWEST_IONS:g}",
             MapWarning,
+            f"use fewer bins than {max(measured.values.shape)}, or simulate more ions",
         )
 
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy
 
+from apt_evap._common.digits import rounded_text
 from apt_evap._common.short_repr import short_repr
 from apt_evap._common.validation import check_kind, check_number
 from apt_evap.analysis.charge_states import LEAST, charge_history, field_of_counts, ion_charges, ratio_of_counts
@@ -17,7 +18,7 @@ from apt_evap.detection.hits import Hits
 from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.emission.post_ionisation import RATIO_PARAMETERS
-from apt_evap.fit.start_settings import FIELD_FACTOR, has_voltage, voltages_of
+from apt_evap.fit.start_settings import FIELD_FACTOR, FIELD_FACTORS, has_voltage, voltages_of
 from apt_evap.maps.indexing.index_map import Candidate
 from apt_evap.maps.indexing.orientation_search import disc_of
 from apt_evap.maps.indexing.refine import bins_of, refine, resolution
@@ -31,6 +32,7 @@ _SECTIONS = 40  # of the sequence, for a slope and its error
 _DEEP = 0.05  # radii that the apex must recede for an angle of the shank: over less, the apex changes its shape
 _FEWEST = 5_000  # ions of each half, for its scale
 _STEP = 0.01  # relative, for sensitivities
+_FIELD_ERROR = 0.1  # relative, of evaporation fields, which are computed by image-hump models
 _MEDIAN = math.sqrt(math.pi / 2)  # standard error of a median, in that of a mean
 
 
@@ -45,13 +47,22 @@ class Constant(NamedTuple):
     """Standard error by noise alone; NaN if it is not known."""
     depends: str
     """Constants with which it is degenerate, or the reason why it is not determined."""
+    between: tuple[float, float] | None = None
+    """Values for the range of a constant that is assumed; None if none is."""
+    needs_crystal: bool = True
+    """Whether it is wrong if the crystal or its orientation is."""
 
     @property
     def text(self) -> str:
-        """Value and error."""
+        """Value and error, with the digits that the error and an assumed constant allow."""
         if math.isnan(self.value):
             return "not determined"
-        return f"{self.value:.5g}" if math.isnan(self.error) else f"{self.value:.5g} ± {self.error:.2g}"
+        if self.between is not None and (width := abs(self.between[1] - self.between[0]) / 2) > 0:
+            number, low, high = (rounded_text(value, width) for value in (self.value, *self.between))
+            return f"{number} ({low} to {high})"
+        if math.isnan(self.error):
+            return rounded_text(self.value, math.nan, 4)
+        return f"{rounded_text(self.value, self.error)} ± {rounded_text(self.error, self.error)}"
 
 
 class Observed(NamedTuple):
@@ -76,7 +87,18 @@ class Observed(NamedTuple):
     @property
     def text(self) -> str:
         """Measured and expected value, and their deviation, as text."""
-        return f"{self.value:.4g}, expected {self.expected:.4g} ± {self.error:.2g}: z = {self.z:+.1f}"
+        return f"{self.found}, expected {self.predicted}"
+
+    @property
+    def found(self) -> str:
+        """Measured value as text."""
+        return rounded_text(self.value, self.error)
+
+    @property
+    def predicted(self) -> str:
+        """Expected value with its error, and the deviation, as text."""
+        expected, error = (rounded_text(number, self.error) for number in (self.expected, self.error))
+        return f"{expected} ± {error}: z = {self.z:+.1f}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +118,10 @@ class Measurement:
     constants: tuple[Constant, ...]
     checks: tuple[Observed, ...]
     arguments: dict[str, Any]
+
+    def without_crystal(self) -> Measurement:
+        """What remains if the crystal or its orientation is in doubt: no checks, and no arguments of `reconstruct`."""
+        return Measurement(tuple(constant for constant in self.constants if not constant.needs_crystal), (), {})
 
     def __repr__(self) -> str:
         return short_repr(self)
@@ -192,7 +218,8 @@ def constants_of(
     field = material.evaporation_field
 
     # constants by the voltage: field, radius and field factor; then the angle of the shank by its increase
-    constants += _voltage_constants(voltages, field, lens, factor)
+    factors = FIELD_FACTORS if field_factor is None else (factor, factor)
+    constants += _voltage_constants(voltages, field, lens, factor, factors)
     volume = 1 / atom_density(material.structure, material.a, material.c)
     disc = disc_of(measured)  # a few ions are far outside the field of view
     constants.append(_shank(hits, disc, scale, volume, efficiency, field, lens, factor, length))
@@ -235,18 +262,27 @@ def _scale_of(measured, candidate):
     return fitted.scale, fitted.scale * math.sqrt(fitted.covariance[3, 3] * fitted.dispersion)
 
 
-def _voltage_constants(voltages, field, lens, factor):
-    """Voltages of both ends, and what they give."""
-    constants = []
+def _voltage_constants(voltages, field, lens, factor, factors):
+    """Voltages of both ends, and what they give; `factors` is the range of the field factor without a lens."""
+    constants: list[Constant] = []
+    fields = field * (1 + _FIELD_ERROR), field * (1 - _FIELD_ERROR)
     for where, part in (("first", voltages[:_ENDS]), ("last", voltages[-_ENDS:])):
         voltage = float(np.median(part))
         error = _MEDIAN * float(np.std(part)) / math.sqrt(len(part)) or math.nan  # a supply has steps
         fixed = "the product field factor x evaporation field x radius"
-        constants.append(Constant(f"voltage of the {where} ions [V]", voltage, error, fixed))
+        name = f"voltage of the {where} ions [V]"
+        constants.append(Constant(name, voltage, error, fixed, needs_crystal=False))
         if lens is None:
             radius = voltage / (factor * field)
-            why = f"for k_f = {factor:g} and F = {field:g} V/nm: 1 % more of either is 1 % less; k_f is 2 to 8"
-            constants.append(Constant(f"radius at the {where} ions [nm]", radius, radius * error / voltage, why))
+            why = f"for k_f = {factor:g} and F = {field:g} V/nm: 1 % more of either is 1 % less; between them for "
+            low, high = (voltage / (factors[1] * field), voltage / (factors[0] * field))
+            if low == high:
+                low, high = (voltage / (factor * other) for other in fields)
+                why += f"{fields[1]:.3g} to {fields[0]:.3g} V/nm"
+            else:
+                why += f"k_f of {factors[0]:g} to {factors[1]:g}"
+            name = f"radius at the {where} ions [nm]"
+            constants.append(Constant(name, radius, radius * error / voltage, why, (low, high)))
             continue
         radius = float(lens.radius(voltage, field))
         less = 100 * (float(lens.radius(voltage, field * (1 + _STEP))) / radius - 1)
@@ -258,7 +294,10 @@ def _voltage_constants(voltages, field, lens, factor):
                 if other is not None:
                     why += f", {100 * (float(other.radius(voltage, field)) / radius - 1):+.2f} %{text}"
         slope = math.log(float(lens.radius(voltage * (1 + _STEP), field)) / radius) / math.log(1 + _STEP)
-        constants.append(Constant(f"radius at the {where} ions [nm]", radius, radius * slope * error / voltage, why))
+        why += f"; between them for {fields[1]:.3g} to {fields[0]:.3g} V/nm"
+        low, high = (float(lens.radius(voltage, other)) for other in fields)
+        name = f"radius at the {where} ions [nm]"
+        constants.append(Constant(name, radius, radius * slope * error / voltage, why, (low, high)))
         of_lens = "of the lens at this radius"
         constants.append(
             Constant(f"field factor at the {where} ions", float(lens.field_factor(radius)), math.nan, of_lens)

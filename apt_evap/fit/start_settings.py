@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from apt_evap._common.codec import for_json
+from apt_evap._common.digits import rounded_text
 from apt_evap._common.files import open_for_reading, replace_file
 from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import AnyPath, Booleans, Floats
@@ -33,7 +34,9 @@ from apt_evap.specimen.lattice import atom_density
 MARK = "# Settings of a simulation, made from a measured map by apt_evap"
 """Beginning of the first line of the text."""
 FIELD_FACTOR = 3.3
-"""Field factor if there is no lens: the middle of 2 to 8 of usual specimens (Gault et al., Atom Probe Microscopy)."""
+"""Field factor if there is no lens."""
+FIELD_FACTORS = 2.0, 8.0
+"""Range of the field factors of usual specimens (Gault et al., Atom Probe Microscopy)."""
 RADII = (80, 60, 50, 40, 32, 25, 20, 16, 12, 10)
 """Radii of simulated tips [lattice constants], the largest one that the time allows is taken."""
 ENERGY, HEIGHT, SHARPNESS = 0.35, 0.1, 0.4
@@ -181,6 +184,7 @@ def settings_of(
         if field_factor is not None:
             raise ValueError("give lens or field_factor, not both")
     factor = FIELD_FACTOR if field_factor is None else check_number(field_factor, "field_factor", above=0)
+    factors = FIELD_FACTORS if field_factor is None else (factor, factor)
     budget = check_number(minutes, "minutes", above=0, unit="min") * check_count(threads, "threads", at_least=1) / 60
     best = indexing.best
     material = best.orientation.material
@@ -188,7 +192,7 @@ def settings_of(
     radius = math.nan if math.isnan(radii[0]) else sum(radii) / 2
     sizes = [size for size in RADII if not size * material.a > radius] or [RADII[-1]]
     for size in sizes:
-        text = _text(indexing, radii, size, lens, factor)
+        text = _text(indexing, radii, size, lens, factors)
         needs = estimate_cost(config_of(tomllib.loads(text), Path("settings.toml")), threads)
         if needs.hours is not None and needs.hours <= budget:
             break
@@ -235,7 +239,7 @@ def _radii(hits, field, lens, factor):
     return float(lens.radius(ends[0], field)), float(lens.radius(ends[1], field))
 
 
-def _text(indexing, radii, size, lens, factor):
+def _text(indexing, radii, size, lens, factors):
     """The settings file."""
     best = indexing.best
     material, projection = best.orientation.material, best.projection
@@ -258,6 +262,7 @@ def _text(indexing, radii, size, lens, factor):
     lines = [
         f"{MARK} {__version__}.",
         comment(f"Measured: {indexing.map.source or 'a map'}"),
+        *(() if indexing.decided else ("# NOT DECIDED: axis and rotation are those of the first candidate.",)),
         "",
         "[tip]",
         f"material = {material_value(material)}",
@@ -266,7 +271,7 @@ def _text(indexing, radii, size, lens, factor):
         *others,
         f"rotation = {best.orientation.rotation:.2f}    # of the crystal on the map; the map is not mirrored",
         f'apex_radius = "{size:g} a"    # simulated: {size * material.a:.1f} nm',
-        f"# {_radius_text(material, radii, lens, factor)}",
+        f"# {_radius_text(material, radii, lens, factors)}",
         f'shank_length = "{2 * size:g} a"',
         f"shank_angle = {shank:g}    # degrees: {shank_why}",
         'depth = "6 a"    # atoms deeper below the surface are not kept in memory',
@@ -307,19 +312,24 @@ def _text(indexing, radii, size, lens, factor):
     return "\n".join(lines)
 
 
-def _radius_text(material, radii, lens, factor):
+def _radius_text(material, radii, lens, factors):
+    """The radius with the digits that the field factor, or else the evaporation field, allows."""
     if math.isnan(radii[0]):
         return "the radius of the specimen is not known: the file has no voltages"
-    by = f"k_f = {factor:g}" if lens is None else "the lens"
-    return (
-        f"the specimen has R = {radii[0]:.0f} to {radii[1]:.0f} nm, by V = k_f F R with {by} and F = "
-        f"{material.evaporation_field:g} V/nm"
-    )
+    field = f"F = {material.evaporation_field:g} V/nm"
+    if lens is None and factors[1] > factors[0]:
+        low, high = (FIELD_FACTOR * sum(radii) / 2 / factor for factor in factors[::-1])
+        radius, low, high = (rounded_text(value, (high - low) / 2) for value in (sum(radii) / 2, low, high))
+        known = f"k_f = {FIELD_FACTOR:g} ({factors[0]:g} to {factors[1]:g})"
+        return f"the specimen has R = {radius} nm ({low} to {high}), by V = k_f F R with {known} and {field}"
+    first, last = (rounded_text(value, 0.1 * value) for value in radii)  # of an error of the field of a tenth
+    by = "the lens" if lens is not None else f"k_f = {factors[0]:g}"
+    return f"the specimen has R = {first} to {last} nm, by V = k_f F R with {by} and {field}"
 
 
 def _emission(rolled):
     """Lines of the panel with the emission that the patterns suggest."""
-    why = f"# the map has {rolled:.0%} of the pattern of ions that roll up; the energy is to be fitted"
+    why = f"# the map has {rolled:.1f} of the pattern of ions that roll up; the energy is to be fitted"
     if rolled < ROLLS:
         table = f'{{ name = "LateralVelocity", energy = {ENERGY}, height = {HEIGHT} }}'
         return ['title = "lateral velocities"', f"perturbation = {table}    # eV", why]

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from apt_evap._common.codec import for_json, to_plain
+from apt_evap._common.digits import rounded_text
 from apt_evap._common.files import replace_file
 from apt_evap._common.notebook import as_table
 from apt_evap._common.types import AnyPath, Floats
@@ -16,13 +17,19 @@ from apt_evap._version import __version__
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.projection import Projection
 from apt_evap.emission.perturbations import described
+from apt_evap.fit.confirmation import confirmed
 from apt_evap.fit.fit_settings import FitSettings
 from apt_evap.fit.grid import EnergyGrid
 from apt_evap.fit.structure import RegisteredProjection, StructureScores
-from apt_evap.maps.crystallography.directions import plain_label
 from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.registration.register import Registration
 from apt_evap.maps.registration.verdict import Likeness, likeness, symmetric_places
+
+LEAST_CEILING = 0.1
+"""Score of two halves of the measured ions below which scores are not corrected for noise: it would be a division of
+noise by noise."""
+ABOVE_NOISE = 2.0
+"""Standard deviations above 0 of an uncorrected score that is corrected for noise."""
 
 
 class Score(NamedTuple):
@@ -164,9 +171,60 @@ class Study:
 
     @cached_property
     def likeness(self) -> Likeness:
-        """Whether the best simulated map and the measured one show the same crystal along the same axis."""
+        """Whether the best simulated map and the measured one show the same crystal along the same axis.
+
+        The symmetries about a pole must agree, the folded maps correlate, and the lines have the same sign.
+        """
         places = symmetric_places(self.orientation, self._projection)
-        return likeness(self.maps["optimum"], self.measured, self.registration, about=places)
+        by_symmetry = likeness(self.maps["optimum"], self.measured, self.registration, about=places)
+        scores = self.structure
+        pair = (None, None) if scores is None else (scores.optimum, scores.measured)
+        return confirmed(by_symmetry, *pair)
+
+    @property
+    def no_energy(self) -> str:
+        """Reason why the study gives no energy, as part of a sentence; empty if it gives one."""
+        if self.likeness.verdict != "alike":
+            return _VERDICTS[self.likeness.verdict]
+        if self.registration.doubtful:
+            return "the registration is doubtful"
+        if "true_mean" not in self.refined.intervals:
+            return "the errors are not known without resamples"
+        below, above = self.refined.open_ends.get("true_mean", (False, False))
+        if below or above:
+            sides = "lower and upper" if below and above else "lower" if below else "upper"
+            return f"the interval of 95 % has no {sides} bound within the grid"
+        return ""
+
+    @property
+    def no_score(self) -> str:
+        """Reason why the study gives no score that is corrected for noise; empty if it gives one."""
+        if self.likeness.verdict != "alike":
+            return _VERDICTS[self.likeness.verdict]
+        plain = self.plain["optimum"]
+        if plain.value <= ABOVE_NOISE * np.nan_to_num(plain.error):
+            return "the uncorrected one is not above its noise"
+        if self.ceiling is not None and self.ceiling.value < LEAST_CEILING:
+            return f"two halves of the measured ions reach only {self.ceiling}"
+        return ""
+
+    @property
+    def score_text(self) -> str:
+        """The score of the best map as text, with its ceiling; uncorrected for noise if a correction means nothing.
+
+        Scores of maps that are not alike are not comparable with those of maps that are, and not given.
+        """
+        if self.likeness.verdict != "alike":
+            return f"no {self.settings.score_name}: {self.no_score}"
+        corrected = self.settings.allow_noise and not self.no_score
+        best = self.optimum.score if corrected else self.plain["optimum"]
+        unperturbed = self.baselines["unperturbed"] if corrected else self.plain["unperturbed"]
+        text = f"{self.settings.score_name} {best}, unperturbed {unperturbed}"
+        if corrected:
+            text += f"; uncorrected for noise {self.plain['optimum']}"
+        elif self.settings.allow_noise:
+            text += f"; not corrected for noise: {self.no_score}"
+        return text + (f", two halves of the measured ions {self.ceiling}" if self.ceiling else ", ceiling not known")
 
     @property
     def _projection(self):
@@ -192,7 +250,7 @@ class Study:
     def to_dict(self) -> dict[str, Any]:
         """Return results and settings in plain types, NaN as None, dict."""
         names = ("scores", "errors", "shares", "gain_share", "optimum", "refined", "registration", "gain", "ceiling")
-        names += ("baselines", "plain", "real_energies", "likeness")
+        names += ("baselines", "plain", "real_energies", "likeness", "no_energy", "no_score", "result")
         results = to_plain({name: getattr(self, name) for name in names})
         results["made_by"] = f"apt_evap {__version__}"
         results["grid"] = to_plain(self.grid) | {"mechanism": self.grid.name}
@@ -232,60 +290,55 @@ class Study:
         return tuple(axis.index(values[name]) for name, axis in self.grid.axes.items())
 
     def __repr__(self) -> str:
-        best, refined = self.optimum, self.refined
-        combined = self.grid.mechanism == "combined"
-        fraction = f", roll-up fraction {best.rollup_fraction:g}" if combined else ""
-        fraction += "".join(f", {name} {value:g}" for name, value in best.options.items())
-        edge = f" (at the end of the grid in {' and '.join(best.at_edge)})" if best.at_edge else ""
-        others = [f"{name} {score}" for name, score in self.baselines.items()]
-        uncorrected = f";\n uncorrected {self.plain['optimum']}, " if self.settings.allow_noise else ", "
-        others = f"{', '.join(others)}, gain over unperturbed {self.gain}" + (uncorrected if self.ceiling else "")
-        others += f"two halves of the measured ions {self.ceiling}" if self.ceiling else ""
-        between = f"{refined.bounded('mean')} eV, sigma/mean {refined.bounded('relative_spread')}"
-        between += f", roll-up fraction {refined.bounded('rollup_fraction')}" if combined else ""
-        between += "".join(f", {name} {refined.bounded(name)}" for name in refined.options)
-        doubtful = ", registration doubtful" if self.registration.doubtful else ""
-        return (
-            f"<Study: maps {self.likeness.verdict}; {self.grid.name}{doubtful}, "
-            f"best at {best.mean:g} eV, sigma/mean {best.relative_spread:g}{fraction}"
-            f"{edge}, {self.settings.score_name} {best.score}; {others};\n between points {between}; "
-            f"{self._structure()}{self._energies()}>"
-        )
+        if self.likeness.verdict != "alike":
+            return f"<Study: maps {self.likeness.verdict}, no energy and no score>"
+        return f"<Study: maps alike; {self.result}; {self.score_text}>"
 
     _repr_html_ = as_table
 
     def lines(self) -> list[str]:
-        """Result, similarity, and doubts if there are any: at most three lines, list of str."""
-        best, likeness = self.optimum, self.likeness
-        verdict = {"alike": "the maps are alike", "doubtful": "it is doubtful that the maps are alike"}
-        first = f"{verdict.get(likeness.verdict, 'the maps are not alike')} ({likeness.reason}); {self.grid.name}, "
-        first += f"best at {self.point(self.best_cell)}"
-        second = f"{self.settings.score_name} {best.score}, unperturbed {self.baselines['unperturbed']}"
-        if self.settings.allow_noise:
-            second += f"; uncorrected for noise {self.plain['optimum']}"
-        second += f", two halves of the measured ions {self.ceiling}" if self.ceiling else ", ceiling not known"
+        """Result, score, and doubts if there are any: at most three lines, list of str."""
+        best = self.optimum
+        first = f"{_VERDICTS[self.likeness.verdict]} ({self.likeness.reason})"
+        if self.likeness.verdict == "alike":
+            results = [f"{first}{', but' if self.no_energy else ';'} {self.result}", self.score_text]
+        else:
+            results = [f"{first}; so no energy and no score are given"]
         doubts = []
-        if likeness.verdict != "alike":
-            doubts.append("the energies have no meaning if the maps are not alike")
         if self.registration.doubtful:
             doubts.append(f"the registration, correlation {self.registration.score:.2f}")
-        if best.at_edge:
+        if best.at_edge and self.likeness.verdict == "alike":
             doubts.append(f"best at the end of the grid in {' and '.join(best.at_edge)}")
         if self.structure is not None and self.structure.lost:
             doubts.append("the best map has lost the zone lines")
-        elif self.structure is not None and self.structure.disagrees:
+        elif self.structure is not None and self.structure.disagrees and not self.no_energy:
             doubts.append(f"the rings about the pole are best at {self.point(self.structure.best)}")
-        return [first, second, *([f"doubt: {'; '.join(doubts)}"] if doubts else [])]
+        return [*results, *([f"doubt: {'; '.join(doubts)}"] if doubts else [])]
+
+    @property
+    def real_factor(self) -> tuple[float, str]:
+        """Factor from energies of the fit to those of the experiment, and what they are energies at.
+
+        1 and the simulated voltage, if the operating point of the run is not known.
+        """
+        real = self.provenance.get("real_units")
+        if real is None:
+            return 1.0, f"at the simulated voltage, {self.provenance['run']['voltage']:g} V"
+        return real["real_per_study"], f"at {real['operating_field']:.3g} V/nm and {real['flight_charge']}+"
 
     @property
     def result(self) -> str:
-        """The result as one sentence: how the ions leave, and their mean energy in real units, if these are known."""
-        refined, real = self.refined, self.provenance.get("real_units")
-        factor, unit = (1.0, "eV at the simulated voltage") if real is None else (real["real_per_study"], "eV")
+        """The result as one sentence: how the ions leave, and their mean energy or the reason why it is not given.
+
+        The mean is that after the truncation, at the field of the experiment if it is known.
+        """
+        refined, (factor, where) = self.refined, self.real_factor
+        if self.no_energy:
+            return f"no energy is given: {self.no_energy}"
         material = self.provenance["run"]["tip"].get("material")
         name = material.get("name") if isinstance(material, dict) else material
         ions = f"{name} ions" if isinstance(name, str) else "ions"
-        energy = f"a mean of {refined.scaled('true_mean', factor)} {unit}"
+        energy = f"a mean of {refined.scaled('true_mean', factor)} eV {where}"
         mechanism = self.grid.mechanism
         if mechanism == "roll-up":
             text = f"{ions} roll up with {energy}"
@@ -306,24 +359,6 @@ class Study:
         text += f", roll-up fraction {fraction:g}" if self.grid.mechanism == "combined" else ""
         return text + "".join(f", {name} {value:g}" for name, value in values.items())
 
-    def _structure(self):
-        """Text of the rings about the pole."""
-        scores = self.structure
-        if scores is None:
-            return ""
-        contrasts, measured = (
-            " ".join(f"{ring.contrast:.2f}" for ring in structure.rings)
-            for structure in (scores.optimum, scores.measured)
-        )
-        text = f"rings about ({plain_label(scores.plane)}): contrasts {contrasts}, measured {measured}, misfit "
-        text += f"{scores.misfit[scores.at_optimum]:.2f} ± {scores.errors[scores.at_optimum]:.2f}"
-        if scores.disagrees:
-            text += (
-                f"; rings and {self.settings.score_name} disagree: rings are best at {self.point(scores.best)}, misfit "
-            )
-            text += f"{scores.misfit[scores.best]:.2f} ± {scores.errors[scores.best]:.2f}"
-        return f"{text};\n "
-
     @property
     def real_energies(self) -> tuple[float, float] | None:
         """Mean and standard deviation of the refined optimum in real units [eV]; None if these are not known.
@@ -336,23 +371,12 @@ class Study:
         factor = real["real_per_study"]
         return self.refined.true_mean * factor, self.refined.true_standard_deviation * factor
 
-    def _energies(self):
-        """Text of the refined energies: in real units first, then at the simulated voltage."""
-        refined, run, real = self.refined, self.provenance["run"], self.provenance.get("real_units")
-        radius = run["tip"].get("apex_radius")
-        place = f" at {run['voltage']:g} V" + (f" and R = {radius:.3g} nm" if radius else "")
 
-        def text(factor):
-            mean, deviation = (refined.scaled(name, factor) for name in ("true_mean", "true_standard_deviation"))
-            return f"{mean} ± {deviation} eV"
-
-        if real is None:
-            return f"energies {text(1.0)}{place}"
-        field, charge = f"{real['operating_field']:.3g} V/nm", f"{real['flight_charge']}+"
-        return (
-            f"energies {text(real['real_per_study'])} at {field} and {charge}; "
-            f"simulated {text(real['simulated_per_study'])}{place}, {real['barrier_charge']}+"
-        )
+_VERDICTS = {
+    "alike": "the maps are alike",
+    "doubtful": "it is doubtful that the maps are alike",
+    "not alike": "the maps are not alike",
+}
 
 
 def bounded_text(
@@ -361,7 +385,7 @@ def bounded_text(
     open_ends: Sequence[bool] | None = None,
     factor: float = 1.0,
 ) -> str:
-    """Text of a number and its interval, times a factor; open ends are "at most" and "at least".
+    """Text of a number and its interval with the digits that it allows; open ends are "at most" and "at least".
 
     Parameters
     ----------
@@ -379,5 +403,6 @@ def bounded_text(
     if interval is None or interval[0] == interval[1]:  # not known, or given
         return f"{value * factor:.3g}"
     low, high = (bound * factor for bound in interval)
+    number, first, last = (rounded_text(part, abs(high - low) / 2) for part in (value * factor, low, high))
     below, above = open_ends or (False, False)
-    return f"{value * factor:.3g} ({'at most ' * below}{low:.3g} to {'at least ' * above}{high:.3g})"
+    return f"{number} ({'at most ' * below}{first} to {'at least ' * above}{last})"

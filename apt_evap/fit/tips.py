@@ -101,7 +101,9 @@ class TipFit:
             study = self.studies[name]
             share = f", best in {self.shares[name]:.0%} of the resamples" if np.isfinite(self.shares[name]) else ""
             doubt = ", registration doubtful" if name in self.doubtful else ""
-            lines.append(f" {name}: {study.refined.score}, {study.refined.bounded('true_mean')} eV{share}{doubt}")
+            alike = study.likeness.verdict == "alike"
+            result = f"{study.score_text}; {study.result}" if alike else f"maps {study.likeness.verdict}"
+            lines.append(f" {name}: {result}{share}{doubt}")
         return "\n".join(lines) + ">"
 
 

@@ -53,7 +53,7 @@ def read_rng(path: AnyPath) -> Ranges:
     if not rows:
         raise FileError(f"{str(path)!r} has no range with a species, expected at least one")
     if n_empty:
-        warn(f"{str(path)!r}: {n_empty} ranges have no species and are left out", DataWarning)
+        warn(f"{str(path)!r}: {n_empty} range{'' if n_empty == 1 else 's'} without species, left out", DataWarning)
     named = [names.get(bounds, ("", "")) for bounds, _ in rows]
     species = [formula(atoms) for _, atoms in rows]
     return Ranges(

@@ -10,6 +10,7 @@ from .map_figures import detector_map as detector_map
 from .map_figures import detector_maps as detector_maps
 from .overlays import overlay as overlay
 from .overlays import score_surface as score_surface
+from .paper_figures import paper_maps as paper_maps
 from .pole_labels import poles as poles
 from .profile_figures import profile as profile
 from .profile_figures import profile_comparison as profile_comparison

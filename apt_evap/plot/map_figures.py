@@ -13,7 +13,7 @@ from apt_evap._common.validation import check_kind
 from apt_evap.detection.binning import bins_for, shown_bins
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
-from apt_evap.maps.crystallography.directions import label
+from apt_evap.maps.crystallography.directions import label as plane_label
 from apt_evap.plot._figure import OUTSIDE, DrawnAxes, add_colorbar, new_figure, set_caption, set_title
 from apt_evap.plot.limits import color_limits
 from apt_evap.simulation.run import Run
@@ -90,6 +90,7 @@ def detector_maps(
     colormap: str = "inferno",
     columns: int | None = None,
     title: str | None = None,
+    label: str = "hits per area / mean",
 ) -> NDArray[np.object_]:
     """Draw several detector maps side by side with a common colour scale.
 
@@ -108,6 +109,8 @@ def detector_maps(
         columns.
     title : str, optional
         Title of the figure, such as `specimen_title`.
+    label : str
+        Quantity of the colours.
 
     Returns
     -------
@@ -136,7 +139,7 @@ def detector_maps(
     for ax in axes[len(drawn) :]:
         ax.remove()
     axes = axes[: len(drawn)]
-    add_colorbar([ax.images[0] for ax in axes], list(axes))
+    add_colorbar([ax.images[0] for ax in axes], list(axes), label)
     if title:
         figure.suptitle(title, fontsize="large")
     return axes
@@ -167,7 +170,7 @@ def specimen_title(run: Run) -> str:
     if "axis" in tip:  # not of a specimen from positions
         axis = tip["axis"]
         whole = all(index == round(index) for index in axis)
-        parts.append(f"axis [{label(axis) if whole else ' '.join(f'{index:.2f}' for index in axis)}]")
+        parts.append(f"axis [{plane_label(axis) if whole else ' '.join(f'{index:.2f}' for index in axis)}]")
     if "apex_radius" in tip:
         parts.append(f"R = {tip['apex_radius']:.1f} nm")
     return ", ".join(parts)

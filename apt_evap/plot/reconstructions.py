@@ -17,8 +17,9 @@ from apt_evap.reconstruction.reconstruct import Reconstruction
 _COLORS = ("C0", "C1", "C2", "C3", "C4", "C5", "C6", "0.6")
 _MOST = 7  # species with a colour of their own
 _DOTS = 20_000  # ions from the side: more hide each other
-_SECTIONS = 60  # along the depth, of at least _FEWEST ions
-_FEWEST = 50
+_SECTIONS = 60  # along the depth, of at least FEWEST ions
+FEWEST = 50
+"""Fewest ions of a picture."""
 _CORE = 0.5  # of the field of view, in which profiles are counted
 OUTSIDE = "outside every range"
 
@@ -47,6 +48,11 @@ def reconstruction(
     ndarray of matplotlib.axes.Axes
         Shape (4,).
 
+    Raises
+    ------
+    ValueError
+        If it has fewer than 50 ions.
+
     Examples
     --------
     >>> rng = np.random.default_rng(1)
@@ -58,8 +64,11 @@ def reconstruction(
     4
     """
     check_kind(result, "result", Reconstruction, "a Reconstruction, the result of reconstruct")
+    if len(result) < FEWEST:
+        raise ValueError(f"result must have at least {FEWEST} ions for a picture, got {len(result)}")
     names, species = _species(result, ranges)
     figure = new_figure((11.0, 8.4))
+    figure.set_layout_engine("constrained")  # not compressed: the panels stay in their columns
     axes = figure.subplots(2, 2).ravel()
     _side(axes[0], result, names, species)
     _top(axes[1], result)
@@ -128,7 +137,7 @@ def _core(result):
 
 def _sections(values):
     """Edges of sections of equal width."""
-    n = int(np.clip(len(values) // _FEWEST, 1, _SECTIONS))
+    n = int(np.clip(len(values) // FEWEST, 1, _SECTIONS))
     return np.linspace(values.min(), values.max() * (1 + 1e-12) + 1e-12, n + 1)
 
 

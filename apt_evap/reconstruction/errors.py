@@ -155,6 +155,12 @@ class ReconstructionErrors:
     compression: float = math.nan
     by_group: GroupErrors | None = field(default=None, repr=False)
 
+    def __repr__(self) -> str:
+        return (
+            f"<ReconstructionErrors of {len(self.depths):,} ions: RMS {self.lateral_rms:.3g} nm lateral, "
+            f"{self.depth_rms:.3g} nm in depth>"
+        )
+
     def by_poles(self, poles: ArrayLike, edges: ArrayLike = NEAR_POLES) -> ErrorBins:
         """Errors in bins of the distance from the nearest pole.
 

@@ -107,8 +107,9 @@ class MonitorState:
                 ChargesWarning,
                 "charges",
                 f"after {ions:,} ions the RMS residual of {len(residuals)} charges is {rms:.2g} of the mean charge, "
-                f"above the bound of {self._settings.charge_bound:g}: use a smaller sweep_interval or tolerance, or a "
-                "larger patch_radius (ChargeSettings, or [charges] in a settings file)",
+                f"above the bound of {self._settings.charge_bound:g}",
+                "use a smaller sweep_interval or tolerance, or a larger patch_radius (ChargeSettings, or [charges] in "
+                "a settings file)",
             )
         self._close()
 
@@ -156,13 +157,14 @@ class MonitorState:
                     kind,
                     what,
                     f"{fraction:.1%} of the last ions, up to number {self._last:,}, {what} (bound "
-                    f"{self._settings.fraction_bound:.2g}): {advice}",
+                    f"{self._settings.fraction_bound:.2g})",
+                    advice,
                 )
 
-    def _warn(self, kind, what, message):
+    def _warn(self, kind, what, message, advice):
         if what not in self._warned:  # once per run, not at every check
             self._warned.add(what)
-            warn(message, kind)
+            warn(message, kind, advice)
 
     def pop_history(self) -> History:
         """Return and clear the history of the checks since the last call."""

@@ -2,7 +2,9 @@
 
 import json
 
+import numpy as np
 import pytest
+from matplotlib.image import imread
 
 import apt_evap as ae
 from apt_evap.cli.main import main
@@ -22,6 +24,14 @@ def test_an_image_of_a_run(run, capsys, blank_pictures):
     assert told["maps"][0]["title"] == "field-ion image, He" and told["maps"][0]["bins"] == [64, 64]
     assert main(["map", "ni.h5", "--field-ion", "-o", "neon.png"]) == 0  # the default gas, as the last word but options
     assert "surface atoms in Ne at " in capsys.readouterr().out
+
+
+def test_an_image_is_grey(run, tmp_path):
+    """Also its bar: brightness is no density of hits."""
+    assert main(["map", "ni.h5", "--field-ion", "Ne", "--bins", "64", "-o", "image.png"]) == 0
+    assert main(["map", "ni.h5", "--perturbation", "Unperturbed", "-o", "map.png"]) == 0
+    image, other = (imread(tmp_path / name)[..., :3] for name in ("image.png", "map.png"))
+    assert np.ptp(image, axis=-1).max() == 0 < np.ptp(other, axis=-1).max()
 
 
 @pytest.mark.parametrize(

@@ -646,7 +646,7 @@ def test_ions_of_a_run_are_selected(folder, made, monkeypatch, capsys):
         (["--mass", "29,27"], "argument --mass: must be two increasing numbers, such as 27,29.5, got '29,27'"),
         (["--circle", "1,2"], "argument --circle: must be a radius or R,X,Y such as 15,0,-2 [mm], got '1,2'"),
         (["--species", "Si"], "--species needs --ranges"),
-        (["--ranges", "mixed.rrng", "--species", "Sn"], "--species: mixed.rrng have no species 'Sn'"),
+        (["--ranges", "mixed.rrng", "--species", "Sn"], "--species: the ranges of 'mixed.rrng' have no species 'Sn'"),
         (["--mass", "1,2"], "the options select none of the 1,000 ions of 'mixed.epos'"),
     ],
 )
@@ -796,3 +796,16 @@ def test_a_table_that_has_no_effect_is_told(folder, capsys):
     (folder / "a.toml").write_text(text.replace("ions = 60", "ions = 5"))
     assert main(["run", "a.toml", "--quiet"]) == 0
     assert "[responses]" in capsys.readouterr().err
+
+
+def test_ranges_are_summarised(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "r.rrng").write_text("[Ranges]\nRange1=27.5 28.5 Si:1\nRange2=57.5 58.5 Ni:1\nRange3=13.8 14.2 Si:1\n")
+    assert main(["info", "r.rrng", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["ranges"] == 3 and told["mass_to_charge"] == [13.8, 58.5]
+    assert told["species"] == {"Si": ["27.5 to 28.5", "13.8 to 14.2"], "Ni": ["57.5 to 58.5"]}
+    assert main(["info", "r.rrng"]) == 0 and "57.5 to 58.5" in capsys.readouterr().out
+    assert main(["info", "r.rrng", "--ions", "0,10"]) == 2 and "r.rrng" in capsys.readouterr().err
+    (tmp_path / "empty.rrng").write_text("[Ranges]\n")
+    assert main(["info", "empty.rrng"]) == 2 and "empty.rrng" in capsys.readouterr().err

@@ -46,3 +46,9 @@ def test_a_study_can_be_set_by_options(options):
     assert str(FitSettings().resamples) in study["resamples"].help
     assert f"{FitSettings().temperature:g}" in study["temperature"].help
     assert str(FitSettings().seed) in study["seed"].help
+
+
+def test_options_have_hyphens_and_no_underscores(options):
+    for command, actions in options.items():
+        for action in actions.values():
+            assert not [text for text in action.option_strings if "_" in text], command

@@ -32,6 +32,7 @@ def test_measured_ions(measured, nickel, tmp_path, capsys):
     assert main([*command, "--compression", "1.6"]) == 0
     told = capsys.readouterr().out
     assert "<Reconstruction: 2,000 ions, " in told and "wrote 2,000 ions to ni_reconstructed.pos" in told
+    assert (tmp_path / "ni_reconstructed.png").stat().st_size > 10_000  # it is drawn without being asked
     known = {"atomic_volume": nickel.a**3 / 4, "distance": 90.0, "efficiency": 0.6, "compression": 1.6}
     expected = ae.reconstruct(measured, **known, evaporation_field=35.0)
     assert ae.read("ni_reconstructed.pos").positions == pytest.approx(expected.positions, rel=1e-6, abs=1e-5)  # float32
@@ -159,3 +160,15 @@ def test_an_unknown_element_names_the_options_of_the_shell(measured, capsys):
     told = capsys.readouterr().err
     assert all(name in told for name in ("--element", "'Ca'", "--atomic-volume", "--evaporation-field"))
     assert "Material(" not in told and told.count("\n") == 1
+
+
+@pytest.mark.parametrize("ions", [1, 2, 5, 49, 50])
+def test_few_ions_are_reconstructed(measured, tmp_path, capsys, ions):
+    """A picture that nobody asked for does not stop them; one that is asked for is refused before a file is written."""
+    command = ["reconstruct", "ni.epos", "--element", "Ni", "--distance", "90", "--ions", f"0,{ions}", "-o", "few.pos"]
+    assert main(command) == 0
+    assert len(ae.read("few.pos")) == ions and (tmp_path / "few.png").exists() == (ions == 50)
+    if ions < 50:
+        capsys.readouterr()
+        assert main([*command[:-1], "other.pos", "--picture", "p.png"]) == 2
+        assert "at least 50 ions" in capsys.readouterr().err and not (tmp_path / "other.pos").exists()

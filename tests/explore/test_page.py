@@ -104,7 +104,10 @@ def test_a_slider_moves_the_map_as_the_core_computes_it(opened):
     inside, whole = shown.measured.mask, shown.whole.density
     expected = (whole / whole[inside].mean()).astype(np.float32)
     assert np.array_equal(image(page.figures.sources[1]), expected, equal_nan=True)
-    assert f"{shown.similarity.value:.3f}" in page.summary.readout.text
+    opened.settle(lambda: page.registration.likeness is not None)
+    for verdict in ("alike", "doubtful", "not alike"):  # similarities of unrelated maps say nothing
+        page.summary.judge(page.maps, page.registration.likeness._replace(verdict=verdict))
+        assert (f"{shown.similarity.value:.3f}" in page.summary.readout.text) == (verdict == "alike")
     assert page.code.python.text == page.explorer.commands(page.settings()).python
     assert "RollUp:0.33,0.33" in page.code.shell.text
 

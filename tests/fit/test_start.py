@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import tomllib
 from dataclasses import replace
 
@@ -45,6 +46,22 @@ def test_the_settings_are_those_of_the_map(found, tmp_path):
     assert config.maps.panels[2].perturbation == ae.RollUp.of_metal("Ni")
     assert all("#" in line for line in start.text.splitlines() if line.startswith(("axis", "rotation", "apex", "ions")))
     assert np.isnan(start.radii).all() and "no voltages" in start.text
+
+
+def test_results_have_short_representations(found):
+    _, indexing = found
+    for result in (indexing, indexing.best):
+        assert len(repr(result)) < 160
+        assert not re.search(r"\d\.\d{5}", repr(result))
+
+
+def test_undecided_settings_say_so_at_once(found):
+    """Without a per cent, which would be a confidence."""
+    _, indexing = found
+    undecided = replace(indexing, decided=False, reason="two orientations explain the same")
+    text = ae.fit.settings_of(undecided, minutes=5).text
+    assert any("NOT DECIDED" in line for line in text.splitlines()[:4]) and "%" not in text
+    assert "NOT DECIDED" not in ae.fit.settings_of(indexing, minutes=5).text
 
 
 def test_the_radius_is_that_of_the_voltage(found):

@@ -55,7 +55,7 @@ def test_decimal_commas_comments_and_windows(save):
 def test_rng_that_is_odd(save):
     with pytest.warns(DataWarning, match=r"a\.rng' states 5 ranges but contains 4"):
         assert len(read_ranges(save(RNG.replace("3 4", "3 5", 1)))) == 4
-    with pytest.warns(DataWarning, match="1 ranges have no species and are left out"):
+    with pytest.warns(DataWarning, match="1 range without species"):
         assert len(read_ranges(save(RNG.replace(". 13.8 14.2 0 1 0", ". 13.8 14.2 0 0 0")))) == 3
 
 

@@ -1,12 +1,14 @@
 """Report of a sweep: one row for each point, the best one first."""
 
 import json
+import re
 
 import numpy as np
 import pytest
 from html_reader import Reader
 
 import apt_evap as ae
+from apt_evap.fit.study import bounded_text
 from apt_evap.plot.report.html_page import read_report
 from apt_evap.plot.report.sweep_report import SweepRow
 
@@ -17,10 +19,16 @@ def rows(study):
     better["optimum"]["score"] = {"value": 1.97654, "error": None}
     better["refined"]["intervals"] = {}
     better["registration"]["doubtful"] = True
+    better["no_energy"] = "the errors are not known"
+    unrelated = json.loads(json.dumps(content))
+    unrelated["optimum"]["score"] = {"value": 2.55555, "error": None}
+    unrelated["likeness"]["verdict"], unrelated["no_energy"] = "not alike", "the maps are not alike"
+    content["refined"]["open_ends"], content["no_energy"] = {}, ""
     maps = {"measured": study.measured, "best": study.maps["optimum"]}
     return [
         SweepRow("3f9c", {"tip.axis": [1, 1, 1], "tip.apex_radius": "20 a"}, {"ions": 15000}, content),
         SweepRow("77aa", {"tip.axis": [0, 0, 1]}, message="exit code 2: <no> memory"),
+        SweepRow("9e9e", {"tip.apex_radius": "60 a"}, {}, unrelated, maps),
         SweepRow("0b1d", {"tip.apex_radius": "40 a"}, {"ions": 500, "R [nm]": np.float64(7.04)}, better, maps),
     ]
 
@@ -29,20 +37,25 @@ def test_points_in_the_order_of_their_similarity(study, tmp_path):
     ae.plot.write_sweep(rows(study), tmp_path / "s.html", title="Axes", command="apt-evap sweep collect study")
     seen = Reader((tmp_path / "s.html").read_text())
     text = seen.text
-    assert text.index("0b1d") < text.index("3f9c") < text.index("77aa")
-    real = f"{study.real_energies[0]:.3g} ± {study.real_energies[1]:.3g}"
+    order = ["0b1d", "3f9c", "9e9e", "77aa"]
+    places = [text.index(name) for name in order]
+    assert places == sorted(places)  # the score of an unrelated map counts for nothing
+    refined, factor = study.refined, study.provenance["real_units"]["real_per_study"]
+    real = bounded_text(refined.true_mean, refined.intervals["true_mean"], None, factor)
     for each in (
-        "3 points, 1 of them incomplete.", "Axes", "tip.axis", "1, 1, 1", "15,000", "R [nm]", "7.04", "1.977", real,
-        str(study.optimum.score), study.refined.bounded("mean"), "exit code 2: <no> memory", "20 a", "Maps of 0b1d",
+        "4 points, 1 of them incomplete.", "Axes", "tip.axis", "1, 1, 1", "15,000", "R [nm]", "7.04", "1.977", real,
+        str(study.optimum.score), "exit code 2: <no> memory", "20 a", "apex_radius 40 a",
         "apt-evap sweep collect study",
     ):  # fmt: skip
         assert each in text, each
-    assert len(seen.all("tr", "best")) == 1 and len(seen.all("span", "red")) == 1
-    # measured and simulated map of the best point, and the similarity against the radius
-    assert len(seen.all("img")) == 3 and all(each.startswith(("data:", "#")) for each in seen.addresses)
+    assert "2.556" not in text
+    assert len(seen.all("tr", "best")) == 1 and len(seen.all("span", "red")) == 2
+    headings = re.findall("<h2>(.*?)</h2>", (tmp_path / "s.html").read_text())
+    assert not any(name in heading for name in order for heading in headings)  # of settings
+    # measured and simulated map of two points, and the similarity against the radius
+    assert len(seen.all("img")) == 5 and all(each.startswith(("data:", "#")) for each in seen.addresses)
     content = read_report(tmp_path / "s.html")
-    assert [row["name"] for row in content["points"]] == ["0b1d", "3f9c", "77aa"]
-    assert content["points"][1]["study"] == json.loads(json.dumps(study.to_dict()))
+    assert [row["name"] for row in content["points"]] == order
 
 
 def test_the_score_has_the_name_of_its_objective(study, tmp_path):

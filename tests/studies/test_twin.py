@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,9 +13,11 @@ import pytest
 
 import apt_evap as ae
 from apt_evap.cli.main import main
+from apt_evap.fit.fit_energies import FEWEST_IONS, measured_map
 from apt_evap.maps.indexing.master_pattern import master_patterns
 from apt_evap.studies.workflows import kept_files, twin_of_map
 from apt_evap.studies.workflows.kept_files import RECORD, KeptFiles
+from apt_evap.warnings import warn
 
 ARGUMENTS = ("--element", "Ni", "--scales", "56,64")
 
@@ -35,8 +38,11 @@ def measurement(path, rotation=20.0, voltages=(2000.0, 2500.0)):
     return ions
 
 
-class _Likeness:
+class _Study:
     """In the place of a study: what the command asks it for."""
+
+    likeness = SimpleNamespace(verdict="alike")
+    no_energy = ""
 
     def lines(self):
         return ["the maps are alike"]
@@ -57,11 +63,12 @@ def quick(tmp_path, monkeypatch):
         calls.append("compare")
         folder.mkdir(exist_ok=True)
         (folder / "report.html").write_text("a report")
-        return _Likeness()
+        return _Study()
 
     class Run:
         def hits(self, emission):
-            return emission
+            places = np.random.default_rng(0).uniform(-30, 30, (2, 500))
+            return ae.Hits(x=places[0], y=places[1])
 
     def index(measured, material, **options):
         calls.append("index")
@@ -291,3 +298,55 @@ def test_what_is_wrong_is_said_before_anything_is_done(quick, small_tip, changed
     with pytest.raises(ValueError) as error:
         ae.twin(**arguments)
     assert sentence in str(error.value) and quick == [] and not os.path.exists("t")
+
+
+@pytest.mark.parametrize("verdict, given", [("alike", True), ("not alike", False)])
+def test_constants_of_the_crystal_and_commands_are_given_only_for_its_maps(quick, capsys, monkeypatch, verdict, given):
+    monkeypatch.setattr(_Study, "likeness", SimpleNamespace(verdict=verdict))
+    monkeypatch.setattr(_Study, "no_energy", "" if given else "the maps are not alike")
+    assert main(["twin", "ni.epos", "--element", "Ni", "--distance", "90", "-o", "t"]) == 0
+    answer = open("t/answer.txt").read()
+    for text in ("radius at the first ions", "scale of the map", "apt-evap reconstruct"):
+        assert (text in answer) == given
+    assert "voltage of the first ions" in answer  # measured, whatever the crystal is
+    assert "report.html" in capsys.readouterr().out
+
+
+def test_a_radius_has_the_digits_of_its_field_factor(quick):
+    assert main(["twin", "ni.epos", "--element", "Ni", "--distance", "90", "-o", "t"]) == 0
+    (line,) = [line for line in open("t/answer.txt") if line.startswith("radius at the first ions")]
+    value = line.partition(": ")[2].split()[0]
+    assert len(value.strip("0").replace(".", "")) <= 2  # k_f is 2 to 8
+
+
+def test_a_twin_takes_as_many_bins_as_the_run_has_ions_for():
+    """The comparison warns of fewer ions in a bin, which the user has not chosen."""
+    edges = np.linspace(-30, 30, 129)
+
+    class Run:
+        def __init__(self, ions):
+            self.ions = ions
+
+        def hits(self, emission):
+            x, y = np.random.default_rng(0).uniform(-30, 30, (2, self.ions))
+            return ae.Hits(x=x, y=y)
+
+    here = ae.Registration(0.0, 1.0, (0.0, 0.0))
+    for is_counts in (True, False):
+        measured = ae.DetectorMap.from_array(np.ones((128, 128)), edges, edges, is_counts=is_counts)
+        assert twin_of_map.bins_for_run(Run(40_000), measured, here) is None
+        bins = twin_of_map.bins_for_run(Run(2_000), measured, here)
+        used = bins if is_counts else max(measured_map(measured, bins).values.shape)  # bins of a map are merged
+        assert 24 <= used and 2_000 / used**2 >= FEWEST_IONS
+
+
+def test_an_advice_on_the_settings_of_a_twin_is_a_note():
+    told = []
+    with warnings.catch_warnings(), twin_of_map.advice_as_notes(told.append):
+        warnings.simplefilter("always")
+        warn("12 ions are inexact", ae.warnings.ResponseWarning, "use a smaller energy_limit")
+    assert told == ["note: 12 ions are inexact"]
+    with pytest.warns(ae.warnings.MapWarning, match="the map does not decide"):
+        warn("the map does not decide", ae.warnings.MapWarning)
+    with pytest.warns(ae.warnings.ResponseWarning, match="inexact: use"):  # elsewhere it is an advice
+        warn("12 ions are inexact", ae.warnings.ResponseWarning, "use a smaller energy_limit")

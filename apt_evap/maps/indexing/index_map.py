@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import scipy
 
-from apt_evap._common.short_repr import short_repr
 from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence, short_text
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
@@ -92,7 +91,7 @@ class Candidate:
     pattern: MasterPattern
 
     def __repr__(self) -> str:
-        return short_repr(self)
+        return f"<Candidate: {self.orientation.material.name} {self}, score {self.score:.2f}>"
 
     def predicted(self, like: DetectorMap) -> DetectorMap:
         """Density of the pattern in the bins of a map, with a mean of 1, without noise or a change of efficiency.
@@ -201,7 +200,8 @@ class Indexing:
         }
 
     def __repr__(self) -> str:
-        return short_repr(self)
+        several = "s" * (len(self.candidates) != 1)
+        return f"<Indexing: {self.verdict}, {len(self.candidates)} candidate{several}, first {self.best}>"
 
     def __str__(self):
         rows = [f"{self.verdict}: {self.reason}"]

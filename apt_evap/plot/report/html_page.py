@@ -76,31 +76,45 @@ figure { margin: 0.6em 0; }
 figcaption { color: #555; font-size: 0.9em; }
 img { max-width: 100%; height: auto; display: block; }
 .blink { display: flex; flex-wrap: wrap; gap: 0 1em; align-items: start; }
-.blink figure { cursor: pointer; }
+.blink figure { cursor: pointer; margin: 0; }
+.blink.beside figure { flex: 1 1 20em; }
+details { border-top: 1px solid #e4e4e4; padding: 0.3em 0; }
 .blink figure[hidden] { display: none; }
 .blink p { flex: 100%; margin: 0.3em 0; }
-summary { cursor: pointer; }
+summary { cursor: pointer; font-weight: 600; }
 footer { margin-top: 3em; color: #555; font-size: 0.9em; border-top: 1px solid #ccc; }
 @media print { .blink figure[hidden] { display: block; } .blink button { display: none; } }
 """
 
-# blocks of maps on one place: a press switches one block, B switches all, A switches all at intervals
+# blocks of maps, at first side by side or on one place: a press switches one block, B switches all, A switches all at
+# intervals, S puts them side by side again
 _SCRIPT = """\
-const blocks = [...document.querySelectorAll(".blink")].map(block => [...block.querySelectorAll("figure")]);
-const show = (frames, n) => frames.forEach((frame, k) => frame.hidden = k !== n % frames.length);
-const next = frames => show(frames, 1 + frames.findIndex(frame => !frame.hidden));
+const blocks = [...document.querySelectorAll(".blink")];
+const frames = block => [...block.querySelectorAll("figure")];
+const show = (block, n) => frames(block).forEach((frame, k, all) => frame.hidden = k !== n % all.length);
+const next = block => {
+  const first = block.classList.contains("beside");
+  block.classList.remove("beside");
+  show(block, first ? 0 : 1 + frames(block).findIndex(frame => !frame.hidden));
+};
+const beside = () => blocks.filter(block => block.dataset.start === "beside").forEach(block => {
+  block.classList.add("beside");
+  frames(block).forEach(frame => frame.hidden = false);
+});
 let timer = 0;
 const blink = () => { timer = timer ? void clearInterval(timer) : setInterval(() => blocks.forEach(next), 700); };
-for (const frames of blocks) {
-  show(frames, 0);
-  frames.forEach(frame => frame.onclick = () => next(frames));
+for (const block of blocks) {
+  if (!block.classList.contains("beside")) show(block, 0);
+  frames(block).forEach(frame => frame.onclick = () => next(block));
 }
 document.querySelectorAll(".blink .switch").forEach(button => button.onclick = () => blocks.forEach(next));
 document.querySelectorAll(".blink .auto").forEach(button => button.onclick = blink);
+document.querySelectorAll(".blink .both").forEach(button => button.onclick = () => { if (timer) blink(); beside(); });
 document.onkeydown = event => {
   if (event.ctrlKey || event.altKey || event.metaKey) return;
   if (event.key === "b") blocks.forEach(next);
   if (event.key === "a") blink();
+  if (event.key === "s") { if (timer) blink(); beside(); }
 };
 """
 
@@ -288,13 +302,27 @@ def color_scale(colors: Sequence[str], low: str, high: str, label: str) -> str:
     return f'<p class="scale">{escape(label)} {escape(low)} {bar} {escape(high)}</p>'
 
 
-def switched(pictures: Sequence[str]) -> str:
-    """Pictures on one place, switched by a press or a key, str; side by side without a script."""
+def switched(pictures: Sequence[str], beside: bool = False) -> str:
+    """Pictures on one place, switched by a press or a key, str; side by side without a script.
+
+    Parameters
+    ----------
+    pictures : sequence of str
+        Pictures, as HTML.
+    beside : bool
+        Whether they are side by side until then.
+
+    Returns
+    -------
+    str
+    """
+    both = ' <button type="button" class="both">side by side (S)</button>' if beside else ""
     controls = (
-        '<p><button type="button" class="switch">switch (B)</button> '
-        '<button type="button" class="auto">blink (A)</button></p>'
+        '<p><button type="button" class="switch">on one place (B)</button> '
+        f'<button type="button" class="auto">blink (A)</button>{both}</p>'
     )
-    return "\n".join(['<div class="blink">', controls, *pictures, "</div>"])
+    head = '<div class="blink beside" data-start="beside">' if beside else '<div class="blink">'
+    return "\n".join([head, *pictures, controls, "</div>"])
 
 
 def flat(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -13,7 +13,7 @@ import matplotlib
 from apt_evap._common.files import check_path, open_for_reading
 from apt_evap._common.types import AnyPath
 from apt_evap._version import __version__
-from apt_evap.plot.report.html_page import Page, collapsed, escape, heading, table, text_of
+from apt_evap.plot.report.html_page import Page, collapsed, escape, table, text_of
 from apt_evap.simulation.provenance import system
 
 
@@ -93,12 +93,13 @@ def origin(files: Sequence[AnyPath] = (), command: str = "", messages: Sequence[
 
 def add_origin(page: Page, content: Mapping[str, Any]) -> None:
     """Add command, files and versions to a page, and their data."""
-    page.add(heading("Command and files"))
+    parts = []
     if content["command"]:
-        page.add(f"<pre>{escape(content['command'])}</pre>")
+        parts.append(f"<pre>{escape(content['command'])}</pre>")
     if content["files"]:
         rows = [(file["name"], f"{file['bytes']:,}", file["sha256"]) for file in content["files"]]
-        page.add(table(rows, ("File", "Bytes", "SHA-256")))
+        parts.append(table(rows, ("File", "Bytes", "SHA-256")))
     versions = {"written by": content["made_by"], "written at": content["created"], **content["system"]}
-    page.add(collapsed("Versions", table((name, text_of(value)) for name, value in versions.items())))
+    parts.append(table((name, text_of(value)) for name, value in versions.items()))
+    page.add(collapsed("Command, files and versions", "\n".join(parts)))
     page.data("origin", content)

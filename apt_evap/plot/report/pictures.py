@@ -1,20 +1,27 @@
 """Pictures of maps on one place, switched by a press or a key."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from apt_evap import plot
 from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.plot._figure import OUTSIDE
 from apt_evap.plot.report.html_page import Page, switched
 
 _LEFT, _RIGHT, _BELOW, _ABOVE = 0.7, 1.05, 0.55, 0.35  # margins [inch]: labels, colour bar, labels, title
 
 
-def blinking_pictures(page: Page, maps: Mapping[str, DetectorMap], width: float = 7.2) -> str:
-    """Maps on one place that are switched by a press or a key, as HTML.
+def blinking_pictures(
+    page: Page,
+    maps: Mapping[str, DetectorMap],
+    width: float = 5.4,
+    crystal: tuple[Orientation, Any] | None = None,
+) -> str:
+    """Maps side by side, which a press or a key puts on one place, as HTML.
 
     Parameters
     ----------
@@ -24,6 +31,8 @@ def blinking_pictures(page: Page, maps: Mapping[str, DetectorMap], width: float 
         Maps by title, with the same bins. The region is the mask of the first one.
     width : float
         Width of a picture [inch].
+    crystal : tuple, optional
+        Orientation of a crystal and its projection, whose poles are drawn on all maps.
 
     Returns
     -------
@@ -47,9 +56,11 @@ def blinking_pictures(page: Page, maps: Mapping[str, DetectorMap], width: float 
         low, high = np.percentile(density, [2, 99.5])  # below 2 percent may be a dark rim
         limits = (float(low), float(high)) if high > low else (0.0, 2.0)
         plot.detector_map(map, ax, limits=limits, colorbar=False, caption=False)
+        if crystal is not None:
+            plot.poles(ax, *crystal, region=first)
         ax.set(xlim=(left, right), ylim=(bottom, top), facecolor=OUTSIDE)
         ax.set_title(title, fontsize="medium", parse_math=False)
         bar = figure.add_axes(((_LEFT + side + 0.15) / width, _BELOW / height, 0.15 / width, up / height))
         figure.colorbar(ax.images[0], cax=bar, label="hits per area / mean")
         pictures.append(page.picture(figure, alt=title))
-    return switched(pictures)
+    return switched(pictures, beside=True)

@@ -19,7 +19,6 @@ from apt_evap.plot.report.html_page import (
     color_scale,
     escape,
     flat,
-    heading,
     paragraph,
     table,
     text_of,
@@ -29,6 +28,7 @@ from apt_evap.plot.report.pictures import blinking_pictures
 
 _COLORS = "viridis"  # of the matrix, as of `plot.score_matrix`
 _LONG = ("run", "registered", "share_above_energy_limit")  # settings in tables of their own, or only for programs
+_SHOWN = 2  # doubts that are not folded
 _RARE = 0.05
 """Largest fraction of resamples without gain, and of energies above the limit of the responses, without a doubt."""
 
@@ -46,9 +46,10 @@ def write_study(
 ) -> None:
     """Write a study as one HTML file.
 
-    The file contains its pictures and needs no network. Measured and simulated map are drawn on the same place; a press
-    on the picture or the key B switches between them, so that errors of the registration are visible as motion. The
-    content of `Study.to_dict` is inside, too (`read_report`).
+    Measured and simulated map are side by side, each on its own colour scale, with the poles of the simulated crystal;
+    a press on a map or the key B puts both on one place and switches between them, so that errors of the registration
+    are visible as motion. One sentence has the result. The rest is folded. The file contains its pictures and needs no
+    network. The content of `Study.to_dict` is inside, too (`read_report`).
 
     Parameters
     ----------
@@ -59,7 +60,7 @@ def write_study(
     title : str
         Title of the page; by default the mechanism.
     figures : dict, optional
-        Figures by caption, in addition to the maps; by default that of `plot.side_by_side`.
+        Figures by caption, in addition to the maps.
     files : sequence of str or path-like
         Files of the study, whose names, sizes and SHA-256 are listed.
     command : str
@@ -67,7 +68,7 @@ def write_study(
     warnings : sequence of str
         Warnings of the study.
     sections : sequence of str
-        More parts of the page, as HTML, after the energies.
+        More parts of the page, as HTML.
 
     Raises
     ------
@@ -77,36 +78,38 @@ def write_study(
     check_kind(study, "study", Study, "a Study")
     content, made = study.to_dict(), origin(files, command, warnings)
     page = Page(title or f"Emission energies: {study.grid.mechanism}")
-    of_registration, others = doubts(content)
+    reasons = [*doubts(content), *(f"Warning: {line}" for line in made["warnings"])]
+    page.add(_maps(page, study))
+    page.add(paragraph(_sentence(study), "result"))
+    page.add(*(paragraph(text, "doubt") for text in reasons[:_SHOWN]))
+    if reasons[_SHOWN:]:
+        page.add(collapsed("More doubts", "\n".join(paragraph(text, "doubt") for text in reasons[_SHOWN:])))
+    page.add(*_evidence(page, study), *sections)
     if study.likeness.verdict == "alike":
-        page.add(paragraph(f"The maps are alike: {study.likeness.reason}."))
-    page.add(*(paragraph(text, "doubt red") for text in of_registration))
-    page.add(paragraph(f"{study.result[:1].upper()}{study.result[1:]}.", "result"))
-    page.add(_blinking(page, study))
-    page.add(*(paragraph(text, "doubt") for text in (*others, *(f"Warning: {line}" for line in made["warnings"]))))
-    page.add(*_poles(page, study), *_evidence(page, study))
-    page.add(heading("Energies"), _energies(study), *sections)
-    page.add(heading("Similarity with the measured map"), _scores(study))
-    page.add('<div class="matrices">', *_matrices(study), "</div>", _scale(study))
-    page.add(paragraph("Rows: standard deviation / mean. Columns: mean energy [eV]. Frame: the best point.", "note"))
-    if figures is None:
-        figures = {
-            "Maps as compared: flattened, smoothed, inside the common region.": plot.side_by_side(study)[0].figure
-        }
-    page.add(heading("Pictures"), *(page.picture(figure, caption) for caption, figure in figures.items()))
-    page.add(heading("Registration"), _registration(content["registration"]))
-    page.add(heading("Settings"))
+        page.add(collapsed("Energies", _energies(study)), collapsed("Scores on the grid", _grid(study)))
+    for caption, figure in (figures or {}).items():
+        page.add(collapsed(caption, page.picture(figure, alt=caption)))
+    page.add(collapsed("Registration", _registration(content["registration"])))
     settings = content["settings"]
     comparison = {name: value for name, value in settings.items() if name not in _LONG}
-    for name, part in (("Comparison", comparison), ("Simulated run", settings["run"])):
+    for name, part in (("Settings of the comparison", comparison), ("Settings of the simulated run", settings["run"])):
         page.add(collapsed(name, table((key, text_of(value)) for key, value in flat(part).items())))
     add_origin(page, made)
     page.data("study", content)
     page.save(path)
 
 
-def doubts(content: Mapping[str, Any]) -> tuple[list[str], list[str]]:
-    """Reasons to doubt the energies of a study.
+def _sentence(study):
+    """The verdict and the result."""
+    verdict, reason = study.likeness.verdict, study.likeness.reason
+    if verdict == "alike":
+        return f"The maps are alike{', but' if study.no_energy else ':'} {study.result}."
+    whether = "It is doubtful that the maps are alike" if verdict == "doubtful" else "The maps are not alike"
+    return f"{whether}, so no energy is given: {reason}."
+
+
+def doubts(content: Mapping[str, Any]) -> list[str]:
+    """Reasons to doubt the energies of a study whose maps are alike; none of others, which have no energies.
 
     Parameters
     ----------
@@ -115,21 +118,13 @@ def doubts(content: Mapping[str, Any]) -> tuple[list[str], list[str]]:
 
     Returns
     -------
-    of_registration, others : list of str
+    list of str
         Sentences.
     """
-    registration, settings, edges = content["registration"], content["settings"], content["optimum"]["at_edge"]
-    of_registration, others = [], []
-    doubtful = content["likeness"]["verdict"] == "doubtful"
-    if content["likeness"]["verdict"] != "alike" and not (doubtful and registration["doubtful"]):
-        verdict = "It is doubtful that the maps are alike" if doubtful else "The maps are not alike"
-        of_registration.append(f"{verdict}: {content['likeness']['reason']}.")
-    if registration["doubtful"]:
-        of_registration.append(
-            f"The registration is doubtful: the correlation of the maps is only {registration['score']:.2f} in their "
-            f"common area ({registration['overlap']:.0%} of the measured one), as for unrelated maps. If it is wrong, "
-            "the energies have no meaning."
-        )
+    settings, edges = content["settings"], content["optimum"]["at_edge"]
+    others: list[str] = []
+    if content["likeness"]["verdict"] != "alike":
+        return others
     if edges:
         names = {"mean": "the mean", "relative_spread": "standard deviation / mean"}
         labels = " and ".join(names.get(name, name) for name in edges)
@@ -150,43 +145,41 @@ def doubts(content: Mapping[str, Any]) -> tuple[list[str], list[str]]:
             "The noise of the measured densities is not known and not corrected: the best energies have slightly more "
             "contrast than the true ones."
         )
-    return of_registration, others
+    return others
 
 
 # ---- parts of the page -----------------------------------------------------------------------------------------------
 
 
 def _energies(study):
-    best, refined, mechanism = study.optimum, study.refined, study.grid.mechanism
+    """The mean after the truncation at the field of the experiment, and the parameters of the grid."""
+    best, refined, (factor, where) = study.optimum, study.refined, study.real_factor
+    after = {"true_mean": "mean energy [eV]", "true_standard_deviation": "standard deviation [eV]"}
+    rows = [(f"{label}, {where}", refined.scaled(name, factor)) for name, label in after.items()]
+    if study.no_energy:
+        rows.append(("not a result, because", study.no_energy))
     names = {"mean": "mean [eV]", "relative_spread": "standard deviation / mean"}
-    if mechanism == "combined":
+    if study.grid.mechanism == "combined":
         names["rollup_fraction"] = "roll-up fraction"
-    after = {"true_mean": "mean", "true_standard_deviation": "standard deviation"}
-    varied = [(label, f"{getattr(best, name):.4g}", refined.bounded(name)) for name, label in names.items()]
-    varied += [(name, f"{value:.4g}", refined.bounded(name)) for name, value in best.options.items()]
-    following = [
-        (f"{label} after truncation [eV]", f"{getattr(best, name):.4g}", refined.bounded(name))
-        for name, label in after.items()
-    ]
-    run, real = study.provenance["run"], study.provenance.get("real_units")
-    place = f"at {run['voltage']:g} V"
-    if real is not None:
-        operating = f"at {real['operating_field']:.3g} V/nm and {real['flight_charge']}+"
-        if real["real_per_study"] == 1.0:
-            factor, place, other = real["simulated_per_study"], operating, f"{place} and {real['barrier_charge']}+"
-        else:
-            factor, other = real["real_per_study"], operating
-        for name, label in after.items():
-            values = f"{getattr(best, name) * factor:.4g}", refined.scaled(name, factor)
-            following.append((f"{label} after truncation, {other} [eV]", *values))
-    following.append((study.settings.score_name, best.score, refined.score))
-    between = "between its points" + " (interval of 95 %)" * bool(refined.intervals)
-    head = f"{mechanism}, {place}", "best on the grid", between
+    varied = [(label, f"{getattr(best, name):.3g}", refined.bounded(name)) for name, label in names.items()]
+    varied += [(name, f"{value:.3g}", refined.bounded(name)) for name, value in best.options.items()]
+    voltage = f"{study.provenance['run']['voltage']:g} V"
     note = "Fitted energies scale with the assumed tip radius and voltage."
     if study.provenance.get("microscope"):
         note += f" The run is behind a {lens_text(study.provenance['microscope'])}."
-    more = collapsed("Energies after truncation, in both units", table(following, head))
-    return table(varied, head) + paragraph(note, "note") + more
+    head = (f"parameters of {study.grid.name}", "best on the grid", "between its points")
+    return (
+        table(rows, ("after truncation", "value" + " (interval of 95 %)" * bool(refined.intervals)))
+        + table(varied, head)
+        + paragraph(f"Parameters are those before the truncation, at the voltage of the run, {voltage}. {note}", "note")
+    )
+
+
+def _grid(study):
+    """Scores of the maps, and of all points of the grid."""
+    note = "Rows: standard deviation / mean. Columns: mean before the truncation [eV]. Frame: the best point."
+    parts = [_scores(study), '<div class="matrices">', *_matrices(study), "</div>", _scale(study)]
+    return "\n".join([*parts, paragraph(note, "note")])
 
 
 def _scores(study):
@@ -200,7 +193,11 @@ def _scores(study):
     head = ["Map", corrected, f"uncorrected {study.settings.score_name}"]
     if not study.settings.allow_noise:
         rows, head = [row[:2] for row in rows], head[:2]
+    elif study.no_score:
+        rows, head = [(name, plain) for name, _, plain in rows], [head[0], head[2]]
     facts = f"Gain over unperturbed: {study.gain}."
+    if study.settings.allow_noise and study.no_score:
+        facts = f"Not corrected for noise: {study.no_score}."
     if study.ceiling is not None:
         facts += f" Two halves of the measured ions: {study.ceiling} (uncorrected)."
     width, height = study.measured.bin_size
@@ -218,28 +215,15 @@ def _scale(study):
     return color_scale(shades, f"{low:z.3f}", f"{high:z.3f}", study.settings.score_name)
 
 
-def _poles(page, study):
-    """Both maps with the poles and zone lines of the simulated crystal."""
-    orientation, projection = study.orientation, study.projection
-    if orientation is None or projection is None:
-        return []
-    maps = {"measured": study.measured, "simulated": study.maps["optimum"]}
-    axes = plot.detector_maps([study.compared(map) for map in maps.values()], list(maps))
-    for ax in axes:
-        plot.poles(ax, orientation, projection, region=study.measured)
-    text = "Poles and zone lines of the simulated crystal, as registered, on both maps."
-    return [page.picture(axes[0].figure, text)]
-
-
 def _evidence(page, study):
     """Folded maps, and what they say."""
     scores = study.structure
     if scores is None or not scores.evidence:
         return []
     parts = [paragraph(f"{scores.evidence[:1].upper()}{scores.evidence[1:]}.")]
-    maps = {"measured": scores.measured, "unperturbed": scores.unperturbed, "best": scores.optimum}
+    maps = {"measured": scores.measured, "simulated": scores.optimum}
     known = {title: scores_of_map.folded for title, scores_of_map in maps.items() if scores_of_map.folded is not None}
-    if "measured" in known and len(known) > 1:
+    if len(known) > 1:
         pole = plain_label(scores.plane)
         parts.append(
             page.picture(
@@ -247,7 +231,7 @@ def _evidence(page, study):
                 f"Maps folded about the pole ({pole}) by its symmetry, {known['measured'].symmetry}, and flattened.",
             )
         )
-    return parts
+    return [collapsed("Folded maps", "\n".join(parts))]
 
 
 def _matrices(study):
@@ -306,13 +290,10 @@ def _registration(content):
     return table((name, text_of(value)) for name, value in rows)
 
 
-def _blinking(page, study):
-    """The measured and the best map on one place."""
-    best = study.optimum
-    energies = f"{best.mean:g} eV, σ/mean {best.relative_spread:g}"
-    if study.grid.mechanism == "combined":
-        energies += f", roll-up fraction {best.rollup_fraction:g}"
-    maps = {"measured": study.measured, f"simulated: {study.grid.mechanism}, {energies}": study.maps["optimum"]}
-    pictures = blinking_pictures(page, {title: study.compared(map) for title, map in maps.items()})
-    note = "Both maps are flattened and smoothed as for the comparison, each with its own colour scale."
-    return pictures + paragraph(note, "note")
+def _maps(page, study):
+    """The measured and the best map side by side, with the poles of the simulated crystal as registered."""
+    maps = {"measured": study.measured, "simulated": study.maps["optimum"]}
+    crystal = None
+    if study.orientation is not None and study.projection is not None:
+        crystal = study.orientation, study.projection
+    return blinking_pictures(page, {title: study.compared(map) for title, map in maps.items()}, crystal=crystal)

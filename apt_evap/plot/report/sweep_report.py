@@ -14,12 +14,12 @@ from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.fit.fit_settings import FitSettings
 from apt_evap.fit.study import bounded_text
 from apt_evap.plot.map_figures import default_smoothing
-from apt_evap.plot.report.html_page import Markup, Page, heading, paragraph, switched, table, text_of
+from apt_evap.plot.report.html_page import Markup, Page, escape, heading, paragraph, switched, table, text_of
 from apt_evap.plot.report.origin import add_origin, origin
 from apt_evap.plot.report.pictures import blinking_pictures
 
-_STUDY = ("mean [eV]", "standard deviation / mean", "roll-up fraction", "real energy [eV]", "doubts")
-_MOST_SETTINGS, _MOST_MAPS = 4, 12  # in the pictures
+_STUDY = ("mean energy [eV]", "doubts")
+_MOST_SETTINGS, _MOST_MAPS, _MOST_TITLES = 4, 12, 3  # in the pictures
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,11 @@ class SweepRow:
         """Largest similarity with the measured map, -inf without a study."""
         return -np.inf if self.study is None else float(self.study["optimum"]["score"]["value"])
 
+    @property
+    def alike(self) -> bool:
+        """Whether the maps are alike; scores of others are not comparable with theirs."""
+        return self.study is not None and self.study["likeness"]["verdict"] == "alike"
+
 
 def write_sweep(
     rows: Sequence[SweepRow],
@@ -70,8 +75,8 @@ def write_sweep(
 ) -> None:
     """Write a sweep as one HTML file, with a row for each point.
 
-    The points are in the order of their similarity with the measured map; points without a study follow in their own
-    order. The file needs no network. The rows are inside as data (`read_report`).
+    The points whose maps are alike are first, in the order of their similarity with the measured map; points without
+    a study are last, in their own order. The file needs no network. The rows are inside as data (`read_report`).
 
     Parameters
     ----------
@@ -99,7 +104,7 @@ def write_sweep(
     """
     if not rows:
         raise ValueError("rows must contain a point of the sweep, got none")
-    rows = sorted(rows, key=lambda row: -row.similarity)
+    rows = sorted(rows, key=lambda row: (not row.alike, -row.similarity))
     made = origin(files, command, warnings)
     page = Page(title)
     page.add(*(paragraph(f"Warning: {text}", "doubt") for text in made["warnings"]))
@@ -111,16 +116,16 @@ def write_sweep(
     if compared:
         page.add(
             paragraph(
-                "The best point is first. Energies are those between the points of the grid, with the interval of "
-                "95 %, in the units of each run; real energies are after the truncation. Compare similarities only for "
-                "the same bins and the same smoothing.",
+                "The best point is first. Scores and energies are given for maps that are alike: the mean after the "
+                "truncation, at the field of the experiment if it is known, with the interval of 95 %. Compare scores "
+                "only for the same bins and the same smoothing.",
                 "note",
             )
         )
     if pictures:
         page.add(*_course(page, rows), *_gallery(page, rows))
     for row in [row for row in rows if row.maps][:pictures]:
-        page.add(heading(f"Maps of {row.name}"), blinking_pictures(page, row.maps, 5.0))
+        page.add(heading(_short(row).replace("\n", ", ")), blinking_pictures(page, row.maps, 5.0))
     add_origin(page, made)
     page.data("points", [_data(row) for row in rows])
     page.save(path)
@@ -128,7 +133,7 @@ def write_sweep(
 
 def _course(page, rows):
     """Similarity against each setting that is a number; seeds only tell specimens apart."""
-    compared = [row for row in rows if row.study]
+    compared = [row for row in rows if row.alike]
     varied = [name for name in _names(row.settings for row in compared) if not name.endswith("seed")]
     values = {name: [_number(row.settings.get(name)) for row in compared] for name in varied}
     names = [name for name in varied if len({*values[name]} - {None}) > 1][:_MOST_SETTINGS]
@@ -180,9 +185,9 @@ def _gallery(page, rows):
 
 
 def _short(row):
-    """Name of a point with its first settings, for a title."""
+    """Settings of a point, for a title; its name if it has none."""
     values = [f"{name.rpartition('.')[2]} {text_of(value)}" for name, value in row.settings.items()]
-    return "\n".join([row.name, *values[:2]])
+    return "\n".join(values[:_MOST_TITLES]) or row.name
 
 
 def _table(rows, compared):
@@ -197,26 +202,32 @@ def _table(rows, compared):
     head = ["Point", *settings, *results, *of_study, "Message"]
     if not any(row.message for row in rows):
         head, lines = head[:-1], [line[:-1] for line in lines]
-    return table(lines, head, best=0 if compared else None)
+    return table(lines, head, best=0 if any(row.alike for row in rows) else None)
 
 
 def _study_cells(content):
+    """Score and mean energy, if they are results, and doubts."""
     if content is None:
         return [""] * (1 + len(_STUDY))
     score, refined = content["optimum"]["score"], content["refined"]
+    alike = content["likeness"]["verdict"] == "alike"
+    corrected = not (content["settings"]["allow_noise"] and content["no_score"])
+    score = score if corrected else content["plain"]["optimum"]
     error = f" ± {score['error']:.3f}" if score["error"] is not None else ""
-    open_ends = refined["open_ends"]
-    energies = [
-        bounded_text(refined[name], refined["intervals"].get(name), open_ends.get(name))
-        for name in ("mean", "relative_spread", "rollup_fraction")
-    ]
+    text = f"{score['value']:.3f}{error}" + ("" if corrected else ", not corrected for noise")
+    real = content["settings"]["real_units"]
+    factor = 1.0 if real is None else real["real_per_study"]
+    energy = bounded_text(
+        refined["true_mean"], refined["intervals"].get("true_mean"), refined["open_ends"].get("true_mean"), factor
+    )
     reasons = [
+        Markup(f'<span class="red">{escape(content["likeness"]["verdict"])}</span>') if not alike else "",
         Markup('<span class="red">registration doubtful</span>') if content["registration"]["doubtful"] else "",
-        "end of the grid" if content["optimum"]["at_edge"] else "",
+        content["no_energy"] if alike else "",
+        "end of the grid" if content["optimum"]["at_edge"] and alike else "",
     ]
-    real = content["real_energies"]
-    energies.append("" if real is None else f"{real[0]:.3g} ± {real[1]:.3g}")
-    return [f"{score['value']:.3f}{error}", *energies, Markup(", ".join(filter(None, reasons)))]
+    shown = "" if content["no_energy"] else energy
+    return [text if alike else "", shown, Markup(", ".join(escape(reason) for reason in reasons if reason))]
 
 
 def _names(parts):

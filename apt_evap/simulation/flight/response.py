@@ -329,9 +329,9 @@ class ResponseModel:
         if faster:
             warn(
                 f"{faster:,} of {len(velocities):,} ions launch above the energy limit of the responses "
-                f"({limit:.3g} eV): their hits are extrapolated; run with a larger energy_limit (ResponseSettings, or "
-                "[responses] in a settings file)",
+                f"({limit:.3g} eV), and their hits are extrapolated",
                 ResponseWarning,
+                "run with a larger energy_limit (ResponseSettings, or [responses] in a settings file)",
             )
         values = np.empty((len(velocities), 3))
         starts = (~launches.rolled, launches.rolled)

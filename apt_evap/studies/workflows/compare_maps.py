@@ -46,7 +46,7 @@ def compare(
     progress: bool | None = None,
     note: Callable[[str], None] = no_note,
     command: str = "",
-    sections: Sequence[str] = (),
+    sections: Callable[[Study], Sequence[str]] | None = None,
 ) -> Study:
     """Fit the emission energies of a run to a measured map, as ``apt-evap compare`` does.
 
@@ -74,8 +74,8 @@ def compare(
         Receives lines of text: the result, and the files.
     command : str
         Command line to repeat the study, for the report.
-    sections : sequence of str
-        More parts of the report, as HTML.
+    sections : callable, optional
+        Returns more parts of the report of a study, as HTML.
 
     Returns
     -------
@@ -131,9 +131,13 @@ def compare(
                 title=f"{source.name}: emission energies from {'a run' if isinstance(run, Run) else Path(run).name}",
                 files=files,
                 command=command,
-                # the report tells a doubtful registration by itself
-                warnings=[str(message) for message in messages if not isinstance(message, RegistrationWarning)],
-                sections=sections,
+                # the report says by itself that a registration is doubtful; its readers cannot follow an advice
+                warnings=[
+                    getattr(message, "fact", "") or str(message)
+                    for message in messages
+                    if not isinstance(message, RegistrationWarning)
+                ],
+                sections=() if sections is None else sections(study),
             )
     note("\n".join(study.lines()))
     if folder is not None:
@@ -173,8 +177,7 @@ def _write(study: Study, run: Run, folder: Path, **parts: Any) -> None:
             _write_table(study, written / TABLE)
             for name, figure in figures.items():
                 figure.savefig(written / name)
-            captions = {_CAPTIONS[name]: figure for name, figure in figures.items() if name in _CAPTIONS}
-            write_study(study, written / REPORT, figures=captions, **parts)
+            write_study(study, written / REPORT, **parts)
             folder.mkdir(exist_ok=True)
             for name in FILES:
                 with replace_file(folder / name) as file, open(written / name, "rb") as source:
@@ -214,10 +217,6 @@ _FIGURES = {
     "scores.png": lambda study, run: plot.score_matrix(study)[0].figure,
     "maps.png": lambda study, run: plot.side_by_side(study)[0].figure,
     OVERLAY: _overlay,
-}
-_CAPTIONS = {
-    "maps.png": "Maps as compared: flattened, smoothed, inside the common region.",
-    OVERLAY: "Registration: contours of the simulated map on the measured one, and the simulated map.",
 }
 FILES = (STUDY, TABLE, *_FIGURES, REPORT)
 """Names of the files that are written."""

@@ -170,7 +170,8 @@ def simulate(
     check_output(picture, is_picture, overwrite)
 
     n_ions = config.n_ions
-    note(f"{estimate_cost(config, 1)} of one thread")
+    cost = estimate_cost(config, 1)
+    note(f"{cost}" if cost.hours is None else f"{cost} of one thread")
     note("building the specimen and relaxing the charges of its surface")
     simulation = config.simulation(n_threads=threads)
     note(f"{str(simulation.tip).strip('<>')}; {len(simulation.emitter):,} atoms on the surface")
@@ -241,8 +242,9 @@ def _note_outcomes(config: Config, run: Run, path: Path, note: Callable[[str], N
     if frequent_misses:
         warn(
             f"{max(frequent_misses):,} of {len(run):,} ions miss the detector, which is {run.detector.width:g} mm "
-            f"wide at {run.detector.distance:g} mm: use a larger width or a smaller distance in [detector]",
+            f"wide at {run.detector.distance:g} mm",
             WorkflowWarning,
+            "use a larger width or a smaller distance in [detector]",
         )
     if run.ended == StopReason.INTERRUPTED:
         text = f"interrupted; {len(run):,} of {config.n_ions:,} ions are in {str(path)!r}; {_CONTINUE}"

@@ -1,16 +1,19 @@
 """Twin of a measured specimen: its map is indexed, simulated, registered and fitted, with a report."""
 
 import json
+import math
 import os
 import shlex
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from apt_evap import plot
+import numpy as np
+
 from apt_evap._common.codec import checked, choice, from_plain, number, settings, to_plain, vector
 from apt_evap._common.files import FileError, check_path, sha256_of
 from apt_evap._common.notebook import as_table
@@ -24,7 +27,9 @@ from apt_evap.detection.hits import Hits
 from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.detection.projection import Projection
-from apt_evap.emission.perturbations import LateralVelocity, RollUp
+from apt_evap.emission.perturbations import LateralVelocity, RollUp, Unperturbed
+from apt_evap.fit.fit_energies import FEWEST_IONS
+from apt_evap.fit.fit_settings import FitSettings
 from apt_evap.fit.grid import EnergyGrid
 from apt_evap.fit.measured_constants import Measurement, constants_of
 from apt_evap.fit.start_settings import ENERGY, HEIGHT, ROLLS, SHARPNESS, StartSettings, registration_start, settings_of
@@ -49,6 +54,8 @@ SETTINGS, FACTS, RUN, REGISTRATION, STUDY, ANSWER = (
 _REPORT = f"{STUDY}/{REPORT}"
 _FRACTIONS = (0.2, 0.4, 0.6, 0.8, 1.0)  # that roll up, in the fit
 _BINS = 128  # of a map of ions
+_FEWEST_BINS = 24  # along the longer side of a comparison
+_MARGIN = 1.2  # of the ions in a bin, as the common region is smaller
 
 
 def _text(value, name):
@@ -269,22 +276,25 @@ class Twin:
         _ = self.candidate
         if os.path.lexists(path) and not is_run(path):
             raise FileError(f"{str(path)!r} is not a run: remove it, or give another folder with -o (folder=...)")
-        simulated = simulate(
-            self.folder / SETTINGS,
-            path,
-            threads=self._threads,
-            resume=True,
-            progress=self._progress,
-            note=self._note,
-        )
+        with advice_as_notes(self._note):
+            simulated = simulate(
+                self.folder / SETTINGS,
+                path,
+                threads=self._threads,
+                resume=True,
+                progress=self._progress,
+                note=self._note,
+            )
         if simulated.interrupted:
             raise KeyboardInterrupt
         told: list[str] = []
         if not (kept.has(REGISTRATION) and kept.has(ANSWER) and kept.has(_REPORT)):
             if not kept.has(REGISTRATION):
-                self._make_registration()
+                with advice_as_notes(self._note):
+                    self._make_registration()
             kept.forget(ANSWER, _REPORT)
-            self.study = self._compared(path, self._as_read(), self.folder / STUDY)
+            with advice_as_notes(self._note):
+                self.study = self._compared(path, self._as_read(), self.folder / STUDY)
             told = self.study.lines()  # by `compare`
             kept.write({ANSWER: self._made_answer()}, [_REPORT])
         self._note("\n".join(line for line in self.answer if line not in told))
@@ -333,18 +343,20 @@ class Twin:
         options = {"probability": _FRACTIONS, "sharpness": (SHARPNESS,), "height": (HEIGHT,)}
         grid = EnergyGrid("roll-up", options=options) if self._rolls else EnergyGrid("lateral", options=_HEIGHT)
         written = folder is not None
+        settings = FitSettings(bins=bins_for_run(self.run, self.measured_map, self.registration))
         with recorded_warnings(IN_LINES):
             return compare(
                 run,
                 measured,
                 folder,
                 grid,
+                settings,
                 registration=self.registration,
                 threads=self._threads,
                 progress=False if self._progress is False else None,
                 note=self._note if written else no_note,
                 command=self._command,
-                sections=[self._section()] if written else (),
+                sections=self._sections if written else None,
             )
 
     @cached_property
@@ -369,24 +381,30 @@ class Twin:
 
     # ---- texts -------------------------------------------------------------------------------------------------------
 
-    def _section(self):
-        """Part of the report: the constants, and the measured map with the poles and zone lines of the candidate."""
-        from apt_evap.plot.report.html_page import Page
+    def _sections(self, study):
+        """Part of the report: the constants."""
         from apt_evap.plot.report.measurement_report import measurement_section
 
-        measured_map, candidate = self.measured_map, self.candidate
-        shown = measured_map.smoothed(max(measured_map.bin_size)) if measured_map.is_counts else measured_map
-        ax = plot.detector_map(shown, title=f"{candidate}")
-        plot.poles(ax, candidate.orientation, candidate.projection, region=shown, families=8)
-        caption = "Measured map with the poles and zone lines that it was simulated with"
-        picture = Page("").picture(ax.figure, f"{caption} ({self._facts.verdict}).")
-        return measurement_section(
-            self.measurement.constants, self.measurement.checks, self._reconstruct_command(), picture
-        )
+        known = self._known(study)
+        doubt = self._crystal_doubt(study)
+        return [measurement_section(known.constants, known.checks, self._reconstruct_command(study), doubt)]
 
-    def _reconstruct_command(self):
-        """Command that reconstructs with the constants, "" if there is no file, no ions or no flight length."""
-        known, path, lens = self.measurement.arguments, self._source.path, self._options.lens
+    def _crystal_doubt(self, study):
+        """Reason why constants that depend on the crystal are not given, "" if they are."""
+        verdict = study.likeness.verdict
+        if verdict == "not alike":
+            return "the maps are not alike: check the material and the axis"
+        if verdict == "doubtful" and self._facts.verdict != "indexed":
+            return "the map does not decide its orientation, and it is doubtful that the maps are alike"
+        return ""
+
+    def _known(self, study):
+        """The measurement, or what of it does not depend on the crystal if that is in doubt."""
+        return self.measurement.without_crystal() if self._crystal_doubt(study) else self.measurement
+
+    def _reconstruct_command(self, study):
+        """Command that reconstructs with the constants, "" if they are in doubt, or without file or flight length."""
+        known, path, lens = self._known(study).arguments, self._source.path, self._options.lens
         if "distance" not in known or path is None:
             return ""
         element = write_material(as_material(self._options.element))
@@ -405,14 +423,17 @@ class Twin:
             f"indexing: {facts.verdict}, {facts.reason}",
             f"axis [{' '.join(f'{component:.3f}' for component in best.axis)}] at the centre of the map, rotation "
             f"{best.rotation:.1f}, errors {best.angle_error:.1f} degrees by noise",
-            *str(self.measurement).splitlines(),
+            *str(self._known(self.study)).splitlines(),
         ]
-        if not self.measurement.arguments:
+        if doubt := self._crystal_doubt(self.study):
+            lines.append(f"scale, radius and shank are not given: {doubt}")
+        elif not self.measurement.arguments:
             lines.append("radius: not known, the file has no voltages")
         lines.append(f"simulated with R = {facts.simulated_radius:.1f} nm")
         lines += self.study.lines()
-        lines.append("the energies depend on the radius and the voltage, and on the rule of the roll-up")
-        if command := self._reconstruct_command():
+        if not self.study.no_energy:
+            lines.append("the energies depend on the radius and the voltage, and on the rule of the roll-up")
+        if command := self._reconstruct_command(self.study):
             lines.append(f"reconstruct with: {command}")
         return ("\n".join(lines) + "\n").encode(errors="backslashreplace")
 
@@ -434,6 +455,54 @@ def _registered(hits, measured_map, bounds):
     for warning in caught:
         warn(str(warning.message), RegistrationWarning)
     return registration
+
+
+def bins_for_run(run: Run, measured: DetectorMap, registration: Registration) -> int | None:
+    """Bins along the longer side with enough ions of a run in each, None for the bins of the map.
+
+    Parameters
+    ----------
+    run : Run
+        The run.
+    measured : DetectorMap
+        The measured map.
+    registration : Registration
+        From the run into its frame.
+
+    Returns
+    -------
+    int or None
+        At least 24.
+    """
+    seen = registration.hits(run.hits(Unperturbed())).map(like=measured, position_step=None)
+    covered = measured.mask & seen.mask
+    ions, bins = int(seen.counts[covered].sum()), np.count_nonzero(covered)
+    if ions >= _MARGIN * FEWEST_IONS * bins:
+        return None
+    side = max(measured.values.shape)
+    if measured.is_counts:
+        return max(_FEWEST_BINS, int(side * math.sqrt(ions / (_MARGIN * FEWEST_IONS * bins))))
+    factor = math.ceil(math.sqrt(_MARGIN * FEWEST_IONS * bins / max(ions, 1)))  # of merged bins
+    return max(_FEWEST_BINS, side // factor)
+
+
+@contextmanager
+def advice_as_notes(note: Callable[[str], None]) -> Iterator[None]:
+    """Give warnings with an advice as notes without it: who asks for a twin has not chosen its settings."""
+    show = warnings.showwarning
+
+    def tell(message: Any, category: Any, *where: Any, **options: Any) -> None:
+        fact = getattr(message, "fact", "")
+        if fact and fact != str(message):
+            note(f"note: {fact}")
+        else:
+            show(message, category, *where, **options)
+
+    warnings.showwarning = tell
+    try:
+        yield
+    finally:
+        warnings.showwarning = show
 
 
 def path_word(path: str | Path) -> str:

@@ -15,6 +15,8 @@ from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.projection import Projection
 from apt_evap.maps.crystallography.orientation import Orientation
 
+DPI = 200
+"""Resolution of the pictures [dots per inch]."""
 _MARK = f"apt_evap {__version__}"
 _MARK_RANGE = 1 << 16  # bytes: the mark is at the beginning of a .png or .svg, and at the end of a .pdf
 _MARK_KEYS = {".png": "Software", ".pdf": "Creator", ".svg": "Creator"}
@@ -34,14 +36,23 @@ def save_picture(
     titles: Sequence[str],
     title: str | None = None,
     crystal: tuple[Orientation, Projection] | None = None,
+    *,
+    width: float | None = None,
+    **colors: Any,
 ) -> None:
-    """Draw maps side by side into a file, perhaps with the poles of a crystal."""
+    """Draw maps side by side into a file, perhaps with the poles of a crystal.
+
+    With a width [mm] the figure is one of a paper, without titles. `colors` are ``colormap`` and ``label``.
+    """
     from apt_evap.plot.limits import common_limits  # with Matplotlib
 
-    axes = plot.detector_maps(maps, titles, limits=common_limits(maps), title=title)
+    if width is None:
+        axes = plot.detector_maps(maps, titles, limits=common_limits(maps), title=title, **colors)
+    else:
+        axes = plot.paper_maps(maps, width, **colors)
     if crystal is not None:
         for ax, detector_map in zip(axes, maps, strict=True):
-            plot.poles(ax, *crystal, region=detector_map, families=8)
+            plot.poles(ax, *crystal, region=detector_map, families=8, size=9 if width is None else 6)
     save_figure(path, axes[0].figure)
 
 
@@ -49,7 +60,7 @@ def save_figure(path: Path, figure: Any) -> None:
     """Write a figure; it is drawn in memory, so that a kill in the second that it takes leaves no temporary file."""
     suffix, drawn = path.suffix.lower(), io.BytesIO()
     try:
-        figure.savefig(drawn, format=suffix[1:], dpi=200, metadata={_MARK_KEYS[suffix]: _MARK})
+        figure.savefig(drawn, format=suffix[1:], dpi=DPI, metadata={_MARK_KEYS[suffix]: _MARK})
     except OSError as error:  # such as a font that cannot be read
         raise FileError(f"cannot write {str(path)!r}: {error.strerror or error}") from error
     with replace_file(path) as file:
