@@ -14,7 +14,7 @@ def drawn(tmp_path, monkeypatch):
     """Orientations and projections whose poles were drawn."""
     monkeypatch.chdir(tmp_path)
     crystals = []
-    monkeypatch.setattr(plot, "poles", lambda ax, *crystal, region, families: crystals.append(crystal))
+    monkeypatch.setattr(plot, "poles", lambda ax, *crystal, **_: crystals.append(crystal))
     return crystals
 
 

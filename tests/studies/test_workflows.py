@@ -102,7 +102,7 @@ def test_a_comparison_is_that_of_the_command(folder, pair, capsys):
     run.save("run.h5")
     edges = {"x_edges_mm": measured.x_edges, "y_edges_mm": measured.y_edges}
     np.savez("map.npz", counts=measured.counts, **edges, inside=measured.mask)
-    options = "--means 0.1,0.2 --relative_spreads 0.5,1 --replicas 1 --resamples 2 --registration 0,1,0,0".split()
+    options = "--means 0.1,0.2 --relative-spreads 0.5,1 --replicas 1 --resamples 2 --registration 0,1,0,0".split()
     assert main(["compare", "run.h5", "map.npz", "-o", "shell", *options]) == 0
     told, lines = capsys.readouterr().out, []
     study = ae.compare("run.h5", "map.npz", "mine", GRID, QUICK, registration=HERE, note=lines.append, progress=False)

@@ -64,6 +64,10 @@ def _text(value, name):
     return value
 
 
+def _texts(value, name):
+    return tuple(_text(line, name) for line in check_sequence(value, name, "texts"))
+
+
 def _candidates(value, name):
     if not value:
         raise ValueError(f"{name} must have at least one candidate, got none")
@@ -101,6 +105,7 @@ class _Facts:
     reason: str = checked("Reason of the verdict", "str", _text)
     simulated_radius: float = number("Radius of the simulated tip", above=0, unit="nm")
     candidates: tuple = checked("Candidates", "tuple", _candidates, read=_read_candidates)
+    deciding_marks: tuple = checked("Marks that would decide", "tuple", _texts, read=lambda plain, _: plain)
     radii: Any = checked("Radii of the specimen, which are in the settings, too", "list", lambda radii, _: radii)
 
     @property
