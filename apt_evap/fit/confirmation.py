@@ -5,8 +5,8 @@ the amplitudes of the lines in the rings about the pole, do.
 
 Measured, with tips of R = 16 a and 10,000 ions of which all roll up, and registrations that were searched: folded maps
 of the same crystal and axis correlate to 0.55, 0.77 and 0.79; with a registration that was only refined from a start,
-0.46 (nickel) and -0.09 and 0.26 (tungsten). Of other crystals or axes three of six pairs correlate to -0.09 to 0.01, and
-three to 0.45 to 0.69; the symmetries of these three do not agree. The limit was chosen with these numbers.
+0.46 (nickel) and -0.09 and 0.26 (tungsten). Of other crystals or axes three of six pairs correlate to -0.09 to 0.01,
+and three to 0.45 to 0.69; the symmetries of these three do not agree. The limit was chosen with these numbers.
 """
 
 import math

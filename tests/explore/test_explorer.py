@@ -135,7 +135,8 @@ def test_without_a_measurement_it_is_the_map_of_the_command_line(run, tmp_path, 
     explorer = Explorer(run, run_arguments=["run.h5"])
     drawn = []
     monkeypatch.setattr(
-        "apt_evap.studies.workflows.written_pictures.save_picture", lambda path, maps, titles, *_, **__: drawn.append(maps[0])
+        "apt_evap.studies.workflows.written_pictures.save_picture",
+        lambda path, maps, titles, *_, **__: drawn.append(maps[0]),
     )
     for settings in (explorer.start, ExplorerSettings(ae.Combined(ENERGY, 0.4), 48, 3.5, ions=(100, 1500))):
         words = shlex.split(explorer.commands(settings).shell)
@@ -204,7 +205,8 @@ def test_a_rectangle_selects_ions(run, measured, explorer, tmp_path, monkeypatch
     ae.write("MEASURED.epos", measured)
     drawn = []
     monkeypatch.setattr(
-        "apt_evap.studies.workflows.written_pictures.save_picture", lambda path, maps, titles, *_, **__: drawn.append(maps[0])
+        "apt_evap.studies.workflows.written_pictures.save_picture",
+        lambda path, maps, titles, *_, **__: drawn.append(maps[0]),
     )
     words = shlex.split(selection.shell.replace("MEASURED", "MEASURED.epos"))
     assert main([*words[1:], "--quiet"]) == 0
