@@ -59,6 +59,12 @@ class EnergySearch:
         mask = region.mask & field_of_view(np.where(region.mask, region.values, 0))
         for perturbation in (Unperturbed(), self.perturbation(self.middle)):
             hits = registration.hits(self.run.hits(perturbation))
+            edges = ((region.x_edges[0], region.x_edges[-1]), (region.y_edges[0], region.y_edges[-1]))
+            if not len(hits[hits.detected].window(x=edges[0], y=edges[1])):
+                raise ValueError(
+                    f"the registration must put simulated hits on the measured map, got one that puts none there: "
+                    f"{registration}"
+                )
             mask &= field_of_view(DetectorMap.from_hits(hits, like=region, position_step=None).counts)
         self.region = region = replace(
             region, mask=mask, ions=int(region.values[mask].sum()) if region.is_counts else None, detected=None
