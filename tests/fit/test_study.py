@@ -781,7 +781,7 @@ def test_studies_that_cannot_be(run, other):
         fit_energies(run, measured, registration=HERE, replicas=0)
     with pytest.raises(ValueError, match="smoothing"):
         fit_energies(run, measured, registration=HERE, smoothing=-1)
-    with pytest.raises(ValueError, match=r"none of [\d,]+ hits is in"):
+    with pytest.raises(ValueError, match="the registration must put simulated hits on the measured map"):
         fit_energies(run, measured, registration=ae.Registration(0.0, 1.0, (1e6, 0.0)))
     with pytest.raises(ValueError, match="must contain a window of 11 bins"):
         small = replace(measured, mask=np.add.outer(np.arange(48), np.arange(48)) < 9)
