@@ -77,7 +77,7 @@ def open_for_reading(path: AnyPath) -> Iterator[BinaryIO]:
     """
     path = check_path(path)
     try:
-        with open(path, "rb", buffering=0, opener=_open_regular) as file:
+        with open(path, "rb", buffering=0, opener=open_regular) as file:
             yield file
     except OSError as error:
         raise FileError(f"cannot read {str(path)!r}: {_reason(error)}") from error
@@ -166,8 +166,9 @@ def replace_file(path: AnyPath) -> Iterator[BinaryIO]:
                 part.unlink()
 
 
-def _open_regular(path, flags):
-    descriptor = os.open(path, flags | _WAIT_FOR_NOBODY)
+def open_regular(path: AnyPath, flags: int) -> int:
+    """Open a regular file as `os.open` does; OSError for folders, pipes and devices."""
+    descriptor = os.open(path, flags | _WAIT_FOR_NOBODY, 0o666)
     try:
         check_regular(os.fstat(descriptor))
     except OSError:

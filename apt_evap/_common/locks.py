@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from apt_evap._common.files import FileError, check_regular
+from apt_evap._common.files import FileError, open_regular
 from apt_evap._common.types import AnyPath
 from apt_evap.warnings import RunWarning, warn
 
@@ -19,20 +19,13 @@ except ImportError:  # Windows
     import msvcrt
 
 _OWNER = "process "  # first word of a lock file
-_FLAGS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
 _LOCKED_BYTE = 1 << 20  # behind the text: nobody can read a locked byte on Windows
 _PAUSE = 0.2  # seconds between two tries
 
 
 def open_lock(path: AnyPath, flags: int = os.O_RDWR | os.O_CREAT) -> int:
     """Open a lock file, with the flags of `os.open`; OSError if it is a link or not a regular file."""
-    descriptor = os.open(path, flags | _FLAGS, 0o666)
-    try:
-        check_regular(os.fstat(descriptor))
-    except OSError:
-        os.close(descriptor)
-        raise
-    return descriptor
+    return open_regular(path, flags | getattr(os, "O_NOFOLLOW", 0))
 
 
 def try_lock(descriptor: int, shared: bool = False) -> bool:

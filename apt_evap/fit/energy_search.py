@@ -57,10 +57,10 @@ class EnergySearch:
         """Set the registration, and find the common region of measured and simulated maps."""
         region = self.measured
         mask = region.mask & field_of_view(np.where(region.mask, region.values, 0))
+        x, y = ((float(edges[0]), float(edges[-1])) for edges in (region.x_edges, region.y_edges))
         for perturbation in (Unperturbed(), self.perturbation(self.middle)):
             hits = registration.hits(self.run.hits(perturbation))
-            edges = ((region.x_edges[0], region.x_edges[-1]), (region.y_edges[0], region.y_edges[-1]))
-            if not len(hits[hits.detected].window(x=edges[0], y=edges[1])):
+            if not len(hits[hits.detected].window(x=x, y=y)):
                 raise ValueError(
                     f"the registration must put simulated hits on the measured map, got one that puts none there: "
                     f"{registration}"
@@ -81,9 +81,9 @@ class EnergySearch:
         return self.grid.perturbation(*self.grid.values_at(np.asarray(index)))
 
     def hits(self, index: ArrayLike) -> Hits:
-        """Hits of several draws of all ions at an index of the grid, in the frame of the run."""
+        """Detected hits of several draws of all ions at an index of the grid, in the frame of the run."""
         draws = [hits_of_draw(self.run, self.perturbation(index), draw) for draw in range(ROUGH)]
-        x, y = (np.concatenate([getattr(hits, name) for hits in draws]) for name in ("x", "y"))
+        x, y = (np.concatenate([getattr(hits, name)[hits.detected] for hits in draws]) for name in ("x", "y"))
         return Hits(x=x, y=y)
 
     def refine_registration(self, registration: Registration, index: ArrayLike) -> Registration:

@@ -27,7 +27,7 @@ def test_an_image_of_a_run(run, capsys, blank_pictures):
 
 
 def test_an_image_is_grey(run, tmp_path):
-    """Also its bar: brightness is no density of hits."""
+    """Also its bar: brightness is not a density of hits."""
     assert main(["map", "ni.h5", "--field-ion", "Ne", "--bins", "64", "-o", "image.png"]) == 0
     assert main(["map", "ni.h5", "--perturbation", "Unperturbed", "-o", "map.png"]) == 0
     image, other = (imread(tmp_path / name)[..., :3] for name in ("image.png", "map.png"))

@@ -1,4 +1,4 @@
-"""NXapm: what the validator of pynxtools 0.16 asks for, ions that come back as they were, and files of others."""
+"""NXapm: what the validator of pynxtools 0.16 requires, ions that come back as they were, and files of others."""
 
 import datetime
 

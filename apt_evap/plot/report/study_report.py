@@ -105,7 +105,8 @@ def _sentence(study):
     if verdict == "alike":
         return f"The maps are alike{', but' if study.no_energy else ':'} {study.result}."
     whether = "It is doubtful that the maps are alike" if verdict == "doubtful" else "The maps are not alike"
-    return f"{whether}, so no energy is given: {reason}."
+    known = " The registration is doubtful." if study.registration.doubtful else ""
+    return f"{whether}, so no energy is given: {reason}.{known}"
 
 
 def doubts(content: Mapping[str, Any]) -> list[str]:

@@ -493,7 +493,7 @@ def bins_for_run(run: Run, measured: DetectorMap, registration: Registration) ->
 
 @contextmanager
 def advice_as_notes(note: Callable[[str], None]) -> Iterator[None]:
-    """Give warnings with an advice as notes without it: who asks for a twin has not chosen its settings."""
+    """Give warnings with an advice as notes without it: the user of a twin has not chosen its settings."""
     show = warnings.showwarning
 
     def tell(message: Any, category: Any, *where: Any, **options: Any) -> None:
