@@ -294,7 +294,7 @@ class CheckedFile:
             filters.pop(h5py.h5z.FILTER_SHUFFLE, None)
         largest = _DEFLATED if compressed and level else 1
         if max(math.prod(dimensions), math.prod(chunks)) * stored.itemsize > self._size * largest:
-            raise ValueError(f"{path} has shape {dimensions}, more than the {self._size} bytes of the file")
+            raise ValueError(f"{path} has shape {dimensions}, more than a file of {self._size} bytes can contain")
         if (level and not compressed) or filters.keys() - {h5py.h5z.FILTER_FLETCHER32}:
             raise ValueError(f"{path} is compressed or filtered: h5repack -f NONE writes a copy that is not")
         if n_bytes * largest < math.prod(dimensions) * stored.itemsize:

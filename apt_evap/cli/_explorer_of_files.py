@@ -137,7 +137,7 @@ def _run_code(options):
 
 
 _READING = ("format", "byte_order", "voltage_unit", "arrays", "unit")
-_OTHERS = ("ranges", "species", "partial", "circle", "box", "undistort")
+_OTHERS = ("ranges", "species", "partial", "circle", "box", "undistort", "distance", "time_zero")
 _SELECTION = {"ions": "ion", "mass": "mass_to_charge", "voltage": "voltage"}
 
 

@@ -24,7 +24,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("file", metavar="FILE", help="measured ions (.epos, .pos, .raw, ...)")
     add_reading(parser)
-    parser.add_argument("--element", metavar="NAME[,NAME]", help="ions to name, such as W or Cr,CrO; default: all")
+    parser.add_argument(
+        "--element",
+        metavar="NAME[,NAME]",
+        help="ions to name, such as W or Cr,CrO; default: the most probable of 27 elements and six molecules",
+    )
     add_flight(parser)
     parser.add_argument("--save", metavar="FILE.rrng", help="save the ranges of the named peaks")
     parser.add_argument(
@@ -49,8 +53,8 @@ def execute(options: argparse.Namespace) -> int:
     saved = None if options.save is None else check_path(options.save)
     if saved is not None and saved.suffix.lower() != ".rrng":
         raise ValueError(f"--save must be a file .rrng, got {options.save!r:.80}")
-    if saved is not None and saved.exists() and not options.force:
-        raise ValueError(f"{options.save!r} exists: --force overwrites it")
+    if saved is not None:
+        check_output(saved, lambda path: False, options.force)
     if options.mass is not None or options.species is not None:
         raise ValueError("--mass and --species select peaks, of which a spectrum needs all")
     hits = read(options)

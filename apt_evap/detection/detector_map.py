@@ -281,6 +281,15 @@ class DetectorMap:
         """Centres of the bins in x and in y [mm], shapes (nx,) and (ny,)."""
         return tuple((edges[:-1] + edges[1:]) / 2 for edges in (self.x_edges, self.y_edges))
 
+    def contains(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.bool_]:
+        """Whether points [mm] are in bins inside the mask; NaN is outside, as is what lies beyond the edges."""
+        places = []
+        for values, edges in ((y, self.y_edges), (x, self.x_edges)):
+            index = np.searchsorted(edges, values) - 1
+            places.append(np.where((index >= 0) & (index < len(edges) - 1), index, -1))
+        row, column = places
+        return (row >= 0) & (column >= 0) & self.mask[row, column]
+
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         """Values of the bins, shape (ny, nx), for functions of NumPy: ``np.asarray(hit_map)``."""
         return np.array(self.values, dtype) if copy else np.asarray(self.values, dtype)

@@ -8,7 +8,7 @@ import numpy as np
 
 from apt_evap._common.types import Floats
 from apt_evap.detection.hits import Hits
-from apt_evap.detection.isotope_comb import Comb, LogSpectrum
+from apt_evap.detection.isotope_comb import Comb, LogSpectrum, in_intervals
 
 _SHAPE = 0.25  # of the width of a peak, by which its unknown shape may shift it
 _DRIFT = 3e-4  # of m/n, by which a measured voltage may shift it
@@ -74,16 +74,13 @@ class FlightFit:
         combs : sequence of Comb
             Ions of the spectrum that this fit gives.
         """
-        masses, groups, names = self.masses(hits), [], []
+        masses, groups, names, widths = self.masses(hits), [], [], []
         time, x, y = (np.asarray(values, np.float64) for values in hits.require("time_of_flight", "x", "y"))
         of_time = 2.0 / (time - self.time_zero)  # relative change of m/n by a time, and by a length
         of_length = 2.0 * self.distance / (self.distance**2 + x * x + y * y)
-        voltage = total_voltage(hits)
+        voltage = hits.total_voltage
         for comb in combs:
-            inside = np.zeros(len(hits), bool)
-            for low, high in comb.intervals:
-                inside |= (masses >= low) & (masses < high)
-            rows = np.flatnonzero(inside)
+            rows = np.flatnonzero(in_intervals(masses, comb.intervals))
             if len(rows) < _FEWEST:
                 continue
             place = np.log(masses[rows])
@@ -93,14 +90,16 @@ class FlightFit:
                 error = math.hypot(spread / math.sqrt(len(part)), _DRIFT)
                 groups.append((shift, of_time[part].mean(), of_length[part].mean(), error, len(names)))
             names.append(comb.name)
+            widths.append(comb.width * _SHAPE)
         if not names:
             return self
         shift, of_time, of_length, error, number = np.array(groups).T
         # the shape of a peak, which is not known, shifts all its groups alike: an unknown of its own, about zero
         of_peak = (number[:, None] == np.arange(len(names))).astype(float)
-        width = np.array([comb.width * _SHAPE for comb in combs if comb.name in names])
         design = np.column_stack([of_length, of_peak, of_time]) / error[:, None]
-        design = np.vstack([design, np.column_stack([np.zeros(len(names)), np.diag(1 / width), np.zeros(len(names))])])
+        design = np.vstack(
+            [design, np.column_stack([np.zeros(len(names)), np.diag(1 / np.array(widths)), np.zeros(len(names))])]
+        )
         target = np.append(shift / error, np.zeros(len(names)))
         for unknowns in (design.shape[1], design.shape[1] - 1):  # first with the time, then without
             covariance = np.linalg.inv(design[:, :unknowns].T @ design[:, :unknowns])
@@ -121,7 +120,7 @@ class FlightFit:
         """The fit with the time zero whose spectrum is sharpest, if the voltages vary enough to see it."""
         from scipy.ndimage import uniform_filter1d
 
-        voltage = total_voltage(hits)
+        voltage = hits.total_voltage
         if not len(hits) or np.std(voltage) < _VARIED * np.mean(voltage):
             return self
         time = np.asarray(hits.require("time_of_flight")[0], np.float64)
@@ -137,9 +136,3 @@ class FlightFit:
         if scores[best] < _SHARPER * scores[min(scores, key=abs)]:
             return self
         return replace(self, time_zero=self.time_zero + best)
-
-
-def total_voltage(hits: Hits) -> Floats:
-    """Voltage at the time of the evaporation [V], shape (n,): with the pulse."""
-    (voltage,) = hits.require("voltage")
-    return voltage if hits.pulse_voltage is None else voltage + hits.pulse_voltage

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from apt_evap._common.notebook import as_table
-from apt_evap._common.types import Booleans, Column
+from apt_evap._common.types import Booleans, Column, Floats
 from apt_evap._common.validation import (
     check_array,
     check_kind,
@@ -165,6 +165,12 @@ class Hits:
         """Names of the existing columns without those in `extra`, tuple of str."""
         return tuple(name for name in _COLUMNS if getattr(self, name) is not None)
 
+    @property
+    def total_voltage(self) -> Floats:
+        """Voltage at the time of the evaporation, with the pulse [V], shape (n,)."""
+        (voltage,) = self.require("voltage")
+        return voltage if self.pulse_voltage is None else voltage + self.pulse_voltage
+
     def require(self, *names: str) -> tuple[NDArray[Any], ...]:
         """Return columns by name; an error names a missing one.
 
@@ -268,10 +274,9 @@ class Hits:
         ValueError
             If a column is missing, or a number is outside its range.
         """
-        time, voltage, x, y = self.require("time_of_flight", "voltage", "x", "y")
+        time, _, x, y = self.require("time_of_flight", "voltage", "x", "y")
         time_zero = check_number(time_zero, "time_zero", unit="ns")
-        total = voltage if self.pulse_voltage is None else voltage + self.pulse_voltage
-        return replace(self, mass_to_charge=mass_to_charge(total, time - time_zero, x, y, distance))
+        return replace(self, mass_to_charge=mass_to_charge(self.total_voltage, time - time_zero, x, y, distance))
 
     def within_circle(self, radius: float, centre: ArrayLike = (0.0, 0.0)) -> Hits:
         """Select the detected ions within a circle on the detector.

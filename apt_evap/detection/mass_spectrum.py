@@ -12,7 +12,14 @@ from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_kind, check_number, short_text
 from apt_evap.detection.flight_fit import FlightFit
 from apt_evap.detection.hits import Hits
-from apt_evap.detection.isotope_comb import LARGEST_MISFIT, Comb, LogSpectrum, atoms_of_formula, isotopes_of
+from apt_evap.detection.isotope_comb import (
+    LARGEST_MISFIT,
+    Comb,
+    LogSpectrum,
+    atoms_of_formula,
+    in_intervals,
+    isotopes_of,
+)
 from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.specimen.isotopes import ISOTOPES, SPECTRUM_ELEMENTS, mean_mass
 
@@ -159,10 +166,7 @@ class Spectrum:
             reason = self.refused or f"the spectrum has no peaks of {short_text(formula)}"
             raise ValueError(reason)
         (mass,) = self.hits.require("mass_to_charge")
-        inside = np.zeros(len(self.hits), bool)
-        for peak in chosen:
-            for low, high in peak.intervals:
-                inside |= (mass >= low) & (mass < high)
+        inside = in_intervals(mass, [interval for peak in chosen for interval in peak.intervals])
         if (number := int(np.count_nonzero(inside))) < FEWEST_OF_ELEMENT:
             raise ValueError(f"only {number:,} ions are in peaks of {formula}, expected at least {FEWEST_OF_ELEMENT:,}")
         return inside
@@ -202,7 +206,7 @@ def spectrum(
     -----
     The isotopes of each ion and charge state are a comb. One factor on m/n puts it on the spectrum; the ion is there if
     the comb explains at least 70 % of the ions above the background about it, and no other comb explains 10 % more of
-    the same ions. The fill of W3+ in a measured spectrum was 86 %, that of Re3+ in the same one 68 %.
+    the same ions. In a measured spectrum of tungsten it explains 90 % for W3+, 68 % for Re3+.
 
     Examples
     --------
@@ -261,8 +265,9 @@ def _combs(counts, formulas, tolerance):
     chosen: list[tuple[Comb, tuple[str, ...]]] = []
     fewest = _LEAST * counts.counts.sum()
     for _ in range(_MOST):
+        named = {comb.name for comb, _ in chosen}  # an ion has one comb: another shift of it is another ion
         candidates = _candidates(counts, formulas, tolerance)
-        best = next((pair for pair in candidates if pair[0].ions >= fewest), None)
+        best = next((pair for pair in candidates if pair[0].ions >= fewest and pair[0].name not in named), None)
         if best is None:
             break
         chosen.append(best)
@@ -295,8 +300,6 @@ def _charges(formula, expected):
     highest = _EXPECTED if expected else 1
     if formula in ISOTOPES:
         highest = max(highest, next(charge for mass, charge in _HIGHEST_CHARGES if mean_mass(formula) < mass))
-    elif expected:
-        highest = _EXPECTED
     return range(1, highest + 1)
 
 
@@ -349,6 +352,8 @@ def _refusal(counts, formulas, combs, tolerance):
                 f"no peaks of {formula}: the isotopes of {best.name} explain {best.fill:.0%} of the ions about them, "
                 f"expected at least {1 - LARGEST_MISFIT:.0%}"
             )
+        elif best.ions < _LEAST * counts.counts.sum():
+            reasons.append(f"no peaks of {formula}: {best.ions:,.0f} ions of {best.name} are too few to be named")
         else:
             reasons.append(f"no peaks of {formula}: another ion explains the peaks of {best.name} better")
     return "; ".join(reasons)

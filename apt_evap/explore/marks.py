@@ -9,7 +9,7 @@ import numpy as np
 from apt_evap._common.types import Floats
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.projection import Projection
-from apt_evap.maps.crystallography.directions import Poles, poles, zones
+from apt_evap.maps.crystallography.directions import members_of_families, poles, zones
 from apt_evap.maps.crystallography.orientation import FittedOrientation, Orientation, fit_orientation
 from apt_evap.specimen.materials import as_material
 
@@ -55,7 +55,7 @@ class Marks:
     def __post_init__(self):
         self.material = as_material(self.material)
         crystal = poles(self.material, FAMILIES)
-        self._members = _families(crystal)
+        self._members = members_of_families(crystal)
         self.families = tuple(plain(crystal.labels[members[0]]) for members in self._members)
         self.planes = tuple(tuple(crystal.planes[members[0]].tolist()) for members in self._members)
         self._crystal = crystal
@@ -205,13 +205,6 @@ def plain(label: str) -> str:
     return label
 
 
-def _families(crystal: Poles) -> list[list[int]]:
-    """Members of each family: its first member has the spacing and the sorted indices of all."""
-    keys = [(round(spacing, 9), tuple(sorted(map(abs, plane)))) for spacing, plane in zip(
-        crystal.spacings.tolist(), crystal.planes.tolist(), strict=True)]  # fmt: skip
-    return [[k for k, key in enumerate(keys) if key == family] for family in dict.fromkeys(keys)]
-
-
 def _frame(first, second):
     """Orthonormal vectors, as columns: the first one, and a normal of the plane of both."""
     normal = np.cross(first, second)
@@ -232,7 +225,7 @@ def _equal(first, second, crystal):
     if abs(math.log(first.projection.scale / second.projection.scale)) > 1e-3:
         return False
     normals = [fit.orientation.directions(crystal.normals) for fit in (first, second)]
-    for family in _families(crystal)[:3]:
+    for family in members_of_families(crystal)[:3]:
         cosines = normals[0][family] @ normals[1][family].T
         if cosines.max(axis=1).min() < math.cos(_SAME):
             return False

@@ -62,6 +62,7 @@ class RegistrationPanel:
         self._progress: tuple[int, int] | None = None
         self._progress_text = ""
         self._maps: ExplorerMaps | None = None
+        self._judged_registration: Any = None
         self.likeness: Any = None
         """The last verdict."""
         self.status = Div()
@@ -167,7 +168,7 @@ class RegistrationPanel:
 
     def _put_likeness(self, maps, likeness):
         if maps is self._maps:
-            self.likeness = likeness
+            self.likeness, self._judged_registration = likeness, self._explorer.registration
             self._judged(maps, likeness)
             self._put_status()
 
@@ -181,7 +182,8 @@ class RegistrationPanel:
                 f"<small>registering, {self._progress_text}</small>"
             )
         registration = self._explorer.registration
-        if self._explorer.registered and registration is not None and self.likeness is not None:
+        is_judged = self.likeness is not None and self._judged_registration is registration
+        if self._explorer.registered and registration is not None and is_judged:
             text, reason = self.likeness.verdict, self.likeness.reason
             if registration.doubtful:
                 reason += f"; the correlation of the registered maps is only {registration.score:.2f}"

@@ -30,7 +30,8 @@ class SummaryPanel:
     def __init__(self, explorer: Explorer | None, later: Callable[[Callable[[], None], int], Any]) -> None:
         self._later = later
         self._maps: ExplorerMaps | None = None
-        self._verdict = ""  # of the last maps that were judged
+        self._explorer = explorer
+        self._judged: tuple[Any, str] = (None, "")  # registration and verdict of the last maps that were judged
         self._readout_waits = False
         facts = ["<b>apt-evap explore</b>"] if explorer is None else _facts(explorer)
         self.facts = Div(text=" &nbsp; ".join(facts), sizing_mode="stretch_width")
@@ -48,7 +49,8 @@ class SummaryPanel:
 
     def judge(self, maps: ExplorerMaps, likeness: Likeness) -> None:
         """Take the verdict on maps: the similarity is a number for maps that are alike."""
-        self._verdict = likeness.verdict
+        if self._explorer is not None:
+            self._judged = self._explorer.registration, likeness.verdict
         if maps is self._maps:
             self._put_numbers(maps)
 
@@ -63,9 +65,12 @@ class SummaryPanel:
 
     def _put_numbers(self, maps):
         text = ""
+        registration, verdict = self._judged
+        if self._explorer is None or registration is not self._explorer.registration:
+            verdict = ""  # of another registration
         if maps.similarity is not None:
-            text = "no similarity: the maps are " + self._verdict + "<br>" if self._verdict else ""
-        if maps.similarity is not None and self._verdict == "alike":
+            text = f"no similarity: the maps are {verdict}<br>" if verdict else ""
+        if maps.similarity is not None and verdict == "alike":
             halves = "" if maps.ceiling is None else f"; of two halves of the measurement {maps.ceiling.value:.3f}"
             text = f'<span style="font-size: 26px">{maps.similarity.value:.3f}</span> similarity{halves}<br>'
         ions = "" if maps.simulated is None else f"{maps.simulated.shown_ions} on the map"

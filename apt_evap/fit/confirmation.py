@@ -65,11 +65,10 @@ def lines_of_other_sign(simulated: Structure, measured: Structure) -> Sequence[t
         Inner and outer radii [degrees].
     """
     wrong = []
-    for ring, other in zip(simulated.rings, measured.rings, strict=True):
-        if other.contrast > 0 and other.contrast > SIGNIFICANT * np.nan_to_num(other.error):
-            value = line_amplitude(ring, other).value
-            if value < 0:
-                wrong.append((ring.inner, ring.outer))
+    for ring, other in simulated.significant_rings(measured):
+        amplitude = line_amplitude(ring, other)
+        if amplitude.value < -SIGNIFICANT * np.nan_to_num(amplitude.error):
+            wrong.append((ring.inner, ring.outer))
     return wrong
 
 

@@ -57,15 +57,15 @@ class EnergySearch:
         """Set the registration, and find the common region of measured and simulated maps."""
         region = self.measured
         mask = region.mask & field_of_view(np.where(region.mask, region.values, 0))
-        x, y = ((float(edges[0]), float(edges[-1])) for edges in (region.x_edges, region.y_edges))
         for perturbation in (Unperturbed(), self.perturbation(self.middle)):
             hits = registration.hits(self.run.hits(perturbation))
-            if not len(hits[hits.detected].window(x=x, y=y)):
+            try:
+                counts = DetectorMap.from_hits(hits, like=region, position_step=None).counts
+            except ValueError as error:
                 raise ValueError(
-                    f"the registration must put simulated hits on the measured map, got one that puts none there: "
-                    f"{registration}"
-                )
-            mask &= field_of_view(DetectorMap.from_hits(hits, like=region, position_step=None).counts)
+                    f"the registration must put simulated hits on the measured map, got {registration}: {error}"
+                ) from error
+            mask &= field_of_view(counts)
         self.region = region = replace(
             region, mask=mask, ions=int(region.values[mask].sum()) if region.is_counts else None, detected=None
         )

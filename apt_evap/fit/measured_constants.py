@@ -417,7 +417,7 @@ def _charges(hits, material, ranges):
     if (history.lower + history.upper).min() < LEAST:
         return []
     (ratio, error), pair = ratio_of_counts(history.lower, history.upper), f"{history.charge + 1}+ / {history.charge}+"
-    constants = [
+    checks = [
         Observed(
             f"ln of {material.name} {pair}, second half against first", float(np.log(ratio[1])),
             float(np.log(ratio[0])), float(np.hypot(*error)), "the field of evaporation changes",
@@ -426,9 +426,9 @@ def _charges(hits, material, ranges):
     if material.name in RATIO_PARAMETERS:
         field, field_error = field_of_counts(material.name, history.charge, history.lower.sum(), history.upper.sum())
         meaning = "the assumed evaporation field is not on the scale of the charge states (Kingham)"
-        constants.append(
+        checks.append(
             Observed(
                 f"field by {pair} [V/nm]", float(field), float(material.evaporation_field), float(field_error), meaning
             )
         )
-    return constants
+    return checks

@@ -214,18 +214,14 @@ def voltages_of(hits: Hits | None) -> Floats | None:
     """Standing voltage plus pulse of the ions that have one [V], None if there is none."""
     if hits is None or hits.voltage is None:
         return None
-    voltages = _voltages(hits)[has_voltage(hits)]
+    voltages = hits.total_voltage[has_voltage(hits)]
     return voltages.astype(float) if len(voltages) else None
 
 
 def has_voltage(hits: Hits) -> Booleans:
     """Whether the voltage of an ion is known: finite and above 0; bool (n,)."""
-    voltages = _voltages(hits)
+    voltages = hits.total_voltage
     return np.isfinite(voltages) & (voltages > 0)
-
-
-def _voltages(hits):
-    return hits.voltage if hits.pulse_voltage is None else hits.voltage + hits.pulse_voltage
 
 
 def _radii(hits, field, lens, factor):

@@ -112,12 +112,16 @@ class Structure(NamedTuple):
 
     def lost(self, measured: Structure) -> bool:
         """Whether all rings with a significant measured contrast have lost it."""
-        pairs = [
-            (ring.contrast, other.contrast)
+        pairs = self.significant_rings(measured)
+        return bool(pairs) and all(ring.contrast < LOST * other.contrast for ring, other in pairs)
+
+    def significant_rings(self, measured: Structure) -> list[tuple[Ring, Ring]]:
+        """Pairs of rings of this and of a measured structure in which the measured one has a significant contrast."""
+        return [
+            (ring, other)
             for ring, other in zip(self.rings, measured.rings, strict=True)
             if other.contrast > SIGNIFICANT * np.nan_to_num(other.error) and other.contrast > 0
         ]
-        return bool(pairs) and all(contrast < LOST * other for contrast, other in pairs)
 
 
 class PoleMeasure:

@@ -46,12 +46,17 @@ class TipFit:
 
     @property
     def order(self) -> list[str]:
-        """Names of the runs, that with the largest similarity first."""
-        return sorted(self.studies, key=lambda name: -self.studies[name].refined.score.value)
+        """Names of the runs by similarity, first those whose maps are alike: scores of others are not comparable."""
+
+        def key(name):
+            study = self.studies[name]
+            return study.likeness.verdict != "alike", -study.refined.score.value
+
+        return sorted(self.studies, key=key)
 
     @property
     def best(self) -> str:
-        """Name of the run with the largest similarity."""
+        """Name of the run with the largest similarity among those whose maps are alike, or of all if none are."""
         return self.order[0]
 
     def rows(self) -> list[dict[str, Any]]:
@@ -63,7 +68,8 @@ class TipFit:
             For each run: run, similarity and error (at the maximum between the points of the grid), share,
             unperturbed, gain, mean and standard_deviation (after the truncation, [eV]), mean_low and mean_high (95 %
             of the resamples), relative_spread, rollup_fraction, real_mean and real_standard_deviation
-            (real units [eV]), scale, rotation [degrees], mirror, doubtful.
+            (real units [eV]), scale, rotation [degrees], mirror, doubtful, likeness (the verdict on the maps) and
+            no_energy (why the energies are no result; empty if they are).
         """
         rows = []
         for name in self.order:
@@ -91,6 +97,8 @@ class TipFit:
                     "rotation": place.rotation,
                     "mirror": place.mirror,
                     "doubtful": name in self.doubtful,
+                    "likeness": study.likeness.verdict,
+                    "no_energy": study.no_energy,
                 }
             )
         return for_json(rows)

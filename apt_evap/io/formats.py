@@ -78,12 +78,6 @@ def _read_hdf5(path, *, columns=None):
     return read_hdf5(path, columns=columns)
 
 
-def _read_nxapm(path, *, columns=None):
-    from apt_evap.io.hdf5 import read_hdf5
-
-    return read_hdf5(path, columns=columns)
-
-
 def _write_nxapm(path, hits, *, elements=(), start_time=None):
     from apt_evap.io.nxapm import write_nxapm
 
@@ -95,7 +89,7 @@ _WIDEST = 500.0  # [mm]: of a detector; those of atom probes have 80 to 120
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 FORMATS = (
     Format(".h5", _HDF5, _read_hdf5),
-    Format(".nxs", _HDF5, _read_nxapm, _write_nxapm, keeps=lambda name, values: values.dtype.kind in "biuf"),
+    Format(".nxs", _HDF5, _read_hdf5, _write_nxapm, keeps=lambda name, values: values.dtype.kind in "biuf"),
     Format(".epos", None, read_epos, write_epos, chunk_epos, EPOS, lambda name, _: name in (*EPOS, *_GROUPING)),
     Format(".pos", None, read_pos, write_pos, chunk_pos, POS, lambda name, _: name in POS),
     Format(".apt", SIGNATURE, read_apt, None, chunk_apt),

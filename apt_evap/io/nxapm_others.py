@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from apt_evap._common import nexus
 from apt_evap._common.checked_hdf5 import CheckedFile, open_hdf5
 from apt_evap._common.files import FileError
 from apt_evap._common.types import AnyPath
@@ -42,19 +43,25 @@ _TIMES = {"s": 1.0, "second": 1.0, "ms": 1e-3, "millisecond": 1e-3, "us": 1e-6, 
 _TIMES |= {"microsecond": 1e-6, "ns": 1e-9, "nanosecond": 1e-9, "ps": 1e-12, "picosecond": 1e-12}
 _VOLTAGES = {"V": 1.0, "volt": 1.0, "kV": 1e3, "kilovolt": 1e3, "mV": 1e-3, "millivolt": 1e-3}
 _MASSES = {"Da": 1.0, "dalton": 1.0, "u": 1.0, "amu": 1.0, "unified_atomic_mass_unit": 1.0}
-_PULSER = "measurement/event1/instrument/pulser"
+
+
+def _in_entry(path):
+    return path.removeprefix(f"{nexus.ENTRY}/")
+
+
+_PULSER = _in_entry(nexus.PULSER)
 # path in the entry, values per ion, units and that of `Hits`
 _COLUMNS: dict[str, tuple[str, int, dict[str, float], str]] = {
-    "positions": ("atom_probe/reconstruction/reconstructed_positions", 3, _LENGTHS, "nm"),
-    "mass_to_charge": ("atom_probe/mass_to_charge_conversion/mass_to_charge", 1, _MASSES, "Da"),
-    "time_of_flight": ("atom_probe/voltage_and_bowl/raw_tof", 1, _TIMES, "ns"),
+    "positions": (_in_entry(nexus.POSITIONS), 3, _LENGTHS, "nm"),
+    "mass_to_charge": (_in_entry(nexus.MASSES), 1, _MASSES, "Da"),
+    "time_of_flight": (_in_entry(nexus.TIMES), 1, _TIMES, "ns"),
     "voltage": (f"{_PULSER}/standing_voltage", 1, _VOLTAGES, "V"),
     "pulse_voltage": (f"{_PULSER}/pulse_voltage", 1, _VOLTAGES, "V"),
-    "hits": ("atom_probe/hit_finding/hit_positions", 2, _LENGTHS, "mm"),
-    "ion": ("atom_probe/hit_spatial_filtering/evaporation_id", 1, {}, ""),
+    "hits": (_in_entry(nexus.HITS), 2, _LENGTHS, "mm"),
+    "ion": (_in_entry(nexus.IONS), 1, {}, ""),
     "pulses": ("atom_probe/hit_finding/epos_number_of_pulses", 1, {}, ""),
     "ions_per_pulse": ("atom_probe/hit_finding/epos_ions_per_pulse", 1, {}, ""),
-    "multiplicity": ("atom_probe/hit_finding/hit_multiplicity", 1, {}, ""),
+    "multiplicity": (_in_entry(nexus.MULTIPLICITY), 1, {}, ""),
     "pulse_number": (f"{_PULSER}/pulse_number", 1, {}, ""),
 }
 _ABSENT = ("positions", "mass_to_charge", "time_of_flight", "voltage", "hits")  # zero for all ions: not recorded

@@ -64,7 +64,7 @@ def overlay(
     x, y = np.meshgrid(np.linspace(low_x, high_x, 400), np.linspace(low_y, high_y, 400))
     back_x, back_y = registration.inverse_points(x, y)
     values, covered = image.sample(back_x + 1j * back_y)
-    common = _on(measured, x, y) & covered  # contours outside the measured map are meaningless
+    common = measured.contains(x, y) & covered  # contours outside the measured map are meaningless
     legend = []
     if common.any() and np.ptp(values[common]) > 0:
         field = np.ma.masked_array(values, ~common)
@@ -94,12 +94,6 @@ def overlay(
     set_caption(ax, _caption(registration))
     set_title(ax, title, pad=8)
     return ax
-
-
-def _on(map, x, y):
-    """Whether points are in bins inside the mask of a map."""
-    columns = np.searchsorted(map.x_edges[1:-1], x)
-    return map.mask[np.searchsorted(map.y_edges[1:-1], y), columns]
 
 
 def _caption(registration):

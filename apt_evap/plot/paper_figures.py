@@ -72,10 +72,11 @@ def paper_maps(
         ax.remove()
     axes = axes[: len(maps)]
     limits = common_limits(maps)
-    for letter, ax, panel_map in zip(string.ascii_lowercase, axes, maps, strict=False):
+    letters = string.ascii_lowercase if 1 < len(maps) <= len(string.ascii_lowercase) else [""] * len(maps)
+    for letter, ax, panel_map in zip(letters, axes, maps, strict=False):
         detector_map(panel_map, ax, limits=limits, colormap=colormap, colorbar=False, caption=False)
         ax.set(xlabel="", ylabel="", xticks=[], yticks=[])
-        if len(maps) > 1:
+        if letter:
             _text(ax, 0.03, 0.97, letter, va="top", weight="bold")
         add_scale_bar(ax)
     bar = add_colorbar([ax.images[0] for ax in axes], list(axes), label)

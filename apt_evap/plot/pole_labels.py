@@ -67,14 +67,7 @@ def poles(
         with np.errstate(invalid="ignore"):
             inside = (places[:, 0] > x_limits[0]) & (places[:, 0] < x_limits[1])
             inside &= (places[:, 1] > y_limits[0]) & (places[:, 1] < y_limits[1])
-        if region is not None:
-            columns = np.searchsorted(region.x_edges, places[inside, 0]) - 1
-            rows = np.searchsorted(region.y_edges, places[inside, 1]) - 1
-            ny, nx = region.mask.shape
-            visible = (columns >= 0) & (columns < nx) & (rows >= 0) & (rows < ny)
-            visible[visible] = region.mask[rows[visible], columns[visible]]
-            inside[inside] = visible
-        return inside
+        return inside if region is None else inside & region.contains(*places.T)
 
     if zone_families is None or len(zone_families):
         axes = zones(material, zone_families)

@@ -102,7 +102,8 @@ class Observation:
     def _flights(self, perturbation: Perturbation, by_response: bool = False) -> tuple[Floats, Floats, Booleans]:
         """Stereographic directions (n, 2), times of flight (n,) and ions that were not flown, for a perturbation."""
         run, operating = self.run, self.operating
-        elements = [run.elements[species] for species in np.unique(run.species)]
+        present = np.flatnonzero(np.bincount(run.species, minlength=len(run.elements)))
+        elements = list(dict.fromkeys(run.elements[species] for species in present))  # phases may share an element
         warn_if_not_for(dict(run.settings.get("rule") or {}).get("name"), perturbation, elements)
         for flown_as, flown in zip(run.perturbations, run.flown, strict=True):
             known = flown_as == perturbation or flown_as == described(perturbation)  # by name and repr in a file

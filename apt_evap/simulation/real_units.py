@@ -381,9 +381,8 @@ def _instrument_voltages(run, field_factor, voltages, operating_field):
 def _pulse_ids(run, control, excess, u):
     """Number of the pulse of each ion: from the clock, or drawn for the rate, or without pulses its own."""
     pulse_length = run.settings["pulse_length"]
-    if run.clock is not None:
-        in_pulses = np.floor(np.cumsum(run.clock.waits) / (pulse_length or 1.0)).astype(np.int64)
-        return in_pulses if pulse_length else np.arange(len(run))
-    if control.pulse_fraction == 0:
+    if run.clock is not None and pulse_length:
+        return np.floor(np.cumsum(run.clock.waits) / pulse_length).astype(np.int64)
+    if run.clock is not None or control.pulse_fraction == 0:
         return np.arange(len(run))
     return pulses_of(excess, control.rate, u)

@@ -168,9 +168,8 @@ class Recorder:
         """All ions so far as one run, with the last state whose events are all among them."""
         self._gather()
         run = Run.join([*self._stored, *self._new])
-        run = replace(
-            run, history=History.join([run.history, self._monitor.pop_history()])
-        )  # which returns a check once
+        history = History.join([run.history, self._monitor.pop_history()])  # each check is returned once
+        run = replace(run, history=history)
         self._stored, self._new = [run], []
         state = self._emitter.state()
         if len(state.sites) <= self._first_event + len(run):

@@ -681,6 +681,7 @@ def of_annotation(parameter):
         values.append(None)
     if re.fullmatch(r"float( \| None)?", kinds):
         values += [True, [1.0], NAN, -INF, 10**400]
+        values += [INF] if parameter.name != "ions" else []  # infinite: a map without noise
     if re.fullmatch(r"int( \| None)?", kinds):
         values += [True, 1.5, -1, NAN, 2**80]
     if re.fullmatch(r"bool( \| None)?", kinds):
@@ -692,7 +693,11 @@ def of_annotation(parameter):
 
 def of_declaration(setting, default):
     """Values of another type than a field of settings is declared to have, or outside its bounds."""
-    values = {"float": [object(), True, NAN, -INF, 10**400], "int": [object(), True, 1.5, 2**80], "bool": ["no", 1]}
+    values = {
+        "float": [object(), True, NAN, INF, -INF, 10**400],
+        "int": [object(), True, 1.5, 2**80],
+        "bool": ["no", 1],
+    }
     values = values.get(setting.kind, [])
     values = [object(), 3, "", "no such"] if re.fullmatch(r"\{.*\}", setting.kind) else values
     steps = {">": 0, ">=": -1, "from": -1, "<": 0, "<=": 1, "to": 1}

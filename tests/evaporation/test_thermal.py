@@ -29,8 +29,8 @@ def history_of(emitter, n, batch_size=256):
     return [None if parts[0] is None else np.concatenate(parts) for parts in joined]
 
 
-def same(one, other):
-    return [np.array_equal(a, b, equal_nan=np.asarray(a).dtype.kind == "f") for a, b in zip(one, other, strict=True)]
+def same(one, other, **options):
+    return [np.array_equal(a, b, **options) for a, b in zip(one, other, strict=True)]
 
 
 def one_by_one(emitter, n):
@@ -521,6 +521,11 @@ def test_light_on_one_side_of_a_cold_specimen(small_tip):
     sites, _, waits, voltages = history_of(emitter, 100)
     assert np.isfinite(waits).all() and np.isfinite(voltages).all()
     assert (small_tip.positions[sites, 0] > -0.6).mean() > 0.9
+    # measured: 0.97 with the charges as they are between relaxations
+    unbounded = ae.evaporation.ChargeSettings(potential_bound=1.0)
+    emitter = emitter_of(small_tip, ae.Arrhenius(5.0, laser=laser), seed=1, settings=unbounded)
+    sites = history_of(emitter, 100)[0]
+    assert (small_tip.positions[sites, 0] > 0).mean() > 0.9
 
 
 def test_a_laser_needs_a_temperature():
@@ -572,7 +577,7 @@ def test_a_run_that_is_resumed_between_two_relaxations_has_the_same_bits(tmp_pat
         assert len(part) == n_ions
     assert part.fingerprint() == whole.fingerprint()
     assert same(part.clock, whole.clock) == [True, True]
-    assert same(part.cap, whole.cap) == [True] * 5
+    assert same(part.cap, whole.cap, equal_nan=True) == [True] * 5  # NaN where no cap could be fitted
     assert part.clock.waits.shape == part.clock.voltages.shape == (130,)
     assert ae.load(tmp_path / "run.h5").fingerprint() == whole.fingerprint()
 

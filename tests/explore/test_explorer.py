@@ -340,7 +340,7 @@ def test_before_the_registration_both_maps_have_one_size(run, measured):
     hits = explorer.hits(replace(maps.settings, perturbation=ae.Unperturbed()))
     hits = hits[hits.detected]
     for own, other in ((hits.x, measured.x), (hits.y, measured.y)):
-        assert np.nanmedian(own) == pytest.approx(np.median(other), abs=6)  # mm, of a field of settings of 70 mm
+        assert np.nanmedian(own) == pytest.approx(np.median(other), abs=6)  # mm, of a field of view of 70 mm
     assert np.ptp(np.nanpercentile(hits.x, [1, 99])) == pytest.approx(
         np.ptp(np.percentile(measured.x, [1, 99])), rel=0.2
     )
@@ -427,8 +427,9 @@ def test_a_file_is_opened_beside_the_others(run, measured, tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     run.save("run.h5")
     ae.write("ions.epos", measured)
-    options = make_parser().parse_args(["explore", "--circle", "20"])
+    options = make_parser().parse_args(["explore", "--circle", "20", "--distance", "90", "--t0", "12.5"])
     explorer, _ = with_file(options, "ions.epos")
+    assert options.distance is None and not options.time_zero
     assert explorer.run is None and len(explorer.measured) == len(measured)  # the circle was of another file
     with pytest.raises(ValueError, match="none"):
         with_file(options, "none.epos")

@@ -152,9 +152,7 @@ def test_a_preview_is_grey(opened):
     assert gray in page.summary.readout.text
     page.emission.sliders["mean"].trigger("value_throttled", None, 0.4)
     opened.settle(opened.shows)
-    assert (
-        gray not in page.summary.readout.text and "2,000 ions" in page.summary.readout.text
-    ) or "of" in page.summary.readout.text
+    assert gray not in page.summary.readout.text and "preview" not in page.summary.readout.text
 
 
 def test_a_preview_sends_only_what_changes(opened):
@@ -421,7 +419,15 @@ def test_the_registration_arrives(run, measured, monkeypatch):
     throttled(page.emission.sliders["mean"], 0.3)  # the page goes on
     opened.settle(opened.shows)
     go.release()
-    opened.settle(lambda: "similarity" in page.summary.readout.text and 'value="1"' in page.registration.status.text)
+    opened.settle(
+        lambda: (
+            re.search(
+                r">[-\d.]+</span> similarity|no similarity: the maps are (not alike|doubtful)",
+                page.summary.readout.text,
+            )
+            and 'value="1"' in page.registration.status.text
+        )
+    )
     go.release()
     opened.settle(lambda: "progress" not in page.registration.status.text and page.explorer.registration.score == 0.9)
     opened.settle(

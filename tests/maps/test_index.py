@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
+from apt_evap.maps.crystallography.directions import plane_normals
 from apt_evap.maps.crystallography.symmetry import point_group
+from apt_evap.maps.indexing.deciding_marks import deciding_marks
 from apt_evap.maps.indexing.index_map import DECIDED, LEAST_IONS
 from apt_evap.maps.indexing.marked_poles import marks_of
 from apt_evap.maps.indexing.master_pattern import master_patterns
@@ -354,6 +356,21 @@ def test_marks_that_would_decide_are_named():
         first = distances.pop(int(number) - 1)
         # rounded to 1 mm; 4.5 degrees are 4.7 mm
         assert first < 0.8 and min(distances) > 3.5
+
+
+def test_marks_of_a_hexagonal_crystal():
+    """Families are those by spacing and indices in any order, named with their signs."""
+    map = ae.DetectorMap.from_array(np.ones((64, 64)), *[np.linspace(-40, 40, 65)] * 2)
+    projection = ae.detection.Projection(60.0)
+    candidates = [(ae.Orientation("Ti", axis=axis), projection) for axis in ((0, 0, 0, 1), (1, 0, -1, 1))]
+    first, second = deciding_marks(map, candidates)
+    assert first == "if the spot at (0, 0) mm is {0002}: candidate 1"
+    x, y = re.fullmatch(r"if the spot at \((-?\d+), (-?\d+)\) mm is \{1 0 -1 1\}: candidate 2", second).groups()
+    normals = plane_normals(
+        ae.material("Ti"), [(1, 0, -1, 1), (0, 1, -1, 1), (-1, 1, 0, 1), (-1, 0, 1, 1), (0, -1, 1, 1)]
+    )
+    places = projection.places(candidates[1][0].directions(np.vstack([normals, -normals])))
+    assert np.nanmin(np.hypot(*(places - (float(x), float(y))).T)) < 0.8  # rounded to 1 mm
 
 
 def nearest_of_family(candidate, place, plane):

@@ -36,6 +36,11 @@ def test_a_figure_has_its_width_and_no_titles(maps, number, width, tmp_path):
     assert sum(box.width for box in boxes[: 2 if width == 85.0 else 3]) > 0.7 * figure.bbox.width * min(number, 2) / 2
 
 
+def test_more_maps_than_letters(maps):
+    axes = ae.plot.paper_maps(maps * 10, 170.0)
+    assert len(axes) == 30 and all([text.get_text() for text in ax.texts] == ["20 mm"] for ax in axes)
+
+
 @pytest.mark.parametrize("extent, length", [(70.0, 20.0), (4.0, 1.0), (300.0, 50.0), (0.9, 0.2)])
 def test_a_scale_bar_is_a_round_number(extent, length):
     edges = np.linspace(0, extent, 33)

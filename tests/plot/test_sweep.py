@@ -34,7 +34,8 @@ def rows(study):
 
 
 def test_points_in_the_order_of_their_similarity(study, tmp_path):
-    ae.plot.write_sweep(rows(study), tmp_path / "s.html", title="Axes", command="apt-evap sweep collect study")
+    made = rows(study)
+    ae.plot.write_sweep(made, tmp_path / "s.html", title="Axes", command="apt-evap sweep collect study")
     seen = Reader((tmp_path / "s.html").read_text())
     text = seen.text
     order = ["0b1d", "3f9c", "9e9e", "77aa"]
@@ -56,6 +57,7 @@ def test_points_in_the_order_of_their_similarity(study, tmp_path):
     assert len(seen.all("img")) == 5 and all(each.startswith(("data:", "#")) for each in seen.addresses)
     content = read_report(tmp_path / "s.html")
     assert [row["name"] for row in content["points"]] == order
+    assert content["points"][1]["study"] == json.loads(json.dumps(made[0].study))
 
 
 def test_the_score_has_the_name_of_its_objective(study, tmp_path):

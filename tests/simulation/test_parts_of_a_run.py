@@ -76,7 +76,9 @@ def test_a_file_with_rows_in_another_order_is_refused(run, real, tmp_path):
 # ---- join ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("cuts", [[], *(pytest.param(cuts, marks=pytest.mark.slow) for cuts in ([50], [50, 90])), [0, 75, 150]])
+@pytest.mark.parametrize(
+    "cuts", [[], [0, 75, 150], *(pytest.param(cuts, marks=pytest.mark.slow) for cuts in ([50], [50, 90]))]
+)
 def test_parts_are_joined_to_the_whole(run, cuts):
     bounds = [0, *cuts, len(run)]
     joined = Run.join([run[first:last] for first, last in itertools.pairwise(bounds)])

@@ -74,7 +74,8 @@ def test_isotopes_give_the_standard_atomic_weight(name):
 @pytest.mark.parametrize("name", MATERIALS)
 def test_isotopes_agree_with_the_mass_of_the_material(name):
     # atomic weights have five digits, of some elements with an uncertainty of 1 or 2 in the last one
-    assert mean_mass(name) == pytest.approx(MATERIALS[name].mass, rel=9e-5)
+    uncertain = {"Zn": 4e-5, "Rh": 5e-5, "Pd": 5e-5, "Ru": 6e-5, "Pb": 9e-5}
+    assert mean_mass(name) == pytest.approx(MATERIALS[name].mass, rel=uncertain.get(name, 3e-5))
 
 
 @pytest.mark.parametrize("name", ISOTOPES)

@@ -89,11 +89,11 @@ def test_fields_from_other_energies_differ_by_up_to_a_fifth(entry):
 
 @pytest.mark.parametrize("name", DENSITIES)
 def test_mass_density_follows_from_lattice_and_mass(name):
-    # lattice constants to three digits: 3 x 0.2 % each; the handbook's values of Ru and Ta are 2 % lower than X-rays'
+    # lattice constants to three digits: 3 x 0.2 % each; values of a handbook for V, Ru and Ta are 1.4 to 2 % too low
     entry = MATERIALS[name]
     volume = entry.a**3 if entry.c is None else math.sqrt(3) / 2 * entry.a**2 * entry.c
     density = ATOMS[entry.structure] * entry.mass * DALTON / (volume * 1e-27)
-    assert density == pytest.approx(DENSITIES[name], rel=0.021)
+    assert density == pytest.approx(DENSITIES[name], rel={"V": 0.014, "Ru": 0.02, "Ta": 0.02}.get(name, 0.012))
 
 
 @pytest.mark.parametrize("entry", MATERIALS.values(), ids=lambda entry: entry.name)

@@ -218,6 +218,13 @@ def plain_label(indices: Iterable[int]) -> str:
     return ("" if all(len(text) == 1 for text in texts) else " ").join(texts)
 
 
+def members_of_families(crystal: Poles) -> list[list[int]]:
+    """Members of each family of poles, by their numbers: all have its spacing, and the same indices in any order."""
+    keys = [(round(spacing, 9), tuple(sorted(map(abs, plane)))) for spacing, plane in zip(
+        crystal.spacings.tolist(), crystal.planes.tolist(), strict=True)]  # fmt: skip
+    return [[k for k, key in enumerate(keys) if key == family] for family in dict.fromkeys(keys)]
+
+
 def _three(material, indices, name, from_four):
     """Convert rows of three or, for hcp, four indices to three."""
     check_kind(material, "material", Material, "a Material")

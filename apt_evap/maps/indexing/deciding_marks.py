@@ -7,7 +7,7 @@ import numpy as np
 
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.projection import Projection
-from apt_evap.maps.crystallography.directions import poles
+from apt_evap.maps.crystallography.directions import members_of_families, plain_label, poles
 from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.indexing.marked_poles import POLE_ERROR
 
@@ -59,15 +59,11 @@ def deciding_marks(map: DetectorMap, candidates: Sequence[tuple[Orientation, Pro
 def _spots(map, orientation, projection):
     """Poles of an orientation inside a map, those of the largest spacing first."""
     known = poles(orientation.material, _FAMILIES)
-    places = projection.places(orientation.directions(known.planes))
-    x, y = map.centres
-    spots = []
-    for plane, place in zip(known.planes, places, strict=True):
-        if not np.isfinite(place).all():
-            continue
-        column, row = np.abs(x - place[0]).argmin(), np.abs(y - place[1]).argmin()
-        near = max(map.bin_size)
-        if map.mask[row, column] and abs(x[column] - place[0]) < near and abs(y[row] - place[1]) < near:
-            indices = np.abs(plane) if len(plane) == 4 else np.sort(np.abs(plane))
-            spots.append(_Spot(place, "".join(str(index) for index in indices)))
-    return spots
+    places = projection.places(orientation.directions(known.normals))
+    inside = map.contains(*places.T)
+    return [
+        _Spot(places[member], plain_label(known.planes[members[0]]))
+        for members in members_of_families(known)
+        for member in members
+        if inside[member]
+    ]

@@ -53,9 +53,16 @@ class SweepRow:
     message: str = ""
 
     @property
-    def similarity(self) -> float:
-        """Largest similarity with the measured map, -inf without a study."""
-        return -np.inf if self.study is None else float(self.study["optimum"]["score"]["value"])
+    def is_corrected(self) -> bool:
+        """Whether the score is corrected for noise, as far as that means anything."""
+        return self.study is not None and not (self.study["settings"]["allow_noise"] and self.study["no_score"])
+
+    @property
+    def score(self) -> Mapping[str, Any]:
+        """Largest similarity with the measured map, and its error; -inf without a study."""
+        if self.study is None:
+            return {"value": -np.inf, "error": None}
+        return self.study["optimum"]["score"] if self.is_corrected else self.study["plain"]["optimum"]
 
     @property
     def alike(self) -> bool:
@@ -104,7 +111,7 @@ def write_sweep(
     """
     if not rows:
         raise ValueError("rows must contain a point of the sweep, got none")
-    rows = sorted(rows, key=lambda row: (not row.alike, -row.similarity))
+    rows = sorted(rows, key=lambda row: (not row.alike, -row.score["value"]))
     made = origin(files, command, warnings)
     page = Page(title)
     page.add(*(paragraph(f"Warning: {text}", "doubt") for text in made["warnings"]))
@@ -142,8 +149,8 @@ def _course(page, rows):
     figure = plot.new_figure((3.4 * len(names) + 0.6, 3.2))
     for ax, name in zip(figure.subplots(1, len(names), squeeze=False, sharey=True)[0], names, strict=True):
         points = [(x, row) for x, row in zip(values[name], compared, strict=True) if x is not None]
-        errors = [row.study["optimum"]["score"]["error"] or 0.0 for _, row in points]
-        ax.errorbar([x for x, _ in points], [row.similarity for _, row in points], errors, fmt="o", markersize=4)
+        errors = [row.score["error"] or 0.0 for _, row in points]
+        ax.errorbar([x for x, _ in points], [row.score["value"] for _, row in points], errors, fmt="o", markersize=4)
         units = {text.partition(" ")[2] for _, row in points if isinstance(text := row.settings[name], str)}
         ax.set_xlabel(f"{name} [{units.pop()}]" if len(units) == 1 else name)
         ax.grid(alpha=0.3)
@@ -197,7 +204,7 @@ def _table(rows, compared):
     for row in rows:
         cells = [text_of(row.settings.get(name)) for name in settings]
         cells += [text_of(row.results.get(name)) for name in results]
-        cells += _study_cells(row.study) * compared
+        cells += _study_cells(row) * compared
         lines.append((row.name, *cells, row.message))
     head = ["Point", *settings, *results, *of_study, "Message"]
     if not any(row.message for row in rows):
@@ -205,16 +212,14 @@ def _table(rows, compared):
     return table(lines, head, best=0 if any(row.alike for row in rows) else None)
 
 
-def _study_cells(content):
+def _study_cells(row):
     """Score and mean energy, if they are results, and doubts."""
+    content, score, alike = row.study, row.score, row.alike
     if content is None:
         return [""] * (1 + len(_STUDY))
-    score, refined = content["optimum"]["score"], content["refined"]
-    alike = content["likeness"]["verdict"] == "alike"
-    corrected = not (content["settings"]["allow_noise"] and content["no_score"])
-    score = score if corrected else content["plain"]["optimum"]
+    refined = content["refined"]
     error = f" ± {score['error']:.3f}" if score["error"] is not None else ""
-    text = f"{score['value']:.3f}{error}" + ("" if corrected else ", not corrected for noise")
+    text = f"{score['value']:.3f}{error}" + ("" if row.is_corrected else ", not corrected for noise")
     real = content["settings"]["real_units"]
     factor = 1.0 if real is None else real["real_per_study"]
     energy = bounded_text(

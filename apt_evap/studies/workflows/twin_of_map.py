@@ -19,7 +19,7 @@ from apt_evap._common.files import FileError, check_path, sha256_of
 from apt_evap._common.notebook import as_table
 from apt_evap._common.threads import thread_count
 from apt_evap._common.types import AnyPath
-from apt_evap._common.validation import check_kind, check_number, check_sequence, short_text
+from apt_evap._common.validation import check_kind, check_number, check_sequence
 from apt_evap.config.lens_text import read_lens
 from apt_evap.config.material_text import write_material
 from apt_evap.detection.detector_map import DetectorMap
@@ -59,9 +59,7 @@ _MARGIN = 1.2  # of the ions in a bin, as the common region is smaller
 
 
 def _text(value, name):
-    if not isinstance(value, str):
-        raise ValueError(f"{name} must be text, got {short_text(value)}")
-    return value
+    return check_kind(value, name, str, "a text")
 
 
 def _texts(value, name):
