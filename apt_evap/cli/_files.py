@@ -253,7 +253,7 @@ def measured_source(options: argparse.Namespace) -> MeasuredSource:
     return MeasuredSource(
         partial(measured_of, options),
         Path(options.file),
-        {name: None if path is None else sha256_of(path) for name, path in paths.items()},
+        lambda: {name: None if path is None else sha256_of(path) for name, path in paths.items()},
         # what is not given is None, as for a twin made in Python
         {name: getattr(options, name) or None for name in (*_READING, *_SELECTING, *_MASSES) if name != "ranges"},
         tuple(words),

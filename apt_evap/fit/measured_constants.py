@@ -25,6 +25,7 @@ from apt_evap.maps.indexing.refine import bins_of, refine, resolution
 from apt_evap.reconstruction.reconstruct import reconstruct
 from apt_evap.reconstruction.shank import fit_shank
 from apt_evap.specimen.lattice import atom_density
+from apt_evap.specimen.materials import EVAPORATION_FIELD_ERROR
 
 _ENDS = 1000  # ions at the beginning and at the end, for the voltages there
 _IONS = 20_000  # that are reconstructed for the angle of the shank
@@ -32,7 +33,6 @@ _SECTIONS = 40  # of the sequence, for a slope and its error
 _DEEP = 0.05  # radii that the apex must recede for an angle of the shank: over less, the apex changes its shape
 _FEWEST = 5_000  # ions of each half, for its scale
 _STEP = 0.01  # relative, for sensitivities
-_FIELD_ERROR = 0.1  # relative, of evaporation fields, which are computed by image-hump models
 _MEDIAN = math.sqrt(math.pi / 2)  # standard error of a median, in that of a mean
 
 
@@ -265,7 +265,7 @@ def _scale_of(measured, candidate):
 def _voltage_constants(voltages, field, lens, factor, factors):
     """Voltages of both ends, and what they give; `factors` is the range of the field factor without a lens."""
     constants: list[Constant] = []
-    fields = field * (1 + _FIELD_ERROR), field * (1 - _FIELD_ERROR)
+    fields = field * (1 + EVAPORATION_FIELD_ERROR), field * (1 - EVAPORATION_FIELD_ERROR)
     for where, part in (("first", voltages[:_ENDS]), ("last", voltages[-_ENDS:])):
         voltage = float(np.median(part))
         error = _MEDIAN * float(np.std(part)) / math.sqrt(len(part)) or math.nan  # a supply has steps

@@ -30,6 +30,7 @@ from apt_evap.maps.indexing.index_map import Indexing
 from apt_evap.maps.indexing.orientation_search import disc_of
 from apt_evap.maps.registration.register import Registration
 from apt_evap.specimen.lattice import atom_density
+from apt_evap.specimen.materials import EVAPORATION_FIELD_ERROR
 
 MARK = "# Settings of a simulation, made from a measured map by apt_evap"
 """Beginning of the first line of the text."""
@@ -318,7 +319,7 @@ def _radius_text(material, radii, lens, factors):
         radius, low, high = (rounded_text(value, (high - low) / 2) for value in (sum(radii) / 2, low, high))
         known = f"k_f = {FIELD_FACTOR:g} ({factors[0]:g} to {factors[1]:g})"
         return f"the specimen has R = {radius} nm ({low} to {high}), by V = k_f F R with {known} and {field}"
-    first, last = (rounded_text(value, 0.1 * value) for value in radii)  # of an error of the field of a tenth
+    first, last = (rounded_text(value, EVAPORATION_FIELD_ERROR * value) for value in radii)
     by = "the lens" if lens is not None else f"k_f = {factors[0]:g}"
     return f"the specimen has R = {first} to {last} nm, by V = k_f F R with {by} and {field}"
 

@@ -20,6 +20,8 @@ _IMAGE_HUMP = (
 _MULLER = "measured; Mueller and Tsong, Field Ion Microscopy (1969)"
 _IUPAC = "IUPAC standard atomic weights, abridged (Prohaska et al., Pure Appl. Chem. 94, 573, 2022)"
 _SHAIKH = "Shaikh et al., arXiv 2509.13744, appendix on polarization"
+EVAPORATION_FIELD_ERROR = 0.1
+"""Relative error of an evaporation field that is computed by an image-hump model."""
 # larger than for any element: finds wrong units, such as a = 3.52 (Angstrom) or 35e9 (V/m)
 _LONGEST = 2.0
 _HIGHEST_FIELD = 1000.0

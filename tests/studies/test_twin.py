@@ -57,7 +57,7 @@ def quick(tmp_path, monkeypatch):
     def simulate(settings, output, **_):
         calls.append("run")
         output.write_text("a run")
-        return SimpleNamespace(interrupted=False)
+        return SimpleNamespace(interrupted=False, run=Run())
 
     def compare(run, measured, folder, *_, **__):
         calls.append("compare")
@@ -81,7 +81,7 @@ def quick(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(twin_of_map, "simulate", simulate)
     monkeypatch.setattr(twin_of_map, "compare", compare)
-    monkeypatch.setattr(twin_of_map, "load", lambda path: Run())
+    monkeypatch.delattr(twin_of_map, "load")  # the simulated run is in memory
     monkeypatch.setattr(twin_of_map, "is_run", lambda path: path.read_text() == "a run")
     monkeypatch.setattr(twin_of_map, "index", index)
     monkeypatch.setattr(twin_of_map, "_registered", lambda *_: ae.Registration(1.0, 1.0, (0.0, 0.0)))

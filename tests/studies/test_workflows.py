@@ -12,6 +12,7 @@ from rough import ROUGH
 import apt_evap as ae
 from apt_evap.cli.main import main
 from apt_evap.plot.report.html_page import read_report
+from apt_evap.studies.workflows import compare_maps, measured_source
 from apt_evap.warnings import WorkflowWarning
 
 SMALL = """
@@ -91,6 +92,11 @@ def pair(small_tip):
     return run, hits.map(bins=24, extent=(-60, 60, -60, 60))
 
 
+def save_map(path, measured):
+    edges = {"x_edges_mm": measured.x_edges, "y_edges_mm": measured.y_edges}
+    np.savez(path, counts=measured.counts, **edges, inside=measured.mask)
+
+
 GRID = ae.fit.EnergyGrid(means=(0.1, 0.2), relative_spreads=(0.5, 1.0))
 QUICK = ae.fit.FitSettings(replicas=1, resamples=2)
 HERE = ae.Registration(0.0, 1.0, (0.0, 0.0))
@@ -100,8 +106,7 @@ HERE = ae.Registration(0.0, 1.0, (0.0, 0.0))
 def test_a_comparison_is_that_of_the_command(folder, pair, capsys):
     run, measured = pair
     run.save("run.h5")
-    edges = {"x_edges_mm": measured.x_edges, "y_edges_mm": measured.y_edges}
-    np.savez("map.npz", counts=measured.counts, **edges, inside=measured.mask)
+    save_map("map.npz", measured)
     options = "--means 0.1,0.2 --relative-spreads 0.5,1 --replicas 1 --resamples 2 --registration 0,1,0,0".split()
     assert main(["compare", "run.h5", "map.npz", "-o", "shell", *options]) == 0
     told, lines = capsys.readouterr().out, []
@@ -132,6 +137,20 @@ def test_a_comparison_of_data_in_memory_writes_nothing_unless_it_is_asked_to(fol
     with pytest.raises(ValueError, match="run must have responses"):
         ae.compare(replace(run, responses=None), measured, "other")
     assert not Path("other").exists()
+
+
+@NO_PICTURES
+def test_a_comparison_takes_what_a_simulation_returned_and_reads_nothing_twice(folder, pair, monkeypatch):
+    save_map("map.npz", pair[1])
+    Path("small.toml").write_text(SMALL.replace("6 a", "8 a").replace("40", "600"))
+    simulated = ae.simulate("small.toml", progress=False)
+    expected = ae.compare("small.h5", "map.npz", None, GRID, QUICK, registration=HERE, progress=False)
+    monkeypatch.delattr(compare_maps, "load")
+    monkeypatch.delattr(measured_source, "sha256_of")
+    study = ae.compare(simulated, "map.npz", "mine", GRID, QUICK, registration=HERE, progress=False)
+    assert study.to_dict() == expected.to_dict()
+    report = read_report("mine/report.html")
+    assert [described["name"] for described in report["origin"]["files"]] == ["small.h5", "map.npz"]
 
 
 def test_a_sweep_is_shown_as_a_table(folder):

@@ -23,7 +23,7 @@ from apt_evap.maps.registration.register import Registration
 from apt_evap.simulation.run import Run, load
 from apt_evap.simulation.run_hdf5 import is_run
 from apt_evap.studies.workflows.measured_source import MeasuredSource, source_of
-from apt_evap.studies.workflows.simulate_file import no_note
+from apt_evap.studies.workflows.simulate_file import Simulated, no_note
 from apt_evap.studies.workflows.written_pictures import check_output
 from apt_evap.warnings import RegistrationWarning, StructureWarning
 
@@ -34,7 +34,7 @@ MAX_STUDY = 1 << 28  # bytes: a study contains three numbers for each point of i
 
 
 def compare(
-    run: Run | AnyPath,
+    run: Run | Simulated | AnyPath,
     measured: MeasuredSource | Hits | DetectorMap | AnyPath,
     folder: AnyPath | None = None,
     grid: EnergyGrid | None = None,
@@ -52,8 +52,8 @@ def compare(
 
     Parameters
     ----------
-    run : Run, str or path-like
-        A run with responses, or its file.
+    run : Run, Simulated, str or path-like
+        A run with responses, what `simulate` returned, or the file of a run.
     measured : Hits, DetectorMap, str or path-like
         Measured ions, a map, or the file of one of them.
     folder : str or path-like, optional
@@ -109,27 +109,18 @@ def compare(
             _check_folder(folder, overwrite)
         source = source_of(measured)
         content = source.read()
-        simulated = run if isinstance(run, Run) else load(run)
-        simulated.require_responses("run" if isinstance(run, Run) else repr(str(run)))
+        simulated, path = _run_and_file(run)
+        simulated.require_responses("run" if path is None else repr(str(path)))
         study = fit_energies(
-            simulated,
-            content,
-            grid,
-            settings,
-            registration=registration,
-            n_threads=threads,
-            progress=progress,
+            simulated, content, grid, settings, registration=registration, n_threads=threads, progress=progress
         )
         if folder is not None:
-            files = [
-                path for path in (None if isinstance(run, Run) else check_path(run), source.path) if path is not None
-            ]
             _write(
                 study,
                 simulated,
                 folder,
-                title=f"{source.name}: emission energies from {'a run' if isinstance(run, Run) else Path(run).name}",
-                files=files,
+                title=f"{source.name}: emission energies from {'a run' if path is None else path.name}",
+                files=[file for file in (path, source.path) if file is not None],
                 command=command,
                 # the report says by itself that a registration is doubtful; its readers cannot follow an advice
                 warnings=[
@@ -144,6 +135,15 @@ def compare(
         check = f"; check {OVERLAY}, --registration sets a known registration" if study.registration.doubtful else ""
         note(f"wrote {', '.join(FILES)} to {folder}{check}")
     return study
+
+
+def _run_and_file(run: Run | Simulated | AnyPath) -> tuple[Run, Path | None]:
+    """A run, and its file if it has one."""
+    if isinstance(run, Run):
+        return run, None
+    if isinstance(run, Simulated):
+        return run.run, run.path
+    return load(run), check_path(run)
 
 
 def _check_folder(folder: Path, overwrite: bool) -> None:

@@ -24,8 +24,8 @@ class MeasuredSource:
         Reads it, without arguments: Hits or a DetectorMap.
     path : Path or None
         The file, for reports and names.
-    files : dict
-        SHA-256 of the files that it is made from, by name.
+    hashes : callable
+        SHA-256 of the files that it is made from, by name; called by those who need them.
     options : dict
         How the files are read and which ions are selected, in plain types by name.
     words : tuple of str
@@ -34,7 +34,7 @@ class MeasuredSource:
 
     read: Callable[[], Hits | DetectorMap]
     path: Path | None = None
-    files: Mapping[str, str | None] = field(default_factory=dict)
+    hashes: Callable[[], Mapping[str, str | None]] = dict
     options: Mapping[str, Any] = field(default_factory=dict)
     words: tuple[str, ...] = ()
 
@@ -57,9 +57,9 @@ def source_of(measured: MeasuredSource | Hits | DetectorMap | AnyPath) -> Measur
     if isinstance(measured, MeasuredSource):
         return measured
     if isinstance(measured, Hits | DetectorMap):
-        return MeasuredSource(lambda: measured, files={"FILE": _digest_of(measured)})
+        return MeasuredSource(lambda: measured, hashes=lambda: {"FILE": _digest_of(measured)})
     path = check_path(measured)
-    return MeasuredSource(partial(_read, path), path, {"FILE": sha256_of(path)})
+    return MeasuredSource(partial(_read, path), path, lambda: {"FILE": sha256_of(path)})
 
 
 def _read(path):

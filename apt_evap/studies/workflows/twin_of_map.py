@@ -177,7 +177,7 @@ class Twin:
         self._source, self._options, self._threads = source, options, threads
         self._progress, self._note, self._command = progress, note, command
         ranges = None if options.ranges is None else sha256_of(options.ranges)
-        files = {"FILE": None, "file of --undistort": None, **source.files, "file of --ranges": ranges}
+        files = {"FILE": None, "file of --undistort": None, **source.hashes(), "file of --ranges": ranges}
         made_from = {**source.options, **options.to_plain()}
         self._kept = KeptFiles(folder, files, made_from, (SETTINGS, FACTS, RUN, REGISTRATION, STUDY, ANSWER))
 
@@ -290,6 +290,7 @@ class Twin:
             )
         if simulated.interrupted:
             raise KeyboardInterrupt
+        self.run = simulated.run
         told: list[str] = []
         if not (kept.has(REGISTRATION) and kept.has(ANSWER) and kept.has(_REPORT)):
             if not kept.has(REGISTRATION):
@@ -297,7 +298,7 @@ class Twin:
                     self._make_registration()
             kept.forget(ANSWER, _REPORT)
             with advice_as_notes(self._note):
-                self.study = self._compared(path, self._as_read(), self.folder / STUDY)
+                self.study = self._compared(simulated, self._as_read(), self.folder / STUDY)
             told = self.study.lines()  # by `compare`
             kept.write({ANSWER: self._made_answer()}, [_REPORT])
         self._note("\n".join(line for line in self.answer if line not in told))
