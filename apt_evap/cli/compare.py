@@ -5,8 +5,22 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-from apt_evap.cli._options import MAX_BINS, add_reading, integer_type, number_type, numbers_type
+from apt_evap.cli._declared_options import add_declared
+from apt_evap.cli._options import add_reading, integer_type, numbers_type
 from apt_evap.cli._output import put
+
+_OF_FIT = (
+    "bins",
+    "smoothing",
+    "flattening",
+    "objective",
+    "replicas",
+    "resamples",
+    "seed",
+    "temperature",
+    "same_radius",
+)
+"""Fields of `FitSettings` that are options of their own."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,13 +43,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", metavar="RUN.h5", help="a run with responses")
     parser.add_argument("file", metavar="MEASURED", help="measured ions (.epos, ...), a map (.npz), or a run (.h5)")
     parser.add_argument("-o", "--output", metavar="FOLDER", help="default: MEASURED_study in this folder")
-    parser.add_argument("--mechanism", choices=("roll-up", "lateral", "combined"), help="default: roll-up")
-    for name, default, what in (
-        ("means", "0.01,0.0825,0.155,0.2275,0.3,0.3725", "means of the energy [eV]"),
-        ("relative-spreads", "0.01,0.0316,0.1,0.316,1,3.16", "standard deviations relative to the means"),
-        ("rollup-fractions", "0,0.25,0.5,0.75,1", "roll-up fractions for the mechanism combined"),
-    ):
-        parser.add_argument(f"--{name}", type=numbers_type, metavar="N,N,...", help=f"{what}; default: {default}")
+    add_declared(parser, "fit.grid", "EnergyGrid", ("mechanism", "means", "relative_spreads", "rollup_fractions"))
     parser.add_argument(
         "--option",
         dest="options",
@@ -49,38 +57,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         metavar="R",
         help="a JSON file (such as study.json) or ROTATION,SCALE,DX,DY[,mirror] in degrees and mm; default: automatic",
     )
-    parser.add_argument(
-        "--objective",
-        choices=("similarity", "folded"),
-        help="what is compared: the maps place by place (SSIM), or folded about a pole, the default if they show one",
-    )
-    parser.add_argument("--bins", type=integer_type(11, MAX_BINS), metavar="N", help="bins along the longer side")
-    parser.add_argument(
-        "--smooth",
-        dest="smoothing",
-        type=number_type("mm"),
-        metavar="MM",
-        help="sigma of a Gaussian; default: half a bin, for densities one bin",
-    )
-    parser.add_argument(
-        "--flatten",
-        dest="flattening",
-        type=number_type("mm"),
-        metavar="MM",
-        help="sigma of the Gaussian for flattening; 0 for none",
-    )
-    parser.add_argument("--temperature", type=float, metavar="K", help="temperature of the thermal map; default: 50")
+    flags = {"smoothing": "--smooth", "flattening": "--flatten"}
+    add_declared(parser, "fit.fit_settings", "FitSettings", _OF_FIT, flags)
     parser.add_argument(
         "--plain", dest="allow_noise", action="store_const", const=False, help="SSIM without noise correction"
-    )
-    parser.add_argument("--replicas", type=integer_type(1), metavar="N", help="draws per ion; default: 4 to 16")
-    parser.add_argument("--resamples", type=integer_type(0), metavar="N", help="resamples for errors; default: 200")
-    parser.add_argument("--seed", type=integer_type(0), metavar="N", help="seed of the resamples; default: 0")
-    parser.add_argument(
-        "--same-radius",
-        action="store_const",
-        const=True,
-        help="the specimen is known to have the radius of the run, within 5%%: narrower intervals of mean energies",
     )
     parser.add_argument("--threads", type=integer_type(1), metavar="N", help="default: all processors")
     parser.add_argument("--quiet", action="store_true", help="no progress bar, no summary")

@@ -3,7 +3,8 @@
 import argparse
 from pathlib import Path
 
-from apt_evap.cli._options import MATERIAL_HELP, add_reading, add_real_units, add_speech, add_time_zero, integer_type
+from apt_evap.cli._declared_options import add_declared
+from apt_evap.cli._options import MATERIAL_HELP, add_reading, add_real_units, add_speech, add_time_zero
 from apt_evap.cli._output import tell, tell_json
 
 _CONSTANTS = (
@@ -52,37 +53,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "default: the name of OUT with .png",
     )
     constants = parser.add_argument_group("constants", "The defaults of a run are its own constants.")
-    constants.add_argument("--protocol", choices=("cap", "bas"), help="depth increment; default: cap")
-    constants.add_argument(
-        "--projection",
-        choices=("bas", "equidistant", "compressed"),
-        help="angle on the cap; default: bas, of a run compressed",
-    )
-    constants.add_argument("--distance", type=float, metavar="MM", help="flight length; default: that of the run")
-    add_time_zero(constants)
-    constants.add_argument(
-        "--detector-radius",
-        type=float,
-        metavar="MM",
-        help="default: that of the outermost ion, of a run half its width",
-    )
-    constants.add_argument(
-        "--compression", type=float, metavar="XI", help="image compression; default: 1.5, of a run its own"
-    )
-    constants.add_argument("--efficiency", type=float, metavar="ETA", help="of the detector; default: 1")
+    add_declared(constants, "reconstruction.reconstruction_settings", "ReconstructionSettings", _CONSTANTS)
     constants.add_argument("--element", metavar="NAME", help=f"gives atomic volume and field: {MATERIAL_HELP}")
-    constants.add_argument("--atomic-volume", type=float, metavar="NM3", help="default: that of the element")
     constants.add_argument(
         "--radius", default="voltage", metavar="R", help="voltage, shank, or a constant radius [nm]; default: voltage"
     )
-    constants.add_argument("--field-factor", type=float, metavar="KF", help="default: 3.3, of a run its own")
-    constants.add_argument("--evaporation-field", type=float, metavar="F", help="[V/nm]; default: that of the element")
-    constants.add_argument(
-        "--smoothing", type=integer_type(1), metavar="N", help="ions in the mean of the voltage; default: 1"
-    )
     constants.add_argument("--origins", metavar="TABLE.npz", help="correct lateral positions by a table of origins")
-    constants.add_argument("--initial-radius", type=float, metavar="NM", help="for --radius shank")
-    constants.add_argument("--shank-angle", type=float, metavar="DEGREES", help="for --radius shank; half the opening")
+    add_time_zero(constants)
     parser.add_argument("--perturbation", metavar="P", help="of a run, as for map; default: the first one of the run")
     add_real_units(parser)
     add_reading(parser)

@@ -2,6 +2,7 @@
 
 from apt_evap._common.codec import checked, choice, count, number, settings, switch
 from apt_evap._common.validation import check_seed
+from apt_evap.detection.binning import MAX_BINS
 
 MODEL_ERROR = 0.2
 """Relative increase of the misfit 1 - SSIM from the best to the true point, by the error of the model.
@@ -30,10 +31,11 @@ class FitSettings:
     """
 
     bins: int | None = count(
-        "Bins along the longer side. For measured hits 128 by default. The bins of a map are merged by an integer "
-        "factor to come closest to this number, or unchanged by default.",
+        "Bins along the longer side. By default 128 for measured hits, and those of a map, whose bins are merged by an "
+        "integer factor to come closest to another number.",
         default=None,
         at_least=11,
+        at_most=MAX_BINS,
     )
     smoothing: float | None = number(
         "Standard deviation of the Gaussian that smooths both maps. By default half a bin for counts, and one bin for "

@@ -71,29 +71,29 @@ class EnergyGrid:
     """Grid of truncated normal energy distributions, by mean and relative standard deviation, for one mechanism."""
 
     mechanism: str | Callable[..., Perturbation] = checked(
-        "Mechanism of emission: `RollUp`, `LateralVelocity` or `Combined`; or a function of an energy distribution and "
-        "of the options by name that returns a perturbation, such as a class of perturbations.",
+        "Mechanism of emission: `RollUp`, `LateralVelocity` or `Combined`. Also a function of an energy distribution "
+        "and of the options by name that returns a perturbation, such as a class of perturbations.",
         '{"roll-up", "lateral", "combined"} or callable',
         _mechanism,
         default="roll-up",
     )
     means: Sequence[float] = checked(
-        "Means before the truncation, increasing; by default those of Shaikh et al. (2025).",
+        "Means before the truncation, increasing. The default is that of Shaikh et al. (2025).",
         "sequence of float",
         _positive,
         default=MEANS,
         unit="eV",
     )
     relative_spreads: Sequence[float] = checked(
-        "Standard deviations before the truncation, relative to the means, increasing; by default those of Shaikh et "
-        "al. (2025).",
+        "Standard deviations before the truncation, relative to the means, increasing. The default is that of Shaikh "
+        "et al. (2025).",
         "sequence of float",
         _positive,
         default=RSDS,
     )
     rollup_fractions: Sequence[float] | None = checked(
-        'Fractions of the energy for the roll-up, increasing; only for "combined", by default those of Shaikh et al. '
-        "(2025).",
+        'Fractions of the energy for the roll-up, increasing; only for "combined". By default 0, 0.25, 0.5, 0.75 and '
+        "1, those of Shaikh et al. (2025).",
         "sequence of float",
         _fractions,
         default=None,

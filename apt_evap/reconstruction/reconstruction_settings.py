@@ -83,7 +83,7 @@ class ReconstructionSettings:
     )
     compression: float | None = number("Image compression xi. By default 1.5.", default=None, above=0)
     projection: str | None = choice(
-        'Relation of places on the detector to angles on the cap, see `reconstruct`. By default "bas".',
+        'Relation of places on the detector to angles on the cap. See `reconstruct`. By default "bas".',
         PROJECTIONS,
         default=None,
     )
