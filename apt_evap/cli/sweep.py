@@ -62,18 +62,16 @@ def _plan(options):
     from apt_evap.studies.sweep.planning import plan_sweep
 
     sweep = plan_sweep(options.study)
-    hours = [cost.hours for cost in sweep.estimates]
-    memory = [cost.memory for cost in sweep.estimates if cost.memory is not None]
+    costs = [point.estimate for point in sweep.points]
+    hours = [cost.hours for cost in costs]
+    memory = [cost.memory for cost in costs if cost.memory is not None]
     content = {
         "folder": str(sweep.folder),
-        "points": [
-            {"key": point.key, "values": point.values, **to_plain(cost)}
-            for point, cost in zip(sweep.points, sweep.estimates, strict=True)
-        ],
+        "points": [{"key": point.key, "values": point.values, **to_plain(point.estimate)} for point in sweep.points],
     }
     if not (options.quiet or options.json):
-        for point, cost in zip(sweep.points, sweep.estimates, strict=True):
-            put(f"{point.key}  {cost}  {point}")
+        for point in sweep.points:
+            put(f"{point.key}  {point.estimate}  {point}")
         most = f", {max(memory) / 1e9:.2g} GB at most" if memory else ""
         total = "" if None in hours else f", about {hours_text(sum(hours))} of one worker"
         put(f"{len(sweep.points):,} points in {sweep.folder}{most}{total}")

@@ -117,7 +117,7 @@ def test_status_corrects_the_hours_by_those_of_finished_points(sweep):
         (sweep.folder_of(key) / "work.json").write_text('{"seconds": 36.0, "error": ""}')
     content = sweep_status(sweep)
     assert content["counts"] == {"done": 4, "running": 0, "waiting": 1, "failed": 0, "wrong": 0}
-    estimated = [cost.hours for cost in sweep.estimates]
+    estimated = [point.estimate.hours for point in sweep.points]
     speed = np.median([0.01 / hours for number, hours in enumerate(estimated) if number != 1])
     assert content["hours_left"] == pytest.approx(estimated[1] * speed)
     json.dumps(content)

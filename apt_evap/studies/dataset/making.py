@@ -104,13 +104,12 @@ class PlannedSet:
     def hours(self) -> float | None:
         """Time of one worker that is left, within a factor of 3 [h]; None if it is not known."""
         left = sweep_status(self.sweep)["hours_left"]
-        ions = sum(cost.ions for cost in self.sweep.estimates)
-        return None if left is None else left + _RECORDING * ions * self.settings.per_run / 3600
+        return None if left is None else left + _RECORDING * self._ions * self.settings.per_run / 3600
 
     @property
     def bytes(self) -> int:
         """Largest size of the data set: all ions within the field of view, before any compression [bytes]."""
-        ions = sum(cost.ions for cost in self.sweep.estimates)
+        ions = self._ions
         rows = {"examples": 1, "poles": 24 * self.settings.families, "zone_lines": 13}  # as many as there can be
         rows["cap"] = 1 + ions // len(self.sweep.points) // 100
         sizes = {name: sum(field.bytes for field in fields) for name, fields in self.schema.items()}
@@ -123,8 +122,12 @@ class PlannedSet:
     @property
     def run_bytes(self) -> int:
         """Size of the runs in the folder of the sweep, which the finished data set does not need [bytes]."""
-        estimates = self.sweep.estimates
-        return int(_RUN_BYTES * len(estimates) + _RUN_BYTES_PER_ION * sum(cost.ions for cost in estimates))
+        return int(_RUN_BYTES * len(self.sweep.points) + _RUN_BYTES_PER_ION * self._ions)
+
+    @property
+    def _ions(self) -> int:
+        """Planned number of ions of all runs."""
+        return sum(point.estimate.ions for point in self.sweep.points)
 
 
 def plan_dataset(path: AnyPath) -> PlannedSet:

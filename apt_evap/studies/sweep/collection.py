@@ -3,8 +3,6 @@
 All files are made from the plan and the files of the runs alone, and can be made again at any time.
 """
 
-import csv
-import io
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -30,7 +28,7 @@ INDEX, MAPS, FIT_TABLE, FIT, REPORT = "index.csv", "maps.h5", "fit.csv", "fit.js
 """Files of a collection."""
 DEFAULT_BINS = 128
 _DRAWN = 12  # points whose maps are in the report
-_OF_RUN = ("ended", "version", "created", "processor", "fingerprint")
+_OF_RUN = ("ions", "ended", "version", "created", "processor", "fingerprint")
 
 
 def collect_sweep(
@@ -92,18 +90,22 @@ def collect_sweep(
                 states[key] = PointState("wrong", str(error))
     done, fit = list(rows), None
     note(f"{len(done):,} of {len(sweep.points):,} points are done")
-    _write_index(sweep, states, rows)
+    nothing = dict.fromkeys(_OF_RUN, "")
+    columns = {
+        key: {"state": state.name, "message": state.message} | rows.get(key, nothing) for key, state in states.items()
+    }
+    sweep.write_table(INDEX, columns)
     files = [str(sweep.folder / INDEX)]
     if done:
         target = Path(maps) if maps is not None else unlinked(sweep.folder / MAPS)
-        write_maps(sweep, done, target, bins)
+        panels = write_maps(sweep, done, target, bins)
         files.append(str(target))
     if compare and sweep.compare is not None and done:
         note(f"comparing {len(done):,} runs with {sweep.compare.measured}")
         fit = _compare(sweep, done)
         files += [str(sweep.folder / name) for name in (FIT_TABLE, FIT)]
     if done:
-        _write_report(sweep, states, rows, fit, command, target)
+        _write_report(sweep, states, rows, fit, command, panels)
         files.append(str(sweep.folder / REPORT))
     wrong = {key: state.message for key, state in states.items() if state.name == "wrong"}
     return {"points": len(sweep.points), "done": len(done), "wrong": wrong, "files": files, "fit": fit}
@@ -126,20 +128,7 @@ def _row(sweep, key):
     }
 
 
-def _write_index(sweep, states, rows):
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(["key", *sweep.paths, "state", "message", "ions", *_OF_RUN])
-    for point in sweep.points:
-        state, row = states[point.key], rows.get(point.key, {})
-        values = [csv_value(sweep.value(point, path)) for path in sweep.paths]
-        of_run = [row.get(name, "") for name in ("ions", *_OF_RUN)]
-        table.writerow([point.key, *values, state.name, state.message, *of_run])
-    write_text(sweep.folder / INDEX, text.getvalue())
-
-
-def _write_report(sweep, states, rows, fit, command, maps_file):
-    panels = _panels(maps_file, _DRAWN)
+def _write_report(sweep, states, rows, fit, command, panels):
     studies, failed = ({}, {}) if fit is None else (fit.studies, fit.failed)
     points = []
     for point in sweep.points:
@@ -167,22 +156,9 @@ def _write_report(sweep, states, rows, fit, command, maps_file):
     plot.write_sweep(points, target, title=f"Sweep {sweep.folder.name}", files=files, command=command)
 
 
-def _panels(path, most):
-    """Maps of the first points of a file of `write_maps`: by key, then by the title of the emission."""
-    panels: dict[str, dict[str, DetectorMap]] = {}
-    with h5py.File(path) as file:
-        titles, keys = (file[name].asstr()[:] for name in ("title", "key"))
-        edges = [file[f"{axis}_edges"][:] for axis in "xy"]
-        for row, key in enumerate(keys[:most]):
-            counts = file["maps"][row]
-            panels[str(key)] = {
-                str(title): DetectorMap.from_array(values, *edges, is_counts=True)
-                for title, values in zip(titles, counts, strict=True)
-            }
-    return panels
-
-
-def write_maps(sweep: Sweep, keys: list[str], path: AnyPath, bins: int | None = None) -> None:
+def write_maps(
+    sweep: Sweep, keys: list[str], path: AnyPath, bins: int | None = None
+) -> dict[str, dict[str, DetectorMap]]:
     """Write the maps of runs to one rectangular HDF5 file, which xarray and other readers of netCDF-4 open.
 
     The dimensions of ``maps`` are point, perturbation, y and x; its values are hits per bin, on the same bins for all
@@ -201,6 +177,11 @@ def write_maps(sweep: Sweep, keys: list[str], path: AnyPath, bins: int | None = 
     bins : int, optional
         As for `collect_sweep`.
 
+    Returns
+    -------
+    dict
+        Maps of the first points: by key, then by the title of the emission.
+
     Raises
     ------
     FileError
@@ -210,6 +191,8 @@ def write_maps(sweep: Sweep, keys: list[str], path: AnyPath, bins: int | None = 
     panels = configs[0].maps.panels
     bins = bins or configs[0].maps.bins or DEFAULT_BINS
     grid = max((config.detector for config in configs), key=lambda detector: detector.width).grid(bins)
+    edges = grid.x_edges
+    drawn: dict[str, dict[str, DetectorMap]] = {key: {} for key in keys[:_DRAWN]}
     with replace_file(path) as target, h5py.File(target, "w") as file:
         file.attrs["made_by"] = f"apt_evap {__version__}"
         file.attrs["sweep"] = sweep.folder.name
@@ -221,12 +204,15 @@ def write_maps(sweep: Sweep, keys: list[str], path: AnyPath, bins: int | None = 
             run = load(sweep.folder_of(key) / RUN)
             ions[row] = len(run)
             for column, panel in enumerate(panels):
-                hits = run.hits(panel.perturbation)
-                counts[row, column] = hits.map(like=grid, position_step=None).values if hits.detected.any() else 0
+                hits, values = run.hits(panel.perturbation), np.zeros((bins, bins), np.int32)
+                if hits.detected.any():
+                    values[:] = hits.map(like=grid, position_step=None).values
+                counts[row, column] = values
+                if key in drawn:
+                    drawn[key][panel.title] = DetectorMap.from_array(values, edges, edges, is_counts=True)
         # each dimension is a scale of the same name, as in netCDF-4
         _put(file, "point", np.arange(len(keys)))
         _put(file, "perturbation", [json.dumps(described(panel.perturbation)) for panel in panels])
-        edges = grid.x_edges
         for axis in ("y", "x"):
             _put(file, axis, (edges[1:] + edges[:-1]) / 2, "mm")
         for axis, name in enumerate(("point", "perturbation", "y", "x")):
@@ -241,6 +227,7 @@ def write_maps(sweep: Sweep, keys: list[str], path: AnyPath, bins: int | None = 
             columns[path_of_setting.replace(".", "_")] = _column(values)
         for name, values in columns.items():
             _put(file, name, values).dims[0].attach_scale(file["point"])
+    return drawn
 
 
 def _column(values):
@@ -264,13 +251,9 @@ def _compare(sweep: Sweep, keys: list[str]) -> TipFit:
     settings: Any = sweep.compare
     runs = {key: sweep.folder_of(key) / RUN for key in keys}
     fit = fit_tips(runs, settings.read(), settings.grid, settings.settings, progress=False)
-    text = io.StringIO()
-    table, rows = csv.writer(text, lineterminator="\n"), fit.rows()
-    table.writerow(["key", *sweep.paths, *list(rows[0])[1:]])
-    for row in rows:
-        values = [csv_value(sweep.value(sweep.by_key[row["run"]], path)) for path in sweep.paths]
-        table.writerow([row["run"], *values, *(_cell(value) for value in list(row.values())[1:])])
-    write_text(sweep.folder / FIT_TABLE, text.getvalue())
+    rows = fit.rows()
+    columns = {row["run"]: {name: _cell(value) for name, value in row.items() if name != "run"} for row in rows}
+    sweep.write_table(FIT_TABLE, columns)
     content = {
         "made_by": f"apt_evap {__version__}",
         "compare": settings.to_table() | {"sha256": sha256_of(settings.measured)},

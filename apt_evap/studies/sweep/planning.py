@@ -4,7 +4,7 @@ import csv
 import io
 import json
 import statistics
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -56,8 +56,6 @@ class Sweep:
         Folder of the sweep.
     points : tuple of Point
         The points, in the order of the study file.
-    estimates : tuple of CostEstimate
-        Cost of each point.
     job : JobSettings
         How each point is run.
     compare : CompareSettings or None
@@ -66,7 +64,6 @@ class Sweep:
 
     folder: Path
     points: tuple[Point, ...]
-    estimates: tuple[CostEstimate, ...]
     job: JobSettings
     compare: CompareSettings | None
 
@@ -128,6 +125,24 @@ class Sweep:
         for point in self.points:
             yield point, self.state(point.key)
 
+    def write_table(self, name: str, rows: Mapping[str, Mapping[str, Any]]) -> None:
+        """Write a CSV file of points with their numbers, keys and settings that differ.
+
+        Parameters
+        ----------
+        name : str
+            Name of the file in the folder of the sweep.
+        rows : mapping of str to mapping
+            Further columns of each point, by its key; all have the same ones.
+        """
+        text, numbers = io.StringIO(), {key: number for number, key in enumerate(self.by_key)}
+        table = csv.writer(text, lineterminator="\n")
+        table.writerow(["point", "key", *self.paths, *next(iter(rows.values()))])
+        for key, row in rows.items():
+            values = [csv_value(self.value(self.by_key[key], path)) for path in self.paths]
+            table.writerow([numbers[key], key, *values, *row.values()])
+        write_text(self.folder / name, text.getvalue())
+
 
 def plan_sweep(path: AnyPath) -> Sweep:
     """Plan the sweep of a study file: make its folder with one folder for each point. Nothing is run.
@@ -155,7 +170,7 @@ def plan_sweep(path: AnyPath) -> Sweep:
         if "path" in config.tip and (table := json.dumps(point.document["tip"])) not in tables:
             config.specimen()  # a wrong file is an error of the plan
             tables.add(table)
-    sweep = Sweep(folder, study.points, study.estimates, study.job, study.compare)
+    sweep = Sweep(folder, study.points, study.job, study.compare)
     try:
         for point in sweep.points:
             place = sweep.folder_of(point.key)
@@ -164,7 +179,7 @@ def plan_sweep(path: AnyPath) -> Sweep:
             write_text(place / SETTINGS, f"{comment(f'made from {study.base.name}: {point}')}\n{settings}")
     except OSError as error:
         raise FileError(f"cannot write {error.filename!r}: {error.strerror}") from error
-    write_text(folder / _TABLE, _table(sweep))
+    sweep.write_table(_TABLE, {point.key: _columns(point.estimate) for point in sweep.points})
     content = {
         "format": _FORMAT,
         "version": __version__,
@@ -174,8 +189,13 @@ def plan_sweep(path: AnyPath) -> Sweep:
         "each": to_plain(sweep.job),
         "compare": sweep.compare and sweep.compare.to_table(),
         "points": [
-            {"key": point.key, "paths": list(point.values), "document": point.document, "estimate": to_plain(estimate)}
-            for point, estimate in zip(sweep.points, sweep.estimates, strict=True)
+            {
+                "key": point.key,
+                "paths": list(point.values),
+                "document": point.document,
+                "estimate": to_plain(point.estimate),
+            }
+            for point in sweep.points
         ],
     }
     write_text(folder / _PLAN, json.dumps(content, indent=1) + "\n")
@@ -210,7 +230,6 @@ def open_sweep(path: AnyPath) -> Sweep:
         sweep = Sweep(
             folder,
             tuple(map(_point, content["points"])),
-            tuple(from_plain(point["estimate"], CostEstimate) for point in content["points"]),
             from_plain(content["each"], JobSettings),
             None if content["compare"] is None else CompareSettings.of(content["compare"], folder),
         )
@@ -239,20 +258,13 @@ def _point(content):
         values[path] = value_at(document, path)
         if values[path] is None:
             raise ValueError(f"the paths of point {key} must be settings of it, got {short_text(path)}")
-    return Point(key, values, document)
+    return Point(key, values, document, from_plain(content["estimate"], CostEstimate))
 
 
-def _table(sweep):
-    """Table of the points, as text with commas."""
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(["point", "key", *sweep.paths, "ions", "atoms", "memory_GB", "hours"])
-    for number, (point, cost) in enumerate(zip(sweep.points, sweep.estimates, strict=True)):
-        values = [csv_value(sweep.value(point, path)) for path in sweep.paths]
-        numbers = (cost.atoms, cost.memory and cost.memory / 1e9, cost.hours)
-        texts = ["" if value is None else f"{value:.3g}" for value in numbers]
-        table.writerow([number, point.key, *values, cost.ions, *texts])
-    return text.getvalue()
+def _columns(cost):
+    """Estimates in the table of the points."""
+    numbers = {"atoms": cost.atoms, "memory_GB": cost.memory and cost.memory / 1e9, "hours": cost.hours}
+    return {"ions": cost.ions} | {name: "" if value is None else f"{value:.3g}" for name, value in numbers.items()}
 
 
 def csv_value(value: Any) -> str:
@@ -300,7 +312,8 @@ def sweep_status(sweep: Sweep) -> dict[str, Any]:
         point its key, values, state, message, ions, n_ions, seconds.
     """
     table, speeds, left, memory = [], [], [], []
-    for (point, state), cost in zip(sweep.states(), sweep.estimates, strict=True):
+    for point, state in sweep.states():
+        cost = point.estimate
         ions = 0 if state.name == "wrong" else ions_of(sweep.folder_of(point.key))
         if state.name == "done" and cost.hours and state.seconds:
             speeds.append(state.seconds / (3600 * cost.hours))

@@ -52,15 +52,22 @@ class Point:
     document : dict
         Complete settings, as in a file of `apt-evap run`. The file of a specimen is relative to the folder of the
         point, and has its SHA-256.
+    estimate : CostEstimate
+        Its cost.
     """
 
     key: str
     values: dict
     document: dict
+    estimate: CostEstimate
 
     def __str__(self):
-        texts = [f"{path} = {json.dumps(value, default=str)}" for path, value in self.values.items()]
-        return ", ".join(texts) or "the base"
+        return _text_of(self.values)
+
+
+def _text_of(values):
+    """Settings in which a point differs from the base, as text."""
+    return ", ".join(f"{path} = {json.dumps(value, default=str)}" for path, value in values.items()) or "the base"
 
 
 @dataclass(frozen=True)
@@ -77,8 +84,6 @@ class SweepStudy:
         All points, each once.
     configs : tuple of Config
         Their settings, validated.
-    estimates : tuple of CostEstimate
-        Cost of each point.
     job : JobSettings
         How each point is run.
     compare : CompareSettings or None
@@ -93,7 +98,6 @@ class SweepStudy:
     base: Path
     points: tuple[Point, ...]
     configs: tuple[Config, ...]
-    estimates: tuple[CostEstimate, ...]
     job: JobSettings
     compare: CompareSettings | None
     sha256: str
@@ -165,7 +169,6 @@ def read_study(path: AnyPath) -> SweepStudy:
     config_of(settings, base_path)  # an error of the base is not that of a point
     points: dict[str, Point] = {}
     configs: list[Config] = []
-    estimates: list[CostEstimate] = []
     place, digests = folder_of_study(path) / POINTS / "point", {}
     for values in choices:
         try:
@@ -176,25 +179,16 @@ def read_study(path: AnyPath) -> SweepStudy:
                 document["tip"] = _specimen_table(document["tip"], config.tip["path"], place, digests)
             key = key_of(document)
             if key not in points:
-                _check_responses(config, compare)
-                points[key] = Point(key, values, document)
+                if compare is not None and not config.responses:
+                    raise ValueError("[compare] needs responses = true in [simulation]")
+                points[key] = Point(key, values, document, estimate_cost(config, job.threads))
                 configs.append(config)
-                estimates.append(estimate_cost(config, job.threads))
         except ValueError as error:
-            raise FileError(f"{str(path)!r}, {Point('', values, {})}: {error}") from error
+            raise FileError(f"{str(path)!r}, {_text_of(values)}: {error}") from error
     content = path.read_bytes() + base_path.read_bytes() + "".join(digests.values()).encode()
     sha256 = hashlib.sha256(content).hexdigest()
-    return SweepStudy(
-        path,
-        base_path,
-        tuple(points.values()),
-        tuple(configs),
-        tuple(estimates),
-        job,
-        compare,
-        sha256,
-        table.get("dataset", {}),
-    )
+    dataset = table.get("dataset", {})
+    return SweepStudy(path, base_path, tuple(points.values()), tuple(configs), job, compare, sha256, dataset)
 
 
 def _fitting(values, settings, path):
@@ -269,11 +263,6 @@ def check_setting_path(path: str) -> None:
         raise ValueError(f"{path} is the same for all points: change it in the base")
     if not all(path.split(".")):
         raise ValueError(f"a path must be names joined by dots, such as 'tip.axis', got {short_text(path)}")
-
-
-def _check_responses(config, compare):
-    if compare is not None and not config.responses:
-        raise ValueError("[compare] needs responses = true in [simulation]")
 
 
 def with_values(document: dict[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
