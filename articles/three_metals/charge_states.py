@@ -31,11 +31,15 @@ CHARGES = {  # lower charge, assumed ratio elsewhere, and the two families of po
 }
 
 
-def regions(directions, orientation, metal):
-    """Masks of directions: in the strips from the pole towards the poles of two families, and of the rest."""
+def regions(directions, orientation, metal, near=NEAR, between=None):
+    """Masks of directions: in the strips from the pole towards the poles of two families, and of the rest.
+
+    Strips have half the width `near`, between two angles from the pole [degrees].
+    """
     pole = np.asarray(orientation.nearest_pole(METALS[metal].pole).direction)
     angle = np.degrees(np.arccos(np.clip(directions @ pole, -1, 1)))
-    inside = (angle > FIRST) & (angle < METALS[metal].reach)
+    inner, outer = between or (FIRST, METALS[metal].reach)
+    inside = (angle > inner) & (angle < outer)
     found = poles(orientation.material, 10)
     strips = []
     for family in CHARGES[metal][2]:
@@ -48,7 +52,7 @@ def regions(directions, orientation, metal):
             along = normal - (normal @ pole) * pole
             along = along / np.linalg.norm(along)
             beside = np.degrees(np.arcsin(np.clip(directions @ np.cross(pole, along), -1, 1)))
-            strip |= inside & (np.abs(beside) < NEAR) & (directions @ along > 0)
+            strip |= inside & (np.abs(beside) < near) & (directions @ along > 0)
         strips.append(strip)
     return *strips, inside & ~strips[0] & ~strips[1]
 
@@ -67,14 +71,21 @@ def measured(path):
     three, four = (ratio > 59.0) & (ratio < 63.4), (ratio > 44.8) & (ratio < 47.2)
     beside = ((ratio > 42.2) & (ratio < 44.6)) | ((ratio > 47.4) & (ratio < 49.8))
     _, orientation, projection = measured_of("W", ions[three])
-    found = []
-    for name, region in zip(
-        names_of("W"), regions(projection.directions(np.column_stack([ions.x, ions.y])), orientation, "W"), strict=True
-    ):
+    directions = projection.directions(np.column_stack([ions.x, ions.y]))
+
+    def counted(region):
         n, peak, ground = (np.count_nonzero(region & each) for each in (three, four, beside))
-        found.append((peak - ground / 2) / n)
-        print(f"measured {name}: {found[-1]:.4f} +- {np.sqrt(peak + ground / 4) / n:.4f}")
-    return found[-1]
+        return (peak - ground / 2) / n, np.sqrt(peak + ground / 4) / n
+
+    found = [counted(region) for region in regions(directions, orientation, "W")]
+    for name, (part, error) in zip(names_of("W"), found, strict=True):
+        print(f"measured {name}: {part:.4f} +- {error:.4f}")
+    for near in (1.0, NEAR, 2.5):  # the ratio depends on the region
+        for between in ((3.0, 10.0), (3.0, 12.0), (3.0, 15.5), (10.0, 15.5)):
+            part, error = counted(regions(directions, orientation, "W", near, between)[0])
+            print(f"measured {names_of('W')[0]}, within {near:g} degrees, {between[0]:g} to {between[1]:g}: "
+                  f"{part:.4f} +- {error:.4f}")  # fmt: skip
+    return found[-1][0]
 
 
 def fields_on_the_way(run, skip, starts, chosen):
